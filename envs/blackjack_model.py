@@ -71,13 +71,10 @@ def dealer_sums(total: int, usable_ace: bool) -> tuple[float, ...]:
 
 
 def sticking(total: int, dealer: int, natural: str | None) -> tuple[float, float, float, float]:
-    """Probabilities of the rewards 1.5, 1, 0 and -1 when the player sticks.
+    """Probabilities of the rewards 1.5, 1, 0 and -1 when the player sticks on a sum.
 
-    Args:
-        total: the player's sum.
-        dealer: the dealer's card that shows.
-        natural: what the player's natural brings: "wins" against all but another natural, "pays"
-            1.5 where it is more than the dealer has; None for neither, or no natural.
+    A natural "wins" against all but another natural, or "pays" 1.5 where it is more than the dealer
+    has; None for neither, or no natural.
     """
     if natural == "wins":
         # The other card of the dealer's natural.

@@ -26,17 +26,11 @@ _OBSERVATION_HOMES = ("gymnasium.wrappers.", "envs.wrappers.")
 
 @dataclass(frozen=True)
 class OptimumBracket:
-    """What is known of the highest mean return that any policy has, over starts that are drawn.
+    """What is known of the highest mean return that any policy has, over starts that are drawn."""
 
-    Attributes:
-        lower: what a policy was seen to reach.
-        upper: what no policy exceeds.
-        baseline: the mean return of the best random or constant policy.
-    """
-
-    lower: float
-    upper: float
-    baseline: float
+    lower: float  # what a policy was seen to reach
+    upper: float  # what no policy exceeds
+    baseline: float  # the mean return of the best random or constant policy
 
 
 def optimum_bracket(env: gym.Env[Any, Any]) -> OptimumBracket | None:
@@ -69,7 +63,8 @@ def constants_of(base: gym.Env[Any, Any]) -> dict[str, Any]:
 
     Those of its class count too. What drawing needs, and what changes from step to step, do not.
     """
-    named = {**_members(type(base)), **vars(base)}
+    of_class = {k: v for each in reversed(type(base).__mro__) for k, v in vars(each).items()}
+    named = {**of_class, **vars(base)}
     return {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in sorted(named.items())
@@ -81,10 +76,6 @@ _NO_DYNAMICS = (
     *("__", "_is_protocol", "_np_random", "render", "screen", "SCREEN", "isopen"),
     *("state", "steps_beyond", "last_u"),
 )
-
-
-def _members(kind: type) -> dict[str, Any]:
-    return {name: value for each in reversed(kind.__mro__) for name, value in vars(each).items()}
 
 
 def _is_plain(env: gym.Env[Any, Any]) -> bool:

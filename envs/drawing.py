@@ -19,12 +19,8 @@ from envs.argument_checks import check_choice
 if TYPE_CHECKING:
     import pygame
 
-
-# How the things of a grid world look: colours, and shapes in a unit square, y pointing down.
-#
 # The colours are those of Okabe and Ito ("Color universal design", 2008) where things must be told
 # apart, and every thing has a shape of its own, so that no meaning rests on colour alone.
-
 Colour = tuple[int, int, int]
 Point = tuple[float, float]
 
@@ -102,36 +98,36 @@ def _star(n_rays: int, outer: float, inner: float) -> tuple[Point, ...]:
     )
 
 
+# Shapes in a unit square, y pointing down.
 _WHOLE_CELL: tuple[Point, Point, float] = ((0, 0), (1, 1), 0)
 _BOLT = ((0.58, 0.14), (0.24, 0.57), (0.46, 0.57), (0.40, 0.87), (0.76, 0.42), (0.53, 0.42))
 
-SHELF_SHAPES: tuple[Shape, ...] = (
-    Box((0.03, 0.03), (0.94, 0.94), 0.10, SHELF_DARK),
-    Box((0.03, 0.03), (0.94, 0.86), 0.10, SHELF),
-    Box((0.14, 0.15), (0.72, 0.20), 0.04, SHELF_LIGHT),
-    Box((0.14, 0.47), (0.72, 0.20), 0.04, SHELF_LIGHT),
-)
-START_SHAPES: tuple[Shape, ...] = (
-    Box(*_WHOLE_CELL, SKY),
-    Ring((0.5, 0.5), 0.34, 0.07, BLUE),
-)
-GOAL_SHAPES: tuple[Shape, ...] = (
-    Box(*_WHOLE_CELL, PALE_GREEN),
-    Box((0.27, 0.14), (0.07, 0.74), 0.03, INK),
-    Polygon(((0.34, 0.16), (0.82, 0.34), (0.34, 0.52)), GREEN),
-    Box((0.17, 0.84), (0.27, 0.06), 0.03, INK),
-)
-MINE_SHAPES: tuple[Shape, ...] = (
-    Box(*_WHOLE_CELL, PALE_RED),
-    Polygon(_star(8, 0.42, 0.26), INK),
-    Disc((0.5, 0.5), 0.30, INK),
-    Disc((0.5, 0.5), 0.13, VERMILION),
-)
-POWER_SHAPES: tuple[Shape, ...] = (
-    Box(*_WHOLE_CELL, PALE_YELLOW),
-    Disc((0.5, 0.5), 0.42, ORANGE),
-    Polygon(_BOLT, WHITE),
-)
+LETTER_SHAPES: dict[str, tuple[Shape, ...]] = {
+    "#": (
+        Box((0.03, 0.03), (0.94, 0.94), 0.10, SHELF_DARK),
+        Box((0.03, 0.03), (0.94, 0.86), 0.10, SHELF),
+        Box((0.14, 0.15), (0.72, 0.20), 0.04, SHELF_LIGHT),
+        Box((0.14, 0.47), (0.72, 0.20), 0.04, SHELF_LIGHT),
+    ),
+    "S": (Box(*_WHOLE_CELL, SKY), Ring((0.5, 0.5), 0.34, 0.07, BLUE)),
+    "G": (
+        Box(*_WHOLE_CELL, PALE_GREEN),
+        Box((0.27, 0.14), (0.07, 0.74), 0.03, INK),
+        Polygon(((0.34, 0.16), (0.82, 0.34), (0.34, 0.52)), GREEN),
+        Box((0.17, 0.84), (0.27, 0.06), 0.03, INK),
+    ),
+    "M": (
+        Box(*_WHOLE_CELL, PALE_RED),
+        Polygon(_star(8, 0.42, 0.26), INK),
+        Disc((0.5, 0.5), 0.30, INK),
+        Disc((0.5, 0.5), 0.13, VERMILION),
+    ),
+    "P": (
+        Box(*_WHOLE_CELL, PALE_YELLOW),
+        Disc((0.5, 0.5), 0.42, ORANGE),
+        Polygon(_BOLT, WHITE),
+    ),
+}
 EMPTIED_SHAPES: tuple[Shape, ...] = (
     Box(*_WHOLE_CELL, FLOOR),
     Ring((0.5, 0.5), 0.42, 0.04, GRID),
@@ -154,13 +150,6 @@ ROBOT_SHAPES: tuple[Shape, ...] = (
     Ring((0.5, 0.66), 0.12, 0.05, SKY),
 )
 
-LETTER_SHAPES: dict[str, tuple[Shape, ...]] = {
-    "#": SHELF_SHAPES,
-    "S": START_SHAPES,
-    "G": GOAL_SHAPES,
-    "M": MINE_SHAPES,
-    "P": POWER_SHAPES,
-}
 # One colour each, for maps whose cells are too small to show a shape.
 LETTER_COLOURS: dict[str, Colour] = {
     "#": SHELF_LIGHT,
@@ -185,28 +174,16 @@ def trail_shapes(sides: frozenset[int]) -> tuple[Shape, ...]:
     return (Disc((0.5, 0.5), half, BLUE), *(arms[side] for side in sorted(sides)))
 
 
-# What pictures show.
-
-
 @dataclass(frozen=True)
 class Scene:
-    """A moment of an episode in a grid world; cells are numbered row by row.
-
-    Attributes:
-        rows: the map.
-        robot: where the robot is.
-        steps: pairs of neighbouring cells that it has gone from and to, in no order.
-        collected: cells that it has emptied.
-        last_action: its latest move, 0 up, 1 down, 2 left, 3 right; None before the first.
-        title: what to write above the map as text; None for the latest move.
-    """
+    """A moment of an episode in a grid world; cells are numbered row by row."""
 
     rows: tuple[str, ...]
     robot: int
-    steps: Collection[tuple[int, int]]
-    collected: Collection[int]
-    last_action: int | None
-    title: str | None = None
+    steps: Collection[tuple[int, int]]  # neighbouring cells that it has gone from and to
+    collected: Collection[int]  # cells that it has emptied
+    last_action: int | None  # 0 up, 1 down, 2 left, 3 right; None before the first
+    title: str | None = None  # above the map as text; None for the latest move
 
     def place(self, cell: int) -> tuple[int, int]:
         """Row and column of a cell."""
@@ -215,20 +192,75 @@ class Scene:
 
 @dataclass(frozen=True)
 class Chart:
-    """A picture made of shapes whose coordinates are pixels.
-
-    Attributes:
-        size: width and height in pixels.
-        shapes: what it is made of, the hindmost first.
-    """
+    """A picture made of shapes, the hindmost first, all in pixels."""
 
     size: tuple[int, int]
     shapes: Sequence[Shape]
 
 
-# Environments as pictures and in a window; the only module that draws with pygame.
-#
-# pygame is imported when the first picture is drawn.
+class Renderer(ABC):
+    """Shows scenes, as pixels or in a window; pygame is imported when the first one is drawn.
+
+    Copies, pickled ones included, share no window: they open their own when they need it.
+    """
+
+    def __init__(self, fps: int, title: str) -> None:
+        self.fps = fps  # pictures a second in a window
+        self.title = title
+        self._window: pygame.Surface | None = None
+        self._clock: pygame.time.Clock | None = None
+
+    @abstractmethod
+    def paint(self, scene: Any) -> pygame.Surface:
+        """Draw a scene."""
+
+    def pixels(self, scene: Any) -> NDArray[np.uint8]:
+        """The picture of a scene, shape (height, width, 3)."""
+        import pygame
+
+        picture = self.paint(scene)
+        return np.ascontiguousarray(pygame.surfarray.array3d(picture).swapaxes(0, 1))
+
+    def show(self, scene: Any) -> None:
+        """Draw a scene into the window, no sooner than the time for it has come."""
+        import pygame
+
+        picture = self.paint(scene)
+        if self._window is None:
+            pygame.display.init()
+            pygame.display.set_caption(self.title)
+            self._window = pygame.display.set_mode(picture.get_size())
+            self._clock = pygame.time.Clock()
+        assert self._clock is not None
+        self._window.blit(picture, (0, 0))
+        pygame.event.pump()
+        pygame.display.update()
+        self._clock.tick(self.fps)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            import pygame
+
+            pygame.display.quit()
+            self._window = None
+
+
+class ChartRenderer(Renderer):
+    """Shows charts."""
+
+    def __reduce__(self) -> tuple[type[ChartRenderer], tuple[int, str]]:
+        return ChartRenderer, (self.fps, self.title)
+
+    def paint(self, scene: Chart) -> pygame.Surface:
+        import pygame
+
+        picture = pygame.Surface(scene.size)
+        picture.fill(FLOOR)
+        for shape in scene.shapes:
+            _draw(picture, shape, 1)
+        return picture
+
 
 MAX_SIDE = 1024
 MAX_CELL = 64
@@ -241,14 +273,11 @@ TRAIL_MARKER = 4
 OVERSAMPLING = 4
 
 
-class GridPainter:
-    """Draws the moments of one map; what they have in common is drawn once.
+class GridRenderer(Renderer):
+    """Shows the moments of one map; what they have in common is drawn once."""
 
-    Args:
-        rows: the map.
-    """
-
-    def __init__(self, rows: tuple[str, ...]) -> None:
+    def __init__(self, rows: tuple[str, ...], fps: int, title: str) -> None:
+        super().__init__(fps, title)
         self.rows = rows
         self.n_columns = len(rows[0])
         longest = max(len(rows), self.n_columns)
@@ -256,8 +285,10 @@ class GridPainter:
         self.detailed = self.cell >= MIN_DETAILED_CELL
         self._sprites: dict[tuple[tuple[Shape, ...], int], pygame.Surface] = {}
 
+    def __reduce__(self) -> tuple[type[GridRenderer], tuple[tuple[str, ...], int, str]]:
+        return GridRenderer, (self.rows, self.fps, self.title)
+
     def paint(self, scene: Scene) -> pygame.Surface:
-        """Draw a scene."""
         import pygame
 
         picture = self._detailed(scene) if self.detailed else self._coarse(scene)
@@ -382,95 +413,6 @@ class GridPainter:
         return self._sprites[shapes, size]
 
 
-class Renderer(ABC):
-    """Shows scenes, as pixels or in a window.
-
-    Copies, pickled ones included, share no window: they open their own when they need it.
-
-    Args:
-        fps: pictures a second in a window.
-        title: what the window is called.
-    """
-
-    def __init__(self, fps: int, title: str) -> None:
-        self.fps = fps
-        self.title = title
-        self._window: pygame.Surface | None = None
-        self._clock: pygame.time.Clock | None = None
-
-    @abstractmethod
-    def paint(self, scene: Any) -> pygame.Surface:
-        """Draw a scene."""
-
-    def pixels(self, scene: Any) -> NDArray[np.uint8]:
-        """The picture of a scene, shape (height, width, 3)."""
-        import pygame
-
-        picture = self.paint(scene)
-        return np.ascontiguousarray(pygame.surfarray.array3d(picture).swapaxes(0, 1))
-
-    def show(self, scene: Any) -> None:
-        """Draw a scene into the window, no sooner than the time for it has come."""
-        import pygame
-
-        picture = self.paint(scene)
-        if self._window is None:
-            pygame.display.init()
-            pygame.display.set_caption(self.title)
-            self._window = pygame.display.set_mode(picture.get_size())
-            self._clock = pygame.time.Clock()
-        assert self._clock is not None
-        self._window.blit(picture, (0, 0))
-        pygame.event.pump()
-        pygame.display.update()
-        self._clock.tick(self.fps)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            import pygame
-
-            pygame.display.quit()
-            self._window = None
-
-
-class GridRenderer(Renderer):
-    """Shows one map.
-
-    Args:
-        rows: the map.
-        fps: see `Renderer`.
-        title: see `Renderer`.
-    """
-
-    def __init__(self, rows: tuple[str, ...], fps: int, title: str) -> None:
-        super().__init__(fps, title)
-        self.rows = rows
-        self._painter = GridPainter(rows)
-
-    def __reduce__(self) -> tuple[type[GridRenderer], tuple[tuple[str, ...], int, str]]:
-        return GridRenderer, (self.rows, self.fps, self.title)
-
-    def paint(self, scene: Scene) -> pygame.Surface:
-        return self._painter.paint(scene)
-
-
-class ChartRenderer(Renderer):
-    """Shows charts."""
-
-    def __reduce__(self) -> tuple[type[ChartRenderer], tuple[int, str]]:
-        return ChartRenderer, (self.fps, self.title)
-
-    def paint(self, scene: Chart) -> pygame.Surface:
-        import pygame
-
-        picture = pygame.Surface(scene.size)
-        picture.fill(FLOOR)
-        for shape in scene.shapes:
-            _draw(picture, shape, 1)
-        return picture
-
-
 def _draw(surface: pygame.Surface, shape: Shape, scale: int) -> None:
     import pygame
 
@@ -498,20 +440,11 @@ def _draw(surface: pygame.Surface, shape: Shape, scale: int) -> None:
             pygame.draw.rect(surface, shape.colour, area, border_radius=rounding)
 
 
-# What environments share that can be looked at: as text, as a picture, in a window.
-
 RENDER_MODES = ("ansi", "rgb_array", "human")
 
 
 class ShownEnv(gym.Env[Any, Any], ABC):
-    """An environment with the three ways of looking at it.
-
-    Args:
-        render_mode: ``"ansi"``, ``"rgb_array"``, ``"human"`` or None.
-
-    Raises:
-        ValueError: if it is none of these.
-    """
+    """An environment with three ways of looking at it: ``ansi``, ``rgb_array`` and ``human``."""
 
     # Not annotated as ClassVar, since Gymnasium declares it as an attribute of the instance.
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
@@ -554,45 +487,3 @@ class ShownEnv(gym.Env[Any, Any], ABC):
     @abstractmethod
     def _make_renderer(self, fps: int, title: str) -> Renderer:
         """What paints the pictures."""
-
-
-# Amounts as text and as bars, for environments whose state is one.
-
-# In characters.
-BAR = 40
-# In pixels.
-WIDTH, MARGIN, TITLE, ROW, TEXT = 560, 24, 48, 64, 22
-
-
-class Gauge(NamedTuple):
-    """An amount between nothing and full."""
-
-    name: str
-    amount: int
-    full: int
-
-
-def gauges_text(title: str, gauges: Sequence[Gauge]) -> str:
-    """The title on a line, then a line for each gauge."""
-    longest = max(len(gauge.name) for gauge in gauges)
-    lines = [f"({title})"]
-    for name, amount, full in gauges:
-        bar = "=" * round(BAR * amount / full)
-        lines.append(f"{name:{longest}}  {amount:>{len(str(full))}}/{full} |{bar:{BAR}}|")
-    return "\n".join(lines) + "\n"
-
-
-def gauges_chart(title: str, gauges: Sequence[Gauge]) -> Chart:
-    """The title, then a bar for each gauge below its name and numbers."""
-    shapes: list[Shape] = [Label(title, (MARGIN, TITLE / 2), TEXT + 4, INK, align=0)]
-    length = WIDTH - 2 * MARGIN
-    for i, (name, amount, full) in enumerate(gauges):
-        top = TITLE + i * ROW
-        right = WIDTH - MARGIN
-        shapes += [
-            Label(name, (MARGIN, top + 8), TEXT, INK, align=0),
-            Label(f"{amount} of {full}", (right, top + 8), TEXT, INK, align=1),
-            Box((MARGIN, top + 22), (length, 24), 4, GRID),
-            Box((MARGIN, top + 22), (length * amount / full, 24), 4, BLUE),
-        ]
-    return Chart((WIDTH, TITLE + ROW * len(gauges)), shapes)

@@ -6,12 +6,12 @@ from abc import abstractmethod
 from bisect import bisect_right
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
-from envs.drawing import ShownEnv
+from envs.drawing import BLUE, GRID, INK, Box, Chart, ChartRenderer, Label, Shape, ShownEnv
 from mdp.array_types import Bools, Floats
 
 if TYPE_CHECKING:
@@ -85,14 +85,7 @@ class FiniteEnv(ShownEnv):
         return self._observe(), reward, terminated, False, {}
 
     def observation_of(self, states: Any) -> Any:
-        """What is observed in each of many states: by default the states themselves.
-
-        Args:
-            states: their numbers, shape (n,).
-
-        Returns:
-            The observations, shape (n,).
-        """
+        """What is observed in each of many states, shape (n,): by default their numbers."""
         return states
 
     def _observe(self) -> int:
@@ -139,6 +132,54 @@ class MaskedFiniteEnv(FiniteEnv):
         """What may be done now, bool of shape (A,): sb3-contrib's convention."""
         mask: Bools = self.masks_of_states()[self.s]
         return mask.copy()
+
+
+# Of bars, in characters.
+BAR = 40
+# In pixels.
+WIDTH, MARGIN, TITLE, ROW, TEXT = 560, 24, 48, 64, 22
+
+
+class Gauge(NamedTuple):
+    """An amount between nothing and full."""
+
+    name: str
+    amount: int
+    full: int
+
+
+class GaugeEnv(MaskedFiniteEnv):
+    """One whose state is one or more amounts, shown as bars."""
+
+    @abstractmethod
+    def _gauges(self) -> tuple[str, list[Gauge]]:
+        """What was done last, in words, and the amounts."""
+
+    def _text(self) -> str:
+        title, gauges = self._gauges()
+        longest = max(len(gauge.name) for gauge in gauges)
+        lines = [f"({title})"]
+        for name, amount, full in gauges:
+            bar = "=" * round(BAR * amount / full)
+            lines.append(f"{name:{longest}}  {amount:>{len(str(full))}}/{full} |{bar:{BAR}}|")
+        return "\n".join(lines) + "\n"
+
+    def _picture(self) -> Chart:
+        title, gauges = self._gauges()
+        shapes: list[Shape] = [Label(title, (MARGIN, TITLE / 2), TEXT + 4, INK, align=0)]
+        length, right = WIDTH - 2 * MARGIN, WIDTH - MARGIN
+        for i, (name, amount, full) in enumerate(gauges):
+            top = TITLE + i * ROW
+            shapes += [
+                Label(name, (MARGIN, top + 8), TEXT, INK, align=0),
+                Label(f"{amount} of {full}", (right, top + 8), TEXT, INK, align=1),
+                Box((MARGIN, top + 22), (length, 24), 4, GRID),
+                Box((MARGIN, top + 22), (length * amount / full, 24), 4, BLUE),
+            ]
+        return Chart((WIDTH, TITLE + ROW * len(gauges)), shapes)
+
+    def _make_renderer(self, fps: int, title: str) -> ChartRenderer:
+        return ChartRenderer(fps, title)
 
 
 def first_above(cumulative: Sequence[float] | Floats, uniform: float) -> int:

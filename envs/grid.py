@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeGuard
 
 import numpy as np
 from gymnasium import spaces
@@ -25,9 +25,6 @@ from safe_files.files import UnsafeFileError, read_file
 if TYPE_CHECKING:
     from mdp.transition_model import TransitionModel
 
-
-# Maps of grid worlds: reading, checking, and how far each cell is from the goal.
-
 START = "S"
 GOAL = "G"
 # 4096 x 4096 cells: a Q-table of four actions then fills half a gigabyte.
@@ -41,20 +38,12 @@ Description = Sequence[str] | str | os.PathLike[str]
 
 @dataclass(frozen=True, eq=False)
 class GridMap:
-    """A rectangular map of letters; row 0 is at the top, cells are numbered row by row.
-
-    Attributes:
-        rows: the map as text.
-        codes: the letters' ASCII codes, one per cell.
-        start: the cell of the only ``S``.
-        distances: moves from each cell to the nearest goal, -1 where there is no way; int32 of
-            shape (cells,).
-    """
+    """A rectangular map of letters; row 0 is at the top, cells are numbered row by row."""
 
     rows: tuple[str, ...]
-    codes: bytes
-    start: int
-    distances: NDArray[np.int32]
+    codes: bytes  # the letters' ASCII codes, one per cell
+    start: int  # the cell of the only ``S``
+    distances: NDArray[np.int32]  # see `distances_to`, to the nearest goal; shape (cells,)
 
     @classmethod
     def read(cls, desc: Description, known: Collection[str], passable: Collection[str]) -> GridMap:
@@ -71,11 +60,16 @@ class GridMap:
                 there is not exactly one start or no goal, or no way between them. Where there
                 is a place to name, the message names row and column, counted from one.
         """
-        rows, source = _read_rows(desc)
+        rows, source = read_rows(desc), f"the map {desc}" if _is_path(desc) else "the map"
         _check_shape(rows, source)
-        _check_letters(rows, source, known)
-        codes = "".join(rows).encode("ascii")
-        n_columns = len(rows[0])
+        letters, n_columns = "".join(rows), len(rows[0])
+        if not set(letters) <= set(known):
+            cell = next(cell for cell, letter in enumerate(letters) if letter not in known)
+            raise ValueError(
+                f"{source}: unknown letter {letters[cell]!r} at {_place(cell, n_columns)}; "
+                f"known are {' '.join(known)}"
+            )
+        codes = letters.encode("ascii")
         start = _only_start(codes, n_columns, source)
         goals = [cell for cell, code in enumerate(codes) if code == ord(GOAL)]
         if not goals:
@@ -108,12 +102,7 @@ class GridMap:
 def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
     """Moves from each cell to the nearest target over free cells, by breadth-first search.
 
-    Args:
-        targets: cells to reach, numbered row by row; they need not be free.
-        free: where the way may lead, bool of shape (rows, columns).
-
-    Returns:
-        int32 of the same shape, -1 where no way leads to a target.
+    Targets need not be free. -1 where no way leads to one; the shape is that of ``free``.
     """
     n_rows, n_columns = free.shape
     # A border all around saves the search from asking whether it left the map. Plain Python on
@@ -140,26 +129,23 @@ def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
 
 
 def read_rows(desc: Description) -> tuple[str, ...]:
-    """The rows of a map, not checked yet; see `GridMap.read`.
+    """The rows of a map, not checked yet; see `GridMap.read`."""
+    if _is_path(desc):
+        text = _read_file(Path(desc))
+    elif isinstance(desc, str):
+        text = desc
+    elif isinstance(desc, Sequence) and all(isinstance(row, str) for row in desc):
+        return tuple(desc)
+    else:
+        raise ValueError(
+            f"desc must be a list of rows, such as ['S.', '#G'], or the path to a text file, not "
+            f"{desc!r}"
+        )
+    return tuple(text.strip("\r\n").splitlines())
 
-    Raises:
-        ValueError: if there is no such file, or it is no text.
-    """
-    return _read_rows(desc)[0]
 
-
-def _read_rows(desc: object) -> tuple[tuple[str, ...], str]:
-    """The rows, and what to call the map in an error message."""
-    if isinstance(desc, str) and "\n" in desc:
-        return tuple(desc.strip("\r\n").splitlines()), "the map"
-    if isinstance(desc, str | os.PathLike):
-        return tuple(_read_file(Path(desc)).strip("\r\n").splitlines()), f"the map {desc}"
-    if isinstance(desc, Sequence) and all(isinstance(row, str) for row in desc):
-        return tuple(desc), "the map"
-    raise ValueError(
-        f"desc must be a list of rows, such as ['S.', '#G'], or the path to a text file, not "
-        f"{desc!r}"
-    )
+def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:
+    return isinstance(desc, os.PathLike) or (isinstance(desc, str) and "\n" not in desc)
 
 
 def _read_file(path: Path) -> str:
@@ -191,16 +177,6 @@ def _check_shape(rows: tuple[str, ...], source: str) -> None:
             )
 
 
-def _check_letters(rows: tuple[str, ...], source: str, known: Collection[str]) -> None:
-    for row, cells in enumerate(rows, 1):
-        if not set(cells) <= set(known):
-            column = next(column for column, letter in enumerate(cells) if letter not in known)
-            raise ValueError(
-                f"{source}: unknown letter {cells[column]!r} at row {row}, column {column + 1}; "
-                f"known are {' '.join(known)}"
-            )
-
-
 def _only_start(codes: bytes, n_columns: int, source: str) -> int:
     first = codes.find(ord(START))
     if first < 0:
@@ -218,8 +194,6 @@ def _place(cell: int, n_columns: int) -> str:
     row, column = divmod(cell, n_columns)
     return f"row {row + 1}, column {column + 1}"
 
-
-# What happens on a grid when a robot moves: one rule, for a single step and for all at once.
 
 MOVE_NAMES = ("up", "down", "left", "right")
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -254,7 +228,7 @@ class Move(NamedTuple):
 
 
 class GridDynamics:
-    """The rules of a grid world: a map, and what each of its letters means.
+    """What happens when a robot moves on a map, for a single step and for all at once.
 
     A state is a cell plus the number of cells times a bit mask: bit i is set when the i-th
     collectable cell, row by row, has been visited in this episode. Without collectable cells
@@ -313,14 +287,9 @@ class GridDynamics:
         return Move(target + self.n_cells * collected, reward, tile.terminated, bumped=False)
 
     def transition_model(self, initial: Floats) -> TransitionModel:
-        """Every move of every state as arrays.
+        """Every move of every state as arrays, for starts of probabilities of shape (S,).
 
-        Args:
-            initial: probabilities of the starting states, shape (S,).
-
-        Returns:
-            A model with 4 actions and one outcome, or three where moves may slip: as meant, then
-            to the two sides. Equal outcomes stay apart.
+        There is one outcome, or three where moves may slip: as meant, then to the two sides.
         """
         from mdp.transition_model import TransitionModel
 
@@ -341,17 +310,14 @@ class GridDynamics:
 
     def action_masks(self) -> Bools:
         """`action_mask` of all states, bool of shape (S, 4)."""
-        codes = np.frombuffer(self.codes, np.uint8)
-        blocked = self._per_code("blocked", np.bool_)
         entered, _ = self._entered()
-        free = ~blocked[entered]
-        free |= (blocked | self._per_code("terminated", np.bool_))[codes][:, None]
+        free = ~self._per_code("blocked", np.bool_)[entered]
+        free |= self._over()[:, None]
         free |= ~free.any(axis=1, keepdims=True)
         return np.tile(free, (self.n_states // self.n_cells, 1))
 
     def _all_moves(self) -> tuple[Ints, Floats, Bools]:
         """`move` for all states and directions: next states, rewards, ends; each (S, 4)."""
-        codes = np.frombuffer(self.codes, np.uint8)
         entered, target = self._entered()
         stays = self._per_code("blocked", np.bool_)[entered]
         cells = np.arange(self.n_cells)[:, None]
@@ -365,11 +331,10 @@ class GridDynamics:
 
         next_state = destination + self.n_cells * (collected | found)
         reward = self._per_code("reward", np.float64)[entered] + bonus
-        terminated = np.broadcast_to(
-            self._per_code("terminated", np.bool_)[entered], next_state.shape
-        ).copy()
+        ends = self._per_code("terminated", np.bool_)[entered]
+        terminated = np.broadcast_to(ends, next_state.shape).copy()
 
-        over = (self._per_code("blocked", np.bool_) | self._per_code("terminated", np.bool_))[codes]
+        over = self._over()
         states = np.arange(self.n_states).reshape(-1, self.n_cells)
         next_state[:, over] = states[:, over, None]
         reward[:, over] = 0.0
@@ -379,18 +344,20 @@ class GridDynamics:
 
     def _entered(self) -> tuple[NDArray[np.uint8], Ints]:
         """The code of what each move meets, and the cell it aims at; each (cells, 4)."""
-        codes = np.frombuffer(self.codes, np.uint8)
-        target, inside = self._targets()
-        # The edge takes the place of a letter: code 0, which no map holds.
-        return np.where(inside, codes[target], 0).astype(np.uint8), target
-
-    def _targets(self) -> tuple[Ints, Bools]:
-        """The cell each move aims at, and whether it lies on the map; each (cells, 4)."""
         rows, columns = np.divmod(np.arange(self.n_cells)[:, None], self.n_columns)
         steps = np.array(MOVES)
         rows, columns = rows + steps[:, 0], columns + steps[:, 1]
         inside = (rows >= 0) & (rows < self.n_rows) & (columns >= 0) & (columns < self.n_columns)
-        return np.where(inside, rows * self.n_columns + columns, 0), inside
+        target = np.where(inside, rows * self.n_columns + columns, 0)
+        codes = np.frombuffer(self.codes, np.uint8)
+        # The edge takes the place of a letter: code 0, which no map holds.
+        return np.where(inside, codes[target], 0).astype(np.uint8), target
+
+    def _over(self) -> Bools:
+        """The cells from which no move can be made, shape (cells,)."""
+        over = self._per_code("blocked", np.bool_) | self._per_code("terminated", np.bool_)
+        found: Bools = over[np.frombuffer(self.codes, np.uint8)]
+        return found
 
     def _per_code(self, name: str, dtype: type[Any]) -> NDArray[Any]:
         """An attribute of the tiles as a table of ASCII codes, the edge's at 0, None as zero."""
@@ -399,8 +366,6 @@ class GridDynamics:
             table[code] = getattr(tile, name) or 0
         return table
 
-
-# Grid worlds as text, in colour where the terminal has it.
 
 ROBOT = "R"
 TRAIL = "*"
@@ -428,18 +393,13 @@ def render_text(scene: Scene) -> str:
     trail = {scene.place(cell) for step in scene.steps for cell in step}
     marks = {(row, column): TRAIL for row, column in trail if scene.rows[row][column] != START}
     marks[robot_row, robot_column] = ROBOT
-    style = _coloured if terminal_has_colour() else str
+    opted_out = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
+    style = _coloured if sys.stdout.isatty() and not opted_out else str
     lines = [_title(scene, rows, columns)]
     for row in rows:
         letters = (marks.get((row, column), scene.rows[row][column]) for column in columns)
         lines.append("".join(map(style, letters)))
     return "\n".join(lines) + "\n"
-
-
-def terminal_has_colour() -> bool:
-    """Whether standard output is a terminal that shows colours and the user has not opted out."""
-    opted_out = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
-    return sys.stdout.isatty() and not opted_out
 
 
 def _title(scene: Scene, rows: range, columns: range) -> str:
@@ -459,8 +419,6 @@ def _window(centre: int, length: int, most: int) -> range:
 def _coloured(letter: str) -> str:
     return f"{STYLES[letter]}{letter}{RESET}" if letter in STYLES else letter
 
-
-# What every grid world shares: its arguments, stepping, the exact model, and rendering.
 
 Observation = int | NDArray[np.float32]
 
@@ -540,7 +498,10 @@ class GridWorld(ShownEnv):
         outcome = first_above(self._slip_thresholds, self.np_random.random())
         move = self.dynamics.move(self.s, POSSIBLE_MOVES[action][outcome])
         if self.render_mode is not None:
-            self._note_step(action, move.next_state)
+            origin, target = self.s % self.map.n_cells, move.next_state % self.map.n_cells
+            if origin != target:
+                self._steps.add((origin, target))
+            self._last_action = action
         self.s = move.next_state
         if self.render_mode == "human":
             self.render()
@@ -556,14 +517,7 @@ class GridWorld(ShownEnv):
         return self.dynamics.action_mask(self.s)
 
     def observation_of(self, states: AnyInts) -> NDArray[Any]:
-        """What is observed in each of many states: here the states themselves.
-
-        Args:
-            states: indices of states, shape (n,).
-
-        Returns:
-            The observations, the first axis counting the states.
-        """
+        """What is observed in each of many states, shape (n,): here the states themselves."""
         return states
 
     def transition_model(self) -> TransitionModel:
@@ -624,13 +578,6 @@ class GridWorld(ShownEnv):
             "is_success": self.map.codes[cell] == ord(GOAL),
         }
 
-    def _note_step(self, action: int, next_state: int) -> None:
-        """Remember for the next picture what was done."""
-        origin, target = self.s % self.map.n_cells, next_state % self.map.n_cells
-        if origin != target:
-            self._steps.add((origin, target))
-        self._last_action = action
-
     def _text(self) -> str:
         return render_text(self._picture())
 
@@ -652,8 +599,6 @@ def _equal(n: int) -> Floats:
     """Equal probabilities."""
     return summing_to_one(np.full(n, 1 / n))
 
-
-# Finite environments whose states have places on a map, for looking at.
 
 # Chains that are longer are drawn in several rows, to be read as text is.
 LONGEST_ROW = 50

@@ -71,9 +71,7 @@ def transition_model(env: Env) -> TransitionModel | None:
     wrappers that leave the dynamics alone, `ScaleReward`, Gymnasium's `ClipReward`, and
     `TerminationReward` where it gives its reward at terminations only. What `ClipReward` makes of
     rewards that are drawn is not known. A time limit is no part of the model: see `time_limit`.
-
-    Returns:
-        The model, or None where it is not known.
+    None where the model is not known.
     """
     base, wrappers = _layers(env)
     claim = _believed(base) if all(map(_folds, wrappers)) else None
@@ -98,12 +96,10 @@ def transition_model(env: Env) -> TransitionModel | None:
 
 
 def model_check(env: Env) -> ModelCheck | None:
-    """What came of holding the environment's own model against its `step`.
+    """What came of comparing the environment's own model with its `step`.
 
-    Those whose word is enough pass without a look.
-
-    Returns:
-        The check; None where there is no model, or wrappers hide it.
+    Those whose word is enough pass without a look. None where there is no model, or wrappers hide
+    it.
     """
     base, wrappers = _layers(env)
     return _judged(base)[1] if all(map(_folds, wrappers)) else None
@@ -122,9 +118,7 @@ def success_outcomes(env: Env) -> Bools | None:
     In a grid world those are the ones that reach a goal. Elsewhere they are the ones that
     terminate with the highest reward that any termination has before wrappers change it: the goal
     of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
-
-    Returns:
-        The mask, or None where the model is not known or no episode terminates.
+    None where the model is not known or no episode terminates.
     """
     base, wrappers = _layers(env)
     claim = _believed(base) if all(map(_folds, wrappers)) else None
@@ -146,11 +140,7 @@ def success_outcomes(env: Env) -> Bools | None:
 
 
 def observations_of_states(env: Env) -> NDArray[Any] | None:
-    """What an agent observes in each state of `transition_model`, states along the first axis.
-
-    Returns:
-        The observations of states 0, 1, ..., S-1, or None where they are not known.
-    """
+    """What an agent observes in each state of `transition_model`; None where it is not known."""
     base, wrappers = _layers(env)
     claim = _believed(base)
     if claim is None or claim.observations is None:
@@ -168,10 +158,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     """What may be done in each state of `transition_model`, bool of shape (S, A).
 
     Known are the masks of this project's environments, of Gymnasium's Taxi, and of
-    `IdleActionMasks`, under the wrappers that `transition_model` knows.
-
-    Returns:
-        What `envs.wrappers.action_masks` says in each state, or None where that is not known.
+    `IdleActionMasks`, under the wrappers that `transition_model` knows; elsewhere it is None.
     """
     base, wrappers = _layers(env)
     if not all(map(_folds, wrappers)):

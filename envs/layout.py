@@ -33,18 +33,12 @@ class GridLayout:
     State ``cell + n_cells * layer`` is the robot on a cell, cells counted row by row from the top
     left, where bit i of the layer says that the i-th prize has been collected. Without prizes
     there is one layer, 0, and states are cells.
-
-    Attributes:
-        rows: the map in the letters above.
-        moves: the step (rows down, columns to the right) that each action tries.
-        names: what this environment calls its walls, traps and prizes.
-        prizes: the cells of the prizes.
     """
 
     rows: tuple[str, ...]
-    moves: tuple[tuple[int, int], ...]
-    names: Mapping[str, str]
-    prizes: tuple[int, ...] = ()
+    moves: tuple[tuple[int, int], ...]  # rows down, columns to the right: what each action tries
+    names: Mapping[str, str]  # what this environment calls its walls, traps and prizes
+    prizes: tuple[int, ...] = ()  # their cells
 
     @property
     def n_rows(self) -> int:
@@ -103,20 +97,25 @@ class GridLayout:
 
 
 def grid_layout(env: gym.Env[Any, Any]) -> GridLayout | None:
-    """The layout of an environment, for the states of its ``envs.known_models.transition_model``.
+    """The layout for the states of `envs.known_models.transition_model`, None where there is none.
 
-    Returns:
-        The layout of this project's grid worlds, WindyGridworld, FrozenLake and CliffWalking; None
-        for all others.
+    Grid worlds of this project, WindyGridworld, FrozenLake and CliffWalking have one.
     """
     base = env.unwrapped
     if isinstance(base, GridWorld):
-        return _of_grid_world(base)
+        tiles = {chr(code): tile for code, tile in base.dynamics.tiles.items()}
+        letters = {letter: _letter(letter, tile) for letter, tile in tiles.items()}
+        return GridLayout(
+            rows=tuple("".join(letters[letter] for letter in row) for row in base.map.rows),
+            moves=MOVES,
+            names={letters[letter]: word for letter, word in WORDS.items() if letter in letters},
+            prizes=tuple(base.dynamics.collectable_bits),
+        )
     if isinstance(base, WindyGridworldEnv):
         return GridLayout(base.rows, base.steps, {})
     if isinstance(base, FrozenLakeEnv):
-        letters = str.maketrans("FH", FREE + TRAP)
-        rows = tuple("".join(row).translate(letters) for row in np.array(base.desc).astype(str))
+        ours = str.maketrans("FH", FREE + TRAP)
+        rows = tuple("".join(row).translate(ours) for row in np.array(base.desc).astype(str))
         return GridLayout(rows, (LEFT, DOWN, RIGHT, UP), {TRAP: "hole"})
     if isinstance(base, CliffWalkingEnv):
         cells = np.where(base._cliff, TRAP, FREE)
@@ -124,17 +123,6 @@ def grid_layout(env: gym.Env[Any, Any]) -> GridLayout | None:
         rows = tuple("".join(row) for row in cells)
         return GridLayout(rows, (UP, RIGHT, DOWN, LEFT), {TRAP: "cliff"})
     return None
-
-
-def _of_grid_world(base: GridWorld) -> GridLayout:
-    tiles = {chr(code): tile for code, tile in base.dynamics.tiles.items()}
-    letters = {letter: _letter(letter, tile) for letter, tile in tiles.items()}
-    return GridLayout(
-        rows=tuple("".join(letters[letter] for letter in row) for row in base.map.rows),
-        moves=MOVES,
-        names={letters[letter]: word for letter, word in WORDS.items() if letter in letters},
-        prizes=tuple(base.dynamics.collectable_bits),
-    )
 
 
 def _letter(own: str, tile: Tile) -> str:

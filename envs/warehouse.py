@@ -84,8 +84,6 @@ def _easiest_way(free: Bools, start: int, goal: int) -> list[int]:
     return way
 
 
-# A robot that has to find its way between the shelves of a warehouse.
-
 DEFAULT_MAP = (
     "...#.....G",
     ".###.####.",
@@ -200,15 +198,7 @@ class WarehouseEnv(GridWorld):
             self.observation_space = spaces.Box(0, 1, (self.map.n_cells,), np.float32)
 
     def observation_of(self, states: AnyInts) -> NDArray[Any]:
-        """What is observed in each of many states.
-
-        Args:
-            states: indices of states, shape (n,).
-
-        Returns:
-            For "discrete" the states themselves; for "position" float32 of shape (n, 2); for
-            "one_hot" float32 of shape (n, cells).
-        """
+        """What is observed in each of many states: shape (n,), (n, 2) or (n, cells)."""
         if self.observation == "position":
             largest = np.maximum((self.map.n_rows - 1, self.map.n_columns - 1), 1)
             position = np.stack(np.divmod(states, self.map.n_columns), axis=-1)
@@ -275,7 +265,6 @@ class RandomWarehouseEnv(WarehouseEnv):
         observation: str = "discrete",
         render_mode: str | None = None,
     ) -> None:
-
         super().__init__(
             random_warehouse(size, shelf_density, map_seed),
             shelf_reward=shelf_reward,

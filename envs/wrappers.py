@@ -14,11 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
 from envs.argument_checks import check_flag, check_number, check_whole_number
-from envs.bandits.bandit import Bandit
-from envs.grid import GridWorld
 from mdp.array_types import AnyInts, Bools, Floats, Ints
-
-# Which actions an environment allows now, however it says so.
 
 Env = gym.Env[Any, Any]
 
@@ -55,9 +51,6 @@ def action_masks(env: Env) -> Bools | None:
     """
     source = mask_source(env)
     return None if source is None else np.asarray(source(), dtype=np.bool_)
-
-
-# Wrappers that tell which actions an environment allows.
 
 
 class ActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -144,9 +137,6 @@ def _changes(state: int, outcomes: list[tuple[float, int, float, bool]]) -> bool
     return any(prob > 0 and (ends or after != state) for prob, after, _, ends in outcomes)
 
 
-# Other rewards than the environment's own, for training.
-
-
 class ScaleReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
     """Multiplies every reward.
 
@@ -196,9 +186,6 @@ class TerminationReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return obs, reward, terminated, truncated, info
 
 
-# Whole numbers as one, and as one-hot vectors.
-
-
 class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
     """Turns an observation of several whole numbers into one, the last number counting fastest.
 
@@ -237,7 +224,9 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
                 side by side in shape (n, parts).
         """
         parts = np.asarray(batch, np.int64)
-        return row_major(parts.reshape(len(parts), -1) - self._first, self._sizes)
+        places = parts.reshape(len(parts), -1) - self._first
+        numbers: Ints = np.ravel_multi_index(tuple(places.T), self._sizes)
+        return numbers
 
 
 class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
@@ -273,14 +262,6 @@ class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
         return hot
 
 
-def row_major(parts: NDArray[Any], sizes: Sequence[int]) -> Ints:
-    """The index of each row of ``parts``, the last column counting fastest."""
-    index = np.zeros(len(parts), np.int64)
-    for column, size in enumerate(sizes):
-        index = index * size + parts[:, column]
-    return index
-
-
 def _sizes_and_starts(space: spaces.Space[Any]) -> tuple[list[int], list[int]]:
     if isinstance(space, spaces.MultiDiscrete):
         return space.nvec.ravel().tolist(), space.start.ravel().tolist()
@@ -291,9 +272,6 @@ def _sizes_and_starts(space: spaces.Space[Any]) -> tuple[list[int], list[int]]:
             f"FlattenToDiscrete needs MultiDiscrete, a Tuple of Discrete, or Discrete, not {space}"
         )
     return [int(part.n) for part in discrete], [int(part.start) for part in discrete]
-
-
-# Vectors of numbers as one whole number.
 
 
 class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
@@ -353,7 +331,8 @@ class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstru
         """The indices of many vectors of shape (n, dimensions), shape (n,)."""
         places = (batch[:, self.dims].astype(np.float64) - self.low) / (self.high - self.low)
         places = np.clip(np.floor(places * self.bins), 0, self.bins - 1).astype(np.int64)
-        return row_major(places, self.bins.tolist())
+        indices: Ints = np.ravel_multi_index(tuple(places.T), tuple(self.bins))
+        return indices
 
     def _check_bounds(self) -> None:
         for dim, low, high in zip(self.dims, self.low, self.high, strict=True):
@@ -388,9 +367,6 @@ def _per_dim(name: str, values: ArrayLike, dims: list[int]) -> Floats:
         ) from None
 
 
-# Time limits that depend on the environment's arguments.
-
-
 def limit_by_shortest_path(
     env: gym.Env[Any, Any], multiple: int, instead_of: int
 ) -> gym.Env[Any, Any]:
@@ -405,27 +381,18 @@ def limit_by_shortest_path(
     Returns:
         The environment under the limit.
     """
-    grid_world = env.unwrapped
-    if not isinstance(env, gym.wrappers.TimeLimit) or env.spec is None:
-        return env
-    if env.spec.max_episode_steps != instead_of or not isinstance(grid_world, GridWorld):
-        return env
-    return gym.wrappers.TimeLimit(env.env, multiple * grid_world.shortest_path_length)
+    base: Any = env.unwrapped
+    return _limited(env, multiple * base.shortest_path_length, instead_of)
 
 
 def limit_by_pulls(env: gym.Env[Any, Any], instead_of: int) -> gym.Env[Any, Any]:
-    """Limit the episodes of a bandit to its `pulls`.
+    """Limit the episodes of a bandit to its `pulls`; see `limit_by_shortest_path`."""
+    base: Any = env.unwrapped
+    return _limited(env, base.pulls, instead_of)
 
-    Args:
-        env: a bandit as `gymnasium.make` returns it.
-        instead_of: see `limit_by_shortest_path`.
 
-    Returns:
-        The environment under the limit.
-    """
-    bandit = env.unwrapped
+def _limited(env: gym.Env[Any, Any], n_steps: int, instead_of: int) -> gym.Env[Any, Any]:
     if not isinstance(env, gym.wrappers.TimeLimit) or env.spec is None:
         return env
-    if env.spec.max_episode_steps != instead_of or not isinstance(bandit, Bandit):
-        return env
-    return gym.wrappers.TimeLimit(env.env, bandit.pulls)
+    is_default = env.spec.max_episode_steps == instead_of
+    return gym.wrappers.TimeLimit(env.env, n_steps) if is_default else env

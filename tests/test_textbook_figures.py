@@ -18,17 +18,13 @@ def as_scripts(monkeypatch):
     """They import each other, as scripts in one folder do."""
     monkeypatch.syspath_prepend(str(FOLDER))
     yield
-    for name in [
-        n
-        for n in sys.modules
-        if n.startswith(("_figures", "_random_walks", "_blackjack", "figure_"))
-    ]:
+    for name in [n for n in sys.modules if n.startswith(("_figures", "figure_"))]:
         del sys.modules[name]
 
 
 @pytest.mark.parametrize("env_kwargs", [{}, {"n_states": 19, "left_reward": -1}])
 def test_true_values_are_those_of_the_model(env_kwargs):
-    from _random_walks import WALK, true_values
+    from _figures import WALK, true_values
 
     model = transition_model(gym.make(WALK, **env_kwargs))
     chain = PolicyChain.build(model, np.ones((model.n_states, 1)))
@@ -37,8 +33,7 @@ def test_true_values_are_those_of_the_model(env_kwargs):
 
 
 def test_an_agent_that_begins_anew_is_as_good_as_another():
-    from _figures import agent_on
-    from _random_walks import WALK, errors_of_runs, true_values
+    from _figures import WALK, agent_on, errors_of_runs, true_values
 
     settings = {"learning_rate": 0.1, "initial_q": 0.5}
     both = errors_of_runs("qlearning", [0, 1], 20, {}, **settings)
@@ -54,8 +49,7 @@ def test_an_agent_that_begins_anew_is_as_good_as_another():
 
 
 def test_the_policy_that_sticks_on_twenty_is_worth_what_its_rules_say():
-    from _blackjack import observations
-    from figure_5_1 import exact_values
+    from figure_5_1 import exact_values, observations
 
     values = exact_values()[observations()]
     # Sticking asks for no ace; below 12 are no states of the figure.

@@ -1,13 +1,12 @@
-"""What the figures share: agents with a book's settings, drawings, and the book's statements."""
+"""What the figures share: agents with a book's settings, random walks, drawings, statements."""
 
 from __future__ import annotations
 
 import argparse
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -17,44 +16,35 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
+from stable_baselines3.common.callbacks import CallbackList, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
 from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon
-from mdp.array_types import Bools, Floats
+from mdp.array_types import Floats
 
 mpl.use("Agg")
 
 IMAGES = Path(__file__).resolve().parent.parent / "images" / "textbook"
 MOST_STEPS = 10**9  # where episodes are counted
+WALK = "envs:RandomWalk-v0"
+LARGEST_ERROR = 2.0  # that means something
 
 
-@dataclass(frozen=True)
-class Statement:
-    """Something that the book says, and whether it came out.
+class Statement(NamedTuple):
+    """Something that the book says, and whether it came out."""
 
-    Attributes:
-        text: what it says, in our words.
-        figures: what was measured.
-        holds: whether that agrees.
-    """
-
-    text: str
-    figures: str
+    text: str  # what it says, in our words
+    figures: str  # what was measured
     holds: bool
 
 
 class ValueErrors(BlockCallback):
-    """The root mean square error of predicted values after each episode, over the states given.
+    """The root mean square error of predicted values after each episode, but for those of ends."""
 
-    Args:
-        true_values: of all observations, shape (S,).
-        counted: which observations count, bool of shape (S,).
-    """
-
-    def __init__(self, true_values: Floats, counted: Bools) -> None:
+    def __init__(self, true_values: Floats) -> None:
         super().__init__()
-        self.true_values, self.counted = true_values[counted], counted
+        self.true_values = true_values[1:-1]
         self.errors: list[float] = []
         self._has_ended = False
 
@@ -68,7 +58,7 @@ class ValueErrors(BlockCallback):
     def _on_rollout_end(self) -> None:  # what the last step says has been learnt by now
         if self._has_ended:
             policy: Any = self.model.policy
-            differences = policy.q_table[self.counted, 0] - self.true_values
+            differences = policy.q_table[1:-1, 0] - self.true_values
             self.errors.append(float(np.sqrt(np.mean(differences**2))))
 
 
@@ -92,21 +82,40 @@ def agent_on(
 
 
 def learn_episodes(agent: Any, n_episodes: int) -> tuple[Floats, Floats]:
-    """Train for so many episodes, by which schedules run too.
-
-    Returns:
-        Their returns and their lengths, shapes (n_episodes,).
-    """
+    """Returns and lengths of a training of so many episodes, by which schedules run too."""
     agent.learn(MOST_STEPS, callback=EpisodeBudget(n_episodes), log_interval=None)
     monitor = agent.env.envs[0]
     returns, lengths = monitor.get_episode_rewards(), monitor.get_episode_lengths()
     return np.array(returns[:n_episodes], dtype=float), np.array(lengths[:n_episodes], dtype=float)
 
 
-def mean_and_error(values: Floats, axis: int = 0) -> tuple[Floats, Floats]:
-    """Means over runs, and their standard errors."""
-    n = values.shape[axis]
-    return values.mean(axis=axis), values.std(axis=axis, ddof=1) / np.sqrt(n)
+def true_values(env_kwargs: dict[str, Any]) -> Floats:
+    """The probability of ending on the right, turned into rewards, shape (n_states + 2,)."""
+    walk: Any = gym.make(WALK, **env_kwargs).unwrapped
+    right = np.arange(walk.n_states + 2) / (walk.n_states + 1)
+    return np.asarray(walk.left_reward + (walk.right_reward - walk.left_reward) * right)
+
+
+def errors_of_runs(
+    algo: str, seeds: Sequence[int], n_episodes: int, env_kwargs: dict[str, Any], **settings: Any
+) -> Floats:
+    """Root mean square errors over the states, after each episode of each run.
+
+    There is one action, so what a method learns of it is the state's value.
+    """
+    values = true_values(env_kwargs)
+    agent = agent_on(WALK, algo, 0, env_kwargs=env_kwargs, **settings)
+    start = {name: table.clone() for name, table in agent.policy.state_dict().items()}
+    runs = []
+    for seed in seeds:
+        # The same agent begins anew, which takes a tenth of the time of making another.
+        agent.policy.load_state_dict(start)
+        agent.set_random_seed(seed)
+        errors = ValueErrors(values)
+        stop = StopTrainingOnMaxEpisodes(n_episodes)
+        agent.learn(MOST_STEPS, callback=CallbackList([errors, stop]), log_interval=None)
+        runs.append(errors.errors[:n_episodes])
+    return np.array(runs)
 
 
 def canvas(title: str, x: str, y: str) -> tuple[Figure, Any]:
@@ -118,12 +127,33 @@ def canvas(title: str, x: str, y: str) -> tuple[Figure, Any]:
     return figure, axes
 
 
-def finish(name: str, figure: Figure, folder: Path, statements: Sequence[Statement]) -> None:
-    """Save the picture, and print what the book says beside what was measured.
+def step_size_curves(
+    name: str, algo: str, step_sizes: Floats, settings: dict[Any, dict[str, Any]], n_runs: int
+) -> tuple[Figure, dict[Any, list[float]]]:
+    """Errors over the first ten episodes on the walk of 19 states, by step size, for each setting.
 
-    Raises:
-        SystemExit: with 1 if a statement does not hold.
+    Errors that mean nothing, because large steps diverge, are NaN.
     """
+    figure, axes = canvas(
+        "RandomWalk-v0, 19 states", "step size", "error over the first 10 episodes"
+    )
+    walk, curves = {"n_states": 19, "left_reward": -1}, {}
+    for each, own in settings.items():
+        curve = []
+        for size in step_sizes:
+            with np.errstate(over="ignore", invalid="ignore"):
+                runs = errors_of_runs(algo, range(n_runs), 10, walk, learning_rate=size, **own)
+            mean = float(runs.mean())
+            curve.append(mean if mean < LARGEST_ERROR else float("nan"))
+        axes.plot(step_sizes, curve, label=f"{name} = {each:g}")
+        curves[each] = curve
+    axes.set_ylim(0.25, 0.55)
+    axes.legend(fontsize="small", ncols=2)
+    return figure, curves
+
+
+def finish(name: str, figure: Figure, folder: Path, statements: Sequence[Statement]) -> None:
+    """Save the picture, and print what the book says; exit with 1 if that does not hold."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.png"
     figure.savefig(path, dpi=110)

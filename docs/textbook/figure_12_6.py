@@ -8,47 +8,17 @@ The error of the predicted values, over the first ten episodes, with accumulatin
 from __future__ import annotations
 
 import numpy as np
-from _figures import Statement, arguments, canvas, finish
-from _random_walks import errors_of_runs
+from _figures import Statement, arguments, finish, step_size_curves
 
-WALK = {"n_states": 19, "left_reward": -1}
-N_EPISODES = 10
 DECAYS = (0.0, 0.4, 0.8, 0.9, 0.95, 0.975, 0.99, 1.0)
 STEP_SIZES = np.array([0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
-LARGEST = 2.0  # of an error that means something
-TOP = 0.55  # of the picture
-
-
-def errors(decay: float, n_runs: int) -> list[float]:
-    """For each step size, over the first episodes of all runs."""
-    found = []
-    for size in STEP_SIZES:
-        with np.errstate(over="ignore", invalid="ignore"):  # large steps diverge
-            runs = errors_of_runs(
-                "sarsa_lambda",
-                range(n_runs),
-                N_EPISODES,
-                WALK,
-                learning_rate=size,
-                trace_decay=decay,
-                trace_type="accumulating",
-            )
-        mean = float(runs.mean())
-        found.append(mean if mean < LARGEST else float("nan"))
-    return found
 
 
 def main() -> None:
     """Draw the figure, and hold it against the book."""
     args = arguments("Figure 12.6 of Sutton and Barto: TD(lambda).", 100)
-    figure, axes = canvas(
-        "RandomWalk-v0, 19 states", "step size", "error over the first 10 episodes"
-    )
-    curves = {decay: errors(decay, args.runs) for decay in DECAYS}
-    for decay, curve in curves.items():
-        axes.plot(STEP_SIZES, curve, label=f"lambda = {decay:g}")
-    axes.set_ylim(0.25, TOP)
-    axes.legend(fontsize="small", ncols=2)
+    settings = {each: {"trace_decay": each, "trace_type": "accumulating"} for each in DECAYS}
+    figure, curves = step_size_curves("lambda", "sarsa_lambda", STEP_SIZES, settings, args.runs)
     finish("figure_12_6", figure, args.folder, statements(curves))
 
 

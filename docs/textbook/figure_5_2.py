@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from _blackjack import DEALER, HIT, PLAYER, STICK, game, model, observations
 from _figures import Statement, agent_on, arguments, finish, learn_episodes
+from figure_5_1 import DEALER, HIT, PLAYER, STICK, game, model, observations
 from matplotlib.figure import Figure
 from stable_baselines3.common.utils import LinearSchedule
 

@@ -8,8 +8,7 @@ The error of the predicted values after each of 100 episodes. All values begin a
 from __future__ import annotations
 
 import numpy as np
-from _figures import Statement, arguments, canvas, finish
-from _random_walks import errors_of_runs
+from _figures import Statement, arguments, canvas, errors_of_runs, finish
 
 N_EPISODES = 100
 STEP_SIZES = {"qlearning": (0.15, 0.1, 0.05), "monte_carlo": (0.01, 0.02, 0.03, 0.04)}

@@ -10,13 +10,13 @@ in its own next action, so that its step size can be 1.
 from __future__ import annotations
 
 import numpy as np
-from _figures import Statement, agent_on, arguments, canvas, finish, learn_episodes, mean_and_error
+from _figures import Statement, agent_on, arguments, canvas, finish, learn_episodes
 
 STEP_SIZES = np.arange(1, 11) / 10
 INTERIM, ASYMPTOTIC = 100, 20_000
 N_LONG_RUNS = 5
 LABELS = {"sarsa": "SARSA", "expected_sarsa": "expected SARSA", "qlearning": "Q-learning"}
-Curves = dict[str, tuple[list[float], list[float]]]
+Curves = dict[str, tuple[list[float], list[float]]]  # by agent: interim, asymptotic
 
 
 def mean_return(algo: str, step_size: float, n_episodes: int, n_runs: int) -> float:
@@ -25,18 +25,7 @@ def mean_return(algo: str, step_size: float, n_episodes: int, n_runs: int) -> fl
     for seed in range(n_runs):
         agent = agent_on("CliffWalking-v1", algo, seed, learning_rate=step_size)
         means.append(learn_episodes(agent, n_episodes)[0].mean())
-    return float(mean_and_error(np.array(means))[0])
-
-
-def measure(n_runs: int, n_long_runs: int, n_long: int) -> Curves:
-    """By agent, interim and asymptotic performance for each step size."""
-    return {
-        algo: (
-            [mean_return(algo, size, INTERIM, n_runs) for size in STEP_SIZES],
-            [mean_return(algo, size, n_long, n_long_runs) for size in STEP_SIZES],
-        )
-        for algo in LABELS
-    }
+    return float(np.mean(means))
 
 
 def statements(curves: Curves) -> list[Statement]:
@@ -74,18 +63,15 @@ def statements(curves: Curves) -> list[Statement]:
 def main() -> None:
     """Draw the figure, and hold it against the book."""
     args = arguments("Figure 6.3 of Sutton and Barto: three targets on the cliff.", 100)
-    curves = measure(args.runs, N_LONG_RUNS, ASYMPTOTIC)
     figure, axes = canvas("CliffWalking-v1", "step size", "mean return of an episode")
-    for algo, (interim, asymptotic) in curves.items():
-        (line,) = axes.plot(STEP_SIZES, asymptotic, marker="o", label=f"{LABELS[algo]}, asymptotic")
-        axes.plot(
-            STEP_SIZES,
-            interim,
-            "--",
-            marker="x",
-            color=line.get_color(),
-            label=f"{LABELS[algo]}, interim",
-        )
+    curves: Curves = {}
+    for algo, label in LABELS.items():
+        interim = [mean_return(algo, size, INTERIM, args.runs) for size in STEP_SIZES]
+        asymptotic = [mean_return(algo, size, ASYMPTOTIC, N_LONG_RUNS) for size in STEP_SIZES]
+        curves[algo] = interim, asymptotic
+        (line,) = axes.plot(STEP_SIZES, asymptotic, marker="o", label=f"{label}, asymptotic")
+        style = {"linestyle": "--", "marker": "x", "color": line.get_color()}
+        axes.plot(STEP_SIZES, interim, label=f"{label}, interim", **style)
     axes.set_ylim(-160, 0)
     axes.legend(fontsize="small")
     finish("figure_6_3", figure, args.folder, statements(curves))

@@ -9,12 +9,11 @@ are left at least.
 from __future__ import annotations
 
 import numpy as np
-from _figures import Statement, agent_on, arguments, canvas, finish, learn_episodes, mean_and_error
+from _figures import Statement, agent_on, arguments, canvas, finish, learn_episodes
 
 from mdp.array_types import Floats
 
 N_EPISODES = 300
-LEFT = 2  # steps
 LEFT = 2  # steps
 LEAST = 0.05  # half of epsilon, for two actions
 LABELS = {"qlearning": "Q-learning", "double_qlearning": "double Q-learning"}
@@ -35,7 +34,7 @@ def main() -> None:
     shares = {}
     for algo, label in LABELS.items():
         runs = np.array([went_left(algo, seed) for seed in range(args.runs)])
-        shares[algo], _ = mean_and_error(runs)
+        shares[algo] = runs.mean(axis=0)
         axes.plot(np.arange(1, N_EPISODES + 1), 100 * shares[algo], label=label)
     axes.axhline(100 * LEAST, color="grey", linestyle="--", label="least, by epsilon")
     axes.set_ylim(0, 100)

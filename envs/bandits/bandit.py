@@ -16,8 +16,6 @@ from envs.argument_checks import check_whole_number
 from envs.drawing import Box, Chart, ChartRenderer, Disc, Label, Shape, ShownEnv
 from mdp.array_types import Floats, Ints
 
-# Bandits as text and as bar charts: for each arm its true mean and what was seen of it.
-
 # Of more arms the first are shown, of more contexts those around the present one.
 MAX_ARMS_SHOWN = 40
 MAX_CONTEXTS_SHOWN = 4
@@ -37,17 +35,11 @@ MIN_LABELLED = 30
 
 @dataclass(eq=False)
 class Tally:
-    """What the pulls of an episode have brought, by context and arm.
+    """What the pulls of an episode have brought."""
 
-    Attributes:
-        counts: the number of pulls, shape (n_contexts, n_arms).
-        sums: the sum of their rewards, likewise.
-        last: context, arm and reward of the latest pull, None before the first.
-    """
-
-    counts: Ints
-    sums: Floats
-    last: tuple[int, int, float] | None = None
+    counts: Ints  # the number of pulls, shape (n_contexts, n_arms)
+    sums: Floats  # of their rewards, likewise
+    last: tuple[int, int, float] | None = None  # context, arm and reward of the latest pull
 
     @classmethod
     def empty(cls, n_contexts: int, n_arms: int) -> Tally:
@@ -77,19 +69,15 @@ class Tally:
         return f"pull {self.counts.sum()}: arm {arm}, reward {reward:.4g}"
 
 
-@dataclass(frozen=True)
 class _Scale:
     """From values to places on an axis; zero is always on it."""
 
-    low: float
-    high: float
-
-    @classmethod
-    def over(cls, *means: Floats | None) -> _Scale:
+    def __init__(self, *means: Floats | None) -> None:
         known = np.concatenate([array.ravel() for array in means if array is not None])
         known = np.append(known[np.isfinite(known)], 0)
-        low, high = float(known.min()), float(known.max())
-        return cls(low, high if high > low else low + 1)
+        self.low, self.high = float(known.min()), float(known.max())
+        if self.high == self.low:
+            self.high = self.low + 1
 
     def part(self, value: float) -> float:
         """0 for the lowest value, 1 for the highest."""
@@ -99,15 +87,11 @@ class _Scale:
 def render_text(tally: Tally, true: Floats | None, present: int) -> str:
     """The latest pull on a line, then a line for each arm.
 
-    In the bars ``=`` reaches from zero to the observed mean, ``|`` marks the true one.
-
-    Args:
-        tally: what has been pulled.
-        true: the true means, shape (n_contexts, n_arms); None where they are not known.
-        present: the context of the next pull.
+    In the bars ``=`` reaches from zero to the observed mean, ``|`` marks the ``true`` one, of shape
+    (n_contexts, n_arms). ``present`` is the context of the next pull.
     """
     observed = tally.observed
-    scale = _Scale.over(observed, true)
+    scale = _Scale(observed, true)
     lines = [tally.title]
     for context in _shown_contexts(len(observed), present):
         if len(observed) > 1:
@@ -127,13 +111,7 @@ def render_text(tally: Tally, true: Floats | None, present: int) -> str:
 
 
 def render_chart(tally: Tally, true: Floats | None, present: int) -> Chart:
-    """A bar for each arm, with one panel for each context.
-
-    Args:
-        tally: what has been pulled.
-        true: the true means, shape (n_contexts, n_arms); None where they are not known.
-        present: the context of the next pull.
-    """
+    """A bar for each arm, with one panel for each context; see `render_text`."""
     observed = tally.observed
     contexts = _shown_contexts(len(observed), present)
     n_arms = min(observed.shape[1], MAX_ARMS_SHOWN)
@@ -141,7 +119,7 @@ def render_chart(tally: Tally, true: Floats | None, present: int) -> Chart:
     height = TITLE + len(contexts) * (PANEL + CAPTION)
     cut = f"arms 0-{n_arms - 1} of {observed.shape[1]}" if n_arms < observed.shape[1] else ""
     shapes = list(_heading(tally.title, cut, width, true is not None))
-    scale = _Scale.over(observed, true)
+    scale = _Scale(observed, true)
     for i, context in enumerate(contexts):
         panel = _Panel(scale, TITLE + i * (PANEL + CAPTION), width, n_arms)
         if len(observed) > 1:
@@ -238,8 +216,6 @@ def _text_bar(scale: _Scale, observed: float, true: float | None) -> str:
     return "".join(cells)
 
 
-# What bandits share: counting pulls, rendering, and what `step` tells where arms are known.
-
 MAX_PULLS = 10**9
 MAX_ARMS = 10_000
 
@@ -248,26 +224,11 @@ class Bandit(ShownEnv):
     """Arms to pull, one a step, in the present context.
 
     A subclass says with `_begin` how an episode begins, with `step` what a pull gives, and with
-    `_true_means` what is known of the arms.
-
-    Args:
-        n_arms: the number of arms.
-        observation_space: of the contexts.
-        pulls: the length of an episode; the time limit that `gymnasium.make` sets.
-        batch_size: after how many pulls feedback comes in, see `step`.
-        render_mode: ``"ansi"``, ``"rgb_array"``, ``"human"`` or None.
-
-    Attributes:
-        kind: the dynamics' name, by which compiled copies know them.
-        context: what the agent observes before the next pull.
-        pulls_done: pulls of this episode.
-
-    Raises:
-        ValueError: if an argument is out of range.
+    `_true_means` what is known of the arms. `gymnasium.make` makes ``pulls`` the time limit.
     """
 
-    kind: str
-    context: Any
+    kind: str  # of the dynamics, by which compiled copies know them
+    context: Any  # what the agent observes before the next pull
 
     def __init__(
         self,
@@ -284,7 +245,7 @@ class Bandit(ShownEnv):
         self.batch_size = check_whole_number("batch_size", batch_size, 1, MAX_PULLS)
         self.observation_space = observation_space
         self.action_space = spaces.Discrete(n_arms)
-        self.pulls_done = 0
+        self.pulls_done = 0  # of this episode
         self._tally = Tally.empty(max(self.n_contexts, 1), n_arms)
 
     @property
@@ -385,11 +346,7 @@ class StochasticBandit(Bandit):
 
 
 def agreed_size(name: str, asked: int | None, given: int | None, default: int, low: int) -> int:
-    """How many there are: as many as are given, else as are asked for, else the default.
-
-    Raises:
-        ValueError: if what is asked for is out of range, or not what is given.
-    """
+    """How many there are: as many as are given, else as are asked for, else the default."""
     if asked is None:
         return default if given is None else given
     size = check_whole_number(name, asked, low, MAX_ARMS)

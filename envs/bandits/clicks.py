@@ -24,22 +24,8 @@ class ClickBandit(StochasticBandit):
     """Arms with a click rate in each of finitely many contexts.
 
     As `envs.grid.GridWorld`, `reset` and `step` draw one uniform number each and choose by
-    cumulative sum, so that the arrays of `transition_model` replay an episode exactly.
-
-    Args:
-        context_probabilities: shape (n_contexts,).
-        click_rates: shape (n_contexts, n_arms).
-        pulls: see `Bandit`.
-        batch_size: see `Bandit`.
-        render_mode: see `Bandit`.
-
-    Attributes:
-        means: the click rates, shape (n_contexts, n_arms).
-        context_probabilities: shape (n_contexts,).
-        context_cumulative: their cumulative sum.
-        outcome_cumulative: cumulative probabilities of what a pull may bring, shape (n_contexts,
-            n_arms, 2 * n_contexts): a click and then context 0, 1, ...; no click and then context
-            0, 1, ...
+    cumulative sum, so that the arrays of `transition_model` replay an episode exactly. Rates have
+    the shape (n_contexts, n_arms).
     """
 
     kind = "clicks"
@@ -70,6 +56,7 @@ class ClickBandit(StochasticBandit):
         self.means = click_rates
         self.context_probabilities = context_probabilities
         self.context_cumulative = np.cumsum(context_probabilities)
+        # A click and then context 0, 1, ...; no click and then context 0, 1, ...
         outcomes = np.stack((click_rates, 1 - click_rates), axis=2)[..., None]
         self._outcome_prob = (outcomes * context_probabilities).reshape(n_contexts, n_arms, -1)
         self.outcome_cumulative = np.cumsum(self._outcome_prob, axis=2)

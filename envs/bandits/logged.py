@@ -1,10 +1,14 @@
-"""Logged pulls in a CSV file, and policies tried on them."""
+"""Logged pulls in a CSV file, and policies tried on them.
+
+Each row is one pull, under a header with the columns ``arm``, ``reward`` and, if it is known with
+what probability the arm was chosen, ``propensity``. Every other column is part of the context.
+"""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
 from itertools import islice
@@ -20,10 +24,6 @@ from envs.bandits.bandit import MAX_ARMS, Bandit
 from mdp.array_types import Bools, Floats, Ints
 from safe_files.files import UnsafeFileError, opened
 
-# The columns of a CSV file of logged pulls, read in pieces and held against their limits.
-#
-# What is kept are numbers: as texts, a file of some hundred megabytes would take gigabytes.
-
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
 
 MAX_BYTES = 1 << 30
@@ -37,21 +37,6 @@ MAX_CATEGORIES = 1_000_000
 ROWS_AT_ONCE = 10_000
 LONGEST_SHOWN, MOST_SHOWN = 60, 12  # characters of a name, and names, in a message
 NUMBER = "a finite number of no more than 1e15"
-
-
-def read_columns(path: Path) -> tuple[dict[str, Floats], Words | None]:
-    """The columns of a file as numbers; and as words, where text is all of the context.
-
-    Raises:
-        ValueError: if the file cannot be read, or is no such log; see `read_log`.
-    """
-    try:
-        with opened(path, MAX_BYTES) as binary:
-            lines = _BoundedLines(TextIOWrapper(binary, encoding="utf-8-sig", newline=""))
-            return _read_columns(path, _rows(path, lines))
-    except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ValueError(f"cannot read {path}: {reason}") from error
 
 
 class _BoundedLines:
@@ -91,16 +76,19 @@ def _rows(path: Path, lines: _BoundedLines) -> Iterator[tuple[int, list[str]]]:
 def _read_columns(
     path: Path, rows: Iterator[tuple[int, list[str]]]
 ) -> tuple[dict[str, Floats], Words | None]:
+    """The columns as numbers, read in pieces; and as words, where text is all of the context.
+
+    As texts, a file of some hundred megabytes would take gigabytes.
+    """
     header = [name for _, cells in islice(rows, 1) for name in cells]
     names = [name for name in header if name not in _WANTED]
     words = Words(f"{path}", names[0]) if len(names) == 1 else None
     pieces: dict[str, list[Floats]] = {name: [] for name in header}
     while piece := list(islice(rows, ROWS_AT_ONCE)):
         lines = [line for line, _ in piece]
-        for name, texts in zip(
-            header, zip(*(cells for _, cells in piece), strict=True), strict=True
-        ):
-            values = _as_floats(texts)
+        columns_of_text = zip(*(cells for _, cells in piece), strict=True)
+        for name, texts in zip(header, columns_of_text, strict=True):
+            values = np.fromiter(map(_as_float, texts), np.float64)
             if words is not None and name == words.name:
                 words.add(lines, texts, values)
             else:
@@ -143,11 +131,7 @@ class Words:
             )
 
     def are_numbers(self) -> bool:
-        """Whether all cells are numbers.
-
-        Raises:
-            ValueError: if some are, and others are not.
-        """
+        """Whether all cells are numbers; ValueError if some are, and others are not."""
         if self._any_number and self._mistake is not None:
             raise self._mistake
         return self._any_number
@@ -193,16 +177,11 @@ def some(names: Sequence[str]) -> str:
     return text if len(names) <= MOST_SHOWN else f"{text} and {len(names) - MOST_SHOWN:,} more"
 
 
-def _as_floats(texts: Iterable[str]) -> Floats:
-    """Each text as a number, NaN where it is none."""
-
-    def number(text: str) -> float:
-        try:
-            return float(text)
-        except ValueError:
-            return math.nan
-
-    return np.fromiter(map(number, texts), np.float64)
+def _as_float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _is_arm(values: Floats) -> Bools:
@@ -223,34 +202,17 @@ _WANTED: Mapping[str, tuple[str, Callable[[Floats], Bools]]] = {
 }
 
 
-# What was shown to whom, and what came of it: logged pulls in a CSV file.
-#
-# Each row is one pull, under a header with the columns ``arm``, ``reward`` and, if it is known with
-# what probability the arm was chosen, ``propensity``. Every other column is part of the context.
-
-
 @dataclass(frozen=True, eq=False)
 class LoggedData:
-    """Pulls that somebody else made, in the order of the file.
+    """Pulls that somebody else made, in the order of the file."""
 
-    Attributes:
-        source: the file, for messages.
-        context_names: the columns that make up the context, d of them.
-        contexts: what was known before each pull, shape (n, d). Text is given as its place in
-            ``categories``.
-        arms: the arms pulled, int64 of shape (n,).
-        rewards: what they gave, shape (n,).
-        propensities: the probability with which each was chosen, shape (n,); None if not known.
-        categories: the values of a context of text, in alphabetical order; None for numbers.
-    """
-
-    source: str
-    context_names: tuple[str, ...]
-    contexts: Floats
-    arms: Ints
-    rewards: Floats
-    propensities: Floats | None
-    categories: tuple[str, ...] | None = None
+    source: str  # the file, for messages
+    context_names: tuple[str, ...]  # the columns that make up the context, d of them
+    contexts: Floats  # before each pull, shape (n, d); text is given as its place in `categories`
+    arms: Ints  # shape (n,)
+    rewards: Floats  # shape (n,)
+    propensities: Floats | None  # with what probability each was chosen, shape (n,)
+    categories: tuple[str, ...] | None = None  # the values of a context of text, in order
 
     def __len__(self) -> int:
         return len(self.arms)
@@ -262,11 +224,7 @@ class LoggedData:
 
     @property
     def observation_space(self) -> spaces.Space[Any]:
-        """The space of the contexts.
-
-        Discrete for no context, for one column of text, and for one that holds every whole number
-        from 0 to its largest; otherwise a Box with the bounds of each column.
-        """
+        """The space of the contexts: Discrete as `ReplayBandit` says, or a Box within bounds."""
         if not self.context_names:
             return spaces.Discrete(1)
         if self.categories is not None:
@@ -281,14 +239,7 @@ class LoggedData:
     def observations(self, space: spaces.Space[Any]) -> NDArray[Any]:
         """The contexts as an agent with a certain observation space is shown them.
 
-        Args:
-            space: Discrete, or a Box of one axis.
-
-        Returns:
-            int64 of shape (n,) for Discrete, float32 of shape (n, d) for a Box.
-
-        Raises:
-            ValueError: if the contexts do not fit into the space.
+        Shape (n,) for Discrete, (n, d) for a Box; a ValueError if they do not fit.
         """
         if isinstance(space, spaces.Discrete):
             return self._as_discrete(int(space.n))
@@ -330,7 +281,14 @@ def read_log(path: str | Path) -> LoggedData:
             too long, an arm is not a whole number from 0, a number not finite or beyond 1e15, or a
             propensity not from 1e-9 to 1. The message names file and line.
     """
-    columns, words = read_columns(Path(path))
+    file = Path(path)
+    try:
+        with opened(file, MAX_BYTES) as binary:
+            lines = _BoundedLines(TextIOWrapper(binary, encoding="utf-8-sig", newline=""))
+            columns, words = _read_columns(file, _rows(file, lines))
+    except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ValueError(f"cannot read {file}: {reason}") from error
     names = tuple(name for name in columns if name not in {ARM, REWARD, PROPENSITY})
     contexts = np.empty((len(columns[ARM]), len(names)))
     for i, name in enumerate(names):
@@ -377,8 +335,6 @@ def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -
             if terminated or truncated:
                 context, _ = env.reset()
 
-
-# A policy tried on pulls that were logged before.
 
 # By what part a propensity may differ from one in so many arms: files round.
 TOLERANCE = 0.02
@@ -481,11 +437,7 @@ class ReplayBandit(Bandit):
 
 
 def _number_of_arms(data: LoggedData) -> int:
-    """How many arms a uniform log chose from.
-
-    Raises:
-        ValueError: if it did not choose uniformly, or does not say how it did.
-    """
+    """How many arms a uniform log chose from; ValueError if it did not choose so, or says not."""
     if data.propensities is None:
         raise ValueError(
             f"{data.source} has no column 'propensity': replay needs one, each value the "

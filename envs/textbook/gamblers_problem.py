@@ -7,15 +7,14 @@ from functools import lru_cache
 import numpy as np
 
 from envs.argument_checks import check_number, check_whole_number
-from envs.drawing import Chart, ChartRenderer, Gauge, gauges_chart, gauges_text
-from envs.finite_env import MaskedFiniteEnv, summing_to_one
+from envs.finite_env import Gauge, GaugeEnv, summing_to_one
 from mdp.array_types import Bools
 from mdp.transition_model import TransitionModel
 
 LARGEST_GOAL = 2000
 
 
-class GamblersProblemEnv(MaskedFiniteEnv):
+class GamblersProblemEnv(GaugeEnv):
     """Stakes on a coin that comes up heads with a known probability: all at once, or a little?
 
     ## Description
@@ -82,15 +81,6 @@ class GamblersProblemEnv(MaskedFiniteEnv):
     def _gauges(self) -> tuple[str, list[Gauge]]:
         title = "start" if self.last_action is None else f"stake {self.last_action}"
         return title, [Gauge("capital", self.s, self.goal)]
-
-    def _text(self) -> str:
-        return gauges_text(*self._gauges())
-
-    def _picture(self) -> Chart:
-        return gauges_chart(*self._gauges())
-
-    def _make_renderer(self, fps: int, title: str) -> ChartRenderer:
-        return ChartRenderer(fps, title)
 
 
 def allowed_stakes(goal: int) -> Bools:

@@ -9,8 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from envs.argument_checks import check_choice, check_whole_number
-from envs.drawing import Chart, ChartRenderer, Gauge, gauges_chart, gauges_text
-from envs.finite_env import MaskedFiniteEnv
+from envs.finite_env import Gauge, GaugeEnv
 from mdp.array_types import Bools, Floats, Ints
 from mdp.transition_model import TransitionModel
 
@@ -28,7 +27,7 @@ VARIANTS = ("example", "exercise")
 N_SIDE = MOST_CARS + 1
 
 
-class JacksCarRentalEnv(MaskedFiniteEnv):
+class JacksCarRentalEnv(GaugeEnv):
     """Cars are rented out at two places, and moved between them so that few customers go away.
 
     ## Description
@@ -121,22 +120,11 @@ class JacksCarRentalEnv(MaskedFiniteEnv):
     def _gauges(self) -> tuple[str, list[Gauge]]:
         moved = None if self.last_action is None else self.last_action - MOST_MOVED
         first, second = divmod(self.s, N_SIDE)
-        return (
-            "start" if moved is None else f"moved {moved:+d}",
-            [
-                Gauge("cars at the first place", first, MOST_CARS),
-                Gauge("cars at the second place", second, MOST_CARS),
-            ],
-        )
-
-    def _text(self) -> str:
-        return gauges_text(*self._gauges())
-
-    def _picture(self) -> Chart:
-        return gauges_chart(*self._gauges())
-
-    def _make_renderer(self, fps: int, title: str) -> ChartRenderer:
-        return ChartRenderer(fps, title)
+        title = "start" if moved is None else f"moved {moved:+d}"
+        return title, [
+            Gauge("cars at the first place", first, MOST_CARS),
+            Gauge("cars at the second place", second, MOST_CARS),
+        ]
 
 
 @lru_cache(maxsize=2)
@@ -159,11 +147,9 @@ def poisson(mean: float, most: int) -> Floats:
 
 
 def _day(requests: float, returns: float) -> tuple[Floats, Floats, Floats]:
-    """What a day brings at one place, by the cars in the morning and in the evening.
+    """What a day brings at one place, by the cars in the morning and in the evening, (21, 21).
 
-    Returns:
-        The probability of the evening, and mean and variance of the cars rented out; each of shape
-        (21, 21), the first axis for the morning.
+    The probability of the evening, and mean and variance of the cars rented out.
     """
     joint = np.zeros((N_SIDE, N_SIDE, N_SIDE))  # morning, rented, evening
     for cars in range(N_SIDE):

@@ -142,14 +142,9 @@ class RacetrackEnv(MapEnv):
 
 
 def crossed_cells(up: int, right: int) -> list[tuple[int, int]]:
-    """The cells that the straight line from a cell to another enters, in order.
+    """The cells that the straight line to one so many rows up and columns right enters, in order.
 
-    Args:
-        up: how many rows up the other lies, 0 or more.
-        right: how many columns to the right, 0 or more.
-
-    Returns:
-        For each cell, how many rows up and columns to the right it lies; the last is the other.
+    Of each cell, how many rows up and columns to the right it lies.
     """
     # The line leaves a row, or a column, halfway between two middles.
     rows = {Fraction(2 * i + 1, 2 * up) for i in range(up)}
@@ -169,9 +164,7 @@ def _cells_of(rows: tuple[str, ...]) -> Ints:
 def _arrivals(rows: tuple[str, ...]) -> tuple[Ints, Bools]:
     """Where a car gets from each cell of the track at each velocity, and whether it finishes.
 
-    Returns:
-        The number of the cell among those of the track, or `CRASH`, and the flag; both of shape
-        (cells, 25).
+    The number of a cell of the track, or `CRASH`, and the flag, both of shape (cells, 25).
     """
     places = {divmod(int(cell), len(rows[0])): i for i, cell in enumerate(_cells_of(rows))}
     arrival = np.full((len(places), N_SPEEDS**2), CRASH)
