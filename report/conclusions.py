@@ -239,7 +239,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
             *_on_other_tasks(environment),
             *on_unreliable(environment),
             *speed_sentences(environment),
-            *_on_the_impossible(study, environment),
+            *_on_the_impossible(environment),
             *_on_variants(study, environment),
             *on_changes([environment]),
             *_on_missing(study, environment),
@@ -384,7 +384,7 @@ def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
         )
 
 
-def _on_the_impossible(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
+def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:
     """Agents whose returns are above what no policy exceeds."""
     most = environment.optimum
     if environment.optimum_at_least is None or most is None:

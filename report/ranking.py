@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 
@@ -74,23 +74,14 @@ class Row:
 
     agent: AgentAnalysis
     environment: EnvironmentAnalysis
-
-
-@dataclass(frozen=True)
-class BanditRow(Row):
-    """An agent on a bandit, with its figures by pull."""
-
-    pulls: PullStatistics
-
-
-AnyRow = TypeVar("AnyRow", bound=Row)
+    pulls: PullStatistics | None = None  # on a bandit: its figures by pull
 
 
 @dataclass(frozen=True, kw_only=True)
-class Column(Generic[AnyRow]):
+class Column:
     """One column. A heading that is empty leaves it out there."""
 
-    cell: Callable[[AnyRow], Cell | None]  # what it says on an agent; None where it does not apply
+    cell: Callable[[Row], Cell | None]  # what it says on an agent; None where it does not apply
     page: str = ""  # its heading on the page
     help: str = ""  # what stands below that heading; ``{threshold}`` is the environment's
     terminal: str = ""  # its heading in the terminal
@@ -105,9 +96,7 @@ class Column(Generic[AnyRow]):
         return self.best_first or ("ascending" if study.metric in COSTS else "descending")
 
 
-def filled(
-    columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]
-) -> list[tuple[Column[AnyRow], list[Cell]]]:
+def filled(columns: Sequence[Column], rows: Sequence[Row]) -> list[tuple[Column, list[Cell]]]:
     """The columns that apply to some row, each with a cell for every row."""
     found = [(column, [column.cell(row) for row in rows]) for column in columns]
     dash = Cell("-", None)
@@ -176,12 +165,17 @@ def _runs(row: Row) -> Cell:
     return Cell(f"{row.agent.n_runs}", row.agent.n_runs, missing)
 
 
-def _spread(row: BanditRow) -> Cell:
-    low, *_, high = np.quantile(row.pulls.total_regret, QUANTILES)
+def _spread(pulls: PullStatistics) -> Cell:
+    low, *_, high = np.quantile(pulls.total_regret, QUANTILES)
     return Cell(f"{number(low)} to {number(high)}", float(high))
 
 
-COLUMNS: tuple[Column[Row], ...] = (
+def _by_pulls(cell: Callable[[PullStatistics], Cell]) -> Callable[[Row], Cell | None]:
+    """A cell of bandits alone."""
+    return lambda row: None if row.pulls is None else cell(row.pulls)
+
+
+COLUMNS = (
     Column(
         page="Mean",
         help="over seeds",
@@ -233,14 +227,16 @@ COLUMNS: tuple[Column[Row], ...] = (
 )
 
 # In the terminal, bandits have a table of their own; on the page, a section.
-BANDIT_COLUMNS: tuple[Column[BanditRow], ...] = (
+BANDIT_COLUMNS = (
     Column(terminal="mean regret", cell=lambda row: estimate_cell(row.agent.regret)),
-    Column(terminal=f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs", cell=_spread),
-    Column(terminal="simple regret", cell=lambda row: number_cell(row.pulls.simple_regret[-1])),
-    Column(terminal="reward", cell=lambda row: number_cell(row.pulls.reward[-1])),
+    Column(terminal=f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs", cell=_by_pulls(_spread)),
+    Column(
+        terminal="simple regret", cell=_by_pulls(lambda pulls: number_cell(pulls.simple_regret[-1]))
+    ),
+    Column(terminal="reward", cell=_by_pulls(lambda pulls: number_cell(pulls.reward[-1]))),
     Column(
         terminal="best arm",
-        cell=lambda row: Cell(f"{row.pulls.optimal[-1]:.1%}", float(row.pulls.optimal[-1])),
+        cell=_by_pulls(lambda p: Cell(f"{p.optimal[-1]:.1%}", float(p.optimal[-1]))),
     ),
     Column(terminal="CPU time", cell=_seconds),
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TypeVar
 
 import pandas as pd
 from rich.console import Console
@@ -17,7 +16,7 @@ from experiments.off_policy.logged_policies import Comparison, Judged
 from experiments.plan import tuning_seeds
 from experiments.study import METRIC_WORDS, StudySpec
 from report.conclusions import conclusion, pairs_both_ways, seeds_of
-from report.ranking import BANDIT_COLUMNS, COLUMNS, BanditRow, Cell, Column, Row, filled
+from report.ranking import BANDIT_COLUMNS, COLUMNS, Cell, Column, Row, filled
 from report.words import enumeration, number, optimum_words, seed_sentence
 from verdicts import Estimate, Verdict
 
@@ -48,8 +47,6 @@ FIRST_LEFT_OUT = (
     *("training", "IQM", "solved", "stays from"),
     *("simple regret", "reward", "CPU time", "score", "best arm"),
 )
-
-AnyRow = TypeVar("AnyRow", bound=Row)
 
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
@@ -94,16 +91,14 @@ def _print_ranking(
     console: Console, analysis: StudyAnalysis, environment: EnvironmentAnalysis
 ) -> None:
     pulls, label = analysis.results.pulls, environment.environment
-    on_bandit = [
-        BanditRow(agent, environment, pulls[agent.agent, label])
-        for agent in environment.agents
-        if (agent.agent, label) in pulls
+    rows = [
+        Row(agent, environment, pulls.get((agent.agent, label))) for agent in environment.agents
     ]
+    on_bandit = [row for row in rows if row.pulls is not None]
     if on_bandit:
         left_out = _print_fitting(console, label, BANDIT_COLUMNS, on_bandit)
         explained = _bandit_caption(analysis.study, left_out)
     else:
-        rows = [Row(agent, environment) for agent in environment.agents]
         columns = [column for column in COLUMNS if column.terminal]
         title = label
         if environment.optimum is not None:
@@ -118,7 +113,7 @@ def _print_ranking(
 
 
 def _print_fitting(
-    console: Console, title: str, columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]
+    console: Console, title: str, columns: Sequence[Column], rows: Sequence[Row]
 ) -> list[str]:
     """Print a table with as many columns as there is room for; the headings of the others."""
     shown = filled(columns, rows)
@@ -132,9 +127,7 @@ def _print_fitting(
     return left_out
 
 
-def _table(
-    title: str, shown: Sequence[tuple[Column[AnyRow], list[Cell]]], rows: Sequence[AnyRow]
-) -> Table:
+def _table(title: str, shown: Sequence[tuple[Column, list[Cell]]], rows: Sequence[Row]) -> Table:
     table = Table(title=title, title_justify="left")
     names = [row.agent.marked for row in rows]
     # Longer names go over several lines.

@@ -60,8 +60,7 @@ def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candida
         value = trial.value if trial.state == TrialState.COMPLETE else None
         if value is not None and isinstance(entry, Mapping):
             found.setdefault(name_of(entry), Candidate(trial.number, entry, value))
-    sign = 1 if is_cost else -1
-    return sorted(found.values(), key=lambda each: (sign * each.value, each.number))
+    return sorted(found.values(), key=lambda each: each.value, reverse=not is_cost)
 
 
 def chosen_for_retest(ranked: Sequence[Candidate], k: int) -> list[Candidate]:
