@@ -34,6 +34,7 @@ from report.series import (
     COLOURS,
     DASHES,
     SPREAD,
+    AgentRuns,
     ArmSeries,
     Belief,
     Curve,
@@ -43,7 +44,6 @@ from report.series import (
     LearningCurves,
     Mark,
     PullSeries,
-    RunSeries,
     StudySeries,
     Sweep,
     best_of,
@@ -468,10 +468,14 @@ def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
 
 
 def draw_runs(
-    axes: Axes, runs: RunSeries, environment: EnvironmentAnalysis, metric: str, marks: Marks
+    axes: Axes,
+    runs: Sequence[AgentRuns],
+    environment: EnvironmentAnalysis,
+    metric: str,
+    marks: Marks,
 ) -> None:
     """Each run as a dot, the mean with its interval; the best agent on top."""
-    upwards = runs.agents[::-1]
+    upwards = runs[::-1]
     for row, agent in enumerate(upwards):
         colour = COLOURS[marks[agent.agent].colour]
         n = len(agent.values)

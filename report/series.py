@@ -382,14 +382,6 @@ class AgentRuns:
 
 
 @dataclass(frozen=True)
-class RunSeries:
-    """The runs of all agents on an environment."""
-
-    agents: tuple[AgentRuns, ...]  # the best first
-    linear_up_to: float | None  # as in `LearningCurves`
-
-
-@dataclass(frozen=True)
 class Sweep:
     """Means by the one parameter that an agent was swept over."""
 
@@ -417,16 +409,15 @@ class Grid:
         return np.asarray(1 - shares if is_cost else shares)
 
 
-def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> RunSeries:
-    """The runs on an environment, by what the verdicts are about."""
+def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> list[AgentRuns]:
+    """The runs on an environment, by what the verdicts are about; the best agent first."""
     values = values_over_seeds(results, environment.environment, results.study.metric)
-    agents = []
+    found = []
     for agent in environment.agents:
         there = np.flatnonzero(np.isfinite(values[agent.agent]))
         runs, seeds = values[agent.agent][there], there + results.study.first_seed
-        agents.append(AgentRuns(agent.agent, agent.metric.mean, seeds, runs))
-    scale = linear_up_to((runs.values for runs in agents), environment.optimum)
-    return RunSeries(tuple(agents), scale)
+        found.append(AgentRuns(agent.agent, agent.metric.mean, seeds, runs))
+    return found
 
 
 def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Sweep]:
@@ -488,7 +479,7 @@ class EnvironmentSeries:
     environment: EnvironmentAnalysis  # how the agents did on it
     # By kind; on bandits None, which have theirs by pull.
     curves: Mapping[str, LearningCurves] | None
-    runs: RunSeries  # each run, and the means
+    runs: Sequence[AgentRuns]  # the best agent first
     pulls: PullSeries | None  # on bandits; else None
     sweeps: Mapping[str, Sweep]  # by agent, where it was swept over one parameter
     grids: Mapping[str, Grid] = field(default_factory=dict)  # by agent, where it was swept over two

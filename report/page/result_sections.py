@@ -19,7 +19,15 @@ from report.conclusions import conclusion, on_changes, pairs_both_ways, places_w
 from report.documents import MARKUPS, verdicts_as
 from report.page.frame import Report, Section, setting
 from report.ranking import COLUMNS, Row, filled
-from report.series import AgentRuns, Curve, EnvironmentSeries, Grid, best_of, mean_regret
+from report.series import (
+    AgentRuns,
+    Curve,
+    EnvironmentSeries,
+    Grid,
+    best_of,
+    linear_up_to,
+    mean_regret,
+)
 from report.terminal import PHRASES, SIGNS, says_more
 from report.words import look_sentences, number, seed_sentence
 
@@ -219,7 +227,10 @@ def comparison(report: Report) -> Section | None:
         ],
     }
     places = [
-        {"intervals": [_runs(agent) for agent in one.runs.agents], "linear": one.runs.linear_up_to}
+        {
+            "intervals": [_runs(agent) for agent in one.runs],
+            "linear": linear_up_to((runs.values for runs in one.runs), one.environment.optimum),
+        }
         for one in report.series.environments
     ]
     data = {"metric": metric}

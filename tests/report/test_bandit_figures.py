@@ -20,7 +20,6 @@ from report.series import (
     Mark,
     PullSeries,
     RegretBounds,
-    RunSeries,
     StudySeries,
 )
 
@@ -272,7 +271,7 @@ def study(made_up, tmp_path):
     def make(pulls, agents=("first", "second")):
         place = made_up.environment([made_up.agent(name, 1.0) for name in agents], "coins")
         analysis = made_up.analysis([place], agents, tmp_path, metric="regret")
-        one = EnvironmentSeries(place, None, RunSeries((), None), pulls, {})
+        one = EnvironmentSeries(place, None, (), pulls, {})
         marks = {name: MARKS.get(name, Mark(name, 2, "solid")) for name in agents}
         return StudySeries(analysis, marks, (one,))
 

@@ -22,7 +22,6 @@ from report.series import (
     LearningCurves,
     PullSeries,
     RegretBounds,
-    RunSeries,
     StudySeries,
     Sweep,
     agent_marks,
@@ -77,7 +76,7 @@ def all_figures(made_up, root, names):
     kinds = {"evaluation": (), "training": tuple(names[:1])}
     learning = {kind: LearningCurves(by_axis, 79.0, who) for kind, who in kinds.items()}
     seeds = np.arange(5)
-    runs = RunSeries(tuple(AgentRuns(a.agent, a.metric.mean, seeds, seeds) for a in agents), None)
+    runs = [AgentRuns(a.agent, a.metric.mean, seeds, seeds) for a in agents]
     x = np.array([0.001, 0.1, 0.9])
     means = Curve(x, x * 50, x * 40, x * 60)
     sweeps = {name: Sweep(name, means, tuple((names * 2)[:3])) for name in names}

@@ -25,7 +25,6 @@ from report.series import (
     Curve,
     EnvironmentSeries,
     Grid,
-    RunSeries,
     StudySeries,
     Sweep,
     agent_marks,
@@ -467,8 +466,8 @@ def sweep_page(made_up, tmp_path):
     sweep = Sweep("a", Curve(x, np.array([90.0, 80, 70]), x, x), tuple(labels[:3]))
     grid = Grid(("a", "e"), ["1", "2"], ["3", "4"], means, [labels[:2], [labels[2], ""]])
     series = [
-        EnvironmentSeries(places[0], None, RunSeries((), None), None, {"swept": sweep}),
-        EnvironmentSeries(places[1], None, RunSeries((), None), None, {}, {"swept": grid}),
+        EnvironmentSeries(places[0], None, (), None, {"swept": sweep}),
+        EnvironmentSeries(places[1], None, (), None, {}, {"swept": grid}),
     ]
     report = Report(StudySeries(analysis, agent_marks(analysis.study), tuple(series)), "compare")
     return Page(render(report, [result_sections.verdict(report)]))

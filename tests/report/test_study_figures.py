@@ -27,7 +27,6 @@ from report.series import (
     Grid,
     LearningCurves,
     Mark,
-    RunSeries,
     StudySeries,
     Sweep,
     agent_marks,
@@ -202,13 +201,10 @@ def test_an_axis_is_logarithmic_where_some_returns_dwarf_the_others(curves_drawn
 
 def run_series(made_up):
     seeds = np.arange(3)
-    return RunSeries(
-        (
-            AgentRuns("first", made_up.estimate(90.0, 80.0, 95.0), seeds, np.array([85, 90, 95.0])),
-            AgentRuns("second", made_up.estimate(40.0, 35.0, 45.0), seeds[:1], np.array([40.0])),
-        ),
-        None,
-    )
+    return [
+        AgentRuns("first", made_up.estimate(90.0, 80.0, 95.0), seeds, np.array([85, 90, 95.0])),
+        AgentRuns("second", made_up.estimate(40.0, 35.0, 45.0), seeds[:1], np.array([40.0])),
+    ]
 
 
 @pytest.fixture
@@ -505,7 +501,7 @@ def test_an_interval_that_is_not_known_is_not_drawn(axes, drawn, made_up):
     alone = AgentRuns(
         "first", made_up.estimate(5.0, math.nan, math.nan), np.arange(1), np.array([5.0])
     )
-    draw_runs(axis, RunSeries((alone,), None), made_up.environment(), "area", MARKS)
+    draw_runs(axis, [alone], made_up.environment(), "area", MARKS)
     dots, bar, mean = drawn(axis).lines
     assert dots["x"] == mean["x"] == [5]
     assert all(math.isnan(end) for end in bar["x"])
