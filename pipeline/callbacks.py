@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -240,10 +240,6 @@ class PullSummary:
     # worth, as with a log.
     regret: float | None
     optimal: float | None  # share of a best arm among the last pulls, likewise
-
-    def as_data(self) -> dict[str, Any]:
-        """The figures as JSON."""
-        return asdict(self)
 
 
 def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:

@@ -210,12 +210,9 @@ class FolderGoneError(UserError):
 def is_gone(path: Path) -> bool:
     """Whether there is no such file or folder; False where it cannot be reached."""
     try:
-        path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return True
+        return not path.exists()
     except OSError:
         return False
-    return False
 
 
 @contextmanager
@@ -248,7 +245,8 @@ def folder_lock(
             lost.append(error)
             on_loss()
 
-    made = _make_folders(root)
+    made = [folder for folder in (root, *root.parents) if not folder.exists()]  # innermost first
+    root.mkdir(parents=True, exist_ok=True)
     path, token = root / LOCK, secrets.token_hex(16)
     try:
         _take(path, token, say)
@@ -272,13 +270,6 @@ def folder_lock(
         for folder in made:
             with contextlib.suppress(OSError):
                 folder.rmdir()
-
-
-def _make_folders(root: Path) -> list[Path]:
-    """Make the folder; those that were not there, innermost first."""
-    missing = [folder for folder in (root, *root.parents) if not folder.exists()]
-    root.mkdir(parents=True, exist_ok=True)
-    return missing
 
 
 def _take(path: Path, token: str, say: Callable[[str], object]) -> None:

@@ -165,7 +165,8 @@ _SETTINGS = (
 
 def is_plain(spec: TrainSpec) -> bool:
     """Whether a run is such a one."""
-    if not _is_known_agent(spec) or not _is_known_wrapping(spec):
+    wrappers = {wrapper.name for wrapper in spec.hyperparams.train_env_wrapper}
+    if not _is_known_agent(spec) or not wrappers <= WRAPPERS:
         return False
     if spec.gym_packages or spec.user_modules or spec.tensorboard_log or spec.trained_agent:
         return False
@@ -181,10 +182,6 @@ def _is_known_agent(spec: TrainSpec) -> bool:
         default = ALGORITHMS[spec.algo].engines[0]
         return bool(spec.hyperparams.algorithm.get("engine", default) != "library")
     return spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].family in FAMILIES
-
-
-def _is_known_wrapping(spec: TrainSpec) -> bool:
-    return {wrapper.name for wrapper in spec.hyperparams.train_env_wrapper} <= WRAPPERS
 
 
 def is_known_environment(env_id: str) -> bool:

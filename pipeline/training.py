@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from signal import Signals
 from typing import Any
 
@@ -301,7 +301,7 @@ def _record(outcome: Outcome) -> None:
         engine=outcome.engine,
         **outcome.taken.as_data(),
         **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),
-        **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
+        **({} if pulls is None else {"regret": pulls.regret, "pulls": asdict(pulls)}),
     )
 
 
