@@ -68,11 +68,7 @@ class FiniteEnv(ShownEnv):
         return self._observe(), {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        """Do one thing; see the class for the meaning of what is returned.
-
-        Raises:
-            ValueError: if there is no such action.
-        """
+        """Do one thing; see the class for the meaning of what is returned."""
         action = int(action)
         if not 0 <= action < self.n_actions:
             raise ValueError(

@@ -487,11 +487,7 @@ class GridWorld(ShownEnv):
         return self._observe(), self._info(bumped=False)
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Try to move one cell; see the class for the meaning of what is returned.
-
-        Raises:
-            ValueError: if the action is not one of 0, 1, 2, 3.
-        """
+        """Try to move one cell; see the class for the meaning of what is returned."""
         action = int(action)
         if not 0 <= action < len(MOVES):
             raise ValueError(f"action {action} does not exist: 0 up, 1 down, 2 left, 3 right")
@@ -605,12 +601,7 @@ LONGEST_ROW = 50
 
 
 class MapEnv(FiniteEnv):
-    """One whose states are shown on a map; its letters are those of `envs.drawing`.
-
-    Attributes:
-        rows: the map.
-        action_names: what its actions are called.
-    """
+    """One whose states are shown on a map, ``rows``; its letters are those of `envs.drawing`."""
 
     rows: tuple[str, ...]
     action_names: ClassVar[tuple[str, ...]]

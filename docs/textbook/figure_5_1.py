@@ -50,7 +50,7 @@ def stick_on_twenty(n_observations: int) -> Ints:
     return np.where(np.arange(n_observations) // 22 >= STICKS_FROM, STICK, HIT)
 
 
-class OnePolicy(gym.Wrapper[Any, Any, Any, Any]):
+class OnePolicy(gym.ObservationWrapper[Any, Any, Any]):
     """Plays a policy: its one action is what that does, so that a learner only predicts."""
 
     def __init__(self, env: gym.Env[Any, Any], policy: Ints) -> None:
@@ -59,16 +59,14 @@ class OnePolicy(gym.Wrapper[Any, Any, Any, Any]):
         self.action_space = spaces.Discrete(1)
         self._obs = 0
 
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
-        self._obs, info = self.env.reset(**kwargs)
-        return self._obs, info
+    def observation(self, observation: int) -> int:
+        """Remember it for the policy."""
+        self._obs = observation
+        return observation
 
     def step(self, action: int) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step of the policy."""
-        result = self.env.step(self.policy[self._obs])
-        self._obs = result[0]
-        return result
+        return super().step(self.policy[self._obs])
 
 
 def surfaces(axes: Any, values: Floats, title: str) -> None:
@@ -90,18 +88,13 @@ def exact_values() -> Floats:
     return values
 
 
-def learner() -> Any:
-    """First-visit Monte Carlo of the policy: its one action is what that does."""
-    policy = stick_on_twenty(len(model().initial) - 11)  # of what is observed
-    return agent_on(
-        lambda: OnePolicy(game(), policy), "monte_carlo", 0, learning_rate="sample_average"
-    )
-
-
 def main() -> None:
     """Draw the figure, and hold it against the book."""
     args = arguments("Figure 5.1 of Sutton and Barto: a policy's values in Blackjack.", MANY)
-    agent, shown = learner(), observations()
+    policy, shown = stick_on_twenty(model().n_states - 11), observations()  # of what is observed
+    agent = agent_on(
+        lambda: OnePolicy(game(), policy), "monte_carlo", 0, learning_rate="sample_average"
+    )
     learn_episodes(agent, FEW)
     few = agent.policy.q_table[shown, 0]
     learn_episodes(agent, args.runs - FEW)

@@ -313,11 +313,7 @@ class StochasticBandit(Bandit):
     """
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Pull an arm; see the class for the meaning of what is returned.
-
-        Raises:
-            ValueError: if there is no such arm.
-        """
+        """Pull an arm; see the class for the meaning of what is returned."""
         arm = self._checked(action)
         expected = self.expected_rewards()
         best = max(expected)

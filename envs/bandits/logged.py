@@ -39,136 +39,99 @@ LONGEST_SHOWN, MOST_SHOWN = 60, 12  # characters of a name, and names, in a mess
 NUMBER = "a finite number of no more than 1e15"
 
 
-class _BoundedLines:
-    """The lines of a file, of which no row may take too much: a line may go on for gigabytes."""
+class _LogReader:
+    """Reads a file in pieces and keeps numbers: as texts, a large one would take gigabytes."""
 
-    def __init__(self, file: TextIO) -> None:
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self.path = path
+        self.columns: dict[str, Floats] = {}
+        # The values of text, each with a number, where text is all of the context.
+        self.words: dict[str, int] = {}
+        self.codes: list[Ints] = []  # the number of each row's text, in pieces
         self._file = file
-        self.room = MAX_ROW
+        self._room = MAX_ROW  # characters that the present row may still have
+        self._reader = csv.reader(self._lines(), strict=True)
 
-    def __iter__(self) -> Iterator[str]:
-        while line := self._file.readline(MAX_ROW + 1):
-            self.room -= len(line)
-            if self.room < 0:
+    def read(self) -> None:
+        """Read all rows; ValueError where this is no such log, see `read_log`."""
+        rows = self._rows()
+        header = [name for _, cells in islice(rows, 1) for name in cells]
+        context = [name for name in header if name not in _WANTED]
+        either = context[0] if len(context) == 1 else None  # text in all rows, or numbers in all
+        any_number, mistake = False, None
+        pieces: dict[str, list[Floats]] = {name: [] for name in header}
+        while piece := list(islice(rows, ROWS_AT_ONCE)):
+            lines = [line for line, _ in piece]
+            columns_of_text = zip(*(cells for _, cells in piece), strict=True)
+            for name, texts in zip(header, columns_of_text, strict=True):
+                values = np.fromiter(map(_as_float, texts), np.float64)
+                pieces[name].append(values)
+                found = self._mistake(name, lines, texts, values)
+                if name != either:
+                    if found is not None:
+                        raise found
+                    continue
+                mistake = mistake or found
+                any_number |= not np.isnan(values).all()
+                if not any_number:
+                    self._number_words(name, texts)
+        if not (header and pieces[ARM]):
+            raise ValueError(f"{self.path} holds no pulls: a header and a row for each are needed")
+        if any_number:
+            self.words.clear()
+            if mistake is not None:
+                raise mistake
+        self.columns = {name: np.concatenate(values) for name, values in pieces.items()}
+
+    def _lines(self) -> Iterator[str]:
+        while line := self._file.readline(MAX_ROW + 1):  # one may go on for gigabytes
+            self._room -= len(line)
+            if self._room < 0:
                 raise csv.Error(f"a row has more than {MAX_ROW:,} characters")
             yield line
 
+    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+        """The header, and each row below it, which has as many cells; each with its line."""
+        n_cells = None
+        for row in self._reader:
+            self._room = MAX_ROW
+            if not row:
+                continue
+            cells, line = [cell.strip() for cell in row], self._reader.line_num
+            if n_cells is None:
+                self._check_header(cells)
+                n_cells = len(cells)
+            if len(cells) != n_cells:
+                raise ValueError(f"{self.path}, line {line} has {len(cells)} values, not {n_cells}")
+            yield line, cells
 
-def _rows(path: Path, lines: _BoundedLines) -> Iterator[tuple[int, list[str]]]:
-    """The header, and each row below it, which has as many cells; each with its line."""
-    reader = csv.reader(lines, strict=True)
-    n_cells = None
-    for row in reader:
-        lines.room = MAX_ROW
-        if not row:
-            continue
-        cells = [cell.strip() for cell in row]
-        if n_cells is None:
-            _check_header(cells, path)
-            n_cells = len(cells)
-        if len(cells) != n_cells:
-            raise ValueError(
-                f"{path}, line {reader.line_num} has {len(cells)} values, not {n_cells}"
-            )
-        yield reader.line_num, cells
+    def _check_header(self, header: list[str]) -> None:
+        if len(header) > MAX_COLUMNS:
+            raise ValueError(f"{self.path} has {len(header):,} columns, more than {MAX_COLUMNS:,}")
+        for name in (ARM, REWARD):
+            if name not in header:
+                raise ValueError(f"{self.path} has no column {name!r}, only {some(header)}")
+        twice = next((name for name in header if header.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{self.path} has two columns {twice[:LONGEST_SHOWN]!r}")
 
-
-def _read_columns(
-    path: Path, rows: Iterator[tuple[int, list[str]]]
-) -> tuple[dict[str, Floats], Words | None]:
-    """The columns as numbers, read in pieces; and as words, where text is all of the context.
-
-    As texts, a file of some hundred megabytes would take gigabytes.
-    """
-    header = [name for _, cells in islice(rows, 1) for name in cells]
-    names = [name for name in header if name not in _WANTED]
-    words = Words(f"{path}", names[0]) if len(names) == 1 else None
-    pieces: dict[str, list[Floats]] = {name: [] for name in header}
-    while piece := list(islice(rows, ROWS_AT_ONCE)):
-        lines = [line for line, _ in piece]
-        columns_of_text = zip(*(cells for _, cells in piece), strict=True)
-        for name, texts in zip(header, columns_of_text, strict=True):
-            values = np.fromiter(map(_as_float, texts), np.float64)
-            if words is not None and name == words.name:
-                words.add(lines, texts, values)
-            else:
-                _check_numbers(f"{path}, line", name, lines, texts, values)
-            pieces[name].append(values)
-    if not (header and pieces[ARM]):
-        raise ValueError(f"{path} holds no pulls: a header and a row for each are needed")
-    columns = {name: np.concatenate(values) for name, values in pieces.items()}
-    return columns, None if words is None or words.are_numbers() else words
-
-
-class Words:
-    """The cells of a column that is all of the context: text in all rows, or numbers in all."""
-
-    def __init__(self, path: str, name: str) -> None:
-        self.name = name
-        self._path = path
-        self._numbers: dict[str, int] = {}
-        self._codes: list[Ints] = []
-        self._any_number = False
-        self._mistake: ValueError | None = None
-
-    def add(self, lines: list[int], texts: tuple[str, ...], values: Floats) -> None:
-        """Take in some rows."""
-        self._any_number |= not np.isnan(values).all()
-        if self._mistake is None:
-            try:
-                _check_numbers(f"{self._path}, line", self.name, lines, texts, values)
-            except ValueError as error:
-                self._mistake = error
-        if self._any_number:
-            self._numbers.clear()
-            self._codes.clear()
-            return
-        known = self._numbers
-        self._codes.append(np.array([known.setdefault(text, len(known)) for text in texts]))
-        if len(known) > MAX_CATEGORIES:
-            raise ValueError(
-                f"{self._path}: {self.name} has more than {MAX_CATEGORIES:,} values of text"
-            )
-
-    def are_numbers(self) -> bool:
-        """Whether all cells are numbers; ValueError if some are, and others are not."""
-        if self._any_number and self._mistake is not None:
-            raise self._mistake
-        return self._any_number
-
-    @property
-    def sorted(self) -> tuple[str, ...]:
-        """The texts in alphabetical order."""
-        return tuple(sorted(self._numbers))
-
-    def places(self) -> Ints:
-        """The place of each row's text among `sorted`, shape (n,)."""
-        rank = np.empty(len(self._numbers), np.int64)
-        rank[[self._numbers[text] for text in self.sorted]] = np.arange(len(rank))
-        return rank[np.concatenate(self._codes)]
-
-
-def _check_numbers(
-    where: str, name: str, lines: list[int], texts: tuple[str, ...], values: Floats
-) -> None:
-    """Make sure that numbers are valid, and of a size to reckon with."""
-    wanted, valid = _WANTED.get(name, _CONTEXT)
-    wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
-    if len(wrong):
+    def _mistake(
+        self, name: str, lines: list[int], texts: tuple[str, ...], values: Floats
+    ) -> ValueError | None:
+        """The first number that is not valid, or not of a size to reckon with."""
+        wanted, valid = _WANTED.get(name, _CONTEXT)
+        wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
+        if not len(wrong):
+            return None
         line, text = lines[wrong[0]], texts[wrong[0]]
         shown = text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
-        raise ValueError(f"{where} {line}: {name} is {shown!r}, it must be {wanted}")
+        return ValueError(f"{self.path}, line {line}: {name} is {shown!r}, it must be {wanted}")
 
-
-def _check_header(header: list[str], path: Path) -> None:
-    if len(header) > MAX_COLUMNS:
-        raise ValueError(f"{path} has {len(header):,} columns, more than {MAX_COLUMNS:,}")
-    for name in (ARM, REWARD) if header else ():
-        if name not in header:
-            raise ValueError(f"{path} has no column {name!r}, only {some(header)}")
-    twice = next((name for name in header if header.count(name) > 1), None)
-    if twice is not None:
-        raise ValueError(f"{path} has two columns {twice[:LONGEST_SHOWN]!r}")
+    def _number_words(self, name: str, texts: tuple[str, ...]) -> None:
+        known = self.words
+        self.codes.append(np.array([known.setdefault(text, len(known)) for text in texts]))
+        if len(known) > MAX_CATEGORIES:
+            raise ValueError(f"{self.path}: {name} has more than {MAX_CATEGORIES:,} values of text")
 
 
 def some(names: Sequence[str]) -> str:
@@ -284,15 +247,19 @@ def read_log(path: str | Path) -> LoggedData:
     file = Path(path)
     try:
         with opened(file, MAX_BYTES) as binary:
-            lines = _BoundedLines(TextIOWrapper(binary, encoding="utf-8-sig", newline=""))
-            columns, words = _read_columns(file, _rows(file, lines))
+            log = _LogReader(file, TextIOWrapper(binary, encoding="utf-8-sig", newline=""))
+            log.read()
     except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ValueError(f"cannot read {file}: {reason}") from error
-    names = tuple(name for name in columns if name not in {ARM, REWARD, PROPENSITY})
+    columns, categories = log.columns, tuple(sorted(log.words))
+    names = tuple(name for name in columns if name not in _WANTED)
     contexts = np.empty((len(columns[ARM]), len(names)))
     for i, name in enumerate(names):
-        contexts[:, i] = columns[name] if words is None else words.places()
+        contexts[:, i] = columns[name]
+    if categories:
+        place = {word: i for i, word in enumerate(categories)}
+        contexts[:, 0] = np.array([place[word] for word in log.words])[np.concatenate(log.codes)]
     return LoggedData(
         source=str(path),
         context_names=names,
@@ -300,7 +267,7 @@ def read_log(path: str | Path) -> LoggedData:
         arms=columns[ARM].astype(np.int64),
         rewards=columns[REWARD],
         propensities=columns.get(PROPENSITY),
-        categories=None if words is None else words.sorted,
+        categories=categories or None,
     )
 
 
