@@ -27,7 +27,7 @@ from agents.common.callbacks import BlockCallback, Horizon
 from machine_code.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
-from pipeline.files import settle, sync
+from pipeline.files import files_below, sync
 from pipeline.progress import ProgressDisplay
 from pipeline.runs import Run
 from pipeline.state_files import SavedState, save_state
@@ -78,6 +78,7 @@ class StateSaver(BlockCallback):
             float(note.get("seconds", 0.0)), float(note.get("cpu_seconds", 0.0))
         )
         self.started = WorkTime.now()
+        self.stamps: dict[Path, tuple[int, int, int]] = {}  # of files, at the last state
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
         self.was_cut_off = keeping.was_cut_off
@@ -188,11 +189,22 @@ class StateSaver(BlockCallback):
             "spec": settings_digest(self.run.recorded_spec()),
         }
         # The disk has to have what the state is checked against, and what is not written again.
-        settle(self.run.path)
-        logs = (self.run.path / name for name in positions)
-        sync(*(path for path in logs if path.parent != self.run.path), *self.run.path.parents[:2])
+        sync(*self._changed_files(positions), *self.run.path.parents[:2])
         save_state(self.run.state_path, self.n_saved + 1, content, note)
         self.n_saved += 1
+
+    def _changed_files(self, logs: Iterable[str]) -> set[Path]:
+        """The files of the run and its logs that have changed since the last state; their folders.
+
+        To ask the disk for all would take as long as the state itself, once there are checkpoints.
+        """
+        paths = {*files_below(self.run.path), *(self.run.path / name for name in logs)}
+        before, self.stamps = self.stamps, {}
+        for path in paths:
+            status = path.stat()
+            self.stamps[path] = status.st_ino, status.st_mtime_ns, status.st_size
+        changed = {path for path, stamp in self.stamps.items() if before.get(path) != stamp}
+        return {*changed, *(path.parent for path in changed)}
 
     def _roots(self) -> dict[str, Any]:
         logger = self.model.logger
