@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -27,10 +27,6 @@ from agents.compiled.records import Episodes
 from agents.compiled.worlds import NotCompilable
 from agents.networks.network_worlds import NetworkEnvStates, Numbers, network_playground
 from agents.networks.torch_bridge import FlatTensors, Reference, SharedOptimizer, address_of
-
-if TYPE_CHECKING:
-    from agents.networks.policy_gradients import PolicyTraining
-    from agents.networks.q_learning import QTraining
 
 
 class RolloutEvents:
@@ -161,7 +157,7 @@ class NetworkEngine(CompiledEngine):
 
     def __init__(
         self,
-        training: QTraining | PolicyTraining,
+        training: Any,  # a `QTraining` or a `PolicyTraining`
         world: Any,
         callback: BaseCallback,
         log_interval: int | None,
@@ -191,7 +187,7 @@ class NetworkEngine(CompiledEngine):
 
     def _is_over(self, total_timesteps: int) -> bool:
         # As in the library, what is being collected is collected to its end.
-        return self.training.until_end(total_timesteps) <= 0
+        return bool(self.training.until_end(total_timesteps) <= 0)
 
     def _run_block(self, total_timesteps: int) -> bool:
         self._begin_rollout()
