@@ -30,8 +30,8 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.cluster import cluster_launcher as launching_there
-from experiments.cluster.addresses import SchedulerAddress
 from experiments.cluster.cluster_launcher import cluster_launcher
+from experiments.cluster.schedulers import SchedulerAddress
 from experiments.cluster.working import Probe, probing
 from experiments.launching import Launchers, execute, local_launcher
 from experiments.plan import PlannedRun, plan

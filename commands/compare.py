@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from experiments.analysis import StudyAnalysis
-    from experiments.cluster.addresses import Cluster
+    from experiments.cluster.schedulers import Cluster
     from experiments.growing import Step
     from experiments.launching import EarlyResults, Launcher, RunFailure
     from experiments.looks import Standing
@@ -590,8 +590,7 @@ def run_context(
     for library in ("distributed", "cryptography", "dask_jobqueue"):
         if importlib.util.find_spec(library) is None:
             raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'")
-    from experiments.cluster.addresses import JobQueue
-    from experiments.cluster.schedulers import checked_cluster
+    from experiments.cluster.schedulers import JobQueue, checked_cluster
 
     cluster = checked_cluster(args.cluster, args.insecure_cluster)
     if isinstance(cluster, JobQueue):

@@ -13,16 +13,14 @@ import shutil
 import struct
 import time
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from experiments.launching import RunFailure
 from experiments.plan import PlannedRun
 from experiments.run_folders import claim_draft, draft_path, put_run_in_place, remove_draft
 from pipeline.digests import FIELD, RECORD, RecordedFiles
-from pipeline.errors import UserError, one_line
+from pipeline.errors import UserError
 from pipeline.files import portable_name, sync
 from pipeline.locks import is_gone
 
@@ -221,82 +219,3 @@ def _check(planned: PlannedRun, draft: Path, names: set[str]) -> None:
             RecordedFiles(draft, digests).check(draft / name)
     except UserError as error:
         raise RefusedAnswerError(str(error)) from error
-
-
-# --- What has become of a run, and whose fault it was that it has not come back.
-
-MOST_TRIES = 3
-# Who did nothing wrong is sent again as often as that.
-MOST_SENDS = 50
-
-
-@dataclass
-class SentRun:
-    """A run under way.
-
-    Only a run that had begun may have to do with the end of its worker. One that merely waited
-    there, or whose worker left in good order, or whose scheduler went, is sent again without blame.
-    """
-
-    planned: PlannedRun
-    future: Future[RunFailure | None] = field(default_factory=Future)  # what its sender waits for
-    key: str = ""  # its name at the scheduler, another each time
-    task: Any = None  # what the scheduler promises
-    n_sent: int = 0  # how often it was sent
-    n_lost: int = 0  # how often the worker that had begun it was lost
-    n_refused: int = 0  # how often what came back was not the run, or none
-    worker: str | None = None  # where it has begun, as far as is known
-    reason: str = ""  # why it was last lost or refused
-
-    def begin(self, worker: str, has_left: bool) -> None:
-        """Note that a worker has begun; where another had before, that one was lost."""
-        self.lose(has_left)
-        self.worker = worker
-
-    def lose(self, has_left: bool) -> None:
-        """Note that the worker that had begun, if any, is gone; ``has_left`` if in good order."""
-        if self.worker is not None and not has_left:
-            self.n_lost += 1
-            self.reason = f"the worker that did it was lost {self.n_lost} times ({self.worker})"
-        self.worker = None
-
-    def refuse(self, reason: str) -> None:
-        """Note that something else than the run came back."""
-        self.n_refused += 1
-        self.worker = None
-        self.reason = f"{self.n_refused} times it did not come back as a run: {reason}"
-
-    @property
-    def is_given_up(self) -> bool:
-        """Whether it has been tried often enough."""
-        is_sent_too_often = self.n_sent >= MOST_SENDS
-        if is_sent_too_often and not self.reason:
-            self.reason = f"it was sent {self.n_sent} times and never came back"
-        return self.n_lost + self.n_refused >= MOST_TRIES or is_sent_too_often
-
-
-def ending_of(sent: SentRun, content: object, root: Path) -> tuple[str, str] | None:
-    """Why a run failed, in one line and at length; both empty where it is done, and in its place.
-
-    Nothing is believed of ``content``, the answer of its worker. None where the run is to be sent
-    again; a worker that can do no run at all is a `UserError`.
-    """
-    try:
-        answer = unpacked(content)
-        if answer.kind == FAILED:
-            return answer.reason or "it does not say why", answer.details
-        if answer.kind == UNFIT:
-            raise UserError(f"--cluster: {answer.reason}: start it anew, from the same folder")
-        if answer.kind == STOPPED:
-            sent.worker = None
-            return None
-        if answer.files is None:
-            check_in_place(sent.planned)
-        else:
-            receive(sent.planned, root, answer.files)
-    except RefusedAnswerError as error:
-        sent.refuse(one_line(error))
-        return None
-    except OSError as error:  # the disk is full
-        return one_line(error), ""
-    return "", ""

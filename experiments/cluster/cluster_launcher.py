@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,24 @@ from distributed import Future as DaskFuture
 from distributed.scheduler import KilledWorker
 
 from experiments.child_processes import NO_LIMITS
-from experiments.cluster.addresses import Cluster, JobQueue, LocalWorkers
-from experiments.cluster.answers import SentRun, ending_of
-from experiments.cluster.schedulers import Connection, Replace, opened
-from experiments.cluster.tasks import do_order
+from experiments.cluster import do_order
+from experiments.cluster.answers import (
+    FAILED,
+    STOPPED,
+    UNFIT,
+    RefusedAnswerError,
+    check_in_place,
+    receive,
+    unpacked,
+)
+from experiments.cluster.schedulers import (
+    Cluster,
+    Connection,
+    JobQueue,
+    LocalWorkers,
+    Replace,
+    opened,
+)
 from experiments.cluster.working import LEAVING, Probe, RunOrder, Supervisors, probing, version
 from experiments.launching import Launcher, RunFailure, ended
 from experiments.plan import PlannedRun
@@ -34,6 +49,56 @@ SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_REPLACEMENTS = 15.0
 # Answers that are looked at and put in place at once: so many are in memory.
 N_RECEIVERS = 4
+
+
+MOST_TRIES = 3
+# Who did nothing wrong is sent again as often as that.
+MOST_SENDS = 50
+
+
+@dataclass
+class SentRun:
+    """A run under way.
+
+    Only a run that had begun may have to do with the end of its worker. One that merely waited
+    there, or whose worker left in good order, or whose scheduler went, is sent again without blame.
+    """
+
+    planned: PlannedRun
+    future: Future[RunFailure | None] = field(default_factory=Future)  # what its sender waits for
+    key: str = ""  # its name at the scheduler, another each time
+    task: Any = None  # what the scheduler promises
+    n_sent: int = 0  # how often it was sent
+    n_lost: int = 0  # how often the worker that had begun it was lost
+    n_refused: int = 0  # how often what came back was not the run, or none
+    worker: str | None = None  # where it has begun, as far as is known
+    reason: str = ""  # why it was last lost or refused
+
+    def begin(self, worker: str, has_left: bool) -> None:
+        """Note that a worker has begun; where another had before, that one was lost."""
+        self.lose(has_left)
+        self.worker = worker
+
+    def lose(self, has_left: bool) -> None:
+        """Note that the worker that had begun, if any, is gone; ``has_left`` if in good order."""
+        if self.worker is not None and not has_left:
+            self.n_lost += 1
+            self.reason = f"the worker that did it was lost {self.n_lost} times ({self.worker})"
+        self.worker = None
+
+    def refuse(self, reason: str) -> None:
+        """Note that something else than the run came back."""
+        self.n_refused += 1
+        self.worker = None
+        self.reason = f"{self.n_refused} times it did not come back as a run: {reason}"
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether it has been tried often enough."""
+        is_sent_too_often = self.n_sent >= MOST_SENDS
+        if is_sent_too_often and not self.reason:
+            self.reason = f"it was sent {self.n_sent} times and never came back"
+        return self.n_lost + self.n_refused >= MOST_TRIES or is_sent_too_often
 
 
 @contextlib.contextmanager
@@ -204,7 +269,7 @@ class ClusterLauncher:
             except Exception:  # noqa: BLE001  # of whatever kind, from the scheduler: it is lost
                 sent.worker = None
             else:
-                ending = ending_of(sent, content, self._probe.root)
+                ending = _ending_of(sent, content, self._probe.root)
                 if ending is not None:
                     self._settle(sent, *ending)
                     return
@@ -260,3 +325,30 @@ class ClusterLauncher:
 def _set_error(future: Future[RunFailure | None], error: Exception) -> None:
     if not future.done():
         future.set_exception(error)
+
+
+def _ending_of(sent: SentRun, content: object, root: Path) -> tuple[str, str] | None:
+    """Why a run failed, in one line and at length; both empty where it is done, and in its place.
+
+    Nothing is believed of ``content``, the answer of its worker. None where the run is to be sent
+    again; a worker that can do no run at all is a `UserError`.
+    """
+    try:
+        answer = unpacked(content)
+        if answer.kind == FAILED:
+            return answer.reason or "it does not say why", answer.details
+        if answer.kind == UNFIT:
+            raise UserError(f"--cluster: {answer.reason}: start it anew, from the same folder")
+        if answer.kind == STOPPED:
+            sent.worker = None
+            return None
+        if answer.files is None:
+            check_in_place(sent.planned)
+        else:
+            receive(sent.planned, root, answer.files)
+    except RefusedAnswerError as error:
+        sent.refuse(one_line(error))
+        return None
+    except OSError as error:  # the disk is full
+        return one_line(error), ""
+    return "", ""

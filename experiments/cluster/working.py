@@ -200,7 +200,7 @@ class WatchedLimits(RunLimits):
 
 
 def answer_to(content: bytes) -> bytes:
-    """Do the run of an order, and say how it ended; see `experiments.cluster.tasks.do_order`."""
+    """Do the run of an order, and say how it ended; see `experiments.cluster.do_order`."""
     worker = get_worker()
     key = worker.get_current_task()
     order = RunOrder.unpacked(content)

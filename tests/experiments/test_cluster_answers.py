@@ -12,16 +12,15 @@ from hypothesis import strategies as st
 
 from experiments.cluster import answers
 from experiments.cluster.answers import (
-    MOST_SENDS,
     Answer,
     RefusedAnswerError,
-    SentRun,
     check_in_place,
     files_in,
     packed,
     receive,
     unpacked,
 )
+from experiments.cluster.cluster_launcher import MOST_SENDS, SentRun
 from experiments.cluster.working import Probe, RunOrder, probing
 from experiments.plan import plan
 from experiments.run_folders import draft_path

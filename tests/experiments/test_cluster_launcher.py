@@ -20,10 +20,15 @@ import compare
 from experiments.child_processes import NO_LIMITS
 from experiments.cluster import answers, schedulers
 from experiments.cluster import cluster_launcher as launching_there
-from experiments.cluster.addresses import JobQueue, LocalWorkers, SchedulerAddress
-from experiments.cluster.answers import MOST_SENDS, Answer, packed
-from experiments.cluster.cluster_launcher import ClusterLauncher, cluster_launcher
-from experiments.cluster.schedulers import opened, opened_queue
+from experiments.cluster.answers import Answer, packed
+from experiments.cluster.cluster_launcher import MOST_SENDS, ClusterLauncher, cluster_launcher
+from experiments.cluster.schedulers import (
+    JobQueue,
+    LocalWorkers,
+    SchedulerAddress,
+    opened,
+    opened_queue,
+)
 from experiments.cluster.working import Probe, probing
 from experiments.launching import execute
 from experiments.plan import plan
@@ -136,7 +141,7 @@ def check_what_is_refused(there, folder, monkeypatch):
     def lying(planned, root, files):
         raise answers.RefusedAnswerError("a stray file")
 
-    monkeypatch.setattr(answers, "receive", lying)
+    monkeypatch.setattr(launching_there, "receive", lying)
     root = folder / "refused"
     root.mkdir()
     (failure,) = execute(runs_of(root)[:1], root, there(root), lambda *_: None)

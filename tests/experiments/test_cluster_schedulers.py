@@ -10,37 +10,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.cluster import schedulers
-from experiments.cluster.addresses import (
+from experiments.cluster.schedulers import (
+    SECONDS_TO_RESTART,
     JobQueue,
+    Jobs,
     LocalWorkers,
     SchedulerAddress,
+    _retiring,
     check_address,
+    checked_cluster,
     is_loopback,
     read_cluster,
 )
-from experiments.cluster.schedulers import (
-    QUEUES,
-    SECONDS_TO_RESTART,
-    Jobs,
-    _retiring,
-    checked_cluster,
-)
 from pipeline.errors import UserError
 
-SYSTEMS = tuple(QUEUES)
 SLURM = "jobqueue:\n  slurm: {cores: 4, memory: 8GB, walltime: '01:00:00'}\n"
 
 
 def test_the_four_forms(tmp_path):
-    assert read_cluster("local:8", SYSTEMS) == LocalWorkers(8)
-    assert read_cluster("tls://node:8786", SYSTEMS) == SchedulerAddress("tls://node:8786")
-    assert read_cluster("127.0.0.1:8786", SYSTEMS).read() == "tcp://127.0.0.1:8786"
+    assert read_cluster("local:8") == LocalWorkers(8)
+    assert read_cluster("tls://node:8786") == SchedulerAddress("tls://node:8786")
+    assert read_cluster("127.0.0.1:8786").read() == "tcp://127.0.0.1:8786"
     file = tmp_path / "scheduler.json"
     file.write_text(json.dumps({"address": "tls://10.0.0.1:8786"}))
-    assert read_cluster(str(file), SYSTEMS).read() == "tls://10.0.0.1:8786"
+    assert read_cluster(str(file)).read() == "tls://10.0.0.1:8786"
     jobs = tmp_path / "slurm.yml"
     jobs.write_text(SLURM)
-    queue = read_cluster(str(jobs), SYSTEMS)
+    queue = read_cluster(str(jobs))
     assert isinstance(queue, JobQueue)
     assert (queue.system, queue.n_cores) == ("slurm", 4)
 
@@ -51,7 +47,7 @@ def test_the_four_forms(tmp_path):
 )
 def test_nonsense_is_refused(text):
     with pytest.raises(UserError, match="--cluster"):
-        read_cluster(text, SYSTEMS)
+        read_cluster(text)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +57,7 @@ def test_a_file_that_holds_no_address_is_refused(tmp_path, content):
     file = tmp_path / "scheduler.json"
     file.write_text(content)
     with pytest.raises(UserError, match="scheduler"):
-        read_cluster(str(file), SYSTEMS).read()
+        read_cluster(str(file)).read()
 
 
 @pytest.mark.parametrize(
@@ -79,7 +75,7 @@ def test_a_queue_that_cannot_be_is_refused(tmp_path, content, words):
     file = tmp_path / "slurm.yml"
     file.write_text(content)
     with pytest.raises(UserError, match=words):
-        read_cluster(str(file), SYSTEMS)
+        read_cluster(str(file))
 
 
 @given(st.ip_addresses())
