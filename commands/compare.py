@@ -218,7 +218,7 @@ def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], 
     missing: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in planned:
         if run.spec.algo in NETWORKS and run.is_to_do:
-            missing.setdefault((run.agent, run.environment), []).append(run)
+            missing.setdefault(run.labels, []).append(run)
     if not missing:  # without the libraries
         return "", {}
     from agents.networks.engine_setting import machine_pace
@@ -697,22 +697,26 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
+def typed_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """The settings that the flags of a study, or of a search, give every agent."""
+    from experiments.study import layered
+    from pipeline.settings.values import parse_assignments
+
+    settings: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
+    if args.env_kwargs:
+        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
+        settings = layered(settings, named)
+    budgets = {"n_timesteps": args.n_timesteps, "n_episodes": args.n_episodes}
+    return settings | {key: value for key, value in budgets.items() if value is not None}
+
+
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
     from experiments.study import AS_IT_COMES, layered
     from pipeline.agent_settings import with_engine
-    from pipeline.settings.values import parse_assignments
 
     files = _conf_files(study, args.conf_file)
-    changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
-    if args.env_kwargs:
-        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
-        changes = layered(changes, named)
-    if args.as_it_comes:
-        changes = {**AS_IT_COMES, **changes}
-    for key in ("n_timesteps", "n_episodes"):
-        if getattr(args, key) is not None:
-            changes[key] = getattr(args, key)
+    changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed_settings(args)}
     agents = tuple(
         replace(
             agent,
@@ -779,8 +783,8 @@ class StudyProgress(LiveProgress):
         super().__init__(console)
         there = {run.path for run in done}
         self.left = TimeLeft([run for run in runs if run.path not in there], expected or {})
-        self.total = Counter((run.agent, run.environment) for run in runs)
-        self.done = Counter((run.agent, run.environment) for run in done)
+        self.total = Counter(run.labels for run in runs)
+        self.done = Counter(run.labels for run in done)
         self.failed: Counter[tuple[str, str]] = Counter()
         self._refused: set[str] = set()
         self.n_missing = len(runs) - len(done)
@@ -793,7 +797,7 @@ class StudyProgress(LiveProgress):
         self.left.start(self.started if self.n_ended == 1 else now, self.n_workers)
         self.left.end(run, now)
         self.left.start(now, self.n_workers)
-        key = (run.agent, run.environment)
+        key = run.labels
         if failure is None:
             self.done[key] += 1
             self.note_refusal(run)

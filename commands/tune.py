@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -30,7 +30,15 @@ from commands.cli import (
     go_on_unread,
     whole_number,
 )
-from commands.compare import RunContext, conclude, do_missing, give_way, read, run_context
+from commands.compare import (
+    RunContext,
+    conclude,
+    do_missing,
+    give_way,
+    read,
+    run_context,
+    typed_settings,
+)
 from commands.terminal import LiveProgress, say, search_line, table_console
 from pipeline.errors import UserError, unknown
 from pipeline.failures import exits_as_mistakes
@@ -332,11 +340,10 @@ def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     """The tuning that the arguments mean."""
     from agents import ALGORITHMS
-    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
+    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name
     from pipeline.agent_settings import with_engine
     from pipeline.environments import check_env_id
     from pipeline.runs import environment_name
-    from pipeline.settings.values import parse_assignments
     from pipeline.user_modules import import_typed
 
     if importlib.util.find_spec("optuna") is None:
@@ -349,15 +356,9 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         if name is not None and not Path(name).is_file():
             raise UserError(f"{flag}: there is no file {name}")
     # The agent, with the settings that the command line fixes.
-    settings: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
-    if args.env_kwargs:
-        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
-        settings = layered(settings, named)
+    settings = typed_settings(args)
     if args.n_timesteps is not None and args.n_episodes is not None:
         raise UserError("how long to train? give -n or --n-episodes, not both")
-    for key in ("n_timesteps", "n_episodes"):
-        if getattr(args, key) is not None:
-            settings[key] = getattr(args, key)
     conf_file = None if args.conf_file is None else Path(args.conf_file)
     settings = with_engine(args.algo, settings, args.engine)
     study = StudySpec(

@@ -357,11 +357,15 @@ def _analyse_environment(
     agents = [_analyse_agent(results, environment, *each) for each in evidence.seeds.items()]
     missing = {agent.agent: agent.n_missing for agent in agents}
     agents = [agent for agent in agents if agent.n_runs]
-    agents.sort(key=lambda agent: _rank(sign * agent.metric.mean.point), reverse=True)
+    points = {agent.agent: sign * agent.metric.mean.point for agent in agents}
+    last = -np.inf  # those without a figure
+    agents.sort(key=lambda a: last if np.isnan(points[a.agent]) else points[a.agent], reverse=True)
     names = [agent.agent for agent in agents]
     scores = {name: evidence.scores[name] for name in names}
     failed = failures(study.metric, scores, evidence.baseline, look.level, evidence.certain)
     fewest = evidence.fewest(look.level)
+    # Of agents with fewer runs nothing is claimed.
+    enough = {name: count for name, count in failed.items() if count.n >= fewest}
     return EnvironmentAnalysis(
         environment=environment,
         env_id=str(table["env_id"].iloc[0]),
@@ -375,7 +379,7 @@ def _analyse_environment(
         missing=missing,
         fewest=fewest,
         failures=failed,
-        unreliable=tuple(fail_more_often(_enough(failed, fewest), look.level)),
+        unreliable=tuple(fail_more_often(enough, look.level)),
         speeds=speeds(results, environment, names, look.level),
         seeds=evidence.seeds,
         look=look,
@@ -410,15 +414,6 @@ def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[Pai
         }
     levels = (look.level, look.next_level)
     return describe_pairs(judged, scores, margin, levels, seed=RESAMPLING_SEED)
-
-
-def _enough(counts: Mapping[str, FailureCount], fewest: int) -> dict[str, FailureCount]:
-    """Those of agents with so many runs; with fewer, nothing is claimed of anybody."""
-    return {name: count for name, count in counts.items() if count.n >= fewest}
-
-
-def _rank(value: float) -> float:
-    return -np.inf if np.isnan(value) else value
 
 
 def _analyse_agent(
@@ -465,7 +460,7 @@ def _analyse_agent(
 
 def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:
     """By the first of its runs: its seeds share their settings."""
-    of_agent = (r for r in results.finished if (r.agent, r.environment) == (agent, environment))
+    of_agent = (r for r in results.finished if r.labels == (agent, environment))
     run = next(of_agent, None)
     return () if run is None else training_changes(TrainSpec.of_data(run.run.read_info()["spec"]))
 
@@ -476,56 +471,44 @@ def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tu
 MOST_TOLD = 4
 
 
-@dataclass(frozen=True)
-class _Failure:
-    """The runs of an agent that failed on an environment, told by the first of them."""
-
-    agent: str
-    n_failed: int
-    n_runs: int
-    first: PlannedRun
-
-    def sentence(self, found: tuple[str, str | None]) -> str:
-        """What the first one's agent does instead, and what to try first."""
-        of = f"{self.n_failed} of {self.n_runs} runs" if self.n_runs > 1 else "its run"
-        seed = f"; seed {self.first.seed}" if self.n_failed > 1 else ""
-        instead, try_first = found
-        then = f"; try first: {try_first}" if try_first else ""
-        return f"{self.agent} failed in {of}{seed}: {instead}{then}."
-
-
 def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
     """The analysis with sentences on runs that failed, where something can be said of them."""
-    failures = [_failures(analysis.results, one.environment) for one in analysis.environments]
-    asked = [failure.first for several in failures for failure in several[:MOST_TOLD]]
+    failed = [_failed_runs(analysis.results, one.environment) for one in analysis.environments]
+    asked = [runs[0] for several in failed for runs, _ in several[:MOST_TOLD]]
     answers = iter(do_aside(advice_on, asked) if asked else ())
     environments = []
-    for one, several in zip(analysis.environments, failures, strict=True):
-        told, more = several[:MOST_TOLD], several[MOST_TOLD:]
-        found = [(failure, next(answers)) for failure in told]
-        advice = [failure.sentence(answer) for failure, answer in found if answer is not None]
-        if more:
-            names = ", ".join(f"{each.agent} ({each.n_failed} of {each.n_runs})" for each in more)
+    for one, several in zip(analysis.environments, failed, strict=True):
+        advice = []
+        for runs, n_runs in several[:MOST_TOLD]:
+            first, answer = runs[0], next(answers)
+            if answer is not None:
+                of = f"{len(runs)} of {n_runs} runs" if n_runs > 1 else "its run"
+                seed = f"; seed {first.seed}" if len(runs) > 1 else ""
+                instead, try_first = answer
+                then = f"; try first: {try_first}" if try_first else ""
+                advice.append(f"{first.agent} failed in {of}{seed}: {instead}{then}.")
+        if more := several[MOST_TOLD:]:
+            names = ", ".join(f"{runs[0].agent} ({len(runs)} of {n})" for runs, n in more)
             advice.append(f"Runs of {len(more)} more agents failed: {names}.")
         environments.append(replace(one, advice=tuple(advice)))
     return replace(analysis, environments=tuple(environments))
 
 
-def _failures(results: StudyResults, environment: str) -> list[_Failure]:
+def _failed_runs(results: StudyResults, environment: str) -> list[tuple[list[PlannedRun], int]]:
+    """For each agent with such: its runs that failed, by seed, and how many runs it has."""
     table = results.summary[results.summary["environment"] == environment]
     runs = {
         (run.agent, run.seed): run for run in results.finished if run.environment == environment
     }
-    failures = []
+    found = []
     for agent, rows in table.groupby("agent", sort=False):
         has_failed = rows["score"].astype(float) < FAILED
         # Such a policy may never end an episode; the advice looks whether it does.
         has_failed |= rows["success_rate"].astype(float) < 1 - NEARLY_ALL
-        failed = rows[has_failed & rows["exact"].astype(bool)]
-        if not failed.empty:
-            first = runs[str(agent), int(failed["seed"].min())]
-            failures.append(_Failure(str(agent), len(failed), len(rows), first))
-    return failures
+        seeds = rows[has_failed & rows["exact"].astype(bool)]["seed"]
+        if len(seeds):
+            found.append(([runs[str(agent), int(seed)] for seed in sorted(seeds)], len(rows)))
+    return found
 
 
 def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:

@@ -10,16 +10,16 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from experiments.plan import PlannedRun
-from experiments.run_files import read_outcome
+from experiments.run_files import read_outcome, read_shaped
 from mdp.array_types import AnyInts, Floats, Ints
-from pipeline.digests import DamagedFileError, read_arrays
+from pipeline.digests import DamagedFileError
 from pipeline.environments import make_single_env
 from pipeline.files import replacing
 from pipeline.runs import (
@@ -48,30 +48,30 @@ class PullStatistics:
     recommending the arm pulled most so far (Bubeck, Munos and Stoltz, 2009), in each context.
     """
 
-    pulls: Ints  # the pulls that the figures are given at, counted from 1, shape (n_points,)
-    reward: Floats  # mean reward of a pull since the point before, shape (n_points,)
-    optimal: Floats  # share of those pulls that were of a best arm, shape (n_points,)
-    regret: Floats  # mean regret of those pulls, shape (n_points,)
-    cumulative_regret: Floats  # mean sum of the regrets up to the point, shape (n_points,)
-    cumulative_regret_sem: Floats  # its standard error over runs, shape (n_points,)
-    cumulative_regret_quantiles: Floats  # over runs, see `QUANTILES`, shape (n_quantiles, n_points)
-    simple_regret: Floats  # mean over runs, shape (n_points,)
-    total_reward: Floats  # of each run, shape (n_runs,)
-    total_regret: Floats  # of each run, shape (n_runs,)
-    # Share of the pulls that went to each arm, by context, shape (n_contexts, n_arms).
-    shares: Floats
-    # Mean regret of a pull, by context and arm; nan where it was never pulled, shape (n_contexts,
-    # n_arms).
-    context_regret: Floats
-    # Mean of the final estimates over runs, shape (n_contexts, n_arms); empty where the agent has
-    # none.
-    estimates: Floats
-    estimates_std: Floats  # their standard deviation over runs, likewise
-    true_means: Floats  # of the arms, where all runs have the same, likewise; else empty
-    moments: Ints  # pulls after which posteriors were kept, shape (n_moments,)
-    # Of the first run's arms: parameters of Beta distributions, or mean and standard deviation,
-    # shape (n_moments, n_contexts, n_arms, 2); else empty.
-    posteriors: Floats
+    # The pulls that the figures are given at, counted from 1.
+    pulls: Annotated[Ints, "points"]
+    reward: Annotated[Floats, "points"]  # mean reward of a pull since the point before
+    optimal: Annotated[Floats, "points"]  # share of those pulls that were of a best arm
+    regret: Annotated[Floats, "points"]  # mean regret of those pulls
+    cumulative_regret: Annotated[Floats, "points"]  # mean sum of the regrets up to the point
+    cumulative_regret_sem: Annotated[Floats, "points"]  # its standard error over runs
+    cumulative_regret_quantiles: Annotated[Floats, "5 points"]  # over runs, see `QUANTILES`
+    simple_regret: Annotated[Floats, "points"]  # mean over runs
+    total_reward: Annotated[Floats, "runs"]
+    total_regret: Annotated[Floats, "runs"]
+    shares: Annotated[Floats, "contexts arms"]  # of the pulls that went to each arm, by context
+    # Mean regret of a pull; nan where the arm was never pulled.
+    context_regret: Annotated[Floats, "contexts arms"]
+    # Mean of the final estimates over runs; empty where the agent has none. An agent that sees no
+    # contexts has one row for all of them.
+    estimates: Annotated[Floats, "seen arms_seen"]
+    estimates_std: Annotated[Floats, "seen arms_seen"]  # their standard deviation over runs
+    # Of the arms, where all runs have the same; else empty.
+    true_means: Annotated[Floats, "known arms_known"]
+    moments: Annotated[Ints, "moments"]  # pulls after which posteriors were kept
+    # Of the first run's arms: parameters of Beta distributions, or mean and standard deviation;
+    # else empty.
+    posteriors: Annotated[Floats, "kept contexts_kept arms_kept 2"]
 
     def save(self, path: Path) -> None:
         """Write all arrays to a NumPy archive."""
@@ -86,44 +86,14 @@ class PullStatistics:
         Raises:
             DamagedFileError: if the file is missing or changed, or holds anything else.
         """
-        arrays = read_arrays(path, Run(path.parent, "").files.read(path))
-        names = [field.name for field in fields(cls)]
-        lacking = [name for name in names if name not in arrays]
-        if lacking:
-            raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
-        statistics = cls(**{name: arrays[name] for name in names})
-        if not statistics._is_of_one_shape():
+        kinds = get_type_hints(cls, include_extras=True)
+        shapes = {name: kind.__metadata__[0] for name, kind in kinds.items()}
+        arrays = read_shaped(Run(path.parent, ""), path, shapes)
+        found = cls(**{name: arrays[name] for name in shapes})
+        n_kept = found.moments.size if found.posteriors.size else len(found.posteriors)
+        if not found.pulls.size or len(found.posteriors) != n_kept:
             raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
-        return statistics
-
-    def _is_of_one_shape(self) -> bool:
-        """Whether the arrays have the shapes that the class says."""
-        n_points, n_runs = self.pulls.size, self.total_reward.size
-        shapes = {
-            (n_points,): (
-                self.pulls,
-                self.reward,
-                self.optimal,
-                self.regret,
-                self.cumulative_regret,
-                self.cumulative_regret_sem,
-                self.simple_regret,
-            ),
-            (len(QUANTILES), n_points): (self.cumulative_regret_quantiles,),
-            (n_runs,): (self.total_reward, self.total_regret),
-            self.shares.shape: (self.shares, self.context_regret),
-        }
-        fits = all(array.shape == shape for shape, arrays in shapes.items() for array in arrays)
-        return (
-            fits
-            and self.shares.ndim == 2
-            and n_points > 0
-            # An agent that sees no contexts has one row of estimates for all of them.
-            and self.estimates.shape == self.estimates_std.shape
-            and self.estimates.ndim == self.true_means.ndim == 2
-            and self.posteriors.ndim == 4
-            and (not self.posteriors.size or self.posteriors.shape[0] == self.moments.size)
-        )
+        return found
 
 
 def points_of(n_pulls: int) -> Ints:
@@ -149,17 +119,8 @@ def pull_statistics(
 ) -> PullStatistics:
     """Sum up runs; arrays have a row for each run and a column for each pull.
 
-    Args:
-        arms: what was pulled, shape (n_runs, n_pulls).
-        rewards: what it gave, likewise.
-        regrets: of each pull, likewise.
-        contexts: what the arm was chosen in, likewise; None where there is but one.
-        n_arms: how many arms there are.
-        n_contexts: how many contexts.
-        estimates: of each run at its end, shape (n_runs, n_contexts, n_arms).
-        true_means: of the arms, where all runs have the same, shape (n_contexts, n_arms).
-        moments: after how many pulls posteriors were kept.
-        posteriors: shape (n_runs, n_moments, n_contexts, n_arms, 2).
+    Estimates have the shape (n_runs, n_contexts, n_arms), true means (n_contexts, n_arms), and
+    posteriors (n_runs, n_moments, n_contexts, n_arms, 2).
     """
     points = points_of(arms.shape[1])
     at = points - 1
@@ -245,14 +206,11 @@ _PULLS = ("arms", "rewards", "regrets")  # what figures are made of, beside cont
 def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStatistics]:
     """Figures by pull of all runs on bandits."""
     batches = [run for run in finished if run.is_batch]
-    pulls = {
-        (run.agent, run.environment): PullStatistics.load(run.path / STATISTICS_FILE)
-        for run in batches
-    }
+    pulls = {run.labels: PullStatistics.load(run.path / STATISTICS_FILE) for run in batches}
     one_by_one: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in finished:
         if run.run.files.matching(PULLS_FILE):
-            one_by_one.setdefault((run.agent, run.environment), []).append(run)
+            one_by_one.setdefault(run.labels, []).append(run)
     for labels, runs in one_by_one.items():
         pulls[labels] = stacked_statistics(runs[0].spec, [run.path for run in runs])
     return pulls
@@ -279,13 +237,7 @@ def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
         "path": str(planned.path),
     }
     return [
-        {
-            **shared,
-            "seed": seed,
-            "training": reward,
-            "last_episodes": reward,
-            "regret": regret,
-        }
+        {**shared, "seed": seed, "training": reward, "last_episodes": reward, "regret": regret}
         for seed, (reward, regret) in enumerate(
             zip(pulls.total_reward.tolist(), pulls.total_regret.tolist(), strict=True),
             start=planned.seed,
@@ -309,25 +261,16 @@ def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
 
     Agents that collect whole rollouts go on beyond ``n_timesteps``; that is left out.
     """
-    return {name: array.T.ravel()[:n_timesteps] for name, array in _pulls(folder).items()}
-
-
-def _pulls(folder: Path) -> dict[str, NDArray[Any]]:
     path = folder / PULLS_FILE
-    arrays = read_arrays(path, Run(folder, "").files.read(path))
-    lacking = [name for name in _PULLS if name not in arrays]
-    if lacking:
-        raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
-    shape = arrays["arms"].shape
-    if len(shape) != 2 or not arrays["arms"].size:
-        raise DamagedFileError(path, "is damaged: it has not one row for each environment")
-    if any(array.shape != shape for array in arrays.values()):
-        raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+    shapes = dict.fromkeys((*_PULLS, "contexts"), "environments pulls")
+    arrays = read_shaped(Run(folder, ""), path, shapes, optional=("contexts",))
+    if not arrays["arms"].size:
+        raise DamagedFileError(path, "is damaged: it holds no pull")
     for name in ("arms", "contexts"):
         numbers = arrays.get(name)
         if numbers is not None and (numbers.dtype.kind not in "iu" or (numbers < 0).any()):
             raise DamagedFileError(path, f"is damaged: {name} are no numbers from 0 on")
-    return arrays
+    return {name: arrays[name].T.ravel()[:n_timesteps] for name in shapes if name in arrays}
 
 
 def check_pulls(spec: TrainSpec, folder: Path) -> None:

@@ -42,11 +42,9 @@ LEFT_TO_SUPERVISOR = tuple(
 
 
 def answer_from_child(sender: Connection, last_words: Connection, tasks: Connection) -> None:
-    """Do tasks until there are none any more, or one fails, and send what came of each.
+    """Do pickled tasks until there are none any more, or one fails, and send what came of each.
 
-    A task is a function, its arguments, and what to call if the supervisor dies first, pickled. The
-    ``sender`` takes `RETURNED` and the value, or `RAISED` and the message with the traceback;
-    ``last_words`` the traceback where the process crashes, or is about to be ended.
+    ``last_words`` takes the traceback where the process crashes, or is about to be ended.
     """
     leave_signals_to_supervisor()
     if sys.platform != "win32":  # there a pipe has no number that a crash could write to
@@ -120,10 +118,11 @@ context: Any = multiprocessing.get_context(START_METHOD)
 
 
 def start_server(warm_ups: str = "[]") -> None:
-    """Start what children begin from, in the background: start it early to have it sooner.
+    """Start what children begin from, in the background, and let them be started after `stop_all`.
 
     It compiles ``warm_ups`` once for all runs, see `experiments.warm_ups`.
     """
+    _stopping.clear()
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
     # Python would look in the folder where the command is typed before everywhere else, and take a
@@ -189,15 +188,11 @@ _stopping = threading.Event()
 
 
 class TaskFailedError(Exception):
-    """The function raised an exception, or exceeded a limit.
-
-    Attributes:
-        details: the traceback, or what is known.
-    """
+    """The function raised an exception, or exceeded a limit."""
 
     def __init__(self, message: str, details: str) -> None:
         super().__init__(message)
-        self.details = details
+        self.details = details  # the traceback, or what is known
 
 
 class TaskDiedError(TaskFailedError):
@@ -218,20 +213,10 @@ def supervise(
 ) -> Any:
     """Call ``function`` in a child process; again if the process dies without an answer.
 
-    A task that may share a process is done where others were done before, and leaves it to others;
-    not so where memory is limited, which is that of the process. After one that fails, and for
-    another try, there is a fresh process.
-
-    Args:
-        function: of a module that the child can import.
-        args: what to call it with.
-        clean_up: called here after each try, and in the child if this process dies before it.
-        tries: how often to begin.
-        limits: what each try may take.
-        shares_process: whether it may share one with other such tasks.
-
-    Returns:
-        What the function returns.
+    ``clean_up`` is called here after each try, and in the child if this process dies before it.
+    With ``shares_process`` the task is done where others were done before, and leaves the process
+    to others; not so where memory is limited, which is that of the process. After a failure, and
+    for another try, there is a fresh process.
 
     Raises:
         TaskFailedError: if it raised an exception or exceeded a limit, which is not tried again.
@@ -403,7 +388,7 @@ def _start(child: BaseProcess) -> None:
 @contextlib.contextmanager
 def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
     """As many supervisors as processes that work at once; left early, it ends their children."""
-    be_ready()
+    start_server()
     executor = ThreadPoolExecutor(n_workers)
     try:
         yield executor
@@ -415,12 +400,6 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
         raise
     executor.shutdown(cancel_futures=True)
     _end_idle()
-
-
-def be_ready(warm_ups: str = "[]") -> None:
-    """Start what children begin from, and let them be started, also after `stop_all`."""
-    start_server(warm_ups)
-    _stopping.clear()
 
 
 def stop_all() -> None:

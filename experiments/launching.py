@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -131,12 +131,7 @@ def do_supervised(
 ) -> None:
     """Do a run in a child process of this one, with two tries if it dies.
 
-    Args:
-        planned: the run.
-        root: the study's folder.
-        command: the command that asked for it.
-        limits: what it may take.
-        home: the folder that relative paths begin at, those of the run and of the study too.
+    Relative paths, those of the run and of the study too, begin at ``home``.
 
     Raises:
         TaskFailedError: if the run failed, or no process could be started for it.
@@ -294,21 +289,20 @@ class TimeLeft:
 
     def __init__(self, runs: Sequence[PlannedRun], expected: Mapping[Key, float]) -> None:
         self._waiting = deque(runs)
-        self._n_waiting = Counter((run.agent, run.environment) for run in runs)
+        self._n_waiting = Counter(run.labels for run in runs)
         self._began: dict[Path, tuple[PlannedRun, float]] = {}
-        self._algos = {(run.agent, run.environment): run.spec.algo for run in runs}
+        first = {run.labels: run for run in runs}
+        self._algos = {key: run.spec.algo for key, run in first.items()}
         self._expected = {
-            key: expected.get(key) or expected_seconds(run.spec)
-            for key, run in {(run.agent, run.environment): run for run in runs}.items()
+            key: expected.get(key) or expected_seconds(run.spec) for key, run in first.items()
         }
-        self._taken: dict[Key, float] = {}
-        self._n_taken: Counter[Key] = Counter()
+        self._taken: dict[Key, list[float]] = {}
 
     def start(self, now: float, n_workers: int) -> None:
         """Let runs begin, as many as there are free workers."""
         while self._waiting and len(self._began) < n_workers:
             run = self._waiting.popleft()
-            self._n_waiting[run.agent, run.environment] -= 1
+            self._n_waiting[run.labels] -= 1
             self._began[run.path] = (run, now)
 
     def end(self, run: PlannedRun, now: float) -> None:
@@ -318,13 +312,11 @@ class TimeLeft:
                 return
             path, (other, began) = next(iter(self._began.items()))
             self._waiting[self._waiting.index(run)] = other
-            self._n_waiting[run.agent, run.environment] -= 1
-            self._n_waiting[other.agent, other.environment] += 1
+            self._n_waiting[run.labels] -= 1
+            self._n_waiting[other.labels] += 1
             del self._began[path]
             self._began[run.path] = (run, began)
-        key = (run.agent, run.environment)
-        self._taken[key] = self._taken.get(key, 0.0) + now - self._began.pop(run.path)[1]
-        self._n_taken[key] += 1
+        self._taken.setdefault(run.labels, []).append(now - self._began.pop(run.path)[1])
 
     def seconds(self, now: float, n_workers: int) -> float | None:
         """How long all runs together may still take; None while that cannot be said."""
@@ -340,34 +332,33 @@ class TimeLeft:
         return max([left / max(n_workers, 1), *under_way])
 
     def _under_way(self) -> list[tuple[Key, float]]:
-        return [((run.agent, run.environment), began) for run, began in self._began.values()]
+        return [(run.labels, began) for run, began in self._began.values()]
 
     def _estimates(self, now: float) -> dict[Key, float]:
         """Seconds of a run, by agent and environment."""
         off = self._by_how_much_off(now)
         found = {}
         for key, expected in self._expected.items():
-            if self._n_taken[key]:
-                found[key] = self._taken[key] / self._n_taken[key]
-                continue
-            algo = self._algos[key]
-            like = [ratio for other, ratio in off if other == algo] or [
-                ratio for other, ratio in off if (other in NETWORKS) == (algo in NETWORKS)
-            ]
-            if not like:  # on a busy machine everything takes longer
-                like = [min(max(ratio, 1.0), BUSY) for _, ratio in off]
-            if expected is not None:
+            if key in self._taken:
+                found[key] = sum(self._taken[key]) / len(self._taken[key])
+            elif expected is not None:
+                algo = self._algos[key]
+                like = [ratio for other, ratio in off if other == algo] or [
+                    ratio for other, ratio in off if (other in NETWORKS) == (algo in NETWORKS)
+                ]
+                if not like:  # on a busy machine everything takes longer
+                    like = [min(max(ratio, 1.0), BUSY) for _, ratio in off]
                 found[key] = expected * (sum(like) / len(like) if like else 1.0)
         for key, began in self._under_way():
-            if not self._n_taken[key] and key in found:
+            if key not in self._taken and key in found:
                 found[key] = max(found[key], LONGER * (now - began))
         return found
 
     def _by_how_much_off(self, now: float) -> list[tuple[str, float]]:
         """Agents, and what their runs took by what they were expected to take."""
         off = [
-            (self._algos[key], self._taken[key] / n / expected)
-            for key, n in self._n_taken.items()
+            (self._algos[key], sum(taken) / len(taken) / expected)
+            for key, taken in self._taken.items()
             if (expected := self._expected[key]) is not None
         ]
         known = {algo for algo, _ in off}
@@ -389,23 +380,22 @@ class EarlyResults:
         self.study = study
         self._found: dict[Path, RunResults] = {}
 
-    @cached_property
-    def _read_run(self) -> Callable[[StudySpec, PlannedRun], RunResults | None]:
-        with loading_libraries():
-            from experiments.results import read_run
-        return read_run
-
     def get_ready(self) -> None:
         """Load what reading takes, which is long: best while the first runs are under way."""
-        self._read_run  # noqa: B018
+        with loading_libraries():
+            import experiments.results  # noqa: F401
 
     def read(self, planned: PlannedRun) -> None:
         """Read a run that has just ended; one that is damaged is found to be so at the end."""
+        from experiments.results import read_run
+
         with contextlib.suppress(DamagedFileError):
-            found = self._read_run(self.study, planned)
+            found = read_run(self.study, planned)
             if found is not None:
                 self._found[planned.path] = found
 
     def of(self, planned: PlannedRun) -> RunResults | None:
         """As `read_run`, where that was not done before."""
-        return self._found.get(planned.path) or self._read_run(self.study, planned)
+        from experiments.results import read_run
+
+        return self._found.get(planned.path) or read_run(self.study, planned)

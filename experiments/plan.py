@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -71,6 +72,11 @@ class PlannedRun:
     #: Whether it stands for all seeds of a bandit agent, of which ``seed`` is the first.
     is_batch: bool = False
     n_runs: int = 1  #: how many runs it stands for
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """The labels of agent and environment."""
+        return self.agent, self.environment
 
     @property
     def run(self) -> Run:
@@ -199,7 +205,13 @@ def plan(
     Raises:
         UserError: if an agent cannot be trained so, or does not fit an environment.
     """
-    _check_number(study)
+    n_agents, n_environments = len(study.agents), len(study.environments)
+    n_runs = n_agents * n_environments * study.n_seeds
+    if n_runs > MOST_RUNS:
+        raise UserError(
+            f"{study.name}: {n_agents:,} agents on {n_environments:,} environments with "
+            f"{study.n_seeds:,} seeds are {n_runs:,} runs; a study has {MOST_RUNS:,} at most"
+        )
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders(
         "environments",
@@ -227,16 +239,6 @@ def plan(
         if seed == study.first_seed
         or (labels not in batches and seed - study.first_seed < n_seeds[labels])
     ]
-
-
-def _check_number(study: StudySpec) -> None:
-    n_agents, n_environments = len(study.agents), len(study.environments)
-    n_runs = n_agents * n_environments * study.n_seeds
-    if n_runs > MOST_RUNS:
-        raise UserError(
-            f"{study.name}: {n_agents:,} agents on {n_environments:,} environments with "
-            f"{study.n_seeds:,} seeds are {n_runs:,} runs; a study has {MOST_RUNS:,} at most"
-        )
 
 
 def _planned_run(
@@ -356,7 +358,9 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
         raise UserError(f"{place}: how long to train? give n_timesteps or n_episodes")
     if study.is_quick:
-        raw = _shortened(spec.saved_hyperparams, study.quick.budget)
+        raw = dict(spec.saved_hyperparams)
+        for key in raw.keys() & {"n_timesteps", "n_episodes"}:
+            raw[key] = max(round(raw[key] * study.quick.budget), 1)
         spec = replace(spec, hyperparams=split(raw, place), saved_hyperparams=raw)
     return spec
 
@@ -379,13 +383,6 @@ def _raw_hyperparams(
         key: value for key, value in raw.items() if environment.settings.get(key, key) is not None
     }
     return training_follows(layered(kept, own), own)
-
-
-def _shortened(raw: Mapping[str, Any], share: float) -> dict[str, Any]:
-    return {
-        key: max(round(value * share), 1) if key in ("n_timesteps", "n_episodes") else value
-        for key, value in raw.items()
-    }
 
 
 # --- Which of its seeds the settings of a study were tuned on, as far as anybody says.
@@ -416,20 +413,22 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
     unknown: dict[str, None] = {}
     elsewhere: dict[str, None] = {}
     known = lru_cache(maxsize=None)(_said)
-    for agent, environment in _pairs(study):
+    for agent, environment in product(study.agents, study.environments):
+        label = agent.group or agent.label
         tuned_on = known(agent.algo, environment.env_id, agent.conf_file)
-        begins_with_defaults = not (agent.tuned or agent.conf_file)
         own = layered(environment.settings, agent.settings)
         as_it_comes = {key for key in AS_IT_COMES if own.get(key) is None}
         if {*own} - _NO_TUNING - as_it_comes or tuned_on is None:
-            unknown[agent.group or agent.label] = None
+            unknown[label] = None
         if tuned_on is None:
             continue
-        seen = () if begins_with_defaults else tuned_on
+        seen = tuned_on if agent.tuned or agent.conf_file else ()
         if seen and _is_changed(agent, environment):
-            elsewhere[agent.group or agent.label] = None
+            elsewhere[label] = None
             continue
-        place, name = _source(agent, shipped, files)
+        place, name = shipped, agent.algo
+        if agent.conf_file is not None:
+            place, name = files, Path(agent.conf_file).name
         shared = frozenset(seed for seeds in seen for seed in study.seeds if seed in seeds)
         place[name] = place.get(name, frozenset()) | shared
     return TuningSeeds(shipped, files, tuple(unknown), tuple(elsewhere))
@@ -458,15 +457,3 @@ def _said(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] |
         return seeds_tuned_on(algo, env_id, conf_file)
     except UserError:  # a file that was there when the runs were planned
         return None
-
-
-def _pairs(study: StudySpec) -> Iterator[tuple[AgentSpec, EnvironmentSpec]]:
-    return ((agent, place) for agent in study.agents for place in study.environments)
-
-
-def _source(
-    agent: AgentSpec, shipped: dict[str, Seeds], files: dict[str, Seeds]
-) -> tuple[dict[str, Seeds], str]:
-    if agent.conf_file is None:
-        return shipped, agent.algo
-    return files, Path(agent.conf_file).name

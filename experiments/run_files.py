@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,13 @@ _FINAL_FIGURES = (
 )
 # The last where the optimum is bracketed.
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
-_MAPS = ("timesteps", "values", "actions", "optimal_values", "optimal_actions")
+_MAPS = {
+    "timesteps": "n",
+    "values": "n states",
+    "actions": "n states",
+    "optimal_values": "states",
+    "optimal_actions": "states choices",
+}
 _COLUMNS = ["r", "l", "t"]  # return, length, seconds since the beginning
 
 
@@ -94,22 +100,48 @@ def _table_of(content: bytes) -> Floats:
     return table[places].to_numpy()
 
 
+def read_shaped(
+    run: Run, path: Path, shapes: Mapping[str, str], optional: Collection[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """The arrays in an archive of a run, by name, each of its shape.
+
+    A shape names the lengths of its axes: those of one name are alike, and one may be a number.
+    """
+    arrays = read_arrays(path, run.files.read(path))
+    lengths: dict[str, int] = {}
+    for name, shape in shapes.items():
+        if name not in arrays:
+            if name in optional:
+                continue
+            raise DamagedFileError(path, f"is damaged: it lacks {name}")
+        axes, found = shape.split(), arrays[name].shape
+        wanted = [
+            int(axis) if axis.isdigit() else lengths.setdefault(axis, n)
+            for axis, n in zip(axes, found, strict=False)
+        ]
+        if len(axes) != len(found) or tuple(wanted) != found:
+            raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+    return arrays
+
+
+def _check_finite(path: Path, *arrays: NDArray[Any]) -> None:
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise DamagedFileError(path, "is damaged: it holds what is no finite number")
+
+
 def read_evaluations(run: Run) -> tuple[Floats, Floats]:
     """Steps and mean returns of the evaluations during training, each of shape (n_evaluations,)."""
-    files = run.files
-    for path in files.matching(run.evaluations_path.name):
-        arrays = read_arrays(path, files.read(path))
-        steps, returns = arrays.get("timesteps"), arrays.get("results")
-        if steps is None or returns is None:
-            raise DamagedFileError(path, "is damaged: it lacks timesteps or results")
-        if steps.ndim != 1 or returns.ndim != 2 or len(steps) != len(returns) or not returns.size:
-            raise DamagedFileError(path, "is damaged: it has not one row for each evaluation")
-        if not (np.isfinite(returns).all() and np.isfinite(steps).all()):
-            raise DamagedFileError(path, "is damaged: it holds what is no finite number")
-        if (steps < 0).any() or (np.diff(steps.astype(np.float64)) < 0).any():
-            raise DamagedFileError(path, "is damaged: its steps do not rise")
-        return steps.astype(np.float64), returns.mean(axis=1, dtype=np.float64)
-    return np.empty(0), np.empty(0)
+    path = run.evaluations_path
+    if not run.files.matching(path.name):
+        return np.empty(0), np.empty(0)
+    arrays = read_shaped(run, path, {"timesteps": "n", "results": "n episodes"})
+    steps, returns = arrays["timesteps"], arrays["results"]
+    if not returns.size:
+        raise DamagedFileError(path, "is damaged: it holds no evaluation")
+    _check_finite(path, steps, returns)
+    if (steps < 0).any() or (np.diff(steps.astype(np.float64)) < 0).any():
+        raise DamagedFileError(path, "is damaged: its steps do not rise")
+    return steps.astype(np.float64), returns.mean(axis=1, dtype=np.float64)
 
 
 def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
@@ -154,25 +186,15 @@ def _is_figure(value: object) -> bool:
 def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
     """The maps that a run kept, as `pipeline.evaluation.value_maps` writes them."""
     path = run.value_maps_path
-    arrays = read_arrays(path, run.files.read(path))
-    lacking = [name for name in _MAPS if name not in arrays]
-    if lacking:
-        raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
-    steps, values, actions, best_values, best_actions = (arrays[name] for name in _MAPS)
-    if values.ndim != 2 or best_actions.ndim != 2 or not values.size:
-        raise DamagedFileError(path, "is damaged: it has not one row for each evaluation")
-    n_states, n_actions = best_actions.shape
-    shapes = (values.shape, actions.shape, best_values.shape)
-    if shapes != ((len(values), n_states), (len(values), n_states), (n_states,)) or (
-        steps.shape != (len(values),)
-    ):
-        raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+    arrays = read_shaped(run, path, _MAPS)
+    actions, best_actions = arrays["actions"], arrays["optimal_actions"]
+    if not actions.size:
+        raise DamagedFileError(path, "is damaged: it holds no evaluation")
     if actions.dtype.kind not in "iu" or best_actions.dtype.kind not in "biu":
         raise DamagedFileError(path, "is damaged: its actions are no whole numbers")
-    if (actions < 0).any() or (actions >= n_actions).any():
+    if (actions < 0).any() or (actions >= best_actions.shape[1]).any():
         raise DamagedFileError(path, "is damaged: it has actions that there are not")
-    if not all(np.isfinite(array).all() for array in (steps, values, best_values)):
-        raise DamagedFileError(path, "is damaged: it holds what is no finite number")
+    _check_finite(path, arrays["timesteps"], arrays["values"], arrays["optimal_values"])
     return arrays
 
 

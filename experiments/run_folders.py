@@ -56,10 +56,6 @@ def _own_mark() -> str:
     return f"{mark['pid']}-{mark['began'] or 0}-{_place(mark)}"
 
 
-def _is_own(draft: Path) -> bool:
-    return draft.name.startswith(f"{_own_mark()}@")
-
-
 def _place(mark: dict[str, object]) -> str:
     """Where the numbers of processes mean what they mean in the process of the mark."""
     named = "\n".join(str(mark[name]) for name in _NAMING)
@@ -118,13 +114,14 @@ def claim_draft(draft: Path) -> None:
     Others can tell its name beforehand: what is there already is an earlier process's, or a link to
     where the run should not write, and is removed.
     """
-    for _ in range(1000):
-        make_folder(draft.parent)
+    for _ in range(1000):  # other runs remove the folder of drafts whenever it is empty
         with contextlib.suppress(FileExistsError, FileNotFoundError):
+            draft.parent.mkdir(parents=True, exist_ok=True)
             draft.mkdir()
             return
         if os.path.lexists(draft):
             remove_draft(draft)
+    draft.parent.mkdir(parents=True, exist_ok=True)
     draft.mkdir()
 
 
@@ -154,7 +151,9 @@ def leave_drafts(root: Path, name: str) -> None:
     What can be gone on from stays.
     """
     for draft in _drafts(root):
-        is_left = _run_of(draft) == name and (_is_own(draft) or _is_dead(draft))
+        is_left = _run_of(draft) == name and (
+            draft.name.startswith(f"{_own_mark()}@") or _is_dead(draft)
+        )
         if is_left and not holds_state(draft):
             remove_draft(draft)
     _remove_empty(root / DRAFTS_FOLDER)
@@ -166,16 +165,6 @@ def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
         if _is_dead(draft) and _run_of(draft) not in kept:
             remove_draft(draft)
     _remove_empty(root / DRAFTS_FOLDER)
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it, also while another run removes those that are empty."""
-    for _ in range(1000):
-        # Also a folder that is there, but no longer when it is looked at, "exists".
-        with contextlib.suppress(FileNotFoundError, FileExistsError):
-            path.mkdir(parents=True, exist_ok=True)
-            return
-    path.mkdir(parents=True, exist_ok=True)
 
 
 # --- Runs that are there and are not those of the plan, or damaged: moved aside and kept.

@@ -158,22 +158,18 @@ class ClosedWorker(_Closed, Worker):
 
 
 class Supervisors(WorkerPlugin):
-    """Makes workers able to do runs: the process that children are forked from starts at once.
-
-    Attributes:
-        warm_ups: what it is to compile once for all runs, see `experiments.warm_ups`.
-    """
+    """Makes workers able to do runs: the process that children are forked from starts at once."""
 
     name = "yardstick-supervisors"
     idempotent = True  # of several drivers, the first is enough
 
     def __init__(self, warm_ups: str) -> None:
-        self.warm_ups = warm_ups
+        self.warm_ups = warm_ups  # what it compiles once, see `experiments.warm_ups`
 
     def setup(self, worker: Worker) -> None:
         """Get ready; what takes long goes on in the background."""
         multiprocessing.current_process().daemon = False  # those of a nanny may have no children
-        child_processes.be_ready(self.warm_ups)
+        child_processes.start_server(self.warm_ups)
         version()  # of what has been loaded, before it can change
 
     def teardown(self, worker: Worker) -> None:

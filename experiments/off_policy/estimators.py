@@ -43,15 +43,10 @@ class RewardModel(Protocol):
         ...
 
     def sensitivity(self, contexts: NDArray[Any], policy: Floats) -> Floats:
-        """By how much a prediction of the policy's total reward rises with each reward fitted to.
+        """By how much the predicted total reward of a policy rises with each reward fitted to.
 
-        Args:
-            contexts: m of them.
-            policy: probability of each arm in each, shape (m, n_arms).
-
-        Returns:
-            Derivatives of the sum of ``policy * predict(contexts)``, one for each pull that the
-            model was fitted to.
+        That is, the derivatives of the sum of ``policy * predict(contexts)``; ``policy`` has the
+        probability of each arm in each of m contexts, shape (m, n_arms).
         """
         ...
 
@@ -59,14 +54,7 @@ class RewardModel(Protocol):
 class ArmMeans:
     """The mean reward of each arm in each context; the arm's overall mean where there is none.
 
-    Saturated: nothing is assumed about the rewards.
-
-    Args:
-        contexts: whole numbers from 0, shape (n,).
-        arms: shape (n,).
-        rewards: shape (n,).
-        n_arms: number of arms.
-        n_contexts: number of contexts.
+    Saturated: nothing is assumed about the rewards. Contexts are whole numbers from 0, shape (n,).
     """
 
     def __init__(
@@ -101,13 +89,7 @@ class ArmRegressions:
     """A ridge regression of the rewards on the context for each arm.
 
     Features are standardised, and rewards counted from their mean, which is what is predicted for
-    an arm without pulls.
-
-    Args:
-        contexts: shape (n, d).
-        arms: shape (n,).
-        rewards: shape (n,).
-        n_arms: number of arms.
+    an arm without pulls. Contexts have the shape (n, d).
 
     Source: Hoerl and Kennard (1970), "Ridge regression", Technometrics 12.
     """
@@ -155,11 +137,7 @@ class CrossFit:
     def reward_influence(self, policy: Floats) -> Floats:
         """What each reward's deviation from its model adds to the predictions for the policy.
 
-        Args:
-            policy: probability of each arm before each pull, shape (n, n_arms).
-
-        Returns:
-            Shape (n,), on the scale of a single term: their mean is what they add together.
+        On the scale of a single term: their mean is what they add together.
         """
         added = np.zeros(len(self.arms))
         for fold, model in enumerate(self.models):
@@ -309,11 +287,6 @@ def difference_in_value(
 def importance_weights(policy: Floats, arms: Ints, propensities: Floats) -> Floats:
     """How much more often the policy makes each pull than the log did, shape (n,).
 
-    Args:
-        policy: shape (n, n_arms), rows summing to 1.
-        arms: shape (n,).
-        propensities: shape (n,), above 0.
-
     Raises:
         ValueError: if the shapes do not fit, or something is no probability.
     """
@@ -332,11 +305,7 @@ def importance_weights(policy: Floats, arms: Ints, propensities: Floats) -> Floa
 
 
 def check_rewards(rewards: Floats, n_pulls: int) -> None:
-    """Refuse rewards that are not one finite number for each pull.
-
-    Raises:
-        ValueError: naming the first pull with another.
-    """
+    """Refuse rewards that are not one finite number for each pull."""
     if rewards.shape != (n_pulls,):
         raise ValueError(f"{n_pulls} pulls need as many rewards, not {rewards.shape}")
     _refuse(~np.isfinite(rewards), "reward", rewards)
@@ -348,11 +317,6 @@ def check_support(policy: Floats, arms: Ints, weights: Floats) -> None:
     Weights are expected to be 1 if the propensities are right and the log could choose every arm
     that the policy chooses, wherever it does. How far their mean is from 1 is measured in standard
     errors, for a mean of 1: too few large weights would make their own variance too small.
-
-    Args:
-        policy: shape (n, n_arms).
-        arms: shape (n,).
-        weights: from `importance_weights`, shape (n,).
 
     Raises:
         ValueError: naming the arm that was never logged, or what the weights are on average.
@@ -396,11 +360,7 @@ def snips(weights: Floats, rewards: Floats) -> Floats:
     """Self-normalised inverse propensities: a weighted mean of the rewards, and so within them.
 
     Consistent, with a bias of order 1/n. The terms are the ratio's linear approximation (delta
-    method): s + w (r - s) / mean(w), s being the estimate.
-
-    Args:
-        weights: from `importance_weights`, shape (n,); not all 0, which `check_support` refuses.
-        rewards: shape (n,).
+    method): s + w (r - s) / mean(w), s being the estimate. Not all weights may be 0.
 
     Source: Swaminathan and Joachims (2015), "The self-normalized estimator for counterfactual
     learning", NeurIPS.
@@ -432,13 +392,6 @@ def doubly_robust(
 
     Unbiased if the propensities are right, whatever the model, as long as no pull is predicted by a
     model that has seen it; and the closer the model, the smaller the variance.
-
-    Args:
-        policy: shape (n, n_arms).
-        weights: from `importance_weights`, shape (n,).
-        arms: shape (n,).
-        rewards: shape (n,).
-        predicted: mean reward of each arm before each pull, shape (n, n_arms).
 
     Source: Dudik, Langford and Li (2011); crossing folds as in Chernozhukov et al. (2018),
     "Double/debiased machine learning", The Econometrics Journal 21.

@@ -64,11 +64,7 @@ def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
 
 
 def load_policy(found: PolicyFile, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
-    """Load an agent.
-
-    Args:
-        found: its file.
-        modules: those that the user typed, which the agent may need.
+    """Load an agent; ``modules`` are those that the user typed, which it may need.
 
     Raises:
         UserError: if it cannot be loaded, or is none that sees a context as the log has it.

@@ -49,9 +49,6 @@ def read_logged(path: str | Path) -> LoggedData:
 def find_policy(path: Path) -> PolicyFile:
     """The agent of a run folder or in a zip.
 
-    Args:
-        path: either.
-
     Raises:
         UserError: if there is none, or none that sees a context as the log has it.
     """

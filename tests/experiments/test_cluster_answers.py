@@ -1,9 +1,10 @@
 """What a worker may answer, and what is refused before anything of it is written."""
 
-import hashlib
+import io
 import json
 import shutil
-import struct
+import warnings
+import zipfile
 from dataclasses import replace
 
 import pytest
@@ -31,14 +32,13 @@ from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 FILES = {"run/run.json": b"{}", "run/a/b.zip": b"\0\1", "tensorboard/x": b""}
 
 
-def raw(files, contents, **changes):
-    head = {"kind": "done", "reason": "", "details": "", "files": files, **changes}
-    text = json.dumps(head).encode()
-    return struct.pack(">Q", len(text)) + text + contents
-
-
-def entry(name, data):
-    return [name, len(data), hashlib.sha256(data).hexdigest()]
+def raw(files=(), **changes):
+    head = {"kind": "done", "reason": "", "details": "", "has_files": True, **changes}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive, warnings.catch_warnings(action="ignore"):
+        for name in ("answer.json", *files):
+            archive.writestr(name, json.dumps(head))
+    return buffer.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,6 @@ def test_a_bit_that_is_turned_is_noticed(data):
         found = unpacked(bytes(content))
     except RefusedAnswerError:
         return
-    # In the head, other words may be right by themselves: contents are not.
     assert sorted((found.files or {}).values()) in ([], sorted(FILES.values()))
 
 
@@ -84,9 +83,7 @@ def test_a_bit_that_is_turned_is_noticed(data):
         "run/./x",
         "run/x/",
         "x",
-        "",
         "run/a\\b",
-        "run/a\0b",
         "run/a\nb",
         "run/c:x",
         "run/nul",
@@ -97,26 +94,20 @@ def test_a_bit_that_is_turned_is_noticed(data):
 )
 def test_names_that_lead_elsewhere_are_refused(name):
     with pytest.raises(RefusedAnswerError):
-        unpacked(raw([entry(name, b"x")], b"x"))
+        unpacked(raw([name]))
 
 
 @pytest.mark.parametrize(
-    ("files", "contents", "words"),
+    ("files", "words"),
     [
-        ([entry("run/x", b"y")], b"x", "digest"),
-        ([entry("run/x", b"xx")], b"x", "digest"),
-        ([["run/x", -1, ""]], b"", "something else"),
-        ([["run/x", True, ""]], b"x", "something else"),
-        ([["run/x", 1]], b"x", "something else"),
-        ({}, b"", "no files"),
-        ([entry("run/x", b"x")], b"xy", "follows"),
-        ([entry("run/x", b"x"), entry("run/X", b"x")], b"xx", "twice"),
-        ([entry("run/x", b"x"), entry("run/X/y", b"x")], b"xx", "folder too"),
+        (["run/x", "run/x"], "twice"),
+        (["run/x", "run/X"], "twice"),
+        (["run/x", "run/X/y"], "folder too"),
     ],
 )
-def test_lies_about_files_are_refused(files, contents, words):
+def test_files_that_cannot_lie_beside_each_other_are_refused(files, words):
     with pytest.raises(RefusedAnswerError, match=words):
-        unpacked(raw(files, contents))
+        unpacked(raw(files))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +115,7 @@ def test_lies_about_files_are_refused(files, contents, words):
 )
 def test_heads_that_say_something_else_are_refused(changes):
     with pytest.raises(RefusedAnswerError):
-        unpacked(raw(None, b"", **changes))
+        unpacked(raw(**changes))
 
 
 @pytest.mark.parametrize(

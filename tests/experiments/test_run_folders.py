@@ -19,7 +19,6 @@ from experiments.run_folders import (
     draft_path,
     in_the_way,
     leave_drafts,
-    make_folder,
     move_replaced_aside,
     remove_dead_drafts,
     remove_draft,
@@ -224,7 +223,7 @@ def test_a_draft_of_long_labels_has_a_name_that_can_be_made(tmp_path):
     paths = [draft_path(tmp_path, run) for run in plan(study, tmp_path)]
     assert len({path.name for path in paths}) == 2
     for path in paths:
-        make_folder(path.with_name(f"{path.name}.dead"))
+        claim_draft(path.with_name(f"{path.name}.dead"))
 
 
 @pytest.mark.parametrize(
@@ -278,9 +277,8 @@ def test_a_folder_is_made_while_another_run_removes_it(tmp_path, monkeypatch):
         mkdir(path, *args, **kwargs)
 
     monkeypatch.setattr(Path, "mkdir", vanishing)
-    make_folder(tmp_path / "a" / "b")
+    claim_draft(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()
-    make_folder(tmp_path / "a" / "b")
 
 
 def test_a_folder_is_made_that_another_run_removes_as_soon_as_it_is_found(tmp_path, monkeypatch):
@@ -293,14 +291,14 @@ def test_a_folder_is_made_that_another_run_removes_as_soon_as_it_is_found(tmp_pa
         return False
 
     monkeypatch.setattr(Path, "is_dir", vanishing)
-    make_folder(folder)
-    assert folder.is_dir()
+    claim_draft(folder / "b")
+    assert (folder / "b").is_dir()
 
 
 def test_a_file_where_a_folder_should_be_is_an_error(tmp_path):
     (tmp_path / "a").touch()
     with pytest.raises(FileExistsError):
-        make_folder(tmp_path / "a")
+        claim_draft(tmp_path / "a" / "b")
 
 
 def test_a_folder_that_can_never_be_made_is_an_error(tmp_path, monkeypatch):
@@ -309,7 +307,7 @@ def test_a_folder_that_can_never_be_made_is_an_error(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "mkdir", never)
     with pytest.raises(FileNotFoundError, match="never"):
-        make_folder(tmp_path / "a")
+        claim_draft(tmp_path / "a" / "b")
 
 
 # --- Finished runs of other settings: named, kept, and moved aside when that is asked for.
