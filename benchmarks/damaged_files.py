@@ -31,8 +31,7 @@ from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from experiments.plan import PlannedRun, plan
-from experiments.results import read_run
-from experiments.run_files import joined
+from experiments.results import joined, read_run
 from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec

@@ -26,8 +26,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.analysis import analyse
-from experiments.results import RUN_COLUMNS, StudyResults
-from experiments.run_files import CURVE_COLUMNS
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.figures import write_figures
 from report.page import write_report

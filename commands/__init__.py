@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import NoReturn
 
 
@@ -24,25 +26,12 @@ def main() -> NoReturn:
 
 def _carry_out(command: str) -> int:
     """Do what the command does; the others' flags are not even looked at."""
-    if command == "train":
-        from commands import train
+    if command in ("pack", "inspect"):
+        from commands import share
 
-        return train.main()
-    if command == "enjoy":
-        from commands import enjoy
-
-        return enjoy.main()
-    if command == "compare":
-        from commands import compare
-
-        return compare.main()
-    if command == "tune":
-        from commands import tune
-
-        return tune.main()
-    from commands import share
-
-    return share.pack() if command == "pack" else share.inspect()
+        return share.pack() if command == "pack" else share.inspect()
+    main: Callable[[], int] = import_module(f"commands.{command}").main
+    return main()
 
 
 def _explain() -> NoReturn:

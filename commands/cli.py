@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 MISTAKE = 2  # exit code
 
 # The command that installing the project brings, and its own commands: the scripts of a checkout.
-# The command that installing the project brings, and its own commands: the scripts of a checkout.
 NAME = "yardstick"
 
 COMMANDS = {
@@ -137,32 +136,25 @@ INSTEAD: Mapping[str, str] = {
 }
 
 # Flags of ours, and what people type for them; the first that the command has is named.
-_TYPED_FOR: Mapping[str, Sequence[str]] = {
-    "--algo": ["algorithm", "agent", "model", "agents", "algorithms"],
-    "--algos": ["agents", "algorithms", "algorithm", "agent", "model"],
-    "--env": ["environment", "env-id", "env-name", "game", "envs"],
-    "--n-timesteps": [
-        "timesteps",
-        "total-timesteps",
-        "steps",
-        "num-timesteps",
-        "max-steps",
-        "n-steps",
-    ],
-    "--n-episodes": ["episodes", "num-episodes"],
-    "--render": ["render-mode", "mode"],
-    "--record": ["video", "gif", "film", "record-video", "save-video"],
-    "--device": ["gpu", "cuda", "cpu"],
-    "--verbose": ["quiet", "silent"],
-    "--log-folder": ["logdir", "log-dir", "output", "out", "save-dir", "folder"],
-    "--folder": ["logdir", "log-dir", "output", "out", "save-dir", "log-folder"],
-    "--trained-agent": ["continue", "load", "pretrained"],
-    "--jobs": ["workers", "n-jobs", "num-workers", "parallel"],
-    "--seeds": ["seed", "n-seeds", "num-seeds"],
-    "--conf-file": ["config", "conf", "yaml", "yaml-file"],
-    "--hyperparams": ["params", "hyperparameters", "kwargs"],
-    "--load-best": ["best"],
-    "--load-checkpoint": ["checkpoint"],
+_TYPED_FOR: Mapping[str, str] = {
+    "--algo": "algorithm agent model agents algorithms",
+    "--algos": "agents algorithms algorithm agent model",
+    "--env": "environment env-id env-name game envs",
+    "--n-timesteps": "timesteps total-timesteps steps num-timesteps max-steps n-steps",
+    "--n-episodes": "episodes num-episodes",
+    "--render": "render-mode mode",
+    "--record": "video gif film record-video save-video",
+    "--device": "gpu cuda cpu",
+    "--verbose": "quiet silent",
+    "--log-folder": "logdir log-dir output out save-dir folder",
+    "--folder": "logdir log-dir output out save-dir log-folder",
+    "--trained-agent": "continue load pretrained",
+    "--jobs": "workers n-jobs num-workers parallel",
+    "--seeds": "seed n-seeds num-seeds",
+    "--conf-file": "config conf yaml yaml-file",
+    "--hyperparams": "params hyperparameters kwargs",
+    "--load-best": "best",
+    "--load-checkpoint": "checkpoint",
 }
 
 # Arguments of constructors that are flags.
@@ -183,7 +175,8 @@ def hint(words: Sequence[str], flags: Iterable[str], algos: Sequence[str]) -> st
     name = flag.lstrip("-").replace("_", "-").lower()
     setting = _hyperparameter(name.replace("-", "_"), algos)
     ours = next(
-        (ours for ours, typed in _TYPED_FOR.items() if name in typed and ours in flags), None
+        (ours for ours, typed in _TYPED_FOR.items() if name in typed.split() and ours in flags),
+        None,
     )
     if ours is not None and setting != name.replace("-", "_"):
         return f"did you mean {ours!r}?"

@@ -252,15 +252,9 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
 
     How many seeds there are at each look is settled before the first.
     """
-    from experiments.growing import (
-        counts_after,
-        counts_of,
-        grown,
-        settle,
-        settled_looks,
-        take_planned_looks,
-    )
+    from experiments.growing import counts_of, grown, remember, settled_looks, take_planned_looks
     from experiments.launching import EarlyResults
+    from experiments.looks import read_looks
     from experiments.plan import plan
     from report.words import seeds
 
@@ -269,7 +263,7 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
     now = grown(study, counts)
     planned = plan(now, context.root, counts)
     _prepare(args, now, planned, context)
-    settle(context.root, looks)
+    remember(context.root, read_looks(context.root), looks)  # before the first run is done
     failures: list[RunFailure] = []
     said: set[tuple[str, int]] = set()
     with context.held():  # from one look to the next
@@ -285,7 +279,7 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
                     say(context.console, _on_look(step))
             if all(step.growth.is_done for step in steps):
                 break
-            counts = counts_after(counts, steps)
+            counts = counts_of(study, read_looks(context.root))
             now = grown(study, counts)
             planned = plan(now, context.root, counts)
         code = conclude(
@@ -378,7 +372,7 @@ def conclude(
 
     ``looks`` are those that have been taken, by environment; None for one that is taken now.
     """
-    from experiments.run_files import mixed_versions
+    from experiments.results import mixed_versions
 
     tell = partial(say, context.console)
     results = replace(results, failures={one.planned.path: one.details for one in failures})
@@ -510,8 +504,6 @@ class RunContext:
     n_workers: int = 1  # processes that may work on this machine at once
     cluster: Cluster | None = None
     address: str = ""  # of the cluster, as it was typed
-    n_jobs: int = 0  # jobs at once in the cluster's queue
-    is_insecure: bool = False  # whether the user has said that the cluster may be without TLS
     # Seconds of a run by agent and environment, where something is known of them.
     expected: Mapping[tuple[str, str], float] = field(default_factory=dict)
     _warm_ups: str = "[]"  # what the cluster's workers compile once
@@ -534,7 +526,7 @@ class RunContext:
 
         compiled = "[]"
         if any(run.spec.user_modules for run in planned):
-            from experiments.warm_ups import warm_ups
+            from experiments.run_in_child import warm_ups
 
             compiled = warm_ups(planned)
         if self.cluster is None:
@@ -564,15 +556,9 @@ class RunContext:
             return local_launcher(self.root, self.command, self.n_workers, self.limits)
         from experiments.cluster.cluster_launcher import cluster_launcher
 
+        tell = partial(say, self.console)
         return cluster_launcher(
-            self.cluster,
-            self.root,
-            self.command,
-            self.limits,
-            n_runs=self.n_jobs,
-            is_told=self.is_insecure,
-            warm_ups=self._warm_ups,
-            tell=partial(say, self.console),
+            self.cluster, self.root, self.command, self.limits, self._warm_ups, tell
         )
 
 
@@ -596,15 +582,10 @@ def run_context(
     if isinstance(cluster, JobQueue):
         if args.jobs < 1:
             raise UserError(f"{cluster.file}: say how many runs to do at once: --jobs N")
+        cluster = replace(cluster, n_workers=args.jobs)
     elif args.jobs > 0:
         raise UserError("--jobs is for this machine or a queue of jobs; a cluster has its workers")
-    return replace(
-        context,
-        cluster=cluster,
-        address=args.cluster,
-        n_jobs=args.jobs,
-        is_insecure=args.insecure_cluster,
-    )
+    return replace(context, cluster=cluster, address=args.cluster)
 
 
 def give_way() -> None:

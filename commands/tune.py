@@ -9,7 +9,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -377,20 +377,10 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         run_timeout=args.run_timeout,
         run_memory=args.run_memory,
     )
-    tuning = TuningSpec(
-        study=study,
-        n_trials=args.n_trials,
-        figure=args.metric or AUTO,
-        objective=args.objective,
-        sampler=args.sampler,
-        pruner=args.pruner,
-        n_startup_trials=args.n_startup_trials,
-        seed=args.seed,
-        search_space=None if args.search_space is None else Path(args.search_space),
-        retest=args.retest,
-        retest_seeds=args.retest_seeds,
-        first_retest_seed=args.first_retest_seed,
-    )
+    # A flag that has the name of a field goes there as it is.
+    named = {key.name: getattr(args, key.name) for key in fields(TuningSpec) if key.name in args}
+    named["search_space"] = None if args.search_space is None else Path(args.search_space)
+    tuning = TuningSpec(**named, study=study, figure=args.metric or AUTO)
     tuning.check()
     if args.storage is not None:
         kind_of(args.storage)

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.plan import PlannedRun
-from experiments.run_files import read_outcome, read_shaped
 from mdp.array_types import AnyInts, Floats, Ints
-from pipeline.digests import DamagedFileError
+from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.environments import make_single_env
 from pipeline.files import replacing
 from pipeline.runs import (
@@ -88,7 +87,7 @@ class PullStatistics:
         """
         kinds = get_type_hints(cls, include_extras=True)
         shapes = {name: kind.__metadata__[0] for name, kind in kinds.items()}
-        arrays = read_shaped(Run(path.parent, ""), path, shapes)
+        arrays = read_shaped(path, Run(path.parent, "").files.read(path), shapes)
         found = cls(**{name: arrays[name] for name in shapes})
         n_kept = found.moments.size if found.posteriors.size else len(found.posteriors)
         if not found.pulls.size or len(found.posteriors) != n_kept:
@@ -216,35 +215,6 @@ def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStat
     return pulls
 
 
-def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
-    """A row of the summary for each run of a batch."""
-    info = read_outcome(planned.run, ("seconds",))
-    cpu_seconds = info.get("cpu_seconds")
-    path = planned.path / STATISTICS_FILE
-    pulls = PullStatistics.load(path)
-    if pulls.total_reward.size != planned.n_runs or info["seconds"] is None:
-        raise DamagedFileError(path, "is damaged: it is not of as many runs")
-    shared = {
-        "agent": planned.agent,
-        "algo": planned.spec.algo,
-        "environment": planned.environment,
-        "env_id": planned.spec.env_id,
-        "n_timesteps": planned.spec.hyperparams.n_timesteps,
-        "n_episodes": 1,
-        "seconds": info["seconds"] / planned.n_runs,
-        "cpu_seconds": None if cpu_seconds is None else cpu_seconds / planned.n_runs,
-        "engine": info.get("engine"),
-        "path": str(planned.path),
-    }
-    return [
-        {**shared, "seed": seed, "training": reward, "last_episodes": reward, "regret": regret}
-        for seed, (reward, regret) in enumerate(
-            zip(pulls.total_reward.tolist(), pulls.total_regret.tolist(), strict=True),
-            start=planned.seed,
-        )
-    ]
-
-
 def run_regret(planned: PlannedRun) -> float | None:
     """The regret of a run of its own, or None where it was on no bandit."""
     files = planned.run.files
@@ -263,7 +233,7 @@ def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
     """
     path = folder / PULLS_FILE
     shapes = dict.fromkeys((*_PULLS, "contexts"), "environments pulls")
-    arrays = read_shaped(Run(folder, ""), path, shapes, optional=("contexts",))
+    arrays = read_shaped(path, Run(folder, "").files.read(path), shapes, ("contexts",))
     if not arrays["arms"].size:
         raise DamagedFileError(path, "is damaged: it holds no pull")
     for name in ("arms", "contexts"):

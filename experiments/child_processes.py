@@ -41,7 +41,7 @@ LEFT_TO_SUPERVISOR = tuple(
 )
 
 
-def answer_from_child(sender: Connection, last_words: Connection, tasks: Connection) -> None:
+def answer_from_child(line: Connection, last_words: Connection) -> None:
     """Do pickled tasks until there are none any more, or one fails, and send what came of each.
 
     ``last_words`` takes the traceback where the process crashes, or is about to be ended.
@@ -55,7 +55,7 @@ def answer_from_child(sender: Connection, last_words: Connection, tasks: Connect
     kind = RETURNED
     while kind == RETURNED:
         try:
-            task = tasks.recv_bytes()
+            task = line.recv_bytes()
         except (EOFError, OSError):
             break
         # Only now is the task unpacked: in a process that begins anew, its imports take seconds.
@@ -65,9 +65,9 @@ def answer_from_child(sender: Connection, last_words: Connection, tasks: Connect
             answer = function(*args)
         except BaseException as error:  # noqa: BLE001  # whatever it is, the supervisor is told
             kind, answer = RAISED, (_words(error), traceback.format_exc())
-        with contextlib.suppress(BrokenPipeError):
-            sender.send((kind, answer))
-    sender.close()
+        with contextlib.suppress(ConnectionError):
+            line.send((kind, answer))
+    line.close()
 
 
 def leave_signals_to_supervisor() -> None:
@@ -120,7 +120,7 @@ context: Any = multiprocessing.get_context(START_METHOD)
 def start_server(warm_ups: str = "[]") -> None:
     """Start what children begin from, in the background, and let them be started after `stop_all`.
 
-    It compiles ``warm_ups`` once for all runs, see `experiments.warm_ups`.
+    It compiles ``warm_ups`` once for all runs, see `experiments.run_in_child.warm_ups`.
     """
     _stopping.clear()
     for name in THREAD_VARIABLES:
@@ -255,10 +255,9 @@ class _Child:
     """A child process, and what goes to it and comes from it."""
 
     def __init__(self) -> None:
-        self.answers, sender = context.Pipe(duplex=False)
+        self.line, line = context.Pipe()  # for tasks and answers
         self.last_words, writer = context.Pipe(duplex=False)
-        given, self.tasks = context.Pipe(duplex=False)
-        theirs = (sender, writer, given)
+        theirs = (line, writer)
         self.process = context.Process(target=answer_from_child, args=theirs, daemon=True)
         try:
             with _lock:
@@ -273,21 +272,19 @@ class _Child:
             for connection in theirs:
                 connection.close()
 
-    def attempt(self, task: bytes, limits: RunLimits, is_last: bool) -> tuple[str, Any]:
+    def attempt(self, task: bytes, limits: RunLimits) -> tuple[str, Any]:
         """Have a task done: `RETURNED` and value; `RAISED`, reason and details; or `DIED` and how.
 
         The child is ended where it exceeds a limit. One that has returned a value may be given
         another task; any other has ended.
         """
         with contextlib.suppress(OSError):  # it is gone, as is found below
-            self.tasks.send_bytes(task)
-        if is_last:
-            self.tasks.close()
+            self.line.send_bytes(task)
         if reason := self._exceeded(limits):
             self.process.join()
             return RAISED, (reason, f"{self._read_last_words()}{reason}\n")
         try:
-            kind, answer = self.answers.recv()
+            kind, answer = self.line.recv()
         except (EOFError, OSError):
             self.process.join()
             code = self.process.exitcode or 0
@@ -300,12 +297,12 @@ class _Child:
     def _exceeded(self, limits: RunLimits) -> str:
         """Wait until there is an answer, or none will come; which limit ended it before."""
         pid, started = self.process.pid, time.monotonic()
-        while not self.answers.poll(limits.pause):
+        while not self.line.poll(limits.pause):
             reason = limits.exceeded(pid or 0, time.monotonic() - started)
-            if reason and not self.answers.poll(0):
+            if reason and not self.line.poll(0):
                 if sys.platform != "win32":
                     _send(pid, signal.SIGUSR1)  # it says where it is
-                    self.answers.poll(SECONDS_FOR_LAST_WORDS)
+                    self.line.poll(SECONDS_FOR_LAST_WORDS)
                 self.kill()
                 return reason
         return ""
@@ -330,15 +327,14 @@ class _Child:
 
     def end(self) -> None:
         """Wait until it is gone, which it is soon, since nothing is left to do."""
-        self.tasks.close()
+        self._close()
         self.process.join()
         with _lock:
             _children.discard(self)
-        self._close()
 
     def _close(self) -> None:
-        for connection in (self.answers, self.last_words, self.tasks):
-            connection.close()
+        self.line.close()
+        self.last_words.close()
 
 
 def _attempt(task: bytes, limits: RunLimits, shares_process: bool) -> tuple[str, Any]:
@@ -352,7 +348,7 @@ def _attempt(task: bytes, limits: RunLimits, shares_process: bool) -> tuple[str,
         child = _Child()
     kind = DIED
     try:
-        kind, answer = child.attempt(task, limits, is_last=not shares_process)
+        kind, answer = child.attempt(task, limits)
     except BaseException:
         child.kill()
         raise

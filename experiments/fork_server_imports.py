@@ -14,8 +14,7 @@ from pipeline.library_loading import loading_libraries
 
 
 def _warm_up() -> None:
-    import experiments.run_in_child  # noqa: F401  # what children call
-    from experiments.warm_ups import take_steps, train_aside
+    from experiments.run_in_child import take_steps, train_aside
     from pipeline.settings.hyperparams import split
     from pipeline.train_spec import TrainSpec
 

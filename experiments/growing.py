@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,15 +35,15 @@ def take_looks(results: StudyResults) -> dict[str, Standing]:
     The same runs and the same question are the same look, however often it is taken.
     """
     log = read_looks(results.root)
-    question, standings, environments = question_of(results.study), {}, dict(log.environments)
+    question, standings, environments = question_of(results.study), {}, dict(log)
     for environment in results.study.environments:
         evidence = evidence_on(results, environment.label)
         if evidence is not None:
-            looks, standing = _taken(log.on(environment.label), evidence, question)
+            looks, standing = _taken(log.get(environment.label, Looks()), evidence, question)
             standings[environment.label] = standing
             if looks.taken:
                 environments[environment.label] = looks
-    remember(results.root, log, LookLog(environments))
+    remember(results.root, log, environments)
     return standings
 
 
@@ -119,7 +119,7 @@ class Step:
 def settled_looks(study: StudySpec, root: Path, most: int | None) -> LookLog:
     """The looks at a study, with when to look at it until it is decided, settled now or before.
 
-    Nothing is written: see `settle`.
+    Nothing is written: see `remember`.
 
     Args:
         study: the study.
@@ -134,20 +134,15 @@ def settled_looks(study: StudySpec, root: Path, most: int | None) -> LookLog:
     if most is not None and most < study.n_seeds:
         raise UserError(f"--max-seeds is {most}, the study begins with {study.n_seeds} seeds")
     log = read_looks(root)
-    environments = dict(log.environments)
+    environments = dict(log)
     for environment in study.environments:
-        looks = log.on(environment.label)
+        looks = log.get(environment.label, Looks())
         design = _settled(study, looks, most)
         if looks.design is not None:
             _check_same(root, looks.design, design)
             design = looks.design
         environments[environment.label] = replace(looks, design=design)
-    return LookLog(environments)
-
-
-def settle(root: Path, log: LookLog) -> None:
-    """Write down when to look, before the first run is done for it."""
-    remember(root, read_looks(root), log)
+    return environments
 
 
 def counts_of(study: StudySpec, log: LookLog) -> Counts:
@@ -155,7 +150,7 @@ def counts_of(study: StudySpec, log: LookLog) -> Counts:
     return {
         (agent, environment.label): n
         for environment in study.environments
-        if (design := log.on(environment.label).design) is not None
+        if (design := log.get(environment.label, Looks()).design) is not None
         for agent, n in design.seeds.items()
     }
 
@@ -168,24 +163,17 @@ def grown(study: StudySpec, counts: Counts) -> StudySpec:
 def take_planned_looks(results: StudyResults) -> list[Step]:
     """Look at every environment as was settled, and write down who gets more seeds."""
     log = read_looks(results.root)
-    environments, steps = dict(log.environments), []
+    environments, steps = dict(log), []
     for environment in results.study.environments:
         label, evidence = environment.label, evidence_on(results, environment.label)
-        looks = log.on(label)
+        looks = log.get(label, Looks())
         if evidence is None or looks.design is None:
             continue
         _check_runs(results.root, looks, evidence)
         environments[label], step = _looked(looks, looks.design, evidence)
         steps.append(step)
-    remember(results.root, log, LookLog(environments))
+    remember(results.root, log, environments)
     return steps
-
-
-def counts_after(counts: Counts, steps: Sequence[Step]) -> Counts:
-    """How many seeds agents are to have, after looks."""
-    return counts | {
-        (agent, step.environment): n for step in steps for agent, n in step.design.seeds.items()
-    }
 
 
 def _settled(study: StudySpec, looks: Looks, most: int | None) -> Design:

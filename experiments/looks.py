@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -113,15 +113,7 @@ class Looks:
         return level_of_look(ALPHA, n_before + with_design + 1)
 
 
-@dataclass(frozen=True)
-class LookLog:
-    """The looks at a study, by environment."""
-
-    environments: Mapping[str, Looks] = field(default_factory=dict)
-
-    def on(self, environment: str) -> Looks:
-        """Those at the runs on one environment."""
-        return self.environments.get(environment, Looks())
+LookLog = Mapping[str, Looks]  # all looks at a study, by environment
 
 
 @dataclass(frozen=True)
@@ -151,7 +143,7 @@ _LARGEST_NUMBER = 1e300
 
 def write_looks(root: Path, log: LookLog) -> None:
     """Replace the file, so that it is there whole and for good."""
-    looks = {name: asdict(each) for name, each in log.environments.items()}
+    looks = {name: asdict(each) for name, each in log.items()}
     write_json(root / LOOKS_FILE, {"format": _FORMAT, "environments": looks})
 
 
@@ -165,7 +157,7 @@ def read_looks(root: Path) -> LookLog:
     try:
         data = json.loads(read_file(path, _LARGEST))
     except FileNotFoundError:
-        return LookLog()
+        return {}
     except OSError as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
     except UnsafeFileError as error:
@@ -222,7 +214,7 @@ def _log(data: Any) -> LookLog:
     is_whole = isinstance(data, dict) and data.keys() == {"format", "environments"}
     if not is_whole or data["format"] != _FORMAT or not isinstance(data["environments"], dict):
         raise _MisfitError("the whole")
-    return LookLog({name: _looks(each, name) for name, each in data["environments"].items()})
+    return {name: _looks(each, name) for name, each in data["environments"].items()}
 
 
 def _looks(data: Any, where: str) -> Looks:

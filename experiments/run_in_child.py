@@ -1,12 +1,24 @@
-"""One run of a study in the process that does it: from the beginning, or going on from a state."""
+"""What the processes do that runs are done in: a run, and before the first what all runs share.
+
+A run begins anew, or goes on from a state that another process has left. Compiled once for all runs
+are learning rules of the user's own: machine code of ours is kept on disk, but of theirs nobody
+knows all the sources. So the server that runs are forked from takes a few steps with each rule.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from rich.console import Console
 
+from experiments.bandits import do_batch
 from experiments.plan import PlannedRun
 from experiments.run_folders import (
     claim_draft,
@@ -14,14 +26,18 @@ from experiments.run_folders import (
     put_run_in_place,
     take_over,
 )
+from machine_code.sources import kept_packages
 from pipeline.errors import UserError
 from pipeline.failures import is_of_the_machine
 from pipeline.locks import SECONDS_BETWEEN_SIGNS, give_sign
+from pipeline.models.load import agent_class
 from pipeline.runs import Run, remove_states
+from pipeline.settings.hyperparams import split
 from pipeline.signs_of_life import Heartbeat
+from pipeline.train_spec import TrainSpec
 from pipeline.training import train
 from pipeline.unfinished_runs import StateKeeping, go_on
-from pipeline.user_modules import import_again
+from pipeline.user_modules import UserModule, import_again
 
 
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
@@ -49,10 +65,11 @@ def _do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
     run = Run(draft, planned.run.env_name)
     keeping = _to_go_on_with(planned, run)
     if not keeping.goes_on:
-        _begin_anew(planned, run)
+        claim_draft(draft)
+        run.params_path.mkdir()
+        if planned.spec.tensorboard_log is not None:
+            shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)  # of an earlier try
     if planned.is_batch:
-        from experiments.bandits import do_batch  # with pandas, which no other run needs
-
         do_batch(planned.spec, planned.n_runs, run, command)
         return
     args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
@@ -77,8 +94,63 @@ def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:
     return keeping if is_ours else anew
 
 
-def _begin_anew(planned: PlannedRun, run: Run) -> None:
-    claim_draft(run.path)
-    run.params_path.mkdir()
-    if planned.spec.tensorboard_log is not None:
-        shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)  # of an earlier try
+# --- What is compiled once for all runs.
+
+N_STEPS = 10
+# It goes by an environment variable, which Linux bounds at 128 KB.
+MAX_CHARACTERS = 100_000
+
+
+def warm_ups(planned: Sequence[PlannedRun]) -> str:
+    """The trainings that compile what the runs need, as JSON for `take_steps`."""
+    chosen: dict[tuple[str, str], dict[str, Any]] = {}
+    for run in planned:
+        spec, key = run.spec, (run.spec.algo, run.environment)
+        # A batch is one process, and a batch alone.
+        if not spec.user_modules or run.is_batch or key in chosen or not run.is_to_do:
+            continue
+        if _is_compiled_rule_of_users(spec.algo):
+            chosen[key] = {
+                "algo": spec.algo,
+                "env_id": spec.env_id,
+                "hyperparams": spec.saved_hyperparams,
+                "modules": [asdict(module) for module in spec.user_modules],
+            }
+    text = json.dumps(list(chosen.values()))
+    return text if len(text) < MAX_CHARACTERS else "[]"
+
+
+def _is_compiled_rule_of_users(algo: str) -> bool:
+    from agents.compiled.learning_algorithm import LearningAlgorithm
+
+    algorithm = agent_class(algo)
+    is_ours = algorithm.__module__.partition(".")[0] in kept_packages()
+    return issubclass(algorithm, LearningAlgorithm) and not is_ours
+
+
+def take_steps(wanted: str) -> None:
+    """Do the trainings of `warm_ups`; whatever goes wrong, the run itself will say so."""
+    for item in json.loads(wanted):
+        with contextlib.suppress(Exception):
+            modules = tuple(UserModule(**module) for module in item["modules"])
+            import_again(modules)
+            raw = {k: v for k, v in item["hyperparams"].items() if k != "n_episodes"}
+            raw["n_timesteps"] = N_STEPS
+            spec = TrainSpec(
+                item["algo"],
+                item["env_id"],
+                split(raw),
+                raw,
+                seed=0,
+                eval_freq=-1,
+                gym_packages=tuple(module.name for module in modules),
+                user_modules=modules,
+            )
+            train_aside(spec)
+
+
+def train_aside(spec: TrainSpec) -> None:
+    """Train, and keep nothing of it but what has been compiled."""
+    with TemporaryDirectory() as folder:
+        spec = replace(spec, log_folder=Path(folder), pictures=False, verbose=0)
+        train(spec, Console(quiet=True), {}, "")

@@ -11,6 +11,7 @@ import math
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,6 +68,7 @@ class RunLimits:
 
     seconds: float | None = None  # from the start of its process; None for no limit
     memory: int | None = None  # bytes of the machine's memory; None for no limit
+    is_wanted: Callable[[], bool] | None = None  # a run that nobody waits for any more is ended
 
     def __post_init__(self) -> None:
         if self.memory is not None and sys.platform == "win32":
@@ -75,11 +77,12 @@ class RunLimits:
     @property
     def pause(self) -> float | None:
         """Seconds between two looks; None where there is nothing to look at."""
-        is_limited = self.seconds is not None or self.memory is not None
-        return SECONDS_BETWEEN_LOOKS if is_limited else None
+        return None if self == RunLimits() else SECONDS_BETWEEN_LOOKS
 
     def exceeded(self, pid: int, elapsed: float) -> str:
         """Which limit a process exceeds after ``elapsed`` seconds, in words; empty for none."""
+        if self.is_wanted is not None and not self.is_wanted():
+            return "nobody waits for it any more"
         if self.seconds is not None and elapsed > self.seconds:
             return f"took longer than --run-timeout allows, {self.seconds:g} s"
         if self.memory is not None:

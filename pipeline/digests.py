@@ -15,7 +15,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -247,3 +247,27 @@ def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
             return arrays
     except _DAMAGE as error:
         raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error
+
+
+def read_shaped(
+    path: Path, content: bytes, shapes: Mapping[str, str], optional: Collection[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """As `read_arrays`, each of its shape.
+
+    A shape names the lengths of its axes: those of one name are alike, and one may be a number.
+    """
+    arrays = read_arrays(path, content)
+    lengths: dict[str, int] = {}
+    for name, shape in shapes.items():
+        if name not in arrays:
+            if name in optional:
+                continue
+            raise DamagedFileError(path, f"is damaged: it lacks {name}")
+        axes, found = shape.split(), arrays[name].shape
+        wanted = [
+            int(axis) if axis.isdigit() else lengths.setdefault(axis, n)
+            for axis, n in zip(axes, found, strict=False)
+        ]
+        if len(axes) != len(found) or tuple(wanted) != found:
+            raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+    return arrays

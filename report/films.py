@@ -162,7 +162,7 @@ def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
 
 def _checkpoints(planned: PlannedRun) -> Iterator[tuple[Path, int]]:
     """The checkpoints that were due, each with the number of the episode it followed."""
-    from experiments.run_files import read_episodes
+    from experiments.results import read_episodes
 
     every = planned.spec.save_every_n_episodes
     ends = read_episodes(planned.run).steps

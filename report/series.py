@@ -15,8 +15,13 @@ from scipy import integrate, special, stats
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.bandits import QUANTILES, PullStatistics
-from experiments.results import StudyResults, curves_by_agent, mean_curve, values_over_seeds
-from experiments.run_files import read_episodes
+from experiments.results import (
+    StudyResults,
+    curves_by_agent,
+    mean_curve,
+    read_episodes,
+    values_over_seeds,
+)
 from experiments.study import AgentSpec, StudySpec, symbol
 from mdp.array_types import Floats, Ints
 from pipeline.environments import make_single_env

@@ -21,8 +21,7 @@ from optuna.trial import TrialState
 from agents import ALGORITHMS
 from experiments.launching import Launcher, RunFailure
 from experiments.plan import PlannedRun, check_settings
-from experiments.results import read_run
-from experiments.run_files import Curve
+from experiments.results import Curve, read_run
 from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from pipeline.files import DISK_ERRORS, plain

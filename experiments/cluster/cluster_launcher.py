@@ -28,14 +28,7 @@ from experiments.cluster.answers import (
     receive,
     unpacked,
 )
-from experiments.cluster.schedulers import (
-    Cluster,
-    Connection,
-    JobQueue,
-    LocalWorkers,
-    Replace,
-    opened,
-)
+from experiments.cluster.schedulers import Cluster, Connection, Replace, opened
 from experiments.cluster.working import LEAVING, Probe, RunOrder, Supervisors, probing, version
 from experiments.launching import Launcher, RunFailure, ended
 from experiments.plan import PlannedRun
@@ -107,33 +100,20 @@ def cluster_launcher(
     root: Path,
     command: str,
     limits: RunLimits = NO_LIMITS,
-    *,
-    n_runs: int = 0,
-    is_told: bool = False,
     warm_ups: str = "[]",
     tell: Callable[[str], object] = str,
 ) -> Iterator[Launcher]:
-    """Do runs on a cluster.
+    """Do runs on a cluster, of which ``tell`` is told where the dashboard is, if there is one.
 
-    Args:
-        cluster: which.
-        root: the study's folder.
-        command: the command that asked for it, noted in every run folder.
-        limits: what each run may take.
-        n_runs: for how many runs at once jobs are to be started, in a queue.
-        is_told: whether the user has said that a scheduler open to the network will do.
-        warm_ups: what workers are to compile once, see `experiments.warm_ups`.
-        tell: told where the dashboard is, if there is one.
+    Workers compile ``warm_ups`` once, see `experiments.run_in_child.warm_ups`.
 
     Raises:
         UserError: if there is no such cluster.
     """
-    plugin, wanted = Supervisors(warm_ups), n_runs if isinstance(cluster, JobQueue) else 0
-    wanted = cluster.n_workers if isinstance(cluster, LocalWorkers) else wanted
-    with probing(root) as probe, opened(cluster, n_runs, is_told) as (connect, replace_jobs):
-        launcher = ClusterLauncher(probe, command, limits, wanted)
-        prepare = partial(launcher.prepare, plugin)
-        launcher.connection = connection = Connection(connect, prepare, is_told)
+    with probing(root) as probe, opened(cluster) as (connect, replace_jobs):
+        launcher = ClusterLauncher(probe, command, limits, cluster.n_workers)
+        prepare = partial(launcher.prepare, Supervisors(warm_ups))
+        launcher.connection = connection = Connection(connect, prepare, cluster.is_insecure)
         connection.begin()
         if link := connection.client().dashboard_link:
             tell(f"dashboard: {link}")

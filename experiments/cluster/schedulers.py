@@ -22,7 +22,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import ModuleType
@@ -59,6 +59,7 @@ class LocalWorkers:
     """That many workers on this machine, for as long as the command takes."""
 
     n_workers: int
+    is_insecure: bool = False  # of no matter: nobody else can talk to them
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ class SchedulerAddress:
 
     text: str  # the address; empty where it stands in the file
     file: Path | None = None  # the file; None where there is none
+    n_workers: int = 0  # to be waited for: whatever there is will do
+    is_insecure: bool = False  # whether the user has said that one open to the network will do
 
     def read(self) -> str:
         """The address, as it is now: with ``tcp://`` or ``tls://``."""
@@ -82,6 +85,8 @@ class JobQueue:
     settings: dict[str, Any]  # what dask-jobqueue is told of it
     n_cores: int  # of each job, as many runs at once
     file: Path  # where that stands
+    n_workers: int = 0  # for how many runs at once jobs are started
+    is_insecure: bool = False  # as of a `SchedulerAddress`
 
 
 Cluster = LocalWorkers | SchedulerAddress | JobQueue
@@ -104,11 +109,8 @@ def read_cluster(text: str) -> Cluster:
     return SchedulerAddress(text)
 
 
-def check_address(address: str, has_certificates: bool, is_told: bool) -> None:
-    """Refuse a scheduler that is open to the network, or by TLS without its certificates.
-
-    Where ``is_told``, the user has said that an open one will do.
-    """
+def check_address(address: str, has_certificates: bool, is_insecure: bool) -> None:
+    """Refuse a scheduler that is open to the network, or by TLS without its certificates."""
     scheme = urlsplit(address).scheme
     if scheme not in ("tcp", "tls"):
         raise UserError(f"--cluster {address}: give an address that begins with tls:// or tcp://")
@@ -117,7 +119,7 @@ def check_address(address: str, has_certificates: bool, is_told: bool) -> None:
             f"--cluster {address}: TLS takes a ca-file and the client's cert and key in Dask's "
             "configuration, under distributed.comm.tls; docs/cluster.md shows how"
         )
-    if scheme == "tcp" and not is_loopback(address) and not is_told:
+    if scheme == "tcp" and not is_loopback(address) and not is_insecure:
         raise UserError(
             f"--cluster {address}: without TLS, anybody who can connect to a scheduler can run "
             "code as you; use tls://, or give --insecure-cluster if the network is yours alone"
@@ -309,11 +311,11 @@ class Connection:
     """
 
     def __init__(
-        self, connect: Callable[[], Client], prepare: Callable[[Client], None], is_told: bool
+        self, connect: Callable[[], Client], prepare: Callable[[Client], None], is_insecure: bool
     ) -> None:
         self._connect = connect
         self._prepare = prepare
-        self._is_told = is_told
+        self._is_insecure = is_insecure
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._client: Client | None = None
@@ -392,7 +394,7 @@ class Connection:
     def _check_open(self, addresses: Any) -> None:
         """Refuse what listens to a network without TLS, whatever it was called here."""
         for address in addresses:
-            if not (self._is_told or address.startswith("tls://") or is_loopback(address)):
+            if not (self._is_insecure or address.startswith("tls://") or is_loopback(address)):
                 raise UserError(
                     f"--cluster: {address} is open to its network without TLS: start it with "
                     "--host 127.0.0.1 or with TLS, or say --insecure-cluster"
@@ -417,16 +419,16 @@ Connect = Callable[[], Client]
 Replace = Callable[[Collection[str]], object]
 
 
-def checked_cluster(text: str, is_told: bool) -> Cluster:
+def checked_cluster(text: str, is_insecure: bool) -> Cluster:
     """What ``--cluster`` means, before anything is begun; refused if it is open to others."""
-    cluster = read_cluster(text)
+    cluster = replace(read_cluster(text), is_insecure=is_insecure)
     if isinstance(cluster, SchedulerAddress):
-        check_address(cluster.read(), has_certificates(Security()), is_told)
+        check_address(cluster.read(), has_certificates(Security()), is_insecure)
     return cluster
 
 
 @contextlib.contextmanager
-def opened(cluster: Cluster, n_runs: int, is_told: bool) -> Iterator[tuple[Connect, Replace]]:
+def opened(cluster: Cluster) -> Iterator[tuple[Connect, Replace]]:
     """Have a scheduler while the ``with`` statement runs.
 
     Yields what makes a client of it; and what is to be called now and then with the addresses of
@@ -435,13 +437,13 @@ def opened(cluster: Cluster, n_runs: int, is_told: bool) -> Iterator[tuple[Conne
     _be_quiet()
     dask.config.set({"distributed.deploy.lost-worker-timeout": SECONDS_TO_RESTART})
     if isinstance(cluster, SchedulerAddress):
-        yield lambda: _client_of(cluster, is_told), _nothing
+        yield lambda: _client_of(cluster), lambda _: None
     elif isinstance(cluster, LocalWorkers):
         with _local(cluster.n_workers) as local:
             n_workers = cluster.n_workers
             yield lambda: Client(local, set_as_default=False), lambda _: local.scale(n_workers)
     else:
-        n_jobs = math.ceil(n_runs / cluster.n_cores)
+        n_jobs = math.ceil(cluster.n_workers / cluster.n_cores)
         with opened_queue(cluster) as queue:
             jobs = Jobs(queue, n_jobs)
             yield lambda: Client(queue, set_as_default=False), jobs.replace
@@ -455,13 +457,9 @@ def _be_quiet() -> None:
     warnings.filterwarnings("ignore", "Creating scratch directories")
 
 
-def _nothing(_: Collection[str]) -> None:
-    """Nothing has to be done."""
-
-
-def _client_of(cluster: SchedulerAddress, is_told: bool) -> Client:
+def _client_of(cluster: SchedulerAddress) -> Client:
     address, security = cluster.read(), Security()
-    check_address(address, has_certificates(security), is_told)
+    check_address(address, has_certificates(security), cluster.is_insecure)
     try:
         return Client(address, timeout=SECONDS_TO_CONNECT, set_as_default=False, security=security)
     except (ValueError, RuntimeError) as error:

@@ -12,9 +12,9 @@ import multiprocessing
 import platform
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -137,7 +137,6 @@ def version() -> str:
 
 # --- The side of the worker.
 
-SECONDS_BETWEEN_LOOKS = 0.5
 # The states of a task that its driver has given up, or that was lost with its scheduler.
 _UNWANTED = ("cancelled", "released", "forgotten")
 
@@ -164,7 +163,7 @@ class Supervisors(WorkerPlugin):
     idempotent = True  # of several drivers, the first is enough
 
     def __init__(self, warm_ups: str) -> None:
-        self.warm_ups = warm_ups  # what it compiles once, see `experiments.warm_ups`
+        self.warm_ups = warm_ups  # what it compiles once, see `experiments.run_in_child.warm_ups`
 
     def setup(self, worker: Worker) -> None:
         """Get ready; what takes long goes on in the background."""
@@ -179,22 +178,6 @@ class Supervisors(WorkerPlugin):
         child_processes.end_server()
 
 
-@dataclass(frozen=True)
-class WatchedLimits(RunLimits):
-    """Limits of a run that is ended too when nobody waits for it any more."""
-
-    is_wanted: Callable[[], bool] = lambda: True
-
-    @property
-    def pause(self) -> float | None:
-        return super().pause or SECONDS_BETWEEN_LOOKS
-
-    def exceeded(self, pid: int, elapsed: float) -> str:
-        if not self.is_wanted():
-            return "nobody waits for it any more"
-        return super().exceeded(pid, elapsed)
-
-
 def answer_to(content: bytes) -> bytes:
     """Do the run of an order, and say how it ended; see `experiments.cluster.do_order`."""
     worker = get_worker()
@@ -205,9 +188,8 @@ def answer_to(content: bytes) -> bytes:
         Supervisors("[]").setup(worker)
     if order.version != version():
         return packed(Answer(UNFIT, f"{worker.address} has other code or libraries than this"))
-    limits = order.limits
-    watched = WatchedLimits(limits.seconds, limits.memory, lambda: _is_wanted(worker, key))
-    order = replace(order, limits=watched)
+    limits = replace(order.limits, is_wanted=partial(_is_wanted, worker, key))
+    order = replace(order, limits=limits)
     try:
         if order.probe.is_there:
             _do(order, order.probe.home)

@@ -23,7 +23,7 @@ from envs.layout import GridLayout, action_names, grid_layout
 from experiments.analysis import StudyAnalysis
 from experiments.child_processes import TaskFailedError, local_executor, supervise
 from experiments.plan import PlannedRun
-from experiments.run_files import difference
+from experiments.results import difference
 from experiments.run_limits import RunLimits
 from mdp.array_types import Floats
 from pipeline.environments import make_single_env

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.analysis import EnvironmentAnalysis
-from experiments.looks import read_looks
+from experiments.looks import Looks, read_looks
 from experiments.plan import PlannedRun, tuning_seeds
-from experiments.results import StudyResults
-from experiments.run_files import mixed_versions
+from experiments.results import StudyResults, mixed_versions
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from mdp.array_types import Floats
 from report.conclusions import conclusion, on_changes, pairs_both_ways, places_without_a_run
@@ -295,7 +294,7 @@ def settings(report: Report) -> Section | None:
         ],
         "versions": recorded("versions", infos),
         "machine": recorded("machine", infos),
-        "looks": [look_sentences(looks.on(one.environment)) for one in environments],
+        "looks": [look_sentences(looks.get(e.environment, Looks())) for e in environments],
         "mixed": mixed_versions(infos),
         "missing": _missing_runs(results),
     }

@@ -17,7 +17,7 @@ from envs.layout import GridLayout, grid_layout
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.child_processes import do_aside
 from experiments.plan import PlannedRun
-from experiments.run_files import read_value_maps
+from experiments.results import read_value_maps
 from pipeline.environments import make_single_env
 from report.films import MAX_BYTES, films_of, has_film
 from report.page.frame import Report, Section, data_uri, first_runs, layout_data

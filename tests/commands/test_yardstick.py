@@ -1,6 +1,5 @@
 """The installed command: what it runs, and how messages name it."""
 
-import builtins
 import os
 import runpy
 import shlex
@@ -171,15 +170,16 @@ def test_a_study_of_ours_is_found_by_its_name(type_command, tmp_path):
 def test_ctrl_c_while_the_command_itself_is_imported(monkeypatch, capsys, program):
     """Which takes a tenth of a second, in which a traceback would be all that there is to say."""
     wanted = program.removesuffix(".py").split()[-1]
-    imported = builtins.__import__
 
-    def interrupted(name, variables=None, local=None, names=(), level=0):
-        if name == f"commands.{wanted}" or (name == "commands" and wanted in (names or ())):
-            raise KeyboardInterrupt
-        return imported(name, variables, local, names, level)
+    class Interrupted:
+        @staticmethod
+        def find_spec(name, path=None, target=None):
+            if name == f"commands.{wanted}":
+                raise KeyboardInterrupt
 
     monkeypatch.setattr(sys, "argv", program.split())
-    monkeypatch.setattr(builtins, "__import__", interrupted)
+    monkeypatch.setattr(sys, "meta_path", [Interrupted, *sys.meta_path])
+    monkeypatch.delitem(sys.modules, f"commands.{wanted}", raising=False)
     script = partial(runpy.run_path, str(ROOT / program), run_name="__main__")
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
         (script if program.endswith(".py") else yardstick)()

@@ -206,7 +206,7 @@ def check_ports(n_processes, before):
 @pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
 def test_all_ports_of_workers_here_want_a_certificate():
     before = listening_in(os.getpid())  # of servers that other tests have left
-    with opened(LocalWorkers(1), 1, is_told=False) as (connect, _), connect() as client:
+    with opened(LocalWorkers(1)) as (connect, _), connect() as client:
         client.wait_for_workers(1, timeout=60)
         assert client.dashboard_link == ""
         check_ports(2, before)  # this one, with the scheduler and the nanny, and the worker
@@ -242,10 +242,10 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("address", ["tcp://10.0.0.1:8786", "tcp://0.0.0.0:8786"])
 def test_one_that_says_itself_that_it_is_open_is_refused(address):
-    connection = schedulers.Connection(pytest.fail, pytest.fail, is_told=False)
+    connection = schedulers.Connection(pytest.fail, pytest.fail, is_insecure=False)
     with pytest.raises(UserError, match="without TLS"):
         connection._check_open(["tls://10.0.0.2:1", "tcp://127.0.0.1:2", address])
-    schedulers.Connection(pytest.fail, pytest.fail, is_told=True)._check_open([address])
+    schedulers.Connection(pytest.fail, pytest.fail, is_insecure=True)._check_open([address])
 
 
 def test_without_a_cluster_nothing_of_dask_is_loaded():

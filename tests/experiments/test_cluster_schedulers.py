@@ -96,22 +96,22 @@ def test_an_address_is_open_unless_it_is_of_this_machine_alone(address):
 )
 def test_an_open_scheduler_is_refused_unless_told(address):
     with pytest.raises(UserError, match="without TLS"):
-        check_address(address, True, is_told=False)
-    check_address(address, False, is_told=True)
+        check_address(address, True, is_insecure=False)
+    check_address(address, False, is_insecure=True)
 
 
 def test_tls_takes_certificates_and_other_ways_are_unknown():
-    check_address("tls://10.0.0.1:8786", True, is_told=False)
-    check_address("tcp://localhost:8786", False, is_told=False)
+    check_address("tls://10.0.0.1:8786", True, is_insecure=False)
+    check_address("tcp://localhost:8786", False, is_insecure=False)
     with pytest.raises(UserError, match="ca-file"):
-        check_address("tls://10.0.0.1:8786", False, is_told=True)
+        check_address("tls://10.0.0.1:8786", False, is_insecure=True)
     with pytest.raises(UserError, match="begins with"):
-        check_address("ws://127.0.0.1:8786", True, is_told=True)
+        check_address("ws://127.0.0.1:8786", True, is_insecure=True)
 
 
 def test_a_command_checks_before_it_connects():
     with pytest.raises(UserError, match="without TLS"):
-        checked_cluster("192.0.2.1:8786", is_told=False)
+        checked_cluster("192.0.2.1:8786", is_insecure=False)
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,13 @@ from commands.compare import RunContext, repair, run_study
 from experiments.bandits import STATISTICS_FILE
 from experiments.child_processes import NO_LIMITS
 from experiments.plan import plan
-from experiments.results import read_results, read_run
-from experiments.run_files import read_episodes, read_evaluations, read_value_maps
+from experiments.results import (
+    read_episodes,
+    read_evaluations,
+    read_results,
+    read_run,
+    read_value_maps,
+)
 from experiments.run_folders import draft_path, move_damaged_aside
 from experiments.run_in_child import do_run
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec

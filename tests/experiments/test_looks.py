@@ -8,18 +8,16 @@ import pytest
 
 from experiments.analysis import analyse
 from experiments.growing import (
-    counts_after,
     counts_of,
     grown,
-    settle,
+    remember,
     settled_looks,
     take_looks,
     take_planned_looks,
 )
-from experiments.looks import LOOKS_FILE, read_looks
+from experiments.looks import LOOKS_FILE, Looks, read_looks
 from experiments.plan import plan
-from experiments.results import RUN_COLUMNS, StudyResults
-from experiments.run_files import CURVE_COLUMNS
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from report.conclusions import conclusion
@@ -74,7 +72,7 @@ def everything_said(analysis):
 
 
 def number_of_looks(root):
-    return len(read_looks(root).on("lake").taken)
+    return len(read_looks(root).get("lake", Looks()).taken)
 
 
 def level(k):
@@ -135,7 +133,7 @@ def test_environments_are_counted_by_themselves(tmp_path):
     both = take_looks(results_of(replace(study, environments=(LAKE, dry)), tmp_path))
     assert [(name, each.number) for name, each in both.items()] == [("lake", 1), ("dry", 1)]
     assert look(tmp_path, n_seeds=11) == (2, level(2))
-    assert len(read_looks(tmp_path).on("dry").taken) == 1
+    assert len(read_looks(tmp_path)["dry"].taken) == 1
 
 
 def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
@@ -242,13 +240,13 @@ def grow(study, root, most=None, steps=99, ends=ENDS):
     """What the command does, with made-up runs; the steps."""
     root.mkdir(exist_ok=True)
     looks = settled_looks(study, root, most)
-    settle(root, looks)
+    remember(root, read_looks(root), looks)
     counts, taken = counts_of(study, looks), []
     for _ in range(steps):
         taken.append(take_planned_looks(results_of(grown(study, counts), root, ends, counts)))
         if all(step.growth.is_done for step in taken[-1]):
             break
-        counts = counts_after(counts, taken[-1])
+        counts = counts_of(study, read_looks(root))
     return counts, taken
 
 
@@ -265,7 +263,7 @@ def test_a_study_grows_where_it_is_undecided_and_remembers_each_look(tmp_path):
     }
     assert [step.growth.n_looks for (step,) in steps] == [1, 2, 3, 4]
     assert steps[-1][0].undecided == [("sarsa", "expected_sarsa")]
-    looks = read_looks(tmp_path).on("lake")
+    looks = read_looks(tmp_path)["lake"]
     assert [dict(each.seeds)["sarsa"] for each in looks.taken] == [10, 16, 25, 40]
     assert [dict(each.seeds)["qlearning"] for each in looks.taken] == [10] * 4
     assert {each.level for each in looks.taken} == {level(1) / 4}
@@ -286,7 +284,7 @@ def test_interrupted_at_any_look_it_ends_the_same(tmp_path, stop):
     assert parts[0] == whole[0]
     assert parts[1][-1][0].growth == whole[1][-1][0].growth
     undated = [
-        [replace(each, date="") for each in read_looks(tmp_path / name).on("lake").taken]
+        [replace(each, date="") for each in read_looks(tmp_path / name)["lake"].taken]
         for name in ("whole", "parts")
     ]
     assert undated[0] == undated[1]
@@ -295,7 +293,7 @@ def test_interrupted_at_any_look_it_ends_the_same(tmp_path, stop):
 def test_after_a_look_by_hand_the_settled_ones_share_what_is_left(tmp_path):
     assert look(tmp_path, *THREE) == (1, level(1))
     grow(study_of(*THREE), tmp_path, most=40)
-    design = read_looks(tmp_path).on("lake").design
+    design = read_looks(tmp_path)["lake"].design
     # At so low a level, ten seeds could not decide anything.
     assert (design.after, design.sizes[0] > 10, design.level) == (1, True, level(2))
     assert look(tmp_path, *THREE, n_seeds=50)[1] == level(3)

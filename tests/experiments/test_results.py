@@ -16,6 +16,7 @@ from experiments.analysis import analyse
 from experiments.launching import EarlyResults
 from experiments.plan import plan
 from experiments.results import (
+    CURVE_COLUMNS,
     RUN_COLUMNS,
     curves_by_agent,
     mean_curve,
@@ -23,7 +24,6 @@ from experiments.results import (
     threshold_of,
     values_over_seeds,
 )
-from experiments.run_files import CURVE_COLUMNS
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.runs import FINISHED
 from report.conclusions import conclusion, places_without_a_run

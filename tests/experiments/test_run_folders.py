@@ -12,7 +12,7 @@ import pytest
 
 from experiments import run_folders
 from experiments.plan import plan
-from experiments.run_files import mixed_versions
+from experiments.results import mixed_versions
 from experiments.run_folders import (
     check_settings_kept,
     claim_draft,

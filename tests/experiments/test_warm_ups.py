@@ -7,7 +7,7 @@ import pytest
 
 import agents
 from agents.tabular.algorithm import TabularAlgorithm
-from experiments import warm_ups
+from experiments import run_in_child
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from machine_code.compiling import inlined
@@ -52,24 +52,24 @@ def planned(tmp_path):
 
 def test_each_rule_of_the_users_is_compiled_once_on_each_environment(planned, monkeypatch):
     trained = []
-    monkeypatch.setattr(warm_ups, "train_aside", trained.append)
-    warm_ups.take_steps(warm_ups.warm_ups(planned))
+    monkeypatch.setattr(run_in_child, "train_aside", trained.append)
+    run_in_child.take_steps(run_in_child.warm_ups(planned))
     assert [(spec.algo, spec.env_id) for spec in trained] == [
         ("mean", "FrozenLake-v1"),
         ("mean", "Warehouse-v0"),
     ]
-    assert {spec.hyperparams.n_timesteps for spec in trained} == {warm_ups.N_STEPS}
+    assert {spec.hyperparams.n_timesteps for spec in trained} == {run_in_child.N_STEPS}
     assert {spec.hyperparams.n_episodes for spec in trained} == {None}
     assert {spec.user_modules for spec in trained} == {MODULES}
 
 
 def test_without_modules_of_the_users_there_is_nothing_to_do(planned, monkeypatch):
     bare = [replace(run, spec=replace(run.spec, user_modules=())) for run in planned]
-    assert json.loads(warm_ups.warm_ups(bare)) == []
-    monkeypatch.setattr(warm_ups, "MAX_CHARACTERS", 10)
-    assert json.loads(warm_ups.warm_ups(planned)) == []
+    assert json.loads(run_in_child.warm_ups(bare)) == []
+    monkeypatch.setattr(run_in_child, "MAX_CHARACTERS", 10)
+    assert json.loads(run_in_child.warm_ups(planned)) == []
 
 
 def test_what_fails_is_left_to_the_run():
     item = {"algo": "no_such", "env_id": "x", "hyperparams": {}, "modules": []}
-    warm_ups.take_steps(json.dumps([item, {}]))
+    run_in_child.take_steps(json.dumps([item, {}]))

@@ -11,8 +11,7 @@ import pytest
 from selenium import webdriver
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.results import RUN_COLUMNS, StudyResults
-from experiments.run_files import CURVE_COLUMNS
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report import films
 from tests.report.browsing import BROWSER, DRIVER, FLAGS

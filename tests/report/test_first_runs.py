@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.child_processes import TaskFailedError
-from experiments.run_files import difference
+from experiments.results import difference
 from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from report.page import learning, write_report
@@ -92,9 +92,9 @@ def test_runs_are_held_against_each_other_to_the_last_bit(analysis, monkeypatch)
     one, other = (run.run for run in analysis.results.finished if run.agent == "sarsa")
     assert difference(one, one) == ""
     assert difference(one, other) == "the agent"
-    monkeypatch.setattr("experiments.run_files._tensors", lambda run: {})
+    monkeypatch.setattr("experiments.results._tensors", lambda run: {})
     assert difference(one, other) == "the episodes"
-    monkeypatch.setattr("experiments.run_files.read_episodes", lambda run: EPISODES)
+    monkeypatch.setattr("experiments.results.read_episodes", lambda run: EPISODES)
     assert difference(one, other) == "the evaluations"
 
 

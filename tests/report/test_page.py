@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
 
-from experiments.looks import Look, LookLog, Looks, Question
+from experiments.looks import Look, Looks, Question
 from report.conclusions import conclusion, pairs_both_ways
 from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
@@ -174,7 +174,7 @@ def test_settings_command_versions_and_failures(page, report_study):
 def test_settings_have_the_looks_and_of_old_runs_no_machine(report_study, tmp_path, monkeypatch):
     question = Question("final", None, None, 5)
     look = Look("2026-11-22 10:00:00", question, {"a": 4, "b": 4}, {}, {}, 0.045, planned=False)
-    looks = LookLog({"Warehouse-v0": Looks((look,))})
+    looks = {"Warehouse-v0": Looks((look,))}
     monkeypatch.setattr(result_sections, "read_looks", lambda _: looks)
     infos = [{"versions": {"numpy": "2"}}]
     assert result_sections.recorded("machine", infos) == {}

@@ -18,8 +18,7 @@ import compare
 from agents import load_algorithm
 from envs.warehouse import WarehouseEnv
 from experiments.plan import plan
-from experiments.results import read_results
-from experiments.run_files import read_episodes
+from experiments.results import read_episodes, read_results
 from experiments.run_in_child import do_run
 from experiments.study import QuickSpec, read_study
 from mdp import value_iteration

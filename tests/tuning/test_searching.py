@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
 
-from experiments.results import RunResults
-from experiments.run_files import Curve
+from experiments.results import Curve, RunResults
 from pipeline import locks
 from pipeline.errors import UserError
 from tuning import searching
