@@ -49,6 +49,7 @@ FLOAT_SCHEDULE = name(UTILS, "FloatSchedule")
 RELU = name("torch.nn.modules.activation", "ReLU")
 FROM_BUFFER = name("numpy._core.numeric", "_frombuffer")
 FLOATS = name("numpy", "dtype") + text("f8") + b"\x89\x88\x87R"
+MEGABYTE = bytes(10**6 - 1)
 NAN = b"G\x7f\xf8" + bytes(6)
 SHORT_LAYERS, SHORT_TOP = shared_tuples(32)
 
@@ -64,7 +65,12 @@ def space(kind, **state):
     return name(f"gymnasium.spaces.{module}", cls) + b")\x81}(" + fields + b"ub"
 
 
-# Each is read by everything that reads pickles, see LOADERS.
+def with_state(maker, key, value):
+    """A new object whose state has one attribute."""
+    return START + maker + b")\x81}" + text(key) + value + b"sb."
+
+
+# Each is read by everything that reads pickles, see `loaders`.
 ATTACKS = {
     "a call of the system": START + name("os", "system") + text("true") + b"\x85R.",
     "the same in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
@@ -76,21 +82,12 @@ ATTACKS = {
     + CONSTANT
     + b"N}"
     + text("__call__")
-    + name("collections", "deque")
+    + DEQUE
     + b"s\x86b.",
     "the state of a class": START + CONSTANT + b"}" + text("x") + b"K\x01sb.",
     "an object that is called": START + CONSTANT + b")R)R.",
-    "an attribute that is no setting": START
-    + CONSTANT
-    + b")\x81}"
-    + text("__class__")
-    + b"K\x01sb.",
-    "a schedule that is a class": START
-    + FLOAT_SCHEDULE
-    + b")\x81}"
-    + text("value_schedule")
-    + RELU
-    + b"sb.",
+    "an attribute that is no setting": with_state(CONSTANT, "__class__", b"K\x01"),
+    "a schedule that is a class": with_state(FLOAT_SCHEDULE, "value_schedule", RELU),
     "a class that is called": START + RELU + b")R.",
     "lists in lists": START + b"]" * 5000 + b"a" * 4999 + b".",
     "a huge index of the memo": START + b"Nr\xff\xff\xff\x0f0h\x01.",
@@ -106,14 +103,7 @@ ATTACKS = {
     "a length that is not there": START + b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
     "an infinite schedule": pickle.dumps(ConstantSchedule(float("inf"))),
     "a schedule that is no number": pickle.dumps(ConstantSchedule(float("nan"))),
-    "a schedule of a huge number": START
-    + CONSTANT
-    + b")\x81}"
-    + text("val")
-    + b"\x8a\xff"
-    # a number of 255 bytes, set, and built
-    + b"\x7f" * 255
-    + b"sb.",
+    "a schedule of a huge number": with_state(CONSTANT, "val", b"\x8a\xff" + b"\x7f" * 255),
     # Calls of what calls return, and states of what is no new object.
     "a call of a call": START + DEQUE + b")R)R.",
     "a call of a call that is huge once it is written out": START
@@ -173,12 +163,8 @@ ATTACKS = {
     "a whole number of protocol 0": b"I" + b"9" * 10**6 + b"\n.",
     "a long number of protocol 0": b"L" + b"9" * 10**6 + b"L\n.",
     "a huge place of protocol 0": b"Np99999999999999\n.",
-    "a long number of a megabyte": START
-    + b"\x8b"
-    + struct.pack("<i", 10**6)
-    + bytes(10**6 - 1)
-    # and a byte that makes it as long as it says
-    + b"\x7f.",
+    # The last byte makes it as long as it says.
+    "a long number of a megabyte": START + b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f.",
     "a long number of -1 bytes": START + b"\x8b\xff\xff\xff\xff.",
     "protocol 255": b"\x80\xff.",
     "a frame without an end": START + b"\x95" + b"\xff" * 8 + b"N.",
@@ -632,7 +618,7 @@ BOMBS = {
     "many dictionaries": b"](" + b"}" * 4_000_000 + b"e.",
     "many marks": b"(" * 4_000_000 + b".",
     "many places of the memo": b"N" + b"\x94" * 4_000_000 + b".",
-    "many calls": name("collections", "deque") + b"\x940](" + b"h\x00)R" * 1_000_000 + b"e.",
+    "many calls": DEQUE + b"\x940](" + b"h\x00)R" * 1_000_000 + b"e.",
     "a wide text": b"X"
     + (16 * MB + 4).to_bytes(4, "little")
     + b"a" * 16 * MB
