@@ -7,7 +7,7 @@ Neither is advised before exact planning has shown that it can help.
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -162,11 +162,8 @@ def _shipped_steps(spec: TrainSpec) -> int:
 
 def _trained_on(spec: TrainSpec, evaluator: ExactEvaluator) -> tuple[TransitionModel, Any] | None:
     """The model of the training environment and what is observed in its states, or None."""
-    env = make_single_env(spec, training=True)
-    try:
+    with closing(make_single_env(spec, training=True)) as env:
         model, observations = transition_model(env), observations_of_states(env)
-    finally:
-        env.close()
     if model is None or observations is None or model.prob.size > MOST_OUTCOMES:
         return None
     return (model, observations) if model.prob.shape == evaluator.model.prob.shape else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -142,8 +143,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     """The exact evaluator of a run, or None where episodes have to be sampled."""
     if _is_wrapped_as_vector(spec):
         return None
-    env = make_single_env(spec)
-    try:
+    with closing(make_single_env(spec)) as env:
         model, horizon = transition_model(env), time_limit(env)
         if model is None or horizon is None:
             return None
@@ -157,8 +157,6 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
             return None
         masks = action_masks_of_states(env)
         success, layout = success_outcomes(env), grid_layout(env)
-    finally:
-        env.close()
     if layout is not None and layout.n_states != model.n_states:
         layout = None  # a grid world of somebody's own has states that are no cells
     yardstick = Yardstick(optimum, baseline=float(baseline_return(model, horizon)))
@@ -182,11 +180,8 @@ def model_refusal(spec: TrainSpec) -> str | None:
     """Why the model that the environment brings is not believed, in one line; None if it is."""
     if _is_wrapped_as_vector(spec):
         return None
-    env = make_single_env(spec)
-    try:
+    with closing(make_single_env(spec)) as env:
         check = model_check(env)
-    finally:
-        env.close()
     return None if check is None else check.refusal
 
 
@@ -196,9 +191,8 @@ def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> st
     The best policy under the discount, planned exactly on the training environment, is judged as
     agents are. No learner can be relied on to do better.
     """
-    env = make_single_env(spec, training=True)
-    model = transition_model(env)
-    env.close()
+    with closing(make_single_env(spec, training=True)) as env:
+        model = transition_model(env)
     if model is None or model.prob.shape != exact.model.prob.shape:
         return None
     if model.prob.size > MOST_OUTCOMES_PLANNED or not 0 <= discount < 1:

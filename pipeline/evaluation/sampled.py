@@ -8,7 +8,7 @@ played in it too.
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, cast
@@ -228,11 +228,8 @@ def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
     """
     if spec.hyperparams.vec_env_wrapper or not may_have_bracket(spec.env_id):
         return None
-    env = make_single_env(spec)
-    try:
+    with closing(make_single_env(spec)) as env:
         found = optimum_bracket(env)
-    finally:
-        env.close()
     if found is None:
         return None
     return Yardstick(found.upper, found.baseline, at_least=found.lower)
