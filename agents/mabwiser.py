@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self, Unpack
 
@@ -26,27 +25,17 @@ from agents.common.settings import (
     check_space,
     settings_of,
 )
-from mdp.array_types import Floats, Ints
+from mdp.array_types import Bools, Floats, Ints
 
-# MABWiser's bandits as policies: the library's traps walked round in one place.
+# MABWiser's bandits as policies.
 #
 # MABWiser 2.7.4 keeps its state in Python objects and refuses to predict before it has seen a
-# reward.
-# Here the state travels as one tensor, since a model file holds no pickle, and random numbers come
-# from a generator that is handed in.
+# reward. Here the state travels as one tensor, since a model file holds no pickle, and random
+# numbers come from a generator that is handed in.
 
 
 class MABWiserPolicy(TablePolicy):
-    """Holds a `mabwiser.mab.MAB` over arms numbered from 0.
-
-    Args:
-        observation_space: what arms are chosen in.
-        action_space: `Discrete`: the arms.
-        lr_schedule: not used; here because every policy is handed one.
-        learning_policy: one of `mabwiser.mab.LearningPolicy`.
-        statistics: names of the implementation's attributes that hold a number for each arm: sum
-            and count of the rewards, or what stands for them, first.
-    """
+    """Holds a `mabwiser.mab.MAB` over arms numbered from 0."""
 
     def __init__(
         self,
@@ -74,16 +63,10 @@ class MABWiserPolicy(TablePolicy):
         from mabwiser.mab import LearningPolicy
 
         name, settings = arguments["learning_policy"]
-        kinds = {
-            kind.__name__: kind
-            for kind in (
-                LearningPolicy.EpsilonGreedy,
-                LearningPolicy.LinUCB,
-                LearningPolicy.ThompsonSampling,
-                LearningPolicy.UCB1,
-            )
-        }
-        return cls(**{**arguments, "learning_policy": kinds[name](**settings)})
+        if name not in KINDS:
+            raise KeyError(name)
+        chosen = getattr(LearningPolicy, name)(**settings)
+        return cls(**{**arguments, "learning_policy": chosen})
 
     @property
     def is_contextual(self) -> bool:
@@ -141,11 +124,7 @@ class MABWiserPolicy(TablePolicy):
         return th.from_numpy(self.parts) if self.fitted else th.zeros(0, dtype=th.float64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        """Copy the state of another policy of the kind.
-
-        Raises:
-            ValueError: if it is of another number of arms.
-        """
+        """Copy the state of another policy of the kind."""
         if len(state) == 0:
             return
         if len(state) != len(self.mab.arms):
@@ -169,9 +148,10 @@ class MABWiserPolicy(TablePolicy):
         return np.zeros((1, *(self.observation_space.shape or ())))
 
 
-# MABWiser's bandits behind the interface of ours, to compare with (extra ``bandits``).
-
 SUMS = ("arm_to_sum", "arm_to_count", "arm_to_expectation")
+
+# The library's learning policies that agents take, and those of a model file.
+KINDS = ("EpsilonGreedy", "LinUCB", "ThompsonSampling", "UCB1")
 
 
 class MABWiserAgent(BanditAlgorithm):
@@ -186,6 +166,8 @@ class MABWiserAgent(BanditAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MABWiserPolicy": MABWiserPolicy}
     policy: MABWiserPolicy
+    goes_by_masks = False
+    kind: ClassVar[str]  # one of `KINDS`
     statistics: ClassVar[tuple[str, ...]] = SUMS
 
     def __init__(
@@ -197,9 +179,9 @@ class MABWiserAgent(BanditAlgorithm):
     ) -> None:
         super().__init__(policy, env, tie_breaking=tie_breaking, **kwargs)
 
-    @abstractmethod
-    def _learning_policy(self) -> Any:
-        """The library's learning policy."""
+    def _library_settings(self) -> dict[str, float]:
+        """What the library's learning policy is made with."""
+        return {}
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -211,11 +193,13 @@ class MABWiserAgent(BanditAlgorithm):
         check_space(self, "observations", self.observation_space)
 
     def _make_policy(self) -> MABWiserPolicy:
+        from mabwiser.mab import LearningPolicy
+
         policy: Any = self.policy_class
         made: MABWiserPolicy = policy(
             self.observation_space,
             self.action_space,
-            learning_policy=self._learning_policy(),
+            learning_policy=getattr(LearningPolicy, self.kind)(**self._library_settings()),
             statistics=self.statistics,
         )
         return made
@@ -227,7 +211,9 @@ class MABWiserAgent(BanditAlgorithm):
         """An arm to pull before the library is asked, which it cannot be without a reward."""
         return None if self.policy.fitted else 0
 
-    def _choose(self, contexts: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
+    def _choose(
+        self, contexts: Floats, rng: np.random.Generator, masks: Bools | None = None
+    ) -> tuple[Ints, Floats]:
         first = self._first_pull()
         arms = [self.policy.choose(c, rng) if first is None else first for c in contexts]
         return np.array(arms, dtype=np.int64), np.ones(len(arms))
@@ -246,6 +232,8 @@ class MABWiserEpsilonGreedy(MABWiserAgent):
         kwargs: as in `MABWiserAgent`.
     """
 
+    kind = "EpsilonGreedy"
+
     def __init__(
         self,
         policy: str | type[BasePolicy] = "MABWiserPolicy",
@@ -260,10 +248,8 @@ class MABWiserEpsilonGreedy(MABWiserAgent):
         super()._check_arguments()
         check_share(settings_of(self, "exploration_initial_eps"))
 
-    def _learning_policy(self) -> Any:
-        from mabwiser.mab import LearningPolicy
-
-        return LearningPolicy.EpsilonGreedy(self.exploration_initial_eps)
+    def _library_settings(self) -> dict[str, float]:
+        return {"epsilon": self.exploration_initial_eps}
 
 
 class MABWiserUCB1(MABWiserAgent):
@@ -276,6 +262,7 @@ class MABWiserUCB1(MABWiserAgent):
         kwargs: as in `MABWiserAgent`.
     """
 
+    kind = "UCB1"
     statistics = (*SUMS, "arm_to_mean")
 
     def __init__(
@@ -292,10 +279,8 @@ class MABWiserUCB1(MABWiserAgent):
         super()._check_arguments()
         check_at_least(0, settings_of(self, "c"))
 
-    def _learning_policy(self) -> Any:
-        from mabwiser.mab import LearningPolicy
-
-        return LearningPolicy.UCB1(self.c)
+    def _library_settings(self) -> dict[str, float]:
+        return {"alpha": self.c}
 
     def _first_pull(self) -> int | None:
         """An arm not tried yet: the library would take its reward for 0 and leave it."""
@@ -309,17 +294,13 @@ class MABWiserThompson(MABWiserAgent):
     Takes the arguments of `MABWiserAgent`.
     """
 
+    kind = "ThompsonSampling"
     statistics = ("arm_to_success_count", "arm_to_fail_count")
 
     @property
     def rewards_known(self) -> str:
         """Others would make its Beta distributions wrong without a word."""
         return algorithm.BINARY
-
-    def _learning_policy(self) -> Any:
-        from mabwiser.mab import LearningPolicy
-
-        return LearningPolicy.ThompsonSampling()
 
 
 class MABWiserLinUCB(MABWiserAgent):
@@ -333,6 +314,8 @@ class MABWiserLinUCB(MABWiserAgent):
         alpha: how many standard deviations the bound lies above the predicted reward.
         kwargs: as in `MABWiserAgent`.
     """
+
+    kind = "LinUCB"
 
     def __init__(
         self,
@@ -353,7 +336,5 @@ class MABWiserLinUCB(MABWiserAgent):
         if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
             super()._check_observations()
 
-    def _learning_policy(self) -> Any:
-        from mabwiser.mab import LearningPolicy
-
-        return LearningPolicy.LinUCB(self.alpha, l2_lambda=1.0)
+    def _library_settings(self) -> dict[str, float]:
+        return {"alpha": self.alpha, "l2_lambda": 1.0}

@@ -60,7 +60,7 @@ logger = logging.getLogger("machine_code")
 Stamps = tuple[tuple[str, int, int], ...]
 
 
-# --- what machine code is keyed by ---------------------------------------------------------------
+# What machine code is keyed by.
 
 
 def source_stamps(package: str) -> Stamps:
@@ -123,7 +123,7 @@ def modules_of(kind: Any) -> Iterator[str]:
             yield from modules_of(part)
 
 
-# --- folders -------------------------------------------------------------------------------------
+# Folders.
 
 
 def parents(package: str) -> Iterator[Path]:
@@ -169,12 +169,7 @@ class NotOwnError(OSError):
 def own_folder(path: Path) -> Path:
     """A folder, made where it is missing, whose files only the user and root can have written.
 
-    Returns:
-        The folder, without the links on the way to it.
-
-    Raises:
-        NotOwnError: if another user could write in it, or replace a folder on the way to it.
-        OSError: if it cannot be made.
+    Returned without the links on the way to it; else a `NotOwnError` or another `OSError`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.mkdir(mode=0o700, exist_ok=True)
@@ -218,7 +213,7 @@ def is_compiled_before(name: str) -> bool:
     return any(any(kept_in.glob(f"*/*.{name}-*.nbi")) for kept_in in folders)
 
 
-# --- Numba's cache, told where and when ----------------------------------------------------------
+# Numba's cache, told where and when.
 
 
 class Locator(_CacheLocator):

@@ -107,7 +107,7 @@ def _decorated(function: Function, options: dict[str, Any]) -> Function:
     return cast(Function, dispatcher)
 
 
-# --- the time that compiling takes ---------------------------------------------------------------
+# The time that compiling takes.
 
 
 class _CompileTimer(event.Listener):
@@ -140,7 +140,7 @@ def compile_timer() -> Iterator[Callable[[], WorkTime]]:
         yield lambda: timer.spent
 
 
-# --- functions that are parts of others ----------------------------------------------------------
+# Functions that are parts of others.
 
 # What unpacks the arrays of a call from Python takes longer to compile than a loop.
 WITHOUT_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}

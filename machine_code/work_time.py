@@ -8,15 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class WorkTime:
-    """A duration.
+    """A duration."""
 
-    Attributes:
-        seconds: by the clock.
-        cpu_seconds: that the processor spent on this process, all threads together, its children
-            left out; on a busy machine less than ``seconds``, with several threads maybe more.
-    """
-
-    seconds: float = 0.0
+    seconds: float = 0.0  # by the clock
+    # That the processor spent on this process, all threads together, its children left out; on a
+    # busy machine less than ``seconds``, with several threads maybe more.
     cpu_seconds: float = 0.0
 
     @classmethod

@@ -42,13 +42,7 @@ class PolicyReturn:
 
 
 def over_starts(initial: Floats, moments: Floats, *, with_success: bool) -> PolicyReturn:
-    """Average over the starting states; their differences add to the variances.
-
-    Args:
-        initial: probabilities of the starting states, shape (n,).
-        moments: as `moments_under_limit` gives them, shape (n, 5).
-        with_success: whether success was defined.
-    """
+    """Average over the starting states; their differences add to the variances."""
     start = initial > 0
     chance, moments = initial[start], moments[start]
     mean = chance @ moments
@@ -305,8 +299,7 @@ def _returns_under_limit(
     return later
 
 
-# --- the forms of a policy -----------------------------------------------------------------------
-
+# The forms of a policy.
 
 Policy = NDArray[np.floating] | AnyInts
 
@@ -365,8 +358,7 @@ def actions_used(model: TransitionModel, policy: Policy) -> Bools:
     return used
 
 
-# --- under a time limit --------------------------------------------------------------------------
-
+# Under a time limit.
 
 # Visited states times steps; beyond, going backwards takes longer than tenths of a second.
 MOST_BACKWARDS = 2_000_000
@@ -374,41 +366,27 @@ MOST_BACKWARDS = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class LimitedEpisodes:
-    """The episodes of a policy under a time limit.
+    """The episodes of a policy under a time limit."""
 
-    Attributes:
-        model: the decision process.
-        policy: as `canonical_policy` gives it.
-        horizon: the time limit in steps.
-    """
-
-    model: TransitionModel
-    policy: Policy
-    horizon: int
+    model: TransitionModel  # the decision process
+    policy: Policy  # as `canonical_policy` gives it
+    horizon: int  # the time limit in steps
 
     def result(
         self, discount: float, ends_well: Bools, *, with_success: bool, floor: float = -np.inf
     ) -> PolicyReturn:
         """Mean and variance of one episode.
 
-        Args:
-            discount: from 0 to 1.
-            ends_well: the outcomes that count as success, bool of shape (S, A, K).
-            with_success: whether success was defined.
-            floor: a mean return that surely is below this may be told as minus infinity; only
-                without discount.
+        A mean return that surely is below ``floor`` may be told as minus infinity; only without
+        discount.
         """
         states = self._visited()
         moments = self.along_ways(states, discount, ends_well)
         if moments is None and self._is_large(states):
-            mean, variance, length, spread, rate = self._forwards(discount, ends_well, floor)
-            return PolicyReturn(
-                float(mean),
-                float(variance),
-                float(length),
-                float(spread),
-                float(rate) if with_success else None,
-            )
+            mean, variance, length, spread, rate = self._forwards(
+                discount, ends_well, floor
+            ).tolist()
+            return PolicyReturn(mean, variance, length, spread, rate if with_success else None)
         if moments is None:
             rows = (*self._rows(states), self.model.reward[states], ends_well[states])
             chances = chances_in(self.model, self.policy, states)
@@ -452,13 +430,7 @@ class LimitedEpisodes:
     def along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
         """The moments where each of the states has one outcome; None where one has more.
 
-        Args:
-            states: those that count, of which none may lead to any other; n of them.
-            discount: from 0 to 1.
-            ends_well: the outcomes that count as success, bool of shape (S, A, K).
-
-        Returns:
-            Shape (n, 5), as `moments_under_limit`.
+        The states, n of them, must not lead to any other; shape (n, 5) as `moments_under_limit`.
         """
         if not self._is_stationary():
             return None
@@ -479,16 +451,15 @@ class LimitedEpisodes:
     def _forwards(self, discount: float, ends_well: Bools, floor: float) -> Floats:
         """The moments (5,) of an episode from the distribution of the starting states."""
         model = self.model
-        if np.issubdtype(self.policy.dtype, np.integer):
-            chances = np.zeros((model.n_states, model.n_actions))
-            chances[np.arange(model.n_states), np.clip(self.policy[0], 0, model.n_actions - 1)] = 1
-        else:
-            chances = np.asarray(self.policy, np.float64)
+        is_actions = np.issubdtype(self.policy.dtype, np.integer)
+        chances = actions_used(model, self.policy) if is_actions else self.policy
         rows = model.prob, model.next_state, model.terminated, model.reward, ends_well
-        return moments_by_spreading(rows, chances, model.initial, self.horizon, discount, floor)
+        return moments_by_spreading(
+            rows, chances.astype(np.float64), model.initial, self.horizon, discount, floor
+        )
 
 
-# --- compiled ------------------------------------------------------------------------------------
+# Compiled.
 
 
 @compiled

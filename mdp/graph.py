@@ -20,11 +20,7 @@ from mdp.transition_model import TransitionModel
 
 
 def reachable_states(model: TransitionModel, allowed: Bools) -> Bools:
-    """The states that are visited, with positive probability, by allowed actions.
-
-    Returns:
-        bool of shape (S,): starting states, and whatever non-terminating transitions reach.
-    """
+    """The states that are visited, with positive probability, by allowed actions."""
     start = model.initial > 0
     return reached_from(start, model.prob, model.next_state, model.terminated, allowed)
 
@@ -142,34 +138,23 @@ def _search_backwards(
     return found
 
 
-# --- the chain of a policy -----------------------------------------------------------------------
-
+# The chain of a policy.
 
 LARGEST_DENSE = 300
 
 
 @dataclass(frozen=True, eq=False)
 class PolicyChain:
-    """The outcomes that happen under a stationary policy, one entry each.
+    """The outcomes that happen under a stationary policy, one entry each."""
 
-    Attributes:
-        model: the decision process.
-        used: the actions that the policy takes, bool of shape (S, A).
-        states: the states of the chain, shape (n,); rows and following states below are places
-            in this array.
-        row: where each outcome happens, shape (m,).
-        weight: its probability under the policy, shape (m,).
-        following: where it leads, shape (m,); of no meaning where it ends the episode.
-        outcome: its flat index into the arrays of the model, shape (m,).
-    """
-
-    model: TransitionModel
-    used: Bools
+    model: TransitionModel  # the decision process
+    used: Bools  # the actions that the policy takes, bool of shape (S, A)
+    # The states of the chain, shape (n,); rows and following states below are places in this array.
     states: Ints
-    row: Ints
-    weight: Floats
-    following: Ints
-    outcome: Ints
+    row: Ints  # where each outcome happens, shape (m,)
+    weight: Floats  # its probability under the policy, shape (m,)
+    following: Ints  # where it leads, shape (m,); of no meaning where it ends the episode
+    outcome: Ints  # its flat index into the arrays of the model, shape (m,)
 
     @classmethod
     def build(

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.planning import value_iteration
 from mdp.transition_model import TransitionModel
 
-# --- a limit that is far away --------------------------------------------------------------------
+# A limit that is far away.
 
 # Backwards from a limit of T steps, planning takes T sweeps over all states. Where every step costs
 # something, the optimum without the limit is nearly always the same number to the last digits; here
@@ -43,21 +42,6 @@ from mdp.transition_model import TransitionModel
 
 # The limit may change the optimum by this, relative to it where it is above 1.
 TOLERANCE = 1e-9
-
-
-@dataclass(frozen=True)
-class Drift:
-    """How values change on the way, over all states and actions that can be met.
-
-    Attributes:
-        step_cost: no step that goes on earns more than minus this.
-        fall: the largest fall of the value below its mean in one step.
-        variance: the largest variance of the value after a step.
-    """
-
-    step_cost: float
-    fall: float
-    variance: float
 
 
 def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None:
@@ -84,25 +68,27 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
         return None
     lowest_start = float(plan.values[model.initial > 0].min())
     highest, lowest = max(float(values.max()), 0.0), min(float(values.min()), 0.0)
-    drift = Drift(*_drift(*_arrays(model), reached, plan.values))
+    rows = model.prob, model.next_state, model.terminated, model.reward
+    step_cost, fall, variance = _drift(*rows, reached, plan.values)
     slack = 4 * plan.error_bound  # of differences of values, each known to within the bound
-    overdue = horizon * drift.step_cost - (highest - lowest_start) - slack
-    chance = _chance_of_losing(overdue + lowest - slack, drift, slack, horizon)
+    overdue = horizon * step_cost - (highest - lowest_start) - slack
+    fall, deviation = fall + slack, math.sqrt(variance) + slack
+    chance = 1.0
+    if step_cost > 0:
+        chance = _chance_of_losing(overdue + lowest - slack, fall, deviation**2, horizon)
     error = plan.error_bound + max(-lowest, highest) * chance
     return plan.start_value if error <= TOLERANCE * max(1.0, abs(plan.start_value)) else None
 
 
-def _chance_of_losing(loss: float, drift: Drift, slack: float, horizon: int) -> float:
-    """A bound on the probability that chance alone takes so much."""
-    if loss <= 0 or drift.step_cost <= 0:
+def _chance_of_losing(loss: float, fall: float, variance: float, horizon: int) -> float:
+    """A bound on the probability that chance alone takes so much in so many steps.
+
+    A step changes the value by this variance at most, and lets it fall below its mean by ``fall``.
+    """
+    if loss <= 0:
         return 1.0
-    fall, variance = drift.fall + slack, (math.sqrt(drift.variance) + slack) ** 2
     scale = 2 * horizon * variance + 2 * fall * loss / 3
     return math.exp(-(loss**2) / scale) if scale > 0 else 0.0
-
-
-def _arrays(model: TransitionModel) -> tuple[Floats, AnyInts, Bools, Floats]:
-    return model.prob, model.next_state, model.terminated, model.reward
 
 
 @compiled
@@ -114,9 +100,11 @@ def _drift(
     reached: Bools,
     values: Floats,
 ) -> tuple[float, float, float]:
-    """The attributes of `Drift`.
+    """How values change on the way, over all states and actions that can be met.
 
-    An end counts as if the episode went on where a step at the least cost would be worth as much.
+    The least cost of a step that goes on, the largest fall of the value below its mean in a step,
+    and the largest variance of the value after one. An end counts as if the episode went on where a
+    step at the least cost would be worth as much.
     """
     step_cost = np.inf
     for state in range(prob.shape[0]):
@@ -144,21 +132,13 @@ def _drift(
     return step_cost, fall, variance
 
 
-# --- spreading -----------------------------------------------------------------------------------
-
+# Spreading.
 
 Rows = tuple[Floats, AnyInts, Bools, Floats, Bools]
 
-# No more than this share of the episodes may be left out, since they are so rare.
+# No more than this share of the episodes may be left out, since they are so rare: if all of the
+# least likely states were, at all steps.
 SHARE_LEFT_OUT = 1e-15
-
-
-def least_probability(n_states: int, horizon: int) -> float:
-    """States that are less likely at a step than this may be left out.
-
-    If all of them were, at all steps, `SHARE_LEFT_OUT` would be missing.
-    """
-    return SHARE_LEFT_OUT / (n_states * horizon)
 
 
 def moments_by_spreading(
@@ -195,7 +175,7 @@ def moments_by_spreading(
     starts = np.flatnonzero(initial)
     here[: len(starts)] = starts
     over = np.zeros((3, 3))
-    least = least_probability(n_states, horizon)
+    least = SHARE_LEFT_OUT / (n_states * horizon)  # of a state at a step
     limits = _best_rewards(rows[0], rows[2], rows[3])
     groups = now, later, here, there
     if not _follow(
@@ -221,19 +201,11 @@ def _follow(
 ) -> bool:
     """Follow the episodes from step to step; False where their mean return is below the floor.
 
-    Args:
-        rows: as in `moments_by_spreading`, and so are all that are not named here.
-        policy: likewise.
-        groups: what is in each state now and one step later, both (S, 3); and the states of which
-            that is true, both (S,), in any order.
-        n_here: how many states there are at the beginning.
-        over: returns and lengths of the episodes that are over, (3, 3): a group of returns, one of
-            lengths, and the probability of success.
-        horizon: likewise.
-        discount: likewise.
-        least: states that are less likely are left out.
-        limits: the highest rewards of an end and of another step.
-        floor: likewise.
+    ``groups`` are what is in each state now and one step later, both (S, 3), and the states of
+    which that is true, both (S,), in any order, ``n_here`` of them at the beginning. ``over``, of
+    shape (3, 3), is of the episodes that are over: a group of returns, one of lengths, and the
+    probability of success. States that are less likely than ``least`` are left out. ``limits`` are
+    the highest rewards of an end and of another step.
     """
     now, later, here, there = groups
     factor = 1.0
@@ -337,8 +309,7 @@ def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[floa
     return best_end, best_step
 
 
-# --- ways ----------------------------------------------------------------------------------------
-
+# Ways.
 
 # What some number of steps from each state comes to, each of shape (n + 1,); the last entry stands
 # for the end. The (discounted) sum of rewards, the number of steps until then or the end, whether
@@ -354,19 +325,7 @@ def moments_along_ways(
     horizon: int,
     discount: float,
 ) -> Floats:
-    """As `mdp.evaluation.moments_under_limit`, where each state has one outcome.
-
-    Args:
-        next_state: where it leads, counting in these n states, shape (n,).
-        terminated: whether it ends the episode, shape (n,).
-        reward: what it earns, shape (n,).
-        success: whether that is a good end, shape (n,).
-        horizon: the time limit in steps.
-        discount: from 0 to 1.
-
-    Returns:
-        Shape (n, 5), the variances zero.
-    """
+    """As `mdp.evaluation.moments_under_limit`, where each state has one outcome."""
     moments = np.zeros((len(reward), 5))
     total = _walked(next_state.astype(np.int64), terminated, reward, success, horizon, discount)
     for place, part in zip((0, 2, 4), total[:3], strict=True):

@@ -198,23 +198,16 @@ def _greedy(problem: PlanningProblem, action_values: Floats, tie: float, rests: 
     margin = np.maximum(TIE_TOLERANCE * np.maximum(1.0, np.abs(best)), tie)
     tied = part.allowed & (action_values >= (best - margin)[:, None])
     if not part.resting.any():
-        return _first(tied)
+        return np.asarray(tied.argmax(axis=1))
     # Going round at no cost ties with going on: only an action that may lead nearer counts.
     steps, _ = steps_to_end(model, tied, rests)
     nearer = model.terminated | (steps[model.next_state] < steps[:, None, None])
     goes_on = tied & ((model.prob > 0) & nearer).any(axis=2)
     chosen = np.where(rests[:, None], part.rest_actions, goes_on)
-    return _first(chosen)
+    return np.asarray(chosen.argmax(axis=1))
 
 
-def _first(mask: Bools) -> Ints:
-    """The first true column of each row."""
-    first: Ints = mask.argmax(axis=1)
-    return first
-
-
-# --- without discount: the part with a finite optimum --------------------------------------------
-
+# Without discount: the part with a finite optimum.
 
 # Expected rewards are sums of products; closer to zero than this they are zero up to rounding.
 ROUNDING = 1e-12
@@ -222,22 +215,16 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class FinitePart:
-    """Where the undiscounted optimum is finite.
+    """Where the undiscounted optimum is finite."""
 
-    Attributes:
-        states: the reachable states whose optimum is finite, bool of shape (S,); from all other
-            reachable states it is minus infinity.
-        allowed: the actions of those states that lead to no others, bool of shape (S, A).
-        resting: the states in which an agent can stay for ever at no cost, bool of shape (S,).
-        rest_actions: the actions that do so, bool of shape (S, A).
-        step_cost: no step that cannot end the episode earns more than minus this; zero where
-            some such step costs nothing.
-    """
-
+    # The reachable states whose optimum is finite, bool of shape (S,); from all other reachable
+    # states it is minus infinity.
     states: Bools
-    allowed: Bools
-    resting: Bools
-    rest_actions: Bools
+    allowed: Bools  # the actions of those states that lead to no others, bool of shape (S, A)
+    resting: Bools  # the states in which an agent can stay for ever at no cost, bool of shape (S,)
+    rest_actions: Bools  # the actions that do so, bool of shape (S, A)
+    # No step that cannot end the episode earns more than minus this; zero where some such step
+    # costs nothing.
     step_cost: float
 
     @classmethod
@@ -249,17 +236,7 @@ class FinitePart:
 
 
 def finite_part(model: TransitionModel, mask: Bools | None = None) -> FinitePart:
-    """Find where the undiscounted optimum is finite.
-
-    Args:
-        model: the decision process.
-        mask: the actions that may be taken, bool of shape (S, A), or None for all.
-
-    Raises:
-        ValueError: if the mask is malformed, or the optimum infinite, because an agent can earn
-            for ever, or minus infinity from a starting state, because from there no policy surely
-            ends the episode.
-    """
+    """Find where the undiscounted optimum is finite."""
     allowed = allowed_actions(model, mask)
     ends = (model.terminated & (model.prob > 0)).any(axis=2)
     endless = allowed & ~ends
@@ -299,11 +276,7 @@ def _surely_ending(model: TransitionModel, allowed: Bools, resting: Bools) -> tu
 
 
 def _rest_actions(model: TransitionModel, endless: Bools) -> Bools:
-    """The actions by which an agent can stay for ever at no cost, bool of shape (S, A).
-
-    Raises:
-        ValueError: if an agent can earn for ever.
-    """
+    """The actions by which an agent can stay for ever at no cost, bool of shape (S, A)."""
     component, staying = end_components(model, endless)
     reward = model.expected_reward
     scale = ROUNDING * max(1.0, float(np.abs(reward[endless]).max()))
@@ -344,8 +317,7 @@ def _largest_gain(model: TransitionModel, inside: Bools) -> float:
     return float(-flow.fun)
 
 
-# --- where to plan, from where, how exactly ------------------------------------------------------
-
+# Where to plan, from where, how exactly.
 
 EPSILON = float(np.finfo(np.float64).eps)
 # Where less of the probability than this is settled, relaxing by its inverse overshoots.
@@ -370,17 +342,7 @@ class PlanningProblem:
     def of(
         cls, model: TransitionModel, discount: float, mask: Bools | None = None
     ) -> PlanningProblem:
-        """Check the discount, and that the optimum is finite.
-
-        Args:
-            model: the decision process.
-            discount: from 0 to 1.
-            mask: the actions that may be taken, bool of shape (S, A), or None for all.
-
-        Raises:
-            ValueError: if the discount is not in [0, 1], the mask malformed, or the undiscounted
-                optimum not finite.
-        """
+        """Check the discount, and that the optimum is finite."""
         if not 0 <= discount <= 1:
             raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
         part = finite_part(model, mask) if discount == 1 else FinitePart.everything(model, mask)
@@ -423,15 +385,8 @@ class PlanningProblem:
     ) -> float:
         """Improve the values of a policy, in place, by some sweeps over the states of ``order``.
 
-        Args:
-            reward: mean rewards, shape (S, A).
-            policy: actions, shape (S,).
-            order: the states to sweep; all others count as ends.
-            values: shape (S,).
-            enough: the change of values at which to stop.
-
-        Returns:
-            The largest change of the last sweep.
+        All others count as ends. Stops once values change by no more than ``enough``; returns the
+        largest change of the last sweep.
         """
         model = self.model
         arrays = (model.prob, model.next_state, model.terminated, reward)
@@ -453,11 +408,6 @@ class PlanningProblem:
 
         The linear system is solved by BiCGSTAB (van der Vorst, 1992), with a sweep as
         preconditioner, to a hundredth of what was missing. Needs a discount below one.
-
-        Args:
-            policy: actions, shape (S,).
-            order: the states, all of those to plan for.
-            values: shape (S,); as they were where the solution is not nearer.
         """
         from scipy.sparse.linalg import LinearOperator, bicgstab
 
@@ -532,8 +482,7 @@ class PlanningProblem:
         return np.inf
 
 
-# --- sweeps over the states ----------------------------------------------------------------------
-
+# Sweeps over the states.
 
 # All arrays are those of `TransitionModel`; ``mean_reward`` and ``allowed`` have shape (S, A),
 # ``values`` and ``floor`` shape (S,). ``order`` lists the states to sweep, nearest to the end of
@@ -687,14 +636,11 @@ def evaluate(
     settled: Floats,
     values: Floats,
 ) -> float:
-    """One sweep of the Bellman operator of a policy over its rows, in place.
+    """One sweep of the Bellman operator of a policy over its rows, in place; the largest change.
 
     Each change is divided by ``settled``: as if the states further on, whose turn comes later,
     were to change by as much. Chance that leads back holds values to where they were; this lets
     go of them (successive over-relaxation, with its factor chosen state by state).
-
-    Returns:
-        The largest change.
     """
     largest = 0.0
     for place in range(len(reward)):

@@ -14,19 +14,7 @@ from mdp.array_types import AnyInts, Bools, Floats
 def reached_from(
     start: Bools, prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools
 ) -> Bools:
-    """The states that are visited from some of ``start`` on, by allowed actions.
-
-    Args:
-        start: where an episode may begin, bool of shape (S,).
-        prob: probabilities of the outcomes, shape (S, A, K).
-        next_state: where they lead, shape (S, A, K).
-        terminated: whether they end the episode, shape (S, A, K).
-        allowed: the actions that count, bool of shape (S, A).
-
-    Returns:
-        bool of shape (S,): ``start``, and whatever non-terminating transitions of positive
-        probability lead to.
-    """
+    """The states that are visited from some of ``start`` on, by allowed actions."""
     found = start.copy()
     # However they lie in memory, it is compiled once.
     allowed = np.ascontiguousarray(allowed)

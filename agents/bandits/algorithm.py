@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, NamedTuple, Protocol, Unpack, cast
+from typing import Any, ClassVar, NamedTuple, Protocol, Unpack, cast
 
 import numpy as np
 import torch as th
@@ -14,6 +14,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.bandits.choosing import (
+    act_in_context,
+    allowed_room,
+    choose_allowed_arms,
+    choose_arms,
+    learn_from_feedback,
+    no_probability,
+)
 from agents.common.algorithm import Transitions
 from agents.common.masks import MaskBufferPolicy, check_masks_exist, checked_masks, present_masks
 from agents.common.settings import LearningArguments, check_space
@@ -32,14 +40,7 @@ class ArmPolicy(MaskBufferPolicy):
         """What each arm is judged by at each of n observations, shape (n, arms)."""
 
     def kept_masks(self, observations: Ints) -> Bools:
-        """What was allowed last at observations of shape (n,), everything where none was met.
-
-        Returns:
-            Masks, bool of shape (n, arms).
-
-        Raises:
-            ValueError: if an observation has no row.
-        """
+        """What was allowed last at observations of shape (n,), everything where none was met."""
         outside = observations[(observations < 0) | (observations >= len(self.masks))]
         if outside.size:
             raise ValueError(f"context {outside[0]} is not in Discrete({len(self.masks)})")
@@ -94,22 +95,14 @@ def reward_misfit(agent: Choosy, reward: float) -> str:
 
 
 def check_reward(agent: Choosy, reward: float) -> None:
-    """Refuse a reward that the agent cannot learn from.
-
-    Raises:
-        ValueError: saying which it can learn from.
-    """
+    """Refuse a reward that the agent cannot learn from."""
     misfit = reward_misfit(agent, reward)
     if misfit:
         raise ValueError(f"{misfit}, not {reward:g}")
 
 
 def check_kinds(agent: Choosy, env: VecEnv) -> None:
-    """Refuse, before the first pull, environments that are known to give other rewards.
-
-    Raises:
-        ValueError: saying which rewards the agent can learn from.
-    """
+    """Refuse, before the first pull, environments that are known to give other rewards."""
     if agent.rewards_known == ANY or not env.has_attr("kind"):
         return
     if set(env.get_attr("kind")) & set(UNBOUNDED_KINDS):
@@ -128,20 +121,13 @@ class BanditArguments(LearningArguments, total=False):
 
 
 class Pull(NamedTuple):
-    """A pull and its reward, kept until the feedback is due.
+    """A pull and its reward, kept until the feedback is due."""
 
-    Attributes:
-        context: what the arm was chosen in: a row of the tables, or a list of features.
-        arm: what was pulled.
-        reward: what it gave.
-        probability: how likely the choice was, for the rules that need to know; else 1.
-        mask: the arms that were allowed, a bool for each; None for agents that do not go by masks.
-    """
-
-    context: Any
-    arm: int
-    reward: float
-    probability: float
+    context: Any  # what the arm was chosen in: a row of the tables, or a list of features
+    arm: int  # what was pulled
+    reward: float  # what it gave
+    probability: float  # how likely the choice was, for the rules that need to know; else 1
+    # The arms that were allowed, a bool for each; None for agents that do not go by masks.
     mask: list[bool] | None = None
 
 
@@ -167,6 +153,8 @@ class BanditAlgorithm(LearningAlgorithm):
             malformed or allows nothing.
     """
 
+    goes_by_masks: ClassVar[bool] = True
+
     _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
 
     def __init__(
@@ -191,7 +179,7 @@ class BanditAlgorithm(LearningAlgorithm):
 
     def _check_masks(self) -> None:
         """Refuse masks that the environment does not tell, or the agent does not go by."""
-        if _owner(type(self), "_choose") is not _owner(type(self), "_choose_allowed"):
+        if not self.goes_by_masks:
             raise ValueError(f"mask_actions: {type(self).__name__} chooses among all arms")
         if self.env is not None:
             check_masks_exist(self.env)
@@ -220,15 +208,13 @@ class BanditAlgorithm(LearningAlgorithm):
         """What arms are chosen in, one for each of the observations, shape (n, ...)."""
 
     @abstractmethod
-    def _choose(self, contexts: Any, rng: np.random.Generator) -> tuple[Ints, Floats]:
-        """An arm for each context and how likely it was, shapes (n,)."""
-
-    def _choose_allowed(
-        self, contexts: Any, masks: Bools, rng: np.random.Generator
+    def _choose(
+        self, contexts: Any, rng: np.random.Generator, masks: Bools | None = None
     ) -> tuple[Ints, Floats]:
-        """As `_choose`, among the arms in ``masks``, of shape (n, arms)."""
-        # Never asked: with masks, a class that does not say this is refused when it is made.
-        raise NotImplementedError
+        """An arm for each context and how likely it was, shapes (n,).
+
+        Masks, of shape (n, arms), say among which; they come only where the class goes by masks.
+        """
 
     @abstractmethod
     def _learn(self, pull: Pull) -> None:
@@ -254,7 +240,7 @@ class BanditAlgorithm(LearningAlgorithm):
             return actions
         assert self.env is not None
         self._masks = present_masks(self.env, obs)
-        actions, self._probabilities = self._choose_allowed(contexts, self._masks, self.rng)
+        actions, self._probabilities = self._choose(contexts, self.rng, self._masks)
         if len(self._policy_masks):
             self._policy_masks[obs] = self._masks
         return actions
@@ -315,7 +301,7 @@ class BanditAlgorithm(LearningAlgorithm):
             if deterministic:
                 actions = cast(ArmPolicy, self.policy).best_arms(obs, masks)
             else:
-                actions, _ = self._choose_allowed(contexts, masks, self.predict_rng)
+                actions, _ = self._choose(contexts, self.predict_rng, masks)
         shape = obs.shape[: obs.ndim - len(self.observation_space.shape or ())]
         return actions.reshape(shape), state
 
@@ -338,6 +324,32 @@ class BanditAlgorithm(LearningAlgorithm):
             self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
 
-def _owner(cls: type, name: str) -> type:
-    """The class that an attribute of ``cls`` stands in."""
-    return next(base for base in cls.__mro__ if name in vars(base))
+class RuleBandit(BanditAlgorithm):
+    """Chooses and learns by compiled rules.
+
+    `choose_arm`, `context_row`, `learn_from_reward` and `among_allowed` are each family's own.
+    """
+
+    act = act_in_context
+    learn_from_step = learn_from_feedback
+    choice_probability = no_probability
+
+    @abstractmethod
+    def _rows(self, agent: Any, contexts: Any) -> tuple[Ints, int]:
+        """In which rows the agent looks up these contexts, shape (n,), and how many there are."""
+
+    def _choose(
+        self, contexts: Any, rng: np.random.Generator, masks: Bools | None = None
+    ) -> tuple[Ints, Floats]:
+        n = len(contexts)
+        arms, probabilities = np.empty(n, dtype=np.int64), np.empty(n)
+        agent = self._workspace_for(rng, n)
+        rows, n_rows = self._rows(agent, contexts)
+        arguments = agent, rows, n_rows, self.progress()[0], arms, probabilities
+        if masks is None:
+            outside = choose_arms(*arguments)
+        else:
+            outside = choose_allowed_arms(*arguments, masks, allowed_room(self.n_arms))
+        if outside >= 0:
+            raise ValueError(f"context {rows[outside]} is not in Discrete({n_rows})")
+        return arms, probabilities

@@ -44,17 +44,11 @@ def masked_sum(tables: Any) -> float:
 
 
 class ScoreTables(NamedTuple):
-    """What an agent knows; each of shape (contexts, arms).
+    """What an agent knows; each of shape (contexts, arms)."""
 
-    Attributes:
-        scores: what it judges arms by: a value, a posterior mean, a preference, a log-weight.
-        sums: sum of the rewards.
-        counts: number of the rewards.
-    """
-
-    scores: Floats
-    sums: Floats
-    counts: Ints
+    scores: Floats  # what it judges arms by: a value, a posterior mean, a preference, a log-weight
+    sums: Floats  # sum of the rewards
+    counts: Ints  # number of the rewards
 
     @inlined
     def masked_count(self) -> int:
@@ -68,46 +62,49 @@ class ScoreTables(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """Pulls that wait for their feedback.
+    """Pulls that wait for their feedback."""
 
-    Attributes:
-        pulls: room for them, records of type `PULL`, shape (capacity,).
-        waiting: how many there are, shape (1,).
-    """
-
-    pulls: NDArray[Any]
-    waiting: Ints
+    pulls: NDArray[Any]  # room for them, records of type `PULL`, shape (capacity,)
+    waiting: Ints  # how many there are, shape (1,)
 
 
 class ScoreAgent(NamedTuple):
-    """An agent as compiled functions see it.
+    """An agent as compiled functions see it."""
 
-    Attributes:
-        settings: a record of the type that its class has.
-        tables: what it knows, `ScoreTables` or `AllowedTables`.
-        feedback: pulls that are not learnt from yet.
-        arms: room for a number for each arm, shape (arms,).
-        draws: room for the random numbers of a choice, shape (2,).
-        rng: a handle of its generator.
-    """
-
-    settings: Any
-    tables: Any
-    feedback: Feedback
-    arms: Floats
-    draws: Floats
-    rng: Any
+    settings: Any  # a record of the type that its class has
+    tables: Any  # what it knows, `ScoreTables` or `AllowedTables`
+    feedback: Feedback  # pulls that are not learnt from yet
+    arms: Floats  # room for a number for each arm, shape (arms,)
+    draws: Floats  # room for the random numbers of a choice, shape (2,)
+    rng: Any  # a handle of its generator
 
 
 @by_type
-def choose_arm(agent: ScoreAgent, row: int, progress: Any) -> int:
+def context_row(agent: Any, env: Any) -> int:
+    """The row in which the agent looks up the context that the environment shows."""
+    raise CompiledOnlyError
+
+
+@by_type
+def choose_arm(agent: Any, row: int, progress: Any) -> int:
     """An arm in the context ``row``."""
     raise CompiledOnlyError
 
 
 @by_type
-def choice_probability(agent: ScoreAgent, row: int, arm: int) -> float:
+def choice_probability(agent: Any, row: int, arm: int) -> float:
     """How likely the choice of ``arm`` was."""
+    raise CompiledOnlyError
+
+
+@by_type
+def learn_from_reward(agent: Any, pull: Any, progress: Any) -> None:
+    """Learn from a record of type `PULL`."""
+
+
+@by_type
+def among_allowed(agent: Any, row: int, mask: Bools, room: AllowedRoom) -> Any:
+    """A smaller bandit: the arms of ``mask``, listed in ``room.arms``, and one context, ``row``."""
     raise CompiledOnlyError
 
 
@@ -151,7 +148,13 @@ def mean_reward(tables: Any, row: int) -> float:
 
 
 @inlined
-def learn(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+def row_of_scores(agent: ScoreAgent, env: Any) -> int:
+    """Each context has a row, unless they are ignored."""
+    return 0 if agent.settings.ignore_context else int(env.obs)
+
+
+@inlined
+def count_and_learn(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """Count a reward in, and learn from it."""
     before_counting(agent, pull, progress)
     agent.tables.counts[pull.row, pull.arm] += 1
@@ -160,41 +163,38 @@ def learn(agent: ScoreAgent, pull: Any, progress: Any) -> None:
 
 
 @inlined
-def act_on_scores(agent: ScoreAgent, env: Any, progress: Any) -> None:
-    """Pull an arm in the context that the environment shows."""
-    row = 0 if agent.settings.ignore_context else env.obs
-    env.action = choose_arm(agent, row, progress)
-    env.probability = choice_probability(agent, row, env.action)
+def act_in_context(agent: Any, env: Any, progress: Any) -> None:
+    """Pull an arm in the context that the environment shows, and keep the pull."""
+    pull = agent.feedback.pulls[agent.feedback.waiting[0]]
+    pull.row = context_row(agent, env)
+    env.action = choose_arm(agent, pull.row, progress)
+    pull.arm = env.action
+    pull.probability = choice_probability(agent, pull.row, env.action)
 
 
 @inlined
-def learn_from_feedback(agent: ScoreAgent, envs: Any, progress: Any) -> None:
-    """Keep the pull; learn from all that wait where their feedback comes in."""
+def learn_from_feedback(agent: Any, envs: Any, progress: Any) -> None:
+    """Keep the reward; learn from all pulls that wait where their feedback comes in."""
     feedback, env = agent.feedback, envs[0]
-    pull = feedback.pulls[feedback.waiting[0]]
-    pull.row = 0 if agent.settings.ignore_context else env.obs
-    pull.arm = env.action
-    pull.reward = env.reward
-    pull.probability = env.probability
+    feedback.pulls[feedback.waiting[0]].reward = env.reward
     feedback.waiting[0] += 1
     if env.feedback_due:
         for k in range(feedback.waiting[0]):
-            learn(agent, feedback.pulls[k], progress)
+            learn_from_reward(agent, feedback.pulls[k], progress)
         feedback.waiting[0] = 0
     env.obs = env.new_obs
 
 
 @kernel
 def choose_arms(
-    agent: ScoreAgent, rows: Ints, progress: Any, arms: Ints, probabilities: Floats
+    agent: Any, rows: Ints, n_rows: int, progress: Any, arms: Ints, probabilities: Floats
 ) -> int:
     """Fill in an arm for each of the contexts ``rows``, and how likely it was; shapes (n,).
 
-    Returns:
-        -1, or the place of a context that has no row in the tables, before which it stops.
+    Returns -1, or the place of a context that has no row, before which it stops.
     """
     for i in range(len(rows)):
-        if not 0 <= rows[i] < agent.tables.scores.shape[0]:
+        if not 0 <= rows[i] < n_rows:
             return i
         arms[i] = choose_arm(agent, rows[i], progress)
         probabilities[i] = choice_probability(agent, rows[i], arms[i])
@@ -202,61 +202,154 @@ def choose_arms(
 
 
 @kernel
-def learn_one(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """`learn`, for the interpreted loop."""
-    learn(agent, pull, progress)
+def choose_allowed_arms(
+    agent: Any,
+    rows: Ints,
+    n_rows: int,
+    progress: Any,
+    arms: Ints,
+    probabilities: Floats,
+    masks: Bools,
+    room: AllowedRoom,
+) -> int:
+    """As `choose_arms`, among the arms in ``masks``, of shape (n, arms)."""
+    for i in range(len(rows)):
+        if not 0 <= rows[i] < n_rows:
+            return i
+        smaller = among_allowed(agent, rows[i], masks[i], room)
+        chosen = choose_arm(smaller, 0, progress)
+        arms[i] = room.arms[chosen]
+        probabilities[i] = choice_probability(smaller, 0, chosen)
+    return -1
+
+
+@kernel
+def learn_one(agent: Any, pull: Any, progress: Any) -> None:
+    """`learn_from_reward`, for the interpreted loop."""
+    learn_from_reward(agent, pull, progress)
+
+
+# Scores of the arms that the environment allows.
+#
+# A rule is handed a smaller bandit: a copy of what the agent knows of the allowed arms in the
+# present context, and of no others. So no rule needs a line for masks, and where all arms are
+# allowed it does the same to the bit. Agents that do not go by masks never come here.
+
+
+class AllowedTables(NamedTuple):
+    """What an agent knows of the allowed arms in one context; arrays of shape (1, n)."""
+
+    scores: Floats
+    sums: Floats
+    counts: Ints
+    other_count: int  # number of the rewards of the other arms
+    other_sum: float  # their sum
+
+    @inlined
+    def masked_count(self) -> int:
+        """Rewards of the masked arms."""
+        return self.other_count
+
+    @inlined
+    def masked_sum(self) -> float:
+        """Their sum."""
+        return self.other_sum
+
+
+class AllowedRoom(NamedTuple):
+    """Where a smaller bandit is put together."""
+
+    scores: Floats  # shape (1, arms)
+    sums: Floats  # shape (1, arms)
+    counts: Ints  # shape (1, arms)
+    arms: Ints  # which arm is the smaller bandit's k-th, shape (arms,)
+
+
+def allowed_room(n_arms: int) -> AllowedRoom:
+    """Room for bandits of up to ``n_arms``."""
+    shape, whole = (1, n_arms), np.int64
+    return AllowedRoom(
+        np.empty(shape), np.empty(shape), np.empty(shape, whole), np.empty(n_arms, whole)
+    )
+
+
+@inlined
+def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom) -> AllowedTables:
+    """What is known of the arms of ``mask`` in the context ``row``, copied."""
+    n, other_count, other_sum = 0, 0, 0.0
+    for arm in range(len(mask)):
+        if mask[arm]:
+            room.arms[n] = arm
+            room.scores[0, n] = tables.scores[row, arm]
+            room.sums[0, n] = tables.sums[row, arm]
+            room.counts[0, n] = tables.counts[row, arm]
+            n += 1
+        else:
+            other_count += tables.counts[row, arm]
+            other_sum += tables.sums[row, arm]
+    scores, sums, counts = room.scores[:, :n], room.sums[:, :n], room.counts[:, :n]
+    return AllowedTables(scores, sums, counts, other_count, other_sum)
+
+
+@inlined
+def scores_of_allowed(agent: ScoreAgent, row: int, mask: Bools, room: AllowedRoom) -> ScoreAgent:
+    """The smaller bandit of an agent with scores."""
+    known = allowed_tables(agent.tables, row, mask, room)
+    numbers = agent.arms[: known.scores.shape[1]]
+    return ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
+
+
+@kernel
+def learn_one_allowed(
+    agent: ScoreAgent, pull: Any, mask: Bools, room: AllowedRoom, progress: Any
+) -> None:
+    """As `learn_one`, of a pull at which the arms in ``mask`` were allowed, of shape (arms,)."""
+    tables, row, place = agent.tables, pull.row, 0
+    smaller = scores_of_allowed(agent, row, mask, room)
+    n = len(smaller.arms)
+    for k in range(n):
+        if room.arms[k] == pull.arm:
+            place = k
+    pull.row = 0
+    pull.arm = place
+    count_and_learn(smaller, pull, progress)
+    for k in range(n):
+        arm = room.arms[k]
+        tables.scores[row, arm] = room.scores[0, k]
+        tables.sums[row, arm] = room.sums[0, k]
+        tables.counts[row, arm] = room.counts[0, k]
 
 
 # Agents with a linear model of each arm's reward in the context.
 #
 # Each arm's ridge regression keeps the matrix A = ridge I + sum x x' as its factors L D L', which a
 # new context changes by a rank-one update that cannot lose positive definiteness (Gill, Golub,
-# Murray
-# and Saunders, 1974, method C1). Compiled functions, shared by both loops. What an algorithm adds
-# is
-# `bonus`, and `pick` where it does not take the best.
+# Murray and Saunders, 1974, method C1). What an algorithm adds is `bonus`, and `pick` where it does
+# not take the best.
 
 
 class Regressions(NamedTuple):
-    """What an agent knows.
+    """What an agent knows."""
 
-    Attributes:
-        factors: D on the diagonal and L below it, shape (arms, features, features).
-        moments: sum of reward times context, shape (arms, features).
-        coefficients: of the regression, shape (arms, features).
-        counts: number of rewards, shape (arms,).
-    """
-
-    factors: Floats
-    moments: Floats
-    coefficients: Floats
-    counts: Ints
+    factors: Floats  # D on the diagonal and L below it, shape (arms, features, features)
+    moments: Floats  # sum of reward times context, shape (arms, features)
+    coefficients: Floats  # of the regression, shape (arms, features)
+    counts: Ints  # number of rewards, shape (arms,)
 
 
 class LinearAgent(NamedTuple):
-    """An agent as compiled functions see it.
+    """An agent as compiled functions see it."""
 
-    Attributes:
-        settings: a record of the type that its class has.
-        models: what it knows.
-        feedback: pulls that are not learnt from yet.
-        contexts: of those pulls, shape (capacity, features).
-        context: what an arm is to be chosen in, shape (features,).
-        arms: room for a number for each arm, shape (arms,).
-        features: room for a number for each feature, shape (features,).
-        draws: room for the random numbers of a choice, shape (2,).
-        rng: a handle of its generator.
-    """
-
-    settings: Any
-    models: Regressions
-    feedback: Feedback
-    contexts: Floats
-    context: Floats
-    arms: Floats
-    features: Floats
-    draws: Floats
-    rng: Any
+    settings: Any  # a record of the type that its class has
+    models: Regressions  # what it knows
+    feedback: Feedback  # pulls that are not learnt from yet
+    contexts: Floats  # of those pulls, or of those to be chosen, shape (capacity, features)
+    context: Floats  # what the environment shows, shape (features,)
+    numbers: Ints  # which model is that of the k-th arm, shape (arms,)
+    arms: Floats  # room for a number for each arm, shape (arms,)
+    features: Floats  # room for a number for each feature, shape (features,)
+    draws: Floats  # room for the random numbers of a choice, shape (2,)
+    rng: Any  # a handle of its generator
 
 
 @by_type
@@ -300,11 +393,13 @@ def deviation(agent: LinearAgent, arm: int, context: Floats) -> float:
 
 
 @inlined
-def choose_by_model(agent: LinearAgent, context: Floats, progress: Any) -> int:
-    """An arm in ``context``."""
-    for arm in range(len(agent.arms)):
-        agent.arms[arm] = predicted_mean(agent.models, arm, context)
-        agent.arms[arm] += bonus(agent, arm, context)
+def choose_by_model(agent: LinearAgent, row: int, progress: Any) -> int:
+    """An arm in the context ``row``."""
+    context = agent.contexts[row]
+    for k in range(len(agent.arms)):
+        arm = agent.numbers[k]
+        agent.arms[k] = predicted_mean(agent.models, arm, context)
+        agent.arms[k] += bonus(agent, arm, context)
     agent.draws[0] = generator_of(agent.rng).random()
     return pick(agent, progress)
 
@@ -344,9 +439,9 @@ def solve(models: Regressions, arm: int) -> None:
 
 
 @inlined
-def learn_by_model(agent: LinearAgent, pull: Any, context: Floats) -> None:
-    """Learn from a record of type `PULL` in ``context``."""
-    models = agent.models
+def learn_by_model(agent: LinearAgent, pull: Any, progress: Any) -> None:
+    """Learn from a record of type `PULL`."""
+    models, context = agent.models, agent.contexts[pull.row]
     add_context(models, pull.arm, context, agent.features)
     for i in range(len(context)):
         models.moments[pull.arm, i] += pull.reward * context[i]
@@ -355,199 +450,31 @@ def learn_by_model(agent: LinearAgent, pull: Any, context: Floats) -> None:
 
 
 @inlined
-def act_on_context(agent: LinearAgent, env: Any, progress: Any) -> None:
-    """Pull an arm in the context that the environment shows."""
-    env.action = choose_by_model(agent, agent.context, progress)
-    waiting = agent.feedback.waiting[0]
-    # The environment moves on to another context before there is anything to learn from this one.
+def row_of_vector(agent: LinearAgent, env: Any) -> int:
+    """Each pull that waits has a row: the environment goes on to another context before that."""
+    row = agent.feedback.waiting[0]
     for i in range(len(agent.context)):
-        agent.contexts[waiting, i] = agent.context[i]
+        agent.contexts[row, i] = agent.context[i]
+    return int(row)
 
 
 @inlined
-def learn_from_contexts(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """Keep the pull; learn from all that wait where their feedback comes in."""
-    feedback, env = agent.feedback, envs[0]
-    pull = feedback.pulls[feedback.waiting[0]]
-    pull.arm = env.action
-    pull.reward = env.reward
-    feedback.waiting[0] += 1
-    if env.feedback_due:
-        for k in range(feedback.waiting[0]):
-            learn_by_model(agent, feedback.pulls[k], agent.contexts[k])
-        feedback.waiting[0] = 0
-    env.obs = env.new_obs
-
-
-@kernel
-def choose_all_by_model(agent: LinearAgent, contexts: Floats, progress: Any, arms: Ints) -> None:
-    """Fill in an arm for each of the contexts, which are of shape (n, features)."""
-    for i in range(len(contexts)):
-        arms[i] = choose_by_model(agent, contexts[i], progress)
-
-
-@kernel
-def learn_one_by_model(agent: LinearAgent, pull: Any, context: Floats) -> None:
-    """`learn_by_model`, for the interpreted loop."""
-    learn_by_model(agent, pull, context)
-
-
-# Choosing and learning among the arms that the environment allows.
-#
-# A rule is handed a smaller bandit: a copy of what the agent knows of the allowed arms in the
-# present
-# context, and of no others. So no rule needs a line for masks, and where all arms are allowed it
-# does
-# the same to the bit. Agents that do not go by masks never come here.
-
-
-class AllowedTables(NamedTuple):
-    """What an agent knows of the allowed arms in one context; arrays of shape (1, n).
-
-    Attributes:
-        scores: as in `ScoreTables`.
-        sums: as in `ScoreTables`.
-        counts: as in `ScoreTables`.
-        other_count: number of the rewards of the other arms.
-        other_sum: their sum.
-    """
-
-    scores: Floats
-    sums: Floats
-    counts: Ints
-    other_count: int
-    other_sum: float
-
-    @inlined
-    def masked_count(self) -> int:
-        """Rewards of the masked arms."""
-        return self.other_count
-
-    @inlined
-    def masked_sum(self) -> float:
-        """Their sum."""
-        return self.other_sum
-
-
-class AllowedRoom(NamedTuple):
-    """Where a smaller bandit is put together.
-
-    Attributes:
-        scores: shape (1, arms).
-        sums: shape (1, arms).
-        counts: shape (1, arms).
-        arms: which arm is the smaller bandit's k-th, shape (arms,).
-    """
-
-    scores: Floats
-    sums: Floats
-    counts: Ints
-    arms: Ints
-
-
-def allowed_room(n_arms: int) -> AllowedRoom:
-    """Room for bandits of up to ``n_arms``."""
-    shape, whole = (1, n_arms), np.int64
-    return AllowedRoom(
-        np.empty(shape), np.empty(shape), np.empty(shape, whole), np.empty(n_arms, whole)
-    )
-
-
-@inlined
-def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom) -> AllowedTables:
-    """What is known of the arms of ``mask`` in the context ``row``, copied."""
-    n, other_count, other_sum = 0, 0, 0.0
+def models_of_allowed(agent: LinearAgent, row: int, mask: Bools, room: AllowedRoom) -> LinearAgent:
+    """The smaller bandit; each arm has a model of its own, so that nothing is copied."""
+    n = 0
     for arm in range(len(mask)):
         if mask[arm]:
             room.arms[n] = arm
-            room.scores[0, n] = tables.scores[row, arm]
-            room.sums[0, n] = tables.sums[row, arm]
-            room.counts[0, n] = tables.counts[row, arm]
             n += 1
-        else:
-            other_count += tables.counts[row, arm]
-            other_sum += tables.sums[row, arm]
-    scores, sums, counts = room.scores[:, :n], room.sums[:, :n], room.counts[:, :n]
-    return AllowedTables(scores, sums, counts, other_count, other_sum)
-
-
-@kernel
-def choose_allowed_arms(
-    agent: ScoreAgent,
-    rows: Ints,
-    masks: Bools,
-    room: AllowedRoom,
-    progress: Any,
-    arms: Ints,
-    probabilities: Floats,
-) -> int:
-    """As `choose_arms`, among the arms in ``masks``, of shape (n, arms)."""
-    for i in range(len(rows)):
-        if not 0 <= rows[i] < agent.tables.scores.shape[0]:
-            return i
-        known = allowed_tables(agent.tables, rows[i], masks[i], room)
-        numbers = agent.arms[: known.scores.shape[1]]
-        smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
-        chosen = choose_arm(smaller, 0, progress)
-        arms[i] = room.arms[chosen]
-        probabilities[i] = choice_probability(smaller, 0, chosen)
-    return -1
-
-
-@kernel
-def learn_one_allowed(
-    agent: ScoreAgent, pull: Any, mask: Bools, room: AllowedRoom, progress: Any
-) -> None:
-    """As `learn_one`, of a pull at which the arms in ``mask`` were allowed, of shape (arms,)."""
-    tables, row = agent.tables, pull.row
-    known, place = allowed_tables(tables, row, mask, room), 0
-    n = known.scores.shape[1]
-    smaller = ScoreAgent(
-        agent.settings, known, agent.feedback, agent.arms[:n], agent.draws, agent.rng
-    )
-    for k in range(n):
-        if room.arms[k] == pull.arm:
-            place = k
-    pull.row = 0
-    pull.arm = place
-    learn(smaller, pull, progress)
-    for k in range(n):
-        arm = room.arms[k]
-        tables.scores[row, arm] = room.scores[0, k]
-        tables.sums[row, arm] = room.sums[0, k]
-        tables.counts[row, arm] = room.counts[0, k]
-
-
-@inlined
-def choose_allowed_by_model(agent: LinearAgent, context: Floats, arms: Ints, progress: Any) -> int:
-    """One of ``arms`` in ``context``; each has a model of its own, so that nothing is copied."""
-    smaller = LinearAgent(
+    return LinearAgent(
         agent.settings,
         agent.models,
         agent.feedback,
-        agent.contexts,
+        agent.contexts[row : row + 1],
         agent.context,
-        agent.arms[: len(arms)],
+        room.arms[:n],
+        agent.arms[:n],
         agent.features,
         agent.draws,
         agent.rng,
     )
-    for k in range(len(arms)):
-        smaller.arms[k] = predicted_mean(agent.models, arms[k], context)
-        smaller.arms[k] += bonus(agent, arms[k], context)
-    agent.draws[0] = generator_of(agent.rng).random()
-    return int(arms[pick(smaller, progress)])
-
-
-@kernel
-def choose_all_allowed_by_model(
-    agent: LinearAgent, contexts: Floats, masks: Bools, room: Ints, progress: Any, arms: Ints
-) -> None:
-    """As `choose_all_by_model`, among the arms in ``masks``, of shape (n, arms)."""
-    for i in range(len(contexts)):
-        n = 0
-        for arm in range(masks.shape[1]):
-            if masks[i, arm]:
-                room[n] = arm
-                n += 1
-        arms[i] = choose_allowed_by_model(agent, contexts[i], room[:n], progress)

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from agents.bandits.algorithm import ArmPolicy, BanditAlgorithm, BanditArguments, Pull
+from agents.bandits.algorithm import ArmPolicy, BanditArguments, Pull, RuleBandit
 from agents.bandits.choosing import (
     PULL,
     Feedback,
     LinearAgent,
     Regressions,
-    act_on_context,
     best_arm,
-    choose_all_allowed_by_model,
-    choose_all_by_model,
+    choose_by_model,
     deviation,
-    learn_from_contexts,
-    learn_one_by_model,
+    learn_by_model,
+    learn_one,
+    models_of_allowed,
+    row_of_vector,
 )
 from agents.common.exploration import choose_action
 from agents.common.schedules import epsilon_schedule
@@ -32,36 +32,23 @@ from agents.common.settings import (
     check_above_zero,
     check_at_least,
     check_epsilons,
-    check_space,
+    check_vectors,
     settings_of,
 )
 from agents.compiled.generators import generator_of, handles_of
 from machine_code.compiling import inlined
-from mdp.array_types import Bools, Floats, Ints
+from mdp.array_types import Floats, Ints
 
 # The policy of agents with a linear model of each arm's reward: all that they know, in buffers.
 
 
 class LinearBanditPolicy(ArmPolicy):
-    """Pulls the arm of the highest predicted reward.
+    """Pulls the arm of the highest predicted reward."""
 
-    Args:
-        observation_space: `Box` of shape (d,), or `Discrete` with d values, each of them a feature.
-        action_space: `Discrete` with A values: the arms.
-        lr_schedule: not used; here because every policy is handed one.
-        ridge: what the regressions start from, on the diagonal.
-
-    Attributes:
-        factors: of each arm's regression matrix, float64 of shape (A, d, d).
-        moments: sum of reward times context, float64 of shape (A, d).
-        coefficients: of each arm's regression, float64 of shape (A, d).
-        counts: number of rewards of each arm, int64 of shape (A,).
-    """
-
-    factors: th.Tensor
-    moments: th.Tensor
-    coefficients: th.Tensor
-    counts: th.Tensor
+    factors: th.Tensor  # of each arm's regression matrix, float64 of shape (A, d, d)
+    moments: th.Tensor  # sum of reward times context, float64 of shape (A, d)
+    coefficients: th.Tensor  # of each arm's regression, float64 of shape (A, d)
+    counts: th.Tensor  # number of rewards of each arm, int64 of shape (A,)
 
     def __init__(
         self,
@@ -149,7 +136,7 @@ def pick_epsilon_greedily(agent: LinearAgent, progress: Any) -> int:
     return choose_action(settings.strategy, agent.arms, epsilon, ties, agent.draws)
 
 
-class LinearBanditAgent(BanditAlgorithm):
+class LinearBanditAgent(RuleBandit):
     """An agent with a ridge regression for each arm; contexts that are numbers become one-hot.
 
     Args:
@@ -165,8 +152,10 @@ class LinearBanditAgent(BanditAlgorithm):
     policy: LinearBanditPolicy
 
     # What the training loops call; `bonus` is each algorithm's own.
-    act = act_on_context
-    learn_from_step = learn_from_contexts
+    choose_arm = choose_by_model
+    context_row = row_of_vector
+    learn_from_reward = learn_by_model
+    among_allowed = models_of_allowed
     pick = best_arm
 
     def __init__(
@@ -181,9 +170,7 @@ class LinearBanditAgent(BanditAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        space = self.observation_space
-        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
-            check_space(self, "observations of shape (d,) in a Box space or", space)
+        check_vectors(self, self.observation_space)
         check_above_zero(settings_of(self, "ridge"))
 
     def _make_policy(self) -> LinearBanditPolicy:
@@ -200,14 +187,7 @@ class LinearBanditAgent(BanditAlgorithm):
         capacity: int = 1,
         context: Floats | None = None,
     ) -> LinearAgent:
-        """The agent as compiled functions see it.
-
-        Args:
-            rng: its generator.
-            models: what it knows; by default what its policy holds.
-            capacity: pulls that may wait for their feedback.
-            context: what an arm is to be chosen in, in the memory of the environment.
-        """
+        """The agent as compiled functions see it."""
         n_features = number_of_features(self.observation_space)
         return LinearAgent(
             self.settings()[0],
@@ -215,36 +195,27 @@ class LinearBanditAgent(BanditAlgorithm):
             Feedback(np.zeros(capacity, dtype=PULL), np.zeros(1, dtype=np.int64)),
             np.empty((capacity, n_features)),
             np.empty(n_features) if context is None else context,
+            np.arange(self.n_arms),
             np.empty(self.n_arms),
             np.empty(n_features),
             np.empty(2),
             handles_of([rng])[0],
         )
 
-    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
-        return self.compiled_agent(rng)
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> LinearAgent:
+        return self.compiled_agent(rng, capacity=n)
 
     def _contexts(self, obs: NDArray[Any]) -> Floats:
         return features(self.observation_space, obs)
 
-    def _choose(self, contexts: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
-        arms = np.empty(len(contexts), dtype=np.int64)
-        choose_all_by_model(
-            self._workspace_for(rng, len(contexts)), contexts, self.progress()[0], arms
-        )
-        return arms, np.ones(len(arms))
-
-    def _choose_allowed(
-        self, contexts: Floats, masks: Bools, rng: np.random.Generator
-    ) -> tuple[Ints, Floats]:
-        arms, room = (np.empty(n, dtype=np.int64) for n in (len(contexts), self.n_arms))
-        agent = self._workspace_for(rng, len(contexts))
-        choose_all_allowed_by_model(agent, contexts, masks, room, self.progress()[0], arms)
-        return arms, np.ones(len(arms))
+    def _rows(self, agent: LinearAgent, contexts: Floats) -> tuple[Ints, int]:
+        agent.contexts[:] = contexts
+        return np.arange(len(contexts)), len(contexts)
 
     def _learn(self, pull: Pull) -> None:
-        record = np.array([(0, *pull[1:4])], dtype=PULL)[0]
-        learn_one_by_model(self._workspace_for(self.rng, 1), record, np.array(pull.context))
+        agent = self._workspace_for(self.rng, 1)
+        agent.contexts[0] = pull.context
+        learn_one(agent, np.array([(0, *pull[1:4])], dtype=PULL)[0], None)
 
 
 class LinUCB(LinearBanditAgent):
@@ -325,9 +296,4 @@ class LinEpsilonGreedy(LinearBanditAgent):
         check_epsilons(self)
 
     def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(
-            self.exploration_decay,
-            self.exploration_initial_eps,
-            self.exploration_final_eps,
-            self.exploration_fraction,
-        )
+        return epsilon_schedule(self)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Unpack
 
 import numpy as np
@@ -12,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from agents.bandits import algorithm
 from agents.bandits.choosing import ScoreAgent, ScoreTables, mean_reward, total_count
 from agents.bandits.tables import TableArguments, TableBandit, mean_rewards
-from agents.common.exploration import boltzmann_action, highest_value
+from agents.common.exploration import boltzmann_action, drawn_action, make_probabilities
 from agents.common.settings import check_above_zero, check_share, settings_of
 from agents.compiled.generators import generator_of
 from machine_code.compiling import inlined
@@ -26,13 +25,7 @@ def softmax(tables: ScoreTables, row: int, probabilities: Floats) -> None:
     """Fill in the probability of each arm, proportional to exp(score)."""
     for arm in range(len(probabilities)):
         probabilities[arm] = tables.scores[row, arm]
-    highest = highest_value(probabilities)
-    total = 0.0
-    for arm in range(len(probabilities)):
-        probabilities[arm] = math.exp(probabilities[arm] - highest)
-        total += probabilities[arm]
-    for arm in range(len(probabilities)):
-        probabilities[arm] /= total
+    make_probabilities(probabilities)
 
 
 class PreferenceBandit(TableBandit):
@@ -120,21 +113,11 @@ def exp3_probabilities(agent: ScoreAgent, row: int) -> None:
 
 
 @inlined
-def drawn_arm(probabilities: Floats, uniform: float) -> int:
-    """The arm on which ``uniform``, in [0, 1), falls."""
-    for arm in range(len(probabilities) - 1):
-        uniform -= probabilities[arm]
-        if uniform < 0.0:
-            return arm
-    return len(probabilities) - 1
-
-
-@inlined
 def draw_by_weight(agent: ScoreAgent, row: int, progress: Any) -> int:
     """An arm by its probability."""
     uniform = generator_of(agent.rng).random()
     exp3_probabilities(agent, row)
-    return drawn_arm(agent.arms, uniform)
+    return drawn_action(agent.arms, uniform)
 
 
 @inlined

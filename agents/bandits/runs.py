@@ -107,36 +107,21 @@ def pull_noisy(model: BanditModel, arm: int, rng: np.random.Generator) -> float:
 
 
 class BanditModel(NamedTuple):
-    """A bandit within an episode. Arrays that its kind does not need hold one number.
+    """A bandit within an episode. Arrays that its kind does not need hold one number."""
 
-    Attributes:
-        kind: which dynamics.
-        batch_size: pulls between two times at which feedback comes in.
-        pulls: after how many it comes in anyway.
-        time_limit: after how many the episode ends, and it comes in too; 0 for never.
-        reward_std: standard deviation of the noise on a reward.
-        drift_std: standard deviation of what is added to all means after each pull.
-        means: expected rewards, shape (contexts, arms); changed in place where they drift.
-        outcomes: cumulative probabilities of reward and next context, shape (contexts, arms, 2
-            contexts).
-        arm_parameters: of linear rewards, shape (arms, features).
-        row: the present context, shape (1,); changed in place.
-        vector: the present context as features, shape (features,); changed in place.
-        expected: room for a number for each arm, shape (arms,).
-    """
-
-    kind: int
-    batch_size: int
-    pulls: int
-    time_limit: int
-    reward_std: float
-    drift_std: float
-    means: Floats
+    kind: int  # which dynamics
+    batch_size: int  # pulls between two times at which feedback comes in
+    pulls: int  # after how many it comes in anyway
+    time_limit: int  # after how many the episode ends, and it comes in too; 0 for never
+    reward_std: float  # standard deviation of the noise on a reward
+    drift_std: float  # standard deviation of what is added to all means after each pull
+    means: Floats  # expected rewards, shape (contexts, arms); changed in place where they drift
+    # Cumulative probabilities of reward and next context, shape (contexts, arms, 2 contexts).
     outcomes: Floats
-    arm_parameters: Floats
-    row: Ints
-    vector: Floats
-    expected: Floats
+    arm_parameters: Floats  # of linear rewards, shape (arms, features)
+    row: Ints  # the present context, shape (1,); changed in place
+    vector: Floats  # the present context as features, shape (features,); changed in place
+    expected: Floats  # room for a number for each arm, shape (arms,)
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
@@ -158,13 +143,9 @@ class BanditModel(NamedTuple):
 
 
 class PullRecord(NamedTuple):
-    """What happens at each pull; all of shape (pulls,), filled in by the loop.
+    """What happens at each pull; all of shape (pulls,), filled in by the loop."""
 
-    Attributes:
-        episodes: room for the one episode that ends.
-    """
-
-    episodes: NDArray[Any]
+    episodes: NDArray[Any]  # room for the one episode that ends
     arms: NDArray[np.int16]
     rewards: NDArray[np.float32]
     regrets: Floats
@@ -185,11 +166,7 @@ class PullRecord(NamedTuple):
 
 
 def check_bandit(env: gym.Env[Any, Any]) -> None:
-    """Make sure that there is compiled code for the environment and all its wrappers.
-
-    Raises:
-        NotCompilable: saying what there is none for.
-    """
+    """Make sure that there is compiled code for the environment and all its wrappers."""
     while isinstance(env, gym.Wrapper):
         if not isinstance(env, _HARMLESS_WRAPPERS):
             raise NotCompilable(f"{type(env).__name__} may change what the environment does")
@@ -227,32 +204,24 @@ def bandit_model(env: gym.Env[Any, Any]) -> BanditModel:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """A row for each run, a column for each pull.
+    """A row for each run, a column for each pull."""
 
-    Attributes:
-        seeds: of the runs, shape (n_runs,).
-        arms: what was pulled, int16 of shape (n_runs, pulls).
-        rewards: what it gave, float32 of shape (n_runs, pulls).
-        regrets: best expected reward less that of the arm, at each pull, float64 of shape (n_runs,
-            pulls).
-        contexts: what the arm was chosen in, int32 of shape (n_runs, pulls); None where there is
-            but one context, or contexts are vectors.
-        estimates: of the mean rewards at the end, shape (n_runs, contexts, arms), nan where the
-            agent has none; None for agents that keep no table.
-        coefficients: of linear agents at the end, shape (n_runs, arms, features); None for others.
-        moments: after how many pulls posteriors are kept.
-        posteriors: of Thompson sampling, shape (n_runs, moments, contexts, arms, 2): parameters of
-            the Beta distribution, or mean and standard deviation; None for others.
-    """
-
-    seeds: Ints
-    arms: NDArray[np.int16]
-    rewards: NDArray[np.float32]
+    seeds: Ints  # of the runs, shape (n_runs,)
+    arms: NDArray[np.int16]  # what was pulled, int16 of shape (n_runs, pulls)
+    rewards: NDArray[np.float32]  # what it gave, float32 of shape (n_runs, pulls)
+    # Best expected reward less that of the arm, at each pull, float64 of shape (n_runs, pulls).
     regrets: Floats
+    # What the arm was chosen in, int32 of shape (n_runs, pulls); None where there is but one
+    # context, or contexts are vectors.
     contexts: NDArray[np.int32] | None = None
+    # Of the mean rewards at the end, shape (n_runs, contexts, arms), nan where the agent has none;
+    # None for agents that keep no table.
     estimates: Floats | None = None
+    # Of linear agents at the end, shape (n_runs, arms, features); None for others.
     coefficients: Floats | None = None
-    moments: tuple[int, ...] = ()
+    moments: tuple[int, ...] = ()  # after how many pulls posteriors are kept
+    # Of Thompson sampling, shape (n_runs, moments, contexts, arms, 2): parameters of the Beta
+    # distribution, or mean and standard deviation; None for others.
     posteriors: Floats | None = None
 
     @property
@@ -312,11 +281,7 @@ def run_batch(
 
 
 def checked_pulls(env: gym.Env[Any, Any], pulls: int | None) -> int:
-    """The length of a run.
-
-    Raises:
-        ValueError: if it is not within an episode.
-    """
+    """The length of a run."""
     limit = time_limit(env)
     if limit is None:
         raise NotCompilable("an episode never ends")
@@ -333,15 +298,7 @@ def run_moments(moments: Sequence[int], n_pulls: int) -> tuple[int, ...]:
 
 
 class Runs:
-    """All runs of a batch, with room for what comes of them.
-
-    Args:
-        agent: an agent of the kind, untrained.
-        env: the environment that it was built on; each run resets it.
-        seeds: of the runs, shape (n_runs,).
-        pulls: pulls of a run, or None for an episode.
-        moments: when to keep tables.
-    """
+    """All runs of a batch, with room for what comes of them."""
 
     def __init__(
         self,
@@ -372,11 +329,7 @@ class Runs:
         self.start = self._start_of_training()
 
     def _start_of_training(self) -> np.ndarray[Any, np.dtype[np.void]]:
-        """How far a training is at its first pull.
-
-        Raises:
-            NotCompilable: if a schedule is a Python function.
-        """
+        """How far a training is at its first pull."""
         progress = self.agent.progress()
         progress["total_timesteps"], progress["remaining"] = self.n_pulls, 1.0
         for name, schedule in self.agent.schedules().items():
@@ -484,14 +437,7 @@ class PullLog(BaseCallback):
         return True
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All pulls so far.
-
-        Returns:
-            ``arms`` (int16), ``rewards`` (float32), ``expected_rewards`` and ``regrets`` (float64),
-            ``optimal`` and ``matched`` (bool: whether a log held the arm; true where there is no
-            log), and, where contexts are numbers, ``contexts`` (int32), each of shape
-            (n_envs, pulls).
-        """
+        """All pulls so far."""
         n_envs = self.training_env.num_envs
         # Ctrl-C may come when some columns have the newest pull and others not yet.
         n_pulls = min(map(len, self._columns.values())) // n_envs

@@ -11,26 +11,24 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from agents.bandits.algorithm import ArmPolicy, BanditAlgorithm, BanditArguments, Pull
+from agents.bandits.algorithm import ArmPolicy, BanditArguments, Pull, RuleBandit
 from agents.bandits.choosing import (
     PULL,
     Feedback,
     ScoreAgent,
     ScoreTables,
-    act_on_scores,
     allowed_room,
-    choose_allowed_arms,
-    choose_arms,
-    learn_from_feedback,
+    count_and_learn,
     learn_one,
     learn_one_allowed,
-    no_probability,
     nothing_before,
+    row_of_scores,
+    scores_of_allowed,
 )
 from agents.common.settings import check_space
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import StepSize
-from mdp.array_types import Bools, Floats, Ints
+from mdp.array_types import Floats, Ints
 
 # The policy of agents that keep a score for each arm: all that they know, in buffers.
 
@@ -39,23 +37,11 @@ class BanditPolicy(ArmPolicy):
     """Pulls the arm of the highest score in the context.
 
     The tables are buffers, so that they travel in the ``policy.pth`` of a model file.
-
-    Args:
-        observation_space: `Discrete`: the context.
-        action_space: `Discrete` with A values: the arms.
-        lr_schedule: not used; here because every policy is handed one.
-        n_contexts: number of contexts C that are told apart; 1 for none.
-        initial_score: of every arm at the start.
-
-    Attributes:
-        scores: what the agent judges arms by, float64 of shape (C, A).
-        sums: sum of the rewards, float64 of shape (C, A).
-        counts: number of the rewards, int64 of shape (C, A).
     """
 
-    scores: th.Tensor
-    sums: th.Tensor
-    counts: th.Tensor
+    scores: th.Tensor  # what the agent judges arms by, float64 of shape (C, A)
+    sums: th.Tensor  # sum of the rewards, float64 of shape (C, A)
+    counts: th.Tensor  # number of the rewards, int64 of shape (C, A)
 
     def __init__(
         self,
@@ -107,7 +93,7 @@ class TableArguments(BanditArguments, total=False):
     ignore_context: bool
 
 
-class TableBandit(BanditAlgorithm):
+class TableBandit(RuleBandit):
     """An agent with a score for each arm in each context, run for each context on its own.
 
     Args:
@@ -123,9 +109,9 @@ class TableBandit(BanditAlgorithm):
     parameters = {"ignore_context": np.bool_}  # noqa: RUF012
 
     # What the training loops call; `choose_arm` and `learn_from_pull` are each algorithm's own.
-    act = act_on_scores
-    learn_from_step = learn_from_feedback
-    choice_probability = no_probability
+    context_row = row_of_scores
+    learn_from_reward = count_and_learn
+    among_allowed = scores_of_allowed
     before_counting = nothing_before
 
     def __init__(
@@ -163,13 +149,7 @@ class TableBandit(BanditAlgorithm):
     def compiled_agent(
         self, rng: np.random.Generator, tables: ScoreTables | None = None, capacity: int = 1
     ) -> ScoreAgent:
-        """The agent as compiled functions see it.
-
-        Args:
-            rng: its generator.
-            tables: what it knows; by default what its policy holds.
-            capacity: pulls that may wait for their feedback.
-        """
+        """The agent as compiled functions see it."""
         return ScoreAgent(
             self.settings()[0],
             tables or self.policy.tables,
@@ -179,46 +159,15 @@ class TableBandit(BanditAlgorithm):
             handles_of([rng])[0],
         )
 
-    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> ScoreAgent:
         return self.compiled_agent(rng)
 
     def _contexts(self, obs: NDArray[Any]) -> Ints:
         rows = obs.astype(np.int64).reshape(-1)
         return np.zeros_like(rows) if self.ignore_context else rows
 
-    def _choose(self, contexts: Ints, rng: np.random.Generator) -> tuple[Ints, Floats]:
-        arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
-        outside = choose_arms(
-            self._workspace_for(rng, len(contexts)),
-            contexts,
-            self.progress()[0],
-            arms,
-            probabilities,
-        )
-        self._check_context(contexts, outside)
-        return arms, probabilities
-
-    def _choose_allowed(
-        self, contexts: Ints, masks: Bools, rng: np.random.Generator
-    ) -> tuple[Ints, Floats]:
-        arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
-        outside = choose_allowed_arms(
-            self._workspace_for(rng, len(contexts)),
-            contexts,
-            masks,
-            allowed_room(self.n_arms),
-            self.progress()[0],
-            arms,
-            probabilities,
-        )
-        self._check_context(contexts, outside)
-        return arms, probabilities
-
-    def _check_context(self, contexts: Ints, outside: int) -> None:
-        """Refuse the context at ``outside``, unless that is -1."""
-        if outside >= 0:
-            n_contexts = len(self.policy.scores)
-            raise ValueError(f"context {contexts[outside]} is not in Discrete({n_contexts})")
+    def _rows(self, agent: ScoreAgent, contexts: Ints) -> tuple[Ints, int]:
+        return contexts, len(agent.tables.scores)
 
     def _learn(self, pull: Pull) -> None:
         agent, progress = self._workspace_for(self.rng, 1), self.progress()[0]

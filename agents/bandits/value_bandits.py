@@ -101,12 +101,7 @@ class EpsilonGreedy(ValueBandit):
         check_epsilons(self)
 
     def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(
-            self.exploration_decay,
-            self.exploration_initial_eps,
-            self.exploration_final_eps,
-            self.exploration_fraction,
-        )
+        return epsilon_schedule(self)
 
 
 class Boltzmann(ValueBandit):

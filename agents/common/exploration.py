@@ -116,6 +116,27 @@ def boltzmann_action(values: Floats, temperature: float, draws: Floats) -> int:
 
 
 @inlined
+def make_probabilities(preferences: Floats) -> None:
+    """Turn preferences into the probabilities of their softmax, in place, shape (A,)."""
+    highest, total = highest_value(preferences), 0.0
+    for action in range(len(preferences)):
+        preferences[action] = math.exp(preferences[action] - highest)
+        total += preferences[action]
+    for action in range(len(preferences)):
+        preferences[action] /= total
+
+
+@inlined
+def drawn_action(probabilities: Floats, uniform: float) -> int:
+    """The action on which ``uniform``, in [0, 1), falls."""
+    for action in range(len(probabilities) - 1):
+        uniform -= probabilities[action]
+        if uniform < 0.0:
+            return action
+    return len(probabilities) - 1
+
+
+@inlined
 def noisy_greedy_action(values: Floats, noise_std: float, draws: Floats) -> int:
     """The best action after Gaussian noise of standard deviation ``noise_std`` on each value."""
     best_action = 0

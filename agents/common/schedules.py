@@ -8,7 +8,7 @@ evaluate them; `schedule_value` does so, and is the only place where the arithme
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.type_aliases import Schedule
@@ -91,15 +91,16 @@ def library_schedule(schedule: ExponentialSchedule) -> Schedule:
     return transform
 
 
-def epsilon_schedule(decay: str, start: float, end: float, end_fraction: float) -> Schedule:
-    """Epsilon over training, which falls over its first ``end_fraction``."""
-    if decay == "constant":
+def epsilon_schedule(agent: Any) -> Schedule:
+    """How epsilon falls over training, by the agent's settings; ``"constant"`` stays."""
+    start, end = agent.exploration_initial_eps, agent.exploration_final_eps
+    if agent.exploration_decay == "constant":
         return FloatSchedule(start)
-    if end_fraction == 0:
+    if agent.exploration_fraction == 0:
         return FloatSchedule(end)
-    if decay == "exponential":
-        return ExponentialSchedule(start, end, end_fraction)
-    return LinearSchedule(start, end, end_fraction)
+    if agent.exploration_decay == "exponential":
+        return ExponentialSchedule(start, end, agent.exploration_fraction)
+    return LinearSchedule(start, end, agent.exploration_fraction)
 
 
 def _row(kind: float, schedule: ExponentialSchedule | LinearSchedule) -> ScheduleRow:

@@ -120,6 +120,12 @@ def check_space(agent: object, role: str, space: spaces.Space[Any]) -> None:
         )
 
 
+def check_vectors(agent: object, space: spaces.Space[Any]) -> None:
+    """Refuse observations that are neither vectors nor in a space that `check_space` takes."""
+    if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+        check_space(agent, "observations of shape (d,) in a Box space or", space)
+
+
 def check_option(name: str, value: object, options: Any) -> None:
     """Refuse words that are not in the Literal ``options``."""
     if value not in get_args(options):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, is_vectorized_observation
+from stable_baselines3.common.utils import FloatSchedule
 
 from agents.common.algorithm import OnlineAlgorithm
 from agents.common.exploration import EPSILON_GREEDY
@@ -24,8 +24,7 @@ from agents.common.settings import (
     check_option,
 )
 from agents.compiled.loop import CompiledClass, check_functions, settings_dtype
-from agents.compiled.worlds import PROGRESS, UNDECIDED, NotCompilable
-from mdp.array_types import Ints
+from agents.compiled.worlds import PROGRESS, NotCompilable
 
 # Training, and exploring by another generator for a few numbers of observations.
 MOST_WORKSPACES = 4
@@ -173,19 +172,6 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
             "train/mean_absolute_td_error": records["mean_td_error"].tolist(),
             "train/learning_rate": records["learning_rate"].tolist(),
         }
-
-    def _note_progress(self, workspace: Any) -> None:
-        """Tell a workspace how far the training is."""
-
-    def _exploring_actions(self, observation: Any) -> Ints:
-        """An action for an observation, or n for n of them, chosen as in training."""
-        obs = np.asarray(observation)
-        many = is_vectorized_observation(obs, self.observation_space)
-        workspace = self._workspace_for(self.predict_rng, len(obs) if many else 1)
-        self._note_progress(workspace)
-        workspace.next_actions[:] = UNDECIDED
-        actions: Ints = workspace.act(obs if many else obs[None])
-        return actions.reshape(len(obs) if many else ())
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy's arrays would no longer be its policy's.

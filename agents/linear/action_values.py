@@ -147,12 +147,7 @@ class SemiGradientAlgorithm(TileAlgorithm):
         return np.full(self.n_actions, float(self.initial_q))
 
     def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(
-            self.exploration_decay,
-            self.exploration_initial_eps,
-            self.exploration_final_eps,
-            self.exploration_fraction,
-        )
+        return epsilon_schedule(self)
 
     def _probabilities(self, sums: Floats) -> Floats:
         ties = self.tie_breaking == "random"

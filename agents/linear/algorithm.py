@@ -24,13 +24,13 @@ from agents.common.settings import (
     check_option,
     check_share,
     check_space,
+    check_vectors,
     settings_of,
 )
 from agents.compiled.engine import CompiledEngine, EngineChoice, choose_engine
 from agents.compiled.generators import handles_of
 from agents.compiled.greedy_play import Playground
-from agents.compiled.learning_algorithm import LearningAlgorithm
-from agents.compiled.worlds import PROGRESS, UNDECIDED, env_dtype
+from agents.compiled.worlds import env_dtype
 from agents.linear.tiles import (
     Bound,
     HandedVectors,
@@ -53,6 +53,7 @@ from agents.networks.network_worlds import (
     network_playground,
     network_world,
 )
+from agents.tabular.workspace import Workspace, WorkspaceAlgorithm
 from machine_code.compiling import called
 from mdp.array_types import Floats, Ints
 
@@ -60,23 +61,10 @@ from mdp.array_types import Floats, Ints
 
 
 class TilePolicy(TablePolicy):
-    """Takes the action of the highest sum of weights over the active tiles.
+    """Takes the action of the highest sum of weights over the active tiles."""
 
-    Args:
-        observation_space: `Box` of shape (d,), or `Discrete`, each number of which is a tile.
-        action_space: `Discrete` with A values.
-        lr_schedule: not used; here because every policy is handed one.
-        tiling: further arguments of `agents.linear.tiles.make_tiles`.
-        values_states: whether there are weights of state values too.
-
-    Attributes:
-        weights: of action values or preferences, float64 of shape (tiles, A).
-        state_weights: of state values, float64 of shape (tiles,), or (0,) without them.
-        tiles: how observations become tiles.
-    """
-
-    weights: th.Tensor
-    state_weights: th.Tensor
+    weights: th.Tensor  # of action values or preferences, float64 of shape (tiles, A)
+    state_weights: th.Tensor  # of state values, float64 of shape (tiles,), or (0,) without them
 
     def __init__(
         self,
@@ -116,49 +104,21 @@ class TilePolicy(TablePolicy):
         return th.from_numpy(self.sums(observation.numpy()).argmax(axis=1))
 
 
-# What compiled functions work on while the interpreted loop steps the environments.
-
 NUMBERED_ENV = env_dtype(("number", np.int64))
 
 
-class TileWorkspace:
-    """Records of n environments, of how far the training is, and of the agent.
-
-    Args:
-        agent: whose weights are worked on in place.
-        space: what it observes.
-        n: number of environments, or of observations.
-    """
+class TileWorkspace(Workspace):
+    """A workspace with an agent, whose weights are worked on in place."""
 
     def __init__(self, agent: LinearAgent, space: spaces.Space[Any], n: int) -> None:
-        self.space = space
-        self.envs = np.zeros(n, dtype=NUMBERED_ENV)
+        super().__init__(n, NUMBERED_ENV)
         self.envs["number"] = np.arange(n)
-        self.envs["next_action"] = UNDECIDED
-        self.progress = np.zeros(1, dtype=PROGRESS)
-        # Looked up once: finding a field takes longer than filling it.
-        names = ("exploration", "learning_rate", "mean_td_error")
-        self._exploration, self._learning_rate, self._mean_td_error = (
-            self.progress[name] for name in names
-        )
-        self.fields = {name: self.envs[name] for name in NUMBERED_ENV.names or ()}
+        self.space = space
         n_dims = len(agent.room.vector)
         self.seen = HandedVectors(np.zeros((n, n_dims)), np.zeros((n, n_dims)))
         self.agent = agent._replace(seen=self.seen)
 
-    def note_progress(self, exploration: float, learning_rate: float, mean_td_error: float) -> None:
-        """Set how much to explore, the step size, and what the error was last."""
-        self._exploration[0] = exploration
-        self._learning_rate[0] = learning_rate
-        self._mean_td_error[0] = mean_td_error
-
-    @property
-    def next_actions(self) -> Ints:
-        """What the agent has committed to in each environment, or `UNDECIDED`; shape (n,)."""
-        actions: Ints = self.fields["next_action"]
-        return actions
-
-    def act(self, observations: NDArray[Any]) -> Ints:
+    def act(self, observations: Any) -> Ints:
         """An action for each observation, the one that was committed to where there is one."""
         self.seen.before[:] = vectors_of(self.space, observations)
         act_in_all(self.agent, self.envs, self.progress[0])
@@ -167,56 +127,26 @@ class TileWorkspace:
 
     def learn(self, transitions: Transitions) -> float:
         """Learn from a step of each environment, and return the mean absolute error."""
-        fields = self.fields
         self.seen.before[:] = vectors_of(self.space, transitions.obs)
         self.seen.after[:] = vectors_of(self.space, transitions.next_obs)
-        fields["action"][:] = transitions.actions
-        fields["reward"][:] = transitions.rewards
-        fields["terminated"][:] = transitions.terminated
-        fields["done"][:] = transitions.dones
+        self.fields["action"][:] = transitions.actions
+        self.take_outcomes(transitions)
         learn_from_all(self.agent, self.envs, self.progress[0])
-        return float(self._mean_td_error[0])
-
-
-# The compiled loop for agents on active tiles.
-
-
-class SeenWorld(NamedTuple):
-    """A compiled environment, and how its observations are read.
-
-    Attributes:
-        world: what `agents.compiled.loop` steps.
-        seen: one of the kinds of `agents.networks.network_worlds`.
-    """
-
-    world: Any
-    seen: Any
-
-
-def tile_world(vec_env: VecEnv) -> SeenWorld:
-    """The compiled counterpart of environments.
-
-    Raises:
-        NotCompilable: where there is none; the message says why.
-    """
-    return SeenWorld(*network_world(vec_env))
+        return float(self.mean_td_error[0])
 
 
 class TileEngine(CompiledEngine):
-    """One call of ``learn`` on the compiled loop.
-
-    Args:
-        agent: the algorithm, whose weights and generator are used in place.
-        seen_world: the compiled counterpart of its environments.
-        callback: what is told of the steps.
-        log_interval: episodes between two log records, or None.
-    """
+    """One call of ``learn`` on the compiled loop, in a world that `network_world` has made."""
 
     def __init__(
-        self, agent: Any, seen_world: SeenWorld, callback: BaseCallback, log_interval: int | None
+        self,
+        agent: Any,
+        world_and_seen: tuple[Any, Any],
+        callback: BaseCallback,
+        log_interval: int | None,
     ) -> None:
-        self.seen = seen_world.seen
-        super().__init__(agent, seen_world.world, callback, log_interval)
+        world, self.seen = world_and_seen
+        super().__init__(agent, world, callback, log_interval)
 
     def _make_states(self) -> NetworkEnvStates:
         return NetworkEnvStates(self.agent.env, self.world, self.seen)
@@ -228,11 +158,8 @@ class TileEngine(CompiledEngine):
         return self.agent.compiled_agent(self.agent.rng, self.seen)
 
 
-# Sums of weights that act on compiled environments, learning nothing.
-
-
 class TilePlayer(NamedTuple):
-    """Takes the first of the actions with the highest sum; attributes as in `LinearAgent`."""
+    """Plays without learning: takes the first of the actions with the highest sum."""
 
     weights: Floats
     tiles: Tiles
@@ -253,14 +180,6 @@ class TilePlayer(NamedTuple):
             move_on(self.seen, envs[i])
 
 
-def tile_player(agent: LinearAgent) -> TilePlayer:
-    """The agent without what it explores and learns by; the weights stay where they are."""
-    return TilePlayer(agent.weights, agent.tiles, agent.seen, agent.room)
-
-
-# What all agents on active tiles share: arguments, weights, and how they are trained.
-
-
 class TileArguments(CommonArguments, total=False):
     """What the constructors of these agents hand on; see `TileAlgorithm`."""
 
@@ -272,7 +191,7 @@ class TileArguments(CommonArguments, total=False):
     engine: EngineChoice
 
 
-class TileAlgorithm(LearningAlgorithm):
+class TileAlgorithm(WorkspaceAlgorithm):
     """Learns weights of tiles: those of a tile coder, or a table's where observations are numbers.
 
     Args:
@@ -301,11 +220,8 @@ class TileAlgorithm(LearningAlgorithm):
     policy: TilePolicy
     parameters = {"gamma": np.float64}  # noqa: RUF012
     values_states: ClassVar[bool] = False
-    logs_by_records = True
 
     act = act_on_tiles
-
-    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions")
 
     def __init__(
         self,
@@ -327,16 +243,11 @@ class TileAlgorithm(LearningAlgorithm):
         self.low = low
         self.high = high
         self.engine = engine
-        self.engine_in_use = ""
-        self.mean_td_error = 0.0
-        self._next_actions: Ints = np.empty(0, dtype=np.int64)
         super().__init__(policy, env, learning_rate, tie_breaking, **kwargs)
 
     def _check_arguments(self) -> None:
         check_space(self, "actions", self.action_space)
-        space = self.observation_space
-        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
-            check_space(self, "observations of shape (d,) in a Box space or", space)
+        check_vectors(self, self.observation_space)
         check_option("engine", self.engine, EngineChoice)
         if isinstance(self.learning_rate, str):
             raise ValueError(
@@ -375,12 +286,7 @@ class TileAlgorithm(LearningAlgorithm):
         return ()
 
     def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> LinearAgent:
-        """The agent as compiled functions see it, its weights in the memory of its policy.
-
-        Args:
-            rng: its generator.
-            seen: how observations are read, one of the kinds of `agents.networks.network_worlds`.
-        """
+        """The agent as compiled functions see it, its weights in the memory of its policy."""
         tiles = self.policy.tiles
         here, ahead = np.empty((2, tiles.n_tilings), dtype=np.int64)
         room = Room(np.empty(len(tiles.dimensions)), here, ahead, np.empty(self.n_actions))
@@ -396,53 +302,18 @@ class TileAlgorithm(LearningAlgorithm):
 
     def greedy_player(self, seen: Any) -> TilePlayer:
         """What plays as `predict` does on compiled environments, whose observations are read so."""
-        return tile_player(self.compiled_agent(self.rng, seen))
-
-    def _begin_episodes(self) -> None:
-        self._next_actions = np.full(self.n_envs, UNDECIDED)
+        agent = self.compiled_agent(self.rng, seen)
+        return TilePlayer(agent.weights, agent.tiles, agent.seen, agent.room)
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        engine = choose_engine(self, callback, log_interval, tile_world, TileEngine)
+        engine = choose_engine(self, callback, log_interval, network_world, TileEngine)
         if engine is not None:
             engine.run(total_timesteps)
             return
         super()._run(total_timesteps, callback, log_interval)
 
-    def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
-        """Write what the compiled loop goes on from into its records."""
-        envs["next_action"] = self._next_actions
-        progress["mean_td_error"] = self.mean_td_error
-
-    def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
-        """Go on from where the compiled loop is."""
-        self._next_actions = envs["next_action"].copy()
-        self.mean_td_error = float(progress["mean_td_error"][0])
-
     def _make_workspace(self, rng: np.random.Generator, n: int) -> TileWorkspace:
         return TileWorkspace(self.compiled_agent(rng), self.observation_space, n)
-
-    def _present_workspace(self) -> TileWorkspace:
-        workspace: TileWorkspace = self._workspace_for(self.rng, self.n_envs)
-        self._note_progress(workspace)
-        workspace.next_actions[:] = self._next_actions
-        return workspace
-
-    def _note_progress(self, workspace: TileWorkspace) -> None:
-        remaining = self._current_progress_remaining
-        exploration, step_size = self.exploration_schedule(remaining), self.lr_schedule(remaining)
-        workspace.note_progress(exploration, step_size, self.mean_td_error)
-
-    def _choose_actions(self) -> Ints:
-        workspace = self._present_workspace()
-        actions = workspace.act(np.asarray(self._last_obs))
-        self._next_actions = workspace.next_actions.copy()
-        return actions
-
-    def _learn_from(self, transitions: Transitions) -> None:
-        workspace = self._present_workspace()
-        self.mean_td_error = workspace.learn(transitions)
-        self._next_actions = workspace.next_actions.copy()
-        self._n_updates += self.n_envs
 
     def predict(
         self,
@@ -470,9 +341,3 @@ class TileAlgorithm(LearningAlgorithm):
             check_space(self, "observations", self.observation_space)
             observations = np.arange(self.observation_space.n)  # type: ignore[attr-defined]
         return self._probabilities(self.policy.sums(observations))
-
-    def _record_training(self) -> None:
-        self.logger.record("train/mean_absolute_td_error", self.mean_td_error)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        rate = self.lr_schedule(self._current_progress_remaining)
-        self.logger.record("train/learning_rate", rate)

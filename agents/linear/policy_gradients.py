@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Unpack
 
@@ -11,7 +10,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from agents.common.algorithm import Transitions
-from agents.common.exploration import BOLTZMANN, action_probabilities, highest_value
+from agents.common.exploration import (
+    BOLTZMANN,
+    action_probabilities,
+    drawn_action,
+    make_probabilities,
+)
 from agents.common.settings import check_at_least, check_finite, check_option, settings_of
 from agents.compiled.generators import next_uniform
 from agents.compiled.worlds import NotCompilable
@@ -31,26 +35,11 @@ from mdp.array_types import Floats, Ints
 
 
 @called
-def make_probabilities(sums: Floats) -> None:
-    """Turn preferences into the probabilities of their softmax, shape (A,)."""
-    highest, total = highest_value(sums), 0.0
-    for action in range(len(sums)):
-        sums[action] = math.exp(sums[action] - highest)
-        total += sums[action]
-    for action in range(len(sums)):
-        sums[action] /= total
-
-
-@called
 def draw_by_preference(agent: LinearAgent, progress: Any) -> int:
     """An action with probability proportional to exp(preference)."""
-    probabilities, remaining = agent.room.sums, next_uniform(agent.rng)
-    make_probabilities(probabilities)
-    for action in range(len(probabilities) - 1):
-        remaining -= probabilities[action]
-        if remaining < 0.0:
-            return action
-    return len(probabilities) - 1
+    uniform = next_uniform(agent.rng)
+    make_probabilities(agent.room.sums)
+    return drawn_action(agent.room.sums, uniform)
 
 
 @called
@@ -134,28 +123,17 @@ class SoftmaxAlgorithm(TileAlgorithm):
 
 
 class Critic(NamedTuple):
-    """What the agent keeps besides its preferences.
+    """What the agent keeps besides its preferences."""
 
-    Attributes:
-        values: weights of the state values, shape (tiles,).
-        discounts: gamma to the power of the steps of the episode under way in each of n
-            environments, shape (n,).
-    """
-
-    values: Floats
+    values: Floats  # weights of the state values, shape (tiles,)
+    # Gamma to the power of the steps of the episode under way in each of n environments, shape
+    # (n,).
     discounts: Floats
 
 
 @called
 def actor_critic_step(agent: LinearAgent, env: Any, progress: Any, discount: float) -> float:
-    """Learn from an environment's last step, and return the TD error.
-
-    Args:
-        agent: the agent.
-        env: the environment's record.
-        progress: how far the training is.
-        discount: weighs what is learnt about the policy.
-    """
+    """Learn from an environment's last step, and return the TD error."""
     room, values = agent.room, agent.memory.values
     look(agent, env, AFTER, room.next_tiles)
     look(agent, env, BEFORE, room.tiles)
@@ -238,21 +216,13 @@ MOST_KEPT = 50_000_000
 
 
 class KeptEpisodes(NamedTuple):
-    """What the agent keeps besides its preferences: the episodes under way in n environments.
+    """What the agent keeps besides its preferences: the episodes under way in n environments."""
 
-    Attributes:
-        values: weights of the state values, shape (tiles,); of shape (0,) without a baseline.
-        lengths: steps that are kept, shape (n,).
-        tiles: active tiles of the observations, shape (n, capacity, n_tilings).
-        actions: what was done, shape (n, capacity).
-        rewards: what it gave, shape (n, capacity); the returns, once the episode is over.
-    """
-
-    values: Floats
-    lengths: Ints
-    tiles: Ints
-    actions: Ints
-    rewards: Floats
+    values: Floats  # weights of the state values, shape (tiles,); of shape (0,) without a baseline
+    lengths: Ints  # steps that are kept, shape (n,)
+    tiles: Ints  # active tiles of the observations, shape (n, capacity, n_tilings)
+    actions: Ints  # what was done, shape (n, capacity)
+    rewards: Floats  # what it gave, shape (n, capacity); the returns, once the episode is over
 
 
 @called

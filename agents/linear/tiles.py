@@ -21,12 +21,9 @@ from mdp.array_types import Floats, Ints
 #
 # A tiling cuts the space between ``low`` and ``high`` into tiles of equal width. Another one is
 # displaced by a share of a tile that differs between the dimensions: tiling t by (1, 3, 5, ...) t /
-# n
-# tiles, where n tilings there are, and whole tiles left out. To cover the space all the same it has
-# a
-# tile more in each dimension. Tiles are numbered; nothing is hashed. A number that stands for
-# itself,
-# as a state of a table, is a dimension with one tiling of tiles of width 1.
+# n tiles, where n tilings there are, and whole tiles left out. To cover the space all the same it
+# has a tile more in each dimension. Tiles are numbered; nothing is hashed. A number that stands for
+# itself, as a state of a table, is a dimension with one tiling of tiles of width 1.
 #
 # Source: Sutton and Barto (2nd edition), section 9.5.4.
 
@@ -43,17 +40,11 @@ DIMENSION = np.dtype(
 
 
 class Tiles(NamedTuple):
-    """Tilings of a space of d dimensions.
+    """Tilings of a space of d dimensions."""
 
-    Attributes:
-        dimensions: records of type `DIMENSION`, shape (d,).
-        n_tilings: number n of tilings.
-        n_in_tiling: tiles of each of them.
-    """
-
-    dimensions: NDArray[np.void]
-    n_tilings: int
-    n_in_tiling: int
+    dimensions: NDArray[np.void]  # records of type `DIMENSION`, shape (d,)
+    n_tilings: int  # number n of tilings
+    n_in_tiling: int  # tiles of each of them
 
     @property
     def n_tiles(self) -> int:
@@ -66,11 +57,6 @@ def active_tiles(tiles: Tiles, vector: Floats, active: Ints) -> None:
     """Fill in the tile of each tiling that a vector lies in.
 
     What lies outside of the bounds, or is no number, counts as lying on them.
-
-    Args:
-        tiles: the tilings.
-        vector: the observation, shape (d,).
-        active: the tiles' numbers, shape (n_tilings,).
     """
     for tiling in range(len(active)):
         active[tiling] = tiling * tiles.n_in_tiling
@@ -100,14 +86,7 @@ def tiles_of_all(tiles: Tiles, vectors: Floats) -> Ints:
 
 
 def tiles_between(low: Floats, tiles_per_unit: Floats, counts: Ints, n_tilings: int) -> Tiles:
-    """Tilings of a space.
-
-    Args:
-        low: where tiles begin, shape (d,).
-        tiles_per_unit: tiles in a unit of the observation, shape (d,).
-        counts: tiles from low to high, shape (d,).
-        n_tilings: number of tilings.
-    """
+    """Tilings of a space."""
     # What is displaced covers the space with a tile more.
     sizes = [int(count) + (n_tilings > 1) for count in counts]
     dimensions = np.zeros(len(sizes), dtype=DIMENSION)
@@ -168,14 +147,7 @@ def make_tiles(
 
 
 def vectors_of(space: spaces.Space[Any], observations: Any) -> Floats:
-    """Observations as `Tiles` read them, those of a `Box` in single precision.
-
-    Returns:
-        Vectors, shape (n, d).
-
-    Raises:
-        ValueError: if a number is not in a `Discrete` space.
-    """
+    """Observations as `Tiles` read them, those of a `Box` in single precision."""
     given = np.asarray(observations)
     if not isinstance(space, spaces.Discrete):
         assert space.shape is not None
@@ -232,61 +204,39 @@ def _whole_number(name: str, value: Any) -> int:
 # Agents whose values or preferences are sums of weights: one for each active tile and action.
 #
 # Compiled functions, shared by the interpreted and the compiled training loop. What an algorithm
-# adds
-# is how it chooses among the sums, and how it learns. Step sizes are divided by the number of
+# adds is how it chooses among the sums, and how it learns. Step sizes are divided by the number of
 # tilings, so that a step size of 1 moves a sum all the way to its target.
 #
 # Source: Sutton and Barto (2nd edition), sections 9.4 and 9.5.4.
 
 
 class Room(NamedTuple):
-    """Where numbers are worked out; what it holds between two calls means nothing.
+    """Where numbers are worked out; what it holds between two calls means nothing."""
 
-    Attributes:
-        vector: an observation, shape (d,).
-        tiles: the active tiles of an observation, shape (n_tilings,).
-        next_tiles: those of the next one, likewise.
-        sums: a number for each action, shape (A,).
-    """
-
-    vector: Floats
-    tiles: Ints
-    next_tiles: Ints
-    sums: Floats
+    vector: Floats  # an observation, shape (d,)
+    tiles: Ints  # the active tiles of an observation, shape (n_tilings,)
+    next_tiles: Ints  # those of the next one, likewise
+    sums: Floats  # a number for each action, shape (A,)
 
 
 class LinearAgent(NamedTuple):
-    """An agent as compiled functions see it.
+    """An agent as compiled functions see it."""
 
-    Attributes:
-        settings: a record of the type that its class has.
-        weights: of action values or preferences, in the memory of its policy, shape (tiles, A).
-        memory: what else it keeps; each algorithm has a type of its own for that.
-        tiles: how observations become tiles.
-        seen: how observations are read from the environments' records.
-        room: for its work.
-        rng: a handle of its generator.
-    """
-
-    settings: Any
+    settings: Any  # a record of the type that its class has
+    # Of action values or preferences, in the memory of its policy, shape (tiles, A).
     weights: Floats
-    memory: Any
-    tiles: Tiles
-    seen: Any
-    room: Room
-    rng: Any
+    memory: Any  # what else it keeps; each algorithm has a type of its own for that
+    tiles: Tiles  # how observations become tiles
+    seen: Any  # how observations are read from the environments' records
+    room: Room  # for its work
+    rng: Any  # a handle of its generator
 
 
 class HandedVectors(NamedTuple):
-    """Observations that the interpreted loop hands over, of environments that know their number.
+    """Observations that the interpreted loop hands over, of environments that know their number."""
 
-    Attributes:
-        before: the observations before the step, shape (n, d).
-        after: those after it, before any reset, shape (n, d).
-    """
-
-    before: Floats
-    after: Floats
+    before: Floats  # the observations before the step, shape (n, d)
+    after: Floats  # those after it, before any reset, shape (n, d)
 
     @called
     def observe(self, env: Any, moment: int, row: Any) -> None:

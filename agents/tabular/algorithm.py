@@ -1,11 +1,12 @@
-"""The base of the tabular agents: their arguments, and how they act and learn."""
+"""The base of the tabular agents: their arguments, masks and memory, how they act and learn."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Unpack
+from typing import Any, ClassVar, Literal, Unpack, cast
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
@@ -14,9 +15,16 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from agents.common.algorithm import Transitions
 from agents.common.exploration import STRATEGIES, action_probabilities, draws_per_choice
-from agents.common.masks import numbers_in
+from agents.common.masks import (
+    check_masks_exist,
+    checked_masks,
+    masks_of_observations,
+    numbers_in,
+    present_masks,
+)
 from agents.common.schedules import epsilon_schedule
 from agents.common.settings import (
+    CommonArguments,
     ExplorationDecay,
     TieBreaking,
     check_above_zero,
@@ -30,10 +38,12 @@ from agents.compiled.engine import EngineChoice, choose_engine
 from agents.compiled.generators import handles_of
 from agents.compiled.greedy_play import Explorer, Plan
 from agents.compiled.learning_algorithm import StepSize
-from agents.compiled.worlds import ENV, PROGRESS, UNDECIDED, env_records
-from agents.tabular.policy import EpisodeKeeper, MaskedArguments, QTablePolicy
+from agents.compiled.worlds import NotCompilable
+from agents.tabular.policy import QTablePolicy
 from agents.tabular.updates import (
+    MaskedTables,
     Room,
+    Tables,
     TabularAgent,
     act_in_all,
     act_on_values,
@@ -41,26 +51,22 @@ from agents.tabular.updates import (
     no_commitment,
     td_learning,
 )
+from agents.tabular.workspace import Workspace, WorkspaceAlgorithm
+from envs.wrappers import INFO_KEY
 from mdp.array_types import Bools, Floats, Ints
 
-# What compiled functions work on while the interpreted loop steps the environments.
+ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
-class Workspace:
-    """Records of n environments, of how far the training is, and of the agent.
+class TableWorkspace(Workspace):
+    """A workspace with an agent, whose tables are worked on in place.
 
-    Args:
-        agent: whose settings and tables are worked on in place.
-        masks: what the environment allows at each observation, or of no rows for everything.
-        rng: its generator, or another one to choose by.
-        n: number of environments, or of observations.
+    The masks say what the environment allows at each observation; of no rows they allow everything.
     """
 
     def __init__(self, agent: TabularAgent, masks: Bools, rng: np.random.Generator, n: int) -> None:
+        super().__init__(n)
         self.rng = rng  # the handle does not keep it alive
-        self.envs = env_records(n, ENV)
-        self.envs["next_action"] = UNDECIDED
-        self.progress = np.zeros(1, dtype=PROGRESS)
         # In the order that `act_in_all` and `learn_from_all` take them in.
         self.arrays = (
             np.array([agent.settings]),
@@ -72,41 +78,17 @@ class Workspace:
             handles_of([rng]),
             agent.memory,
         )
-        # Looked up once: finding a field takes longer than filling it.
-        self.fields = {name: self.envs[name] for name in ENV.names or ()}
-        names = ("exploration", "learning_rate", "episodes")
-        self.exploration, self.learning_rate, self.episodes = (self.progress[n] for n in names)
         self._chosen: Ints | None = None
 
-    @property
-    def next_actions(self) -> Ints:
-        """What the agent has committed to in each environment, or `UNDECIDED`; shape (n,)."""
-        actions: Ints = self.fields["next_action"]
-        return actions
-
-    def note_progress(self, exploration: float, learning_rate: float, episodes: int) -> None:
-        """Set how much to explore, the step size, and how many episodes have ended."""
-        self.exploration[0] = exploration
-        self.learning_rate[0] = learning_rate
-        self.episodes[0] = episodes
-
     def _check(self, field: str, outside: int) -> None:
-        """Refuse an observation that the tables have no row for, which compiled code would not see.
-
-        Raises:
-            ValueError: naming the observation and what it may be.
-        """
+        """Refuse an observation without a row in the tables, unless ``outside`` is -1."""
         if outside >= 0:
             n_states = self.arrays[3].shape[1]
             obs = self.fields[field][outside]
             raise ValueError(f"observation {obs} is not in Discrete({n_states}), the agent's space")
 
     def act(self, obs: Any) -> Ints:
-        """An action for each observation, the one that was committed to where there is one.
-
-        Args:
-            obs: observations, shape (n,).
-        """
+        """An action for each observation, the one that was committed to where there is one."""
         fields = self.fields
         fields["obs"][:] = obs
         self._check("obs", act_in_all(*self.arrays))
@@ -121,158 +103,25 @@ class Workspace:
             # Not what `act` has just chosen, whose observations and actions are there already.
             fields["obs"][:] = transitions.obs
             fields["action"][:] = transitions.actions
-        fields["reward"][:] = transitions.rewards
-        fields["terminated"][:] = transitions.terminated
-        fields["done"][:] = transitions.dones
         fields["next_obs"][:] = transitions.next_obs
+        self.take_outcomes(transitions)
         self._check("next_obs", learn_from_all(*self.arrays))
-        return float(self.progress["mean_td_error"][0])
+        return float(self.mean_td_error[0])
 
 
-# How agents on tables act and learn: what both training loops are handed of them.
+class MaskedArguments(CommonArguments, total=False):
+    """What the constructors of tabular agents hand on; see `TabularAlgorithm`."""
+
+    mask_actions: bool
 
 
-class TableTraining(EpisodeKeeper):
-    """Acts and learns on the tables of its policy, interpreted or compiled.
-
-    Attributes:
-        engine_in_use: which loop the last training ran in, and why if it is not the compiled one.
-        mean_td_error: mean absolute error of the last updates.
-        last_steps: a record for each environment, with target and TD error of its last update.
-    """
-
-    # What the training loops call; `next_value` is each algorithm's own.
-    act = act_on_values
-    learn_from_step = td_learning
-    commit = no_commitment
-
-    _rebuilt = (*EpisodeKeeper._rebuilt, "_in_use", "last_steps")
-    excluded_from_states = ("_in_use", "last_steps")
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.engine_in_use = ""
-        self.mean_td_error = 0.0
-        self._in_use: Workspace | None = None
-        self.last_steps: NDArray[np.void] | None = None
-        super().__init__(*args, **kwargs)
-
-    def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
-        """The agent as compiled functions see it, its tables in the memory of its policy."""
-        values = self.policy.q_tables.numpy()
-        self._check_tables()
-        self._check_memory()
-        n_actions = values.shape[2]
-        n_draws = draws_per_choice(self.strategy, n_actions)
-        return TabularAgent(
-            self.settings()[0],
-            self._tables(),
-            Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
-            handles_of([rng])[0],
-            self._memory_in_use(),
-        )
-
-    def greedy_player(self, seen: Any) -> Plan:
-        """What plays as `predict` does on compiled environments, which show numbers."""
-        numbers = np.arange(self.policy.q_tables.shape[1])
-        return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
-
-    def exploring_player(self, seen: Any) -> Explorer:
-        """What plays as `predict` does that explores, and draws from the same generator."""
-        return Explorer(self.compiled_agent(self.predict_rng), self.progress())
-
-    def _check_tables(self) -> None:
-        super()._check_tables()
-        if self.strategy not in STRATEGIES.values():
-            raise ValueError(f"unknown exploration strategy {self.strategy}")
-
-    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        engine = choose_engine(self, callback, log_interval)
-        if engine is not None:
-            engine.run(total_timesteps)
-            return
-        self._in_use = None
-        super()._run(total_timesteps, callback, log_interval)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_in_use": None, "last_steps": None}
-
-    def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
-        """Write what the compiled loop goes on from into its records."""
-        super().hand_over(envs, progress)
-        progress["mean_td_error"] = self.mean_td_error
-
-    def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
-        """Go on from where the compiled loop is."""
-        super().take_over(envs, progress)
-        self.last_steps = envs
-        self.mean_td_error = float(progress["mean_td_error"][0])
-
-    def _present_workspace(self) -> Workspace:
-        """The one of the training under way, up to date."""
-        workspace: Workspace = self._workspace_for(self.rng, self.n_envs)
-        self._note_progress(workspace)
-        if self._next_actions is not workspace.next_actions:
-            workspace.next_actions[:] = self._next_actions
-            self._next_actions = workspace.next_actions
-        return workspace
-
-    def _note_progress(self, workspace: Workspace) -> None:
-        remaining = self._current_progress_remaining
-        exploration, step_size = self.exploration_schedule(remaining), self.lr_schedule(remaining)
-        workspace.note_progress(exploration, step_size, self._episode_num)
-
-    def _make_workspace(self, rng: np.random.Generator, n: int) -> Workspace:
-        return Workspace(self.compiled_agent(rng), self.policy.masks, rng, n)
-
-    def _choose_actions(self) -> Ints:
-        if self.asks_for_masks:
-            self._note_present_masks()
-        workspace = self._in_use
-        if workspace is None or workspace.rng is not self.rng:
-            workspace = self._present_workspace()
-        else:
-            # Brought up to date when the agent learnt last: episodes have been counted since then.
-            workspace.episodes[0] = self._episode_num
-        return workspace.act(self._last_obs)
-
-    def _learn_from(self, transitions: Transitions) -> None:
-        if self.asks_for_masks:
-            self._note_next_masks(transitions)
-        self._in_use = workspace = self._present_workspace()
-        self.last_steps = workspace.envs
-        self.mean_td_error = workspace.learn(transitions)
-        self._n_updates += self.n_envs
-
-    def predict(
-        self,
-        observation: NDArray[Any] | dict[str, NDArray[Any]],
-        state: tuple[NDArray[Any], ...] | None = None,
-        episode_start: NDArray[Any] | None = None,
-        deterministic: bool = False,
-        action_masks: Any = None,
-    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
-        """The greedy action, or an exploring one unless ``deterministic``, as DQN has it.
-
-        Takes one state index or an array of shape (n,), and returns actions of the same shape and
-        ``state``; ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape
-        (n, A) count here in place of those that the agent has kept.
-        """
-        if deterministic and action_masks is None:
-            return super().predict(observation, state, episode_start, deterministic)
-        obs = numbers_in(self.observation_space, observation)
-        with self.policy.told(obs.reshape(-1), action_masks):
-            if deterministic:
-                return super().predict(obs, state, episode_start, deterministic)
-            return self._exploring_actions(obs), state
-
-
-# What all tabular agents share: their arguments, their tables, and how they act and learn.
-
-ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
-
-
-class TabularAlgorithm(TableTraining):
+class TabularAlgorithm(WorkspaceAlgorithm):
     """Temporal-difference control on a table of action values.
+
+    An algorithm may remember more than its tables: a NamedTuple of arrays from `_make_memory`,
+    which compiled functions are handed as ``agent.memory`` and change in place. What belongs to
+    episodes under way has a row for each environment. The memory is not part of a model file: what
+    is learnt for good belongs into buffers of the policy, which `_memory_in_use` may put beside it.
 
     Args:
         policy: ``"QTablePolicy"``.
@@ -297,15 +146,36 @@ class TabularAlgorithm(TableTraining):
             a hundred times faster, and is refused where there is none; ``"interpreted"`` calls
             them step by step; ``"auto"`` compiles where it can.
         policy_kwargs: further arguments of the policy.
-        kwargs: as in `MaskKeeper`, ``mask_actions`` among them.
+        mask_actions: choose among the actions that the environment allows, and bootstrap from
+            those that it allows next. It says so by a method `action_masks()`, which has to go by
+            the observation alone. At an observation that was never met all actions count.
+        kwargs: as in `OnlineAlgorithm`.
+
+    Attributes:
+        masks_are_known: whether the policy holds the masks of all states.
+        last_steps: a record for each environment, with target and TD error of its last update.
 
     Raises:
-        ValueError: if an argument lies outside its range or a space does not fit.
+        ValueError: if an argument lies outside its range, a space does not fit, or masks are asked
+            for and the environment has none; while learning, if a mask is malformed, allows
+            nothing, or differs from another one of the same observation.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
+    policy: QTablePolicy
+    n_tables: ClassVar[int] = 1
     parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
-    logs_by_records = True
+
+    # What the training loops call; `next_value` is each algorithm's own.
+    act = act_on_values
+    learn_from_step = td_learning
+    commit = no_commitment
+
+    _rebuilt = (
+        *WorkspaceAlgorithm._rebuilt,
+        *("masks_are_known", "_infos", "_memory", "last_steps"),
+    )
+    excluded_from_states = ("last_steps",)
 
     def __init__(
         self,
@@ -326,7 +196,8 @@ class TabularAlgorithm(TableTraining):
         skip_terminal_update: bool = False,
         engine: EngineChoice = "auto",
         policy_kwargs: dict[str, Any] | None = None,
-        **kwargs: Unpack[MaskedArguments],
+        mask_actions: bool = False,
+        **kwargs: Unpack[CommonArguments],
     ) -> None:
         self.gamma = gamma
         self.exploration = exploration
@@ -340,10 +211,16 @@ class TabularAlgorithm(TableTraining):
         self.initial_q_std = initial_q_std
         self.skip_terminal_update = skip_terminal_update
         self.engine = engine
+        self.mask_actions = mask_actions
+        self.masks_are_known = False
+        self.last_steps: NDArray[np.void] | None = None
+        self._infos: list[dict[str, Any]] = []
+        self._memory: tuple[Any, ...] = ()
         super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
-        super()._check_arguments()
+        if self.mask_actions and self.env is not None:
+            check_masks_exist(self.env)
         check_space(self, "observations", self.observation_space)
         check_space(self, "actions", self.action_space)
         check_option("exploration", self.exploration, ExplorationStrategy)
@@ -353,7 +230,15 @@ class TabularAlgorithm(TableTraining):
         check_above_zero(settings_of(self, "temperature"))
 
     def _make_policy(self) -> QTablePolicy:
-        policy = super()._make_policy()
+        policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            n_tables=self.n_tables,
+            **self.policy_kwargs,
+        )
+        if self.mask_actions:
+            policy.keep_masks()
         noise = self.rng.standard_normal(policy.q_tables.shape)
         with np.errstate(over="ignore"):
             tables = self.initial_q + self.initial_q_std * noise
@@ -368,12 +253,178 @@ class TabularAlgorithm(TableTraining):
             return FloatSchedule(self.temperature)
         if self.exploration == "gaussian_noise":
             return FloatSchedule(self.noise_std)
-        return epsilon_schedule(
-            self.exploration_decay,
-            self.exploration_initial_eps,
-            self.exploration_final_eps,
-            self.exploration_fraction,
+        return epsilon_schedule(self)
+
+    # What compiled functions are handed.
+
+    def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
+        """The agent as compiled functions see it, its tables in the memory of its policy."""
+        self._check_tables()
+        self._check_memory()
+        policy = self.policy
+        values, counts = policy.q_tables.numpy(), policy.visit_counts.numpy()
+        n_actions = values.shape[2]
+        n_draws = draws_per_choice(self.strategy, n_actions)
+        return TabularAgent(
+            self.settings()[0],
+            MaskedTables(values, counts, policy.masks)
+            if self.mask_actions
+            else Tables(values, counts),
+            Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
+            handles_of([rng])[0],
+            self._memory_in_use(),
         )
+
+    def _check_tables(self) -> None:
+        """Refuse tables that compiled code would read beside, naming the right shape."""
+        sizes = cast(Any, (self.observation_space, self.action_space))
+        shape = (self.n_tables, *(int(space.n) for space in sizes))
+        found = tuple(self.policy.q_tables.shape), tuple(self.policy.visit_counts.shape)
+        if found != (shape, shape) or self.n_tables not in (1, 2):
+            raise ValueError(f"tables must be 1 or 2, of shape {shape}, not {found[0]}")
+        if self.mask_actions and self.policy.masks.shape != shape[1:]:
+            raise ValueError(f"masks must be of shape {shape[1:]}, not {self.policy.masks.shape}")
+        if self.strategy not in STRATEGIES.values():
+            raise ValueError(f"unknown exploration strategy {self.strategy}")
+
+    def _make_memory(self) -> tuple[Any, ...]:
+        """A memory of nothing, for ``n_envs`` environments."""
+        return ()
+
+    def _memory_in_use(self) -> tuple[Any, ...]:
+        """What compiled functions are handed; their algorithm's memory, unless it says more."""
+        return self._memory
+
+    def _check_memory(self) -> None:
+        """Refuse a memory that compiled code would read beside, naming the array."""
+        expected: Any = self._make_memory()
+        if type(self._memory) is not type(expected):
+            raise ValueError(f"the agent's memory must be a {type(expected).__name__}")
+        for name, found, like in zip(
+            getattr(expected, "_fields", ()), self._memory, expected, strict=True
+        ):
+            if (found.dtype, found.shape) != (like.dtype, like.shape):
+                raise ValueError(
+                    f"the agent's memory was made for other settings: {name} must be of shape "
+                    f"{like.shape} and {like.dtype}, not {found.shape} and {found.dtype}"
+                )
+
+    def greedy_player(self, seen: Any) -> Plan:
+        """What plays as `predict` does on compiled environments, which show numbers."""
+        numbers = np.arange(self.policy.q_tables.shape[1])
+        return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
+
+    def exploring_player(self, seen: Any) -> Explorer:
+        """What plays as `predict` does that explores, and draws from the same generator."""
+        return Explorer(self.compiled_agent(self.predict_rng), self.progress())
+
+    # Training.
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self.mask_actions:
+            assert self.env is not None
+            check_masks_exist(self.env)
+            known = masks_of_observations(self.env, len(self.policy.masks))
+            self.masks_are_known = known is not None
+            if known is not None:
+                self.policy.masks[:] = known
+        return prepared
+
+    def check_compilable(self) -> None:
+        if self.asks_for_masks:
+            raise NotCompilable("the action masks are not known of all states")
+
+    def _begin_episodes(self) -> None:
+        super()._begin_episodes()
+        self._memory = self._make_memory()
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        engine = choose_engine(self, callback, log_interval)
+        if engine is not None:
+            engine.run(total_timesteps)
+            return
+        self._in_use = None
+        super()._run(total_timesteps, callback, log_interval)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "last_steps": None}
+
+    def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Go on from where the compiled loop is."""
+        super().take_over(envs, progress)
+        self.last_steps = envs
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> TableWorkspace:
+        return TableWorkspace(self.compiled_agent(rng), self.policy.masks, rng, n)
+
+    def _choose_actions(self) -> Ints:
+        if self.asks_for_masks:
+            assert self.env is not None
+            self.policy.note_masks(self._last_obs, present_masks(self.env, self._last_obs))
+        workspace: TableWorkspace | None = self._in_use
+        if workspace is None or workspace.rng is not self.rng:
+            return super()._choose_actions()
+        # Brought up to date when the agent learnt last: episodes have been counted since then.
+        workspace.episodes[0] = self._episode_num
+        return workspace.act(self._last_obs)
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        if self.asks_for_masks:
+            self._note_next_masks(transitions)
+        super()._learn_from(transitions)
+        self.last_steps = self._in_use.envs
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Bools | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        self._infos = infos
+
+    @property
+    def asks_for_masks(self) -> bool:
+        """Whether the environments have to be asked at each step."""
+        return self.mask_actions and not self.masks_are_known
+
+    def _note_next_masks(self, transitions: Transitions) -> None:
+        """Keep what may be done where the step has led.
+
+        By now a finished environment has been reset. Of the state in which an episode was cut off,
+        ``info`` may tell; else what was seen there before counts.
+        """
+        assert self.env is not None
+        going_on = np.flatnonzero(~transitions.dones)
+        if going_on.size:
+            masks = present_masks(self.env, transitions.next_obs)
+            self.policy.note_masks(transitions.next_obs[going_on], masks[going_on])
+        n_actions = int(cast(spaces.Discrete, self.action_space).n)
+        for i in np.flatnonzero(transitions.dones & ~transitions.terminated):
+            if INFO_KEY in self._infos[i]:
+                obs = transitions.next_obs[i : i + 1]
+                masks = checked_masks([self._infos[i][INFO_KEY]], obs, n_actions)
+                self.policy.note_masks(obs, masks)
+
+    # What the agent does, and how much it explores.
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+        action_masks: Any = None,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The greedy action, or an exploring one unless ``deterministic``, as DQN has it.
+
+        Takes one state index or an array of shape (n,), and returns actions of the same shape and
+        ``state``; ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape
+        (n, A) count here in place of those that the agent has kept.
+        """
+        if deterministic and action_masks is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        obs = numbers_in(self.observation_space, observation)
+        with self.policy.told(obs.reshape(-1), action_masks):
+            if deterministic:
+                return super().predict(obs, state, episode_start, deterministic)
+            return self._exploring_actions(obs), state
 
     @property
     def strategy(self) -> int:
@@ -404,11 +455,7 @@ class TabularAlgorithm(TableTraining):
 
     def _record_training(self) -> None:
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
-        self.logger.record("train/mean_absolute_td_error", self.mean_td_error)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if not self.averages_samples:
-            rate = self.lr_schedule(self._current_progress_remaining)
-            self.logger.record("train/learning_rate", rate)
+        super()._record_training()
 
     def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
         """As above; Gaussian noise falls with the episodes."""

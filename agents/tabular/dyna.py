@@ -29,23 +29,15 @@ from safe_files.files import MAX_ARCHIVE_BYTES
 
 
 class LearntModel(NamedTuple):
-    """The last K outcomes of each pair, each as likely as the others.
+    """The last K outcomes of each pair, each as likely as the others."""
 
-    Attributes:
-        next_obs: where they led, shape (S, A, K).
-        rewards: what they earned, shape (S, A, K).
-        terminated: whether they ended the episode, shape (S, A, K).
-        counts: how many there have been, those that were dropped included, shape (S, A).
-        pairs: those that planning draws from, in the order in which they were met, shape (S * A,).
-        n_pairs: how many these are, shape (1,).
-    """
-
-    next_obs: Ints
-    rewards: Floats
-    terminated: Bools
-    counts: Ints
+    next_obs: Ints  # where they led, shape (S, A, K)
+    rewards: Floats  # what they earned, shape (S, A, K)
+    terminated: Bools  # whether they ended the episode, shape (S, A, K)
+    counts: Ints  # how many there have been, those that were dropped included, shape (S, A)
+    # Those that planning draws from, in the order in which they were met, shape (S * A,).
     pairs: Ints
-    n_pairs: Ints
+    n_pairs: Ints  # how many these are, shape (1,)
 
 
 @inlined
@@ -79,22 +71,9 @@ MOST_BYTES = MAX_ARCHIVE_BYTES * 15 // 16
 
 
 class ModelPolicy(QTablePolicy):
-    """Greedy in a table, with what was learnt of the environment beside it.
+    """Greedy in a table, with what was learnt of the environment beside it."""
 
-    Args:
-        observation_space: `Discrete` with S values.
-        action_space: `Discrete` with A values.
-        lr_schedule: not used; here because every policy is handed one.
-        n_tables: number of tables.
-        outcomes_kept: room for outcomes of each pair of state and action, K.
-        kwargs: as in `QTablePolicy`.
-
-    Attributes:
-        model_type: the NamedTuple of arrays that the model is.
-        outcomes_kept: K.
-    """
-
-    model_type: ClassVar[Any] = LearntModel
+    model_type: ClassVar[Any] = LearntModel  # the NamedTuple of arrays that the model is
 
     def __init__(
         self,
@@ -113,11 +92,7 @@ class ModelPolicy(QTablePolicy):
         return {**super()._sizes(), "outcomes_kept": self.outcomes_kept}
 
     def keep_outcomes(self, n: int) -> None:
-        """Make room for ``n`` outcomes of each pair; where n changes, what was learnt is forgotten.
-
-        Raises:
-            ValueError: if they would take too much memory.
-        """
+        """Make room for ``n`` outcomes of each pair, and forget others where n changes."""
         most = self._most_outcomes()
         if n > most:
             raise ValueError(
@@ -169,12 +144,7 @@ class ModelPolicy(QTablePolicy):
         return self.model_type(*(buffers[f"model_{name}"].numpy() for name in names))
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over a table and a model.
-
-        Raises:
-            ValueError: if it is no model of these observations and actions, or holds another
-                number of outcomes.
-        """
+        """Take over a table and a model."""
         held = state_dict.get("model_next_obs")
         if getattr(held, "ndim", 0) == 3 and held.shape[2] != self.outcomes_kept:
             raise ValueError(
@@ -186,11 +156,7 @@ class ModelPolicy(QTablePolicy):
         return result
 
     def check_shapes(self) -> None:
-        """Refuse arrays of other shapes, which compiled code would read beside.
-
-        Raises:
-            ValueError: naming the first.
-        """
+        """Refuse arrays of other shapes, which compiled code would read beside."""
         n_states, n_actions = self.visit_counts.shape[1:]
         expected = self._nothing_learnt(n_states, n_actions, self.outcomes_kept)
         for name, like in expected.items():
@@ -202,11 +168,7 @@ class ModelPolicy(QTablePolicy):
                 )
 
     def check_places(self) -> None:
-        """Refuse a model that points beside its tables.
-
-        Raises:
-            ValueError: naming the array.
-        """
+        """Refuse a model that points beside its tables."""
         n_states, n_actions = self.visit_counts.shape[1:]
         for name, (least, end) in self._places(n_states, n_states * n_actions).items():
             numbers = getattr(self.model, name)
@@ -220,15 +182,11 @@ MOST_PLANNING = 10**6  # updates after one step
 
 
 class ModelKeeper(TabularAlgorithm):
-    """Hands the model in its policy to compiled functions as ``agent.memory``.
-
-    Attributes:
-        outcomes_kept: how many outcomes of each pair of state and action the model holds.
-    """
+    """Hands the model in its policy to compiled functions as ``agent.memory``."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": ModelPolicy}
     policy: ModelPolicy
-    outcomes_kept: int = 1
+    outcomes_kept: int = 1  # how many outcomes of each pair of state and action the model holds
 
     def _make_policy(self) -> QTablePolicy:
         policy = super()._make_policy()
@@ -352,18 +310,7 @@ class DynaQ(ModelKeeper, QLearning):
 
 
 class DatedModel(NamedTuple):
-    """A model that knows how old its outcomes are.
-
-    Attributes:
-        next_obs: this and the next ones as in `LearntModel`.
-        rewards: see there.
-        terminated: see there.
-        counts: see there.
-        pairs: see there.
-        n_pairs: see there.
-        tried_at: the time when a pair was tried last, 0 for never, shape (S, A).
-        time: steps of all environments so far, shape (1,).
-    """
+    """A model that knows how old its outcomes are."""
 
     next_obs: Ints
     rewards: Floats
@@ -371,8 +318,8 @@ class DatedModel(NamedTuple):
     counts: Ints
     pairs: Ints
     n_pairs: Ints
-    tried_at: Ints
-    time: Ints
+    tried_at: Ints  # the time when a pair was tried last, 0 for never, shape (S, A)
+    time: Ints  # steps of all environments so far, shape (1,)
 
 
 @inlined

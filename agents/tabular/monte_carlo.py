@@ -32,21 +32,13 @@ from mdp.array_types import Floats, Ints
 
 
 class EpisodeRecords(NamedTuple):
-    """The episodes under way.
+    """The episodes under way."""
 
-    Attributes:
-        states: shape (n_envs, longest_episode).
-        actions: what was done there, shape (n_envs, longest_episode).
-        rewards: what that earned, shape (n_envs, longest_episode).
-        probabilities: how probable the policy thought it, shape (n_envs, longest_episode).
-        lengths: number of steps so far, shape (n_envs,).
-    """
-
-    states: Ints
-    actions: Ints
-    rewards: Floats
-    probabilities: Floats
-    lengths: Ints
+    states: Ints  # shape (n_envs, longest_episode)
+    actions: Ints  # what was done there, shape (n_envs, longest_episode)
+    rewards: Floats  # what that earned, shape (n_envs, longest_episode)
+    probabilities: Floats  # how probable the policy thought it, shape (n_envs, longest_episode)
+    lengths: Ints  # number of steps so far, shape (n_envs,)
 
 
 @by_type
@@ -114,18 +106,9 @@ class RecordAlgorithm(EpisodicAlgorithm):
 
 
 class ImportanceTablePolicy(QTablePolicy):
-    """Greedy in a table of action values, each the weighted mean of returns.
+    """Greedy in a table of action values, each the weighted mean of returns."""
 
-    Args:
-        observation_space: as in `QTablePolicy`.
-        action_space: as in `QTablePolicy`.
-        lr_schedule: as in `QTablePolicy`.
-        kwargs: as in `QTablePolicy`.
-
-    Attributes:
-        weights: sum of the weights of the returns of each entry, float64 of shape (T, S, A).
-    """
-
+    # Sum of the weights of the returns of each entry, float64 of shape (T, S, A).
     weights: th.Tensor
 
     def __init__(

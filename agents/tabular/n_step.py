@@ -39,11 +39,7 @@ MOST_STEPS = 50_000_000
 
 @by_type
 def learn_in(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
-    """Learn from the step of environment ``i``.
-
-    Returns:
-        The mean absolute error of the entries that were updated, or `NOTHING_LEARNT`.
-    """
+    """Learn from the step of environment ``i``."""
     raise CompiledOnlyError
 
 
@@ -108,11 +104,7 @@ class EpisodicAlgorithm(TabularAlgorithm):
             )
 
     def _refuse_gaussian_noise(self, role: str) -> None:
-        """Refuse an exploration without probabilities, where they are needed for something.
-
-        Raises:
-            ValueError: saying what for.
-        """
+        """Refuse an exploration without probabilities, where they are needed for something."""
         if self.exploration == "gaussian_noise":
             raise ValueError(
                 f"{role} needs the probabilities of the actions, which gaussian_noise does not "
@@ -126,21 +118,13 @@ class EpisodicAlgorithm(TabularAlgorithm):
 
 
 class Windows(NamedTuple):
-    """Steps that have not been learnt from yet, a ring for each environment.
+    """Steps that have not been learnt from yet, a ring for each environment."""
 
-    Attributes:
-        states: shape (n_envs, n_steps).
-        actions: what was done there, shape (n_envs, n_steps).
-        rewards: what that earned, shape (n_envs, n_steps).
-        oldest: place of the first step in the ring, shape (n_envs,).
-        lengths: number of steps in it, shape (n_envs,).
-    """
-
-    states: Ints
-    actions: Ints
-    rewards: Floats
-    oldest: Ints
-    lengths: Ints
+    states: Ints  # shape (n_envs, n_steps)
+    actions: Ints  # what was done there, shape (n_envs, n_steps)
+    rewards: Floats  # what that earned, shape (n_envs, n_steps)
+    oldest: Ints  # place of the first step in the ring, shape (n_envs,)
+    lengths: Ints  # number of steps in it, shape (n_envs,)
 
 
 @by_type

@@ -20,9 +20,8 @@ from agents.common.settings import (
     settings_of,
 )
 from agents.compiled.engine import EngineChoice
-from agents.tabular.algorithm import TabularAlgorithm
+from agents.tabular.algorithm import MaskedArguments, TabularAlgorithm
 from agents.tabular.dyna import ModelKeeper, ModelPolicy
-from agents.tabular.policy import MaskedArguments
 from agents.tabular.updates import TabularAgent, best_value
 from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats, Ints
@@ -46,7 +45,7 @@ class OptimisticAlgorithm(TabularAlgorithm):
         tie_breaking: as in `LearningAlgorithm`.
         engine: as in `TabularAlgorithm`.
         policy_kwargs: further arguments of the policy.
-        kwargs: as in `MaskKeeper`.
+        kwargs: as in `TabularAlgorithm`.
 
     Raises:
         ValueError: if an argument lies outside its range, a space does not fit, or ``gamma`` is 1
@@ -186,25 +185,16 @@ ROUNDING = 1e-13
 
 
 class CountedModel(NamedTuple):
-    """How often each pair of state and action had which outcome, until it is known.
+    """How often each pair of state and action had which outcome, until it is known."""
 
-    Attributes:
-        next_obs: the outcomes that differ: where they led, shape (S, A, m).
-        rewards: what they earned together, shape (S, A, m).
-        terminated: whether they ended the episode, shape (S, A, m).
-        tallies: how often they were seen, 0 where there is none, shape (S, A, m).
-        counts: how often the pair was tried, at most m, shape (S, A).
-        states: those in which something is known, in the order in which it became so, shape (S,).
-        n_states: how many these are, shape (1,).
-    """
-
-    next_obs: Ints
-    rewards: Floats
-    terminated: Bools
-    tallies: Ints
-    counts: Ints
+    next_obs: Ints  # the outcomes that differ: where they led, shape (S, A, m)
+    rewards: Floats  # what they earned together, shape (S, A, m)
+    terminated: Bools  # whether they ended the episode, shape (S, A, m)
+    tallies: Ints  # how often they were seen, 0 where there is none, shape (S, A, m)
+    counts: Ints  # how often the pair was tried, at most m, shape (S, A)
+    # Those in which something is known, in the order in which it became so, shape (S,).
     states: Ints
-    n_states: Ints
+    n_states: Ints  # how many these are, shape (1,)
 
 
 @inlined
@@ -252,11 +242,7 @@ def note_known_state(model: CountedModel, obs: int) -> None:
 
 @inlined
 def sweep_states(agent: TabularAgent) -> tuple[float, float]:
-    """Work out all known pairs anew, the latest states first.
-
-    Returns:
-        The largest change of a value, and the largest value without its sign.
-    """
+    """Work out all known pairs anew, the latest states first."""
     model, values = agent.memory, agent.tables.values
     change = largest = 0.0
     for i in range(model.n_states[0] - 1, -1, -1):
@@ -327,11 +313,7 @@ class CountedModelPolicy(ModelPolicy):
         return {"next_obs": (0, n_states), "counts": (0, most), "tallies": (0, most), **limits}
 
     def check_places(self) -> None:
-        """Refuse a model that points beside its tables, or whose counts are none.
-
-        Raises:
-            ValueError: saying what is wrong.
-        """
+        """Refuse a model that points beside its tables, or whose counts are none."""
         super().check_places()
         if not np.array_equal(self.model.tallies.sum(axis=2), self.model.counts):
             raise ValueError("holds no counts: model_tallies and model_counts disagree")

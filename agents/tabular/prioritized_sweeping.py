@@ -16,41 +16,26 @@ from mdp.array_types import Bools, Floats, Ints
 # A learnt model that knows what leads to a state, and which pairs are worth updating most.
 #
 # Compiled functions. A pair is the number ``obs * A + action``. Pairs that lead to the same state
-# are
-# a list, each with the one before and the one behind it; those that are worth updating are a binary
-# heap, each with its place in it.
+# are a list, each with the one before and the one behind it; those that are worth updating are a
+# binary heap, each with its place in it.
 
 NONE = -1
 
 
 class SweepingModel(NamedTuple):
-    """The last outcome of each pair, and the queue.
-
-    Attributes:
-        next_obs: this and the next two as in `LearntModel`, with K = 1.
-        rewards: see there.
-        terminated: see there.
-        counts: see there.
-        first_into: the first pair that leads to a state, or `NONE`, shape (S,).
-        behind: the next one that leads where a pair leads, or `NONE`, shape (S * A,).
-        before: the one before it, or `NONE`, shape (S * A,).
-        queue: the heap, the most urgent pair first, shape (S * A,).
-        n_queued: how many they are, shape (1,).
-        place: where in the heap a pair is, or `NONE`, shape (S * A,).
-        urgency: how urgent it is, shape (S * A,).
-    """
+    """The last outcome of each pair, and the queue."""
 
     next_obs: Ints
     rewards: Floats
     terminated: Bools
     counts: Ints
-    first_into: Ints
-    behind: Ints
-    before: Ints
-    queue: Ints
-    n_queued: Ints
-    place: Ints
-    urgency: Floats
+    first_into: Ints  # the first pair that leads to a state, or `NONE`, shape (S,)
+    behind: Ints  # the next one that leads where a pair leads, or `NONE`, shape (S * A,)
+    before: Ints  # the one before it, or `NONE`, shape (S * A,)
+    queue: Ints  # the heap, the most urgent pair first, shape (S * A,)
+    n_queued: Ints  # how many they are, shape (1,)
+    place: Ints  # where in the heap a pair is, or `NONE`, shape (S * A,)
+    urgency: Floats  # how urgent it is, shape (S * A,)
 
 
 @inlined
@@ -174,11 +159,7 @@ class SweepingPolicy(ModelPolicy):
         }
 
     def check_places(self) -> None:
-        """Refuse a model that points beside its tables, or whose lists and queue are none.
-
-        Raises:
-            ValueError: saying what is wrong.
-        """
+        """Refuse a model that points beside its tables, or whose lists and queue are none."""
         super().check_places()
         if not _is_queue(self.model):
             raise ValueError("holds no queue: model_queue and model_place disagree")

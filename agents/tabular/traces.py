@@ -34,20 +34,13 @@ SMALLEST_TRACE = 1e-12
 
 
 class Traces(NamedTuple):
-    """Entries that have a trace, in no order that means anything.
+    """Entries that have a trace, in no order that means anything."""
 
-    Attributes:
-        states: shape (n_envs, S * A).
-        actions: shape (n_envs, S * A).
-        sizes: traces times step sizes, shape (n_envs, S * A).
-        lengths: how many there are, shape (n_envs,).
-        expected: what the last step took the value of the present state to be, shape (n_envs,).
-    """
-
-    states: Ints
-    actions: Ints
-    sizes: Floats
-    lengths: Ints
+    states: Ints  # shape (n_envs, S * A)
+    actions: Ints  # shape (n_envs, S * A)
+    sizes: Floats  # traces times step sizes, shape (n_envs, S * A)
+    lengths: Ints  # how many there are, shape (n_envs,)
+    # What the last step took the value of the present state to be, shape (n_envs,).
     expected: Floats
 
 

@@ -16,17 +16,11 @@ from mdp.array_types import Bools, Floats, Ints
 
 
 class Room(NamedTuple):
-    """Where numbers are worked out; what it holds between two calls means nothing.
+    """Where numbers are worked out; what it holds between two calls means nothing."""
 
-    Attributes:
-        values: a number for each action that is allowed, shape (n,).
-        actions: which actions these are, in order, shape (n,).
-        draws: the random numbers of one choice, shape (draws_per_choice,).
-    """
-
-    values: Floats
-    actions: Ints
-    draws: Floats
+    values: Floats  # a number for each action that is allowed, shape (n,)
+    actions: Ints  # which actions these are, in order, shape (n,)
+    draws: Floats  # the random numbers of one choice, shape (draws_per_choice,)
 
 
 @by_type
@@ -68,14 +62,10 @@ class Tables(NamedTuple):
     """What an agent knows, in the memory of its policy, where all actions are allowed.
 
     `MaskedTables` of no rows mean the same, and cost the compiled loop a sixth of its speed.
-
-    Attributes:
-        values: action values, shape (T, S, A).
-        visit_counts: updates of each entry so far, shape (T, S, A).
     """
 
-    values: Floats
-    visit_counts: Ints
+    values: Floats  # action values, shape (T, S, A)
+    visit_counts: Ints  # updates of each entry so far, shape (T, S, A)
 
     @inlined
     def room_at(self, obs: int, room: Room) -> Room:
@@ -96,17 +86,12 @@ class Tables(NamedTuple):
 
 
 class MaskedTables(NamedTuple):
-    """What an agent knows, and what the environment allows.
-
-    Attributes:
-        values: as in `Tables`.
-        visit_counts: as in `Tables`.
-        allowed: what may be done at each observation, bool of shape (S, A); everything where a row
-            is False, which means that nothing is known, or where there are no rows.
-    """
+    """What an agent knows, and what the environment allows."""
 
     values: Floats
     visit_counts: Ints
+    # What may be done at each observation, bool of shape (S, A); everything where a row is False,
+    # which means that nothing is known, or where there are no rows.
     allowed: Bools
 
     @inlined
@@ -140,28 +125,20 @@ class MaskedTables(NamedTuple):
 # Compiled functions, shared by the interpreted and the compiled training loop. An update bootstraps
 # from ``values`` of shape (T, S, A): one table, or two for double Q-learning. Termination is folded
 # into the discount, which is 0 then, so that a truncated episode still bootstraps. What an
-# algorithm
-# adds is `next_value`, and `commit` where it decides on its next action before the update.
+# algorithm adds is `next_value`, and `commit` where it decides on its next action before the
+# update.
 #
 # Source: Sutton and Barto (2nd edition), chapter 6.
 
 
 class TabularAgent(NamedTuple):
-    """An agent as compiled functions see it.
+    """An agent as compiled functions see it."""
 
-    Attributes:
-        settings: a record of the type that its class has.
-        tables: what it knows, `Tables` or `MaskedTables`.
-        room: for its work.
-        rng: a handle of its generator.
-        memory: arrays of its algorithm's own, by name; see `EpisodeKeeper`.
-    """
-
-    settings: Any
-    tables: Any
-    room: Room
-    rng: Any
-    memory: Any
+    settings: Any  # a record of the type that its class has
+    tables: Any  # what it knows, `Tables` or `MaskedTables`
+    room: Room  # for its work
+    rng: Any  # a handle of its generator
+    memory: Any  # arrays of its algorithm's own, by name; see `TabularAlgorithm`
 
 
 @by_type
@@ -311,9 +288,7 @@ def act_in_all(
 ) -> int:
     """`act` in each environment, for the interpreted loop.
 
-    Returns:
-        -1, or the number of an environment whose observation has no row in the tables; none acts
-        then.
+    Returns -1, or the number of an environment whose observation has no row; none acts then.
     """
     for i in range(len(envs)):
         if not 0 <= envs[i].obs < values.shape[1]:

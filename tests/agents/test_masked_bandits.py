@@ -80,7 +80,7 @@ def shares(model, mask, n=20_000, context=0):
     """How often an exploring agent pulls each arm."""
     contexts = model._contexts(np.full(n, context))
     rows = np.tile(np.array(mask, bool), (n, 1))
-    arms, _ = model._choose_allowed(contexts, rows, np.random.default_rng(0))
+    arms, _ = model._choose(contexts, np.random.default_rng(0), rows)
     return np.bincount(arms, minlength=A) / n
 
 
@@ -195,7 +195,7 @@ def test_exp3_weighs_by_the_probability_among_the_arms_of_the_pull():
     expected = 0.7 * softmax([5.0, 0.2, 0.7]) + 0.1
     mask = np.array([[True, True, False, True]])
     assert shares(model, mask[0])[[0, 1, 3]] == pytest.approx(expected, abs=0.015)
-    arms, probabilities = model._choose_allowed(np.zeros(50, int), mask.repeat(50, 0), model.rng)
+    arms, probabilities = model._choose(np.zeros(50, int), model.rng, mask.repeat(50, 0))
     assert len(set(arms)) == 3
     assert probabilities == pytest.approx(expected[np.minimum(arms, 2)], rel=1e-14)
     model._learn(Pull(0, 3, 0.5, 0.25, mask[0].tolist()))
@@ -212,7 +212,7 @@ def test_thompson_draws_for_the_allowed_alone():
     expected = np.bincount(draws.argmax(axis=1)) / 200_000
     assert shares(model, [0, 1, 1, 1])[1:] == pytest.approx(expected, abs=0.015)
     rng, other = np.random.default_rng(1), np.random.default_rng(1)
-    model._choose_allowed(np.zeros(1, int), np.array([[False, True, False, True]]), rng)
+    model._choose(np.zeros(1, int), rng, np.array([[False, True, False, True]]))
     other.beta(3, 2), other.beta(2, 1)
     assert rng.random() == other.random()
 
@@ -238,12 +238,12 @@ def test_linear_models_among_the_allowed(vectors):
     n, context = 20_000, np.array([[0.0, 1.0, 0.0]])
     mask = np.array([[False, True, True, True]])
     contexts, masks = context.repeat(n, 0), mask.repeat(n, 0)
-    arms, _ = greedy._choose_allowed(contexts, masks, np.random.default_rng(0))
+    arms, _ = greedy._choose(contexts, np.random.default_rng(0), masks)
     assert np.bincount(arms, minlength=A) / n == pytest.approx([0, 0.8, 0.1, 0.1], abs=0.015)
-    assert ucb._choose_allowed(context, mask, ucb.rng)[0] == [1]
+    assert ucb._choose(context, ucb.rng, mask)[0] == [1]
     # 3/2 + 5/sqrt(2) is more than 9/4 + 5/2.
     ucb.alpha = 5.0
-    assert ucb._choose_allowed(context, mask, ucb.rng)[0] == [2]
+    assert ucb._choose(context, ucb.rng, mask)[0] == [2]
 
 
 def test_linear_thompson_among_the_allowed():

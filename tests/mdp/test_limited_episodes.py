@@ -22,7 +22,7 @@ from mdp import (
     value_iteration,
 )
 from mdp.evaluation import LimitedEpisodes
-from mdp.large_maps import Drift, _chance_of_losing, _drift
+from mdp.large_maps import _chance_of_losing, _drift
 
 
 def random_model(seed: int, outcomes: int, reward: float | None = None) -> TransitionModel:
@@ -195,10 +195,10 @@ def test_how_values_change_on_the_way() -> None:
     )
     # Of the rises 2 and 0 the mean is 1.5, and the variance 0.75 * 0.25 + 0.25 * 2.25.
     assert (step_cost, fall, variance) == pytest.approx((1.0, 1.5, 0.75))
-    bound = _chance_of_losing(10.0, Drift(1.0, fall=1.5, variance=0.75), 0.0, 100)
+    bound = _chance_of_losing(10.0, 1.5, 0.75, 100)
     assert bound == pytest.approx(np.exp(-100 / (150 + 10)))
-    assert _chance_of_losing(-1.0, Drift(1.0, fall=1.5, variance=0.75), 0.0, 100) == 1.0
-    assert _chance_of_losing(1.0, Drift(1.0, fall=0.0, variance=0.0), 0.0, 100) == 0.0
+    assert _chance_of_losing(-1.0, 1.5, 0.75, 100) == 1.0
+    assert _chance_of_losing(1.0, 0.0, 0.0, 100) == 0.0
 
 
 def test_a_task_that_never_ends_is_not_planned_without_a_limit(

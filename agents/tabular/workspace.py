@@ -1,0 +1,131 @@
+"""What agents on tables and on tiles share: they learn from records of their environments.
+
+Compiled functions read and write these records. In the interpreted loop a `Workspace` holds them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.utils import is_vectorized_observation
+
+from agents.common.algorithm import Transitions
+from agents.compiled.learning_algorithm import LearningAlgorithm
+from agents.compiled.worlds import ENV, PROGRESS, UNDECIDED, env_records
+from mdp.array_types import Ints
+
+
+class Workspace:
+    """Records of n environments and of the training's progress, for the interpreted loop."""
+
+    def __init__(self, n: int, kind: np.dtype[np.void] = ENV) -> None:
+        self.envs = env_records(n, kind)
+        self.envs["next_action"] = UNDECIDED
+        self.progress = np.zeros(1, dtype=PROGRESS)
+        # Looked up once: finding a field takes longer than filling it.
+        self.fields = {name: self.envs[name] for name in kind.names or ()}
+        # What the agent has committed to in each environment, or `UNDECIDED`, shape (n,).
+        self.next_actions: Ints = self.fields["next_action"]
+        names = ("exploration", "learning_rate", "episodes", "mean_td_error")
+        self.exploration, self.learning_rate, self.episodes, self.mean_td_error = (
+            self.progress[name] for name in names
+        )
+
+    def note_progress(
+        self, exploration: float, learning_rate: float, episodes: int, mean_td_error: float = 0.0
+    ) -> None:
+        """Set how much to explore, the step size, the episodes so far, and the last error."""
+        self.exploration[0] = exploration
+        self.learning_rate[0] = learning_rate
+        self.episodes[0] = episodes
+        self.mean_td_error[0] = mean_td_error
+
+    def take_outcomes(self, transitions: Transitions) -> None:
+        """Write what the environments' step has brought into their records."""
+        fields = self.fields
+        fields["reward"][:] = transitions.rewards
+        fields["terminated"][:] = transitions.terminated
+        fields["done"][:] = transitions.dones
+
+
+class WorkspaceAlgorithm(LearningAlgorithm):
+    """Acts and learns in a workspace, interpreted, or on the records of the compiled loop.
+
+    Attributes:
+        engine_in_use: which loop the last training ran in, and why if it is not the compiled one.
+        mean_td_error: mean absolute error of the last updates.
+    """
+
+    logs_by_records = True
+
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions", "_in_use")
+    excluded_from_states = ("_in_use",)
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.engine_in_use = ""
+        self.mean_td_error = 0.0
+        self._next_actions: Ints = np.empty(0, dtype=np.int64)
+        self._in_use: Any = None  # the workspace in which the agent has learnt last
+        super().__init__(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_in_use": None}
+
+    def _begin_episodes(self) -> None:
+        self._next_actions = np.full(self.n_envs, UNDECIDED)
+
+    def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Write what the compiled loop goes on from into its records."""
+        envs["next_action"] = self._next_actions
+        progress["mean_td_error"] = self.mean_td_error
+
+    def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Go on from where the compiled loop is."""
+        self._next_actions = envs["next_action"].copy()
+        self.mean_td_error = float(progress["mean_td_error"][0])
+
+    def _present_workspace(self) -> Any:
+        """The one of the training under way, up to date."""
+        workspace = self._workspace_for(self.rng, self.n_envs)
+        self._note_progress(workspace)
+        if self._next_actions is not workspace.next_actions:
+            workspace.next_actions[:] = self._next_actions
+            self._next_actions = workspace.next_actions
+        return workspace
+
+    def _note_progress(self, workspace: Workspace) -> None:
+        remaining = self._current_progress_remaining
+        exploration, step_size = self.exploration_schedule(remaining), self.lr_schedule(remaining)
+        workspace.note_progress(exploration, step_size, self._episode_num, self.mean_td_error)
+
+    def _choose_actions(self) -> Ints:
+        actions: Ints = self._present_workspace().act(self._last_obs)
+        return actions
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        self._in_use = self._present_workspace()
+        self.mean_td_error = self._in_use.learn(transitions)
+        self._n_updates += self.n_envs
+
+    def _exploring_actions(self, observation: Any) -> Ints:
+        """An action for an observation, or n for n of them, chosen as in training.
+
+        Raises:
+            ValueError: if it is neither.
+        """
+        obs = np.asarray(observation)
+        many = is_vectorized_observation(obs, self.observation_space)
+        workspace = self._workspace_for(self.predict_rng, len(obs) if many else 1)
+        self._note_progress(workspace)
+        workspace.next_actions[:] = UNDECIDED
+        actions: Ints = workspace.act(obs if many else obs[None])
+        return actions.reshape(len(obs) if many else ())
+
+    def _record_training(self) -> None:
+        self.logger.record("train/mean_absolute_td_error", self.mean_td_error)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if not self.averages_samples:
+            rate = self.lr_schedule(self._current_progress_remaining)
+            self.logger.record("train/learning_rate", rate)
