@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from agents.bandits import algorithm
-from agents.bandits.algorithm import BanditAlgorithm, Pull
+from agents.bandits.algorithm import BINARY, BanditAlgorithm, Pull
 from agents.bandits.linear import features
 from agents.common.model_files import TablePolicy
 from agents.common.settings import (
@@ -295,12 +294,8 @@ class MABWiserThompson(MABWiserAgent):
     """
 
     kind = "ThompsonSampling"
+    rewards_known = BINARY  # others would make its Beta distributions wrong without a word
     statistics = ("arm_to_success_count", "arm_to_fail_count")
-
-    @property
-    def rewards_known(self) -> str:
-        """Others would make its Beta distributions wrong without a word."""
-        return algorithm.BINARY
 
 
 class MABWiserLinUCB(MABWiserAgent):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple, Protocol, Unpack, cast
+from typing import Any, ClassVar, NamedTuple, Unpack, cast
 
 import numpy as np
 import torch as th
@@ -74,44 +74,8 @@ UNIT = "between 0 and 1"
 BINARY = "0 or 1"
 
 
-class Choosy(Protocol):
-    """An agent that says which rewards it can learn from."""
-
-    @property
-    def rewards_known(self) -> str:
-        """One of `ANY`, `UNIT` and `BINARY`."""
-
-
 # Environments whose rewards have normal noise on them.
 UNBOUNDED_KINDS = ("gaussian", "linear")
-
-
-def reward_misfit(agent: Choosy, reward: float) -> str:
-    """Say why the agent cannot learn from ``reward``; empty where it can."""
-    known = agent.rewards_known
-    if known == ANY or reward in (0.0, 1.0) or (known == UNIT and 0.0 <= reward <= 1.0):
-        return ""
-    return f"{type(agent).__name__} as it is set learns from rewards that are {known}"
-
-
-def check_reward(agent: Choosy, reward: float) -> None:
-    """Refuse a reward that the agent cannot learn from."""
-    misfit = reward_misfit(agent, reward)
-    if misfit:
-        raise ValueError(f"{misfit}, not {reward:g}")
-
-
-def check_kinds(agent: Choosy, env: VecEnv) -> None:
-    """Refuse, before the first pull, environments that are known to give other rewards."""
-    if agent.rewards_known == ANY or not env.has_attr("kind"):
-        return
-    if set(env.get_attr("kind")) & set(UNBOUNDED_KINDS):
-        raise ValueError(
-            f"{reward_misfit(agent, float('nan'))}, and this environment's have normal noise"
-        )
-
-
-# What all bandit agents share: pulling arms, waiting for feedback, learning from it.
 
 
 class BanditArguments(LearningArguments, total=False):
@@ -154,6 +118,7 @@ class BanditAlgorithm(LearningAlgorithm):
     """
 
     goes_by_masks: ClassVar[bool] = True
+    rewards_known: str = ANY  # which the agent can learn from: `ANY`, `UNIT` or `BINARY`
 
     _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
 
@@ -198,10 +163,23 @@ class BanditAlgorithm(LearningAlgorithm):
         """Number of arms."""
         return int(cast(spaces.Discrete, self.action_space).n)
 
-    @property
-    def rewards_known(self) -> str:
-        """The rewards that the agent can learn from, one of `agents.bandits.algorithm`."""
-        return ANY
+    def check_reward(self, reward: float) -> None:
+        """Refuse a reward that the agent cannot learn from."""
+        known = self.rewards_known
+        if not (known == ANY or reward in (0.0, 1.0) or (known == UNIT and 0.0 <= reward <= 1.0)):
+            raise ValueError(f"{self._misfit()}, not {reward:g}")
+
+    def check_kinds(self, env: VecEnv) -> None:
+        """Refuse, before the first pull, environments that are known to give other rewards."""
+        if self.rewards_known == ANY or not env.has_attr("kind"):
+            return
+        if set(env.get_attr("kind")) & set(UNBOUNDED_KINDS):
+            raise ValueError(f"{self._misfit()}, and this environment's have normal noise")
+
+    def _misfit(self) -> str:
+        return (
+            f"{type(self).__name__} as it is set learns from rewards that are {self.rewards_known}"
+        )
 
     @abstractmethod
     def _contexts(self, obs: NDArray[Any]) -> Any:
@@ -224,7 +202,7 @@ class BanditAlgorithm(LearningAlgorithm):
         self, total_timesteps: int, callback: MaybeCallback = None, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None
-        check_kinds(self, self.env)
+        self.check_kinds(self.env)
         if self.mask_actions:
             self._check_masks()
         return super()._setup_learn(total_timesteps, callback, *args, **kwargs)
@@ -261,7 +239,7 @@ class BanditAlgorithm(LearningAlgorithm):
             pending = self._pending[i]
             if info.get("matched", True):
                 reward = float(transitions.rewards[i])
-                check_reward(self, reward)
+                self.check_reward(reward)
                 arm, probability = int(transitions.actions[i]), float(self._probabilities[i])
                 told = [self._masks[i].tolist()] if self.mask_actions else []
                 pending.append([contexts[i], arm, reward, probability, *told])
@@ -327,7 +305,7 @@ class BanditAlgorithm(LearningAlgorithm):
 class RuleBandit(BanditAlgorithm):
     """Chooses and learns by compiled rules.
 
-    `choose_arm`, `context_row`, `learn_from_reward` and `among_allowed` are each family's own.
+    `choose_arm`, `context_row`, `learn_from_reward` and `choose_allowed` are each family's own.
     """
 
     act = act_in_context

@@ -103,8 +103,10 @@ def learn_from_reward(agent: Any, pull: Any, progress: Any) -> None:
 
 
 @by_type
-def among_allowed(agent: Any, row: int, mask: Bools, room: AllowedRoom) -> Any:
-    """A smaller bandit: the arms of ``mask``, listed in ``room.arms``, and one context, ``row``."""
+def choose_allowed(
+    agent: Any, row: int, mask: Bools, room: AllowedRoom, progress: Any
+) -> tuple[int, float]:
+    """One of the arms of ``mask`` in the context ``row``, and how likely it was."""
     raise CompiledOnlyError
 
 
@@ -216,10 +218,7 @@ def choose_allowed_arms(
     for i in range(len(rows)):
         if not 0 <= rows[i] < n_rows:
             return i
-        smaller = among_allowed(agent, rows[i], masks[i], room)
-        chosen = choose_arm(smaller, 0, progress)
-        arms[i] = room.arms[chosen]
-        probabilities[i] = choice_probability(smaller, 0, chosen)
+        arms[i], probabilities[i] = choose_allowed(agent, rows[i], masks[i], room, progress)
     return -1
 
 
@@ -292,11 +291,15 @@ def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom
 
 
 @inlined
-def scores_of_allowed(agent: ScoreAgent, row: int, mask: Bools, room: AllowedRoom) -> ScoreAgent:
-    """The smaller bandit of an agent with scores."""
+def choose_by_allowed_scores(
+    agent: ScoreAgent, row: int, mask: Bools, room: AllowedRoom, progress: Any
+) -> tuple[int, float]:
+    """What the rule chooses in the smaller bandit."""
     known = allowed_tables(agent.tables, row, mask, room)
     numbers = agent.arms[: known.scores.shape[1]]
-    return ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
+    smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
+    chosen = choose_arm(smaller, 0, progress)
+    return int(room.arms[chosen]), choice_probability(smaller, 0, chosen)
 
 
 @kernel
@@ -305,8 +308,10 @@ def learn_one_allowed(
 ) -> None:
     """As `learn_one`, of a pull at which the arms in ``mask`` were allowed, of shape (arms,)."""
     tables, row, place = agent.tables, pull.row, 0
-    smaller = scores_of_allowed(agent, row, mask, room)
-    n = len(smaller.arms)
+    known = allowed_tables(tables, row, mask, room)
+    n = known.scores.shape[1]
+    numbers = agent.arms[:n]
+    smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
     for k in range(n):
         if room.arms[k] == pull.arm:
             place = k
@@ -459,18 +464,20 @@ def row_of_vector(agent: LinearAgent, env: Any) -> int:
 
 
 @inlined
-def models_of_allowed(agent: LinearAgent, row: int, mask: Bools, room: AllowedRoom) -> LinearAgent:
-    """The smaller bandit; each arm has a model of its own, so that nothing is copied."""
+def choose_by_allowed_models(
+    agent: LinearAgent, row: int, mask: Bools, room: AllowedRoom, progress: Any
+) -> tuple[int, float]:
+    """One of the arms of ``mask``; each has a model of its own, so that nothing is copied."""
     n = 0
     for arm in range(len(mask)):
         if mask[arm]:
             room.arms[n] = arm
             n += 1
-    return LinearAgent(
+    smaller = LinearAgent(
         agent.settings,
         agent.models,
         agent.feedback,
-        agent.contexts[row : row + 1],
+        agent.contexts,
         agent.context,
         room.arms[:n],
         agent.arms[:n],
@@ -478,3 +485,4 @@ def models_of_allowed(agent: LinearAgent, row: int, mask: Bools, room: AllowedRo
         agent.draws,
         agent.rng,
     )
+    return int(room.arms[choose_by_model(smaller, row, progress)]), 1.0

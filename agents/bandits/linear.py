@@ -18,11 +18,11 @@ from agents.bandits.choosing import (
     LinearAgent,
     Regressions,
     best_arm,
+    choose_by_allowed_models,
     choose_by_model,
     deviation,
     learn_by_model,
     learn_one,
-    models_of_allowed,
     row_of_vector,
 )
 from agents.common.exploration import choose_action
@@ -155,7 +155,7 @@ class LinearBanditAgent(RuleBandit):
     choose_arm = choose_by_model
     context_row = row_of_vector
     learn_from_reward = learn_by_model
-    among_allowed = models_of_allowed
+    choose_allowed = choose_by_allowed_models
     pick = best_arm
 
     def __init__(

@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from agents.bandits import algorithm
+from agents.bandits.algorithm import UNIT
 from agents.bandits.choosing import ScoreAgent, ScoreTables, mean_reward, total_count
 from agents.bandits.tables import TableArguments, TableBandit, mean_rewards
 from agents.common.exploration import boltzmann_action, drawn_action, make_probabilities
@@ -147,6 +147,7 @@ class Exp3(PreferenceBandit):
     """
 
     parameters = {"mixing": np.float64}  # noqa: RUF012
+    rewards_known = UNIT
     choose_arm = draw_by_weight
     choice_probability = probability_of
     learn_from_pull = raise_weight
@@ -160,11 +161,6 @@ class Exp3(PreferenceBandit):
     ) -> None:
         self.mixing = mixing
         super().__init__(policy, env, **kwargs)
-
-    @property
-    def rewards_known(self) -> str:
-        """Those of the paper."""
-        return algorithm.UNIT
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 
-from agents.bandits.algorithm import check_kinds
 from agents.bandits.choosing import Regressions, ScoreTables
 from agents.bandits.linear import LinearBanditAgent
 from agents.bandits.tables import TableBandit
@@ -270,7 +269,7 @@ def run_batch(
     try:
         check_bandit(env)
         agent: Any = cls(env=env, **(kwargs or {}))
-        check_kinds(agent, agent.env)
+        agent.check_kinds(agent.env)
         agent.check_compilable()
         runs = Runs(agent, env, np.array(list(seeds), dtype=np.int64), pulls, moments)
         for index in range(len(runs.seeds)):
@@ -292,11 +291,6 @@ def checked_pulls(env: gym.Env[Any, Any], pulls: int | None) -> int:
     return pulls
 
 
-def run_moments(moments: Sequence[int], n_pulls: int) -> tuple[int, ...]:
-    """The moments within a run, and its end."""
-    return tuple(sorted({m for m in moments if 0 < m < n_pulls} | {n_pulls}))
-
-
 class Runs:
     """All runs of a batch, with room for what comes of them."""
 
@@ -310,7 +304,10 @@ class Runs:
     ) -> None:
         self.agent, self.env, self.seeds = agent, env, seeds
         self.n_pulls = checked_pulls(env, pulls)
-        self.moments = run_moments(moments, self.n_pulls) if isinstance(agent, Thompson) else ()
+        self.moments: tuple[int, ...] = ()
+        if isinstance(agent, Thompson):
+            within = {moment for moment in moments if 0 < moment < self.n_pulls}
+            self.moments = (*sorted(within), self.n_pulls)
         bandit: Any = env.unwrapped
         self.capacity = min(bandit.batch_size, self.n_pulls)
         shape = (len(seeds), self.n_pulls)

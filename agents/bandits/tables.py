@@ -18,12 +18,12 @@ from agents.bandits.choosing import (
     ScoreAgent,
     ScoreTables,
     allowed_room,
+    choose_by_allowed_scores,
     count_and_learn,
     learn_one,
     learn_one_allowed,
     nothing_before,
     row_of_scores,
-    scores_of_allowed,
 )
 from agents.common.settings import check_space
 from agents.compiled.generators import handles_of
@@ -107,11 +107,12 @@ class TableBandit(RuleBandit):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"BanditPolicy": BanditPolicy}
     policy: BanditPolicy
     parameters = {"ignore_context": np.bool_}  # noqa: RUF012
+    initial_score: float = 0.0  # of every arm
 
     # What the training loops call; `choose_arm` and `learn_from_pull` are each algorithm's own.
     context_row = row_of_scores
     learn_from_reward = count_and_learn
-    among_allowed = scores_of_allowed
+    choose_allowed = choose_by_allowed_scores
     before_counting = nothing_before
 
     def __init__(
@@ -124,11 +125,6 @@ class TableBandit(RuleBandit):
     ) -> None:
         self.ignore_context = ignore_context
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    @property
-    def initial_score(self) -> float:
-        """Score of every arm at the start."""
-        return 0.0
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

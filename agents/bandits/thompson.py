@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.bandits import algorithm
+from agents.bandits.algorithm import ANY, BINARY
 from agents.bandits.choosing import ScoreAgent, ScoreTables
 from agents.bandits.tables import TableArguments, TableBandit
 from agents.common.exploration import greedy_action
@@ -108,12 +108,12 @@ class Thompson(TableBandit):
         return self.likelihood == "gaussian"
 
     @property
-    def rewards_known(self) -> str:
+    def rewards_known(self) -> str:  # type: ignore[override]
         """Those of a coin, unless they have normal noise."""
-        return algorithm.ANY if self.is_gaussian else algorithm.BINARY
+        return ANY if self.is_gaussian else BINARY
 
     @property
-    def initial_score(self) -> float:
+    def initial_score(self) -> float:  # type: ignore[override]
         """The mean of the prior."""
         if self.is_gaussian:
             return self.prior_mean

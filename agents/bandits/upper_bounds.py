@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.bandits import algorithm
+from agents.bandits.algorithm import UNIT
 from agents.bandits.choosing import ScoreAgent, total_count
 from agents.bandits.tables import TableArguments, TableBandit
 from agents.common.exploration import greedy_action
@@ -54,11 +54,7 @@ class UpperBoundBandit(TableBandit):
 
     choose_arm = highest_bound
     learn_from_pull = average_rewards
-
-    @property
-    def initial_score(self) -> float:
-        """Below that of any arm that was tried."""
-        return -math.inf
+    initial_score = -math.inf  # below that of any arm that was tried
 
 
 # Upper confidence bounds.
@@ -194,6 +190,7 @@ class KLUCB(UpperBoundBandit):
     """
 
     parameters = {"c": np.float64}  # noqa: RUF012
+    rewards_known = UNIT
     upper_bound = kl_ucb_bound
 
     def __init__(
@@ -205,11 +202,6 @@ class KLUCB(UpperBoundBandit):
     ) -> None:
         self.c = c
         super().__init__(policy, env, **kwargs)
-
-    @property
-    def rewards_known(self) -> str:
-        """Those of a coin, or in between."""
-        return algorithm.UNIT
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

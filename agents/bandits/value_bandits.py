@@ -55,7 +55,7 @@ class ValueBandit(TableBandit):
     learn_from_pull = move_value
 
     @property
-    def initial_score(self) -> float:
+    def initial_score(self) -> float:  # type: ignore[override]
         """The estimate of every arm at the start."""
         return self.initial_q
 
