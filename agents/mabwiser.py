@@ -24,7 +24,7 @@ from agents.common.settings import (
     check_space,
     settings_of,
 )
-from mdp.array_types import Bools, Floats, Ints
+from mdp.array_types import Floats, Ints
 
 # MABWiser's bandits as policies.
 #
@@ -165,7 +165,6 @@ class MABWiserAgent(BanditAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MABWiserPolicy": MABWiserPolicy}
     policy: MABWiserPolicy
-    goes_by_masks = False
     kind: ClassVar[str]  # one of `KINDS`
     statistics: ClassVar[tuple[str, ...]] = SUMS
 
@@ -210,8 +209,8 @@ class MABWiserAgent(BanditAlgorithm):
         """An arm to pull before the library is asked, which it cannot be without a reward."""
         return None if self.policy.fitted else 0
 
-    def _choose(
-        self, contexts: Floats, rng: np.random.Generator, masks: Bools | None = None
+    def _choose(  # type: ignore[override]  # the library knows no masks
+        self, contexts: Floats, rng: np.random.Generator
     ) -> tuple[Ints, Floats]:
         first = self._first_pull()
         arms = [self.policy.choose(c, rng) if first is None else first for c in contexts]

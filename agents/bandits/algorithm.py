@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple, Unpack, cast
+from typing import Any, NamedTuple, Unpack, cast
 
 import numpy as np
 import torch as th
@@ -117,7 +118,6 @@ class BanditAlgorithm(LearningAlgorithm):
             malformed or allows nothing.
     """
 
-    goes_by_masks: ClassVar[bool] = True
     rewards_known: str = ANY  # which the agent can learn from: `ANY`, `UNIT` or `BINARY`
 
     _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
@@ -144,7 +144,7 @@ class BanditAlgorithm(LearningAlgorithm):
 
     def _check_masks(self) -> None:
         """Refuse masks that the environment does not tell, or the agent does not go by."""
-        if not self.goes_by_masks:
+        if "masks" not in inspect.signature(self._choose).parameters:
             raise ValueError(f"mask_actions: {type(self).__name__} chooses among all arms")
         if self.env is not None:
             check_masks_exist(self.env)
@@ -191,7 +191,7 @@ class BanditAlgorithm(LearningAlgorithm):
     ) -> tuple[Ints, Floats]:
         """An arm for each context and how likely it was, shapes (n,).
 
-        Masks, of shape (n, arms), say among which; they come only where the class goes by masks.
+        Masks, of shape (n, arms), say among which. A class that takes none is refused with masks.
         """
 
     @abstractmethod
