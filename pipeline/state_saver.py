@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from inspect import signature
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -389,6 +390,13 @@ class IterationLogger(Logger):
 def iterations_before(model: BaseAlgorithm, note: dict[str, Any]) -> int:
     """Iterations before a saved state, of an algorithm that counts from 1 at each `learn`."""
     return int(note["rollouts"]) if isinstance(model, OnPolicyAlgorithm) else 0
+
+
+def default_log_interval(model: BaseAlgorithm) -> int:
+    """The interval that ``learn`` has where none is given: 1 for PPO, 100 for A2C."""
+    learns = (vars(kind)["learn"] for kind in type(model).__mro__ if "learn" in vars(kind))
+    named = (signature(learn).parameters.get("log_interval") for learn in learns)
+    return next((int(each.default) for each in named if each is not None), 1)
 
 
 def resumed_logger(model: BaseAlgorithm, note: dict[str, Any]) -> Logger:

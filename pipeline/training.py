@@ -28,7 +28,7 @@ from pipeline.models.load import save_model, save_normalization, save_replay_buf
 from pipeline.preparation import NEW, UNBOUNDED_TIMESTEPS, Training, is_unread, prepare
 from pipeline.runs import FINISHED, INTERRUPTED, Run, remove_states
 from pipeline.signs_of_life import Activity, doing
-from pipeline.state_saver import IterationInterval, iterations_before
+from pipeline.state_saver import IterationInterval, default_log_interval, iterations_before
 from pipeline.stopping import close_environments, current, deaths_told
 from pipeline.train_spec import TrainSpec
 from pipeline.unfinished_runs import StateKeeping
@@ -147,7 +147,8 @@ def _learn(training: Training) -> None:
         kwargs["log_interval"] = None
     elif spec.log_interval != -1:
         kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
-    begun, interval = training.keeping.state, kwargs.get("log_interval", 1)
+    begun = training.keeping.state
+    interval = kwargs.get("log_interval", default_log_interval(training.model))
     before = 0 if begun is None else iterations_before(training.model, begun.note)
     if before and interval is not None:
         kwargs["log_interval"] = IterationInterval(interval)

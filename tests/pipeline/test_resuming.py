@@ -315,9 +315,9 @@ def events(folder):
     return {name: [(e.step, e.value) for e in reader.Scalars(name)] for name in names}
 
 
-@pytest.mark.parametrize(("algo", "interval"), [("ppo", -1), ("ppo", 3), ("dqn", -1)])
+@pytest.mark.parametrize(("algo", "interval"), [("ppo", -1), ("ppo", 3), ("a2c", -1), ("dqn", -1)])
 def test_logs_go_on_in_their_folder(tmp_path, monkeypatch, algo, interval):
-    settings = SMALL if algo == "ppo" else EAGER
+    settings = {"ppo": SMALL, "a2c": {"n_envs": 1}, "dqn": EAGER}[algo]
     spec = spec_of(tmp_path / "whole", LEFT_RIGHT, algo, 1500, settings, log_interval=interval)
     undisturbed(replace(spec, tensorboard_log=tmp_path / "log"))
     parts = replace(spec, log_folder=tmp_path / "parts", tensorboard_log=tmp_path / "other")
