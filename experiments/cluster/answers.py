@@ -1,11 +1,13 @@
 """What comes back of a run: how it ended, and where folders are not shared, the files it left.
 
-An answer is a zip. Whoever reads one trusts nothing in it: names and sizes are checked before
-anything is written, and what the run was asked for and the digests in its record after.
+An answer is a zip after its SHA-256, which shows damage. Whoever reads one trusts nothing in it:
+names and sizes are checked before anything is written, and what the run was asked for and the
+digests in its record after.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import shutil
@@ -63,15 +65,23 @@ def packed(answer: Answer) -> bytes:
         archive.writestr(_HEAD, json.dumps(head))
         for name, content in (answer.files or {}).items():
             archive.writestr(name, content)
-    return buffer.getvalue()
+    return sealed(buffer.getvalue())
+
+
+def sealed(content: bytes) -> bytes:
+    """Bytes after their own SHA-256."""
+    return hashlib.sha256(content).digest() + content
 
 
 def unpacked(content: object) -> Answer:
     """The answer that bytes hold; refused if they hold none, or files that may not be written."""
     if not isinstance(content, bytes):
         raise RefusedAnswerError(f"it is a {type(content).__name__}, and not bytes")
+    archive = content[hashlib.sha256().digest_size :]
+    if sealed(archive) != content:
+        raise RefusedAnswerError("it is damaged")
     try:
-        files = read_members(content, most=MOST_FILES + 1)
+        files = read_members(archive, most=MOST_FILES + 1)
         head = json.loads(files.pop(_HEAD, b""))
     except UnsafeFileError as error:
         raise RefusedAnswerError(f"it {error}") from error

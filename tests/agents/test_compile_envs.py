@@ -13,7 +13,7 @@ import envs  # noqa: F401  # registers the environments
 from agents.compiled.worlds import NotCompilable, compile_envs
 from envs.grid import Tile
 from envs.warehouse import WarehouseEnv
-from envs.wrappers import FlattenToDiscrete, ScaleReward, TerminationReward
+from envs.wrappers import ScaleReward, TerminationReward
 
 
 def lake(**kwargs):
@@ -94,10 +94,6 @@ WRAPPER_CHANGES = {
     "last reward": (
         lambda: wrapped(lambda env: TerminationReward(env, -1.0)),
         lambda vec: setattr(layer(vec, TerminationReward), "last_reward", -2.0),
-    ),
-    "first": (
-        lambda: wrapped(FlattenToDiscrete),
-        lambda vec: setattr(layer(vec, FlattenToDiscrete), "_first", [1]),
     ),
     "time limit": (lake, lambda vec: setattr(layer(vec, TimeLimit), "_max_episode_steps", 7)),
 }

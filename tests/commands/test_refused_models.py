@@ -113,6 +113,7 @@ def test_a_study_says_it_once_for_each_environment(capsys):
         SimpleNamespace(
             agent=agent,
             environment=environment,
+            labels=(agent, environment),
             seed=seed,
             path=Path(agent, f"{environment}_{seed}"),
             spec=SimpleNamespace(
