@@ -272,7 +272,7 @@ def test_an_agent_that_learns_nothing_gets_advice_once(type_command, folder):
     words = ("--env", "Warehouse-v0", "--algos", "qlearning", "random", "--seeds", 2, "-n", 400)
     code, out, err = type_command(*words, "-f", "studies", "--name", "failed")
     assert (code, err) == (0, "")
-    told = re.findall(r"^(\w+) failed in (.*?); seed 0: (.*)$", out, re.M)
+    told = re.findall(r"^(\w+) did not learn the task in (.*?); seed 0: (.*)$", out, re.M)
     assert [(agent, of) for agent, of, _ in told] == [("qlearning", "2 of 2 runs")]
     ((_, _, advice),) = told
     assert re.fullmatch(
@@ -282,7 +282,7 @@ def test_an_agent_that_learns_nothing_gets_advice_once(type_command, folder):
     )
     for name in ("report.html", "verdicts.md"):
         text = (folder / "studies" / "failed" / name).read_text(encoding="utf-8")
-        assert "qlearning failed in 2 of 2 runs; seed 0: 100" in text, name
+        assert "qlearning did not learn the task in 2 of 2 runs; seed 0: 100" in text, name
 
 
 def test_a_run_that_fails_does_not_stop_the_others(type_command, folder):
