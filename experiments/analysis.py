@@ -486,7 +486,8 @@ def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
                 seed = f"; seed {first.seed}" if len(runs) > 1 else ""
                 instead, try_first = answer
                 then = f"; try first: {try_first}" if try_first else ""
-                advice.append(f"{first.agent} did not learn the task in {of}{seed}: {instead}{then}.")
+                told = f"{first.agent} did not learn the task in {of}{seed}"
+                advice.append(f"{told}: {instead}{then}.")
         if more := several[MOST_TOLD:]:
             names = ", ".join(f"{runs[0].agent} ({len(runs)} of {n})" for runs, n in more)
             advice.append(f"Runs of {len(more)} more agents did not learn the task: {names}.")
