@@ -7,7 +7,8 @@ A page says what stands there by a link with a title, which a code host shows as
 The kinds: ``code``, with names that the linked file defines; ``environment``, with an id and
 arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, likewise, for
 a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``agents`` and
-``agents-by-spaces``, with nothing, for tables of agents; ``trainings``, for what commands reach.
+``agents-by-spaces``, with nothing, for tables of agents; ``trainings``, for what commands reach;
+``reference``, with a module and perhaps names in it, for their docstrings below a heading.
 """
 
 from __future__ import annotations
@@ -33,6 +34,13 @@ from environment_facts import (  # noqa: E402
 )
 from recommended_commands import trainings_block, with_outcomes  # noqa: E402
 
+
+def reference_block(module: str, *names: str) -> str:
+    """The heading and the docstrings of a module, all or those of some names."""
+    members = f":members: {', '.join(names)}".rstrip()
+    return f"## `{module}`\n\n```{{eval-rst}}\n.. automodule:: {module}\n   {members}\n```"
+
+
 KINDS: dict[str, Callable[..., str]] = {
     "agents": agents_block,
     "agents-by-spaces": by_spaces_block,
@@ -41,6 +49,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "environment": environment_block,
     "facts": facts_block,
     "optima": optima_block,
+    "reference": reference_block,
     "trainings": trainings_block,
     "variants": variants_block,
 }
