@@ -25,7 +25,7 @@ from agents.networks.engine_setting import NetworkEngineChoice
 from agents.networks.policy_gradients import CompiledPolicyGradient
 from agents.networks.q_learning import CompiledQLearning
 from envs.wrappers import INFO_KEY
-from mdp.array_types import Bools
+from mdp.transition_model import Bools
 
 # From observations of shape (batch, ...) to the values that targets are made of.
 NextValues = Callable[[th.Tensor], th.Tensor]

@@ -24,7 +24,7 @@ from agents.common.settings import (
     check_space,
     settings_of,
 )
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # MABWiser's bandits as policies.
 #

@@ -30,7 +30,7 @@ from envs.known_models import (
     transition_model,
 )
 from mdp import TransitionModel, finite_horizon_optimum, policy_iteration, value_iteration
-from mdp.array_types import Bools, Ints
+from mdp.transition_model import Bools, Ints
 
 # Actions of shape (m, S), with 1, 2, ... steps left, and the horizon.
 Plan = tuple[NDArray[np.integer[Any]], int]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 
 def check_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:

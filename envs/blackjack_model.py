@@ -17,8 +17,7 @@ from functools import cache, lru_cache
 import numpy as np
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
-from mdp.array_types import Floats, Ints
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Floats, Ints, TransitionModel
 
 SIZES = (32, 11, 2)  # of the observation's parts
 N_OBSERVED = 32 * 11 * 2

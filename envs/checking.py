@@ -20,8 +20,7 @@ from gymnasium.utils import seeding
 
 from envs.finite_env import first_above
 from envs.model_claims import Claim, claim_of, one_line
-from mdp.array_types import Floats, Ints
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Floats, Ints, TransitionModel
 
 Env = gym.Env[Any, Any]
 

@@ -6,16 +6,13 @@ from abc import abstractmethod
 from bisect import bisect_right
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from envs.drawing import BLUE, GRID, INK, Box, Chart, ChartRenderer, Label, Shape, ShownEnv
-from mdp.array_types import Bools, Floats
-
-if TYPE_CHECKING:
-    from mdp.transition_model import TransitionModel
+from mdp.transition_model import Bools, Floats, TransitionModel
 
 Outcome = tuple[float, int, float, bool]
 

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeGuard
+from typing import Any, ClassVar, NamedTuple, TypeGuard
 
 import numpy as np
 from gymnasium import spaces
@@ -19,11 +19,8 @@ from numpy.typing import NDArray
 from envs.argument_checks import check_flag, check_number
 from envs.drawing import GridRenderer, Scene, ShownEnv
 from envs.finite_env import FiniteEnv, Outcome, as_dictionaries, first_above, summing_to_one
-from mdp.array_types import AnyInts, Bools, Floats, Ints
+from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 from safe_files.files import UnsafeFileError, read_file
-
-if TYPE_CHECKING:
-    from mdp.transition_model import TransitionModel
 
 START = "S"
 GOAL = "G"
@@ -291,8 +288,6 @@ class GridDynamics:
 
         There is one outcome, or three where moves may slip: as meant, then to the two sides.
         """
-        from mdp.transition_model import TransitionModel
-
         chosen = np.array(POSSIBLE_MOVES)[:, : len(self.outcome_prob)]
         next_state, reward, terminated = self._all_moves()
         return TransitionModel(

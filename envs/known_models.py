@@ -34,8 +34,7 @@ from envs.wrappers import (
     ScaleReward,
     TerminationReward,
 )
-from mdp.array_types import Bools
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Bools, TransitionModel
 
 Env = gym.Env[Any, Any]
 Wrapper = gym.Wrapper[Any, Any, Any, Any]

@@ -17,7 +17,7 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from envs.grid import MOVES, GridWorld, Tile
 from envs.textbook.windy_gridworld import WindyGridworldEnv
-from mdp.array_types import Ints
+from mdp.transition_model import Ints
 
 FREE, START, WALL, GOAL, TRAP, PRIZE = ".S#GXP"
 

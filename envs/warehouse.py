@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from envs.argument_checks import check_choice, check_number, check_whole_number
 from envs.grid import MAX_STATES, Description, GridWorld, Observation, Tile
-from mdp.array_types import AnyInts, Bools
+from mdp.transition_model import AnyInts, Bools
 
 MAX_SIZE = int(MAX_STATES**0.5)
 

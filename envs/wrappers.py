@@ -14,7 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
 from envs.argument_checks import check_flag, check_number, check_whole_number
-from mdp.array_types import AnyInts, Bools, Floats, Ints
+from mdp.transition_model import AnyInts, Bools, Floats, Ints
 
 Env = gym.Env[Any, Any]
 

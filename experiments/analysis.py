@@ -21,7 +21,7 @@ from experiments.looks import Standing
 from experiments.plan import PlannedRun
 from experiments.results import RESAMPLING_SEED, StudyResults, values_over_seeds
 from experiments.study import COSTS, StudySpec
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.environments import training_changes, trains_on_variant
 from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.plan import PlannedRun
-from mdp.array_types import AnyInts, Floats, Ints
+from mdp.transition_model import AnyInts, Floats, Ints
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.environments import make_single_env
 from pipeline.files import replacing
@@ -295,8 +295,8 @@ def _is_drifting(bandit: Any) -> bool:
 
 def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     """Do ``n_runs`` runs, from the spec's seed on, and leave their statistics in the run folder."""
+    from machine_code import WorkTime
     from machine_code.compiling import compile_timer
-    from machine_code.work_time import WorkTime
 
     started = WorkTime.now()
     with compile_timer() as time_compiling:

@@ -24,7 +24,7 @@ from experiments.looks import (
 )
 from experiments.results import StudyResults
 from experiments.study import StudySpec
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.errors import UserError
 from verdicts import Growth, grow, look_sizes
 

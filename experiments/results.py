@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from experiments.bandits import STATISTICS_FILE, PullStatistics, read_pulls, run_regret
 from experiments.plan import PlannedRun
 from experiments.study import StudySpec
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.errors import one_line
 from pipeline.runs import Run

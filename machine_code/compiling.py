@@ -29,8 +29,8 @@ from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 from numba.core.types import unliteral
 
+from machine_code import WorkTime
 from machine_code.cache import cache_of
-from machine_code.work_time import WorkTime
 
 Function = TypeVar("Function", bound=Callable[..., object])
 

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machine_code.compiling import called, compiled
-from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.finite_horizon import finite_horizon_optimum
 from mdp.graph import PolicyChain, reachable_states
 from mdp.large_maps import moments_along_ways, moments_by_spreading
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machine_code.compiling import compiled
-from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.planning import TIE_TOLERANCE
-from mdp.transition_model import TransitionModel, allowed_actions
+from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel, allowed_actions
 
 # Of as few bytes each as the number of actions allows.
 Actions = NDArray[np.unsignedinteger]

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machine_code.compiling import compiled
-from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.reachability import reached_from
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
 
 def reachable_states(model: TransitionModel, allowed: Bools) -> Bools:

@@ -16,9 +16,8 @@ import math
 import numpy as np
 
 from machine_code.compiling import compiled, inlined, kernel
-from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.planning import value_iteration
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
 # A limit that is far away.
 

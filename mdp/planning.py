@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machine_code.compiling import compiled
-from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.graph import PolicyChain, end_components, steps_to_end
-from mdp.transition_model import TransitionModel, allowed_actions
+from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel, allowed_actions
 
 # Beyond this many rounds only plain sweeps are made, which are known to converge.
 ROUNDS_WITH_EVALUATION = 1000

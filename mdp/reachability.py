@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from machine_code.compiling import compiled
-from mdp.array_types import AnyInts, Bools, Floats
+from mdp.transition_model import AnyInts, Bools, Floats
 
 
 def reached_from(

@@ -19,7 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mdp.array_types import AnyInts, Bools, Floats
+# Kinds of arrays; shapes are not part of a type, docstrings give them.
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+# Integers of any width, such as the int32 that halves the size of a large map.
+AnyInts = NDArray[np.integer]
 
 PROBABILITY_TOLERANCE = 1e-9
 

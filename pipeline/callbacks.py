@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from agents.bandits.runs import PullLog
 from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
-from machine_code.work_time import WorkTime
+from machine_code import WorkTime
 from pipeline.errors import UserError
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import ValueMapRecorder

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.callbacks import LAST_PULLS
 from pipeline.files import replacing
 from pipeline.runs import Run

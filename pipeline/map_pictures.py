@@ -16,7 +16,7 @@ import numpy as np
 from envs.drawing import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, SHELF, WHITE, Colour
 from envs.drawing import ORANGE as AMBER
 from envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 from pipeline.curve_pictures import ORANGE, fix_layout, write_png
 from pipeline.evaluation.value_maps import ValueMap
 

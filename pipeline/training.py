@@ -10,8 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
+from machine_code import WorkTime
 from machine_code.compiling import compile_timer
-from machine_code.work_time import WorkTime
 from pipeline.callbacks import PullSummary, summarise_pulls
 from pipeline.curve_pictures import draw_learning_curve, draw_pulls
 from pipeline.errors import UserError, one_line

@@ -20,7 +20,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from agents.common.algorithm import true_outcome
 from agents.common.callbacks import BlockCallback, Horizon
 from agents.compiled.learning_algorithm import LearningAlgorithm
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.value_maps import MAX_STATES, best_actions_of

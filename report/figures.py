@@ -26,7 +26,7 @@ from matplotlib.ticker import (
 
 from experiments.analysis import EnvironmentAnalysis, OverallAnalysis
 from experiments.study import COSTS, METRIC_WORDS, file_name
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 from pipeline.curve_pictures import symlog_ticks
 from pipeline.files import replacing
 from pipeline.signs_of_life import Tell, tell_nobody

@@ -23,7 +23,7 @@ from experiments.results import (
     values_over_seeds,
 )
 from experiments.study import AgentSpec, StudySpec, symbol
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 from pipeline.environments import make_single_env
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import Estimate

@@ -23,7 +23,7 @@ from agents.common.exploration import highest_value
 from agents.common.settings import check_share, settings_of
 from agents.tabular.algorithm import TabularAlgorithm
 from agents.tabular.updates import TabularAgent
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 agents.register("cautious", "cautious:Cautious", observations="Discrete", actions="Discrete")
 
@@ -64,7 +64,7 @@ import math
 import agents
 from agents.bandits.choosing import ScoreAgent
 from agents.bandits.upper_bounds import UpperBoundBandit
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 agents.register("moss", "moss:MOSS", observations="Discrete", for_bandits=True)
 

@@ -28,7 +28,7 @@ from agents.common.masks import MaskBufferPolicy, check_masks_exist, checked_mas
 from agents.common.settings import LearningArguments, check_space
 from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from agents.compiled.worlds import NotCompilable
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # What the policies of bandit agents share: they pull the arm that they judge best.
 

@@ -12,7 +12,7 @@ from agents.common.exploration import greedy_action
 from agents.compiled.generators import generator_of
 from agents.compiled.loop import CompiledOnlyError, by_type
 from machine_code.compiling import inlined, kernel
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # Agents that keep a score for each arm in each context: choosing an arm, learning from its reward.
 #

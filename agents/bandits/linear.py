@@ -37,7 +37,7 @@ from agents.common.settings import (
 )
 from agents.compiled.generators import generator_of, handles_of
 from machine_code.compiling import inlined
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # The policy of agents with a linear model of each arm's reward: all that they know, in buffers.
 

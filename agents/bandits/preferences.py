@@ -15,7 +15,7 @@ from agents.common.exploration import boltzmann_action, drawn_action, make_proba
 from agents.common.settings import check_above_zero, check_share, settings_of
 from agents.compiled.generators import generator_of
 from machine_code.compiling import inlined
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 # What agents share whose scores are preferences or log-weights, and no estimates of rewards.
 

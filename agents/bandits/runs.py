@@ -30,7 +30,7 @@ from envs.bandits import BernoulliBandit, GaussianBandit, LinearBandit, SegmentB
 from envs.known_models import time_limit
 from envs.wrappers import ActionMasks
 from machine_code.compiling import inlined
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # Bandits as compiled code sees them, and a pull of an arm.
 #

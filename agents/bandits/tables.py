@@ -28,7 +28,7 @@ from agents.bandits.choosing import (
 from agents.common.settings import check_space
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import StepSize
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # The policy of agents that keep a score for each arm: all that they know, in buffers.
 

@@ -16,7 +16,7 @@ from agents.common.exploration import greedy_action
 from agents.common.settings import check_above_zero, check_finite, check_option, settings_of
 from agents.compiled.generators import generator_of
 from machine_code.compiling import inlined
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 Likelihood = Literal["bernoulli", "gaussian"]
 

@@ -25,7 +25,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from agents.common.model_files import JsonAlgorithm
 from agents.common.settings import CheckedConstructor, full_signature
-from mdp.array_types import Bools, Floats
+from mdp.transition_model import Bools, Floats
 
 
 @dataclass(slots=True)

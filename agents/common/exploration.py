@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from machine_code.compiling import inlined
-from mdp.array_types import Bools, Floats
+from mdp.transition_model import Bools, Floats
 
 EPSILON_GREEDY = 0
 BOLTZMANN = 1

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from agents.common.model_files import TablePolicy
 from envs.known_models import action_masks_of_states, observations_of_states
 from envs.wrappers import METHOD, action_masks, mask_source
-from mdp.array_types import Bools, Ints
+from mdp.transition_model import Bools, Ints
 
 # Observations of `Discrete` spaces, as tables are looked up by them.
 

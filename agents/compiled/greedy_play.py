@@ -44,7 +44,7 @@ from agents.compiled.worlds import (
     monitor_of,
 )
 from machine_code.compiling import inlined
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # The state of environments, read into the records of the compiled loop and written back.
 #

@@ -22,7 +22,7 @@ from machine_code.compiling import (
     is_interpreted,
     kernel,
 )
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 # Which function a compiled loop calls: decided by type, while the loop is compiled.
 #

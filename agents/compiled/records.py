@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from agents.common.algorithm import is_read
 from machine_code.compiling import inlined, kernel
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # Rows of Monitor's files as text, written by compiled code where returns are whole numbers.
 

@@ -33,8 +33,7 @@ from envs.wrappers import (
     TerminationReward,
 )
 from machine_code.compiling import inlined
-from mdp.array_types import Floats, Ints
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Floats, Ints, TransitionModel
 
 # What the compiled loop works on, as records in arrays.
 #

@@ -29,7 +29,7 @@ from agents.linear.algorithm import TileAlgorithm, TileArguments
 from agents.linear.tiles import LinearAgent, add_up, choose, look, move_sum, sum_of
 from agents.networks.network_worlds import AFTER, BEFORE, move_on
 from machine_code.compiling import called
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 # Semi-gradient control: action values as sums of weights, moved towards bootstrapped targets.
 #

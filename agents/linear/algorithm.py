@@ -55,7 +55,7 @@ from agents.networks.network_worlds import (
 )
 from agents.tabular.workspace import Workspace, WorkspaceAlgorithm
 from machine_code.compiling import called
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # The policy of agents on active tiles: their weights, in buffers.
 

@@ -24,7 +24,7 @@ from agents.linear.tiles import LinearAgent, add_up, look, move_sum
 from agents.networks.network_worlds import AFTER, BEFORE, move_on
 from envs.known_models import time_limit
 from machine_code.compiling import called
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # Policies that draw actions by a softmax of preferences, and steps along their gradient.
 #

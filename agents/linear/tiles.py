@@ -15,7 +15,7 @@ from agents.compiled.loop import CompiledOnlyError, act, by_type, learn_from_ste
 from agents.compiled.worlds import UNDECIDED
 from agents.networks.network_worlds import BEFORE, observe
 from machine_code.compiling import called, kernel
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # Tile coding: an observation as the tiles that it lies in, one of each of several tilings.
 #

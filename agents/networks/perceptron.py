@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from machine_code.compiling import internal, vectorised, view
-from mdp.array_types import Ints
+from mdp.transition_model import Ints
 
 # Products of matrices in single precision, by the BLAS that SciPy brings: Numba's own `numpy.dot`
 # counts references, which compiled loops here do without. BLAS counts by columns, so it is handed

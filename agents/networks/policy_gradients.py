@@ -40,7 +40,7 @@ from agents.networks.perceptron import (
 )
 from agents.networks.torch_bridge import Network, Reference, address_of, call, network_of
 from machine_code.compiling import called, inlined, kernel
-from mdp.array_types import Bools, Ints
+from mdp.transition_model import Bools, Ints
 
 # The softmax distribution over actions that a network's outputs stand for.
 

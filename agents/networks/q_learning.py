@@ -34,7 +34,7 @@ from agents.networks.perceptron import (
 )
 from agents.networks.torch_bridge import Network, Reference, address_of, call, network_of
 from machine_code.compiling import called, inlined, kernel
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # Minibatches out of the library's replay buffer, in whose own arrays transitions lie.
 #

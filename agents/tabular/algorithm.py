@@ -53,7 +53,7 @@ from agents.tabular.updates import (
 )
 from agents.tabular.workspace import Workspace, WorkspaceAlgorithm
 from envs.wrappers import INFO_KEY
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 

@@ -20,7 +20,7 @@ from agents.tabular.one_step import QLearning
 from agents.tabular.policy import QTablePolicy
 from agents.tabular.updates import TabularAgent, action_at, best_value, room_at, update
 from machine_code.compiling import inlined
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 from safe_files.files import MAX_ARCHIVE_BYTES
 
 # What an agent has seen of its environment: the last outcomes of each pair of state and action.

@@ -24,7 +24,7 @@ from agents.tabular.n_step import (
 from agents.tabular.policy import QTablePolicy
 from agents.tabular.updates import TabularAgent, act_on_values, choose, move_towards, values_at
 from machine_code.compiling import inlined
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # Whole episodes, kept until they end and learnt from then.
 #

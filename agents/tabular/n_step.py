@@ -27,7 +27,7 @@ from agents.tabular.updates import (
     values_at,
 )
 from machine_code.compiling import inlined
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # Learning from the environments one after the other, with a memory of each of their episodes.
 

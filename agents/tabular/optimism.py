@@ -24,7 +24,7 @@ from agents.tabular.algorithm import MaskedArguments, TabularAlgorithm
 from agents.tabular.dyna import ModelKeeper, ModelPolicy
 from agents.tabular.updates import TabularAgent, best_value
 from machine_code.compiling import inlined
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # What agents share that explore by optimism: a table that begins at the most that can be.
 

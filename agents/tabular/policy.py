@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.masks import MaskBufferPolicy, numbers_in
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 
 class QTablePolicy(MaskBufferPolicy):

@@ -11,7 +11,7 @@ from agents.common.settings import check_at_least, check_finite, check_whole, se
 from agents.tabular.dyna import MOST_PLANNING, ModelKeeper, ModelPolicy, note_outcome
 from agents.tabular.updates import TabularAgent, best_value
 from machine_code.compiling import inlined
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # A learnt model that knows what leads to a state, and which pairs are worth updating most.
 #

@@ -16,7 +16,7 @@ from agents.tabular.n_step import EpisodicAlgorithm
 from agents.tabular.one_step import best_next_value, commit_to_next_action, committed_value
 from agents.tabular.updates import TabularAgent, count_visit, value_ahead, values_at
 from machine_code.compiling import inlined
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # Eligibility traces of the entries that an episode has visited, and learning along them.
 #

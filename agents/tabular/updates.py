@@ -10,7 +10,7 @@ from agents.compiled.generators import generator_of, next_uniform
 from agents.compiled.loop import CompiledOnlyError, act, by_type, learn_from_step
 from agents.compiled.worlds import UNDECIDED
 from machine_code.compiling import inlined, kernel
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 
 # What a tabular agent knows, as compiled functions see it, and room to work with it.
 

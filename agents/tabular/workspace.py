@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import is_vectorized_observation
 from agents.common.algorithm import Transitions
 from agents.compiled.learning_algorithm import LearningAlgorithm
 from agents.compiled.worlds import ENV, PROGRESS, UNDECIDED, env_records
-from mdp.array_types import Ints
+from mdp.transition_model import Ints
 
 
 class Workspace:

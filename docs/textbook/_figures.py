@@ -21,7 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
 from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 mpl.use("Agg")
 

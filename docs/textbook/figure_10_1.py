@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents.linear.action_values import SemiGradientSARSA
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 MOMENTS = (12, 104, 1000, 9000)  # episodes
 LONGEST = 100_000  # steps; the book's episodes have no limit

@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 
 from envs.known_models import transition_model
 from envs.wrappers import FlattenToDiscrete
-from mdp.array_types import Floats, Ints
 from mdp.graph import PolicyChain
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Floats, Ints, TransitionModel
 
 FEW, MANY = 10_000, 500_000
 STICK, HIT = 0, 1

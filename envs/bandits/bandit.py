@@ -14,7 +14,7 @@ from gymnasium import spaces
 from envs import drawing
 from envs.argument_checks import check_whole_number
 from envs.drawing import Box, Chart, ChartRenderer, Disc, Label, Shape, ShownEnv
-from mdp.array_types import Floats, Ints
+from mdp.transition_model import Floats, Ints
 
 # Of more arms the first are shown, of more contexts those around the present one.
 MAX_ARMS_SHOWN = 40

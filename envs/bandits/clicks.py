@@ -11,8 +11,7 @@ from envs import DEFAULT_PULLS
 from envs.argument_checks import check_numbers, check_table
 from envs.bandits.bandit import StochasticBandit
 from envs.finite_env import first_above
-from mdp.array_types import Floats
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Floats, TransitionModel
 
 # How far probabilities of segments may be from summing to one.
 TOLERANCE = 1e-9

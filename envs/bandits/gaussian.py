@@ -10,7 +10,7 @@ from gymnasium import spaces
 from envs import DEFAULT_PULLS
 from envs.argument_checks import check_number, check_numbers
 from envs.bandits.bandit import StochasticBandit, agreed_size
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 
 
 class GaussianBandit(StochasticBandit):

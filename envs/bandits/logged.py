@@ -21,7 +21,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs.bandits.bandit import MAX_ARMS, Bandit
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 from safe_files.files import UnsafeFileError, opened
 
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"

@@ -8,8 +8,7 @@ import numpy as np
 
 from envs.argument_checks import check_number, check_whole_number
 from envs.finite_env import Gauge, GaugeEnv, summing_to_one
-from mdp.array_types import Bools
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Bools, TransitionModel
 
 LARGEST_GOAL = 2000
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from envs.argument_checks import check_choice, check_whole_number
 from envs.finite_env import Gauge, GaugeEnv
-from mdp.array_types import Bools, Floats, Ints
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Bools, Floats, Ints, TransitionModel
 
 MOST_CARS = 20
 MOST_MOVED = 5

@@ -10,8 +10,7 @@ import numpy as np
 from envs.argument_checks import check_number, check_whole_number
 from envs.finite_env import MaskedFiniteEnv
 from envs.grid import ChainEnv
-from mdp.array_types import Bools
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Bools, TransitionModel
 
 MOST_ACTIONS = 1000
 # B to the left of A, and an end beyond either.

@@ -11,8 +11,7 @@ import numpy as np
 from envs.argument_checks import check_choice, check_number
 from envs.finite_env import summing_to_one
 from envs.grid import MapEnv
-from mdp.array_types import Bools, Ints
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import Bools, Ints, TransitionModel
 
 # Figure 5.5. The car goes up and to the right: it starts at the bottom and ends on the right side.
 LEFT_TRACK = (

@@ -21,7 +21,7 @@ from experiments.off_policy.estimators import (
     terms_as_logged,
 )
 from experiments.off_policy.policy_files import PolicyFile, find_policy, read_logged
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.policies import policy_matrix, why_not_exact
 from pipeline.models.load import load_model

@@ -18,7 +18,7 @@ from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from envs.known_models import observations_of_states, transition_model
 from mdp import TransitionModel, policy_return, state_visitation, value_iteration
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.agent_settings import resolved_spec
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError

@@ -40,7 +40,7 @@ from mdp import (
     policy_return,
     state_values,
 )
-from mdp.array_types import Bools, Floats
+from mdp.transition_model import Bools, Floats
 from pipeline.environments import evaluation_kwargs, make_single_env
 from pipeline.evaluation.policies import OfLastPolicy, best_actions, obstacle, policy_matrix
 from pipeline.evaluation.sampled import Evaluation, Yardstick

@@ -24,7 +24,7 @@ from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.algorithm import TabularAlgorithm
 from agents.tabular.policy import QTablePolicy
-from mdp.array_types import Bools, Floats, Ints
+from mdp.transition_model import Bools, Floats, Ints
 from pipeline.errors import UserError
 
 # The agents of these packages take any number of observations at once.

@@ -21,7 +21,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from envs.brackets import may_have_bracket, optimum_bracket
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.policies import KNOWN_LIBRARIES, is_network, player
 from pipeline.finite_numbers import FinitePlayer, check_numbers

@@ -16,9 +16,9 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from envs.layout import GridLayout
-from mdp.array_types import Bools, Floats, Ints
 from mdp.evaluation import actions_used
 from mdp.graph import reachable_states
+from mdp.transition_model import Bools, Floats, Ints
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.files import replacing
 

@@ -25,7 +25,7 @@ from experiments.child_processes import TaskFailedError, local_executor, supervi
 from experiments.plan import PlannedRun
 from experiments.results import difference
 from experiments.run_limits import RunLimits
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation.value_maps import MAX_STATES

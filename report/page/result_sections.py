@@ -13,7 +13,7 @@ from experiments.looks import Looks, read_looks
 from experiments.plan import PlannedRun, tuning_seeds
 from experiments.results import StudyResults, mixed_versions
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
-from mdp.array_types import Floats
+from mdp.transition_model import Floats
 from report.conclusions import conclusion, on_changes, pairs_both_ways, places_without_a_run
 from report.documents import MARKUPS, verdicts_as
 from report.page.frame import Report, Section, setting

@@ -21,7 +21,7 @@ from commands.train import (
     print_outcome,
     watch_command,
 )
-from machine_code.work_time import WorkTime
+from machine_code import WorkTime
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.runs import Run
 from pipeline.settings.hyperparams import split

@@ -215,7 +215,7 @@ def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
 OWN_RULE = """
 import gc
 gc.disable()
-from mdp.machine_code import inlined  # its name in earlier versions
+from machine_code.compiling import inlined
 from agents.tabular.one_step import QLearning
 from stable_baselines3.common.env_util import make_vec_env
 WORTH = {worth}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numba.core import event
 
+from machine_code import WorkTime
 from machine_code.compiling import called, compile_timer, compiled, inlined, kernel
-from machine_code.work_time import WorkTime
 
 
 @called
