@@ -68,18 +68,18 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
     lowest_start = float(plan.values[model.initial > 0].min())
     highest, lowest = max(float(values.max()), 0.0), min(float(values.min()), 0.0)
     rows = model.prob, model.next_state, model.terminated, model.reward
-    step_cost, fall, variance = _drift(*rows, reached, plan.values)
+    step_cost, fall, variance = drift(*rows, reached, plan.values)
     slack = 4 * plan.error_bound  # of differences of values, each known to within the bound
     overdue = horizon * step_cost - (highest - lowest_start) - slack
     fall, deviation = fall + slack, math.sqrt(variance) + slack
     chance = 1.0
     if step_cost > 0:
-        chance = _chance_of_losing(overdue + lowest - slack, fall, deviation**2, horizon)
+        chance = chance_of_losing(overdue + lowest - slack, fall, deviation**2, horizon)
     error = plan.error_bound + max(-lowest, highest) * chance
     return plan.start_value if error <= TOLERANCE * max(1.0, abs(plan.start_value)) else None
 
 
-def _chance_of_losing(loss: float, fall: float, variance: float, horizon: int) -> float:
+def chance_of_losing(loss: float, fall: float, variance: float, horizon: int) -> float:
     """A bound on the probability that chance alone takes so much in so many steps.
 
     A step changes the value by this variance at most, and lets it fall below its mean by ``fall``.
@@ -91,7 +91,7 @@ def _chance_of_losing(loss: float, fall: float, variance: float, horizon: int) -
 
 
 @compiled
-def _drift(
+def drift(
     prob: Floats,
     next_state: AnyInts,
     terminated: Bools,

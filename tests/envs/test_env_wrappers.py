@@ -1,7 +1,6 @@
-"""The wrappers, worked by hand and against their own batched versions."""
+"""The wrappers and masks, worked by hand, and against their own batched versions."""
 
 import pickle
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,135 +9,93 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from stable_baselines3.common.env_checker import check_env
 
-import envs  # noqa: F401
+import envs  # noqa: F401 (registers the environments)
+from envs.known_models import action_masks_of_states, observations_of_states, transition_model
+from envs.mine_maze import MineMazeEnv
 from envs.warehouse import WarehouseEnv
 from envs.wrappers import (
+    ActionMasks,
     DiscretizeObservation,
     FlattenToDiscrete,
+    IdleActionMasks,
     OneHotObservation,
     ScaleReward,
     TerminationReward,
+    action_masks,
 )
 
-AnyEnv = gym.Env[Any, Any]
 
-
-class Showing(gym.Env[Any, Any]):
+class Showing(gym.Env):
     """Shows what it is told to, for two steps of reward 1 and 2; the second one terminates."""
 
-    def __init__(self, space: spaces.Space[Any], shown: Any) -> None:
+    def __init__(self, space, shown=None):
         self.observation_space = space
         self.action_space = spaces.Discrete(2)
         self.shown = shown
         self.n_steps = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.n_steps = 0
         return self.shown, {}
 
-    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         self.n_steps += 1
         return self.shown, float(self.n_steps), self.n_steps == 2, False, {}
 
 
-def box(low: list[float], high: list[float], shown: list[float] | None = None) -> Showing:
+def box(low, high, shown=None):
     space = spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
     return Showing(space, np.array(low if shown is None else shown, np.float32))
 
 
-def cart_pole(**kwargs: Any) -> DiscretizeObservation:
+def cart_pole(**kwargs):
     bounds = {"low": [-0.41887903, -50], "high": [0.41887903, 50]}
-    return DiscretizeObservation(
-        gym.make("CartPole-v1"), **{"bins": 50, "dims": [2, 3], **bounds, **kwargs}
-    )
+    settings = {"bins": 50, "dims": [2, 3], **bounds, **kwargs}
+    return DiscretizeObservation(gym.make("CartPole-v1"), **settings)
 
 
-@pytest.mark.parametrize(
-    ("value", "index"),
-    [(-9, 0), (-1, 0), (-0.51, 0), (-0.5, 1), (-0.01, 1), (0, 2), (0.5, 3), (1, 3), (9, 3)],
-)
-def test_bins_worked_by_hand(value: float, index: int) -> None:
-    env = DiscretizeObservation(box([-1], [1], [value]), bins=4)
+# --- observations ---------------------------------------------------------------------------------
+
+BINS = [(-9, 0), (-1, 0), (-0.51, 0), (-0.5, 1), (-0.01, 1), (0, 2), (0.5, 3), (1, 3), (9, 3)]
+
+
+@pytest.mark.parametrize(("value", "index"), [*BINS, (-np.inf, 0), (np.inf, 3)])
+def test_bins_worked_by_hand(value, index):
+    env = DiscretizeObservation(box([-np.inf], [np.inf], [value]), bins=4, low=-1, high=1)
     assert env.observation_space == spaces.Discrete(4)
-    assert env.reset()[0] == index
-    assert type(env.reset()[0]) is int
+    observation = env.reset()[0]
+    assert (observation, type(observation)) == (index, int)
+    assert env.map_observations(np.array([[value], [0]])).tolist() == [index, 2]
 
 
-def test_infinite_values_fall_into_the_outer_bins() -> None:
-    env = DiscretizeObservation(box([-np.inf], [np.inf]), bins=4, low=0, high=1)
-    assert env.observation(np.array([-np.inf])) == 0
-    assert env.observation(np.array([np.inf])) == 3
-    assert env.map_observations(np.array([[-np.inf], [np.inf]])).tolist() == [0, 3]
-
-
-def test_the_last_dimension_counts_fastest() -> None:
+def test_the_last_dimension_counts_fastest_and_only_the_chosen_ones_count():
     env = DiscretizeObservation(box([0, 0, 0], [1, 1, 1], [0.9, 0.1, 0.6]), bins=[2, 3, 4])
     assert env.observation_space == spaces.Discrete(24)
     assert env.reset()[0] == (1 * 3 + 0) * 4 + 2
-
-
-def test_only_the_chosen_dimensions_count() -> None:
-    env = DiscretizeObservation(
-        box([0, -np.inf, 0], [1, np.inf, 1], [0.9, 7, 0.6]), bins=[2, 4], dims=[2, 0]
-    )
+    inner = box([0, -np.inf, 0], [1, np.inf, 1], [0.9, 7, 0.6])
+    env = DiscretizeObservation(inner, bins=[2, 4], dims=[2, 0])
     assert env.observation_space == spaces.Discrete(8)
     assert env.reset()[0] == 1 * 4 + 3
 
 
-def test_cart_pole_in_fifty_bins() -> None:
+def test_cart_pole_in_fifty_bins():
     env = cart_pole()
     assert env.observation_space == spaces.Discrete(2500)
-    middle = env.observation(np.array([0, 0, 0.001, 0.001], np.float32))
-    assert middle == 25 * 50 + 25
+    assert env.observation(np.array([0, 0, 0.001, 0.001], np.float32)) == 25 * 50 + 25
     assert env.observation(np.array([9, 9, -0.001, 0.001], np.float32)) == 24 * 50 + 25
-    check_env(env, warn=True)
 
 
-@given(
-    st.lists(
-        st.lists(st.floats(-60, 60, width=32), min_size=4, max_size=4), min_size=1, max_size=20
-    ),
-    st.integers(1, 60),
-)
-def test_a_batch_is_discretised_as_its_members(rows: list[list[float]], bins: int) -> None:
+ROW = st.lists(st.floats(-60, 60, width=32), min_size=4, max_size=4)
+
+
+@given(st.lists(ROW, min_size=1, max_size=20), st.integers(1, 60))
+def test_a_batch_is_discretised_as_its_members(rows, bins):
     env = cart_pole(bins=bins)
     batch = np.array(rows, np.float32)
     assert env.map_observations(batch).tolist() == [env.observation(row) for row in batch]
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"low": None}, "dimension 3 of the observation has the bounds -inf and 50.0: give finite"),
-        ({"low": [1, -50]}, "dimension 2: low 1.0 is not below high 0.418"),
-        ({"bins": 0}, "bins must be whole numbers from 1 on, not 0"),
-        ({"bins": 2.5}, r"bins must be whole numbers from 1 on, not 2\.5"),
-        ({"bins": [2, 2, 2]}, r"bins must be one number, or one for each of the dimensions \[2, 3"),
-        (
-            {"low": "left"},
-            "low must be one number, or one for each of the dimensions .* not 'left'",
-        ),
-        ({"dims": [4]}, "dims must be a whole number from 0 to 3, not 4"),
-        ({"dims": [2, 2]}, r"dims must list dimensions, each once, not \[2, 2\]"),
-        ({"dims": []}, r"dims must list dimensions, each once, not \[\]"),
-        ({"dims": 2}, "dims must list dimensions, each once, not 2"),
-    ],
-)
-def test_bins_that_make_no_sense_are_refused(kwargs: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        cart_pole(**kwargs)
-
-
-@pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.Box(0, 1, (2, 2))])
-def test_only_vectors_are_discretised(space: spaces.Space[Any]) -> None:
-    with pytest.raises(ValueError, match="DiscretizeObservation needs a Box of one axis, not"):
-        DiscretizeObservation(Showing(space, None), bins=2)
 
 
 @pytest.mark.parametrize(
@@ -153,129 +110,239 @@ def test_only_vectors_are_discretised(space: spaces.Space[Any]) -> None:
         (spaces.Discrete(5), np.int64(3), 5, 3),
     ],
 )
-def test_flattening_worked_by_hand(
-    space: spaces.Space[Any], shown: Any, n: int, index: int
-) -> None:
+def test_flattening_worked_by_hand(space, shown, n, index):
     env = FlattenToDiscrete(Showing(space, shown))
     assert env.observation_space == spaces.Discrete(n)
     observed = [env.reset()[0], env.step(0)[0]]
-    assert observed == [index, index]
-    assert type(observed[0]) is int
+    assert (observed, type(observed[0])) == ([index, index], int)
     assert env.map_observations([shown, shown]).tolist() == [index, index]
 
 
-def test_every_value_gets_a_number_of_its_own() -> None:
-    env = FlattenToDiscrete(Showing(spaces.MultiDiscrete([2, 3, 4], start=[1, 0, -3]), None))
+def test_every_value_gets_a_number_of_its_own():
+    env = FlattenToDiscrete(Showing(spaces.MultiDiscrete([2, 3, 4], start=[1, 0, -3])))
     grid = np.stack(np.meshgrid([1, 2], [0, 1, 2], [-3, -2, -1, 0], indexing="ij"), axis=-1)
     assert env.map_observations(grid.reshape(-1, 3)).tolist() == list(range(24))
 
 
-def test_blackjack_is_flattened() -> None:
-    env = FlattenToDiscrete(gym.make("Blackjack-v1"))
-    assert env.observation_space == spaces.Discrete(32 * 11 * 2)
-    check_env(env, warn=True)
-
-
-@pytest.mark.parametrize(
-    ("space", "message"),
-    [
-        (spaces.Box(0, 1, (2,)), "FlattenToDiscrete needs MultiDiscrete, a Tuple of Discrete, or"),
-        (spaces.Tuple([spaces.Discrete(2), spaces.Box(0, 1)]), "FlattenToDiscrete needs"),
-        (spaces.Tuple([]), "FlattenToDiscrete needs"),
-        (spaces.MultiDiscrete([2**31] * 3), "too many to be numbered"),
-    ],
-)
-def test_what_cannot_be_flattened_is_refused(space: spaces.Space[Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        FlattenToDiscrete(Showing(space, None))
-
-
-def test_one_hot_worked_by_hand() -> None:
+def test_one_hot_worked_by_hand():
     env = OneHotObservation(Showing(spaces.Discrete(4, start=2), 3))
     assert env.observation_space == spaces.Box(0, 1, (4,), np.float32)
-    first, _ = env.reset()
-    assert first.dtype == np.float32
-    assert first.tolist() == [0, 1, 0, 0]
-    assert env.step(0)[0].tolist() == [0, 1, 0, 0]
+    for found in (env.reset()[0], env.step(0)[0]):
+        assert (found.tolist(), found.dtype) == ([0, 1, 0, 0], np.float32)
     batch = env.map_observations(np.array([5, 2]))
-    assert batch.dtype == np.float32
-    assert batch.tolist() == [[0, 0, 0, 1], [1, 0, 0, 0]]
+    assert (batch.tolist(), batch.dtype) == ([[0, 0, 0, 1], [1, 0, 0, 0]], np.float32)
 
 
-def test_one_hot_passes_the_checker_and_fits_discrete_alone() -> None:
-    check_env(OneHotObservation(gym.make("MineMaze-v0")), warn=True)
-    with pytest.raises(ValueError, match="OneHotObservation needs Discrete observations, not Box"):
-        OneHotObservation(gym.make("CartPole-v1"))
+# --- rewards --------------------------------------------------------------------------------------
 
 
-def test_rewards_are_scaled() -> None:
+def test_rewards_are_scaled():
     env = ScaleReward(Showing(spaces.Discrete(2), 0), scale=0.25)
     env.reset()
-    assert [env.step(0)[1], env.step(0)[1]] == [0.25, 0.5]
-    assert env.scale == 0.25
-
-
-@pytest.mark.parametrize(("scale", "message"), [(0, "must not be 0"), ("x", "finite number")])
-def test_a_scale_that_makes_no_sense_is_refused(scale: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ScaleReward(Showing(spaces.Discrete(2), 0), scale=scale)
+    assert ([env.step(0)[1], env.step(0)[1]], env.scale) == ([0.25, 0.5], 0.25)
 
 
 @pytest.mark.parametrize(
     ("limit", "on_truncation", "rewards"),
     [(9, False, [1, -10]), (9, True, [1, -10]), (1, False, [1]), (1, True, [-10])],
 )
-def test_the_last_reward_is_replaced(limit: int, on_truncation: bool, rewards: list[float]) -> None:
+def test_the_last_reward_is_replaced(limit, on_truncation, rewards):
     inner = TimeLimit(Showing(spaces.Discrete(2), 0), limit)
     env = TerminationReward(inner, reward=-10, on_truncation=on_truncation)
     env.reset()
     assert [env.step(0)[1] for _ in rewards] == rewards
 
 
-def test_a_last_reward_that_makes_no_sense_is_refused() -> None:
-    env = Showing(spaces.Discrete(2), 0)
-    with pytest.raises(ValueError, match="reward must be a finite number, not nan"):
-        TerminationReward(env, reward=float("nan"))
-    with pytest.raises(ValueError, match="on_truncation must be true or false, not 'yes'"):
-        TerminationReward(env, reward=0, on_truncation="yes")  # type: ignore[arg-type]
+# --- what all share -------------------------------------------------------------------------------
+
+BOX = spaces.Box(0, 1, (2,))
+DISCRETE = spaces.Discrete(2)
+REFUSED = [
+    (lambda: cart_pole(low=None), "dimension 3 of the observation has the bounds -inf and 50.0: g"),
+    (lambda: cart_pole(low=[1, -50]), "dimension 2: low 1.0 is not below high 0.418"),
+    (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
+    (lambda: cart_pole(bins=2.5), r"bins must be whole numbers from 1 on, not 2\.5"),
+    (lambda: cart_pole(bins=[2, 2, 2]), r"bins must be one number, or one for each of .* \[2, 3"),
+    (lambda: cart_pole(low="left"), "low must be one number, or one for each .* not 'left'"),
+    (lambda: cart_pole(dims=[4]), "dims must be a whole number from 0 to 3, not 4"),
+    (lambda: cart_pole(dims=[2, 2]), r"dims must list dimensions, each once, not \[2, 2\]"),
+    (lambda: cart_pole(dims=[]), r"dims must list dimensions, each once, not \[\]"),
+    (lambda: cart_pole(dims=2), "dims must list dimensions, each once, not 2"),
+    (lambda: DiscretizeObservation(Showing(DISCRETE), 2), "DiscretizeObservation needs a Box of"),
+    (
+        lambda: DiscretizeObservation(Showing(spaces.Box(0, 1, (2, 2))), 2),
+        "needs a Box of one axis",
+    ),
+    (lambda: FlattenToDiscrete(Showing(BOX)), "FlattenToDiscrete needs MultiDiscrete, a Tuple of"),
+    (
+        lambda: FlattenToDiscrete(Showing(spaces.Tuple([DISCRETE, BOX]))),
+        r"not Tuple\(Discrete\(2\), Box",
+    ),
+    (lambda: FlattenToDiscrete(Showing(spaces.Tuple([]))), r"or Discrete, not Tuple\(\)"),
+    (
+        lambda: FlattenToDiscrete(Showing(spaces.MultiDiscrete([2**31] * 3))),
+        "too many to be numbered",
+    ),
+    (lambda: OneHotObservation(Showing(BOX)), "OneHotObservation needs Discrete observations, not"),
+    (lambda: ScaleReward(Showing(DISCRETE), 0), "scale must not be 0"),
+    (lambda: ScaleReward(Showing(DISCRETE), "x"), "scale must be a finite number"),
+    (lambda: TerminationReward(Showing(DISCRETE), float("nan")), "reward must be a finite number"),
+    (
+        lambda: TerminationReward(Showing(DISCRETE), 0, on_truncation="yes"),
+        "on_truncation must be true or false, not 'yes'",
+    ),
+    (
+        lambda: ActionMasks(gym.make("CartPole-v1")),
+        r"^CartPole-v1 has no action masks: neither a method",
+    ),
+    (
+        lambda: IdleActionMasks(gym.make("CartPole-v1")),
+        "IdleActionMasks needs an environment that holds P",
+    ),
+]
 
 
-def wrapped() -> list[AnyEnv]:
-    return [
-        cart_pole(),
-        FlattenToDiscrete(gym.make("Blackjack-v1")),
-        OneHotObservation(gym.make("Warehouse-v0", slip=0.2)),
-        ScaleReward(gym.make("Warehouse-v0"), 0.01),
-        TerminationReward(gym.make("CartPole-v1"), -10, on_truncation=True),
-    ]
+@pytest.mark.parametrize(("make", "message"), REFUSED)
+def test_what_makes_no_sense_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
-def rollout(env: AnyEnv) -> list[tuple[NDArray[Any], float]]:
-    history = [(np.asarray(env.reset(seed=3)[0]), 0.0)]
-    for action in np.random.default_rng(0).integers(2, size=100):
-        observation, reward, terminated, truncated, _ = env.step(int(action))
-        history.append((np.asarray(observation), float(reward)))
+WRAPPED = {
+    "DiscretizeObservation": cart_pole,
+    "FlattenToDiscrete": lambda: FlattenToDiscrete(gym.make("Blackjack-v1")),
+    "OneHotObservation": lambda: OneHotObservation(gym.make("Warehouse-v0", slip=0.2)),
+    "ScaleReward": lambda: ScaleReward(gym.make("Warehouse-v0"), 0.01),
+    "TerminationReward": lambda: TerminationReward(
+        gym.make("CartPole-v1"), -10, on_truncation=True
+    ),
+    "ActionMasks": lambda: ActionMasks(gym.make("MineMaze-v0")),
+    "IdleActionMasks": lambda: IdleActionMasks(gym.make("FrozenLake-v1")),
+}
+
+
+def rollout(env):
+    history = [(np.asarray(env.reset(seed=3)[0]).tolist(), 0.0)]
+    for action in np.random.default_rng(0).integers(2, size=100).tolist():
+        observation, reward, terminated, truncated, _ = env.step(action)
+        history.append((np.asarray(observation).tolist(), float(reward)))
         if terminated or truncated:
             env.reset()
     return history
 
 
-@pytest.mark.parametrize("env", wrapped(), ids=lambda env: type(env).__name__)
-def test_wrapped_environments_are_remade_from_their_spec_and_pickled(env: AnyEnv) -> None:
-    assert env.spec is not None
+@pytest.mark.parametrize("name", WRAPPED)
+def test_wrapped_environments_are_checked_remade_from_their_spec_and_pickled(name):
+    env = WRAPPED[name]()
+    check_env(env, warn=True)
     expected = rollout(env)
     for other in (gym.make(env.spec), pickle.loads(pickle.dumps(env))):
         assert str(other) == str(env)
-        for (observation, reward), (again, reward_again) in zip(
-            expected, rollout(other), strict=True
-        ):
-            assert reward == reward_again
-            assert np.array_equal(observation, again)
+        assert rollout(other) == expected
 
 
-def test_states_are_mapped_through_observation_and_wrapper() -> None:
-    env = OneHotObservation(WarehouseEnv(desc=["S.", ".G"]))
-    states = np.arange(4)
-    grid_world = env.unwrapped
-    assert isinstance(grid_world, WarehouseEnv)
-    assert env.map_observations(grid_world.observation_of(states)).tolist() == np.eye(4).tolist()
+# --- action masks ---------------------------------------------------------------------------------
+
+MASKED = {
+    "Warehouse": lambda: gym.make("Warehouse-v0"),
+    "slippery Warehouse": lambda: gym.make("Warehouse-v0", slip=0.5),
+    "MineMaze": lambda: ScaleReward(FlattenToDiscrete(gym.make("MineMaze-v0")), 0.1),
+    "Taxi": lambda: gym.make("Taxi-v4"),
+    "told Taxi": lambda: ActionMasks(gym.make("Taxi-v4")),
+    "idle lake": lambda: IdleActionMasks(gym.make("FrozenLake-v1", is_slippery=False)),
+    "idle cliff": lambda: ActionMasks(IdleActionMasks(gym.make("CliffWalking-v1"))),
+}
+
+
+@pytest.mark.parametrize("name", MASKED)
+def test_a_state_is_told_as_all_states_are(name):
+    env = MASKED[name]()
+    env.reset(seed=0)
+    masks = action_masks_of_states(env)
+    assert masks.shape == (len(observations_of_states(env)), env.action_space.n)
+    assert masks.dtype == np.bool_
+    assert masks.any(axis=1).all()
+    for state, mask in enumerate(masks):
+        env.unwrapped.s = state
+        np.testing.assert_array_equal(action_masks(env), mask)
+
+
+def test_moves_into_shelves_and_out_of_the_map_are_masked():
+    env = gym.make("Warehouse-v0", desc=["S#", ".G"])
+    # Of the start: up leaves the map, down is free, left leaves it, right is a shelf.
+    expected = [[0, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
+    np.testing.assert_array_equal(action_masks_of_states(env), expected)
+    walled_in = WarehouseEnv(desc=["S.G", "###", "#.#", "###"])
+    walled_in.s = 7
+    assert walled_in.action_masks().all()
+    assert walled_in.dynamics.action_masks()[7].all()
+
+
+@pytest.mark.parametrize("slip", [0, 0.3])
+def test_a_masked_move_is_one_that_is_meant_to_bump(slip):
+    env = MineMazeEnv(slip=slip)
+    model, masks = env.transition_model(), action_masks_of_states(env)
+    ends = model.terminated.all(axis=(1, 2))
+    # The first outcome is the one that is meant.
+    stays = model.next_state[:, :, 0] == np.arange(model.n_states)[:, None]
+    np.testing.assert_array_equal(masks, ~stays | ends[:, None])
+
+
+def test_idle_actions_change_nothing():
+    env = IdleActionMasks(gym.make("FrozenLake-v1", is_slippery=False))
+    model = transition_model(env)
+    goes = model.next_state[:, :, 0] != np.arange(16)[:, None]
+    np.testing.assert_array_equal(action_masks_of_states(env), goes | model.terminated[:, :, 0])
+    # On ice any move may lead somewhere.
+    assert IdleActionMasks(gym.make("FrozenLake-v1")).masks.all()
+
+
+@pytest.mark.parametrize("name", ["Warehouse", "Taxi", "idle lake"])
+def test_the_wrapper_tells_both_ways(name):
+    env = ActionMasks(MASKED[name]())
+    rng = np.random.default_rng(0)
+    _, info = env.reset(seed=0)
+    for _ in range(300):
+        mask = action_masks_of_states(env)[env.unwrapped.s]
+        np.testing.assert_array_equal(info["action_mask"], mask)
+        np.testing.assert_array_equal(env.action_masks(), mask)
+        _, _, terminated, truncated, info = env.step(rng.choice(np.flatnonzero(mask)))
+        if terminated or truncated:
+            _, info = env.reset()
+
+
+class ToldByInfo(gym.Wrapper):
+    """Says it in info alone."""
+
+    def reset(self, **kwargs):
+        obs, info = self.env.reset(**kwargs)
+        return obs, {**info, "action_mask": np.array([0, 1], np.int8)}
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        return *rest, {**info, "action_mask": np.array([1, 0], np.int8)}
+
+
+def test_info_alone_is_enough_for_the_wrapper():
+    env = ActionMasks(ToldByInfo(gym.make("CartPole-v1")))
+    env.reset(seed=0)
+    assert env.action_masks().tolist() == [False, True]
+    env.step(1)
+    assert env.action_masks().tolist() == [True, False]
+
+
+class OwnMasks(MineMazeEnv):
+    """Never up."""
+
+    def action_masks(self):
+        return np.array([False, True, True, True])
+
+
+def test_masks_that_are_not_there_are_not_guessed():
+    for env_id in ("CartPole-v1", "FrozenLake-v1", "BernoulliBandit-v0"):
+        env = gym.make(env_id)
+        assert action_masks(env) is action_masks_of_states(env) is None
+    assert action_masks_of_states(OwnMasks()) is None
+    assert action_masks(OwnMasks()).tolist() == [False, True, True, True]
+    # A wrapper that nobody here knows may mask as well.
+    assert action_masks_of_states(gym.Wrapper(MineMazeEnv())) is None

@@ -1,11 +1,9 @@
-"""What is known exactly about an environment: its model must be the environment, step for step."""
-
-import copy
-from typing import Any
+"""What is known exactly about an environment: its model is the environment, step for step."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.seeding import np_random
 from gymnasium.wrappers import (
     ClipReward,
     RecordEpisodeStatistics,
@@ -23,6 +21,7 @@ from envs.known_models import (
     time_limit,
     transition_model,
 )
+from envs.layout import action_names, grid_layout
 from envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
@@ -31,130 +30,121 @@ from envs.wrappers import (
     TerminationReward,
 )
 
-ENVIRONMENTS: list[tuple[str, dict[str, Any]]] = [
-    ("Warehouse-v0", {}),
-    ("Warehouse-v0", {"slip": 0.3, "random_start": True, "shelf_reward": -1}),
-    ("RandomWarehouse-v0", {"size": 7, "map_seed": 3, "slip": 0.2}),
-    ("MineMaze-v0", {}),
-    ("MineMaze-v0", {"slip": 0.4, "random_start": True}),
-    ("FrozenLake-v1", {}),
-    ("FrozenLake-v1", {"is_slippery": False}),
-    ("FrozenLake-v1", {"map_name": "8x8", "success_rate": 0.6, "reward_schedule": (3, -2, -0.1)}),
-    ("FrozenLake-v1", {"desc": ["SFS", "HFG"]}),
-    ("CliffWalking-v1", {}),
-    ("CliffWalking-v1", {"is_slippery": True}),
-    ("Taxi-v4", {}),
-    ("Taxi-v4", {"is_rainy": True, "rainy_probability": 0.7}),
-    ("DynaMaze-v0", {"maze": "shortcut", "changed": True}),
-    ("RandomWalk-v0", {"n_states": 1000, "max_jump": 100, "left_reward": -1}),
-    ("WindyGridworld-v0", {"moves": "king", "stochastic": True}),
-    ("GamblersProblem-v0", {"heads_probability": 0.55, "goal": 20}),
-    ("RiverSwim-v0", {}),
-    ("ShortCorridor-v0", {}),
-    ("DeepSea-v0", {"size": 4}),
-    ("Racetrack-v0", {}),
-]
-EACH_ENVIRONMENT = pytest.mark.parametrize(("env_id", "kwargs"), ENVIRONMENTS)
+EIGHT = {"map_name": "8x8", "success_rate": 0.6, "reward_schedule": (3, -2, -0.1)}
+WORLDS = {
+    "Warehouse": ("Warehouse-v0", {}),
+    "slippery Warehouse": ("Warehouse-v0", {"slip": 0.3, "random_start": True, "shelf_reward": -1}),
+    "sliding Warehouse": ("Warehouse-v0", {"slip": 1, "observation": "position"}),
+    "one-hot Warehouse": ("Warehouse-v0", {"slip": 0.1, "observation": "one_hot"}),
+    "RandomWarehouse": ("RandomWarehouse-v0", {"size": 7, "map_seed": 3, "slip": 0.2}),
+    "MineMaze": ("MineMaze-v0", {}),
+    "slippery MineMaze": ("MineMaze-v0", {"slip": 0.4, "random_start": True, "power_reward": 0}),
+    "FrozenLake": ("FrozenLake-v1", {}),
+    "still FrozenLake": ("FrozenLake-v1", {"is_slippery": False}),
+    "FrozenLake 8x8": ("FrozenLake-v1", EIGHT),
+    "FrozenLake 2x3": ("FrozenLake-v1", {"desc": ["SFS", "HFG"]}),
+    "CliffWalking": ("CliffWalking-v1", {}),
+    "slippery CliffWalking": ("CliffWalking-v1", {"is_slippery": True}),
+    "Taxi": ("Taxi-v4", {}),
+    "rainy Taxi": ("Taxi-v4", {"is_rainy": True, "rainy_probability": 0.7}),
+    "DynaMaze": ("DynaMaze-v0", {"maze": "shortcut", "changed": True}),
+    "RandomWalk": ("RandomWalk-v0", {"n_states": 1000, "max_jump": 100, "left_reward": -1}),
+    "WindyGridworld": ("WindyGridworld-v0", {"moves": "king", "stochastic": True}),
+    "GamblersProblem": ("GamblersProblem-v0", {"heads_probability": 0.55, "goal": 20}),
+    "RiverSwim": ("RiverSwim-v0", {}),
+    "ShortCorridor": ("ShortCorridor-v0", {}),
+    "DeepSea": ("DeepSea-v0", {"size": 4}),
+    "Racetrack": ("Racetrack-v0", {}),
+}
 
 
-def next_uniform(base: Any) -> float:
-    """The uniform number that the environment is about to draw."""
-    return float(copy.deepcopy(base.np_random).random())
+def make(name):
+    env_id, kwargs = WORLDS[name]
+    return gym.make(env_id, **kwargs)
 
 
-def first_above(probabilities: Any, uniform: float) -> int:
+def first_above(probabilities, uniform):
     return int(np.argmax(np.cumsum(probabilities) > uniform))
 
 
-def assert_replays(env: gym.Env[Any, Any], steps: int = 1500) -> None:
-    """Predict every start and step from the model and the environment's next random number."""
-    model, base = transition_model(env), env.unwrapped
-    observations = observations_of_states(env)
-    assert model is not None
-    assert observations is not None
-    rng = np.random.default_rng(5)
-    env.reset(seed=3)
-    over = True
-    for _ in range(steps):
-        if over:
-            start = first_above(model.initial, next_uniform(base))
-            obs, _ = env.reset()
-            assert base.s == start  # type: ignore[attr-defined]
-            np.testing.assert_array_equal(obs, observations[start])
-        state = base.s  # type: ignore[attr-defined]
-        action = int(rng.integers(model.n_actions))
-        outcome = (state, action, first_above(model.prob[state, action], next_uniform(base)))
+def assert_replays(env, steps=1000):
+    """Predict every start and step from the model and a generator of the same seed."""
+    model, base, observations = transition_model(env), env.unwrapped, observations_of_states(env)
+    uniform = np_random(3)[0].random
+    first, _ = env.reset(seed=3)
+    state = first_above(model.initial, uniform())
+    np.testing.assert_array_equal(first, observations[state])
+    for action in np.random.default_rng(5).integers(model.n_actions, size=steps).tolist():
+        outcome = state, action, first_above(model.prob[state, action], uniform())
         obs, reward, terminated, truncated, _ = env.step(action)
-        assert base.s == model.next_state[outcome]  # type: ignore[attr-defined]
-        assert reward == model.reward[outcome]
-        assert terminated == model.terminated[outcome]
-        np.testing.assert_array_equal(obs, observations[base.s])  # type: ignore[attr-defined]
+        state = model.next_state[outcome]
+        assert (base.s, reward, terminated) == (
+            state,
+            model.reward[outcome],
+            model.terminated[outcome],
+        )
+        np.testing.assert_array_equal(obs, observations[state])
         assert env.observation_space.contains(obs)
-        over = terminated or truncated
+        if terminated or truncated:
+            obs, _ = env.reset()
+            state = first_above(model.initial, uniform())
+            np.testing.assert_array_equal(obs, observations[state])
+    assert env.np_random.random() == uniform()
 
 
-@EACH_ENVIRONMENT
-def test_the_model_replays_the_environment(env_id: str, kwargs: dict[str, Any]) -> None:
-    assert_replays(gym.make(env_id, **kwargs))
+@pytest.mark.parametrize("name", WORLDS)
+def test_the_model_replays_the_environment(name):
+    assert_replays(make(name))
 
 
-@EACH_ENVIRONMENT
-def test_rewards_are_folded_in(env_id: str, kwargs: dict[str, Any]) -> None:
-    env: Any = gym.make(env_id, **kwargs)
-    env = TerminationReward(ScaleReward(Monitor(env), 0.01), reward=-0.7)
-    assert_replays(
-        ScaleReward(RecordEpisodeStatistics(env, stats_key="statistics"), -3.0), steps=400
-    )
+@pytest.mark.parametrize(
+    "wrap",
+    {
+        "replaced": lambda env: ScaleReward(
+            RecordEpisodeStatistics(
+                TerminationReward(ScaleReward(Monitor(env), 0.01), reward=-0.7), stats_key="stats"
+            ),
+            -3.0,
+        ),
+        "clipped": lambda env: ScaleReward(ClipReward(ScaleReward(env, 0.1), -0.5, 0.3), 0.7),
+        "clipped above": lambda env: ClipReward(ScaleReward(env, 0.1), None, -0.2),
+        "clipped below": lambda env: ClipReward(env, 0.1, None),
+    }.values(),
+    ids=["replaced", "clipped", "clipped above", "clipped below"],
+)
+@pytest.mark.parametrize("name", ["slippery MineMaze", "FrozenLake 8x8", "Taxi", "GamblersProblem"])
+def test_what_wrappers_do_to_rewards_is_folded_in(name, wrap):
+    assert_replays(wrap(make(name)), steps=300)
 
 
-@pytest.mark.parametrize("bounds", [(-0.5, 0.3), (None, -0.2), (0.1, None)])
-@EACH_ENVIRONMENT
-def test_so_are_bounds_of_rewards(env_id: str, kwargs: dict[str, Any], bounds: Any) -> None:
-    env = ClipReward(ScaleReward(gym.make(env_id, **kwargs), 0.1), *bounds)
-    assert_replays(ScaleReward(env, 0.7), steps=200)
-
-
-@pytest.mark.parametrize("observation", ["discrete", "position", "one_hot"])
-def test_observations_of_the_warehouse(observation: str) -> None:
-    assert_replays(gym.make("Warehouse-v0", observation=observation, slip=0.1))
-
-
-def test_observation_wrappers() -> None:
-    env = gym.make("FrozenLake-v1")
-    assert_replays(OneHotObservation(env), steps=200)
-    assert_replays(OneHotObservation(FlattenToDiscrete(env)), steps=200)
-    position = gym.make("Warehouse-v0", observation="position")
+def test_what_wrappers_do_to_observations_is_folded_in():
+    lake, position = make("FrozenLake"), gym.make("Warehouse-v0", observation="position")
+    assert_replays(OneHotObservation(FlattenToDiscrete(lake)), steps=200)
     assert_replays(DiscretizeObservation(position, bins=4), steps=200)
-    one_hot = observations_of_states(OneHotObservation(env))
-    assert one_hot is not None
-    np.testing.assert_array_equal(one_hot, np.eye(16))
+    np.testing.assert_array_equal(observations_of_states(OneHotObservation(lake)), np.eye(16))
+    # Where it is not known what is seen, the model is known all the same.
+    assert observations_of_states(TimeAwareObservation(lake)) is None
 
 
-def test_what_wrappers_make_of_drawn_rewards() -> None:
-    env: Any = gym.make("MaximizationBias-v0", reward_std=2)
-    scaled = transition_model(ScaleReward(env, 3))
-    assert scaled is not None
-    assert scaled.reward_variance is not None
-    assert scaled.reward_variance[1, 0, 0] == 36
-    replaced = transition_model(TerminationReward(env, -5))
-    assert replaced is not None
-    assert replaced.reward_variance is not None
-    assert not replaced.reward_variance.any()
+def test_what_wrappers_make_of_drawn_rewards():
+    env = gym.make("MaximizationBias-v0", reward_std=2)
+    assert transition_model(ScaleReward(env, 3)).reward_variance[1, 0, 0] == 36
+    assert not transition_model(TerminationReward(env, -5)).reward_variance.any()
     assert transition_model(ClipReward(env, -1, 1)) is None
 
 
-class Anything(gym.Wrapper[Any, Any, Any, Any]):
+class Anything(gym.Wrapper):
     """A wrapper of somebody else's."""
-
-
-def clip_otherwise(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    clipping: Any = ClipReward(env, -1, 1)
-    clipping.func = lambda reward: 2 * reward
-    return clipping
 
 
 class OurOwnTimeLimit(TimeLimit):
     """Not the one that is known."""
+
+
+def clip_otherwise(env):
+    clipping = ClipReward(env, -1, 1)
+    clipping.func = lambda reward: 2 * reward
+    return clipping
 
 
 @pytest.mark.parametrize(
@@ -171,83 +161,143 @@ class OurOwnTimeLimit(TimeLimit):
     ids=["unknown", "subclass", "function", "on_truncation", "bounds", "otherwise", "inside"],
 )
 @pytest.mark.parametrize("env_id", ["FrozenLake-v1", "Warehouse-v0"])
-def test_unknown_wrappers_hide_the_model(env_id: str, wrap: Any) -> None:
+def test_unknown_wrappers_hide_the_model(env_id, wrap):
     env = wrap(gym.make(env_id))
-    assert transition_model(env) is None
-    assert success_outcomes(env) is None
-    # Only what is observed through them stays unknown as well.
-    assert observations_of_states(TimeAwareObservation(gym.make(env_id))) is None
+    assert transition_model(env) is success_outcomes(env) is model_check(env) is None
 
 
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
-    [("CartPole-v1", {}), ("Taxi-v4", {"fickle_passenger": True})],
+    [
+        ("CartPole-v1", {}),
+        ("Taxi-v4", {"fickle_passenger": True}),
+        ("GaussianBandit-v0", {}),
+        ("LinearBandit-v0", {}),
+        ("DynaMaze-v0", {"maze": "blocking", "changed": True, "change_after_steps": 9}),
+    ],
 )
-def test_environments_without_a_model(env_id: str, kwargs: dict[str, Any]) -> None:
+def test_environments_without_a_model(env_id, kwargs):
     env = gym.make(env_id, **kwargs)
-    assert transition_model(env) is None
-    assert success_outcomes(env) is None
-    assert observations_of_states(env) is None
+    for known in (transition_model, success_outcomes, observations_of_states, model_check):
+        assert known(env) is None
 
 
-def test_a_broken_model_is_not_used() -> None:
-    env: Any = gym.make("FrozenLake-v1")
+def test_a_broken_model_is_not_used():
+    env = make("FrozenLake")
     env.unwrapped.P[3][1] = [(0.5, 0, 0.0, False)]
     assert transition_model(env) is None
-    check = model_check(env)
-    assert check is not None
-    assert check.refusal == (
+    assert model_check(env).refusal == (
         "the environment's P is no model: "
         "state 3, action 1 has probabilities that do not sum to one"
     )
 
 
-@pytest.mark.parametrize(
-    ("env_id", "limit"),
-    [
-        ("Warehouse-v0", 1000),
-        ("MineMaze-v0", 100),
-        ("FrozenLake-v1", 100),
-        ("CliffWalking-v1", None),
-    ],
-)
-def test_time_limits(env_id: str, limit: int | None) -> None:
-    env = gym.make(env_id)
-    assert time_limit(env) == limit
-    assert time_limit(Monitor(TimeLimit(env, 5000))) == (limit or 5000)
-    assert time_limit(TimeLimit(ScaleReward(env, 0.5), 7)) == 7
+def test_time_limits():
+    registered = {
+        "Warehouse-v0": 1000,
+        "MineMaze-v0": 100,
+        "FrozenLake-v1": 100,
+        "CliffWalking-v1": None,
+        "DeepSea-v0": 1000,
+        "DynaMaze-v0": 100,
+        "GamblersProblem-v0": 1000,
+        "JacksCarRental-v0": 100,
+        "MaximizationBias-v0": 100,
+        "Racetrack-v0": 1000,
+        "RandomWalk-v0": 1000,
+        "RiverSwim-v0": 20,
+        "ShortCorridor-v0": 1000,
+        "WindyGridworld-v0": 1000,
+    }
+    assert {env_id: time_limit(gym.make(env_id)) for env_id in registered} == registered
+    for env_id, limit in (("MineMaze-v0", 100), ("CliffWalking-v1", 5000)):
+        env = gym.make(env_id)
+        assert time_limit(Monitor(TimeLimit(env, 5000))) == limit
+        assert time_limit(TimeLimit(ScaleReward(env, 0.5), 7)) == 7
 
 
-def successes(env: gym.Env[Any, Any]) -> list[tuple[int, int]]:
-    """(state, action) of the transitions that count as success."""
-    mask = success_outcomes(env)
-    assert mask is not None
-    return [(int(s), int(a)) for s, a, _ in np.argwhere(mask)]
-
-
-def test_success_in_frozen_lake() -> None:
+MINE = {"desc": ["S.M", "..G"]}
+SUCCESSES = {
     # The goal, 15, is reached from 14 by moving right or slipping there; 11 is a hole.
-    assert successes(gym.make("FrozenLake-v1")) == [(14, 1), (14, 2), (14, 3)]
-    assert successes(gym.make("FrozenLake-v1", is_slippery=False)) == [(14, 2)]
+    "slippery lake": (lambda: gym.make("FrozenLake-v1"), [(14, 1), (14, 2), (14, 3)]),
+    "wrapped lake": (
+        lambda: TerminationReward(ScaleReward(make("still FrozenLake"), -1), 0),
+        [(14, 2)],
+    ),
+    "cliff": (lambda: make("CliffWalking"), [(35, 2)]),
+    # The passenger, who sits in the taxi (4), is dropped where he wants to go.
+    "taxi": (lambda: make("Taxi"), [(16, 5), (97, 5), (418, 5), (479, 5)]),
+    "mines": (lambda: gym.make("MineMaze-v0", **MINE, mine_reward=-100), [(4, 3)]),
+    "mines that pay": (lambda: gym.make("MineMaze-v0", **MINE, mine_reward=500), [(4, 3)]),
+}
 
 
-def test_success_in_cliff_walking() -> None:
-    assert successes(gym.make("CliffWalking-v1")) == [(35, 2)]
+@pytest.mark.parametrize("name", SUCCESSES)
+def test_the_transitions_that_count_as_success(name):
+    made, expected = SUCCESSES[name]
+    assert [(s, a) for s, a, _ in np.argwhere(success_outcomes(made())).tolist()] == expected
 
 
-def test_success_in_taxi() -> None:
-    # Dropping the passenger, who sits in the taxi (4), where he wants to go.
-    corners = [0, 4, 20, 23]
-    expected = [(20 * corner + 16 + i, 5) for i, corner in enumerate(corners)]
-    assert successes(gym.make("Taxi-v4")) == sorted(expected)
+# --- states on a map ------------------------------------------------------------------------------
+
+UP, DOWN, LEFT, RIGHT = (-1, 0), (1, 0), (0, -1), (0, 1)
+LAYOUTS = {
+    "Warehouse": ("...#.....G", {"#": "shelf"}, (UP, DOWN, LEFT, RIGHT)),
+    "RandomWarehouse": (None, {"#": "shelf"}, (UP, DOWN, LEFT, RIGHT)),
+    "MineMaze": ("S..X..", {"X": "mine", "P": "power"}, (UP, DOWN, LEFT, RIGHT)),
+    "still FrozenLake": ("S...", {"X": "hole"}, (LEFT, DOWN, RIGHT, UP)),
+    "CliffWalking": ("............", {"X": "cliff"}, (UP, RIGHT, DOWN, LEFT)),
+    "DynaMaze": (None, {"#": "shelf"}, (UP, DOWN, LEFT, RIGHT)),
+}
 
 
-@pytest.mark.parametrize("mine_reward", [-100, 500])
-def test_success_in_grid_worlds_is_the_goal(mine_reward: float) -> None:
-    env = gym.make("MineMaze-v0", desc=["S.M", "..G"], mine_reward=mine_reward)
-    assert successes(env) == [(4, 3)]
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_moves_lead_where_the_layout_says(name):
+    env = make(name) if name != "RandomWarehouse" else gym.make("RandomWarehouse-v0", size=7)
+    layout, model = grid_layout(gym.wrappers.RecordEpisodeStatistics(env)), transition_model(env)
+    first, names, moves = LAYOUTS[name]
+    assert layout.rows[0] == (first or layout.rows[0])
+    assert (layout.names, layout.moves, layout.n_states) == (names, moves, model.n_states)
+    letters = "".join(layout.rows)
+    for state, action in zip(*np.nonzero(np.outer(model.reachable, [True] * 4)), strict=True):
+        reached, cell = model.next_state[state, action, 0], layout.cells[state]
+        row, column = np.divmod(cell, layout.n_columns) + np.array(layout.moves[action])
+        inside = 0 <= row < layout.n_rows and 0 <= column < layout.n_columns
+        target = row * layout.n_columns + column if inside else cell
+        if letters[target] == "#":
+            target = cell
+        if name == "CliffWalking" and letters[target] == "X":
+            target = 36
+        assert layout.cells[reached] == target
+        assert letters[target] != "P" or target in layout.collected_in(layout.layers[reached])
+        assert model.terminated[state, action, 0] == (letters[target] in "GX")
+    assert {letters[start] for start in np.flatnonzero(model.initial)} == {"S"}
 
 
-def test_success_does_not_depend_on_wrapped_rewards() -> None:
-    env = gym.make("FrozenLake-v1", is_slippery=False)
-    assert successes(TerminationReward(ScaleReward(env, -1), 0)) == [(14, 2)]
+def test_the_mine_maze_has_a_layer_for_each_set_of_powers():
+    layout = grid_layout(make("MineMaze"))
+    assert (layout.n_layers, layout.n_states, layout.prizes) == (8, 288, (9, 23, 31))
+    # Row 2, column 4, with the first and the last power collected: 16 + 36 * 0b101.
+    assert (layout.cells[196], layout.layers[196]) == (16, 5)
+    assert (layout.collected_in(0), layout.collected_in(5)) == ((), (9, 31))
+    assert layout.rows_in(0) == layout.rows
+    assert layout.rows_in(5) == ("S..X..", ".X...X", ".X.X..", "...X.P", ".X...X", "..X..G")
+
+
+def test_other_layouts():
+    assert grid_layout(make("FrozenLake 2x3")).rows == ("S.S", "X.G")
+    field = grid_layout(gym.make("WindyGridworld-v0", moves="king_and_stay"))
+    assert (field.rows[3], field.n_states) == ("S......G..", 70)
+    diagonal = ((-1, -1), (-1, 1), (1, -1), (1, 1), (0, 0))
+    assert field.moves == (UP, DOWN, LEFT, RIGHT, *diagonal)
+    for env_id in ("Taxi-v4", "CartPole-v1", "BernoulliBandit-v0"):
+        assert grid_layout(gym.make(env_id)) is None
+
+
+def test_actions_are_called_as_the_environment_says_or_by_their_moves():
+    assert action_names(gym.make("FrozenLake-v1")) == ("left", "down", "right", "up")
+    assert action_names(gym.make("Warehouse-v0")) == ("up", "down", "left", "right")
+    assert action_names(gym.make("WindyGridworld-v0"))[3:5] == ("right", "up left")
+    moves = action_names(gym.make("JacksCarRental-v0"))
+    assert (len(moves), moves[0], moves[5], moves[-1]) == (11, "move -5", "move +0", "move +5")
+    assert action_names(gym.make("Taxi-v4")) == ()

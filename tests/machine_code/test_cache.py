@@ -31,23 +31,7 @@ log = logging.getLogger("machine_code")
 log.addHandler(Note()); log.setLevel(logging.INFO); log.propagate = False
 """
 
-# Q-learning on the cliff: what the greedy policy is worth.
-TRAIN = f"""{NOTE}
-from stable_baselines3.common.env_util import make_vec_env
-from agents.tabular.one_step import QLearning
-model = QLearning(env=make_vec_env("CliffWalking-v1", seed=0), seed=0, learning_rate=0.5)
-model.learn(20_000)
-import gymnasium as gym
-env = gym.make("CliffWalking-v1", max_episode_steps=200)
-obs, _ = env.reset()
-value, is_over = 0, False
-while not is_over:
-    obs, reward, terminated, truncated, _ = env.step(int(model.policy.q_table[obs].argmax()))
-    value, is_over = value + reward, terminated or truncated
-print(int(value), model.engine_in_use, int("compiling run_block" in names))
-"""
-
-# The same in small: a function, and another of another package that it is compiled into.
+# A function, and another of another file that it is compiled into.
 RULE = """
 from machine_code.compiling import inlined
 
@@ -103,21 +87,7 @@ def outcome(root, code=SMALL, **environment):
 
 
 def test_a_changed_rule_is_what_runs(checkout):
-    """The rule stands in another file than the loop, and the constant in yet another."""
-    rule = checkout / "agents" / "common" / "exploration.py"
-    before = rule.read_text()
-    assert outcome(checkout, TRAIN) == (-13, "compiled", True)
-    wrong = before.replace("        highest = max(highest, values[action])\n", "        pass\n")
-    assert wrong != before
-    rule.write_text(wrong)
-    value, engine, compiled = outcome(checkout, TRAIN)
-    rule.write_text(before)
-    assert (engine, compiled) == ("compiled", True)
-    assert value < -13
-
-
-def test_so_it_is_in_small(checkout):
-    """Back again, what was compiled at first is still there and right."""
+    # The rule stands in another file than the loop. Back again, what was compiled is still there.
     rule = checkout / "agents" / "common" / "small_rule.py"
     first, second = RULE.replace("3.0", "7.0"), RULE.replace("3.0", "5.0")
     rule.write_text(first)

@@ -3,7 +3,6 @@
 import itertools
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ STATES, ACTIONS, OUTCOMES = 3, 2, 2
 EPSILON = float(np.finfo(np.float64).eps)
 
 
-def drawn_model(seed: int, scale: float, *, costly: bool = False) -> TransitionModel:
+def drawn_model(seed, scale, *, costly=False):
     """A model whose probabilities are eighths, so that nothing is rounded in writing them down.
 
     With ``costly``, every step costs something and ends the episode with a chance of an eighth.
@@ -41,7 +40,7 @@ def drawn_model(seed: int, scale: float, *, costly: bool = False) -> TransitionM
     )
 
 
-def solved(matrix: list[list[Fraction]]) -> list[Fraction] | None:
+def solved(matrix):
     """The solution of the equations in the rows of a matrix; its last column is the right side."""
     size = len(matrix)
     for i in range(size):
@@ -57,7 +56,7 @@ def solved(matrix: list[list[Fraction]]) -> list[Fraction] | None:
     return [row[-1] for row in matrix]
 
 
-def exact_optimum(model: TransitionModel, discount: float) -> list[Fraction]:
+def exact_optimum(model, discount):
     """The best value of each state over all stationary policies that surely come to an end."""
     gamma, found = Fraction(discount), []
     for policy in itertools.product(range(ACTIONS), repeat=STATES):
@@ -76,7 +75,7 @@ def exact_optimum(model: TransitionModel, discount: float) -> list[Fraction]:
     return [max(values) for values in zip(*found, strict=True)]
 
 
-def true_error(values: Any, exact: list[Fraction]) -> Fraction:
+def true_error(values, exact):
     return max(abs(Fraction(float(v)) - e) for v, e in zip(values, exact, strict=True))
 
 
@@ -88,7 +87,7 @@ N_MODELS = 20
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("tolerance", [1e-10, 1e-3, 1.0])
 @pytest.mark.parametrize("discount", DISCOUNTS)
-def test_the_bound_of_discounted_sweeps(discount: float, tolerance: float, scale: float) -> None:
+def test_the_bound_of_discounted_sweeps(discount, tolerance, scale):
     """Never below the error; and since some models reach it up to one sweep, not far above."""
     shares = []
     for seed in range(N_MODELS):
@@ -105,7 +104,7 @@ def test_the_bound_of_discounted_sweeps(discount: float, tolerance: float, scale
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("discount", DISCOUNTS)
-def test_the_bound_of_a_solved_system_is_rounding(discount: float, scale: float) -> None:
+def test_the_bound_of_a_solved_system_is_rounding(discount, scale):
     for seed in range(N_MODELS):
         model = drawn_model(seed, scale)
         plan = policy_iteration(model, discount)
@@ -115,7 +114,7 @@ def test_the_bound_of_a_solved_system_is_rounding(discount: float, scale: float)
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("tolerance", [1e-10, 1e-3, 1.0])
-def test_the_bound_without_discount(tolerance: float, scale: float) -> None:
+def test_the_bound_without_discount(tolerance, scale):
     """Each step costs something and may end the episode, so that the bound is proven."""
     shares = []
     for seed in range(N_MODELS):
@@ -136,7 +135,7 @@ def test_the_bound_without_discount(tolerance: float, scale: float) -> None:
 @pytest.mark.parametrize(
     ("change", "bound"), [(0.0, 0.0), (0.25, 2 / 3), (0.5, 2.0), (1 - 1e-9, 2e9), (1.0, np.inf)]
 )
-def test_the_bound_without_discount_by_hand(change: float, bound: float) -> None:
+def test_the_bound_without_discount_by_hand(change, bound):
     """A step costs 1 and ends the episode with a chance of 1/2: M is 0, and the value -2."""
     model = TransitionModel(
         prob=np.array([[[0.5, 0.5]]]),
@@ -151,18 +150,18 @@ def test_the_bound_without_discount_by_hand(change: float, bound: float) -> None
     )
 
 
-def rounded(values: Any, times: float) -> float:
+def rounded(values, times):
     """So many times what rounding may do to the largest of some values."""
     return times * EPSILON * max(1.0, float(np.abs(values).max()))
 
 
 @pytest.mark.parametrize(("bounds_apart", "chosen"), [(0.0, 0), (1.9, 0), (2.1, 1), (2.9, 1)])
-def test_what_lies_within_twice_the_bound_is_a_tie(bounds_apart: float, chosen: int) -> None:
+def test_what_lies_within_twice_the_bound_is_a_tie(bounds_apart, chosen):
     """Three states take many sweeps; beside them stands one whose actions end the episode."""
     slow = drawn_model(0, 1.0)
 
-    def plan_with(gap: float) -> Any:
-        def with_fourth(array: Any, row: Any) -> Any:
+    def plan_with(gap):
+        def with_fourth(array, row):
             return np.concatenate([array, [row]])
 
         return value_iteration(
@@ -184,7 +183,7 @@ def test_what_lies_within_twice_the_bound_is_a_tie(bounds_apart: float, chosen: 
     assert plan.policy[3] == chosen
 
 
-def test_steps_to_the_end_or_to_a_target_are_the_fewest() -> None:
+def test_steps_to_the_end_or_to_a_target_are_the_fewest():
     """A line of six: the first is a target, the fourth may end the episode, the last only stays."""
     following = [[0], [0], [1], [4], [3], [5]]
     model = TransitionModel(

@@ -1,37 +1,37 @@
 """Exact evaluation against closed forms and known figures."""
 
+import itertools
 from dataclasses import replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from envs.known_models import success_outcomes, transition_model
+from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import (
     TransitionModel,
     baseline_policies,
     baseline_return,
     finite_horizon_optimum,
     optimal_choices,
+    optimum_far_from_limit,
     policy_return,
     state_values,
     state_visitation,
     value_iteration,
 )
+from mdp.evaluation import LimitedEpisodes
+from mdp.large_maps import chance_of_losing, drift
 
 
-def model_of(env_id: str, **kwargs: Any) -> TransitionModel:
+def model_of(env_id, **kwargs):
     model = transition_model(gym.make(f"envs:{env_id}", **kwargs))
     assert model is not None
     return model
 
 
-def coin(end: float, reward: float = 1.0) -> TransitionModel:
+def coin(end, reward=1.0):
     """One state; each step earns ``reward`` and ends the episode with probability ``end``.
 
     A second action does the same and never ends it.
@@ -45,7 +45,7 @@ def coin(end: float, reward: float = 1.0) -> TransitionModel:
     )
 
 
-def test_the_geometric_distribution() -> None:
+def test_the_geometric_distribution():
     found = policy_return(coin(0.2, reward=3), np.array([0]), None)
     assert found.expected_length == pytest.approx(5)
     assert found.length_variance == pytest.approx(0.8 / 0.04)
@@ -55,7 +55,7 @@ def test_the_geometric_distribution() -> None:
 
 
 @pytest.mark.parametrize("horizon", [None, 400])
-def test_drawn_rewards_add_their_own_variance(horizon: int | None) -> None:
+def test_drawn_rewards_add_their_own_variance(horizon):
     still = coin(0.2, reward=3)
     drawn = replace(still, reward_variance=np.full((1, 2, 2), 4.0))
     for discount in (1.0, 0.9):
@@ -67,7 +67,7 @@ def test_drawn_rewards_add_their_own_variance(horizon: int | None) -> None:
         assert replace(found, return_variance=0.0) == replace(known, return_variance=0.0)
 
 
-def test_the_geometric_distribution_cut_off() -> None:
+def test_the_geometric_distribution_cut_off():
     model = coin(0.5)
     found = policy_return(model, np.array([0]), 3, success=model.terminated)
     assert found.expected_length == 0.5 * 1 + 0.25 * 2 + 0.25 * 3
@@ -75,7 +75,7 @@ def test_the_geometric_distribution_cut_off() -> None:
     assert state_visitation(model, np.array([0]), 3).tolist() == [1.75]
 
 
-def test_a_discounted_return_without_end() -> None:
+def test_a_discounted_return_without_end():
     found = policy_return(coin(0.5), np.array([1]), None, discount=0.9)
     assert found.expected_return == pytest.approx(10)
     assert found.return_variance == pytest.approx(0)
@@ -85,7 +85,7 @@ def test_a_discounted_return_without_end() -> None:
     assert policy_return(coin(0.5), np.array([1]), None, 0.9, success).success_rate == 0
 
 
-def test_different_starts_add_to_the_variance() -> None:
+def test_different_starts_add_to_the_variance():
     # From each of two states one step to the end, for 1 and for 5.
     model = TransitionModel(
         prob=np.ones((2, 1, 1)),
@@ -102,7 +102,7 @@ def test_different_starts_add_to_the_variance() -> None:
 @pytest.mark.parametrize(
     ("shelf_reward", "expected"), [(-100, -27_427), (-1, -776)], ids=["shelf-100", "shelf-1"]
 )
-def test_random_moves_in_the_warehouse(shelf_reward: float, expected: float) -> None:
+def test_random_moves_in_the_warehouse(shelf_reward, expected):
     model = model_of("Warehouse-v0", shelf_reward=shelf_reward)
     uniform, *constant = baseline_policies(model)
     assert policy_return(model, uniform, 1000).expected_return == pytest.approx(expected, abs=0.5)
@@ -111,7 +111,7 @@ def test_random_moves_in_the_warehouse(shelf_reward: float, expected: float) -> 
     assert baseline_return(model, 1000) == pytest.approx(max(-1000, expected), abs=0.5)
 
 
-def test_the_baseline_policies_are_distributions_over_actions_alone() -> None:
+def test_the_baseline_policies_are_distributions_over_actions_alone():
     model = coin(0.5)
     assert [policy.tolist() for policy in baseline_policies(model)] == [
         [[0.5, 0.5]],
@@ -120,7 +120,7 @@ def test_the_baseline_policies_are_distributions_over_actions_alone() -> None:
     ]
 
 
-def test_the_best_route_of_the_warehouse() -> None:
+def test_the_best_route_of_the_warehouse():
     env = gym.make("envs:Warehouse-v0")
     model, success = transition_model(env), success_outcomes(env)
     assert model is not None
@@ -137,7 +137,7 @@ def test_the_best_route_of_the_warehouse() -> None:
     assert visits.sum() == 22
 
 
-def test_the_frozen_lake_without_time_limit() -> None:
+def test_the_frozen_lake_without_time_limit():
     env = gym.make("FrozenLake-v1")
     model, success = transition_model(env), success_outcomes(env)
     assert model is not None
@@ -147,7 +147,7 @@ def test_the_frozen_lake_without_time_limit() -> None:
     assert found.return_variance == pytest.approx(14 / 17 * 3 / 17)
 
 
-def test_large_chains_are_solved_as_small_ones_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_chains_are_solved_as_small_ones_are(monkeypatch):
     model = model_of("FrozenLake-v1", map_name="8x8")
     uniform = baseline_policies(model)[0]
     dense = policy_return(model, uniform, None, success=model.terminated)
@@ -159,7 +159,7 @@ def test_large_chains_are_solved_as_small_ones_are(monkeypatch: pytest.MonkeyPat
     np.testing.assert_allclose(state_visitation(model, uniform, None), dense_visits, rtol=1e-10)
 
 
-def test_forms_of_one_policy_agree() -> None:
+def test_forms_of_one_policy_agree():
     model = model_of("FrozenLake-v1")
     actions = value_iteration(model, 0.99).policy
     matrix = np.eye(4)[actions]
@@ -169,7 +169,7 @@ def test_forms_of_one_policy_agree() -> None:
     assert policy_return(model, np.tile(actions.astype(np.uint8), (100, 1)), 100) == expected
 
 
-def test_networks_round_their_probabilities() -> None:
+def test_networks_round_their_probabilities():
     model = coin(0.5)
     rounded = np.array([[1 / 3, 2 / 3]], np.float32) * np.float32(1 + 1e-6)
     found = policy_return(model, rounded, 50).expected_return
@@ -179,12 +179,12 @@ def test_networks_round_their_probabilities() -> None:
     assert state_visitation(model, rounded, 1).tolist() == [1.0]
 
 
-def test_marks_of_success_that_do_not_end_the_episode_are_ignored() -> None:
+def test_marks_of_success_that_do_not_end_the_episode_are_ignored():
     found = policy_return(coin(0.5), np.array([1]), 9, success=np.ones((1, 2, 2), bool))
     assert found.success_rate == 0
 
 
-def test_what_a_policy_says_of_unreachable_states_is_ignored() -> None:
+def test_what_a_policy_says_of_unreachable_states_is_ignored():
     model = model_of("CliffWalking-v1")
     policy = np.where(model.reachable, value_iteration(model, 1.0).policy, 77)
     assert policy_return(model, policy, 200).expected_return == -13
@@ -210,14 +210,12 @@ def test_what_a_policy_says_of_unreachable_states_is_ignored() -> None:
     ids=str,
 )
 @pytest.mark.parametrize("function", [policy_return, state_visitation])
-def test_wrong_policies_are_refused(
-    function: Any, policy: Any, horizon: int | None, message: str
-) -> None:
+def test_wrong_policies_are_refused(function, policy, horizon, message):
     with pytest.raises(ValueError, match=message):
         function(coin(0.5), policy, horizon)
 
 
-def test_marks_of_the_wrong_shape_are_refused() -> None:
+def test_marks_of_the_wrong_shape_are_refused():
     with pytest.raises(ValueError, match=r"success has shape \(1,\), the model has \(1, 2, 2\)"):
         policy_return(coin(0.5), np.array([0]), 5, success=np.ones(1, bool))
 
@@ -228,7 +226,7 @@ Floats = NDArray[np.float64]
 LEFT, RIGHT = 0, 1
 
 
-def corridor() -> TransitionModel:
+def corridor():
     """States 0 to 3 in a row, and state 4, which nothing leads to.
 
     Each step costs 1; left of state 0 is a wall, right of state 3 the exit, worth 10.
@@ -246,7 +244,7 @@ def corridor() -> TransitionModel:
     )
 
 
-def test_values_of_a_corridor_worked_by_hand() -> None:
+def test_values_of_a_corridor_worked_by_hand():
     always_right = np.full(5, RIGHT)
     assert state_values(corridor(), always_right, 100).tolist() == [7, 8, 9, 10, 0]
     # With three steps left the exit is out of reach from state 0.
@@ -256,19 +254,19 @@ def test_values_of_a_corridor_worked_by_hand() -> None:
     assert state_values(corridor(), to_and_fro, 7).tolist() == [-7, -7, 9, 10, 0]
 
 
-def test_values_of_random_steps_worked_by_hand() -> None:
+def test_values_of_random_steps_worked_by_hand():
     model = corridor()
     half = np.full((5, 2), 0.5)
     assert state_values(model, half, 1).tolist() == [-1, -1, -1, 4.5, 0]
     assert state_values(model, half, 2).tolist() == [-2, -2, 0.75, 4, 0]
 
 
-def test_values_of_a_policy_that_changes_with_the_step() -> None:
+def test_values_of_a_policy_that_changes_with_the_step():
     first_left = np.array([[LEFT] * 5, [RIGHT] * 5, [RIGHT] * 5])
     assert state_values(corridor(), first_left, 3).tolist() == [-3, -3, -3, 8, 0]
 
 
-def test_what_is_best_in_a_corridor() -> None:
+def test_what_is_best_in_a_corridor():
     values, optimal = optimal_choices(corridor(), 100)
     assert values.tolist() == [7, 8, 9, 10, 0]
     assert optimal[:4].tolist() == [[False, True]] * 4
@@ -281,7 +279,7 @@ def test_what_is_best_in_a_corridor() -> None:
 
 
 @pytest.mark.parametrize(("advantage", "n_best"), [(0.0, 2), (1e-11, 2), (1e-7, 1)])
-def test_actions_are_equal_within_rounding(advantage: float, n_best: int) -> None:
+def test_actions_are_equal_within_rounding(advantage, n_best):
     model = TransitionModel(
         prob=np.ones((1, 2, 1)),
         next_state=np.zeros((1, 2, 1), int),
@@ -292,7 +290,7 @@ def test_actions_are_equal_within_rounding(advantage: float, n_best: int) -> Non
     assert optimal_choices(model, 3)[1].sum() == n_best
 
 
-def test_the_warehouse_has_two_best_routes() -> None:
+def test_the_warehouse_has_two_best_routes():
     model = model_of("Warehouse-v0")
     values, optimal = optimal_choices(model, 1000)
     best = value_iteration(model, 1.0)
@@ -300,7 +298,7 @@ def test_the_warehouse_has_two_best_routes() -> None:
     assert optimal[np.arange(100), best.policy].all()
     assert model.initial @ values == 79
 
-    def routes(state: int) -> int:
+    def routes(state):
         following = [
             (model.next_state[state, a, 0], model.terminated[state, a, 0])
             for a in np.flatnonzero(optimal[state])
@@ -310,75 +308,7 @@ def test_the_warehouse_has_two_best_routes() -> None:
     assert routes(90) == 2
 
 
-@st.composite
-def distributions(draw: st.DrawFn, shape: tuple[int, ...]) -> Floats:
-    weight = draw(hnp.arrays(np.int64, shape, elements=st.integers(0, 3)))
-    weight[..., 0] += weight.sum(axis=-1) == 0
-    result: Floats = weight / weight.sum(axis=-1, keepdims=True)
-    return result
-
-
-@st.composite
-def models(draw: st.DrawFn) -> TransitionModel:
-    n_states = draw(st.integers(1, 5))
-    shape = (n_states, draw(st.integers(1, 3)), draw(st.integers(1, 3)))
-    return TransitionModel(
-        prob=draw(distributions(shape)),
-        next_state=draw(hnp.arrays(np.int64, shape, elements=st.integers(0, n_states - 1))),
-        reward=draw(hnp.arrays(np.int64, shape, elements=st.integers(-3, 3))),
-        terminated=draw(hnp.arrays(np.bool_, shape)),
-        initial=draw(distributions((n_states,))),
-    )
-
-
-def starting_from(model: TransitionModel, state: int) -> TransitionModel:
-    return replace(model, initial=np.eye(model.n_states)[state])
-
-
-@given(models(), st.integers(1, 30), st.data())
-def test_each_value_is_the_return_of_episodes_that_begin_there(
-    model: TransitionModel, horizon: int, data: st.DataObject
-) -> None:
-    policy = data.draw(distributions((model.n_states, model.n_actions)))
-    values = state_values(model, policy, horizon)
-    expected = policy_return(model, policy, horizon).expected_return
-    assert model.initial @ values == pytest.approx(expected, abs=1e-9)
-    for state in range(model.n_states):
-        one = starting_from(model, state)
-        reached = model.reachable[state]
-        earned = policy_return(one, policy, horizon).expected_return if reached else 0
-        assert values[state] == pytest.approx(earned, abs=1e-9)
-
-
-@given(models(), st.integers(1, 5), st.data())
-def test_a_policy_that_changes_with_the_step_likewise(
-    model: TransitionModel, horizon: int, data: st.DataObject
-) -> None:
-    elements = st.integers(0, model.n_actions - 1)
-    actions = data.draw(hnp.arrays(np.int64, (horizon, model.n_states), elements=elements))
-    values = state_values(model, actions, horizon)
-    expected = policy_return(model, actions, horizon).expected_return
-    assert model.initial @ values == pytest.approx(expected, abs=1e-9)
-
-
-@given(models(), st.integers(1, 20))
-def test_optimal_actions_followed_by_the_best_plan_earn_the_optimum(
-    model: TransitionModel, horizon: int
-) -> None:
-    values, optimal = optimal_choices(model, horizon)
-    plan = finite_horizon_optimum(model, horizon)
-    np.testing.assert_array_equal(values, plan.values)
-    assert optimal[np.arange(model.n_states), plan.actions(0)].all()
-    for action in range(model.n_actions):
-        first = np.full(model.n_states, action)
-        found = state_values(model, np.vstack([first, plan.policy[1:]]), horizon)
-        reached = model.reachable
-        np.testing.assert_array_equal(
-            optimal[reached, action], np.isclose(found, values, rtol=0, atol=1e-8)[reached]
-        )
-
-
-def test_wrong_arguments_are_refused() -> None:
+def test_wrong_arguments_are_refused():
     for horizon in (0, -1):
         with pytest.raises(ValueError, match=f"horizon is {horizon}, it must be at least 1"):
             state_values(corridor(), np.zeros(5, int), horizon)
@@ -386,3 +316,109 @@ def test_wrong_arguments_are_refused() -> None:
             optimal_choices(corridor(), horizon)
     with pytest.raises(ValueError, match=r"outside 0..1"):
         state_values(corridor(), np.full(5, 2), 3)
+
+
+# --- a time limit ---------------------------------------------------------------------------------
+
+
+def test_a_way_that_goes_round_for_a_million_steps():
+    """0 leads to 1, and 1 and 2 to each other, for 1, 2 and 3; seven steps are 1 + 3 (2 + 3)."""
+    model = TransitionModel(
+        prob=np.ones((3, 1, 1)),
+        next_state=np.array([1, 2, 1]).reshape(3, 1, 1),
+        reward=np.array([1.0, 2.0, 3.0]).reshape(3, 1, 1),
+        terminated=np.zeros((3, 1, 1), bool),
+        initial=np.array([1.0, 0, 0]),
+    )
+    policy = np.zeros(3, int)
+    assert policy_return(model, policy, 7).expected_return == 16
+    assert policy_return(model, policy, 10**6 + 1).expected_return == 1 + 5 * 10**6 / 2
+    assert policy_return(model, policy, 10**6 + 1).expected_length == 10**6 + 1
+
+
+def test_a_hopeless_policy_is_given_up():
+    """Each step costs 1 and the end, which comes with probability 0.1, pays 5."""
+    model = TransitionModel(
+        prob=np.array([[[0.9, 0.1]]]),
+        next_state=np.zeros((1, 1, 2), int),
+        reward=np.array([[[-1.0, 5.0]]]),
+        terminated=np.array([[[False, True]]]),
+        initial=np.ones(1),
+    )
+    worth = policy_return(model, np.array([0]), 100).expected_return
+
+    def told(floor):
+        episodes = LimitedEpisodes(model, np.zeros((1, 1), int), 100)
+        none = np.zeros((1, 1, 2), bool)
+        return episodes.result(1.0, none, with_success=False, floor=floor).expected_return
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mdp.evaluation.MOST_BACKWARDS", 0)
+        assert told(worth - 1e-9) == pytest.approx(worth)
+        assert told(worth + 0.5) == -np.inf
+
+
+# --- a limit far away ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.1])
+def test_of_a_warehouse_it_is_found(slip):
+    env = gym.make("envs:RandomWarehouse-v0", size=15, slip=slip, max_episode_steps=5000)
+    model, horizon = transition_model(env), time_limit(env)
+    assert model is not None
+    assert horizon is not None
+    found, expected = optimum_far_from_limit(model, horizon), finite_horizon_optimum(model, horizon)
+    assert found == pytest.approx(expected.start_value, abs=1e-6)
+
+
+def far_goal(length, **changes):
+    """A corridor: 1 goes on, 0 stays; each step costs 1, and what is changed."""
+    shape = (length, 2, 1)
+    ahead = np.stack([np.arange(length), np.minimum(np.arange(length) + 1, length - 1)], axis=1)
+    terminated = np.zeros(shape, bool)
+    terminated[-1, 1] = True
+    return TransitionModel(
+        prob=np.ones(shape),
+        next_state=ahead.reshape(shape),
+        reward=np.where(terminated, changes.get("end", 0.0), changes.get("step", -1.0)),
+        terminated=terminated,
+        initial=np.eye(length)[0],
+    )
+
+
+def test_a_limit_that_matters_is_noticed():
+    # With an end that costs 50, 30 steps of standing still are better; and 60 are no better than
+    # 10 steps to the end, which is too close to call without looking.
+    for limit, end in itertools.product((30, 58, 62), (-50.0,)):
+        assert optimum_far_from_limit(far_goal(10, end=end), limit) is None
+    assert optimum_far_from_limit(far_goal(10, end=-50.0), 200) == -59.0
+    assert finite_horizon_optimum(far_goal(10, end=-50.0), 30).start_value == -30.0
+    # Where steps cost nothing, or nobody arrives, nothing can be said.
+    assert optimum_far_from_limit(far_goal(10, step=0.0, end=5.0), 10**6) is None
+    endless = far_goal(10)
+    model = TransitionModel(
+        endless.prob, endless.next_state, endless.reward, np.zeros((10, 2, 1), bool), np.eye(10)[0]
+    )
+    assert optimum_far_from_limit(model, 10**6) is None
+
+
+def test_how_values_change_on_the_way():
+    """From state 0 one slips back to it with probability 1/4, else on to 1, which ends for 4."""
+    model = TransitionModel(
+        prob=np.array([[[0.75, 0.25]], [[1.0, 0.0]]]),
+        next_state=np.array([[[1, 0]], [[0, 0]]]),
+        reward=np.array([[[-1.0, -3.0]], [[4.0, 0.0]]]),
+        terminated=np.array([[[False, False]], [[True, False]]]),
+        initial=np.array([1.0, 0.0]),
+    )
+    values = value_iteration(model, 1.0).values
+    assert values == pytest.approx([2.0, 4.0])  # v = 0.75 (4 - 1) + 0.25 (v - 3)
+    step_cost, fall, variance = drift(
+        model.prob, model.next_state, model.terminated, model.reward, model.reachable, values
+    )
+    # Of the rises 2 and 0 the mean is 1.5, and the variance 0.75 * 0.25 + 0.25 * 2.25.
+    assert (step_cost, fall, variance) == pytest.approx((1.0, 1.5, 0.75))
+    bound = chance_of_losing(10.0, 1.5, 0.75, 100)
+    assert bound == pytest.approx(np.exp(-100 / (150 + 10)))
+    assert chance_of_losing(-1.0, 1.5, 0.75, 100) == 1.0
+    assert chance_of_losing(1.0, 0.0, 0.0, 100) == 0.0

@@ -1,12 +1,10 @@
 """Planning against hand-worked problems and the known optima of real environments."""
 
 import itertools
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 
 from envs.known_models import transition_model
 from mdp import (
@@ -20,15 +18,13 @@ from mdp import (
 PLANNERS = pytest.mark.parametrize("plan", [value_iteration, policy_iteration])
 
 
-def model_of(env_id: str, **kwargs: Any) -> TransitionModel:
+def model_of(env_id, **kwargs):
     model = transition_model(gym.make(f"envs:{env_id}", **kwargs))
     assert model is not None
     return model
 
 
-def deterministic(
-    next_state: ArrayLike, reward: ArrayLike, terminated: ArrayLike, start: int = 0
-) -> TransitionModel:
+def deterministic(next_state, reward, terminated, start=0):
     """A model without chance, from arrays of shape (S, A)."""
     following = np.asarray(next_state)[:, :, None]
     return TransitionModel(
@@ -57,9 +53,7 @@ OPTIMA = [
 
 @PLANNERS
 @pytest.mark.parametrize(("env_id", "kwargs", "discount", "optimum", "tolerance"), OPTIMA)
-def test_known_optima(
-    plan: Any, env_id: str, kwargs: Any, discount: float, optimum: float, tolerance: float
-) -> None:
+def test_known_optima(plan, env_id, kwargs, discount, optimum, tolerance):
     found = plan(model_of(env_id, **kwargs), discount)
     assert found.start_value == pytest.approx(optimum, abs=tolerance)
 
@@ -76,7 +70,7 @@ def test_known_optima(
         ("Taxi-v4", {"is_rainy": True}),
     ],
 )
-def test_the_planners_agree_within_their_bounds(env_id: str, kwargs: Any, discount: float) -> None:
+def test_the_planners_agree_within_their_bounds(env_id, kwargs, discount):
     model = model_of(env_id, **kwargs)
     one, two = value_iteration(model, discount), policy_iteration(model, discount)
     assert max(one.error_bound, two.error_bound) < 2e-9
@@ -97,7 +91,7 @@ def test_the_planners_agree_within_their_bounds(env_id: str, kwargs: Any, discou
         ("Warehouse-v0", {"step_reward": 0}),
     ],
 )
-def test_the_greedy_policy_earns_the_optimum(plan: Any, env_id: str, kwargs: Any) -> None:
+def test_the_greedy_policy_earns_the_optimum(plan, env_id, kwargs):
     model = model_of(env_id, **kwargs)
     found = plan(model, 1.0)
     earned = policy_return(model, found.policy, None).expected_return
@@ -113,9 +107,7 @@ def test_the_greedy_policy_earns_the_optimum(plan: Any, env_id: str, kwargs: Any
         ("FrozenLake-v1", {"map_name": "8x8"}, 0.95, 200, 0.7386),
     ],
 )
-def test_greedy_policies_of_the_discounted_optimum(
-    env_id: str, kwargs: Any, discount: float, horizon: int, success: float
-) -> None:
+def test_greedy_policies_of_the_discounted_optimum(env_id, kwargs, discount, horizon, success):
     model = model_of(env_id, **kwargs)
     policy = value_iteration(model, discount).policy
     earned = policy_return(model, policy, horizon).expected_return
@@ -134,9 +126,7 @@ def test_greedy_policies_of_the_discounted_optimum(
         ("FrozenLake-v1", {"map_name": "8x8"}, 99, 0.6353, 5e-5),
     ],
 )
-def test_optima_under_a_time_limit(
-    env_id: str, kwargs: Any, horizon: int, optimum: float, tolerance: float
-) -> None:
+def test_optima_under_a_time_limit(env_id, kwargs, horizon, optimum, tolerance):
     model = model_of(env_id, **kwargs)
     found = finite_horizon_optimum(model, horizon)
     assert found.start_value == pytest.approx(optimum, abs=tolerance)
@@ -144,7 +134,7 @@ def test_optima_under_a_time_limit(
     assert earned == pytest.approx(found.start_value, abs=1e-9)
 
 
-def test_a_time_limit_out_of_reach_costs_no_memory() -> None:
+def test_a_time_limit_out_of_reach_costs_no_memory():
     found = finite_horizon_optimum(model_of("Warehouse-v0"), 10**6)
     assert found.actions_left.dtype == np.uint8
     assert len(found.actions_left) < 40
@@ -153,7 +143,7 @@ def test_a_time_limit_out_of_reach_costs_no_memory() -> None:
         found.actions(10**6)
 
 
-def test_what_is_best_depends_on_the_steps_left() -> None:
+def test_what_is_best_depends_on_the_steps_left():
     # Two steps to 10, or 1 at once: with a single step left only the 1 can be had.
     model = deterministic([[1, 0], [0, 0]], [[0, 1], [10, 0]], [[False, True], [True, True]])
     found = finite_horizon_optimum(model, 3)
@@ -163,7 +153,7 @@ def test_what_is_best_depends_on_the_steps_left() -> None:
 
 
 @PLANNERS
-def test_action_values_and_ties(plan: Any) -> None:
+def test_action_values_and_ties(plan):
     # Both actions of state 0 earn 5 in the end; the first is taken.
     model = deterministic([[1, 1], [0, 0]], [[2, 2], [3, -9]], [[False, False], [True, False]])
     found = plan(model, 1.0)
@@ -174,7 +164,7 @@ def test_action_values_and_ties(plan: Any) -> None:
 
 @PLANNERS
 @pytest.mark.parametrize("discount", [1.0, 0.9])
-def test_rows_that_are_never_used_have_no_say(plan: Any, discount: float) -> None:
+def test_rows_that_are_never_used_have_no_say(plan, discount):
     # State 1 is entered by termination alone; its own row would earn for ever.
     model = deterministic([[1, 0], [1, 1]], [[5, -1], [100, 100]], [[True, False], [False, False]])
     found = plan(model, discount)
@@ -184,7 +174,7 @@ def test_rows_that_are_never_used_have_no_say(plan: Any, discount: float) -> Non
 
 
 @PLANNERS
-def test_a_state_without_end_is_avoided(plan: Any) -> None:
+def test_a_state_without_end_is_avoided(plan):
     # Action 1 of state 0 earns 50 and leads to where every step costs, for ever.
     model = deterministic([[0, 1], [1, 1]], [[3, 50], [-1, -1]], [[True, False], [False, False]])
     found = plan(model, 1.0)
@@ -200,9 +190,7 @@ def test_a_state_without_end_is_avoided(plan: Any) -> None:
     # Staying costs nothing: better than an exit that costs, worse than one that pays.
     [(0, -2, 0.0, 0), (0, 2, 2.0, 1), (-1, -2, -2.0, 1), (-1, 2, 2.0, 1)],
 )
-def test_staying_at_no_cost(
-    plan: Any, step: float, exit_reward: float, optimum: float, action: int
-) -> None:
+def test_staying_at_no_cost(plan, step, exit_reward, optimum, action):
     found = plan(deterministic([[0, 0]], [[step, exit_reward]], [[False, True]]), 1.0)
     assert found.start_value == optimum
     assert found.policy.tolist() == [action]
@@ -219,9 +207,7 @@ def test_staying_at_no_cost(
         ([[1, 1], [0, 0]], [[-1, -1], [-1, -1]], False, "from starting state 0 no policy surely"),
     ],
 )
-def test_infinite_optima_are_refused(
-    plan: Any, next_state: ArrayLike, reward: ArrayLike, exits: bool, message: str
-) -> None:
+def test_infinite_optima_are_refused(plan, next_state, reward, exits, message):
     terminated = np.zeros(np.shape(reward), bool)
     terminated[:, 1] = exits
     model = deterministic(next_state, reward, terminated)
@@ -231,7 +217,7 @@ def test_infinite_optima_are_refused(
 
 
 @PLANNERS
-def test_earning_in_a_loop_that_costs_more_is_no_infinity(plan: Any) -> None:
+def test_earning_in_a_loop_that_costs_more_is_no_infinity(plan):
     # Round the loop: +1 - 3. Once through its better half, then out: 1 + 4.
     model = deterministic([[1, 0], [0, 0]], [[1, 0], [-3, 4]], [[False, True], [False, True]])
     found = plan(model, 1.0)
@@ -249,12 +235,12 @@ def test_earning_in_a_loop_that_costs_more_is_no_infinity(plan: Any) -> None:
     ],
     ids=["value_iteration", "policy_iteration", "finite_horizon_optimum", "policy_return"],
 )
-def test_discounts_out_of_range(call: Any, discount: float) -> None:
+def test_discounts_out_of_range(call, discount):
     with pytest.raises(ValueError, match="it must lie between 0 and 1"):
         call(deterministic([[0]], [[0]], [[True]]), discount)
 
 
-def test_other_arguments_out_of_range() -> None:
+def test_other_arguments_out_of_range():
     model = deterministic([[0]], [[0]], [[True]])
     with pytest.raises(ValueError, match="tolerance is 0, it must be positive"):
         value_iteration(model, 1.0, tolerance=0)
@@ -263,7 +249,7 @@ def test_other_arguments_out_of_range() -> None:
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.1])
-def test_a_large_warehouse(slip: float) -> None:
+def test_a_large_warehouse(slip):
     """Forty thousand states; a million are in the benchmark."""
     model = model_of("RandomWarehouse-v0", size=200, slip=slip)
     found = value_iteration(model, 1.0)
@@ -275,7 +261,7 @@ def test_a_large_warehouse(slip: float) -> None:
     assert earned == pytest.approx(found.start_value, abs=1e-6)
 
 
-def test_sweeps_that_contract_slowly_are_helped_out() -> None:
+def test_sweeps_that_contract_slowly_are_helped_out():
     """Far from the goal standing still is best, and forgets by the discount alone."""
     model = model_of("RandomWarehouse-v0", size=100, slip=0.1)
     one, two = value_iteration(model, 0.99), policy_iteration(model, 0.99)
@@ -292,7 +278,7 @@ def test_sweeps_that_contract_slowly_are_helped_out() -> None:
 STATES, ACTIONS, OUTCOMES = 4, 3, 2
 
 
-def drawn(seed: int) -> tuple[TransitionModel, np.ndarray]:
+def drawn(seed):
     """A random model, and a random mask that allows something everywhere."""
     rng = np.random.default_rng(seed)
     shape = (STATES, ACTIONS, OUTCOMES)
@@ -308,7 +294,7 @@ def drawn(seed: int) -> tuple[TransitionModel, np.ndarray]:
     return model, mask
 
 
-def values_of(model: TransitionModel, policy: np.ndarray, discount: float) -> np.ndarray:
+def values_of(model, policy, discount):
     """Values of a stationary policy, by the linear system."""
     rows = np.arange(STATES)
     follow = np.zeros((STATES, STATES))

@@ -1,42 +1,40 @@
 """Planning and evaluation on random models, against linear programs and brute force."""
 
 import itertools
-from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from mdp import (
     TransitionModel,
+    baseline_policies,
     baseline_return,
     finite_horizon_optimum,
+    optimal_choices,
+    optimum_far_from_limit,
     policy_iteration,
     policy_return,
+    state_values,
     state_visitation,
     value_iteration,
 )
 
-Floats = NDArray[np.float64]
-
 
 @st.composite
-def distributions(draw: st.DrawFn, shape: tuple[int, ...]) -> Floats:
+def distributions(draw, shape):
     """Small fractions along the last axis, zeros among them."""
     weight = draw(hnp.arrays(np.int64, shape, elements=st.integers(0, 3)))
     weight[..., 0] += weight.sum(axis=-1) == 0
-    result: Floats = weight / weight.sum(axis=-1, keepdims=True)
-    return result
+    return weight / weight.sum(axis=-1, keepdims=True)
 
 
 @st.composite
-def models(
-    draw: st.DrawFn, states: int = 5, actions: int = 3, outcomes: int = 3, always_ends: bool = False
-) -> TransitionModel:
+def models(draw, states=5, actions=3, outcomes=3, always_ends=False):
     """Models of up to the given sizes, with small whole numbers as rewards.
 
     With ``always_ends``, the first outcome of each state and action ends the episode.
@@ -57,7 +55,7 @@ def models(
     )
 
 
-def continuing(model: TransitionModel) -> Floats:
+def continuing(model):
     """By action, the probabilities of going from state to state without an end, shape (A, S, S)."""
     found = np.zeros((model.n_actions, model.n_states, model.n_states))
     states, actions, outcomes = np.nonzero((model.prob > 0) & ~model.terminated)
@@ -66,7 +64,7 @@ def continuing(model: TransitionModel) -> Floats:
     return found
 
 
-def by_linear_program(model: TransitionModel, discount: float) -> Floats:
+def by_linear_program(model, discount):
     """The smallest values that no action improves on; zero where the agent never acts."""
     live = np.flatnonzero(model.reachable)
     going_on = np.concatenate(continuing(model))
@@ -84,7 +82,7 @@ def by_linear_program(model: TransitionModel, discount: float) -> Floats:
 
 
 @given(models(), st.sampled_from([0.0, 0.3, 0.9, 0.99]))
-def test_discounted_planning_by_three_methods(model: TransitionModel, discount: float) -> None:
+def test_discounted_planning_by_three_methods(model, discount):
     one, two = value_iteration(model, discount), policy_iteration(model, discount)
     # The tolerance, or with values up to 300 over 1 - 0.99 what rounding leaves.
     assert one.error_bound <= 2e-10
@@ -96,7 +94,7 @@ def test_discounted_planning_by_three_methods(model: TransitionModel, discount: 
 
 
 @given(models(always_ends=True))
-def test_undiscounted_planning_by_three_methods(model: TransitionModel) -> None:
+def test_undiscounted_planning_by_three_methods(model):
     one, two = value_iteration(model, 1.0), policy_iteration(model, 1.0)
     np.testing.assert_allclose(one.values, two.values, rtol=0, atol=1e-9)
     np.testing.assert_allclose(one.values, by_linear_program(model, 1.0), atol=1e-6)
@@ -104,12 +102,12 @@ def test_undiscounted_planning_by_three_methods(model: TransitionModel) -> None:
     assert earned == pytest.approx(one.start_value, abs=1e-9)
 
 
-def stationary_policies(model: TransitionModel) -> Iterator[NDArray[np.int64]]:
+def stationary_policies(model):
     for actions in itertools.product(range(model.n_actions), repeat=model.n_states):
         yield np.array(actions)
 
 
-def total_rewards(model: TransitionModel, policy: NDArray[np.int64]) -> Floats:
+def total_rewards(model, policy):
     """The undiscounted value of a policy for each state, by the theory of finite chains.
 
     Infinite, with the sign of what is earned per step, where the chain may settle in a set that
@@ -143,9 +141,9 @@ def total_rewards(model: TransitionModel, policy: NDArray[np.int64]) -> Floats:
     return values
 
 
-@settings(max_examples=500)
+@settings(max_examples=300)
 @given(models(states=3, actions=2, outcomes=2))
-def test_undiscounted_planning_against_every_stationary_policy(model: TransitionModel) -> None:
+def test_undiscounted_planning_against_every_stationary_policy(model):
     totals = np.array([total_rewards(model, policy) for policy in stationary_policies(model)])
     best = totals.max(axis=0)
     starts = model.initial > 0
@@ -167,15 +165,10 @@ def test_undiscounted_planning_against_every_stationary_policy(model: Transition
     np.testing.assert_allclose(found[starts], best[starts], rtol=0, atol=1e-9)
 
 
-Episode = tuple[float, float, int, bool]
-
-
-def episodes(
-    model: TransitionModel, chances: Floats, success: NDArray[np.bool_], discount: float
-) -> Iterator[Episode]:
+def episodes(model, chances, success, discount):
     """Every episode: probability, return, length, success; chances have shape (horizon, S, A)."""
 
-    def go_on(state: int, step: int, chance: float) -> Iterator[Episode]:
+    def go_on(state, step, chance):
         for a, k in np.ndindex(model.prob.shape[1:]):
             p = chance * chances[step, state, a] * model.prob[state, a, k]
             if p == 0:
@@ -194,9 +187,7 @@ def episodes(
 
 
 @st.composite
-def tiny_problems(
-    draw: st.DrawFn,
-) -> tuple[TransitionModel, Floats, NDArray[np.bool_], float]:
+def tiny_problems(draw):
     """A tiny model, a policy matrix, marks of success, a discount."""
     model = draw(models(states=3, actions=2, outcomes=2))
     policy = draw(distributions((model.n_states, model.n_actions)))
@@ -204,15 +195,16 @@ def tiny_problems(
     return model, policy, success, draw(st.sampled_from([1.0, 0.5]))
 
 
-def assert_moments(
-    model: TransitionModel,
-    policy: Floats | NDArray[np.int64],
-    chances: Floats,
-    success: NDArray[np.bool_],
-    discount: float,
-) -> None:
-    """Hold the evaluation against the list of all episodes."""
-    found = policy_return(model, policy, len(chances), discount, success)
+@given(tiny_problems(), st.booleans(), st.data())
+def test_evaluation_against_all_episodes(problem, changes, data):
+    model, policy, success, discount = problem
+    horizon = data.draw(st.integers(1, 4))
+    chances = np.array([policy] * horizon)
+    if changes:
+        actions = st.integers(0, model.n_actions - 1)
+        policy = data.draw(hnp.arrays(np.int64, (horizon, model.n_states), elements=actions))
+        chances = np.eye(model.n_actions)[policy]
+    found = policy_return(model, policy, horizon, discount, success)
     chance, total, length, succeeded = np.array(
         list(episodes(model, chances, success, discount)), float
     ).T
@@ -226,26 +218,8 @@ def assert_moments(
     assert found.success_rate == pytest.approx(chance @ succeeded, abs=1e-12)
 
 
-@given(tiny_problems(), st.integers(1, 4))
-def test_evaluation_against_all_episodes(
-    problem: tuple[TransitionModel, Floats, NDArray[np.bool_], float], horizon: int
-) -> None:
-    model, policy, success, discount = problem
-    assert_moments(model, policy, np.array([policy] * horizon), success, discount)
-
-
-@given(tiny_problems(), st.data())
-def test_evaluation_of_changing_actions_against_all_episodes(
-    problem: tuple[TransitionModel, Floats, NDArray[np.bool_], float], data: st.DataObject
-) -> None:
-    model, _, success, discount = problem
-    shape = (data.draw(st.integers(1, 4)), model.n_states)
-    actions = data.draw(hnp.arrays(np.int64, shape, elements=st.integers(0, model.n_actions - 1)))
-    assert_moments(model, actions, np.eye(model.n_actions)[actions], success, discount)
-
-
 @given(models(always_ends=True), st.data())
-def test_no_time_limit_is_a_distant_one(model: TransitionModel, data: st.DataObject) -> None:
+def test_no_time_limit_is_a_distant_one(model, data):
     policy = data.draw(distributions((model.n_states, model.n_actions)))
     success = model.terminated & (model.reward > 0)
     limited = policy_return(model, policy, 300, success=success)
@@ -258,9 +232,7 @@ def test_no_time_limit_is_a_distant_one(model: TransitionModel, data: st.DataObj
 
 
 @given(models(), st.integers(1, 30), st.data())
-def test_visits_add_up_to_the_length(
-    model: TransitionModel, horizon: int, data: st.DataObject
-) -> None:
+def test_visits_add_up_to_the_length(model, horizon, data):
     policy = data.draw(distributions((model.n_states, model.n_actions)))
     visits = state_visitation(model, policy, horizon)
     found = policy_return(model, policy, horizon)
@@ -271,9 +243,7 @@ def test_visits_add_up_to_the_length(
 
 
 @given(models(), st.integers(1, 20), st.sampled_from([1.0, 0.8]))
-def test_nothing_beats_the_optimum_under_a_time_limit(
-    model: TransitionModel, horizon: int, discount: float
-) -> None:
+def test_nothing_beats_the_optimum_under_a_time_limit(model, horizon, discount):
     found = finite_horizon_optimum(model, horizon, discount)
     earned = policy_return(model, found.policy, horizon, discount).expected_return
     assert earned == pytest.approx(found.start_value, abs=1e-12)
@@ -284,12 +254,97 @@ def test_nothing_beats_the_optimum_under_a_time_limit(
 
 @settings(max_examples=30)
 @given(models(states=2, actions=2, outcomes=2), st.integers(1, 3))
-def test_the_optimum_under_a_time_limit_against_every_policy(
-    model: TransitionModel, horizon: int
-) -> None:
+def test_the_optimum_under_a_time_limit_against_every_policy(model, horizon):
     choices = itertools.product(range(model.n_actions), repeat=horizon * model.n_states)
     best = max(
         policy_return(model, np.reshape(actions, (horizon, -1)), horizon).expected_return
         for actions in choices
     )
     assert finite_horizon_optimum(model, horizon).start_value == pytest.approx(best, abs=1e-12)
+
+
+def moments_by_recursion(model, chances, horizon, discount, success):
+    """Figures of `policy_return`, and each state's mean return, from one step left to so many."""
+    goes_on = ~model.terminated
+
+    def backed_up(reward, gamma):
+        """First and second moments of discounted sums."""
+        first = second = np.zeros(model.n_states)
+        for _ in range(horizon):
+            one, two = goes_on * first[model.next_state], goes_on * second[model.next_state]
+            totals = reward + gamma * one, reward**2 + 2 * gamma * reward * one + gamma**2 * two
+            first, second = (
+                (chances * (model.prob * each).sum(axis=2)).sum(axis=1) for each in totals
+            )
+        return first, second
+
+    values, squares = backed_up(model.reward, discount)
+    lengths, square_lengths = backed_up(np.ones(model.prob.shape), 1.0)
+    rate, _ = backed_up((success & model.terminated).astype(float), 1.0)
+    start = model.initial
+    figures = [
+        start @ values,
+        start @ squares - (start @ values) ** 2,
+        start @ lengths,
+        start @ square_lengths - (start @ lengths) ** 2,
+        start @ rate,
+    ]
+    return figures, values
+
+
+@given(models(), st.integers(1, 70), st.sampled_from([1.0, 0.9, 0.0]), st.booleans(), st.data())
+def test_evaluation_against_a_recursion(model, horizon, discount, is_random, data):
+    policy = data.draw(distributions((model.n_states, model.n_actions)))
+    if not is_random:
+        policy = np.eye(model.n_actions)[policy.argmax(axis=1)]
+    success = model.terminated & (model.reward > 0)
+    expected, values = moments_by_recursion(model, policy, horizon, discount, success)
+    for most_backwards in (2_000_000, 0):
+        with pytest.MonkeyPatch.context() as patch:
+            # From a limit on, which these models would take minutes to reach, it goes forwards.
+            patch.setattr("mdp.evaluation.MOST_BACKWARDS", most_backwards)
+            found = vars(policy_return(model, policy, horizon, discount, success))
+        np.testing.assert_allclose(list(found.values()), expected, rtol=1e-9, atol=1e-9)
+    _, values = moments_by_recursion(model, policy, horizon, 1.0, success)
+    found = state_values(model, policy, horizon)
+    np.testing.assert_allclose(found[model.reachable], values[model.reachable], atol=1e-9)
+    assert not found[~model.reachable].any()
+    returns = [
+        moments_by_recursion(model, one, horizon, 1.0, success)[0][0]
+        for one in baseline_policies(model)
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mdp.evaluation.MOST_BACKWARDS", 0)
+        assert baseline_return(model, horizon) == pytest.approx(max(returns), abs=1e-9)
+
+
+@given(models(), st.integers(1, 5), st.data())
+def test_values_of_a_policy_that_changes_with_the_step(model, horizon, data):
+    elements = st.integers(0, model.n_actions - 1)
+    actions = data.draw(hnp.arrays(np.int64, (horizon, model.n_states), elements=elements))
+    values = state_values(model, actions, horizon)
+    expected = policy_return(model, actions, horizon).expected_return
+    assert model.initial @ values == pytest.approx(expected, abs=1e-9)
+
+
+@given(models(), st.integers(1, 20))
+def test_optimal_actions_followed_by_the_best_plan_earn_the_optimum(model, horizon):
+    values, optimal = optimal_choices(model, horizon)
+    plan = finite_horizon_optimum(model, horizon)
+    np.testing.assert_array_equal(values, plan.values)
+    assert optimal[np.arange(model.n_states), plan.actions(0)].all()
+    reached = model.reachable
+    for action in range(model.n_actions):
+        first = np.full(model.n_states, action)
+        found = state_values(model, np.vstack([first, plan.policy[1:]]), horizon)
+        equal = np.isclose(found, values, rtol=0, atol=1e-8)
+        np.testing.assert_array_equal(optimal[reached, action], equal[reached])
+
+
+@given(models(), st.integers(1, 4000))
+def test_what_is_said_of_a_limit_far_away_without_the_steps_is_the_optimum(model, horizon):
+    model = replace(model, reward=np.where(model.terminated, model.reward, -1.0))
+    found = optimum_far_from_limit(model, horizon)
+    if found is not None:
+        expected = finite_horizon_optimum(model, horizon).start_value
+        assert found == pytest.approx(expected, abs=2e-9)

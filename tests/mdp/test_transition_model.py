@@ -1,7 +1,6 @@
 """The transition model: what it accepts, what it refuses, what it derives."""
 
 import pickle
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from mdp import TransitionModel
 
 
-def arrays() -> dict[str, Any]:
+def arrays():
     """Two states, two actions, at most two outcomes; the second state is never entered alive."""
     return {
         "prob": np.array([[[0.25, 0.75], [1.0, 0.0]], [[1.0, 0.0], [0.5, 0.5]]]),
@@ -21,21 +20,21 @@ def arrays() -> dict[str, Any]:
     }
 
 
-def test_sizes_and_derived_arrays() -> None:
+def test_sizes_and_derived_arrays():
     model = TransitionModel(**arrays())
     assert (model.n_states, model.n_actions, model.n_outcomes) == (2, 2, 2)
     assert model.expected_reward.tolist() == [[3.5, -1.0], [0.0, 7.0]]
     assert model.reachable.tolist() == [True, False]
 
 
-def test_outcomes_that_lead_to_one_state_stay_apart() -> None:
+def test_outcomes_that_lead_to_one_state_stay_apart():
     given = arrays()
     given["next_state"][1, 1] = [0, 0]
     model = TransitionModel(**given)
     assert model.prob[1, 1].tolist() == [0.5, 0.5]
 
 
-def test_arrays_are_read_only_and_the_callers_stay_writable() -> None:
+def test_arrays_are_read_only_and_the_callers_stay_writable():
     given = arrays()
     model = TransitionModel(**given)
     with pytest.raises(ValueError, match="read-only"):
@@ -47,12 +46,12 @@ def test_arrays_are_read_only_and_the_callers_stay_writable() -> None:
 
 
 @pytest.mark.parametrize(("given", "kept"), [(np.int32, np.int32), (np.uint8, np.int64)])
-def test_index_types(given: type, kept: type) -> None:
+def test_index_types(given, kept):
     model = TransitionModel(**{**arrays(), "next_state": arrays()["next_state"].astype(given)})
     assert model.next_state.dtype == kept
 
 
-def test_pickling_keeps_everything() -> None:
+def test_pickling_keeps_everything():
     model = TransitionModel(**arrays())
     copy = pickle.loads(pickle.dumps(model))
     for name in arrays():
@@ -72,7 +71,7 @@ def test_pickling_keeps_everything() -> None:
         ("initial", slice(None), [1.5, -0.5], r"initial has a probability outside \[0, 1\] at"),
     ],
 )
-def test_wrong_numbers_are_refused(name: str, place: Any, value: Any, message: str) -> None:
+def test_wrong_numbers_are_refused(name, place, value, message):
     given = arrays()
     given[name][place] = value
     with pytest.raises(ValueError, match=message):
@@ -87,13 +86,13 @@ def test_wrong_numbers_are_refused(name: str, place: Any, value: Any, message: s
         ("initial", (1, 2), r"initial has shape \(1, 2\), it must be \(2,\)"),
     ],
 )
-def test_wrong_shapes_are_refused(name: str, shape: tuple[int, ...], message: str) -> None:
+def test_wrong_shapes_are_refused(name, shape, message):
     given = arrays()
     with pytest.raises(ValueError, match=message):
         TransitionModel(**{**given, name: given[name].reshape(shape)})
 
 
-def test_variances_of_rewards_are_checked() -> None:
+def test_variances_of_rewards_are_checked():
     given, variance = arrays(), np.ones((2, 2, 2))
     assert TransitionModel(**given).reward_variance is None
     kept = TransitionModel(**given, reward_variance=variance).reward_variance
@@ -107,13 +106,13 @@ def test_variances_of_rewards_are_checked() -> None:
             TransitionModel(**given, reward_variance=variance)
 
 
-def test_rounding_of_probabilities_is_accepted() -> None:
+def test_rounding_of_probabilities_is_accepted():
     given = arrays()
     given["prob"][1, 1] = [0.5, 0.5 + 5e-10]
     TransitionModel(**given)
 
 
-def test_from_gymnasium_pads_and_keeps_the_order() -> None:
+def test_from_gymnasium_pads_and_keeps_the_order():
     outcomes = [(0.25, 1, 1.0, True), (0.5, 0, 2.0, False), (0.25, 1, 1.0, True)]
     P = {  # noqa: N806 (Gymnasium's own name)
         0: {0: outcomes, 1: [(1.0, 1, 3.0, False)]},
@@ -134,7 +133,7 @@ def test_from_gymnasium_pads_and_keeps_the_order() -> None:
         ({0: {0: []}}, "state 0, action 0 has no outcome"),
     ],
 )
-def test_from_gymnasium_refuses_gaps(P: Any, message: str) -> None:  # noqa: N803 (as above)
+def test_from_gymnasium_refuses_gaps(P, message):  # noqa: N803 (as above)
     with pytest.raises(ValueError, match=message):
         TransitionModel.from_gymnasium(P, np.ones(len(P)) / len(P))
 
@@ -148,8 +147,8 @@ def test_from_gymnasium_refuses_gaps(P: Any, message: str) -> None:  # noqa: N80
         ("Taxi-v4", (500, 6, 1), [s for s in range(500) if s // 4 % 5 == s % 4]),
     ],
 )
-def test_gymnasium_models(env_id: str, shape: tuple[int, ...], unreachable: list[int]) -> None:
-    env: Any = gym.make(env_id).unwrapped
+def test_gymnasium_models(env_id, shape, unreachable):
+    env = gym.make(env_id).unwrapped
     model = TransitionModel.from_gymnasium(env.P, env.initial_state_distrib)
     assert model.prob.shape == shape
     assert np.flatnonzero(~model.reachable).tolist() == unreachable

@@ -1,0 +1,497 @@
+"""Maps, and the worlds on them: steps worked by hand, rules spelt out, optima by search."""
+
+import itertools
+import re
+import tracemalloc
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra, shortest_path
+
+from envs.grid import GridMap, distances_to
+from envs.mine_maze import MineMazeEnv
+from envs.textbook.dyna_maze import DynaMazeEnv
+from envs.warehouse import RandomWarehouseEnv, WarehouseEnv, random_warehouse
+
+UP, DOWN, LEFT, RIGHT = range(4)
+ROWS = ["..G", ".#.", "S.."]
+
+
+def walk(env, letters):
+    """A column each: observations, rewards, whether it terminated, and what ``info`` says."""
+    steps = [env.step("UDLR".index(letter)) for letter in letters]
+    return [[step[i] for step in steps] for i in (0, 1, 2, 4)]
+
+
+# --- maps -----------------------------------------------------------------------------------------
+
+
+def read(desc):
+    return GridMap.read(desc, known="#.SG", passable=".S")
+
+
+def test_a_map_is_read_from_rows_and_text():
+    grid_map = read(ROWS)
+    assert (grid_map.rows, grid_map.codes) == (tuple(ROWS), b"..G.#.S..")
+    assert (grid_map.n_rows, grid_map.n_columns, grid_map.n_cells) == (3, 3, 9)
+    assert grid_map.start == 6
+    assert grid_map.distances.tolist() == [2, 1, 0, 3, -1, 1, 4, 3, 2]
+    assert read("..G\n.#.\nS..\n").rows == tuple(ROWS)
+
+
+@pytest.mark.parametrize("start", ["", "\ufeff"], ids=["plain", "marked as UTF-8"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("end", ["", "\n", "\n\n"])
+def test_a_map_is_read_from_a_file(tmp_path, newline, end, start):
+    path = tmp_path / "map.txt"
+    path.write_bytes((start + newline.join(ROWS) + end.replace("\n", newline)).encode())
+    assert read(path).rows == read(str(path)).rows == tuple(ROWS)
+
+
+BROKEN = [
+    ([], "the map is empty"),
+    ([""], "the map is empty"),
+    ("\n", "the map is empty"),
+    (["S..", "..", "..G"], "row 2 has 2 cells and row 1 has 3: they differ from column 3 on"),
+    (["S..", "....", "..G"], "row 2 has 4 cells and row 1 has 3: they differ from column 4 on"),
+    (["...", "..G"], "the map has no start: mark it with the letter S"),
+    (["..S", "S.G"], "two starts, at row 1, column 3 and at row 2, column 1; there must be one"),
+    (["S..", "..."], "the map has no goal: mark it with the letter G"),
+    (["S..", ".x.", "..G"], "unknown letter 'x' at row 2, column 2; known are # . S G"),
+    (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2"),
+    (
+        ["S#.", "#..", "..G"],
+        "the goal at row 3, column 3 cannot be reached from the start at row 1, column 1",
+    ),
+    ("missing.txt", "cannot read the map file missing.txt: No such file or directory"),
+    (7, "desc must be a list of rows"),
+    ([1, 2], "desc must be a list of rows"),
+    (["S" + "." * 5000 + "G"] * 5000, "5000 rows of 5002 cells, more than 16,777,216 cells"),
+    ("/dev/zero", "is no regular file"),
+]
+
+
+@pytest.mark.parametrize(("desc", "message"), BROKEN)
+def test_a_broken_map_is_refused_in_one_line(desc, message):
+    with pytest.raises(ValueError, match=message) as refused:
+        WarehouseEnv(desc=desc)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path):
+    path = tmp_path / "map.txt"
+    for content, message in (
+        (b"S.\n?G\n", r"map\.txt: unknown letter '\?' at row 2, column 1"),
+        (b"S.\xff\xfe.G", r"map\.txt: it is not a text file in UTF-8"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            WarehouseEnv(desc=path)
+    with path.open("wb") as file:
+        file.truncate(2**40)  # it takes no room on the disk
+    with pytest.raises(ValueError, match="is larger than"):
+        WarehouseEnv(desc=path)
+
+
+def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
+    for desc, message in (
+        (["S#G"], r"unknown letter '#' at row 1, column 2; known are S \. M P"),
+        (["SMG"], "the goal at row 1, column 3 cannot be reached"),
+        (["S" + "P" * 25 + "G"], r"has 27 cells, 25 of them to collect: these make 27 \* 2\*\*25"),
+        (["S" + "P" * 100_000 + "G"], r"100002 cells, 100000 of them to collect"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            MineMazeEnv(desc=desc)
+    assert MineMazeEnv(desc=["S" + "P" * 18 + "G"]).dynamics.n_states == 20 * 2**18
+    # Of several goals the nearest counts.
+    assert WarehouseEnv(desc=["G..S.G", "......"]).shortest_path_length == 2
+
+
+ROW_OF = st.integers(1, 7).flatmap(lambda n: st.lists(st.booleans(), min_size=n, max_size=n))
+
+
+@given(st.integers(1, 7), ROW_OF, st.randoms(), st.data())
+def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, data):
+    free = np.array([shuffler.sample(row, len(row)) for _ in range(n_rows)])
+    cells = st.integers(0, free.size - 1)
+    targets = data.draw(st.lists(cells, min_size=1, max_size=3, unique=True))
+    at, column = np.divmod(np.arange(free.size), free.shape[1])
+    apart = abs(at[:, None] - at) + abs(column[:, None] - column)
+    usable = free.ravel().copy()
+    usable[targets] = True
+    edges = (apart == 1) & usable & usable[:, None]
+    nearest = shortest_path(edges, unweighted=True, indices=targets).min(axis=0)
+    expected = np.where(np.isfinite(nearest), nearest, -1)
+    assert np.array_equal(distances_to(targets, free).ravel(), expected)
+
+
+# --- steps worked by hand -------------------------------------------------------------------------
+
+
+def test_steps_of_the_warehouse():
+    env = WarehouseEnv()
+    observation, info = env.reset(seed=0)
+    assert (observation, info["position"]) == (90, (9, 0))
+    # Against the wall, up, against a shelf, off the map, back.
+    states, rewards, over, infos = walk(env, "DLURLD")
+    assert states == [90, 90, 80, 80, 80, 90]
+    assert rewards == [-1, -1, -1, -100, -1, -1]
+    assert [info["bumped"] for info in infos] == [True, True, False, True, True, False]
+    assert not any(over)
+
+
+def test_the_shortest_way_earns_79_and_then_nothing_moves():
+    env = WarehouseEnv()
+    env.reset(seed=0)
+    _, rewards, over, infos = walk(env, "RRRRRUURRUULLUURURRRUU")
+    assert rewards == [-1] * 21 + [100]
+    assert over == [info["is_success"] for info in infos] == [False] * 21 + [True]
+    assert infos[-1]["position"] == (0, 9)
+    assert env.step(DOWN)[:3] == (9, 0.0, True)
+    assert env.shortest_path_length == 22
+    assert np.count_nonzero(env.map.distances >= 0) == 62
+
+
+def test_steps_of_the_mine_maze():
+    env = MineMazeEnv()
+    assert env.reset(seed=0)[1]["position"] == (0, 0)
+    # Off the map, then to the power at (1, 3) and back onto it, then onto the mine at (2, 3).
+    states, rewards, over, infos = walk(env, "URRDRLRD")
+    # The power at (1, 3) is the first of three: its bit counts 36 * 1.
+    assert states == [0, 1, 2, 8, 36 + 9, 36 + 8, 36 + 9, 36 + 15]
+    assert rewards == [-1, -1, -1, -1, 0, -1, -1, -101]
+    assert over == [False] * 7 + [True]
+    assert [info["bumped"] for info in infos] == [True] + [False] * 7
+    assert not infos[-1]["is_success"]
+    env.reset()
+    _, rewards, over, infos = walk(env, "RRDRRDDDDR")
+    assert rewards == [-1, -1, -1, 0, -1, -1, -1, -1, -1, 99]
+    assert (over[-1], infos[-1]["is_success"], env.s) == (True, True, 36 + 35)
+
+
+def test_what_was_collected_is_collected_once_and_forgotten_at_reset():
+    env = MineMazeEnv(desc=["SPG"], power_reward=5)
+    for _ in range(2):
+        assert env.reset(seed=0)[0] == 0
+        assert walk(env, "RUDLRR")[:2] == [[4, 4, 4, 3, 4, 5], [4, -1, -1, -1, -1, 99]]
+    env = MineMazeEnv(desc=["SP", "PG"])  # bits are numbered row by row
+    env.reset(seed=0)
+    assert walk(env, "RLD")[0] == [4 + 1, 4 + 0, 4 * 3 + 2]
+
+
+def test_the_rewards_are_arguments():
+    env = WarehouseEnv(desc=["S#", ".G"], shelf_reward=-7, step_reward=-0.5, goal_reward=3)
+    env.reset(seed=0)
+    assert walk(env, "RUDR")[1] == [-7.0, -0.5, -0.5, 3.0]
+    rewards = {"step_reward": -2, "mine_reward": -5, "power_reward": 4, "goal_reward": 10}
+    env = MineMazeEnv(["SPG", "M.."], **rewards)
+    env.reset(seed=0)
+    assert walk(env, "URR")[1] == [-2, 2, 8]
+    env.reset()
+    assert env.step(DOWN)[1:3] == (-7.0, True)
+
+
+def test_slip_goes_to_both_sides_in_the_stated_order():
+    middle = WarehouseEnv(desc=["...", ".S.", "..G"], slip=0.2).P[4]
+    reached = {UP: (1, 3, 5), DOWN: (7, 3, 5), LEFT: (3, 1, 7), RIGHT: (5, 1, 7)}
+    for action, cells in reached.items():
+        chances = zip((0.8, 0.1, 0.1), cells, strict=True)
+        assert middle[action] == [(prob, cell, -1.0, False) for prob, cell in chances]
+    # Slipping against a shelf costs as much as driving there.
+    sliding = WarehouseEnv(desc=["#", "S", "G"], slip=1)
+    expected = [(0.0, 1, -1.0, False), (0.5, 1, -100.0, False), (0.5, 2, 100.0, True)]
+    assert sliding.P[1][LEFT] == expected
+
+
+def test_random_starts_leave_out_goals_what_is_cut_off_and_what_holds_something():
+    env = WarehouseEnv(desc=["S.G#.", "..###"], random_start=True)
+    assert np.flatnonzero(env.initial_state_distrib).tolist() == [0, 1, 5, 6]
+    env = MineMazeEnv(desc=["S.P", ".MG", "..M", "MM."], random_start=True)
+    assert env.initial_state_distrib.shape == (24,)
+    assert np.flatnonzero(env.initial_state_distrib).tolist() == [0, 1, 3, 6, 7]
+
+
+def test_what_is_observed():
+    spaces = {
+        "discrete": (gym.spaces.Discrete(15), [0, 6, 14]),
+        "position": (gym.spaces.Box(0, 1, (2,), np.float32), [[0, 0], [0.5, 0.25], [1, 1]]),
+        "one_hot": (gym.spaces.Box(0, 1, (15,), np.float32), np.eye(15)[[0, 6, 14]].tolist()),
+    }
+    for observation, (space, seen) in spaces.items():
+        env = WarehouseEnv(desc=["S....", ".....", "....G"], observation=observation)
+        assert env.observation_space == space
+        batch = env.observation_of(np.array([0, 6, 14]))
+        assert batch.tolist() == seen
+        first, _ = env.reset(seed=0)
+        assert np.asarray(first).tolist() == seen[0]
+        assert observation == "discrete" or first.dtype == batch.dtype == np.float32
+        assert np.asarray(walk(env, "DR")[0][-1]).tolist() == seen[1]
+
+
+@pytest.mark.parametrize(
+    ("make", "limit", "best", "n_moves"), [(WarehouseEnv, 1000, 79, 22), (MineMazeEnv, 100, 91, 10)]
+)
+def test_the_best_return_by_stepping_out_of_every_state_once(make, limit, best, n_moves):
+    env = make()
+    shape = int(env.observation_space.n), 4
+    target, reward, goes_on = np.zeros(shape, int), np.zeros(shape), np.zeros(shape)
+    for state, action in np.ndindex(shape):
+        env.s = state
+        _, reward[state, action], terminated, _, _ = env.step(action)
+        target[state, action], goes_on[state, action] = env.s, not terminated
+    values, found = np.zeros(shape[0]), []
+    for _ in range(limit):
+        values = (reward + goes_on * values[target]).max(axis=1)
+        found.append(values[env.map.start])
+    assert found[-1] == best
+    assert found.index(best) + 1 == env.shortest_path_length == n_moves
+
+
+# --- any map --------------------------------------------------------------------------------------
+
+
+@st.composite
+def maps(draw, letters):
+    """Small maps, whether or not they can be solved, and with at most three cells of power."""
+    n_rows, n_columns = draw(st.integers(1, 5)), draw(st.integers(2, 5))
+    size = n_rows * n_columns
+    found = draw(st.lists(st.sampled_from(letters), min_size=size, max_size=size))
+    if "M" in letters:
+        for cell in draw(st.lists(st.integers(0, size - 1), max_size=3)):
+            found[cell] = "P"
+    start, goal = draw(st.lists(st.integers(0, size - 1), min_size=2, max_size=2, unique=True))
+    found[start], found[goal] = "S", "G"
+    return ["".join(found[i : i + n_columns]) for i in range(0, size, n_columns)]
+
+
+def rules(rows, position, collected, action):
+    """What the descriptions of both worlds say: position, reward, end, and whether it bumped."""
+    row = position[0] + {UP: -1, DOWN: 1}.get(action, 0)
+    column = position[1] + {LEFT: -1, RIGHT: 1}.get(action, 0)
+    if not (0 <= row < len(rows) and 0 <= column < len(rows[0])):
+        return position, -1, False, True
+    letter = rows[row][column]
+    if letter == "#":
+        return position, -100, False, True
+    earned = {"M": -101, "G": 99, "P": -1 if (row, column) in collected else 0}.get(letter, -1)
+    return (row, column), earned, letter in "MG", False
+
+
+def is_solvable(rows):
+    at = "".join(rows).index("S")
+    found, waiting = set(), [divmod(at, len(rows[0]))]
+    while waiting:
+        place = waiting.pop()
+        if place not in found:
+            found.add(place)
+            if rows[place[0]][place[1]] not in "GM":
+                waiting += [rules(rows, place, (), action)[0] for action in range(4)]
+    return any(rows[row][column] == "G" for row, column in found)
+
+
+SIDES = {UP: (LEFT, RIGHT), DOWN: (LEFT, RIGHT), LEFT: (UP, DOWN), RIGHT: (UP, DOWN)}
+
+
+@pytest.mark.parametrize("kind", [WarehouseEnv, MineMazeEnv])
+@given(st.data(), st.sampled_from([0, 0.25, 1]), st.booleans(), st.integers(0, 2**32))
+def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start, seed):
+    rows = data.draw(maps("..#" if kind is WarehouseEnv else "...M"))
+    if not is_solvable(rows):
+        with pytest.raises(ValueError, match="cannot be reached"):
+            kind(desc=rows)
+        return
+    env = kind(
+        desc=rows, slip=slip, random_start=random_start, goal_reward=99 + (kind is MineMazeEnv)
+    )
+    model = env.transition_model()
+    np.testing.assert_allclose(model.prob.sum(axis=2), 1)
+    for state, action in np.ndindex(model.n_states, 4):
+        move = env.dynamics.move(state, action)
+        listed = (model.next_state, model.reward, model.terminated)
+        assert tuple(array[state, action, 0] for array in listed) == move[:3]
+    position, collected = env.reset(seed=seed)[1]["position"], set()
+    powers = [divmod(i, len(rows[0])) for i, letter in enumerate("".join(rows)) if letter == "P"]
+    for action in np.random.default_rng(seed).integers(4, size=40).tolist():
+        ways = (action, *SIDES[action]) if slip else (action,)
+        possible = [rules(rows, position, collected, way) for way in ways]
+        state, reward, terminated, _, info = env.step(action)
+        position = info["position"]
+        assert (position, reward, terminated, info["bumped"]) in possible
+        collected |= {position} & set(powers)
+        mask = sum(1 << i for i, place in enumerate(powers) if place in collected)
+        row, column = position
+        assert state == row * len(rows[0]) + column + len(rows) * len(rows[0]) * mask
+        assert info["is_success"] is (rows[row][column] == "G")
+        if terminated:
+            position, collected = env.reset()[1]["position"], set()
+
+
+# --- random warehouses ----------------------------------------------------------------------------
+
+
+def shelves(rows):
+    return np.array([[letter == "#" for letter in row] for row in rows])
+
+
+@given(st.integers(2, 9), st.floats(0, 1), st.integers(0, 2**63 - 1))
+def test_no_more_shelves_are_taken_out_than_needed(size, density, seed):
+    # The generator's first numbers give the map before; Dijkstra on it the fewest shelves.
+    rows = random_warehouse(size, density, seed)
+    before = np.random.default_rng(seed).random((size, size)) < density
+    before[-1, 0] = before[0, -1] = False
+    row, column = np.divmod(np.arange(size * size), size)
+    beside = abs(row[:, None] - row) + abs(column[:, None] - column) == 1
+    # Graphs hold no edges of weight zero; so many small ones do not add up to one shelf.
+    entering = np.where(before.ravel(), 1.0, 1e-6)
+    cost = dijkstra(csr_array(beside * entering), indices=size * (size - 1))[size - 1]
+    after = shelves(rows)
+    assert not np.any(after & ~before)
+    assert np.count_nonzero(before & ~after) == int(cost)
+    assert (rows[-1][0], rows[0][-1]) == ("S", "G")
+    assert WarehouseEnv(desc=rows).shortest_path_length >= 2 * (size - 1)
+
+
+def test_a_seed_names_a_map_for_good():
+    expected = ["...##G", "#...#.", "#.....", "..##.#", "......", "S###.#"]
+    assert random_warehouse(6, 0.4, 7) == expected
+    assert len({tuple(random_warehouse(10, 0.3, seed)) for seed in range(20)}) == 20
+
+
+def test_the_density_is_as_asked_for():
+    # A million cells at 0.3 have a standard deviation of 0.00046.
+    assert abs(shelves(random_warehouse(1000, 0.3, 5)).mean() - 0.3) < 0.002
+    # A full warehouse keeps all but one shortest way of eleven cells.
+    assert [shelves(random_warehouse(6, density)).sum() for density in (0, 1)] == [0, 36 - 11]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "limit"),
+    [({"size": 50}, None), ({"max_episode_steps": 3}, 3), ({"max_episode_steps": 10**6}, 10**6)],
+    ids=["ten shortest ways", "shorter", "longer"],
+)
+def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(kwargs, limit):
+    env = gym.make("envs:RandomWarehouse-v0", slip=0.1, **kwargs)
+    limit = limit or 10 * env.unwrapped.shortest_path_length
+    again = gym.make(env.spec)
+    assert env.spec.max_episode_steps == again.spec.max_episode_steps == limit
+    assert np.array_equal(again.unwrapped.desc, env.unwrapped.desc)
+    assert str(env).count("TimeLimit") == 1
+    assert str(again) == str(env)
+    assert "TimeLimit" not in str(gym.make("envs:RandomWarehouse-v0", max_episode_steps=-1))
+
+
+def test_steps_and_resets_among_a_million_cells_take_little_memory():
+    env = RandomWarehouseEnv(size=1000, random_start=True)
+    env.reset(seed=0)
+    tracemalloc.start()
+    for step in range(100):
+        env.step(step % 4)
+        env.reset()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e3
+
+
+# --- mazes that change ----------------------------------------------------------------------------
+
+CHANGING = {"maze": "blocking", "changed": True}
+
+
+def test_shortest_ways_of_the_mazes():
+    found = {
+        (maze, changed): DynaMazeEnv(maze=maze, changed=changed).shortest_path_length
+        for maze, changed in itertools.product(("blocking", "shortcut"), (False, True))
+    }
+    expected = [("blocking", False), ("blocking", True), ("shortcut", False), ("shortcut", True)]
+    assert found == dict(zip(expected, (10, 16, 16, 10), strict=True))
+    env = DynaMazeEnv()
+    assert (env.shortest_path_length, env.transition_model().n_states) == (14, 54)
+    env.reset(seed=0)
+    _, rewards, over, infos = walk(env, "DDRRRRURRRRUUU")
+    assert rewards == [0.0] * 13 + [1.0]
+    assert over[-1]
+    assert infos[-1]["is_success"]
+
+
+def test_a_maze_changes_once_after_so_many_steps_over_all_episodes():
+    env = DynaMazeEnv(**CHANGING, change_after_steps=5)
+    env.reset(seed=0)
+    walk(env, "LLLL")
+    env.reset()
+    assert env.map.rows[3] == "########."
+    walk(env, "L")
+    assert env.map.rows[3] == ".########"
+    env.reset()
+    assert walk(env, "LLLUUUUU")[3][-1]["position"] == (0, 0)
+
+
+def test_it_waits_until_nobody_stands_where_a_wall_comes():
+    env = DynaMazeEnv(**CHANGING, change_after_steps=1, render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    env.s, env.steps_done = 3 * 9 + 8, 1
+    walk(env, "R")  # against the edge: the robot stays in the gap
+    assert env.map.rows[3] == "########."
+    walk(env, "U")
+    assert env.map.rows[3] == ".########"
+    assert not np.array_equal(env.render()[200:256, 512:], before[200:256, 512:])
+    assert walk(env, "D")[3][0]["bumped"]
+
+
+def test_what_a_changing_maze_tells_is_of_the_moment():
+    env = DynaMazeEnv(**CHANGING, change_after_steps=2, random_start=True, slip=0.25)
+    env.reset(seed=0)
+    before = env.P, env.initial_state_distrib
+    env.s = 0
+    walk(env, "UU")
+    assert env.map.rows[3] == ".########"
+    assert before[0] != env.P
+    assert not np.array_equal(env.initial_state_distrib, before[1])
+    assert env.dynamics.outcome_prob == (0.75, 0.125, 0.125)
+
+
+# --- arguments ------------------------------------------------------------------------------------
+
+REFUSED = [
+    ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),
+    ("Warehouse", {"slip": 1.5}, "slip must be a finite number from 0 to 1, not 1.5"),
+    ("Warehouse", {"slip": float("nan")}, "slip must be a finite number from 0 to 1, not nan"),
+    ("Warehouse", {"slip": "0.1"}, "slip must be a finite number from 0 to 1, not '0.1'"),
+    ("Warehouse", {"slip": True}, "slip must be a finite number from 0 to 1, not True"),
+    ("Warehouse", {"shelf_reward": "a"}, "shelf_reward must be a finite number, not 'a'"),
+    ("MineMaze", {"step_reward": float("inf")}, "step_reward must be a finite number, not inf"),
+    ("MineMaze", {"goal_reward": None}, "goal_reward must be a finite number, not None"),
+    ("MineMaze", {"random_start": 1}, "random_start must be true or false, not 1"),
+    (
+        "Warehouse",
+        {"observation": "positon"},
+        "unknown observation 'positon': did you mean 'position'? It must be one of discrete, posit",
+    ),
+    ("Warehouse", {"observation": "xyz"}, "'xyz': it must be one of discrete, position, one_hot"),
+    ("RandomWarehouse", {"size": 1}, "size must be a whole number from 2 to 4096, not 1"),
+    ("RandomWarehouse", {"size": 5000}, "size must be a whole number from 2 to 4096, not 5000"),
+    ("RandomWarehouse", {"size": 2.5}, "size must be a whole number from 2 to 4096, not 2.5"),
+    ("RandomWarehouse", {"shelf_density": 1.1}, "shelf_density must be a finite number from 0 to"),
+    ("RandomWarehouse", {"map_seed": -1}, "map_seed must be a whole number from 0 to 9223372036"),
+    ("RandomWarehouse", {"map_seed": True}, "map_seed must be a whole number from 0 to 92233720"),
+    ("DynaMaze", {"maze": "block"}, "unknown maze 'block': did you mean 'blocking'"),
+    ("DynaMaze", {"changed": True}, "changed: the maze 'dyna' never changes"),
+    ("DynaMaze", {"maze": "blocking", "change_after_steps": 5}, "change_after_steps needs changed"),
+    (
+        "DynaMaze",
+        {**CHANGING, "change_after_steps": 0},
+        "change_after_steps must be a whole number",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "wrong", "message"), REFUSED, ids=[row[2] for row in REFUSED])
+def test_arguments_out_of_range_are_refused(name, wrong, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        gym.make(f"envs:{name}-v0", **wrong)
+    with pytest.raises(ValueError, match="render_mode 'ansy': did you mean 'ansi'"):
+        WarehouseEnv(render_mode="ansy")
