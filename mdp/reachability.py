@@ -6,9 +6,14 @@ The model itself asks for this, so nothing here knows the model.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machine_code.compiling import compiled
-from mdp.transition_model import AnyInts, Bools, Floats
+
+# As in the model's own module.
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+AnyInts = NDArray[np.integer]
 
 
 def reached_from(
