@@ -6,7 +6,6 @@ PYTEST_ARGS ?= -n auto --maxprocesses 8 --dist worksteal
 PACKAGE ?= mdp
 N ?= 25
 SEED ?= 0
-JOBS ?= 2
 
 # What is installed, and has to work on systems other than this one.
 PACKAGES := safe_files machine_code mdp verdicts envs agents pipeline experiments tuning report commands
@@ -69,8 +68,8 @@ format: $(STAMP) ## Format the code and mend what ruff can mend
 bench: $(STAMP) ## Time everything, with few rounds
 	@set -e; for run in $(BENCHMARKS); do echo "== $$run"; $(BIN)/python benchmarks/$$run; done
 
-mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0 JOBS=2
-	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED) --jobs $(JOBS)
+mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0
+	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED)
 
 docs: $(STAMP) ## Make the site of all pages, build/site/index.html, and check its links
 	rm -rf build/site

@@ -1,5 +1,6 @@
 """The tool that makes deliberate errors, on a package so small that all is known of it."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -7,8 +8,7 @@ from pathlib import Path
 import pytest
 
 TOOL = Path(__file__).parent / "mutation"
-
-LIMITS = '''"""Made up."""
+SOURCE = '''"""Made up."""
 
 
 def clip(value: int, low: int, high: int) -> int:
@@ -16,201 +16,78 @@ def clip(value: int, low: int, high: int) -> int:
     if value > high:
         return high
     return max(value, low)
+
+
+def unused(value):
+    return value
 '''
-SIZES = '''"""Made up."""
-
-
-def doubled(value):
-    return 2 * value
-'''
-# It sleeps, so that waiting for it takes no processor.
-COUNTDOWN = """from time import sleep
-
-
-def countdown(n):
-    while n > 0 and not sleep(0.1):
-        n -= 1
-    return n
-"""
-GOOD = """from toy import limits
+TESTS = """from toy.a import clip
 
 
 def test_clip():
-    assert [limits.clip(value, 1, 3) for value in (0, 1, 2, 3, 4)] == [1, 1, 2, 3, 3]
-"""
-USELESS = """from toy import sizes
+    assert [clip(value, 1, 3) for value in (0, 1, 2, 3, 4)] == [1, 1, 2, 3, 3]
 
 
-def test_doubled_can_be_called():
-    sizes.doubled(1)
+def test_broken():
+    assert False
 """
 
 
-@pytest.fixture
-def toy(tmp_path):
-    """A checkout whose package has a module with a good test and one with a useless test."""
-    files = {
-        "toy/__init__.py": "",
-        "toy/limits.py": LIMITS,
-        "toy/sizes.py": SIZES,
-        "tests/toy/test_limits.py": GOOD,
-        "tests/toy/test_sizes.py": USELESS,
-    }
-    for name, text in files.items():
-        path = tmp_path / name
+def test_which_errors_are_caught(tmp_path):
+    source, tests, record = (
+        tmp_path / name for name in ("toy/a.py", "tests/toy/test_a.py", "record")
+    )
+    for path, text in (tmp_path / "toy/__init__.py", ""), (source, SOURCE), (tests, TESTS):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    return tmp_path
 
+    def run(*words):
+        command = [sys.executable, TOOL, "toy", "--root", tmp_path, "--record", record, *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return json.loads(record.read_text()), done
 
-@pytest.fixture
-def drawing(monkeypatch):
-    monkeypatch.syspath_prepend(TOOL)
-    import drawing
-
-    return drawing
-
-
-def run(root, *arguments):
-    command = [sys.executable, str(TOOL), "toy", "--root", str(root), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def test_what_a_good_test_catches_and_a_useless_one_does_not(toy):
-    before = {path: path.read_bytes() for path in toy.rglob("*") if path.is_file()}
-    done = run(toy, "-n", "99")
-    assert done.stderr == ""
-    # The checkout itself is never touched.
-    assert {path: path.read_bytes() for path in toy.rglob("*") if path.is_file()} == before
-    *lines, last = done.stdout.splitlines()
-    fates = dict(zip(lines[::2], (line.strip() for line in lines[1::2]), strict=True))
-    of_limits = {error: fate for error, fate in fates.items() if error.startswith("toy/limits")}
-    of_sizes = {error: fate for error, fate in fates.items() if error.startswith("toy/sizes")}
-    assert of_limits == {
+    errors, done = run("-n", "99")
+    name = "tests/toy/test_a.py::test_"
+    assert done.stderr == f"left out, as it fails without any error: {name}broken\n"
+    assert {(line, new.strip(), fate) for _, line, _, new, fate in errors} == {
         # Nothing observable changes: at the limit itself both ways give the limit.
-        "toy/limits.py:6: if value > high:  ->  if value >= high:": "SURVIVED",
-        "toy/limits.py:6: if value > high: return high  ->  pass": (
-            "caught by tests/toy/test_limits.py::test_clip"
-        ),
-        "toy/limits.py:7: return high  ->  return None": (
-            "caught by tests/toy/test_limits.py::test_clip"
-        ),
-        "toy/limits.py:8: return max(value, low)  ->  return None": (
-            "caught by tests/toy/test_limits.py::test_clip"
-        ),
+        (6, "if (value >= high):", "survived"),
+        (6, "if (not value > high):", f"{name}clip"),
+        (6, "pass", f"{name}clip"),
+        (7, "return None", f"{name}clip"),
+        (8, "return None", f"{name}clip"),
+        (12, "return None", "survived"),
     }
-    assert of_sizes == {
-        "toy/sizes.py:5: return 2 * value  ->  return None": "SURVIVED",
-        "toy/sizes.py:5: return 2 * value  ->  return 2 / value": "SURVIVED",
-        "toy/sizes.py:5: return 2 * value  ->  return 3 * value": "SURVIVED",
-    }
-    assert last == "caught 3 of 7 (43 %)"
-
-
-def test_tests_that_fail_without_any_error_count_nothing(toy):
-    (toy / "tests/toy/test_sizes.py").write_text("def test_broken():\n    assert False\n")
-    done = run(toy, "-n", "2")
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr == (
-        "without any error, tests/toy/test_sizes.py::test_broken fails already\n"
-    )
-
-
-def test_a_hang_counts_as_caught(toy, drawing):
-    import imports
-    import running
-
-    (toy / "toy/sizes.py").write_text(COUNTDOWN)
-    (toy / "tests/toy/test_sizes.py").write_text(
-        "from toy.sizes import countdown\n\n\ndef test_it():\n    assert countdown(3) == 0\n"
-    )
-    copy = running.Checkout(toy, toy.parent / "copy")
-    errors = drawing.mutants_of("toy/sizes.py", COUNTDOWN.encode())
-    [mutant] = [error for error in errors if error.new == "pass"]
-    found = imports.Imports(toy, ["toy", "tests"])
-    assert copy.judge(mutant, found, (), limit=5) == "a time-out"
-    assert (copy.path / "toy/sizes.py").read_text() == COUNTDOWN
-
-
-def test_the_same_seed_draws_the_same_errors(toy, drawing):
-    first = drawing.draw(toy, "toy", 3, seed=1)
-    assert len(first) == 3
-    assert drawing.draw(toy, "toy", 3, seed=1) == first
-    assert any(drawing.draw(toy, "toy", 3, seed=seed) != first for seed in range(2, 9))
-    listed = run(toy, "-n", "3", "--seed", "1", "--list").stdout.splitlines()
-    assert listed == [m.describe((toy / m.path).read_bytes()) for m in first]
+    assert done.stdout.endswith("caught 4 of 6\n")
+    assert source.read_text() == SOURCE
+    # The same errors once the file and its tests are others.
+    source.write_text("# A line more.\n" + SOURCE.replace("return value", "return  value"))
+    tests.write_text(TESTS.replace("2, 3, 4)", "2)").replace("2, 3, 3]", "2]"))
+    replayed, done = run("--replay", record)
+    assert [entry[:4] for entry in replayed] == [entry[:4] for entry in errors]
+    assert [fate for _, line, _, _, fate in replayed if line == 12] == ["source changed"]
+    assert done.stdout.endswith("caught 2 of 5\n")
 
 
 @pytest.mark.parametrize(
     ("source", "errors"),
     [
-        ("a < b", {"a <= b"}),
-        ("a == b", {"a != b"}),
-        ("a is not b", {"a is b"}),
-        ("(a) not in b", {"(a) in b"}),
-        ("(a) + (b)", {"(a) - (b)"}),
-        ("a ** b", {"a * b"}),
-        ("a and b", {"a or b"}),
-        ("not a", {"a"}),
-        ("-a", {"a"}),
-        ("x += a", {"x -= a", "pass"}),
-        ("x = 0", {"x = 1"}),
-        ("x = 0.5", {"x = 1.5"}),
-        ("x = True", {"x = False"}),
-        ("x = 'word'", {'x = ""'}),
-        ("x = ''", {'x = "XX"'}),
-        ("x.y = a", {"pass"}),
-        ("x = a.sum(keepdims=True)", {"x = a.sum(keepdims=False)"}),
-        ("x = a[b:c]", {"x = a[:c]", "x = a[b:]"}),
-        ("x = range(a)", {"x = range((a) - 1)"}),
-        ("x = range(a, b)", {"x = range(a, (b) - 1)"}),
-        ("x = a if b else c", {"x = a if not b else c"}),
-        ("if a:\n  x = b", {"if not a:\n  x = b", "pass"}),
-        ("while a:\n  break", {"while not a:\n  break", "while a:\n  continue"}),
-        ("while a:\n  continue", {"while not a:\n  continue", "while a:\n  break"}),
-        (
-            "def f(x=None):\n  return x",
-            {"def f(x=0):\n  return x", "def f(x=None):\n  return None"},
-        ),
-        ("def f(x):\n  x = a", {"def f(x):\n  pass"}),
-        ("raise a", {"pass"}),
-        ("a()", {"pass"}),
+        ("x = a < b", {"x = (a <= b)"}),
+        ("x = a and not b", {"x = (a or not b)", "x = a and (b)"}),
+        ("x = (a) + True", {"x = (a - True)", "x = (a) + False"}),
+        ("x += 0.5", {"x -= 0.5", "x += 1.5"}),
+        ("x.y = range(a)", {"pass", "x.y = range((a) - 1)"}),
+        ("while a:\n  break", {"while (not a):\n  break", "while a:\n  continue"}),
+        ("def f(x=0):\n  raise a", {"def f(x=1):\n  raise a", "def f(x=0):\n  pass"}),
+        ("x = ('ü', a < b)  # ü", {"x = ('', a < b)  # ü", "x = ('ü', (a <= b))  # ü"}),
         # What cannot matter:
-        ("x: 'Word'", set()),
-        ("def f(x: 'Word') -> 'Word':\n  'docstring'", set()),
-        ("def __repr__(self):\n  return 'word'", set()),
-        ("__all__ = ['word']", set()),
-        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n  import x", set()),
-        ("assert a < b", set()),
-        ("x = f'word {a}'", set()),
-        ("logger.info('word')", set()),
+        ("def f(x: 'Word'):\n  'docstring'\ndef __repr__(self):\n  return 'word'", set()),
+        ("assert a < b\nx = f'word {a}', cast('Word', a)\nlogger.info('word')", set()),
         ("if verbose > 0:\n  print('word')", set()),
-        ("add(a, help='word')", {"pass"}),
-        ("x = cast('Word', a)", set()),
     ],
 )
-def test_errors_that_can_be_made(source, errors, drawing):
-    found = drawing.mutants_of("m.py", source.encode())
-    assert {m.applied_to(source.encode()).decode() for m in found} == errors
-    assert len(found) == len(errors)
+def test_errors_that_can_be_made(source, errors, monkeypatch):
+    monkeypatch.syspath_prepend(TOOL)
+    from drawing import mutants_of
 
-
-def test_positions_behind_letters_of_two_bytes(drawing):
-    source = "x = ('ü', a < b)  # ü\ny = 1\n".encode()
-    changed = {m.applied_to(source).decode() for m in drawing.mutants_of("m.py", source)}
-    assert "x = ('ü', a <= b)  # ü\ny = 1\n" in changed
-    assert "x = ('ü', a < b)  # ü\ny = 2\n" in changed
-
-
-def test_imports_lead_through_names_that_a_package_loads_on_first_use(drawing):
-    from imports import Imports
-
-    imports = Imports(Path(__file__).parents[1], ["machine_code", "mdp", "verdicts", "tests"])
-    distances = imports.distances("mdp/evaluation.py")
-    assert distances["mdp/evaluation.py"] == 0
-    assert distances["tests/mdp/test_evaluation.py"] == 1
-    assert "verdicts/resampling.py" not in distances
-    beneath = imports.beneath_machine_code()
-    assert {"machine_code/compiling.py", "mdp/planning.py"} <= beneath
-    assert "verdicts/resampling.py" not in beneath
+    assert {m.applied_to(source) for m in mutants_of("m.py", source)} == errors

@@ -1,98 +1,242 @@
-"""Make deliberate errors in a package, one at a time, and see whether the tests notice.
+"""Make deliberate errors in a package, one at a time, and see whether its tests notice.
 
     make mutants PACKAGE=mdp N=25
 
-Why not mutmut or cosmic-ray: mutmut 3 puts a dispatcher in place of each function, which Numba
-cannot compile, and passes decorated functions by; cosmic-ray changes the working tree in place, and
-neither knows that Numba's cache brings back the machine code from before the error.
+The tests that enter the function are tried first, cheap ones before others, for a limited time:
+what survives may be caught by a test that there was no time for. mutmut and cosmic-ray do not know
+that Numba's cache brings back the machine code from before the error.
 """
 
 from __future__ import annotations
 
 import argparse
-import queue
+import ast
+import contextlib
+import faulthandler
+import hashlib
+import importlib.util
+import json
+import os
+import resource
+import shutil
+import signal
 import sys
-import tempfile
-import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
+import types
+from collections import defaultdict
+from itertools import accumulate
 from pathlib import Path
 
-from drawing import Mutant, draw
-from imports import Imports
-from running import ABOVE, Checkout, test_files
+import pytest
+from drawing import Mutant, drawn
 
-ROOT = Path(__file__).resolve().parents[2]
-# A hang is recognised by this: so many times the tests' usual time, plus what a cold start takes.
-PATIENCE, COLD_START = 4, 120
-
-
-def main() -> int:
-    """Draw, and unless that is all that is wanted, judge each error and count."""
-    arguments = _parse()
-    root = arguments.root.resolve()
-    drawn = draw(root, arguments.package, arguments.n, arguments.seed)
-    if not drawn:
-        print(f"no errors can be made in {root / arguments.package}", file=sys.stderr)
-        return 2
-    if arguments.list:
-        for mutant in drawn:
-            print(mutant.describe((root / mutant.path).read_bytes()))
-        return 0
-    above = () if arguments.own else ABOVE.get(arguments.package, ())
-    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
-        copies = [Checkout(root, Path(folder) / f"copy-{i}") for i in range(arguments.jobs)]
-        start = time.monotonic()
-        broken = copies[0].first_failure(test_files(root, (arguments.package,)), limit=3600)
-        if broken:
-            print(f"without any error, {broken} fails already", file=sys.stderr)
-            return 2
-        limit = PATIENCE * (time.monotonic() - start) + COLD_START
-        caught = _judge_all(drawn, copies, above, limit)
-    print(f"caught {caught} of {len(drawn)} ({100 * caught / len(drawn):.0f} %)")
-    return 0
+NOT_COPIED = shutil.ignore_patterns(".*", "logs", "runs", "build", "__pycache__")
+LIBRARIES = "torch._dynamo scipy.stats pandas matplotlib.pyplot gymnasium stable_baselines3 numba"
+OPTIONS = ["-q", "-n", "0", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
+# Seconds of processor time after which no further test begins, and more where all is compiled anew.
+# The first round has tests of FIRST seconds. So much after the budget the test that runs hangs.
+BUDGET, COMPILING, FIRST, HANG = 10, 15, 3, 40
 
 
-def _judge_all(
-    drawn: list[Mutant], copies: list[Checkout], above: tuple[str, ...], limit: float
-) -> int:
-    """Print each error with what became of it; how many were caught."""
-    folders = [path.name for path in copies[0].path.iterdir() if path.is_dir()]
-    imports = Imports(copies[0].path, [name for name in folders if name[0] != "."])
-    free: queue.Queue[Checkout] = queue.Queue()
-    for copy in copies:
-        free.put(copy)
+class Observer:
+    """A pytest plugin: a line for each test with its name, result, cost and functions entered."""
 
-    def judge(mutant: Mutant) -> str | None:
-        copy = free.get()
+    def __init__(self, root: Path, report: Path, budget: float) -> None:
+        self.root, self.report, self.limit = f"{root}/", report, processor_time() + budget
+        self.failed: set[str] = set()
+        self.entered: dict[int, types.CodeType] = {}
+
+    def enter(self, frame: types.FrameType, event: str, _: object) -> None:
+        """For `sys.settrace`: no lines are traced."""
+        self.entered[id(frame.f_code)] = frame.f_code
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.failed |= set() if report.passed else {report.nodeid}
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item):
+        self.entered.clear()
+        before = processor_time()
+        result = yield
+        codes = [code for code in [*self.entered.values()] if code.co_name != "<module>"]
+        places = [f"{code.co_filename}:{code.co_firstlineno}" for code in codes]
+        own = [p.removeprefix(self.root) for p in places if p.startswith(self.root)]
+        passed, cost = item.nodeid not in self.failed, processor_time() - before
+        with self.report.open("a") as file:
+            file.write(json.dumps([item.nodeid, passed, cost, own]) + "\n")
+        if processor_time() > self.limit:
+            os._exit(0)
+        return result
+
+
+def processor_time() -> float:
+    return sum(os.times()[:4])
+
+
+class Copy:
+    """A copy of a checkout, and which functions each test of one package enters in it."""
+
+    def __init__(self, root: Path, package: str) -> None:
+        self.place = root / "build" / "mutants"
+        self.path, self.report = self.place / "copy", self.place / "report"
+        shutil.rmtree(self.path, ignore_errors=True)
+        shutil.copytree(root, self.path, ignore=NOT_COPIED)
+        folders = [file.parent for file in sorted(self.path.glob("*/__init__.py"))]
+        folders.append(self.path / "tests" / package)
+        text = b"\0".join(p.read_bytes() for f in folders for p in sorted(f.rglob("*.py")))
+        results = self.place / f"{package}.{hashlib.sha256(text).hexdigest()[:16]}"
+        if not results.exists():
+            for old in self.place.glob(f"{package}.*"):
+                old.unlink()
+            self.run([f"tests/{package}"], trace=True)
+            self.report.rename(results)
+        found = [json.loads(line) for line in results.read_text().splitlines()]
+        self.broken = [test for test, passed, *_ in found if not passed]
+        self.costs = {test: cost for test, passed, cost, _ in found if passed}
+        assert self.costs, f"without any error no test passes: {self.place / 'log'}"
+        self.entering: dict[str, set[str]] = defaultdict(set)
+        for test, _, _, functions in found:
+            for function in functions:
+                self.entering[function].add(test)
+
+    def run(self, tests: list[str], fresh: bool = False, trace: bool = False) -> str | None:
+        """Run tests in a child: the first that fails, or how it ended; None if all is well."""
+        budget = 10_000 if trace else BUDGET + COMPILING * fresh
+        self.report.write_text("")
+        child = os.fork()
+        if not child:
+            try:
+                os._exit(self._child(tests, budget, fresh, trace))
+            finally:
+                os._exit(99)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)  # the whole group: tests start processes
+        found = [json.loads(line) for line in self.report.read_text().splitlines()]
+        failed = [test for test, passed, *_ in found if not passed]
+        if code == 0 or failed:
+            return failed[0] if code else None
+        return "a time-out" if code < 2 else f"pytest's code {code}"
+
+    def _child(self, tests: list[str], budget: float, fresh: bool, trace: bool) -> int:
+        os.setsid()
+        os.chdir(self.path)
+        resource.setrlimit(resource.RLIMIT_CPU, (int(budget + HANG), int(budget + HANG) + 5))
+        faulthandler.dump_traceback_later(8 * (budget + HANG), exit=True)
+        log = os.open(self.place / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(log, 1)
+        os.dup2(log, 2)
+        # What multiprocessing starts is not to run this program again.
+        sys.modules["__main__"], sys.argv = types.ModuleType("__main__"), ["pytest"]
+        sys.path[0] = str(self.path)
+        code = self.place / ("kept" if trace else "code")
+        os.environ |= {"PYTHONPATH": str(self.path), "NUMBA_CACHE_DIR": str(code)}
+        observer = Observer(self.path, self.report, budget)
+        options = [*OPTIONS, f"--basetemp={self.place / 'tmp'}", f"--maxfail={int(not trace)}"]
+        if trace:
+            sys.settrace(observer.enter)
+        else:
+            shutil.rmtree(code, ignore_errors=True)
+            with contextlib.suppress(Exception):
+                self._keep_machine_code(code, fresh)
+        status = pytest.main([*options, *tests], plugins=[observer])
+        sys.stdout.flush()
+        return int(status)
+
+    def _keep_machine_code(self, code: Path, fresh: bool) -> None:
+        """Give what was compiled before the error the error's digest, if it is not about that."""
+        import agents  # noqa: F401  # tells which packages keep machine code
+        from machine_code import cache, sources
+
+        for package in sources.kept_packages():
+            digests = (self.place / "kept" / "yardstick" / package).iterdir()
+            before, digest = max(digests, key=lambda p: p.stat().st_mtime), cache.digest(package)
+            if digest == before.name or not fresh:
+                new = code / "yardstick" / package / digest
+                shutil.copytree(before, new, copy_function=os.link)
+
+    def judge(self, mutant: Mutant, first: str | None) -> str:
+        """The test that catches an error, or another fate; a test that did so before goes first."""
+        file = self.path / mutant.path
+        source = file.read_text() if file.exists() else ""
+        if mutant.place(source) is None:
+            return "source changed"
+        tests, fresh = self._likely(mutant, source)
+        tests.sort(key=lambda test: test != first)
+        totals = [*accumulate(self.costs[test] for test in tests)]
+        few, many = (1 + sum(total < limit for total in totals) for limit in (FIRST, BUDGET))
+        # Byte code may be as old as its source, to the second: none is kept of this file.
+        byte_code = Path(importlib.util.cache_from_source(str(file)))
         try:
-            return copy.judge(mutant, imports, above, limit)
+            file.write_text(mutant.applied_to(source))
+            byte_code.unlink(missing_ok=True)
+            for chosen in filter(None, (tests[:few], tests[few:many])):
+                files = list(dict.fromkeys(test.split("::")[0] for test in chosen))
+                chosen.sort(key=lambda test, files=files: files.index(test.split("::")[0]))
+                failure = self.run(chosen, fresh)
+                if failure == "pytest's code 4":  # the names of tests may have changed
+                    failure = self.run(files, fresh)
+                if failure:
+                    return failure
         finally:
-            free.put(copy)
+            file.write_text(source)
+            byte_code.unlink(missing_ok=True)
+        return "survived"
 
-    sources = copies[0].path
-    described = {m: m.describe((sources / m.path).read_bytes()) for m in drawn}
-    caught = 0
-    with ThreadPoolExecutor(len(copies)) as pool:
-        futures = {pool.submit(judge, mutant): mutant for mutant in drawn}
-        for future in as_completed(futures):
-            mutant, failure = futures[future], future.result()
-            caught += failure is not None
-            print(described[mutant])
-            print(f"    caught by {failure}" if failure else "    SURVIVED", flush=True)
-    return caught
+    def _likely(self, mutant: Mutant, source: str) -> tuple[list[str], bool]:
+        """The tests in the order of trying them; and whether the error may be in machine code.
+
+        Compiled functions leave no trace. Nor does a fixture of several tests but in the first: so
+        after the tests that enter the function come the others of their files.
+        """
+        line, stem = source.count("\n", 0, mutant.place(source)) + 1, Path(mutant.path).stem
+        functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+        around = [node for node in functions if node.lineno <= line <= node.end_lineno]
+        parts = [part.lineno for node in around[-1:] for part in (node, *node.decorator_list)]
+        covering = self.entering[f"{mutant.path}:{min(parts, default=0)}"]
+        places = [place for place in self.entering if place.startswith(f"{mutant.path}:")]
+        entering = covering or set().union(*map(self.entering.get, places))
+        files = {test.split("::")[0] for test in entering}
+
+        def rank(test: str) -> tuple[bool, bool, bool, float]:
+            file = test.partition("::")[0]
+            return test not in covering, file not in files, stem not in file, self.costs[test]
+
+        return sorted(self.costs, key=rank), not covering
 
 
-def _parse() -> argparse.Namespace:
+def main() -> None:
+    """Draw errors, or take those drawn before; judge each, and count."""
+    root = Path(__file__).resolve().parents[2]
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("package", help="a package of the project, such as mdp")
-    parser.add_argument("-n", type=int, default=25, help="how many errors (25)")
+    parser.add_argument("packages", nargs="+", help="packages of the project, such as mdp")
+    parser.add_argument("-n", type=int, default=25, help="how many errors in each (25)")
     parser.add_argument("--seed", type=int, default=0, help="which errors (0)")
-    parser.add_argument("--jobs", type=int, default=2, help="how many at a time (2)")
-    parser.add_argument("--own", action="store_true", help="run the tests of the package alone")
-    parser.add_argument("--list", action="store_true", help="draw them, and run nothing")
-    parser.add_argument("--root", type=Path, default=ROOT, help="another checkout than this one")
-    return parser.parse_args()
+    parser.add_argument("--record", type=Path, help="write the errors and their fates to a file")
+    parser.add_argument("--replay", type=Path, help="make the errors of such a file again")
+    parser.add_argument("--root", type=Path, default=root, help="another checkout than this one")
+    args = parser.parse_args()
+    root, entries = args.root.resolve(), []
+    replayed = json.loads(args.replay.read_text()) if args.replay else []
+    os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
+    for name in LIBRARIES.split() if (root / "constraints.txt").exists() else ():
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    for package in args.packages:
+        copy = Copy(root, package)
+        for test in copy.broken:
+            print(f"left out, as it fails without any error: {test}", file=sys.stderr)
+        known = {Mutant(*m): fate for *m, fate in replayed if m[0].startswith(f"{package}/")}
+        mutants = known if args.replay else drawn(root, package, args.n, args.seed)
+        for mutant in mutants:
+            fate = copy.judge(mutant, known.get(mutant))
+            entries.append([*mutant, fate])
+            was, now = (" ".join(text.split())[:90] for text in (mutant.old, mutant.new))
+            print(f"{mutant.path}:{mutant.line}: {was}  ->  {now}\n    {fate}", flush=True)
+            if args.record:
+                args.record.write_text(json.dumps(entries, indent=1) + "\n")
+    fates = [fate for *_, fate in entries if fate != "source changed"]
+    print(f"caught {len(fates) - fates.count('survived')} of {len(fates)}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
