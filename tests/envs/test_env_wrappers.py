@@ -81,13 +81,6 @@ def test_the_last_dimension_counts_fastest_and_only_the_chosen_ones_count():
     assert env.reset()[0] == 1 * 4 + 3
 
 
-def test_cart_pole_in_fifty_bins():
-    env = cart_pole()
-    assert env.observation_space == spaces.Discrete(2500)
-    assert env.observation(np.array([0, 0, 0.001, 0.001], np.float32)) == 25 * 50 + 25
-    assert env.observation(np.array([9, 9, -0.001, 0.001], np.float32)) == 24 * 50 + 25
-
-
 ROW = st.lists(st.floats(-60, 60, width=32), min_size=4, max_size=4)
 
 
@@ -116,12 +109,6 @@ def test_flattening_worked_by_hand(space, shown, n, index):
     observed = [env.reset()[0], env.step(0)[0]]
     assert (observed, type(observed[0])) == ([index, index], int)
     assert env.map_observations([shown, shown]).tolist() == [index, index]
-
-
-def test_every_value_gets_a_number_of_its_own():
-    env = FlattenToDiscrete(Showing(spaces.MultiDiscrete([2, 3, 4], start=[1, 0, -3])))
-    grid = np.stack(np.meshgrid([1, 2], [0, 1, 2], [-3, -2, -1, 0], indexing="ij"), axis=-1)
-    assert env.map_observations(grid.reshape(-1, 3)).tolist() == list(range(24))
 
 
 def test_one_hot_worked_by_hand():

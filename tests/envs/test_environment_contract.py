@@ -174,18 +174,6 @@ def test_p_is_the_model_as_dictionaries(env_id, kwargs):
     assert [type(value) for value in env.P[0][0][0]] == [float, int, float, bool]
 
 
-@named(GRID_WORLDS)
-def test_starts_are_drawn_by_the_stated_probabilities(env_id, kwargs):
-    env = gym.make(env_id, **kwargs).unwrapped
-    possible = np.flatnonzero(env.initial_state_distrib)
-    assert np.cumsum(env.initial_state_distrib)[-1] == 1
-    np.testing.assert_allclose(env.initial_state_distrib[possible], 1 / len(possible), rtol=1e-12)
-    assert (len(possible) > 1) == bool(kwargs.get("random_start"))
-    env.reset(seed=0)
-    drawn = {env.reset()[1]["position"] for _ in range(30 * len(possible))}
-    assert drawn == {divmod(cell, env.map.n_columns) for cell in possible.tolist()}
-
-
 class Fixed:
     """A generator whose next uniform number is known."""
 

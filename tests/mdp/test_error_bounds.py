@@ -81,7 +81,7 @@ def true_error(values, exact):
 
 SCALES = (1e-3, 1.0, 1e9)
 DISCOUNTS = (0.5, 0.9, 0.99)
-N_MODELS = 20
+N_MODELS = 10
 
 
 @pytest.mark.parametrize("scale", SCALES)

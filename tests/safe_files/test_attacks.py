@@ -75,8 +75,6 @@ ATTACKS = {
     "a call of the system": START + name("os", "system") + text("true") + b"\x85R.",
     "the same in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
     "getattr": START + name("builtins", "getattr") + b".",
-    "a partial": START + name("functools", "partial") + name("os", "system") + b"\x85R.",
-    "a tensor's loader": START + name("torch.storage", "_load_from_bytes") + b"C\x01x\x85R.",
     "a way through attributes": START + name(UTILS, "FloatSchedule.__init__.__globals__") + b".",
     "the state of a class, by slots": START
     + CONSTANT
@@ -96,7 +94,6 @@ ATTACKS = {
     + name("numpy", "ndarray")
     + b"J\xff\xff\xff\x7f\x85C\x01b\x87R.",
     "an array of objects": pickle.dumps(np.array([print], dtype=object)),
-    "an array of texts": pickle.dumps(np.array(["a"])),
     "a key whose hash takes for ever": START + LAYERS + b"}" + TOP + b"K\x01s.",
     "a value that is huge once it is written out": START + LAYERS + TOP + b".",
     "a whole number of thousands of digits": pickle.dumps(10**5000),
@@ -111,8 +108,8 @@ ATTACKS = {
     + DEQUE
     + SHORT_TOP
     + b"\x85R)R.",
-    "calls of calls, deep": START + DEQUE + b")R" * 20_000 + b".",
-    "tuples in tuples": START + b"N" + b"\x85" * 20_000 + b".",
+    "calls of calls, deep": START + DEQUE + b")R" * 2_000 + b".",
+    "tuples in tuples": START + b"N" + b"\x85" * 2_000 + b".",
     "two states": START + CONSTANT + b")\x81}b}b.",
     "the state of a list": START + b"]}b.",
     "the state of a name": START + name("builtins", "int") + b"}b.",
@@ -123,18 +120,10 @@ ATTACKS = {
     + b"h\x00sb.",
     # Places of the stack and of the memo.
     "an end before the beginning": START + b"0000.",
-    "marks without an end": START + b"(((N.",
-    "an end of no mark": START + b"N1.",
-    "items of no mark": START + b"]e.",
-    "a key without a value": START + b"}(K\x01u.",
     "an item of a name": START + name("os", "environ") + b"Na.",
-    "an item of bytes": START + b"\x96" + struct.pack("<Q", 2) + b"abK\x01a.",
-    "a place of bytes": START + b"\x96" + struct.pack("<Q", 2) + b"abK\x00K\x01s.",
     "a member of an object": START + DEQUE + b")R(K\x01\x90.",
     "a place of the memo that is empty": START + b"h\x07.",
     "a list of itself": START + b"]\x94h\x00a.",
-    "a tuple in its list": START + b"]\x94h\x00\x85a.",
-    "a dictionary under itself": START + b"}\x94" + text("a") + b"h\x00s.",
     "an object among its own items": START + DEQUE + b")R\x94h\x00a.",
     "an object in its own argument": START + b"]\x94" + DEQUE + b"h\x00\x85R\x94a.",
     # Keys and members whose hash is not theirs alone, or takes for ever.
@@ -150,19 +139,11 @@ ATTACKS = {
     + b"Ns.",
     # Instructions of no model, and of older protocols.
     "an instance": b"(S'true'\nios\nsystem\n.",
-    "an object": START + b"(" + name("os", "system") + text("true") + b"o.",
     "a persistent id": START + b"Px\n.",
-    "a persistent id on the stack": START + b"NQ.",
     "an extension code": START + b"\x82\x01.",
-    "an extension code of four bytes": START + b"\x84\x01\0\0\0.",
     "arguments by keyword": START + CONSTANT + b")}\x92.",
     "a buffer from elsewhere": b"\x80\x05\x97.",
-    "a double": START + b"N2\x86.",
-    "a list of protocol 0": b"(I1\nl.",
-    "a dictionary of protocol 0": b"(I1\nI2\nd.",
     "a whole number of protocol 0": b"I" + b"9" * 10**6 + b"\n.",
-    "a long number of protocol 0": b"L" + b"9" * 10**6 + b"L\n.",
-    "a huge place of protocol 0": b"Np99999999999999\n.",
     # The last byte makes it as long as it says.
     "a long number of a megabyte": START + b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f.",
     "a long number of -1 bytes": START + b"\x8b\xff\xff\xff\xff.",
@@ -171,7 +152,6 @@ ATTACKS = {
     "a frame in a frame": START + b"\x95" + struct.pack("<Q", 20) + b"\x95" + bytes(20) + b"N.",
     "nothing": b"",
     "no end": START + b"N",
-    "only an end": START + b".",
     # Sizes that are no numbers, or too large.
     "an array of no number": START + array(bytes(8), NAN + b"\x85") + b".",
     "an array of -1 numbers": START + array(bytes(8), b"J\xff\xff\xff\xff\x85") + b".",
@@ -181,8 +161,6 @@ ATTACKS = {
     + b".",
     "a space of no number of values": START + space("multi_binary.MultiBinary", n=NAN) + b".",
     "a deque of a length below 0": START + DEQUE + b")J\xfb\xff\xff\xff\x86R.",
-    "an attribute of a module": START + name("numpy", "core.os.system") + b".",
-    "a name that is a number": START + text("a") + b"K\x01\x93.",
 }
 
 
@@ -291,51 +269,59 @@ def test_what_the_reader_decides_is_not_even_read(genuine, tmp_path, key):
     assert not mark.exists()
 
 
-def test_an_environment_id_in_the_settings_imports_nothing(genuine, tmp_path):
-    changed = with_settings(genuine, env="this:Zen-v0", tensorboard_log=str(tmp_path / "log"))
-    model = load(changed)
-    assert model.env is None
-    assert model.tensorboard_log is None
-
-
-@pytest.mark.parametrize("key", ["predict", "learn", "policy_aliases", "__class__", "not a name"])
-def test_attributes_that_would_hide_a_method_are_refused(genuine, key):
-    with pytest.raises(UnsafeFileError, match="no attribute of a model"):
-        load(with_settings(genuine, **{key: 1}))
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("policy_kwargs", {"net_arch": [10**6, 10**6]}),
-        ("policy_kwargs", {"net_arch": {"pi": [10**9], "vf": [4]}}),
-        ("n_steps", 10**15),
-        ("n_steps", -1),
-        ("n_steps", "many"),
-        ("n_envs", 10**9),
-        ("n_steps", float("nan")),
-        ("n_envs", float("nan")),
-        ("policy_kwargs", {"net_arch": [float("nan")]}),
-        ("policy_kwargs", {"net_arch": [-5]}),
-    ],
-)
-def test_settings_out_of_proportion_are_refused(genuine, key, value):
-    with pytest.raises(UnsafeFileError) as refusal:
-        load(with_settings(genuine, **{key: value}))
-    assert refusal.value.key in ({None} if key == "policy_kwargs" else {key, "n_steps"})
-
-
 def tensors(content, **options):
     file = io.BytesIO()
     th.save(content, file, **options)
     return file.getvalue()
 
 
-def test_weights_that_are_not_finite_are_refused(genuine):
-    weights = th.load(io.BytesIO(genuine["policy.pth"]), weights_only=True)
-    weights["action_net.bias"][0] = th.nan
-    with pytest.raises(UnsafeFileError, match=r"policy\.pth: action_net\.bias"):
-        load({**genuine, "policy.pth": tensors(weights)})
+NOT_A_NUMBER = float("nan")
+NO_ATTRIBUTE, NO_MEMBER = "no attribute of a model", "which no model file has"
+# What is changed in the settings, or put in place of a member; and what the refusal says.
+CHANGES = {
+    "a method": ({"predict": 1}, NO_ATTRIBUTE),
+    "a class": ({"__class__": 1}, NO_ATTRIBUTE),
+    "a property": ({"policy_aliases": 1}, NO_ATTRIBUTE),
+    "no name": ({"not a name": 1}, NO_ATTRIBUTE),
+    "wide networks": ({"policy_kwargs": {"net_arch": [10**6, 10**6]}}, "memory"),
+    "a wide part": ({"policy_kwargs": {"net_arch": {"pi": [10**9], "vf": [4]}}}, "memory"),
+    "layers of no number": ({"policy_kwargs": {"net_arch": [NOT_A_NUMBER]}}, "holds no such model"),
+    "layers below zero": ({"policy_kwargs": {"net_arch": [-5]}}, "holds no such model"),
+    "many steps": ({"n_steps": 10**15}, "n_steps"),
+    "steps below zero": ({"n_steps": -1}, "n_steps"),
+    "steps in words": ({"n_steps": "many"}, "n_steps"),
+    "steps of no number": ({"n_steps": NOT_A_NUMBER}, "n_steps"),
+    "many environments": ({"n_envs": 10**9}, "n_steps|n_envs"),
+    "environments of no number": ({"n_envs": NOT_A_NUMBER}, "n_steps|n_envs"),
+    "a script": ({"extra.py": b""}, NO_MEMBER),
+    "a way out": ({"../escaped.pth": b""}, NO_MEMBER),
+    "a place of the system": ({"/etc/passwd": b""}, NO_MEMBER),
+    "tensors by the name of a method": ({"predict.pth": b""}, NO_MEMBER),
+    "variables by that of another": (
+        {"pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})},
+        r"policy\.predict",
+    ),
+    "no settings": ({"data": b""}, "settings that are no JSON"),
+    "settings that are a zip": ({"data": b"PK\x03\x04"}, "settings that are no JSON"),
+    "settings in settings": ({"data": b"[" * 100_000}, "settings that are no JSON"),
+    "settings of nothing": ({"data": b"{}"}, "does not say its policy's class"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_no_model_has_is_refused(genuine, change):
+    changes, message = CHANGES[change]
+    is_member = all(isinstance(value, bytes) for value in changes.values())
+    members = {**genuine, **changes} if is_member else with_settings(genuine, **changes)
+    with pytest.raises(UnsafeFileError, match=message) as refusal:
+        load(members)
+    named = {None, "n_steps", "policy_class", *changes}
+    assert refusal.value.key in named - {"policy_kwargs"}
+
+
+def test_an_environment_id_in_the_settings_imports_nothing(genuine, tmp_path):
+    model = load(with_settings(genuine, env="this:Zen-v0", tensorboard_log=str(tmp_path / "log")))
+    assert model.env is model.tensorboard_log is None
 
 
 def changed_tensor(content, change):
@@ -354,6 +340,7 @@ def trained():
 
 BIAS, ACTOR = "actor.mu.bias", "actor.optimizer.pth"
 WRONG_TENSORS = {
+    "a weight that is no number": ("policy.pth", lambda w: w[BIAS].fill_(th.nan)),
     "a weight of float64": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].double()})),
     "a weight of int8": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].to(th.int8)})),
     "a weight of half": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].half()})),
@@ -389,15 +376,12 @@ WRONG_TENSORS = {
 
 @pytest.mark.parametrize("wrong", WRONG_TENSORS)
 def test_tensors_that_such_a_model_does_not_have_are_refused(trained, wrong):
+    assert isinstance(load(trained, SAC), SAC)
     member, change = WRONG_TENSORS[wrong]
     changed = {**trained, member: changed_tensor(trained[member], change)}
     reason = member.replace(".", r"\.") + "|size mismatch|holds no such model"
     with pytest.raises(UnsafeFileError, match=reason):
         load(changed, SAC)
-
-
-def test_the_tensors_of_a_trained_model_are_loaded(trained):
-    assert isinstance(load(trained, SAC), SAC)
 
 
 def with_members(content, **members):
@@ -411,6 +395,7 @@ def with_members(content, **members):
 def not_tensors(mark):
     """Files that stand in the place of tensors, and what is said of each."""
     zeros, old = tensors({BIAS: th.zeros(1)}), {"_use_new_zipfile_serialization": False}
+    deflated = {"archive/data/0": bytes(10**6)}
     deep = b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b"."
     begin, may_not = "holds tensors that cannot be read: ", ", which may not stand in such a file"
     no_zip = f"{begin}is no whole zip"
@@ -424,6 +409,7 @@ def not_tensors(mark):
         "signs that a terminal obeys": (with_members(zeros, data=b"ca\x1b[2J\nb\n."), begin),
         "TorchScript": (with_members(zeros, constants=b""), "Missing key(s) in state_dict"),
         "a cut one": (zeros[:-30], no_zip),
+        "one that was deflated": (zip_of(deflated, zipfile.ZIP_DEFLATED), "compressed"),
         "one of no bytes": (b"", no_zip),
         "lists in lists": (with_members(zeros, data=deep), f"{begin}is nested more than 40 deep"),
         "a tensor of tensors": (
@@ -450,12 +436,6 @@ def test_what_is_no_tensor_is_told_in_one_line_of_ours(genuine, tmp_path, recwar
         assert not mark.exists()
 
 
-def test_tensors_that_were_deflated_are_refused(genuine):
-    inner = zip_of({"archive/data/0": bytes(10**6)}, zipfile.ZIP_DEFLATED)
-    with pytest.raises(UnsafeFileError, match="compressed"):
-        load({**genuine, "policy.pth": inner})
-
-
 def test_a_zip_that_unpacks_out_of_proportion_is_refused(genuine, tmp_path):
     path = tmp_path / "model.zip"
     path.write_bytes(zip_of(genuine))
@@ -469,12 +449,6 @@ def test_a_zip_that_unpacks_out_of_proportion_is_refused(genuine, tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:
         tracemalloc.stop()
-
-
-@pytest.mark.parametrize("member", ["extra.py", "../escaped.pth", "/etc/passwd", "predict.pth"])
-def test_members_that_no_model_has_are_refused(genuine, member):
-    with pytest.raises(UnsafeFileError, match="which no model file has"):
-        load({**genuine, member: b""})
 
 
 def test_what_zip64_says_leads_nowhere(genuine):
@@ -561,23 +535,11 @@ def test_what_stands_before_a_zip_and_how_many_members_it_says_is_not_read(genui
         assert isinstance(load_model(PPO, io.BytesIO(content)), PPO)
 
 
-def test_variables_of_other_names_than_the_algorithms_are_refused(genuine):
-    changed = {**genuine, "pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})}
-    with pytest.raises(UnsafeFileError, match=r"policy\.predict"):
-        load(changed)
-
-
 def test_what_is_no_regular_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "model.zip")
     for path in (tmp_path / "model.zip", Path("/dev/zero"), tmp_path):
         with pytest.raises(UnsafeFileError, match="no regular file"):
             load_model(PPO, path)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"[" * 100_000, b"{}"])
-def test_settings_that_are_none_are_refused(genuine, content):
-    with pytest.raises(UnsafeFileError):
-        load({**genuine, "data": content})
 
 
 # --- memory in proportion to the file ------------------------------------------------------------
@@ -627,8 +589,6 @@ BOMBS = {
     "keys of one hash": b"}(" + LONGS + b"u.",
     # What reading them takes just fits the budget.
     "lists that just fit": b"](" + b"](Ne" * 230_000 + b"e.",
-    "empty lists that just fit": b"](" + b"]" * 900_000 + b"e.",
-    "empty dictionaries that just fit": b"](" + b"}" * 900_000 + b"e.",
     "tuples that just fit": b"](" + b"N\x85" * 460_000 + b"e.",
     "nothing at many places": b"](" + b"N" * 1_900_000 + b"e.",
     "calls that just fit": DEQUE + b"\x940](" + b"h\x00)R" * 140_000 + b"e.",
@@ -771,20 +731,23 @@ NETWORKS = {
 
 def hostile_zips(genuine):
     """Each attack as a zip of a model."""
-    for bomb, pickle_of_it in BOMBS.items():
-        content = base64.b64encode(START + pickle_of_it).decode()
+    # All are read as statistics below, and these as the settings of a model too.
+    for bomb in ("one text in many arrays", "many lists", "a wide text"):
+        content = base64.b64encode(START + BOMBS[bomb]).decode()
         changed = with_settings(genuine, invented={":type:": "x", ":serialized:": content})
         yield bomb, zip_of(changed, zipfile.ZIP_DEFLATED)
     for bomb, held in JSON_BOMBS.items():
         data = genuine["data"].decode().rstrip()[:-1] + f', "invented": {held}}}'
         yield bomb, zip_of({**genuine, "data": data}, zipfile.ZIP_DEFLATED)
     for lie, tensor in VIEWS.items():
-        for member in ("policy.pth", "policy.optimizer.pth", "pytorch_variables.pth"):
-            yield f"{lie} in {member}", zip_of({**genuine, member: view(*tensor)})
-    far = {**genuine, "policy.pth": view(*VIEWS["no stride at all"])}
+        yield lie, zip_of({**genuine, "policy.pth": view(*tensor)})
+    far = view(*VIEWS["no stride at all"])
+    for member in ("policy.optimizer.pth", "pytorch_variables.pth"):
+        yield f"a lie in {member}", zip_of({**genuine, member: far})
     for wish, kwargs in NETWORKS.items():
         yield wish, zip_of(with_settings(genuine, policy_kwargs=kwargs))
-        yield f"{wish} and a lie", zip_of(with_settings(far, policy_kwargs=kwargs))
+    both = with_settings({**genuine, "policy.pth": far}, policy_kwargs=NETWORKS["wide layers"])
+    yield "wide layers and a lie", zip_of(both)
     yield "many members", zip_of({**genuine, **{f"x{i}": b"" for i in range(30_000)}})
     inflated = zip_of({**genuine, "tensors.pth": bytes(400 * MB)}, zipfile.ZIP_DEFLATED)
     yield "a member that inflates", inflated

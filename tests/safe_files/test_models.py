@@ -61,102 +61,72 @@ FEW = {"learning_starts": 10, "buffer_size": 200, "batch_size": 8}
 ROLLOUT = {"n_steps": 32, "batch_size": 16}
 NOISE = np.zeros(1), np.full(1, 0.1)
 
-# Algorithm, policy, environment, environments at once, what is around them, arguments.
+SCHEDULES = {
+    "learning_rate": LinearSchedule(1e-3, 0.0, 1.0),
+    "clip_range": LinearSchedule(0.2, 0.1, 0.5),
+    "clip_range_vf": 0.2,
+    "policy_kwargs": {
+        "net_arch": {"pi": [4], "vf": [4]},
+        "activation_fn": nn.ReLU,
+        "optimizer_class": optim.AdamW,
+        "optimizer_kwargs": {"weight_decay": 0.01},
+    },
+}
+STACKED = {"policy_kwargs": {"optimizer_class": RMSpropTFLike, "net_arch": [4]}}
+HINDSIGHT = {
+    "replay_buffer_class": sb3.HerReplayBuffer,
+    "replay_buffer_kwargs": {"n_sampled_goal": 2, "goal_selection_strategy": "future"},
+}
+SDE = {"use_sde": True}
+
+
+def case(algorithm, env_id, *kwargs, policy="MlpPolicy", n_envs=1, around=None):
+    """``around`` is what stands around the environments; ``kwargs`` are those of the algorithm."""
+    together = {name: value for part in kwargs for name, value in part.items()}
+    return algorithm, policy, env_id, n_envs, around, together
+
+
+SEVERAL = {"n_steps": 3, "train_freq": (1, "episode")}
+ORNSTEIN, NORMAL = OrnsteinUhlenbeckActionNoise(*NOISE), NormalActionNoise(*NOISE)
+CART, SWING = "CartPole-v1", "Pendulum-v1"
 CASES = {
-    "ppo": (sb3.PPO, "MlpPolicy", "CartPole-v1", 2, None, ROLLOUT),
-    "ppo with schedules, normalised": (
-        sb3.PPO,
-        "MlpPolicy",
-        "CartPole-v1",
-        1,
-        "normalize",
-        {
-            **ROLLOUT,
-            "learning_rate": LinearSchedule(1e-3, 0.0, 1.0),
-            "clip_range": LinearSchedule(0.2, 0.1, 0.5),
-            "clip_range_vf": 0.2,
-            "policy_kwargs": {
-                "net_arch": {"pi": [4], "vf": [4]},
-                "activation_fn": nn.ReLU,
-                "optimizer_class": optim.AdamW,
-                "optimizer_kwargs": {"weight_decay": 0.01},
-            },
-        },
-    ),
-    "ppo with sde": (sb3.PPO, "MlpPolicy", "Pendulum-v1", 1, None, {**ROLLOUT, "use_sde": True}),
-    "ppo on dictionaries": (sb3.PPO, "MultiInputPolicy", bits, 1, None, ROLLOUT),
-    "a2c on stacked frames": (
-        sb3.A2C,
-        "MlpPolicy",
-        "CartPole-v1",
-        1,
-        "stack",
-        {"policy_kwargs": {"optimizer_class": RMSpropTFLike, "net_arch": [4]}},
-    ),
-    "dqn": (sb3.DQN, "MlpPolicy", "CartPole-v1", 1, None, FEW),
-    "dqn of several steps": (
-        sb3.DQN,
-        "MlpPolicy",
-        "FrozenLake-v1",
-        1,
-        None,
-        {**FEW, "n_steps": 3, "train_freq": (1, "episode")},
-    ),
-    "dqn with hindsight": (
-        sb3.DQN,
-        "MultiInputPolicy",
-        bits,
-        1,
-        None,
-        {
-            **FEW,
-            "replay_buffer_class": sb3.HerReplayBuffer,
-            "replay_buffer_kwargs": {"n_sampled_goal": 2, "goal_selection_strategy": "future"},
-        },
-    ),
-    "sac with sde and noise": (
-        sb3.SAC,
-        "MlpPolicy",
-        "Pendulum-v1",
-        1,
-        None,
-        {**FEW, "use_sde": True, "action_noise": OrnsteinUhlenbeckActionNoise(*NOISE)},
-    ),
-    "td3 with noise": (
-        sb3.TD3,
-        "MlpPolicy",
-        "Pendulum-v1",
-        2,
-        None,
-        {**FEW, "action_noise": NormalActionNoise(*NOISE)},
-    ),
-    "ddpg": (sb3.DDPG, "MlpPolicy", "Pendulum-v1", 1, None, FEW),
-    "qrdqn": (contrib.QRDQN, "MlpPolicy", "CartPole-v1", 1, None, FEW),
-    "tqc": (contrib.TQC, "MlpPolicy", "Pendulum-v1", 1, None, FEW),
-    "crossq": (contrib.CrossQ, "MlpPolicy", "Pendulum-v1", 1, None, FEW),
-    "trpo": (contrib.TRPO, "MlpPolicy", "CartPole-v1", 1, None, ROLLOUT),
-    "ars": (contrib.ARS, "LinearPolicy", "Pendulum-v1", 1, None, {"n_delta": 1}),
-    "ppo_lstm": (contrib.RecurrentPPO, "MlpLstmPolicy", "CartPole-v1", 1, None, ROLLOUT),
-    "ppo_mask": (contrib.MaskablePPO, "MlpPolicy", Masked, 1, None, ROLLOUT),
+    "ppo": case(sb3.PPO, CART, ROLLOUT, n_envs=2),
+    "ppo with schedules, normalised": case(sb3.PPO, CART, ROLLOUT, SCHEDULES, around="normalize"),
+    "ppo with sde": case(sb3.PPO, SWING, ROLLOUT, SDE),
+    "ppo on dictionaries": case(sb3.PPO, bits, ROLLOUT, policy="MultiInputPolicy"),
+    "a2c on stacked frames": case(sb3.A2C, CART, STACKED, around="stack"),
+    "dqn": case(sb3.DQN, CART, FEW),
+    "dqn of several steps": case(sb3.DQN, "FrozenLake-v1", FEW, SEVERAL),
+    "dqn with hindsight": case(sb3.DQN, bits, FEW, HINDSIGHT, policy="MultiInputPolicy"),
+    "sac with sde and noise": case(sb3.SAC, SWING, FEW, SDE, {"action_noise": ORNSTEIN}),
+    "td3 with noise": case(sb3.TD3, SWING, FEW, {"action_noise": NORMAL}, n_envs=2),
+    "ddpg": case(sb3.DDPG, SWING, FEW),
+    "qrdqn": case(contrib.QRDQN, CART, FEW),
+    "tqc": case(contrib.TQC, SWING, FEW),
+    "crossq": case(contrib.CrossQ, SWING, FEW),
+    "trpo": case(contrib.TRPO, CART, ROLLOUT),
+    "ars": case(contrib.ARS, SWING, {"n_delta": 1}, policy="LinearPolicy"),
+    "ppo_lstm": case(contrib.RecurrentPPO, CART, ROLLOUT, policy="MlpLstmPolicy"),
+    "ppo_mask": case(contrib.MaskablePPO, Masked, ROLLOUT),
 }
 
 
-def make_env(case):
-    _, _, env_id, n_envs, around, _ = CASES[case]
+def make_env(name):
+    _, _, env_id, n_envs, around, _ = CASES[name]
     env = make_vec_env(env_id, n_envs)
     if around == "normalize":
         return VecNormalize(env)
     return VecFrameStack(env, 2) if around == "stack" else env
 
 
-def make_model(case):
-    algorithm, policy, *_, kwargs = CASES[case]
+def make_model(name):
+    algorithm, policy, *_, kwargs = CASES[name]
     # A copy: the library adds to it.
     policy_kwargs = dict(TINY) if policy == "MlpPolicy" else {}
     if algorithm is contrib.RecurrentPPO:
         policy_kwargs = {"lstm_hidden_size": 4, "net_arch": [4]}
     kwargs = {"policy_kwargs": policy_kwargs, **kwargs}
-    return algorithm(policy, make_env(case), device="cpu", **kwargs)
+    return algorithm(policy, make_env(name), device="cpu", **kwargs)
 
 
 def reseed():
@@ -169,16 +139,16 @@ def weights(model):
     return th.cat([part.flatten().double() for part in model.policy.state_dict().values()])
 
 
-def go_on(case, folder, load, load_buffer, load_statistics):
+def go_on(name, folder, load, load_buffer, load_statistics):
     """Load, seed and train; the model and what it had been at first."""
-    env = make_env(case)
-    if CASES[case][4] == "normalize":
+    env = make_env(name)
+    if CASES[name][4] == "normalize":
         env = load_statistics(str(folder / "statistics.pkl"), env.venv)
     env.seed(1)
-    model = load(CASES[case][0], folder / "model.zip", env)
+    model = load(CASES[name][0], folder / "model.zip", env)
     if (folder / "buffer.pkl").exists():
         load_buffer(model, folder / "buffer.pkl")
-    kinds = {name: type(value) for name, value in vars(model).items()}
+    kinds = {attribute: type(value) for attribute, value in vars(model).items()}
     before = weights(model)
     reseed()
     model.learn(60, reset_num_timesteps=False)
@@ -188,26 +158,26 @@ def go_on(case, folder, load, load_buffer, load_statistics):
 # What the library says when it loads such models, by its own function too.
 @pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored:UserWarning")
 @pytest.mark.filterwarnings("ignore:The last trajectory in the replay buffer:UserWarning")
-@pytest.mark.parametrize("case", CASES)
-def test_a_genuine_model_goes_on_as_the_library_would(case, tmp_path):
+@pytest.mark.parametrize("name", CASES)
+def test_a_genuine_model_goes_on_as_the_library_would(name, tmp_path):
     reseed()
-    model = make_model(case)
+    model = make_model(name)
     model.learn(60)
     model.save(tmp_path / "model")
-    if CASES[case][4] == "normalize":
+    if CASES[name][4] == "normalize":
         model.get_vec_normalize_env().save(str(tmp_path / "statistics.pkl"))
     if isinstance(model, sb3.common.off_policy_algorithm.OffPolicyAlgorithm):
         model.save_replay_buffer(tmp_path / "buffer.pkl")
 
     library, its_kinds, its_weights = go_on(
-        case,
+        name,
         tmp_path,
         lambda algorithm, path, env: algorithm.load(path, env),
         lambda model, path: model.load_replay_buffer(path),
         VecNormalize.load,
     )
     ours, our_kinds, our_weights = go_on(
-        case, tmp_path, load_model, load_replay_buffer, load_vec_normalize
+        name, tmp_path, load_model, load_replay_buffer, load_vec_normalize
     )
     assert our_kinds == its_kinds
     assert th.equal(our_weights, its_weights)
