@@ -32,9 +32,9 @@ from commands.cli import (
     whole_number,
 )
 from commands.terminal import LiveProgress, say, table_console
+from pipeline import loading_libraries
 from pipeline.errors import UserError, unknown
 from pipeline.failures import exits_as_mistakes
-from pipeline.library_loading import loading_libraries
 from pipeline.signs_of_life import doing, duration
 from pipeline.stopping import stops_noticed
 

@@ -25,9 +25,9 @@ from commands.cli import (
     go_on_unread,
     whole_number,
 )
+from pipeline import loading_libraries
 from pipeline.errors import UserError
 from pipeline.failures import exits_as_mistakes
-from pipeline.library_loading import loading_libraries
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import contextlib
 import os
 
 from experiments.child_processes import OUR_OWN, WARM_UPS, leave_signals_to_supervisor
-from pipeline.library_loading import loading_libraries
+from pipeline import loading_libraries
 
 
 def _warm_up() -> None:

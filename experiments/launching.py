@@ -31,10 +31,10 @@ from experiments.plan import PlannedRun
 from experiments.run_folders import draft_path, leave_drafts, remove_dead_drafts, run_name
 from experiments.run_limits import RunLimits
 from experiments.study import StudySpec, file_name
+from pipeline import loading_libraries
 from pipeline.digests import DamagedFileError
 from pipeline.errors import one_line
 from pipeline.files import write_text
-from pipeline.library_loading import loading_libraries
 from pipeline.locks import FolderGoneError, is_gone
 from pipeline.train_spec import FAMILIES, NETWORKS, TrainSpec, is_plain
 from safe_files.files import hold

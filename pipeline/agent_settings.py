@@ -47,7 +47,11 @@ def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dic
     said = settings.get("engine", word)
     if said != word:
         raise UserError(f"--engine {word} and -params engine:{said} disagree: give one of them")
-    engines = _engines_of(algo)
+    entry = ALGORITHMS[algo]
+    engines: Sequence[str] = entry.engines
+    if not engines and not entry.entry_point.startswith("agents."):  # it is the user's own
+        parameter = algorithm_parameters(load_algorithm(algo)).get("engine")
+        engines = () if parameter is None else get_args(parameter.annotation)
     if len(engines) > 1 and word in engines:
         return {**settings, "engine": word}
     if len(engines) < 2 and word in ("auto", *engines):
@@ -56,15 +60,6 @@ def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dic
         f"the engines {', '.join(engines)}" if len(engines) > 1 else "one engine, which auto means"
     )
     raise UserError(f"--engine {word}: {algo} has {has}")
-
-
-def _engines_of(algo: str) -> Sequence[str]:
-    """The engines of an agent; of one of the user's own, as its class has it."""
-    entry = ALGORITHMS[algo]
-    if entry.engines or entry.entry_point.startswith("agents."):
-        return entry.engines
-    parameter = algorithm_parameters(load_algorithm(algo)).get("engine")
-    return () if parameter is None else get_args(parameter.annotation)
 
 
 def check_fit(spec: TrainSpec) -> None:
@@ -191,10 +186,7 @@ _REWARD_RULES: Mapping[str, Callable[[NDArray[np.floating[Any]]], Found]] = {
 
 
 def _wrappers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
-    """The wrappers of training with numbers in place of ``auto``; empty without the word.
-
-    What lies inside of a wrapper counts: it changes the rewards that it is handed.
-    """
+    """The wrappers of training with numbers for ``auto``, inner ones first; empty without it."""
     wrappers = list(component_specs(raw.get("train_env_wrapper"), f"{where}: train_env_wrapper"))
     told = []
     for place, one in enumerate(wrappers):
@@ -222,11 +214,7 @@ def without_auto(entry: Mapping[str, Any]) -> dict[str, Any]:
 def training_follows(
     entry: Mapping[str, Any], typed: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, str] | None]:
-    """Let arguments of the environment that were typed hold in training too, also on a variant.
-
-    The entry, which has what was typed in it, is returned with what gave way, for
-    `TrainSpec.origins`; None for nothing.
-    """
+    """Let typed env_kwargs hold in training too: the entry, and what gave way, for `origins`."""
     variant, own = entry.get("train_env_kwargs"), typed.get("train_env_kwargs")
     asked = typed.get("env_kwargs")
     if not (isinstance(variant, dict) and isinstance(asked, dict)):
@@ -255,8 +243,7 @@ def resolved_spec(
     - ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1 by the largest reward of training,
       its sign aside; ``min_reward: auto`` a tenth of the highest reward, below zero.
 
-    In other settings the word is what it was, such as ``engine: auto``. ``where`` begins every
-    error message; ``fields`` are all others of `TrainSpec`.
+    ``where`` begins every error message; ``fields`` are all others of `TrainSpec`.
     """
     rest = without_auto(raw)
     spec = TrainSpec(hyperparams=split(rest, where), saved_hyperparams=rest, **fields)
@@ -265,7 +252,13 @@ def resolved_spec(
         known = {**rest, **{key: one.value for key, one in found.items()}}
         spec = replace(spec, hyperparams=split(known, where))
         check_fit(spec)
-        found |= _answers(raw, spec, where)
+        n_timesteps = spec.hyperparams.n_timesteps
+        with closing(make_single_env(spec)) as env:
+            for key, rule in _RULES.items():
+                match = _word(key, raw.get(key))
+                if match is not None:
+                    found[key] = rule(_Asked(env, match[1] or "", n_timesteps, f"{where}: {key}"))
+                    n_timesteps = found[key].value if key == "n_timesteps" else n_timesteps
     if not found:
         return replace(spec, origins=dict(origins) if origins else None)
     numbers = {**raw, **{key: one.value for key, one in found.items()}}
@@ -276,19 +269,6 @@ def resolved_spec(
         saved_hyperparams=numbers,
         origins={**(origins or {}), **told},
     )
-
-
-def _answers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
-    """What each ``auto`` of an entry stands for; ``spec`` is without them."""
-    found: dict[str, Found] = {}
-    n_timesteps = spec.hyperparams.n_timesteps
-    with closing(make_single_env(spec)) as env:
-        for key, rule in _RULES.items():
-            match = _word(key, raw.get(key))
-            if match is not None:
-                found[key] = rule(_Asked(env, match[1] or "", n_timesteps, f"{where}: {key}"))
-                n_timesteps = found[key].value if key == "n_timesteps" else n_timesteps
-    return found
 
 
 def _word(key: str, value: Any) -> re.Match[str] | None:

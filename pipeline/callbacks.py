@@ -34,7 +34,7 @@ from pipeline.finite_numbers import (
     check_rows,
     is_finite,
 )
-from pipeline.models.find import replay_buffer_path, statistics_path
+from pipeline.models.find import checkpoint_file
 from pipeline.models.load import save_model, save_normalization, save_replay_buffer
 from pipeline.runs import PULLS_FILE, Run
 from pipeline.settings import components
@@ -61,9 +61,9 @@ class Checkpoint(BlockCallback):
         path = self.save_path / f"rl_model_{self.num_timesteps}_steps.zip"
         with current().held():
             save_model(self.model, path)
-            save_normalization(self.model, statistics_path(path))
+            save_normalization(self.model, checkpoint_file(path, "vecnormalize"))
             if self.with_replay_buffer:
-                save_replay_buffer(self.model, replay_buffer_path(path))
+                save_replay_buffer(self.model, checkpoint_file(path, "replay_buffer"))
 
 
 class StepCheckpoint(Checkpoint):
@@ -86,12 +86,9 @@ class EpisodeCheckpoint(Checkpoint):
     """A checkpoint every ``every_n_episodes`` episodes, counted over all environments.
 
     Args:
-        every_n_episodes: episodes between two checkpoints.
+        every_n_episodes: episodes between two checkpoints, at least 1.
         save_path: folder to write to; in a hyperparameter file, the run's unless given.
         with_replay_buffer: write the agent's replay buffer each time too, where it has one.
-
-    Raises:
-        ValueError: if the number is below 1.
     """
 
     def __init__(
@@ -122,12 +119,9 @@ class ExponentialExploration(BaseCallback):
     """Let epsilon of DQN fall by a constant factor at each gradient update.
 
     Args:
-        initial_eps: epsilon before the first update.
+        initial_eps: epsilon before the first update, within [0, 1] as the others.
         final_eps: the value that it does not fall below.
         decay: the factor.
-
-    Raises:
-        ValueError: if a value lies outside [0, 1].
     """
 
     def __init__(
@@ -175,10 +169,7 @@ _NO_EPISODE: Mapping[str, float] = {"r": 0.0}
 
 
 class NumberWatch(BlockCallback):
-    """Looks at what each step brings: observations, rewards, actions, returns, and losses.
-
-    The compiled loop shows it the last step of each block; the rewards of a model are finite.
-    """
+    """Checks all numbers of each step, or of the last in each compiled block, and losses."""
 
     takes_blocks = True
 
@@ -208,20 +199,18 @@ class NumberWatch(BlockCallback):
             check_rows(new_obs, "observation", when)
             check_rows(actions, "action", when)
         dones = seen.get("dones")
-        if dones is not None and True in (ended := dones.tolist()):
-            self._check_ends(ended, seen["infos"])
-        return True
-
-    def _check_ends(self, dones: list[bool], infos: Any) -> None:
-        """Look at what was seen before resets, and at the returns that Monitor wrote down."""
-        for i, info in enumerate(infos):
-            if not dones[i]:
+        if dones is None or True not in (ended := dones.tolist()):
+            return True
+        # What was seen before resets, and the returns that Monitor wrote down.
+        for i, info in enumerate(seen["infos"]):
+            if not ended[i]:
                 continue
             last, total = info.get("terminal_observation"), info.get("episode", _NO_EPISODE)["r"]
             if not (is_finite(last) and isfinite(total)):
                 where = f"of an episode of environment {i} at step {self.num_timesteps:,}"
                 check_numbers(last, "last observation", where)
                 check_numbers(total, "return", where)
+        return True
 
 
 # --- the pulls of a training on a bandit ----------------------------------------------------------
@@ -336,15 +325,11 @@ class EvaluationCallback(EvalCallback):
         before = self.episodes_seen
         self.episodes_seen += int(np.sum(self.locals["dones"]))
         is_due = self.eval_freq > 0 and self.n_calls % self.eval_freq == 0
-        if self.eval_episode_freq > 0:
-            is_due |= (
-                self.episodes_seen // self.eval_episode_freq > before // self.eval_episode_freq
-            )
-        return self.evaluate_now() if is_due and self._can_afford() else True
-
-    def _can_afford(self) -> bool:
-        sampled = self.evaluator if isinstance(self.evaluator, SampledEvaluator) else None
-        return sampled is None or sampled.can_afford(self.model, self.episodes_seen)
+        if every := max(self.eval_episode_freq, 0):
+            is_due |= self.episodes_seen // every > before // every
+        if is_due and isinstance(self.evaluator, SampledEvaluator):
+            is_due = self.evaluator.can_afford(self.model, self.episodes_seen)
+        return self.evaluate_now() if is_due else True
 
     def _on_training_end(self) -> None:
         self.write()
@@ -377,7 +362,7 @@ class EvaluationCallback(EvalCallback):
             best = self.run.best_model_path
             with current().held():
                 save_model(self.model, best)
-                save_normalization(self.model, statistics_path(best))
+                save_normalization(self.model, checkpoint_file(best, "vecnormalize"))
         return self._on_event() if self.callback is not None else True
 
     def take_statistics(self) -> None:
@@ -427,11 +412,7 @@ class EvaluationCallback(EvalCallback):
 
 
 def _table(rows: list[list[Any]]) -> NDArray[Any]:
-    """Rows as one array; the shorter ones are repeated, which leaves mean and spread as they are.
-
-    A single figure, as of an exact evaluation, stands twice: the plot commands of rl_zoo3 take rows
-    of one for runs that are too short.
-    """
+    """Rows as one array, shorter ones repeated; rl_zoo3's plots want at least two columns."""
     width = max(math.lcm(*map(len, rows)), 2)
     return np.array([row * (width // len(row)) for row in rows])
 
@@ -449,23 +430,19 @@ def named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[Bas
     for callback in callbacks:
         if isinstance(callback, ExponentialExploration):
             callback.check_model(model)
-    by_episodes = spec.hyperparams.n_episodes is not None
-    if by_episodes and isinstance(model, OnPolicyAlgorithm) and _has_moving_schedule(model):
-        raise UserError(
-            f"the schedules of {spec.algo} run by steps: give n_timesteps instead of n_episodes, "
-            "or constant values"
-        )
+    if spec.hyperparams.n_episodes is not None and isinstance(model, OnPolicyAlgorithm):
+        schedules = [getattr(model, name, None) for name in ("lr_schedule", "clip_range")]
+        if any(callable(s) and s(1.0) != s(0.0) for s in schedules):
+            raise UserError(
+                f"the schedules of {spec.algo} run by steps: give n_timesteps instead of "
+                "n_episodes, or constant values"
+            )
     if spec.save_freq > 0:
         callbacks.append(StepCheckpoint(spec.save_freq, run.path, spec.save_replay_buffer))
     if spec.save_every_n_episodes > 0:
         every = spec.save_every_n_episodes
         callbacks.append(EpisodeCheckpoint(every, run.path, spec.save_replay_buffer))
     return callbacks
-
-
-def _has_moving_schedule(model: BaseAlgorithm) -> bool:
-    schedules = [getattr(model, name, None) for name in ("lr_schedule", "clip_range")]
-    return any(callable(s) and s(1.0) != s(0.0) for s in schedules)
 
 
 def evaluation_intervals(

@@ -33,10 +33,7 @@ def fix_layout(figure: Figure) -> None:
 
 
 def write_png(figure: Figure, path: Path) -> None:
-    """Draw a figure, whose layout is fixed, into a file.
-
-    `Figure.savefig` would draw everything twice, the first time for the layout.
-    """
+    """Write a figure with a fixed layout; `Figure.savefig` would draw everything twice."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas: Any = FigureCanvasAgg(figure)
@@ -124,14 +121,6 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
         axes.plot(steps[::stride], smooth[::stride], color=ORANGE, label=label)
 
 
-def _evaluations(run: Run) -> tuple[Floats, Floats]:
-    """Steps and mean returns of the evaluations, each of shape (n_evaluations,)."""
-    if not run.evaluations_path.exists():
-        return np.empty(0), np.empty(0)
-    with np.load(BytesIO(read_file(run.evaluations_path, NO_LIMIT))) as evaluations:
-        return evaluations["timesteps"], evaluations["results"].mean(axis=1)
-
-
 def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
     least = yardstick.at_least
     lines = [("optimum" if least is None else "optimum, at most", yardstick.optimum, "-")]
@@ -155,16 +144,6 @@ def _places(figure: Figure, *, apart: bool) -> tuple[Axes, Axes]:
     return upper, lower
 
 
-def _add_legend(figure: Figure) -> None:
-    """Below, where it covers no episode."""
-    from matplotlib.lines import Line2D
-
-    legend = figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
-    for handle in legend.legend_handles:
-        if isinstance(handle, Line2D) and handle.get_color() == GREY:
-            handle.set(markersize=6, alpha=1)  # a dot as small as those drawn is hard to see
-
-
 def draw_learning_curve(
     run: Run,
     title: str,
@@ -173,16 +152,16 @@ def draw_learning_curve(
     *,
     on_variant: bool = False,
 ) -> None:
-    """Draw training and evaluation returns by environment steps into the run folder.
-
-    ``first_step`` is the number of steps that the agent had behind it when the run began. Training
-    on a variant of the environment has a scale of its own.
-    """
+    """Draw training returns, from ``first_step`` on, and evaluations into the run folder."""
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
     steps, returns = read_monitors(run.path)
-    evaluated_at, means = _evaluations(run)
+    evaluated_at = means = np.empty(0)
+    if run.evaluations_path.exists():
+        with np.load(BytesIO(read_file(run.evaluations_path, NO_LIMIT))) as arrays:
+            evaluated_at, means = arrays["timesteps"], arrays["results"].mean(axis=1)
     has_judgement = len(means) > 0 or yardstick is not None
     apart = on_variant and len(steps) > 0 and has_judgement
     judged, trained = _places(figure, apart=apart)
@@ -200,7 +179,11 @@ def draw_learning_curve(
     for axes in dict.fromkeys((judged, trained)):
         _style(axes)
     if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
-        _add_legend(figure)
+        # Below, where it covers no episode.
+        legend = figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
+        for handle in legend.legend_handles:
+            if isinstance(handle, Line2D) and handle.get_color() == GREY:
+                handle.set(markersize=6, alpha=1)  # a dot as small as those drawn is hard to see
     fix_layout(figure)
     write_png(figure, run.curve_path)
 
@@ -214,10 +197,7 @@ def _style(axes: Axes) -> None:
 
 
 def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> None:
-    """Draw average reward, share of a best arm and cumulative regret by pull, as a PNG.
-
-    ``pulls`` are the arrays of `agents.bandits.runs.PullLog`, of shape (n_envs, pulls).
-    """
+    """Draw reward, share of a best arm and regret by pull; see `PullLog.arrays`."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import PercentFormatter
 

@@ -29,18 +29,8 @@ from safe_files.files import memory_bytes
 EVALUATION_TIME_LIMIT = 1000
 
 # What environments raise when they are made with wrong arguments.
-MISTAKES = (
-    TypeError,
-    ValueError,
-    LookupError,
-    AttributeError,
-    ArithmeticError,
-    AssertionError,
-    OSError,
-    ImportError,
-    MemoryError,
-    gym.error.Error,
-)
+_OF_ARGUMENTS = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
+MISTAKES = (*_OF_ARGUMENTS, AssertionError, OSError, ImportError, MemoryError, gym.error.Error)
 
 _BYTES_PER_ENVIRONMENT = 20_000  # CartPole with its Monitor takes more
 
@@ -60,11 +50,7 @@ def check_memory(what: str, n_bytes: int, where: str) -> None:
 
 
 def check_env_id(env_id: str) -> None:
-    """Make sure that the environment is registered.
-
-    A module before a colon is not imported here, whoever asks: `pipeline.user_modules` does that,
-    for what the user has typed.
-    """
+    """Make sure that the environment is registered; no module is imported for that."""
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:
         raise UserError(
@@ -76,10 +62,7 @@ def check_env_id(env_id: str) -> None:
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    """`gym.make`, with mistakes in the arguments put into one line.
-
-    Of ``module:Env-v0`` the name alone counts: Gymnasium would import the module.
-    """
+    """`gym.make` with mistakes in one line; the module of ``module:Env-v0`` is not imported."""
     try:
         return gym.make(env_id.rpartition(":")[2], **kwargs)
     except MISTAKES as error:
@@ -102,11 +85,7 @@ def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
 
 
 def trains_on_variant(spec: TrainSpec) -> bool:
-    """Whether the returns of training are of another environment than those of evaluation.
-
-    Wrappers make no difference: Monitor lies below them. A time limit that evaluation has for want
-    of any does not count either.
-    """
+    """Whether training's returns, below all wrappers, are of another environment."""
     special = spec.hyperparams
     changes = special.train_env_kwargs, special.eval_env_kwargs
     if not any(changes):
@@ -148,10 +127,7 @@ def usual_kwargs(env_id: str) -> dict[str, Any]:
 
 
 def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> Wrap | None:
-    """The wrappers that the hyperparameters name, as one function, or None for none.
-
-    Where the agent goes by action masks, the outermost tells them.
-    """
+    """The named wrappers as one function, or None; outermost, masks for agents that need them."""
     from pipeline.settings.components import wrapper_factory
 
     named = {"env_wrapper": spec.hyperparams.env_wrapper}
@@ -160,20 +136,20 @@ def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> 
     made = (wrapper_factory(w, spec.gym_packages, key, folder) for key, w in named.items())
     wraps = [wrap for wrap in made if wrap is not None]
     if spec.hyperparams.algorithm.get("mask_actions", False):
-        wraps.append(_with_masks)
+
+        def with_masks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+            try:
+                return ActionMasks(env)
+            except ValueError as error:
+                raise UserError(f"mask_actions: {one_line(error)}") from error
+
+        wraps.append(with_masks)
     elif spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks:
         # Where there are none, `pipeline.agent_settings` names the agents that would fit.
         wraps.append(lambda env: ActionMasks(env) if has_masks(env) else env)
     if not wraps:
         return None
     return lambda env: reduce(lambda wrapped, wrap: wrap(wrapped), wraps, env)
-
-
-def _with_masks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    try:
-        return ActionMasks(env)
-    except ValueError as error:
-        raise UserError(f"mask_actions: {one_line(error)}") from error
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gym.Env[Any, Any]:

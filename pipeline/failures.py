@@ -31,8 +31,7 @@ def exhaustion(error: BaseException) -> str | None:
     """Say in one line what the machine has run out of; None where that was not it."""
     text = one_line(error)
     if isinstance(error, MemoryError):
-        detail = "" if text == type(error).__name__ else f": {text}"
-        return f"this machine gives no more memory{detail}"
+        return "this machine gives no more memory" + (f": {error}" if str(error) else "")
     for sign, what in _SIGNS.items():
         if sign in text.lower():
             return f"this machine gives no more {what}: {text}"
@@ -61,16 +60,14 @@ def exits_as_mistakes() -> Iterator[None]:
     except OwnExit:
         raise
     except (SystemExit, KeyboardInterrupt) as error:
-        if isinstance(error, KeyboardInterrupt) and _may_be_of_a_signal(error):
+        # Where signals are noticed, or left to others, Ctrl-C raises no bare KeyboardInterrupt.
+        if isinstance(error, KeyboardInterrupt) and (
+            isinstance(error, Stopped)
+            or current().number is not None
+            or signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        ):
             raise
         raise ForeignExitError(error) from error
-
-
-def _may_be_of_a_signal(error: KeyboardInterrupt) -> bool:
-    if isinstance(error, Stopped) or current().number is not None:
-        return True
-    # Where signals are noticed, or left to somebody else, Ctrl-C raises no bare KeyboardInterrupt.
-    return signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 _LIBRARIES = frozenset({"torch", "stable_baselines3", "sb3_contrib", "mabwiser", "numpy", "scipy"})
@@ -82,10 +79,7 @@ class LibraryError(UserError):
 
 
 def blame_settings(algo: str, model: Any, error: Exception) -> None:
-    """Say that an agent's settings are at fault, where a library gave up over them.
-
-    What went through code of the user's may be a mistake in there, and keeps its traceback.
-    """
+    """Blame an agent's settings where a library gave up, unless through code of the user's."""
     frames = list(traceback.walk_tb(error.__traceback__))
     packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame, _ in frames]
     is_of_library = packages[-1] in _LIBRARIES and set(packages) <= _LIBRARIES | _AROUND_THEM

@@ -41,10 +41,7 @@ _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
 
 
 def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
-    """The name where every common file system takes it; else one like it, with a digest.
-
-    It has at most ``longest`` bytes.
-    """
+    """The name, or one like it that every file system takes, of ``longest`` bytes at most."""
     plain = _REFUSED_SIGNS.sub("_", name) or "_"
     is_device = _DEVICE.match(plain) is not None
     if plain == name and not is_device and len(name.encode(errors="surrogatepass")) <= longest:
@@ -57,18 +54,15 @@ def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def put_in_place(draft: Path, path: Path, folder: int | None = None) -> None:
-    """Rename a file or folder to ``path``; a file that is there is replaced in one step.
-
-    Both are names in the open ``folder``, where there is one.
-    """
-    for pause in _PAUSES if sys.platform == "win32" else ():
+    """Rename a file or folder to ``path`` in one step; names in the open ``folder``, if any."""
+    for pause in (*(_PAUSES if sys.platform == "win32" else ()), None):
         try:
             os.replace(draft, path, src_dir_fd=folder, dst_dir_fd=folder)
-        except PermissionError:
-            time.sleep(pause)
-        else:
             return
-    os.replace(draft, path, src_dir_fd=folder, dst_dir_fd=folder)
+        except PermissionError:
+            if pause is None:
+                raise
+            time.sleep(pause)
 
 
 @contextmanager
@@ -113,10 +107,7 @@ def settle(folder: Path) -> None:
 
 
 def sync(*paths: Path) -> None:
-    """Wait until the disk has the contents of files and the names in folders.
-
-    All are asked for at once: one after the other, each would be finished before the next begins.
-    """
+    """Wait until the disk has files and folders; faster for all at once."""
     from concurrent.futures import ThreadPoolExecutor  # half of what this module would take to load
 
     with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
@@ -169,13 +160,11 @@ _INFINITY = "1e999"
 
 
 def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
-    """The value as JSON gives it back: Python's numbers, tuples as lists, nan as None.
-
-    Infinities become the texts that are given for them.
-    """
+    """The value as JSON gives it back, nan as None; infinities as the texts given for them."""
     match value:
         case Mapping():
-            return {_key(key): plain(item, infinities) for key, item in value.items()}
+            keys = [key if isinstance(key, str) else json.dumps(plain(key)) for key in value]
+            return dict(zip(keys, (plain(v, infinities) for v in value.values()), strict=True))
         case list() | tuple():
             return [plain(item, infinities) for item in value]
         case float():
@@ -183,15 +172,11 @@ def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
         case None | bool() | int() | str():
             return value
         case _:
-            return plain(_from_numpy(value), infinities)
+            import numpy as np  # where there is such a value; `--help` is there without
 
-
-def _from_numpy(value: Any) -> Any:
-    import numpy as np  # where there is such a value; `--help` is there without
-
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise TypeError(f"a {type(value).__name__} has no place in JSON")
+            if not isinstance(value, np.generic | np.ndarray):
+                raise TypeError(f"a {type(value).__name__} has no place in JSON")
+            return plain(value.tolist(), infinities)
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
@@ -202,8 +187,3 @@ def json_text(value: Any, indent: int | None = None) -> str:
     for sign, token in tokens.items():
         text = text.replace(f'"{token}"', _INFINITY if sign > 0 else f"-{_INFINITY}")
     return text
-
-
-def _key(key: Any) -> str:
-    """A key of JSON: the text of a number or truth value."""
-    return key if isinstance(key, str) else json.dumps(plain(key))

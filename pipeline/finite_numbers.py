@@ -32,10 +32,7 @@ class NotFiniteError(UserError):
 
 
 def is_finite(values: Any) -> bool:
-    """Whether all numbers are finite, of an array, of a mapping's arrays, or of None.
-
-    It is asked after each step of a training.
-    """
+    """Whether all numbers of an array or a mapping of arrays are finite; asked at every step."""
     if type(values) is not np.ndarray:
         return values is None or all(is_finite(array) for _, array in _parts(values))
     kind = values.dtype.char

@@ -48,13 +48,16 @@ _SECONDS_OF_AN_INSTANT = 5.0
 
 def mark() -> dict[str, Any]:
     """The identity of this process, as JSON; None for what the platform does not tell."""
-    pid = os.getpid()
+    pid, machine, namespace = os.getpid(), _first_line(*_MACHINES), None
+    with contextlib.suppress(OSError):
+        namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115  # it leads to no path
     return {
         "pid": pid,
         "host": platform.node(),
-        "machine": _machine(),
+        # Which itself is not for others.
+        "machine": machine and hashlib.sha256(f"yardstick {machine}".encode()).hexdigest()[:32],
         "boot": _first_line(_BOOT),
-        "namespace": _pid_namespace(),
+        "namespace": namespace,
         "began": _ticks_at_begin(pid),
     }
 
@@ -84,26 +87,11 @@ def is_alive(record: object) -> bool | None:
 
 def _first_line(*files: str) -> str | None:
     for file in files:
-        try:
-            line = Path(file).read_text(encoding="utf-8", errors="replace").partition("\n")[0]
-        except OSError:
-            continue
-        if line.strip():
-            return line.strip()
+        with contextlib.suppress(OSError):
+            text = Path(file).read_text(encoding="utf-8", errors="replace")
+            if line := text.partition("\n")[0].strip():
+                return line
     return None
-
-
-def _machine() -> str | None:
-    """A digest of the machine's identity, which itself is not for others."""
-    identity = _first_line(*_MACHINES)
-    return identity and hashlib.sha256(f"yardstick {identity}".encode()).hexdigest()[:32]
-
-
-def _pid_namespace() -> str | None:
-    try:
-        return os.readlink("/proc/self/ns/pid")  # noqa: PTH115  # it leads to no path
-    except OSError:
-        return None
 
 
 def _ticks_at_begin(pid: int) -> int | None:
@@ -142,7 +130,7 @@ else:
         except ProcessLookupError:
             return False
         except PermissionError:
-            return True
+            pass
         return True
 
 
@@ -154,7 +142,14 @@ def give_sign(path: Path) -> None:
 
 def seconds_silent(path: Path) -> float:
     """Seconds since a path was last touched, by the folder's clock."""
-    return _now_in(path.parent) - last_sign(path)
+    probe = path.parent / f".{secrets.token_hex(8)}.tmp"
+    try:
+        probe.touch()
+        now = probe.stat().st_mtime
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink()
+    return now - last_sign(path)
 
 
 def last_sign(path: Path) -> float:
@@ -164,16 +159,6 @@ def last_sign(path: Path) -> float:
     # Network folders remember for a while what a file was, but not beyond its being opened.
     with opened(path, NO_LIMIT) as file:
         return os.fstat(file.fileno()).st_mtime
-
-
-def _now_in(folder: Path) -> float:
-    probe = folder / f".{secrets.token_hex(8)}.tmp"
-    try:
-        probe.touch()
-        return probe.stat().st_mtime
-    finally:
-        with contextlib.suppress(OSError):
-            probe.unlink()
 
 
 def remove_remains(root: Path) -> None:
@@ -301,16 +286,13 @@ def _appears(path: Path, content: str) -> bool:
         except FileExistsError:
             return False
         except OSError:  # the disk is full, or read-only
-            _unlink(path)
+            with contextlib.suppress(OSError):
+                path.unlink()
             raise
     finally:
-        _unlink(draft)
+        with contextlib.suppress(OSError):
+            draft.unlink()
     return True
-
-
-def _unlink(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        path.unlink()
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -345,10 +327,7 @@ def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object])
 
 
 def _remove_dead(path: Path, owner: dict[str, Any]) -> None:
-    """Remove the lock of an owner that is gone, and no other that came meanwhile.
-
-    Of several processes, one alone can give it the name that only this lock can get.
-    """
+    """Remove a dead owner's lock: one process alone can make the folder of its digest."""
     digest = hashlib.sha256(repr(owner.get("token")).encode()).hexdigest()[:32]
     grave = path.with_name(f"{LOCK}.{digest}.dead.tmp")
     try:

@@ -139,11 +139,7 @@ def draw_marks(axes: Axes, policy: Policy, cell: float) -> None:
 
 
 def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) -> None:
-    """An arrow for each action, or a ring for one that stays; dark where the policy comes to.
-
-    A single action has its arrow in the middle of the cell, several set out from there; both are
-    shorter, and higher up, where a number stands below. ``width`` is a share of the cell.
-    """
+    """An arrow for each action, or a ring for staying; dark where the policy comes to."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Annulus
 
@@ -245,11 +241,22 @@ MARGIN = 1.3  # inches, for title, legend and colour bar
 
 def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     """Draw a map into a PNG file; colours are exact values on the scale of the optimal ones."""
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
     layers, cell = shown_layers(found), cell_inches(found.layout)
-    scale, colours = _value_scale(found)
+    best = found.optimal_values[found.matters]
+    low, high = float(best.min()), float(best.max())
+    scale = Normalize(low, high if high > low else low + 1)
+    colours = LinearSegmentedColormap.from_list("values", VALUE_COLOURS)
     decimals = decimals_for(found)
     figure, pairs = _panels(found.layout, len(layers), cell)
-    _name_panels(pairs, found, layers)
+    names = (("agent", found.values), ("optimum, all best actions", found.optimal_values))
+    for axes, (name, values) in zip(pairs[0], names, strict=True):
+        start_value = f"{found.initial @ values:,.2f}".replace("-", "\N{MINUS SIGN}")
+        axes.set_title(f"{name}: return {start_value}", fontsize=10, loc="left")
+    for pair, layer in zip(pairs, layers, strict=True):
+        if found.layout.prizes:
+            pair[0].set_ylabel(layer_name(found.layout, layer))
     _explain(figure, found, scale, colours)
     figure.suptitle(title, x=0.01, ha="left")
     # What stands inside the panels needs no room around them. Fixed now, the layout is worked
@@ -280,8 +287,8 @@ def layer_name(layout: GridLayout, layer: int) -> str:
 
 def cell_inches(layout: GridLayout) -> float:
     """The width of a cell, so that small maps are not tiny and large ones fit on a screen."""
-    longest = max(layout.n_rows, layout.n_columns)
-    return min(max(0.5 * longest, 3.2), 9.0 if _is_wide(layout) else 7.0) / longest
+    longest, is_wide = max(layout.n_rows, layout.n_columns), layout.n_columns >= 2 * layout.n_rows
+    return min(max(0.5 * longest, 3.2), 9.0 if is_wide else 7.0) / longest
 
 
 def decimals_for(found: ValueMap) -> int:
@@ -293,16 +300,12 @@ def decimals_for(found: ValueMap) -> int:
     return 2 if np.ptp(best) < 10 else 1
 
 
-def _is_wide(layout: GridLayout) -> bool:
-    """Whether panels look better above each other."""
-    return layout.n_columns >= 2 * layout.n_rows
-
-
 def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, list[list[Axes]]]:
     """A figure with two empty panels for each layer, cells ``cell`` inches wide."""
     from matplotlib.figure import Figure
 
-    n_rows, n_columns = (2 * n_layers, 1) if _is_wide(layout) else (n_layers, 2)
+    is_wide = layout.n_columns >= 2 * layout.n_rows  # panels look better above each other
+    n_rows, n_columns = (2 * n_layers, 1) if is_wide else (n_layers, 2)
     width = n_columns * (cell * layout.n_columns + 0.3) + MARGIN
     height = n_rows * (cell * layout.n_rows + 0.35) + MARGIN
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
@@ -313,9 +316,7 @@ def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, lis
     for number, axes in enumerate(panels.flat):
         named = number % n_columns == 0
         axes.set(
-            xlim=(-0.5, layout.n_columns - 0.5),
-            ylim=(layout.n_rows - 0.5, -0.5),
-            aspect="equal",
+            xlim=(-0.5, layout.n_columns - 0.5), ylim=(layout.n_rows - 0.5, -0.5), aspect="equal"
         )
         # Counted from 1, as everywhere.
         for axis, length in ((axes.xaxis, layout.n_columns), (axes.yaxis, layout.n_rows)):
@@ -324,16 +325,6 @@ def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, lis
         axes.tick_params(length=0, labelsize=7, labelcolor=DIM, pad=2)
         axes.spines[:].set_visible(False)
     return figure, panels.reshape(-1, 2).tolist()
-
-
-def _value_scale(found: ValueMap) -> tuple[Normalize, Colormap]:
-    """From the lowest optimal value to the highest."""
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-
-    best = found.optimal_values[found.matters]
-    low, high = float(best.min()), float(best.max())
-    scale = Normalize(low, high if high > low else low + 1)
-    return scale, LinearSegmentedColormap.from_list("values", VALUE_COLOURS)
 
 
 def _draw_policy(axes: Axes, policy: Policy, cell: float, decimals: int, *, thick: bool) -> None:
@@ -345,16 +336,6 @@ def _draw_policy(axes: Axes, policy: Policy, cell: float, decimals: int, *, thic
     if with_numbers:
         draw_numbers(axes, policy, font, decimals)
     mark_differing(axes, policy, cell)
-
-
-def _name_panels(pairs: list[list[Axes]], found: ValueMap, layers: list[int]) -> None:
-    names = (("agent", found.values), ("optimum, all best actions", found.optimal_values))
-    for axes, (name, values) in zip(pairs[0], names, strict=True):
-        start_value = f"{found.initial @ values:,.2f}".replace("-", "\N{MINUS SIGN}")
-        axes.set_title(f"{name}: return {start_value}", fontsize=10, loc="left")
-    for pair, layer in zip(pairs, layers, strict=True):
-        if found.layout.prizes:
-            pair[0].set_ylabel(layer_name(found.layout, layer))
 
 
 def _explain(figure: Figure, found: ValueMap, scale: Normalize, colours: Colormap) -> None:

@@ -29,24 +29,21 @@ def card(record: Mapping[str, Any], files: Collection[str]) -> str:
     algo, env_id = spec["algo"], spec["env_id"]
     pictures = [name for name in ("value_map.png", "learning_curve.png") if name in files]
     films = [name for name in files if name.startswith("replay.")]
+    maker = "Trained with Yardstick (the Python package `rl-yardstick`)"
+    seed = f"seed {plain_text(spec['seed'])}"
+    engine = f"; engine: {plain_text(record['engine'])}" if record.get("engine") else ""
     sections = [
         f"---\n{_front_matter(record)}---\n",
         f"# {plain_text(algo)} on {plain_text(env_id)}\n",
-        _trained(record),
+        f"{maker} for {record['n_timesteps']:,} environment steps, {seed}{engine}.\n",
         _figures(record),
-        *(
-            f"![{name.partition('.')[0].replace('_', ' ')}]({name})\n"
-            for name in [*films, *pictures]
-        ),
+        *(f"![{n.partition('.')[0].replace('_', ' ')}]({n})\n" for n in [*films, *pictures]),
         "## Play it\n",
         _playing(record, files),
         "## Settings\n",
         fenced("yaml", str(yaml.safe_dump(spec["hyperparams"]))),
         "## Versions\n",
-        "".join(
-            f"- {plain_text(name)} {plain_text(version)}\n"
-            for name, version in record["versions"].items()
-        ),
+        "".join(f"- {plain_text(k)} {plain_text(v)}\n" for k, v in record["versions"].items()),
     ]
     return visible("\n".join(sections))
 
@@ -56,18 +53,18 @@ def plain_text(value: object) -> str:
     return re.sub(r"[\\`*<>|&\[\]]", lambda found: f"\\{found[0]}", " ".join(str(value).split()))
 
 
-def _trained(record: Mapping[str, Any]) -> str:
-    steps, seed = record["n_timesteps"], record["spec"]["seed"]
-    maker = "Trained with Yardstick (the Python package `rl-yardstick`)"
-    engine = f"; engine: {plain_text(record['engine'])}" if record.get("engine") else ""
-    return f"{maker} for {steps:,} environment steps, seed {plain_text(seed)}{engine}.\n"
-
-
 def _front_matter(record: Mapping[str, Any]) -> str:
     spec, final = record["spec"], record.get("final") or {}
+    figures: list[tuple[str, str, Any]] = []  # the first as hubs write it, the others exact
+    if final:
+        told = f"{final['mean_return']:.2f} +/- {final['std_return']:.2f}"
+        names = {"mean_return": "mean return", **_measured(final), "success_rate": "success rate"}
+        figures = [("mean_reward", "mean_reward", told)]
+        figures += [(key, label, final.get(key)) for key, label in names.items()]
     metrics = [
         {"type": name, "value": value, "name": label, "verified": False}
-        for name, label, value in _metrics(final)
+        for name, label, value in figures
+        if value is not None
     ]
     env = str(spec["env_id"])
     is_deep = spec["algo"] in _DEEP or _plain_class(spec) is not None
@@ -77,26 +74,12 @@ def _front_matter(record: Mapping[str, Any]) -> str:
         "dataset": {"name": env, "type": env},
         "metrics": metrics,
     }
-    return str(
-        yaml.safe_dump(
-            {
-                "library_name": "stable-baselines3",
-                "tags": [env, *kind, "reinforcement-learning", "stable-baselines3"],
-                "model-index": [{"name": spec["algo"], "results": [place]}],
-            },
-            sort_keys=False,
-        )
-    )
-
-
-def _metrics(final: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
-    """Type, name and value of each figure; the first as hubs write it, the others exact."""
-    if not final:
-        return []
-    told = f"{final['mean_return']:.2f} +/- {final['std_return']:.2f}"
-    names = {"mean_return": "mean return", **_measured(final), "success_rate": "success rate"}
-    exact = [(name, label, final.get(name)) for name, label in names.items()]
-    return [("mean_reward", "mean_reward", told), *(row for row in exact if row[2] is not None)]
+    data = {
+        "library_name": "stable-baselines3",
+        "tags": [env, *kind, "reinforcement-learning", "stable-baselines3"],
+        "model-index": [{"name": spec["algo"], "results": [place]}],
+    }
+    return str(yaml.safe_dump(data, sort_keys=False))
 
 
 def _figures(record: Mapping[str, Any]) -> str:
@@ -138,12 +121,8 @@ def _measured(final: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _table(rows: list[tuple[str, Any]]) -> str:
-    told = [
-        f"| {plain_text(name)} | {plain_text(value)} |\n"
-        for name, value in rows
-        if value is not None
-    ]
-    return "".join(["| figure | value |\n", "|---|---|\n", *told])
+    told = [(plain_text(name), plain_text(value)) for name, value in rows if value is not None]
+    return "| figure | value |\n|---|---|\n" + "".join(f"| {a} | {b} |\n" for a, b in told)
 
 
 def _playing(record: Mapping[str, Any], files: Collection[str]) -> str:
@@ -161,13 +140,12 @@ def _playing(record: Mapping[str, Any], files: Collection[str]) -> str:
     if _plain_class(spec) is not None:
         place = shlex.quote(f"{spec['algo']}/{record['env_name']}_1")
         packages = [*(spec.get("gym_packages") or []), *([] if _is_known(spec) else ["envs"])]
-        words = (
-            f"{shlex.join(['--algo', spec['algo'], '--env', spec['env_id']])}{_flag(packages)} -f ."
-        )
+        agent = shlex.join(["--algo", spec["algo"], "--env", spec["env_id"]])
         copying = f"mkdir -p {shlex.quote(spec['algo'])} && cp -r PACK {place}\n"
+        playing = f"python -m rl_zoo3.enjoy {agent}{_flag(packages)} -f .\n"
         parts += [
             "With rl_zoo3, which finds agents by the names of folders (this one is `PACK`):\n",
-            fenced("sh", f"{copying}python -m rl_zoo3.enjoy {words}\n"),
+            fenced("sh", copying + playing),
         ]
     return "\n".join(parts)
 
@@ -184,10 +162,8 @@ def _is_known(spec: Mapping[str, Any]) -> bool:
 
 def to_type(spec: Mapping[str, Any], files: Collection[str]) -> list[str]:
     """What to type after ``--gym-packages``: the copy of a module in the pack, or else its name."""
-    return [
-        copy_of(str(name), files.__contains__) or str(name)
-        for name in spec.get("gym_packages") or []
-    ]
+    names = map(str, spec.get("gym_packages") or [])
+    return [copy_of(name, files.__contains__) or name for name in names]
 
 
 def _plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:
@@ -212,33 +188,24 @@ def _script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
     env_id = spec["env_id"]
     given = {**(settings.get("env_kwargs") or {}), **(settings.get("eval_env_kwargs") or {})}
     statistics = f"{env_name}/vecnormalize.pkl"
+    normalizes = statistics in files
     plain = _plain_class(spec)
     library, name = plain or ("", f"load_algorithm({spec['algo']!r})")
     agents = "from agents import load_algorithm  # Yardstick's agents"
-    lines = [
-        *([] if _is_known(spec) else ["import envs  # Yardstick's environments"]),
-        f"from {library} import {name}" if plain else agents,
-        "from stable_baselines3.common.env_util import make_vec_env",
-        "from stable_baselines3.common.evaluation import evaluate_policy",
-        *(
-            ["from stable_baselines3.common.vec_env import VecNormalize"]
-            if statistics in files
-            else []
-        ),
-        "",
-        f"env = make_vec_env({env_id!r}, env_kwargs={given!r}, seed=0)",
-    ]
-    if statistics in files:
-        lines += [
-            f"env = VecNormalize.load({statistics!r}, env)",
-            "env.training = env.norm_reward = False",
-        ]
-    lines += [
-        f"model = {name}.load({env_name + '.zip'!r})",
-        "mean, std = evaluate_policy(model, env, n_eval_episodes=10)",
-        'print(f"return {mean:.2f} +/- {std:.2f}")',
-    ]
-    return "\n".join(lines) + "\n"
+    lines = (
+        (not _is_known(spec), "import envs  # Yardstick's environments"),
+        (True, f"from {library} import {name}" if plain else agents),
+        (True, "from stable_baselines3.common.env_util import make_vec_env"),
+        (True, "from stable_baselines3.common.evaluation import evaluate_policy"),
+        (normalizes, "from stable_baselines3.common.vec_env import VecNormalize"),
+        (True, f"\nenv = make_vec_env({env_id!r}, env_kwargs={given!r}, seed=0)"),
+        (normalizes, f"env = VecNormalize.load({statistics!r}, env)"),
+        (normalizes, "env.training = env.norm_reward = False"),
+        (True, f"model = {name}.load({env_name + '.zip'!r})"),
+        (True, "mean, std = evaluate_policy(model, env, n_eval_episodes=10)"),
+        (True, 'print(f"return {mean:.2f} +/- {std:.2f}")'),
+    )
+    return "".join(f"{line}\n" for is_needed, line in lines if is_needed)
 
 
 def fenced(language: str, text: str) -> str:

@@ -89,14 +89,10 @@ def _files(run: Run, record: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
     for name in sorted(recorded):
         if name.startswith(f"{COPIES}/") and name.endswith(".py"):
             yield name, read_recorded(run, run.path / name, MAX_ARCHIVE_BYTES)
-    yield f"{settings}/config.yml", _yaml(spec["hyperparams"])
-    arguments = {
-        "algo": spec["algo"],
-        "env": spec["env_id"],
-        "seed": spec["seed"],
-        "env_kwargs": spec["hyperparams"].get("env_kwargs"),
-    }
-    yield f"{settings}/args.yml", _yaml(arguments)
+    arguments = {"algo": spec["algo"], "env": spec["env_id"], "seed": spec["seed"]}
+    arguments["env_kwargs"] = spec["hyperparams"].get("env_kwargs")
+    yield f"{settings}/config.yml", str(yaml.safe_dump(spec["hyperparams"])).encode()
+    yield f"{settings}/args.yml", str(yaml.safe_dump(arguments)).encode()
     for name, path in (
         (f"{settings}/vecnormalize.pkl", run.vecnormalize_path),
         ("value_map.png", run.value_map_path),
@@ -106,15 +102,10 @@ def _files(run: Run, record: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
             yield name, read_recorded(run, path, MAX_ARCHIVE_BYTES)
     if (told := results(record)) is not None:
         yield "results.json", told.encode()
-    for name in sorted(recorded):
-        if Path(name).suffix in FILMS and "/" not in name:
-            film = read_recorded(run, run.path / name, MOST_FILM_BYTES)
-            yield f"replay{Path(name).suffix}", film
-            break
-
-
-def _yaml(data: dict[str, Any]) -> bytes:
-    return str(yaml.safe_dump(data)).encode()
+    films = (name for name in sorted(recorded) if Path(name).suffix in FILMS and "/" not in name)
+    if name := next(films, ""):
+        film = read_recorded(run, run.path / name, MOST_FILM_BYTES)
+        yield f"replay{Path(name).suffix}", film
 
 
 def _digest(content: bytes) -> str:
@@ -255,11 +246,9 @@ def _run_of(study: Path, name: str) -> bytes:
     """The pack of a run in the pack of a study; its suffix may be missing."""
     with _opened_study(study) as (read, names):
         found = next((n for n in (name, f"{name}.zip") if n in names), None)
-        if found is None:
-            raise UserError(
-                f"{study} holds no {shown(name)}: name one of its runs, {_a_run(study)}"
-            )
-        return read(found)
+        if found is not None:
+            return read(found)
+    raise UserError(f"{study} holds no {shown(name)}: name one of its runs, {_a_run(study)}")
 
 
 def _a_run(study: Path) -> str:
@@ -299,10 +288,8 @@ def check_name(name: str, deepest: int = _DEEPEST) -> None:
     """Refuse a name that leads elsewhere, or that some file system does not take."""
     parts = name.split("/")
     deepest = _DEEPEST_MODULE if parts[0] == COPIES else deepest
-    good = all(
-        part not in ("", ".", "..") and portable_name(part, _LONGEST_NAME) == part for part in parts
-    )
-    if len(parts) > deepest or not good:
+    is_good = {"", ".", ".."}.isdisjoint(parts) and len(parts) <= deepest
+    if not is_good or any(portable_name(part, _LONGEST_NAME) != part for part in parts):
         raise UnsafeFileError(f"holds {shown(name)}, which would lie elsewhere")
 
 

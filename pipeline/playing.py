@@ -7,6 +7,7 @@ import importlib.util
 import io
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -37,16 +38,17 @@ def playing_env(
     n_envs: int = 1,
     monitor_folder: Path | None = None,
 ) -> VecEnv:
-    """The VecEnv that a model is played on, drawn in that render mode; rewards are as they are.
-
-    What is drawn to be handed over is kept until `FrameTaker` asks for it.
-    """
+    """The VecEnv to play on, drawn in that mode; `FrameTaker` hands over what is kept of it."""
     if mode == "rgb_array":
         # Drawing into memory needs no display, and SDL complains where it finds none.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     extra = {} if mode is None else {"render_mode": mode}
     # A VecEnv resets a finished environment at once: frames are kept before that happens.
-    wrap_innermost = _keep_frames if mode in KEPT_MODES else None
+    wrap_innermost = None
+    if mode in KEPT_MODES:
+        from gymnasium.wrappers import RenderCollection
+
+        wrap_innermost = partial(RenderCollection, pop_frames=True, reset_clean=False)
     spec = chosen.spec
     env: VecEnv = make_evaluation_env(
         spec, n_envs, wrap_innermost=wrap_innermost, monitor_folder=monitor_folder, **extra
@@ -56,12 +58,6 @@ def playing_env(
     if chosen.statistics is not None:
         take_over(env, chosen.statistics)
     return env
-
-
-def _keep_frames(env: Any) -> Any:
-    from gymnasium.wrappers import RenderCollection
-
-    return RenderCollection(env, pop_frames=True, reset_clean=False)
 
 
 def play_episodes(
@@ -137,10 +133,7 @@ class FrameTaker:
         self._first_of_next: list[Any] = []
 
     def take(self, done: bool) -> list[Any]:
-        """What was drawn since the last call.
-
-        Where a step is the last, a VecEnv has begun the next episode; its first frame waits.
-        """
+        """What was drawn since the last call; the first frame of the next episode waits."""
         drawn: list[Any] = self._first_of_next + self.env.env_method("render")[0]
         self._first_of_next = [drawn.pop()] if done else []
         return drawn

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.common.callbacks import EpisodeBudget
 from agents.compiled.worlds import NotCompilable
 from agents.networks.network_worlds import network_world
+from pipeline import loading_libraries
 from pipeline.callbacks import (
     EvaluationCallback,
     NumberWatch,
@@ -43,7 +44,6 @@ from pipeline.evaluation.sampled import SampledEvaluator, n_environments, takes_
 from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal
 from pipeline.failures import exits_as_mistakes
 from pipeline.files import naming
-from pipeline.library_loading import load_for_optimizer
 from pipeline.models.choose import (
     continuing,
     load_to_continue,
@@ -114,22 +114,17 @@ def prepare(
     run: Run | None = None,
     keeping: StateKeeping = NEW,
 ) -> Training:
-    """Make the run folder and all parts of the training.
+    """Make all parts of the training, and the run folder unless ``run`` is there already.
 
-    Args:
-        spec: what to do.
-        console: where the training is to report to.
-        args: the command's arguments, for the run folder.
-        command: the command itself, likewise.
-        run: the run folder, made already; by default a new one in the spec's log folder.
-        keeping: what becomes of the state of the training.
-
-    Raises:
-        UserError: if the spec does not work out, or the environment asks the program to end; no
-            folder is left behind then.
-        Stopped: if a signal asks for it, likewise.
+    ``args`` and ``command`` are written to it; ``keeping`` says what becomes of the state. If
+    UserError is raised, since the spec does not work out or the environment asks the program to
+    end, or `Stopped`, no folder is left behind.
     """
-    _set_arithmetic(spec)
+    if spec.num_threads > 0:
+        th.set_num_threads(spec.num_threads)
+    flushes = spec.hyperparams.flush_denormal
+    if not th.set_flush_denormal(flushes) and flushes:
+        raise UserError("flush_denormal: this processor has no such setting; leave it out")
     stop = current()
     with stop.waiting(0.0):
         kwargs = algorithm_kwargs(spec)
@@ -155,15 +150,6 @@ def prepare(
     return training
 
 
-def _set_arithmetic(spec: TrainSpec) -> None:
-    """Set the number of threads and denormal numbers for the whole process."""
-    if spec.num_threads > 0:
-        th.set_num_threads(spec.num_threads)
-    flushes = spec.hyperparams.flush_denormal
-    if not th.set_flush_denormal(flushes) and flushes:
-        raise UserError("flush_denormal: this processor has no such setting; leave it out")
-
-
 @contextmanager
 def _library_errors_in_one_line() -> Iterator[None]:
     """Turn errors of settings that only the library checks into one line."""
@@ -171,6 +157,14 @@ def _library_errors_in_one_line() -> Iterator[None]:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
         raise UserError(one_line(error)) from error
+
+
+def load_for_optimizer(model: Any) -> None:
+    """Import PyTorch's compiler, as optimizers do at their first step; it takes over a second."""
+    has_optimizer = getattr(getattr(model, "policy", None), "optimizer", None) is not None
+    if has_optimizer and getattr(model, "engine", "library") == "library":
+        with loading_libraries():
+            import torch._dynamo  # noqa: F401
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
@@ -379,10 +373,7 @@ def engine_outlook(
 
 
 def planned_outlook(spec: TrainSpec) -> EngineOutlook | None:
-    """The outlook of a run that another process will do; its agent is made here and dropped.
-
-    Whatever goes wrong, the run itself will say so.
-    """
+    """The outlook of a run of another process, which itself says what is wrong."""
     if spec.algo not in NETWORKS:
         return None
     with (

@@ -8,13 +8,7 @@ from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-)
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
 
 from agents.common.callbacks import BlockCallback
 from pipeline.signs_of_life import (
@@ -36,11 +30,7 @@ COMPILING = "compiling the training loop"
 
 
 class ProgressDisplay(BlockCallback):
-    """A live bar in a terminal, a few plain lines elsewhere: steps, mean return, time left.
-
-    A line is printed for every tenth of the training, two seconds after its beginning, and where
-    ten seconds have gone by since the last.
-    """
+    """A live bar in a terminal; elsewhere a line for each tenth, and every ten seconds."""
 
     takes_blocks = True
 
@@ -173,10 +163,7 @@ class ProgressDisplay(BlockCallback):
         return figures if left is None else f"{figures}  about {duration(left)} left by the clock"
 
     def _seconds_left(self) -> float | None:
-        """By the speed of the last half of what is done; None where nobody knows.
-
-        Off-policy agents are faster before they begin to learn.
-        """
+        """By the speed of the last half: off-policy agents are faster before they learn."""
         now, share = time.monotonic(), self.share_done
         if share >= self.marks[-1][1] + 0.001:
             self.marks.append((now, share))

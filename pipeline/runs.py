@@ -35,14 +35,7 @@ from pipeline.digests import (
     sealed,
 )
 from pipeline.errors import UserError
-from pipeline.files import (
-    drafts_in,
-    portable_name,
-    put_in_place,
-    replacing,
-    write_json,
-    write_text,
-)
+from pipeline.files import drafts_in, portable_name, put_in_place, replacing, write_json, write_text
 from pipeline.locks import folder_lock, is_alive, mark
 from pipeline.user_modules import COPIES, keep_copies
 from safe_files.files import hold, take_up
@@ -87,23 +80,9 @@ INTERRUPTED = "interrupted"
 FAILED = "failed"
 
 # What ``run.json`` says of the end of a run.
-OUTCOME = (
-    "state",
-    "reason",
-    "stopped_by",
-    "n_timesteps",
-    "seconds",
-    "cpu_seconds",
-    "final",
-    "best_mean_return",
-    "best_timesteps",
-    "best_episodes",
-    "evaluation_steps",
-    "engine",
-    "regret",
-    "pulls",
-    FIELD,
-)
+_OF_END = ("state", "reason", "stopped_by", "n_timesteps", "seconds", "cpu_seconds", FIELD)
+_BEST = ("best_mean_return", "best_timesteps", "best_episodes", "evaluation_steps")
+OUTCOME = (*_OF_END, "final", *_BEST, "engine", "regret", "pulls")
 # The field of ``run.json`` that says, while a run is running, which process is at work on it.
 PROCESS = "process"
 # Reserved while a run is under way, so that its last ``run.json`` fits on a full disk.
@@ -416,10 +395,7 @@ _CLAIM = re.compile(r"\.(.+)\.[0-9a-f]{16}\.tmp")
 
 
 def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
-    """Remove half-written files of runs that were killed, and runs killed before their first step.
-
-    Only what a process that is certainly gone has written is touched.
-    """
+    """Remove drafts of runs that were killed, and runs killed before their first step."""
     parent, env_name = log_folder / algo, environment_name(env_id)
     names = {path: env_name for _, path in numbered_runs(parent, env_name)}
     for path in list(parent.glob(".*.tmp")):  # that have no number yet

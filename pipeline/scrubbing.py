@@ -26,20 +26,9 @@ _PLACES: Mapping[str, Any] = {
     "user_modules": [],
 }
 # Fields of ``run.json`` that say what came out, and nothing of where.
-_TOLD = (
-    "state",
-    "record_version",
-    "env_name",
-    "versions",
-    "n_timesteps",
-    "final",
-    "best_mean_return",
-    "best_timesteps",
-    "best_episodes",
-    "engine",
-    "regret",
-    "pulls",
-)
+_TOLD_OF_RUN = ("state", "record_version", "env_name", "versions", "n_timesteps", "final")
+_TOLD_OF_BEST = ("best_mean_return", "best_timesteps", "best_episodes")
+_TOLD = (*_TOLD_OF_RUN, *_TOLD_OF_BEST, "engine", "regret", "pulls")
 _DATE = (1980, 1, 1, 0, 0, 0)
 _SERIALIZED = re.compile(rb'":serialized:": "([A-Za-z0-9+/=]*)"')
 _SCRIPT = re.compile(rb"(<script\b.*?</script>)", re.DOTALL)
@@ -54,19 +43,13 @@ _SHORTEST = 4  # letters of a path that is looked for: "/" is everywhere
 def without_places(value: Any) -> Any:
     """Settings in which a path from the root, or from somebody's home, is the file's name alone."""
     if isinstance(value, str):
-        return _name_alone(value)
+        windows = PureWindowsPath(value)
+        if windows.is_absolute() or windows.drive or value.startswith("~"):
+            return windows.name
+        return PurePosixPath(value).name if value.startswith("/") else value
     if isinstance(value, dict):
         return {key: without_places(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_places(item) for item in value]
-    return value
-
-
-def _name_alone(text: str) -> str:
-    windows = PureWindowsPath(text)
-    if windows.is_absolute() or windows.drive or text.startswith("~"):
-        return windows.name
-    return PurePosixPath(text).name if text.startswith("/") else text
+    return [*map(without_places, value)] if isinstance(value, list | tuple) else value
 
 
 def record_to_tell(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -83,10 +66,9 @@ def check_secrets(settings: Any, place: str = "hyperparams") -> None:
     if isinstance(settings, dict):
         for key, value in settings.items():
             if isinstance(value, str) and value and _SECRET.search(str(key)):
-                raise UserError(
-                    f"{place}.{key} looks like a secret, and a pack holds all settings: train "
-                    "without it (an environment variable is in no run)"
-                )
+                what = f"{place}.{key} looks like a secret, and a pack holds all settings"
+                how = "train without it (an environment variable is in no run)"
+                raise UserError(f"{what}: {how}")
             check_secrets(value, f"{place}.{key}")
     elif isinstance(settings, list | tuple):
         for item in settings:
@@ -157,12 +139,9 @@ def check_untold(files: Mapping[str, bytes], run: Run) -> None:
     places = _places_of(run)
     for name, content in files.items():
         for piece in _pieces(name, content):
-            for place in places:
-                if place in piece:
-                    raise UserError(
-                        f"{name} names {place.decode(errors='replace')!r}, a place on this "
-                        "machine: nothing was packed"
-                    )
+            if found := next((place for place in places if place in piece), None):
+                what = f"{found.decode(errors='replace')!r}, a place on this machine"
+                raise UserError(f"{name} names {what}: nothing was packed")
 
 
 def _places_of(run: Run) -> list[bytes]:

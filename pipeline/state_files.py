@@ -74,10 +74,7 @@ def save_state(folder: Path, number: int, content: Pickled, note: dict[str, Any]
 
 
 def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | None:
-    """The newest state that is whole; None where there is none at all.
-
-    What is damaged or another user's is told, and refused where nothing else is there.
-    """
+    """The newest whole state, or None; a damaged one is told, and refused if there is no other."""
     key, found, reasons = state_key(), [], []
     for path in filter(Path.is_file, state_files(folder)):
         try:
@@ -167,13 +164,10 @@ def _signature(key: bytes, text: bytes) -> bytes:
 
 def _without_zeros(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The bytes up to the last that is not zero, as those of a buffer not yet full."""
-    end = len(content)
-    while end:
-        begin = max(end - _PIECE, 0)
-        piece = content[begin:end]
+    for begin in reversed(range(0, len(content), _PIECE)):
+        piece = content[begin : begin + _PIECE]
         if piece.any():
             return content[: begin + len(piece.tobytes().rstrip(b"\0"))]
-        end = begin
     return content[:0]
 
 
@@ -208,20 +202,17 @@ def user_key(application: str) -> bytes:
     # Without waiting, as for a pipe; what is checked is what is read.
     number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     try:
-        _check(os.fstat(number), path)
+        status = os.fstat(number)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(f"{path} is no regular file: remove it")
+        if sys.platform != "win32" and (status.st_uid != os.geteuid() or status.st_mode & 0o077):
+            raise OSError(f"{path} must be the user's own, and of mode 600")
         key = os.read(number, KEY_BYTES + 1)
     finally:
         os.close(number)
     if len(key) != KEY_BYTES:
         raise OSError(f"{path} is damaged: remove it")
     return key
-
-
-def _check(status: os.stat_result, path: Path) -> None:
-    if not stat.S_ISREG(status.st_mode):
-        raise OSError(f"{path} is no regular file: remove it")
-    if sys.platform != "win32" and (status.st_uid != os.geteuid() or status.st_mode & 0o077):
-        raise OSError(f"{path} must be the user's own, and of mode 600")
 
 
 def _make(path: Path) -> None:

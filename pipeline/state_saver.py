@@ -145,10 +145,10 @@ class StateSaver(BlockCallback):
         try:
             with _garbage_left():
                 self._write()
-        except NotKeepableError as error:
-            self._give_up(f"no state can be kept: {one_line(error)}")
-        except UserError as error:
-            self._give_up(f"no state can be kept: {error}")
+        except (NotKeepableError, UserError) as error:
+            self.is_off = True
+            what = f"no state can be kept: {one_line(error)}"
+            self.tell(f"{what}; if this run is cut off, --resume begins it anew")
         except OSError as error:
             reason = error.strerror or one_line(error)
             self._tell_once(f"no state was saved: {self.run.state_path}: {reason}")
@@ -166,10 +166,6 @@ class StateSaver(BlockCallback):
         if line not in self.told:
             self.told.add(line)
             self.tell(line)
-
-    def _give_up(self, reason: str) -> None:
-        self.is_off = True
-        self.tell(f"{reason}; if this run is cut off, --resume begins it anew")
 
     def _write(self) -> None:
         environment = self.training_env.unwrapped
@@ -195,10 +191,7 @@ class StateSaver(BlockCallback):
         self.n_saved += 1
 
     def _changed_files(self, logs: Iterable[str]) -> set[Path]:
-        """The files of the run and its logs that have changed since the last state; their folders.
-
-        To ask the disk for all would take as long as the state itself, once there are checkpoints.
-        """
+        """Files of run and logs that changed since the last state, and their folders."""
         paths = {*files_below(self.run.path), *(self.run.path / name for name in logs)}
         before, self.stamps = self.stamps, {}
         for path in paths:
@@ -303,10 +296,7 @@ _CODE = (ModuleType, type, FunctionType)
 
 
 def user_state(modules: Iterable[UserModule]) -> dict[str, dict[str, Any]]:
-    """The values of global names and of classes' attributes, by the names of their holders.
-
-    What lies beside the modules counts too; what is installed does not.
-    """
+    """Global names and class attributes of the user's modules and what lies beside them."""
     return {name: _values(holder) for name, holder in _holders(modules)}
 
 
@@ -343,11 +333,6 @@ def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
     return bool(file) and Path(str(file)).parent == folder and folder != ours
 
 
-def _is_method(value: Any) -> bool:
-    """Whether a class's attribute is a method or the like; caches are not."""
-    return hasattr(type(value), "__get__") and not isinstance(value, functools._lru_cache_wrapper)
-
-
 def _values(holder: ModuleType | type) -> dict[str, Any]:
     """The data that a module or class holds: no code, and nothing of Python's own."""
     return {
@@ -355,7 +340,12 @@ def _values(holder: ModuleType | type) -> dict[str, Any]:
         for name, value in vars(holder).items()
         if not name.startswith(("__", "_abc_"))
         and not isinstance(value, _CODE)
-        and not (isinstance(holder, type) and _is_method(value))
+        # No methods and the like of a class, but its caches.
+        and not (
+            isinstance(holder, type)
+            and hasattr(type(value), "__get__")
+            and not isinstance(value, functools._lru_cache_wrapper)
+        )
     }
 
 
@@ -366,10 +356,7 @@ ITERATIONS = "time/iterations"
 
 
 class IterationInterval(int):
-    """A number of iterations between two log records, counted on from an earlier `learn`.
-
-    The library takes an iteration's number modulo the interval; this adds those that went before.
-    """
+    """An interval that iterations are taken modulo; adds those of an earlier `learn`."""
 
     before: int
 

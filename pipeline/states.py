@@ -257,7 +257,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
     def _array(self, array: NDArray[Any]) -> Any:
         if type(array) is not np.ndarray and not isinstance(array, np.memmap):
             plain, added = array.view(np.ndarray), dict(getattr(array, "__dict__", {}))
-            return _array_of_class, (plain, type(array)), added, None, None, _fill
+            return np.ndarray.view, (plain, type(array)), added, None, None, _fill
         if array.dtype.hasobject:
             return NotImplemented
         array = array.view(np.ndarray) if isinstance(array, np.memmap) else array
@@ -330,10 +330,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
 
 
 def _steps_to(roots: Mapping[str, Any], everything: bool) -> dict[int, tuple[str, ...]]:
-    """How objects are reached from the roots, by their ids.
-
-    Without ``everything`` only what is filled in is looked into, and short lists in it.
-    """
+    """How objects are reached from the roots, by id: all, or only through what is filled in."""
     found: dict[int, tuple[str, ...]] = {}
     pending: deque[tuple[tuple[str, ...], Any, bool]] = deque(
         ((name,), value, True) for name, value in roots.items()
@@ -586,10 +583,6 @@ def _array(
     array: NDArray[Any] = np.ndarray(shape, dtype, content, offset, strides)
     array.flags.writeable = writeable
     return array
-
-
-def _array_of_class(plain: NDArray[Any], kind: type) -> NDArray[Any]:
-    return plain.view(kind)
 
 
 def _tensor(

@@ -126,10 +126,7 @@ class StopRequest:
             self.raise_if_asked()
 
     def _set_timer(self, seconds: float) -> None:
-        """Have `_raise_if_due` called then, also where the main thread waits for something.
-
-        Windows has no such timer: what waits there is told at the next safe moment.
-        """
+        """Have `_raise_if_due` called then, even in a call that waits; not on Windows."""
         if sys.platform != "win32" and self.number is not None:
             is_timed = self._is_waiting and seconds < math.inf
             if is_timed:
@@ -203,11 +200,7 @@ SECONDS_TO_END = 1.0  # for a process whose pipe is closed
 
 
 def shield_workers() -> None:
-    """Let the processes that are started from now on leave signals to this one.
-
-    A terminal and many a cluster signal to all processes at once, and the training still needs its
-    environments.
-    """
+    """Let processes that start from now on leave signals to this one, which needs them still."""
     if sys.platform != "win32" and "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing import forkserver, resource_tracker
 

@@ -22,73 +22,38 @@ _PATHS = ("log_folder", "tensorboard_log", "trained_agent", "watch_learning")
 
 @dataclass(frozen=True)
 class TrainSpec:
-    """One training run.
+    """One training run."""
 
-    Attributes:
-        algo: name of the agent.
-        env_id: id of the environment.
-        hyperparams: the merged hyperparameters, read but not yet made into objects.
-        saved_hyperparams: the same as plain data, for the run folder.
-        seed: of everything random in the run.
-        eval_freq: environment steps between two evaluations; below 0 for none, None for twenty
-            evaluations over the run.
-        eval_episodes: episodes of each evaluation during training; None for as few as will do.
-        final_episodes: of the evaluation at the end, likewise.
-        n_eval_envs: environments that an evaluation plays on at once.
-        save_freq: environment steps between two checkpoints; below 1 for none.
-        save_every_n_episodes: episodes between two checkpoints; below 1 for none.
-        save_replay_buffer: write the agent's replay buffer, if it has one, at the end and at
-            checkpoints.
-        log_folder: the folder above all runs.
-        tensorboard_log: folder for TensorBoard, or None.
-        trained_agent: a zip to go on training, with the statistics of VecNormalize and the replay
-            buffer that belong to it, or None.
-        vec_env: ``"dummy"`` or ``"subproc"``.
-        device: torch device of the networks.
-        num_threads: torch threads; below 1 for PyTorch's own choice. Results may differ between
-            numbers of threads.
-        log_interval: episodes (or rollouts) between two log records; -1 for the library's default,
-            -2 for none.
-        verbose: 0 silent, 1 progress and summary, 2 the library's own log as well.
-        progress: draw a live bar wherever the output goes.
-        gym_packages: names of modules of the user's, whose classes settings may name.
-        user_modules: the same, as another process can import them.
-        unique_id: give the folder a name that no other machine's run can have.
-        pictures: draw the learning curve and the like into the run folder.
-        watch_learning: file of a page that plays the training step by step, or None.
-        watch_episodes: how many episodes that page shows of an agent with tables; 0 for as many as
-            there are in its first steps.
-        origins: by setting, where its value comes from if it does not stand so in the entry, such
-            as ``"auto: 1 - 1/(2 x time limit of 1,000)"``; None for none.
-    """
-
-    algo: str
-    env_id: str
-    hyperparams: Hyperparams
-    saved_hyperparams: dict[str, Any]
-    seed: int
+    algo: str  #: name of the agent
+    env_id: str  #: id of the environment
+    hyperparams: Hyperparams  #: merged, read but not yet made into objects
+    saved_hyperparams: dict[str, Any]  #: the same as plain data, for the run folder
+    seed: int  #: of everything random in the run
+    #: environment steps between two evaluations; below 0 for none, None for twenty over the run
     eval_freq: int | None = None
-    eval_episodes: int | None = 20
-    final_episodes: int | None = 100
-    n_eval_envs: int = 10
-    save_freq: int = -1
-    save_every_n_episodes: int = -1
-    save_replay_buffer: bool = False
-    log_folder: Path = Path("logs")
-    tensorboard_log: Path | None = None
+    eval_episodes: int | None = 20  #: of each evaluation in training; None for as few as will do
+    final_episodes: int | None = 100  #: of the evaluation at the end, likewise
+    n_eval_envs: int = 10  #: environments that an evaluation plays on at once
+    save_freq: int = -1  #: environment steps between two checkpoints; below 1 for none
+    save_every_n_episodes: int = -1  #: episodes between two checkpoints; below 1 for none
+    save_replay_buffer: bool = False  #: at the end and at checkpoints, if the agent has one
+    log_folder: Path = Path("logs")  #: the folder above all runs
+    tensorboard_log: Path | None = None  #: folder for TensorBoard
+    #: a zip to go on training, with the statistics and the replay buffer that belong to it
     trained_agent: Path | None = None
-    vec_env: str = "dummy"
-    device: str = "auto"
-    num_threads: int = 1
-    log_interval: int = -1
-    verbose: int = 1
-    progress: bool = False
-    gym_packages: tuple[str, ...] = ()
-    user_modules: tuple[UserModule, ...] = ()
-    unique_id: bool = False
-    pictures: bool = True
-    watch_learning: Path | None = None
-    watch_episodes: int = 0
+    vec_env: str = "dummy"  #: or ``"subproc"``
+    device: str = "auto"  #: torch device of the networks
+    num_threads: int = 1  #: of PyTorch, on which results may depend; below 1 for its own choice
+    log_interval: int = -1  #: episodes or rollouts a log record; -1: library's default, -2: none
+    verbose: int = 1  #: 0 silent, 1 progress and summary, 2 the library's own log as well
+    progress: bool = False  #: draw a live bar wherever the output goes
+    gym_packages: tuple[str, ...] = ()  #: modules of the user's, whose classes settings may name
+    user_modules: tuple[UserModule, ...] = ()  #: the same, as another process can import them
+    unique_id: bool = False  #: give the folder a name that no other machine's run can have
+    pictures: bool = True  #: draw the learning curve and the like into the run folder
+    watch_learning: Path | None = None  #: file of a page that plays the training step by step
+    watch_episodes: int = 0  #: that it shows of an agent with tables; 0 for as many as have room
+    #: where values come from that do not stand in the entry: ``"auto: 1 - 1/(2 x time limit ..."``
     origins: dict[str, str] | None = None
 
     def as_data(self) -> dict[str, Any]:
@@ -102,11 +67,7 @@ class TrainSpec:
 
     @classmethod
     def of_data(cls, recorded: Mapping[str, Any]) -> Self:
-        """The spec that was written down as `as_data` says, maybe long ago; see `completed`.
-
-        Raises:
-            UserError: if its hyperparameters are none.
-        """
+        """The spec of `as_data`, maybe of long ago; UserError if its hyperparameters are none."""
         data = completed(recorded)
         raw = data.pop("hyperparams")
         paths = {name: None if data[name] is None else Path(data[name]) for name in _PATHS}
@@ -116,11 +77,7 @@ class TrainSpec:
 
 
 def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """A spec that a run folder recorded, maybe long ago, with the fields that a spec has today.
-
-    A field that came later gets its default: a new field must have one under which a run does what
-    it did before. A field that there is no more is left out.
-    """
+    """A recorded spec with the fields of today: under a new one's default, runs do as before."""
     known = _defaults()
     defaults = {key: value for key, value in known.items() if value is not MISSING}
     return {**defaults, **{key: recorded[key] for key in known if key in recorded}}
@@ -142,46 +99,31 @@ NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})
 
 HOMES = ("envs.", "gymnasium.envs.")
 # Around the environments of a training: they hold nothing but numbers.
-WRAPPERS = frozenset(
-    {
-        "envs.wrappers.ScaleReward",
-        "envs.wrappers.TerminationReward",
-        "gymnasium.wrappers.ClipReward",
-    }
-)
+_OWN_WRAPPERS = {"envs.wrappers.ScaleReward", "envs.wrappers.TerminationReward"}
+WRAPPERS = frozenset(_OWN_WRAPPERS | {"gymnasium.wrappers.ClipReward"})
 
 # What such a run may ask for besides: nothing that names code.
-_SETTINGS = (
-    "algorithm",
-    "n_timesteps",
-    "n_episodes",
-    "n_envs",
-    "env_kwargs",
-    "train_env_kwargs",
-    "eval_env_kwargs",
-    "train_env_wrapper",
-)
+_ENV_SETTINGS = ("n_envs", "env_kwargs", "train_env_kwargs", "eval_env_kwargs", "train_env_wrapper")
+_SETTINGS = ("algorithm", "n_timesteps", "n_episodes", *_ENV_SETTINGS)
 
 
 def is_plain(spec: TrainSpec) -> bool:
     """Whether a run is such a one."""
     wrappers = {wrapper.name for wrapper in spec.hyperparams.train_env_wrapper}
-    if not _is_known_agent(spec) or not wrappers <= WRAPPERS:
+    if not wrappers <= WRAPPERS or spec.tensorboard_log or spec.trained_agent:
         return False
-    if spec.gym_packages or spec.user_modules or spec.tensorboard_log or spec.trained_agent:
+    if spec.gym_packages or spec.user_modules or spec.vec_env != "dummy":
         return False
-    special, untouched = spec.hyperparams, Hyperparams()
-    rest = replace(special, **{name: getattr(untouched, name) for name in _SETTINGS})
-    return spec.vec_env == "dummy" and rest == untouched and is_known_environment(spec.env_id)
-
-
-def _is_known_agent(spec: TrainSpec) -> bool:
     from agents import ALGORITHMS
 
-    if spec.algo in NETWORKS:
-        default = ALGORITHMS[spec.algo].engines[0]
-        return bool(spec.hyperparams.algorithm.get("engine", default) != "library")
-    return spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].family in FAMILIES
+    entry = ALGORITHMS.get(spec.algo)
+    if entry is None or (spec.algo not in NETWORKS and entry.family not in FAMILIES):
+        return False
+    special, untouched = spec.hyperparams, Hyperparams()
+    if spec.algo in NETWORKS and special.algorithm.get("engine", entry.engines[0]) == "library":
+        return False
+    rest = replace(special, **{name: getattr(untouched, name) for name in _SETTINGS})
+    return rest == untouched and is_known_environment(spec.env_id)
 
 
 def is_known_environment(env_id: str) -> bool:

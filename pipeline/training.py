@@ -12,6 +12,7 @@ from rich.console import Console
 
 from machine_code import WorkTime
 from machine_code.compiling import compile_timer
+from pipeline import loading_libraries
 from pipeline.callbacks import PullSummary, summarise_pulls
 from pipeline.curve_pictures import draw_learning_curve, draw_pulls
 from pipeline.errors import UserError, one_line
@@ -20,10 +21,9 @@ from pipeline.evaluation.value_maps import value_map
 from pipeline.failures import LibraryError, blame_settings, exits_as_mistakes
 from pipeline.files import DISK_ERRORS, naming
 from pipeline.finite_numbers import check_model
-from pipeline.library_loading import loading_libraries
 from pipeline.locks import FolderGoneError, is_gone
 from pipeline.map_pictures import draw_value_map
-from pipeline.models.find import final_replay_buffer_path
+from pipeline.models.find import REPLAY_BUFFER
 from pipeline.models.load import save_model, save_normalization, save_replay_buffer
 from pipeline.preparation import NEW, UNBOUNDED_TIMESTEPS, Training, is_unread, prepare
 from pipeline.runs import FINISHED, INTERRUPTED, Run, remove_states
@@ -41,36 +41,20 @@ SECONDS_TO_THE_PICTURES = 1.6
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of a run.
+    """What came out of a run."""
 
-    Attributes:
-        run: its folder.
-        state: ``"finished"`` or ``"interrupted"``.
-        n_steps: environment steps that were run.
-        taken: time that they took, evaluations included, and compiling, which is done once, not.
-        final: evaluation of the agent at the end, by episodes used for nothing else; None where
-            evaluation was turned off.
-        best_return: mean return of the best evaluation during training, if there was one.
-        best_timesteps: when that was.
-        best_episodes: how many episodes that is the mean of; 0 where it is exact.
-        evaluating: what all evaluations have taken, the last one included.
-        evaluation_steps: environment steps of those that were sampled.
-        engine: for tabular agents, whether training was compiled, and if not, why.
-        pulls: on bandits, figures on the pulls of training; else None.
-    """
-
-    run: Run
-    state: str
-    n_steps: int
-    taken: WorkTime
-    final: Evaluation | None
-    best_return: float | None
-    best_timesteps: int
-    engine: str | None
-    best_episodes: int
-    evaluating: WorkTime
-    evaluation_steps: int
-    pulls: PullSummary | None = None
+    run: Run  #: its folder
+    state: str  #: ``"finished"`` or ``"interrupted"``
+    n_steps: int  #: environment steps that were run
+    taken: WorkTime  #: for these, with evaluations, without compiling, which is done once
+    final: Evaluation | None  #: by episodes used for nothing else; None if turned off
+    best_return: float | None  #: mean return of the best evaluation during training, if any
+    best_timesteps: int  #: when that was
+    engine: str | None  #: for tabular agents, whether training was compiled, and if not, why
+    best_episodes: int  #: that the best return is the mean of; 0 where it is exact
+    evaluating: WorkTime  #: what all evaluations have taken, the last one included
+    evaluation_steps: int  #: environment steps of those that were sampled
+    pulls: PullSummary | None = None  #: on bandits, figures on the pulls of training
 
 
 def train(
@@ -86,33 +70,26 @@ def train(
 
 
 def carry_out(training: Training, tell: Callable[[Outcome], object] = lambda _: None) -> Outcome:
-    """Train, and save, judge and draw what was learnt.
+    """Train, and save, judge and draw what was learnt, also until a signal ends the training early.
 
-    Ctrl-C ends the training early, and so do the other signals that `pipeline.stopping` notices;
-    what was learnt until then is saved all the same.
-
-    Args:
-        training: what `prepare` has made.
-        tell: called with what came out as soon as it is known, before it is drawn and recorded.
+    ``tell`` is called with what came out before it is drawn and recorded.
 
     Raises:
-        UserError: if the agent finds at its first step that it cannot work so; no folder is left
-            behind then.
+        UserError: if the agent cannot take its first step; no folder is left behind then.
         ForeignExitError: if the environment or a callback asks the program to end.
-        KeyboardInterrupt: if it is stopped before that step, likewise.
+        KeyboardInterrupt: if it is stopped before the first step, likewise.
     """
     with current().held():
+        is_over = False
         try:
             with naming(training.run.path):
                 outcome = _train_and_finish(training, tell)
-        except BaseException as error:
-            with suppress(BaseException):  # it would hide what the run broke by
-                close(training)
-            give_up(training, error)
-            raise
-        try:
+            is_over = True
             close(training)
         except BaseException as error:
+            if not is_over:
+                with suppress(BaseException):  # it would hide what the run broke by
+                    close(training)
             give_up(training, error)
             raise
     return outcome
@@ -136,7 +113,10 @@ def _train_and_finish(training: Training, tell: Callable[[Outcome], object]) -> 
     with doing(training.display.console, "saving what was learnt") as activity:
         outcome = _judged(training, state, taken, activity)
         tell(outcome)
-        return _finish(training, state, outcome, activity)
+        outcome = _drawn(training, state, outcome, activity)
+    if outcome.state == FINISHED and not training.keeping.stays:
+        remove_states(training.run.state_path)
+    return outcome
 
 
 @exits_as_mistakes()
@@ -209,7 +189,7 @@ def _save(training: Training, state: str) -> PullSummary | None:
     save_model(model, run.model_path)
     save_normalization(model, run.vecnormalize_path)
     if training.spec.save_replay_buffer and not current().is_urgent:
-        save_replay_buffer(model, final_replay_buffer_path(run.path))
+        save_replay_buffer(model, run.path / REPLAY_BUFFER)
     if recorder is None or not recorder.n_calls:
         return None
     if state == INTERRUPTED:
@@ -218,10 +198,7 @@ def _save(training: Training, state: str) -> PullSummary | None:
 
 
 def _judge(training: Training, state: str) -> Evaluation | None:
-    """Evaluate what is not evaluated yet; the final evaluation, where the training was not cut off.
-
-    It is exact, or by episodes that were used for nothing else.
-    """
+    """The evaluations not done yet, and the final one if the training was not cut off."""
     evaluation, model = training.evaluation, training.model
     if not evaluation.is_asked_for:
         return None
@@ -232,11 +209,8 @@ def _judge(training: Training, state: str) -> Evaluation | None:
     evaluation.write()
     if evaluation.value_maps is not None:
         evaluation.value_maps.finish(model, model.num_timesteps)
-    return _final_evaluation(training) if state == FINISHED else None
-
-
-def _final_evaluation(training: Training) -> Evaluation:
-    evaluation, model = training.evaluation, training.model
+    if state != FINISHED:
+        return None
     evaluation.take_statistics()
     with evaluation.timed():
         if isinstance(evaluation.evaluator, SampledEvaluator):
@@ -244,8 +218,8 @@ def _final_evaluation(training: Training) -> Evaluation:
         return evaluation.evaluator(model)
 
 
-def _finish(training: Training, state: str, outcome: Outcome, activity: Activity) -> Outcome:
-    """Draw what was learnt; ``run.json`` says so when all else is there."""
+def _drawn(training: Training, state: str, outcome: Outcome, activity: Activity) -> Outcome:
+    """Draw what was learnt; ``run.json`` is written when all else is there."""
     try:
         with _stoppable(state):
             activity.now("drawing the pictures")
@@ -256,9 +230,20 @@ def _finish(training: Training, state: str, outcome: Outcome, activity: Activity
         if outcome.state == FINISHED:
             activity.say("stopped while drawing: the run counts as interrupted")
         outcome = replace(outcome, state=INTERRUPTED)
-    _record(outcome)
-    if outcome.state == FINISHED and not training.keeping.stays:
-        remove_states(training.run.state_path)
+    pulls, number = outcome.pulls, current().number
+    outcome.run.end(
+        state=outcome.state,
+        n_timesteps=outcome.n_steps,
+        final=None if outcome.final is None else outcome.final.summary(),
+        best_mean_return=outcome.best_return,
+        best_timesteps=outcome.best_timesteps,
+        best_episodes=outcome.best_episodes,
+        evaluation_steps=outcome.evaluation_steps,
+        engine=outcome.engine,
+        **outcome.taken.as_data(),
+        **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),
+        **({} if pulls is None else {"regret": pulls.regret, "pulls": asdict(pulls)}),
+    )
     return outcome
 
 
@@ -286,24 +271,6 @@ def draw(training: Training, final: Evaluation | None) -> None:
         found = value_map(maps.evaluator, training.model)
         if found is not None:
             draw_value_map(run.value_map_path, title, found)
-
-
-def _record(outcome: Outcome) -> None:
-    """Write what came out into ``run.json``, the last file of a run."""
-    pulls, number = outcome.pulls, current().number
-    outcome.run.end(
-        state=outcome.state,
-        n_timesteps=outcome.n_steps,
-        final=None if outcome.final is None else outcome.final.summary(),
-        best_mean_return=outcome.best_return,
-        best_timesteps=outcome.best_timesteps,
-        best_episodes=outcome.best_episodes,
-        evaluation_steps=outcome.evaluation_steps,
-        engine=outcome.engine,
-        **outcome.taken.as_data(),
-        **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),
-        **({} if pulls is None else {"regret": pulls.regret, "pulls": asdict(pulls)}),
-    )
 
 
 # --- the end of a training, and of one that breaks ------------------------------------------------

@@ -106,9 +106,8 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
         raise UserError(f"the run needs --gym-packages {' '.join(missing)}: type it again")
     raw = data["hyperparams"]
     if not isinstance(raw, dict) or environment_name(str(data["env_id"])) != run.env_name:
-        raise UserError(
-            f"{run.info_path} is damaged: its hyperparameters or its names are not ours"
-        )
+        what = "its hyperparameters or its names are not ours"
+        raise UserError(f"{run.info_path} is damaged: {what}")
     return replace(
         TrainSpec.of_data({**data, "user_modules": ()}),
         log_folder=run.path.parent.parent,
@@ -120,16 +119,21 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
 
 
 def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> StateKeeping:
-    """Put the files of a run back to where its newest state was, or to its beginning.
-
-    What will not be as it was is told in one line each.
-    """
+    """Put a run's files back to its newest state, or its beginning; tell what will differ."""
     from pipeline.state_files import newest_state  # it takes PyTorch
 
-    _tell_versions(run, tell)
+    versions, now = run.read_info().get("versions"), recorded_versions()
+    before = versions if isinstance(versions, dict) else {}
+    known = {name: before[name] for name in now if name in before}
+    changed = [f"{name} {was} -> {now[name]}" for name, was in known.items() if was != now[name]]
+    if changed:
+        what = "the run began with other versions, so that its result may differ"
+        tell(f"{what}: {', '.join(changed)}")
     state = newest_state(run.state_path, tell) if has_state(run.state_path) else None
-    if state is None:
-        _forget(run)
+    if state is None:  # what a run that begins anew would not overwrite is removed
+        remove_states(run.state_path)
+        for path in monitor_files(run.path):  # another name of one keeps what it holds
+            path.unlink()
     else:
         if state.note["spec"] != settings_digest(run.recorded_spec()):
             raise UserError(f"{run.state_path} holds the state of a run of other settings")
@@ -157,26 +161,6 @@ def _settings(spec: Mapping[str, Any], any_seed: bool) -> Any:
     return json.loads(json.dumps({k: v for k, v in spec.items() if k not in left_out}))
 
 
-def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
-    versions, now = run.read_info().get("versions"), recorded_versions()
-    before = versions if isinstance(versions, dict) else {}
-    changed = [
-        f"{name} {before[name]} -> {now[name]}"
-        for name in now
-        if before.get(name, now[name]) != now[name]
-    ]
-    if changed:
-        what = ", ".join(changed)
-        tell(f"the run began with other versions, so that its result may differ: {what}")
-
-
-def _forget(run: Run) -> None:
-    """Remove what a run that begins anew would not overwrite."""
-    remove_states(run.state_path)
-    for path in monitor_files(run.path):  # another name of one keeps what it holds
-        path.unlink()
-
-
 def settings_digest(spec: Mapping[str, Any]) -> str:
     """The digest of a run's settings."""
     text = json.dumps(spec, sort_keys=True)
@@ -194,10 +178,7 @@ def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Positio
 
 
 def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, Position]) -> None:
-    """Remove what was appended since, and the files that were begun since.
-
-    What is left is a new file, so that no other name of the old one is written to.
-    """
+    """Remove what was appended since, in new files: other links to the old stay as they are."""
     for name, position in positions.items():
         path = run_folder / name  # or the name itself, where that begins at the root
         try:

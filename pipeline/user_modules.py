@@ -51,10 +51,7 @@ class UserModule:
 
 
 class _TypedFolder(MetaPathFinder):
-    """Finds modules in a folder: one that was typed, and those that code from there names.
-
-    On Python's search path, the folder would serve libraries too, and their plugins.
-    """
+    """Finds what was typed and what its code names; `sys.path` would serve libraries too."""
 
     def __init__(self, folder: str, typed: str) -> None:
         self.folder = folder
@@ -87,10 +84,7 @@ def _search(folder: str, typed: str) -> None:
 
 
 def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[UserModule, ...]:
-    """Import what the user typed after ``--gym-packages``, and before the colon of ids.
-
-    The modules are returned as another process can `import_again`; without those of this project.
-    """
+    """Import what was typed after ``--gym-packages`` and before colons; ours are left out."""
     prefixes = [env_id.rpartition(":")[0] for env_id in env_ids]
     modules = []
     for typed in dict.fromkeys([*words, *filter(None, prefixes)]):
@@ -219,15 +213,12 @@ def _what_failed(error: BaseException, module: UserModule) -> str:
         return f"{error.filename}:{error.lineno}: {type(error).__name__}: {error.msg}"
     what = f"{type(error).__name__}: {one_line(error)}"
     frames = traceback.extract_tb(error.__traceback__)[1:]
-    own = [frame for frame in frames if _is_users(frame.filename, module)]
+    if module.search_folder is None:  # it is installed itself, so that all but Python may be its
+        pythons = ("<", str(Path(importlib.__file__).parent))
+        own = [frame for frame in frames if not frame.filename.startswith(pythons)]
+    else:
+        own = [f for f in frames if Path(f.filename).is_relative_to(module.search_folder)]
     return f"{own[-1].filename}:{own[-1].lineno}: {what}" if own else what
-
-
-def _is_users(filename: str, module: UserModule) -> bool:
-    """Whether a file is the user's own, rather than a library that it calls."""
-    if module.search_folder is None:  # it is installed itself
-        return not filename.startswith(("<", str(Path(importlib.__file__).parent)))
-    return Path(filename).is_relative_to(module.search_folder)
 
 
 def _refused(typed: str, reason: str) -> UserError:
@@ -318,10 +309,7 @@ def copy_of(module: str, is_there: Callable[[str], bool]) -> str | None:
 def check_recorded(
     recorded: Mapping[str, Any], folder: Path, zipped_in: Path | None = None
 ) -> None:
-    """Make sure that the modules that a run was trained with have been imported; say what to type.
-
-    ``recorded`` is what the run folder says was asked for; it may come of a pack.
-    """
+    """Make sure that the modules of a run, maybe of a pack, are imported; else say what to type."""
     names = [name for name in recorded.get("gym_packages") or () if isinstance(name, str)]
     missing = [name for name in names if name not in sys.modules]
     if not missing:
@@ -329,11 +317,23 @@ def check_recorded(
     told = ", ".join(map(_printable, missing))
     if zipped_in is None:
         known = [m for m in recorded.get("user_modules") or () if isinstance(m, dict)]
-        words = [_to_type(name, known, folder) for name in missing]
+        words = []
+        for name in missing:  # where it was, or else the run's copy
+            path = next((m.get("path") for m in known if m.get("name") == name), None)
+            if isinstance(path, str) and Path(path).exists():
+                words.append(_near(Path(path)))
+            else:
+                copy = _copy_in(folder, name)
+                words.append(_printable(name if copy is None else str(folder / copy)))
         whose, how = f"{folder} was made with modules of yours ({told})", "add"
     else:
-        near = {name: copy for name in missing if (copy := _copy_near(zipped_in, name))}
         inside = {name: copy for name in missing if (copy := _copy_in(folder, name))}
+        near = {}  # beside the pack, or in a folder above it
+        for name in missing:
+            above = list(zipped_in.resolve().parents)[:_FOLDERS_ABOVE]
+            copies = (_near(f / copy) for f in above if (copy := _copy_in(f, name)))
+            if copy := next(copies, None):
+                near[name] = copy
         words = [{**inside, **near}.get(name, _printable(name)) for name in missing]
         whose = f"{zipped_in} was made with modules of its maker ({told})"
         how = "read them, and if you trust them add" if near else "add"
@@ -350,21 +350,6 @@ def _copy_in(folder: Path, name: str) -> str | None:
     if not all(part.isidentifier() for part in name.split(".")):
         return None
     return copy_of(name, lambda path: (folder / path).is_file())
-
-
-def _copy_near(pack: Path, name: str) -> str | None:
-    """What to type for the copy of a module that lies beside a pack, or in a folder above it."""
-    folders = list(pack.resolve().parents)[:_FOLDERS_ABOVE]
-    return next((_near(f / copy) for f in folders if (copy := _copy_in(f, name))), None)
-
-
-def _to_type(name: str, known: Sequence[Mapping[str, Any]], folder: Path) -> str:
-    """What to type for a module that a run recorded: where it was, or else the run's copy."""
-    path = next((m.get("path") for m in known if m.get("name") == name), None)
-    if isinstance(path, str) and Path(path).exists():
-        return _near(Path(path))
-    copy = _copy_in(folder, name)
-    return _printable(name if copy is None else str(folder / copy))
 
 
 def _near(path: Path) -> str:

@@ -20,7 +20,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from agents.common.algorithm import true_outcome
 from agents.common.callbacks import BlockCallback, Horizon
 from agents.compiled.learning_algorithm import LearningAlgorithm
-from mdp.transition_model import Floats, Ints
+from mdp.transition_model import Floats
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.value_maps import MAX_STATES, best_actions_of
@@ -110,12 +110,8 @@ class MapRecorder(BaseCallback):
             self._keep_end()
 
     def _keep_end(self) -> None:
-        rows = self.moments.rows
-        is_kept = len(rows) and (rows["number"][-1], rows["timesteps"][-1]) == (
-            self.n_units,
-            self.model.num_timesteps,
-        )
-        if not is_kept:
+        last = self.moments.rows[["number", "timesteps"]][-1:].tolist()
+        if last != [(self.n_units, self.model.num_timesteps)]:
             self._append()
 
     def _count(self) -> None:
@@ -308,11 +304,8 @@ class TableRecorder(BlockCallback):
             told["target"] = told["td_error"] = np.nan
 
     def _on_step(self) -> bool:
-        if not self.is_full:
-            self._note_moves()
-        return True
-
-    def _note_moves(self) -> None:
+        if self.is_full:
+            return True
         agent: Any = self.model
         told = self.locals
         next_obs, terminated = true_outcome(told["new_obs"], told["dones"], told["infos"])
@@ -324,10 +317,14 @@ class TableRecorder(BlockCallback):
         moves["action"], moves["reward"] = told["actions"], told["rewards"]
         moves["end"] = np.where(told["dones"], np.where(terminated, TERMINATED, TRUNCATED), GOES_ON)
         moves["target"] = moves["td_error"] = np.nan
-        self.steps.append(self.num_timesteps, agent.exploration_rate, _learning_rate(agent))
+        learning_rate = math.nan
+        if not agent.averages_samples and agent.learning_rate != 0.0:
+            learning_rate = float(agent.lr_schedule(agent._current_progress_remaining))
+        self.steps.append(self.num_timesteps, agent.exploration_rate, learning_rate)
         self.moves.extend(moves)
         self._returns[told["dones"]] = 0.0
         self._episodes[told["dones"]] += 1
+        return True
 
     def _on_rollout_end(self) -> None:
         if self.is_full or not len(self.steps):
@@ -339,22 +336,17 @@ class TableRecorder(BlockCallback):
             last["target"], last["td_error"] = told["target"], told["td_error"]
         for number, now in enumerate(tables_of(agent).values()):
             before = self._tables[number]
-            moved = np.flatnonzero(before != now)
+            # nan is unequal to itself, but did not change.
+            moved = np.flatnonzero((before != now) & ~(np.isnan(before) & np.isnan(now)))
             if len(moved):
-                self._note_changes(number, moved, before, now)
+                changes = np.zeros(len(moved), dtype=CHANGE)
+                changes["step"], changes["table"] = len(self.steps) - 1, number
+                changes["entry"], changes["after"] = moved, now.reshape(-1)[moved]
+                self.changes.extend(changes)
+                before.reshape(-1)[moved] = changes["after"]
         if len(self.steps) % STEPS_BETWEEN_RETURNS == 0:
             self._note_return()
         self._look_whether_full()
-
-    def _note_changes(self, number: int, moved: Ints, before: Floats, now: Floats) -> None:
-        # nan is unequal to itself, but did not change.
-        stays = np.isnan(before.reshape(-1)[moved]) & np.isnan(now.reshape(-1)[moved])
-        moved = moved[~stays]
-        changes = np.zeros(len(moved), dtype=CHANGE)
-        changes["step"], changes["table"] = len(self.steps) - 1, number
-        changes["entry"], changes["after"] = moved, now.reshape(-1)[moved]
-        self.changes.extend(changes)
-        before.reshape(-1)[moved] = changes["after"]
 
     def _look_whether_full(self) -> None:
         if self.n_episodes and self._episodes.sum() >= self.n_episodes:
@@ -385,12 +377,7 @@ class TableRecorder(BlockCallback):
         return len(self.steps) >= STEPS_BETWEEN_RETURNS * risen + STEPS_AROUND
 
     def window(self) -> tuple[int, int]:
-        """The first of the steps to show, and the first behind them.
-
-        They begin with an episode of the first environment, before the return of the greedy policy
-        rises, and end after it has risen; where it rises for longer than there is room, they are
-        the last that there is room for.
-        """
+        """The steps to show, from and to: whole episodes around the rise of the greedy return."""
         n, n_envs = len(self.steps), self.model.n_envs
         returns = np.array(self._greedy_returns)
         if self.exact is None or not len(returns):
@@ -419,10 +406,7 @@ class TableRecorder(BlockCallback):
 
 
 def tables_of(agent: BaseAlgorithm) -> dict[str, Floats]:
-    """The tables that an agent learns in, by name, in the agent's own memory.
-
-    First comes one with a number for each state (or for all as one) and action, if there is one.
-    """
+    """The tables that an agent learns in, by name, those with a number for each action first."""
     tables = {
         name: buffer.numpy()
         for name, buffer in agent.policy.named_buffers()
@@ -437,12 +421,6 @@ def has_actions(agent: BaseAlgorithm, table: Floats) -> bool:
     if not isinstance(states, spaces.Discrete) or not isinstance(actions, spaces.Discrete):
         return False
     return table.ndim > 1 and table.shape[-1] == actions.n and table.shape[-2] in (states.n, 1)
-
-
-def _learning_rate(agent: Any) -> float:
-    if agent.averages_samples or agent.learning_rate == 0.0:
-        return math.nan
-    return float(agent.lr_schedule(agent._current_progress_remaining))
 
 
 Watch = TableRecorder | MapRecorder

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -36,12 +36,9 @@ _MORE_ARGUMENTS: Mapping[type, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True)
-class _Stored:
-    """Class and attributes of a buffer in a file."""
-
+class _Stored(NamedTuple):
     cls: type[ReplayBuffer]
-    state: Mapping[str, Any]
+    state: Mapping[str, Any]  # its attributes
 
 
 def load_replay_buffer(
@@ -61,7 +58,6 @@ def load_replay_buffer(
 
     Raises:
         UnsafeFileError: if the file is no replay buffer, or does not fit the model.
-        OSError: if it cannot be read.
     """
     known: tuple[type[ReplayBuffer], ...] = (*_CLASSES, *classes)
     makers = {name: partial(_stored, cls) for name, cls in by_name(known).items()}
@@ -102,12 +98,8 @@ def _buffer(found: _Stored, device: th.device) -> ReplayBuffer:
         if not isinstance(state.get("infos"), np.ndarray) or state["infos"].shape != shape:
             raise UnsafeFileError("holds a replay buffer with wrong infos")
     try:
-        buffer = found.cls(
-            observation_space=state["observation_space"],
-            action_space=state["action_space"],
-            device=device,
-            **given,
-        )
+        given |= {name: state[name] for name in ("observation_space", "action_space")}
+        buffer = found.cls(device=device, **given)
     except (LookupError, TypeError, ValueError, AssertionError, MemoryError) as error:
         raise UnsafeFileError(f"holds a replay buffer that cannot be made: {error}") from error
     state.pop("device", None)
@@ -155,18 +147,23 @@ class Normalization:
 
 
 def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
-    """As `VecNormalize.load`, without running anything that the file names.
-
-    Args:
-        path: the file, or a stream of its bytes.
-        venv: the environments to normalise.
+    """As `VecNormalize.load` of a path or stream, without running anything that the file names.
 
     Raises:
         UnsafeFileError: if the file is no such statistics, or they do not fit the environments.
-        OSError: if it cannot be read.
     """
-    found = read_normalization(content_of(path, MAX_STATISTICS_BYTES))
-    _check_fit(found, venv.observation_space)
+    found, space = (
+        read_normalization(content_of(path, MAX_STATISTICS_BYTES)),
+        venv.observation_space,
+    )
+    known, rms = found.observation_space, found.obs_rms
+    if type(known) is not type(space) or known.shape != space.shape:
+        raise UnsafeFileError(f"holds statistics of {known}, not of {space}")
+    parts: dict[Any, Any] = dict(rms) if isinstance(rms, dict) else {None: rms} if rms else {}
+    for key, statistics in parts.items():
+        part = space[key] if isinstance(space, spaces.Dict) and key in space.spaces else space
+        if np.shape(statistics.mean) != part.shape or np.shape(statistics.var) != part.shape:
+            raise UnsafeFileError(f"holds statistics of another shape than {part.shape}")
     normalized = VecNormalize(venv, **found.settings)
     if found.obs_rms is not None:
         normalized.obs_rms = cast(Any, found.obs_rms)
@@ -208,18 +205,3 @@ def _normalization(made: Made, build: Build) -> Normalization:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
-
-
-def _check_fit(found: Normalization, space: spaces.Space[Any]) -> None:
-    """Make sure that the statistics are of observations such as these."""
-    known = found.observation_space
-    if type(known) is not type(space) or known.shape != space.shape:
-        raise UnsafeFileError(f"holds statistics of {known}, not of {space}")
-    if found.obs_rms is None:
-        return
-    rms = found.obs_rms
-    parts: dict[Any, Any] = dict(rms) if isinstance(rms, dict) else {None: rms}
-    for key, statistics in parts.items():
-        part = space[key] if isinstance(space, spaces.Dict) and key in space.spaces else space
-        if np.shape(statistics.mean) != part.shape or np.shape(statistics.var) != part.shape:
-            raise UnsafeFileError(f"holds statistics of another shape than {part.shape}")

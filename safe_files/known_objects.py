@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import math
 import operator
@@ -142,9 +143,8 @@ def _seed_sequence(made: Made, build: Build) -> np.random.SeedSequence:
     entropy, n_children, _, pool_size, spawn_key = _state_of_five(made, build)
     if not (isinstance(pool_size, int) and pool_size <= _MAX_POOL):
         raise wrong(made)
-    return np.random.SeedSequence(
-        entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children
-    )
+    counts = {"pool_size": pool_size, "n_children_spawned": n_children}
+    return np.random.SeedSequence(entropy, spawn_key=spawn_key, **counts)
 
 
 def _bit_generator(made: Made, build: Build) -> np.random.PCG64:
@@ -301,9 +301,10 @@ def _parameter(made: Made, build: Build) -> nn.Parameter:
     return nn.Parameter(tensor, bool(requires_grad))
 
 
-def _state_dict(made: Made, build: Build) -> OrderedDict[str, Any]:
+def _state_dict(made: Made, build: Build, has_versions: bool = True) -> OrderedDict[str, Any]:
     """An OrderedDict; what PyTorch says of the versions of a network's parts is left out."""
-    if made.args or made.items or not all(isinstance(key, str) for key, _ in made.pairs):
+    is_plain = all(isinstance(key, str) for key, _ in made.pairs)
+    if made.args or made.items or not is_plain or (made.state is not None and not has_versions):
         raise wrong(made)
     return OrderedDict((key, build(value)) for key, value in made.pairs)
 
@@ -378,16 +379,10 @@ def _space(made: Made, build: Build) -> spaces.Space[Any]:
     return space
 
 
+_OF_NUMBERS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _SPACES: Mapping[str, Maker] = {
-    f"gymnasium.spaces.{name}": _space
-    for name in (
-        "box.Box",
-        "discrete.Discrete",
-        "multi_discrete.MultiDiscrete",
-        "multi_binary.MultiBinary",
-        "tuple.Tuple",
-        "dict.Dict",
-    )
+    f"{kind.__module__}.{kind.__name__}": _space
+    for kind in (*_OF_NUMBERS, spaces.Tuple, spaces.Dict)
 }
 
 
@@ -421,8 +416,7 @@ def _transform(make: Callable[..., Any], /, **kinds: tuple[type, ...]) -> Maker:
 
 
 def _affine(loc: Any, scale: Any, event_dim: int) -> AffineTransform:
-    numbers = [th.as_tensor(value) for value in (loc, scale)]
-    if event_dim or not all(bool(th.isfinite(value).all()) for value in numbers):
+    if event_dim or not all(th.isfinite(th.as_tensor(value)).all() for value in (loc, scale)):
         raise ValueError("not finite")
     return AffineTransform(loc, scale)
 
@@ -469,12 +463,6 @@ _OR_NONE = (*_NUMBERS, type(None))
 _NOISES = NormalActionNoise | OrnsteinUhlenbeckActionNoise
 
 
-def _ordered_dict(made: Made, build: Build) -> OrderedDict[str, Any]:
-    if made.state is not None:
-        raise wrong(made)
-    return _state_dict(made, build)
-
-
 def _deque(made: Made, build: Build) -> deque[Any]:
     # The arguments are what it holds, always nothing, and its greatest length.
     args = build(made.args)
@@ -483,17 +471,9 @@ def _deque(made: Made, build: Build) -> deque[Any]:
     return deque(build(made.items), *args[1:])
 
 
-def _running_mean_std(mean: Any, var: Any, count: Any) -> RunningMeanStd:
-    statistics = RunningMeanStd()
-    statistics.mean, statistics.var, statistics.count = mean, var, count
-    return statistics
-
-
-def _ornstein_uhlenbeck_noise(*arguments_and_last: Any) -> OrnsteinUhlenbeckActionNoise:
-    *given, last = arguments_and_last
-    noise = OrnsteinUhlenbeckActionNoise(*given)
-    noise.noise_prev = last
-    return noise
+def _filled(made: Any, **attributes: Any) -> Any:
+    vars(made).update(attributes)
+    return made
 
 
 def _vectorized_noise(made: Made, build: Build) -> VectorizedActionNoise:
@@ -503,30 +483,24 @@ def _vectorized_noise(made: Made, build: Build) -> VectorizedActionNoise:
         raise wrong(made)
     # The constructor would make as many copies as the file says.
     vectorized = VectorizedActionNoise(cast(Any, base), 1)
-    vectorized.n_envs = len(noises)
-    vectorized.noises = noises
+    vectorized.n_envs, vectorized.noises = len(noises), noises
     return vectorized
 
 
-def _device(made: Made, build: Build) -> th.device:
-    # The reader decides the device.
-    arguments(made, build, *((str,) if len(made.args) == 1 else (str, int)))
-    return th.device("cpu")
-
-
 _OF_LIBRARIES: Mapping[str, Maker] = {
-    "collections.OrderedDict": _ordered_dict,
+    "collections.OrderedDict": partial(_state_dict, has_versions=False),
     "collections.deque": _deque,
     f"{_COMMON}.type_aliases.TrainFreq": _called(TrainFreq, int, TrainFrequencyUnit),
     f"{_COMMON}.type_aliases.TrainFrequencyUnit": _called(TrainFrequencyUnit, str),
     f"{_COMMON}.running_mean_std.RunningMeanStd": _of_state(
-        _running_mean_std, mean=_NUMBERS, var=_NUMBERS, count=_NUMBERS
+        lambda mean, var, count: _filled(RunningMeanStd(), mean=mean, var=var, count=count),
+        **dict.fromkeys(("mean", "var", "count"), _NUMBERS),
     ),
     f"{_COMMON}.noise.NormalActionNoise": _of_state(
         NormalActionNoise, _mu=_OR_NONE, _sigma=_OR_NONE, _dtype=(type,)
     ),
     f"{_COMMON}.noise.OrnsteinUhlenbeckActionNoise": _of_state(
-        _ornstein_uhlenbeck_noise,
+        lambda *given: _filled(OrnsteinUhlenbeckActionNoise(*given[:-1]), noise_prev=given[-1]),
         **dict.fromkeys(("_mu", "_sigma", "_theta", "_dt", "initial_noise"), _OR_NONE),
         _dtype=(type,),
         noise_prev=_OR_NONE,
@@ -535,7 +509,10 @@ _OF_LIBRARIES: Mapping[str, Maker] = {
     "stable_baselines3.her.goal_selection_strategy.GoalSelectionStrategy": _called(
         GoalSelectionStrategy, int
     ),
-    "torch.device": _device,
+    # The reader decides the device.
+    "torch.device": lambda made, build: (
+        arguments(made, build, *(str, int)[: max(len(made.args), 1)]) and th.device("cpu")
+    ),
     "torch.storage._load_from_bytes": _lone_storage,
     "torch._utils._rebuild_tensor_v2": _tensor,
 }
@@ -558,10 +535,8 @@ def _library_classes() -> Mapping[str, type]:
     """Buffers, feature extractors, activations and optimizers, by their full names."""
     modules: list[object] = [buffers]
     with contextlib.suppress(ImportError):
-        from sb3_contrib.common.maskable import buffers as maskable
-        from sb3_contrib.common.recurrent import buffers as recurrent
-
-        modules += [maskable, recurrent]
+        names = (f"sb3_contrib.common.{kind}.buffers" for kind in ("maskable", "recurrent"))
+        modules += [*map(importlib.import_module, names)]
     found = by_name(
         [
             *(cls for module in modules for cls in _subclasses_in(module, buffers.BaseBuffer)),
@@ -576,13 +551,9 @@ def _library_classes() -> Mapping[str, type]:
 
 def all_policy_classes() -> Mapping[str, type]:
     """The policies of all algorithms of Stable-Baselines3 and sb3-contrib, by their full names."""
-    import stable_baselines3 as sb3
-
-    libraries: list[object] = [sb3]
+    libraries: list[object] = [importlib.import_module("stable_baselines3")]
     with contextlib.suppress(ImportError):
-        import sb3_contrib
-
-        libraries.append(sb3_contrib)
+        libraries.append(importlib.import_module("sb3_contrib"))
     algorithms = (one for library in libraries for one in _subclasses_in(library, BaseAlgorithm))
     return {name: cls for one in algorithms for name, cls in policy_classes(one).items()}
 

@@ -85,19 +85,16 @@ def load_model(
     """Load a model as ``algorithm.load`` does, without running anything that the file names.
 
     Args:
-        algorithm: the class of the model, of Stable-Baselines3 or sb3-contrib, or one of your own
-            that is made and saved as theirs are.
+        algorithm: of Stable-Baselines3, sb3-contrib, or your own that is made and saved likewise.
         path: the zip, or a stream of its bytes.
         env: the environment to go on with, or None.
         device: where the tensors go.
         classes: classes of your own that the file may name, by their full names.
-        custom_objects: values for attributes of the file, which are not read then; names that it
-            does not have are passed over.
+        custom_objects: values for those of these attributes that the file has; these are not read.
         replaced: attributes to set instead of those in the file, which are not read then.
 
     Raises:
         UnsafeFileError: if the file holds what may not stand in it, is damaged, or too large.
-        OSError: if it cannot be read.
         ValueError: if the model does not fit ``env``, as the library says it.
     """
     files, variables = _tensors_of(algorithm)
@@ -125,18 +122,19 @@ def load_model(
     try:
         with charged_tensors(budget):
             model = _with_tensors(algorithm, tensors).load(
-                _zipped(data, tensors),
-                env=env,
-                device=device,
-                custom_objects=objects,
-                **replaced,
+                _zipped(data, tensors), env=env, device=device, custom_objects=objects, **replaced
             )
         model.__class__ = algorithm
         _check_fit(model, tensors)
     except ValueError:
         raise  # it does not fit the environment
     except Exception as error:  # settings and weights that do not go together can fail anywhere
-        raise UnsafeFileError(f"holds no such model: {_first_line(error)}") from error
+        lines = str(error).strip().splitlines()
+        # PyTorch says below a heading which tensor it is.
+        n_lines = 2 if lines and lines[0].endswith(":") else 1
+        text = " ".join(line.strip() for line in lines[:n_lines])
+        reason = text.partition(". ")[0] or type(error).__name__
+        raise UnsafeFileError(f"holds no such model: {reason}") from error
     return model
 
 
@@ -208,9 +206,8 @@ def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
             value = variables[key]
             is_tensor = isinstance(value, th.Tensor) and value.dtype == th.float32
             if not is_tensor or value.numel() != 1:
-                raise UnsafeFileError(
-                    f"{name}: {key} is not the one number of float32 that models have"
-                )
+                what = "is not the one number of float32 that models have"
+                raise UnsafeFileError(f"{name}: {key} {what}")
 
 
 def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
@@ -223,15 +220,6 @@ def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
                 th.save(held if name in _VARIABLES else {}, member)
     content.seek(0)
     return content
-
-
-def _first_line(error: BaseException) -> str:
-    """The first sentence of a foreign exception, or its type."""
-    lines = str(error).strip().splitlines()
-    # PyTorch says below a heading which tensor it is.
-    n_lines = 2 if lines and lines[0].endswith(":") else 1
-    text = " ".join(line.strip() for line in lines[:n_lines])
-    return text.partition(". ")[0] or type(error).__name__
 
 
 # --- sizes in proportion to the file, and tensors of such a model ---------------------------------
@@ -357,31 +345,16 @@ def _is_setting(value: Any, like: Any) -> bool:
 
 @dataclass(frozen=True)
 class Report:
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        sizes: bytes of each member of the zip.
-        weights: shapes of the tensors, by member and name.
-        settings: what each attribute is, as a text of one line.
-        suspicious: what should make a reader wary, each in one line; empty where nothing does.
-    """
-
-    sizes: dict[str, int]
-    weights: dict[str, tuple[int, ...]]
-    settings: dict[str, str]
-    suspicious: tuple[str, ...]
+    sizes: dict[str, int]  #: bytes of each member of the zip
+    weights: dict[str, tuple[int, ...]]  #: shapes of the tensors, by member and name
+    settings: dict[str, str]  #: what each attribute is, as a text of one line
+    suspicious: tuple[str, ...]  #: what should make a reader wary, each in one line
 
 
 def inspect_model(path: Path | str) -> Report:
-    """Look into a model's zip; nothing in it is run.
-
-    Args:
-        path: the zip.
-
-    Raises:
-        UnsafeFileError: if it is no zip of a model at all.
-        OSError: if it cannot be read.
-    """
+    """Look into a model's zip; UnsafeFileError if it is none at all."""
     content = read_file(Path(path), MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     members = read_members(content, MEMBERS, budget)

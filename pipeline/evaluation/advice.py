@@ -55,11 +55,7 @@ class Advice:
 def advice(
     spec: TrainSpec, agent: BaseAlgorithm, evaluator: object, final: Evaluation, n_steps: int
 ) -> Advice | None:
-    """Say what an agent that failed after ``n_steps`` does instead, and what to try first.
-
-    None where the score is at least 0.05 and the greedy policy ends its episodes, or where nothing
-    exact is known.
-    """
+    """What a failed agent does instead, and what to try; None for others, or if not exact."""
     if not isinstance(evaluator, ExactEvaluator) or isinstance(agent, RandomAgent):
         return None
     policy = evaluator.policy(agent, deterministic=True)
@@ -179,10 +175,7 @@ def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) ->
 def _share_of_standing_still(
     agent: BaseAlgorithm, model: TransitionModel, observations: Any, gamma: float
 ) -> float:
-    """The agent's own value of its start, as a share of the value of standing still for ever.
-
-    0 where standing still costs nothing or is not possible, and for agents without a table.
-    """
+    """The agent's value of its start, by that of standing still; 0 if that costs nothing."""
     tables = getattr(agent.policy, "q_tables", None)
     stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
     stays &= (model.prob > 0) & model.reachable[:, None, None]

@@ -64,26 +64,15 @@ MOST_STATES_KEPT = 20_000
 
 @dataclass(frozen=True)
 class ExactEvaluator:
-    """Evaluates agents on an environment whose model is known.
+    """Evaluates agents on an environment whose model is known."""
 
-    Attributes:
-        model: the dynamics of the environment that agents are evaluated on.
-        observations: what an agent observes in each state, states along the first axis.
-        horizon: the time limit.
-        success: the outcomes that count as success, shape (S, A, K), or None.
-        yardstick: the best possible and the baseline's return.
-        layout: where the states lie on a map, for grid worlds.
-        masks: what may be done in each state, bool of shape (S, A), or None where that is not
-            known; for agents that are told.
-    """
-
-    model: TransitionModel
-    observations: NDArray[Any]
-    horizon: int
-    success: Bools | None
-    yardstick: Yardstick
-    layout: GridLayout | None = None
-    masks: Bools | None = None
+    model: TransitionModel  #: dynamics of the environment that agents are evaluated on
+    observations: NDArray[Any]  #: of each state, states along the first axis
+    horizon: int  #: the time limit
+    success: Bools | None  #: the outcomes that count as success, shape (S, A, K), or None
+    yardstick: Yardstick  #: the best possible and the baseline's return
+    layout: GridLayout | None = None  #: where the states lie on a map, for grid worlds
+    masks: Bools | None = None  #: what may be done, shape (S, A), for agents that are told
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """The exact worth of the agent's policy as it is."""
@@ -164,10 +153,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
 
 
 def _optimum(model: TransitionModel, horizon: int) -> float | None:
-    """The highest return under the time limit; None where it takes too long to find.
-
-    It goes by numbers of operations: what is exact may not depend on how fast a machine is.
-    """
+    """The highest return under the time limit; None if it takes too many operations."""
     n_backups = int(model.reachable.sum()) * model.n_actions * model.n_outcomes * horizon
     if n_backups > FEW_BACKUPS:
         found = optimum_far_from_limit(model, horizon)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -49,12 +49,12 @@ def has_memory(agent: BaseAlgorithm) -> bool:
 def takes_masks(model: Any) -> bool:
     """Whether `predict` takes ``action_masks``, and the agent goes by them."""
     predict = getattr(model.predict, "__func__", model.predict)
-    return _knows_masks(predict) and bool(getattr(model, "mask_actions", True))
+    return "action_masks" in _parameters(predict) and bool(getattr(model, "mask_actions", True))
 
 
 @lru_cache(maxsize=64)
-def _knows_masks(predict: Callable[..., Any]) -> bool:
-    return "action_masks" in inspect.signature(predict).parameters
+def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
+    return frozenset(inspect.signature(predict).parameters)
 
 
 def player(model: BaseAlgorithm, env: VecEnv) -> Any:
@@ -129,9 +129,9 @@ def obstacle(
     if is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
         return f"to ask a network about {n_states:,} states takes longer than to play"
     if isinstance(agent, PlanningAgent):
-        is_too_large = not agent.policy.is_stationary and n_states * horizon > MOST_PLANNED
-        text = f"a plan for {horizon:,} steps in {n_states:,} states is too large"
-        return text if is_too_large else ""
+        if agent.policy.is_stationary or n_states * horizon <= MOST_PLANNED:
+            return ""
+        return f"a plan for {horizon:,} steps in {n_states:,} states is too large"
     is_random = isinstance(agent, RandomAgent) or not deterministic
     if is_random and n_states * horizon > MOST_AT_RANDOM:
         return f"random actions come to too many of {n_states:,} states in {horizon:,} steps"
@@ -139,11 +139,7 @@ def obstacle(
 
 
 def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
-    """Say why an agent cannot be asked for all states at once; empty where it can.
-
-    Agents of this project and of Stable-Baselines3 can. The others are tried: `predict` has to
-    return one action a state, the same when it is asked again, and nothing to remember.
-    """
+    """Why `predict` cannot be asked for all states at once; strangers' are tried."""
     if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return ""
     try:
@@ -179,9 +175,16 @@ def policy_matrix(
         return np.asarray(agent.action_probabilities()[observations])
     if isinstance(agent, TileAlgorithm):
         return agent.action_probabilities(observations)
-    policy = getattr(agent, "policy", None)
-    if hasattr(policy, "get_distribution"):
-        return _in_parts(agent, observations, masks, partial(_actor_probabilities, policy))
+    policy: Any = getattr(agent, "policy", None)
+    if hasattr(policy, "get_distribution"):  # of an actor with a softmax over its actions
+
+        def probabilities(part: NDArray[Any], **told: Any) -> NDArray[Any]:
+            with th.no_grad():
+                tensor, _ = policy.obs_to_tensor(part)
+                probs = policy.get_distribution(tensor, **told).distribution.probs
+            return np.asarray(probs.cpu().numpy(), dtype=np.float64)
+
+        return _in_parts(agent, observations, masks, probabilities)
     # DQN, and QR-DQN, which may not be installed and is no subclass of it.
     homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
     if any(base.__module__.startswith(homes) for base in type(agent).__mro__):
@@ -243,14 +246,6 @@ def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
     return ""
 
 
-def _actor_probabilities(policy: Any, observations: NDArray[Any], **told: Any) -> Floats:
-    """The probabilities of an actor with a softmax over its actions, shape (S, A)."""
-    with th.no_grad():
-        tensor, _ = policy.obs_to_tensor(observations)
-        distribution = policy.get_distribution(tensor, **told).distribution
-    return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
-
-
 # --- values or probabilities of the actions at one observation ------------------------------------
 
 
@@ -276,21 +271,16 @@ def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | N
     if isinstance(agent, TileAlgorithm):
         return ActionFigures("value", agent.policy.sums(observations)[0])
     with th.no_grad():
-        return _of_network(policy, observations)
-
-
-def _of_network(policy: Any, observations: Any) -> ActionFigures | None:
-    if getattr(policy, "q_net", None) is not None:
-        tensor, _ = policy.obs_to_tensor(observations)
-        return ActionFigures("value", policy.q_net(tensor)[0].cpu().numpy())
-    if getattr(policy, "quantile_net", None) is not None:
-        tensor, _ = policy.obs_to_tensor(observations)
-        return ActionFigures("value", policy.quantile_net(tensor)[0].mean(dim=0).cpu().numpy())
-    # A recurrent policy would need its hidden state.
-    if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
-        tensor, _ = policy.obs_to_tensor(observations)
-        distribution = policy.get_distribution(tensor)
-        if isinstance(distribution, CategoricalDistribution):
-            probabilities = distribution.distribution.probs[0]
-            return ActionFigures("probability", probabilities.cpu().numpy())
+        if (net := getattr(policy, "q_net", None)) is not None:
+            values = net(policy.obs_to_tensor(observations)[0])[0]
+            return ActionFigures("value", values.cpu().numpy())
+        if (net := getattr(policy, "quantile_net", None)) is not None:
+            values = net(policy.obs_to_tensor(observations)[0])[0].mean(dim=0)
+            return ActionFigures("value", values.cpu().numpy())
+        # A recurrent policy would need its hidden state.
+        if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
+            distribution = policy.get_distribution(policy.obs_to_tensor(observations)[0])
+            if isinstance(distribution, CategoricalDistribution):
+                values = distribution.distribution.probs[0]
+                return ActionFigures("probability", values.cpu().numpy())
     return None

@@ -69,18 +69,12 @@ class Yardstick:
 
     def figures(self, expected_return: float) -> dict[str, float]:
         """How a return measures, as JSON; of a bracket by both of its ends."""
-        found = {
-            "optimum": self.optimum,
-            "baseline": self.baseline,
-            "gap": self.gap(expected_return),
-            "score": self.score(expected_return),
-        }
+        found = {"optimum": self.optimum, "baseline": self.baseline}
+        found |= {"gap": self.gap(expected_return), "score": self.score(expected_return)}
         if self.at_least is not None:
-            found |= {
-                "optimum_at_least": self.at_least,
-                "gap_at_least": self.lower_end.gap(expected_return),
-                "score_at_most": self.lower_end.score(expected_return),
-            }
+            found["optimum_at_least"] = self.at_least
+            found["gap_at_least"] = self.lower_end.gap(expected_return)
+            found["score_at_most"] = self.lower_end.score(expected_return)
         return found
 
 
@@ -222,10 +216,7 @@ def evaluation_seed(seed: int, purpose: int) -> int:
 
 
 def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
-    """The bracket of the environment that a run is evaluated on, or None where none holds for it.
-
-    Normalised and stacked observations make no difference; any other wrapper around all copies may.
-    """
+    """The bracket of the evaluation environment, or None where none holds for it."""
     if spec.hyperparams.vec_env_wrapper or not may_have_bracket(spec.env_id):
         return None
     with closing(make_single_env(spec)) as env:
@@ -323,7 +314,7 @@ class SampledEvaluator:
     def __call__(self, model: BaseAlgorithm) -> Evaluation:
         """An evaluation during training."""
         stages = STAGES if self.n_episodes is None else (self.n_episodes,)
-        return self._evaluate(model, stages, PRECISION, self._left, purpose=1)
+        return self._evaluate(model, stages, PRECISION, self._left, evaluation_seed(self.seed, 1))
 
     def at_the_end(self, model: BaseAlgorithm) -> Evaluation:
         """The final evaluation, by episodes of its own."""
@@ -331,21 +322,21 @@ class SampledEvaluator:
         allowed = self._allowed(model, n_trained)
         left = max(allowed - self.n_steps, allowed * (1 - PART_DURING_TRAINING))
         stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
-        length = math.inf if self._last_length is None else self._last_length
+        length = self._last_length or math.inf
         if self.n_final is None and stages[0] * length > left:
             stages = (STAGES[0], *stages)
-        return self._evaluate(model, stages, PRECISION_AT_THE_END, left, purpose=2)
+        seed = evaluation_seed(self.seed, 2)
+        return self._evaluate(model, stages, PRECISION_AT_THE_END, left, seed)
 
     def _evaluate(
         self,
         model: BaseAlgorithm,
         stages: tuple[int, ...],
-        precision: float,
+        within: float,
         most: float,
-        purpose: int,
+        seed: int,
     ) -> Evaluation:
         """Play episodes, until the mean is sure enough or more of them would be too many steps."""
-        seed = evaluation_seed(self.seed, purpose)
         copy = self._compiled_copy(model)
 
         def play(n_episodes: int, seed: int | None) -> Evaluation:
@@ -356,7 +347,7 @@ class SampledEvaluator:
         found = play(stages[0], seed)
         for n_episodes in stages[1:]:
             n_more = n_episodes - len(found.returns)
-            if is_sure(found, precision) or found.lengths.sum() + n_more * found.mean_length > most:
+            if is_sure(found, within) or found.lengths.sum() + n_more * found.mean_length > most:
                 break
             # Without a new seed, the environments go on to other episodes.
             found = found.joined(play(n_more, None))
@@ -383,10 +374,7 @@ class SampledEvaluator:
 
 
 def is_sure(evaluation: Evaluation, precision: float) -> bool:
-    """Whether the standard error of the mean return is small beside it.
-
-    Of fewer than ten episodes that cannot be said: the first five may be alike by chance.
-    """
+    """Whether the standard error is small beside the mean, of ten episodes or more."""
     n_episodes = len(evaluation.returns)
     error = float(np.std(evaluation.returns)) / math.sqrt(max(n_episodes - 1, 1))
     return n_episodes >= LEAST_SURE and error <= precision * abs(evaluation.mean_return)
@@ -426,11 +414,7 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
 def evaluate_compiled(
     model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
 ) -> Evaluation:
-    """Play the episodes that `evaluate` would: the same seeds, starts and order.
-
-    Networks act by the library's `predict` where two actions are so close that rounding could
-    decide.
-    """
+    """Play the episodes of `evaluate`; the library decides near ties of a network."""
     from agents.compiled.greedy_play import play_episodes
     from agents.compiled.records import DECIMALS
     from agents.networks.network_worlds import NetworkEnvStates

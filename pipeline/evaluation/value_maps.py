@@ -31,30 +31,17 @@ SECONDS_BETWEEN_WRITES = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ValueMap:
-    """An agent's policy in every state of a grid world, beside the optimal ones.
+    """An agent's policy in every state of a grid world, beside the optimal ones."""
 
-    Attributes:
-        layout: where the states lie on the map.
-        matters: the states in which the agent may have to act, bool of shape (S,); what the other
-            attributes say of the rest means nothing.
-        initial: probabilities of the starting states, shape (S,).
-        values: the expected return of the agent from each state on, shape (S,).
-        actions: what the agent does there at the first step, shape (S,).
-        visited: the states that it comes to from the start, bool of shape (S,).
-        optimal_values: the highest expected return from each state on, shape (S,).
-        optimal_actions: the actions that may begin it, bool of shape (S, A).
-        optimal_visited: the states that optimal actions lead to, bool of shape (S,).
-    """
-
-    layout: GridLayout
-    matters: Bools
-    initial: Floats
-    values: Floats
-    actions: Ints
-    visited: Bools
-    optimal_values: Floats
-    optimal_actions: Bools
-    optimal_visited: Bools
+    layout: GridLayout  #: where the states lie on the map
+    matters: Bools  #: where the agent may have to act, shape (S,); of other states nothing is said
+    initial: Floats  #: probabilities of the starting states, shape (S,)
+    values: Floats  #: the expected return of the agent from each state on, shape (S,)
+    actions: Ints  #: what the agent does there at the first step, shape (S,)
+    visited: Bools  #: the states that it comes to from the start, shape (S,)
+    optimal_values: Floats  #: the highest expected return from each state on, shape (S,)
+    optimal_actions: Bools  #: the actions that may begin it, shape (S, A)
+    optimal_visited: Bools  #: the states that optimal actions lead to, shape (S,)
 
     @property
     def differs(self) -> Bools:
@@ -64,12 +51,7 @@ class ValueMap:
 
 
 def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | None:
-    """The map of an agent as it is.
-
-    Returns:
-        The map, or None where there is none: on what is no grid world or has more than 2500
-        states, and of agents that have no one action in each state.
-    """
+    """The map of an agent; None but for grid worlds of up to 2500 states and one action in each."""
     policy = best_actions_of(evaluator, agent) if _can_be_drawn(evaluator) else None
     if policy is None or evaluator.layout is None:
         return None
@@ -109,14 +91,10 @@ def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | N
 
 
 class ValueMapRecorder:
-    """Keeps the maps of an agent over its training, in a file that is never half-written.
+    """Keeps the maps of an agent over its training, in the file ``path``.
 
-    The file holds `timesteps` (T,), `values` (T, S), `actions` (T, S), `optimal_values` (S,) and
+    It holds `timesteps` (T,), `values` (T, S), `actions` (T, S), `optimal_values` (S,) and
     `optimal_actions` (S, A), as in `ValueMap`. Of very many maps every second, fourth, ... is kept.
-
-    Args:
-        path: the file; it is written once there is a map.
-        evaluator: of the environment that the agent is judged on.
     """
 
     def __init__(self, path: Path, evaluator: ExactEvaluator) -> None:

@@ -183,10 +183,8 @@ def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) 
 
 def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenModel:
     """The model with the statistics that it is played with, which are there and may be read."""
-    path, normalize = (
-        named or statistics_of(chosen.path, chosen.run),
-        chosen.spec.hyperparams.normalize,
-    )
+    path = named or statistics_of(chosen.path, chosen.run)
+    normalize = chosen.spec.hyperparams.normalize
     if path is None:
         if normalize is not None and normalize.get("norm_obs", True):
             raise UserError(

@@ -20,6 +20,8 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -62,10 +64,7 @@ def run_of(path: Path) -> Run | None:
 
 
 def run_around(model: Path) -> Run | None:
-    """The run folder that a zip lies in, or None where nothing beside it says how it was trained.
-
-    Where the settings lie beside the zip, as model hubs have them, the run's ``env_name`` is empty.
-    """
+    """The run folder of a zip, or None; ``env_name`` is empty where settings lie beside the zip."""
     own = run_of(model)
     if own is not None:
         return own
@@ -111,28 +110,28 @@ def recorded_run(run: Run | None) -> RecordedRun:
     )
 
 
+@contextmanager
+def _telling_way_out() -> Iterator[None]:
+    """Say what to do about a file that is not as its run left it."""
+    try:
+        yield
+    except DamagedFileError as error:
+        raise UserError(f"{error}: train again, or name another copy of it") from error
+
+
 def check_digest(run: Run | None, path: Path) -> None:
     """Make sure that a file of a run is as the run left it, where the run recorded that."""
-    if run is None:
-        return
-    try:
-        run.files.check(path)
-    except DamagedFileError as error:
-        raise _with_way_out(error) from error
+    if run is not None:
+        with _telling_way_out():
+            run.files.check(path)
 
 
 def read_recorded(run: Run | None, path: Path, limit: int) -> bytes:
     """All of a file of at most so many bytes; that of a run has to be as the run left it."""
     if run is None:
         return read_file(path, limit)
-    try:
+    with _telling_way_out():
         return run.files.read(path, limit)
-    except DamagedFileError as error:
-        raise _with_way_out(error) from error
-
-
-def _with_way_out(error: DamagedFileError) -> UserError:
-    return UserError(f"{error}: train again, or name another copy of it")
 
 
 def _has_settings(folder: Path) -> bool:
@@ -155,42 +154,28 @@ def _texts(value: object) -> tuple[str, ...]:
 
 
 _CHECKPOINT = re.compile(r"(.+)_(\d+)_steps")
-_REPLAY_BUFFER = "replay_buffer.pkl"
+REPLAY_BUFFER = "replay_buffer.pkl"
 
 
-def statistics_path(model: Path) -> Path:
-    """Where a checkpoint's statistics lie, such as ``rl_model_vecnormalize_<n>_steps.pkl``."""
-    return _companion(model, "vecnormalize")
-
-
-def replay_buffer_path(model: Path) -> Path:
-    """Where a checkpoint's replay buffer lies, named likewise."""
-    return _companion(model, "replay_buffer")
-
-
-def final_replay_buffer_path(folder: Path) -> Path:
-    """Where the replay buffer of a run's end lies, as rl_zoo3 has it."""
-    return folder / _REPLAY_BUFFER
+def checkpoint_file(model: Path, kind: str) -> Path:
+    """Where "vecnormalize" or "replay_buffer" of a model lies: ``model_<kind>_<n>_steps.pkl``."""
+    checkpoint = _CHECKPOINT.fullmatch(model.stem)
+    if checkpoint is None:
+        return model.with_name(f"{model.stem}_{kind}.pkl")
+    prefix, n_steps = checkpoint.groups()
+    return model.with_name(f"{prefix}_{kind}_{n_steps}_steps.pkl")
 
 
 def statistics_of(model: Path, run: Run | None) -> Path | None:
     """The statistics that belong to a model: the checkpoint's, its run's last, or a model hub's."""
     settings = [] if run is None else [run.vecnormalize_path]
     beside = [model.with_name(name) for name in ("vec_normalize.pkl", "vecnormalize.pkl")]
-    return _first(statistics_path(model), *settings, *beside)
+    return _first(checkpoint_file(model, "vecnormalize"), *settings, *beside)
 
 
 def replay_buffer_of(model: Path) -> Path | None:
     """The replay buffer that belongs to a model: the checkpoint's, or else its run's last one."""
-    return _first(replay_buffer_path(model), model.with_name(_REPLAY_BUFFER))
-
-
-def _companion(model: Path, kind: str) -> Path:
-    checkpoint = _CHECKPOINT.fullmatch(model.stem)
-    if checkpoint is None:
-        return model.with_name(f"{model.stem}_{kind}.pkl")
-    prefix, n_steps = checkpoint.groups()
-    return model.with_name(f"{prefix}_{kind}_{n_steps}_steps.pkl")
+    return _first(checkpoint_file(model, "replay_buffer"), model.with_name(REPLAY_BUFFER))
 
 
 def _first(*paths: Path) -> Path | None:

@@ -74,35 +74,21 @@ def read_model(path: Path, run: Run | None = None) -> ModelFile:
 
 def _shown_space(attributes: Any) -> str | None:
     """A space in words, by its attributes; None where they say nothing plain."""
-    if not isinstance(attributes, dict):
-        return None
-    if "n" in attributes:
-        return f"{attributes['n']} kinds"
-    shape = attributes.get("_shape")
-    return f"shape {tuple(shape)}" if shape else None
+    known = attributes if isinstance(attributes, dict) else {}
+    if "n" in known:
+        return f"{known['n']} kinds"
+    return f"shape {tuple(known['_shape'])}" if known.get("_shape") else None
 
 
 def hand_written_algorithm(model: ModelFile) -> str | None:
-    """The name of the hand-written agent that a zip says it holds, or None for the library's.
-
-    It decides which agent is meant where nobody says so, and nothing about how the zip is read.
-    """
-    class_name = model.data.get("algorithm")
-    for name, entry in ALGORITHMS.items():
-        if (
-            isinstance(class_name, str)
-            and entry.entry_point.endswith(f":{class_name}")
-            and _is_hand_written(name)
-        ):
-            return name
-    return None
+    """The hand-written agent that a zip says it holds, or None; a hint for who is meant."""
+    end = f":{model.data.get('algorithm')}"
+    named = (name for name, entry in ALGORITHMS.items() if entry.entry_point.endswith(end))
+    return next(filter(_is_hand_written, named), None)
 
 
 def telling_masks(spec: TrainSpec, model: ModelFile) -> TrainSpec:
-    """The spec with environments that tell action masks, where the agent in a zip goes by them.
-
-    What the spec says of ``mask_actions`` itself holds.
-    """
+    """The spec with action masks, if the agent in a zip has them and the spec says nothing."""
     algorithm, name = spec.hyperparams.algorithm, "mask_actions"
     if name in algorithm or model.data.get(name) is not True:
         return spec
@@ -165,10 +151,7 @@ def load_model(
     modules: Iterable[UserModule] = (),
     **kwargs: Any,
 ) -> BaseAlgorithm:
-    """Load an agent from its zip, as data: nothing in it is run, whoever wrote it.
-
-    It may name classes of the modules that the user typed. ``kwargs`` are attributes to change.
-    """
+    """Load an agent from its zip as data; ``kwargs`` are attributes to change."""
     file = model if isinstance(model, ModelFile) else read_model(model)
     algorithm = agent_class(algo)
     try:
@@ -181,10 +164,15 @@ def load_model(
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
-        raise UserError(
-            f"{file.path} cannot be loaded as a {algo} agent: {one_line(error)}"
-            f"{_way_out(algorithm, error)}"
-        ) from error
+        key, way_out = getattr(error, "key", None), ""
+        if key in _CLASS_KEYS:
+            way_out = "; a class of yours is admitted where you name its module"
+            way_out += ": --gym-packages MODULE"
+        elif key in algorithm_parameters(algorithm):
+            value = "3e-4" if key == "learning_rate" else "VALUE"
+            way_out = f"; train.py -i goes on with another: -params {key}:{value}"
+        what = f"{file.path} cannot be loaded as a {algo} agent: {one_line(error)}"
+        raise UserError(f"{what}{way_out}") from error
 
 
 def _loaded(
@@ -206,28 +194,13 @@ def _loaded(
         # Code of the user's, which may do with paths alone.
         return algorithm.load(file.path, env=env, **kwargs)
     return load_model(
-        _loadable(algorithm),
-        file.stream(),
-        env,
-        classes=own_classes(algorithm, modules),
-        **kwargs,
+        _loadable(algorithm), file.stream(), env, classes=own_classes(algorithm, modules), **kwargs
     )
 
 
 def _is_load_of(owner: type, algorithm: type[BaseAlgorithm]) -> bool:
     """Whether the class loads as ``owner`` does."""
     return getattr(algorithm.load, "__func__", None) is vars(owner)["load"].__func__
-
-
-def _way_out(algorithm: type[BaseAlgorithm], error: Exception) -> str:
-    """What to do about an attribute that a zip may not hold."""
-    key = getattr(error, "key", None)
-    if key in _CLASS_KEYS:
-        return "; a class of yours is admitted where you name its module: --gym-packages MODULE"
-    if key in algorithm_parameters(algorithm):
-        value = "3e-4" if key == "learning_rate" else "VALUE"
-        return f"; train.py -i goes on with another: -params {key}:{value}"
-    return ""
 
 
 def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
@@ -254,20 +227,15 @@ def load_to_play(
     device: str = "auto",
     modules: Iterable[UserModule] = (),
 ) -> BaseAlgorithm:
-    """As `load_model`, without what only learning needs: buffers, action noise, schedules.
-
-    Observations may have other bounds.
-    """
+    """As `load_model`, without buffers, noise and schedules; observations may have other bounds."""
     file = model if isinstance(model, ModelFile) else read_model(model)
     if _is_hand_written(algo):
         return load_model(algo, file, env, device=device)
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.utils import ConstantSchedule
 
-    saved, given = (
-        _shown_space(file.data.get("observation_space")),
-        _shown_space(vars(env.observation_space)),
-    )
+    spaces = file.data.get("observation_space"), vars(env.observation_space)
+    saved, given = map(_shown_space, spaces)
     if saved != given and saved is not None:
         raise UserError(
             f"{file.path} was trained on observations of {saved}, and the environment as it is "

@@ -19,7 +19,7 @@ import sysconfig
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path, PureWindowsPath
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, get_args, get_origin
@@ -67,16 +67,10 @@ class _Component:
             raise UserError(f"{self.where}: {one_line(error)}") from error
 
 
-@dataclass(frozen=True)
-class _Chain:
-    """Wraps an environment in one wrapper after another; can be pickled."""
-
-    components: tuple[_Component, ...]
-
-    def __call__(self, env: Any) -> Any:
-        for component in self.components:
-            env = component.build(env)
-        return env
+def _wrapped(components: tuple[_Component, ...], env: Any) -> Any:
+    for component in components:
+        env = component.build(env)
+    return env
 
 
 def wrapper_factory(
@@ -89,7 +83,7 @@ def wrapper_factory(
     from gymnasium import Wrapper
 
     components = _components(spec, Wrapper, extra_packages, where, 1, folder)
-    return _Chain(components) if components else None
+    return partial(_wrapped, components) if components else None
 
 
 def vec_wrapper_factory(
@@ -102,7 +96,7 @@ def vec_wrapper_factory(
     from stable_baselines3.common.vec_env import VecEnvWrapper
 
     components = _components(spec, VecEnvWrapper, extra_packages, where, 1, folder)
-    return _Chain(components) if components else None
+    return partial(_wrapped, components) if components else None
 
 
 def callbacks(
@@ -153,10 +147,7 @@ def _components(
     folder: Path | None,
     **defaults: str,
 ) -> tuple[_Component, ...]:
-    """Look up and check classes derived from ``base`` whose first ``n_inner`` arguments are given.
-
-    They may write to ``folder``, or where that is None, to a temporary one.
-    """
+    """Check classes derived from ``base``; they may write to ``folder``, or a temporary one."""
     components = []
     for item in component_specs(spec, where):
         cls = find_class(item.name, (base,), where, extra_packages)
@@ -171,34 +162,19 @@ def _components(
             is_variable = parameter.kind in {parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD}
             if parameter.default is parameter.empty and name not in kwargs and not is_variable:
                 raise UserError(f"{place}: argument {name!r} is missing")
-            if kwargs.get(name) is not None and _is_function(parameter.annotation):
+            kind = str(parameter.annotation).partition("[")[0]  # that admits functions alone
+            if kwargs.get(name) is not None and "Callable" in kind and "|" not in kind:
                 raise UserError(f"{place}: {name} is a function, which settings cannot hold")
         components.append(_Component(cls, build_value(kwargs, extra_packages, place), place))
     return tuple(components)
 
 
-def _is_function(annotation: object) -> bool:
-    """Whether the type of an argument admits functions only."""
-    kind = str(annotation).partition("[")[0]
-    return "Callable" in kind and "|" not in kind
-
-
 # The folders that hold these required libraries count as folders of installed packages.
 _REQUIRED = ("stable_baselines3", "gymnasium", "torch")
 
+_LIBRARIES = ("stable_baselines3", "sb3_contrib", "gymnasium", "torch.nn", "torch.optim")
 # Of rl_zoo3 only two modules: importing the package changes Gymnasium's time limit.
-_PACKAGES = (
-    "stable_baselines3",
-    "sb3_contrib",
-    "gymnasium",
-    "torch.nn",
-    "torch.optim",
-    "rl_zoo3.wrappers",
-    "rl_zoo3.callbacks",
-    "envs",
-    "agents",
-    "pipeline",
-)
+_PACKAGES = (*_LIBRARIES, "rl_zoo3.wrappers", "rl_zoo3.callbacks", "envs", "agents", "pipeline")
 
 # The short names that rl_zoo3's files use.
 _MODULE_ALIASES = {"nn": "torch.nn", "th": "torch", "sb3": "stable_baselines3", "gym": "gymnasium"}
@@ -224,10 +200,8 @@ def find_class(
         raise UserError(f"{where}: {name!r} is not the dotted name of a class")
     packages = (*_PACKAGES, *extra_packages)
     if not any(f"{module_name}.".startswith(f"{package}.") for package in packages):
-        raise UserError(
-            f"{where}: {name} is in none of the packages that may be named "
-            f"({', '.join(packages)}); admit others with --gym-packages"
-        )
+        known = f"none of the packages that may be named ({', '.join(packages)})"
+        raise UserError(f"{where}: {name} is in {known}; admit others with --gym-packages")
     module = _import(module_name, f"{where}: {name}", extra_packages)
     found = getattr(module, class_name, None)
     if isinstance(found, type) and issubclass(found, bases):
@@ -246,32 +220,23 @@ def _import(module_name: str, what: str, typed: Sequence[str]) -> ModuleType:
     try:
         for end in range(1, len(parts) + 1):
             name = ".".join(parts[:end])
-            if not (is_ours(name) or _is_typed(name, typed) or _is_installed(name)):
+            around = (sorted((f"{name}.", f"{one}."), key=len) for one in typed)
+            is_typed = any(longer.startswith(shorter) for shorter, longer in around)
+            if not (is_ours(name) or is_typed or _is_installed(name)):
                 raise UserError(
                     f"{what}: {name} belongs to no package that is installed; if you trust it, "
                     f"type --gym-packages {parts[0]}"
                 )
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        raise UserError(
-            f"{what}: there is no module {error.name}, or it is not installed"
-        ) from error
+        reason = f"there is no module {error.name}, or it is not installed"
+        raise UserError(f"{what}: {reason}") from error
     except ImportError as error:
         raise UserError(f"{what}: cannot be imported: {error}") from error
 
 
-def _is_typed(name: str, typed: Sequence[str]) -> bool:
-    """Whether the user typed this module, a package around it, or a module in it."""
-    return any(
-        f"{name}.".startswith(f"{one}.") or f"{one}.".startswith(f"{name}.") for one in typed
-    )
-
-
 def _is_installed(name: str) -> bool:
-    """Whether a module's file is in the record of the installed distribution of that name.
-
-    The packages around it are imported, so they have to be looked at before.
-    """
+    """Whether a module's file is in the record of the distribution of that name."""
     try:
         spec = importlib.util.find_spec(name)
     except ValueError:  # `sys.modules` has something else under that name
@@ -319,30 +284,23 @@ def names_a_place(argument: str) -> bool:
     return _NAME_OF_A_PLACE.search(argument) is not None
 
 
-def confined(kwargs: Mapping[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """Move paths among the arguments into the folder; refuse those that lead out of it."""
-    return {
-        name: _confined(name, value, folder, f"{where}: {name}") for name, value in kwargs.items()
-    }
-
-
-def _confined(name: str, value: Any, folder: Path | None, where: str) -> Any:
+def confined(value: Any, folder: Path | None, where: str, name: str = "") -> Any:
+    """Move paths among arguments into the folder; refuse those that lead out of it."""
     if isinstance(value, dict):
         return {
-            key: _confined(f"{name}_{key}", item, folder, f"{where}: {key}")
+            key: confined(item, folder, f"{where}: {key}", f"{name}_{key}")
             for key, item in value.items()
         }
     if isinstance(value, list | tuple):
-        return type(value)(_confined(name, item, folder, where) for item in value)
+        return type(value)(confined(item, folder, where, name) for item in value)
     if not (isinstance(value, str | Path) and names_a_place(name)):
         return value
     path = PureWindowsPath(value)  # both slashes part folders, and a drive's letter leads out too
     if "prefix" in name.lower():
-        if path.name != str(value) or str(value) == "..":
-            raise UserError(
-                f"{where} begins the names of files and holds no path, unlike {shown(str(value))}"
-            )
-        return str(value)
+        if path.name == str(value) != "..":
+            return str(value)
+        what = "begins the names of files and holds no path"
+        raise UserError(f"{where} {what}, unlike {shown(str(value))}")
     folder = Path(_scratch().name) if folder is None else folder
     leads_out = bool(path.anchor) or ".." in path.parts or "\0" in str(value)
     # Links are followed first.
@@ -351,9 +309,9 @@ def _confined(name: str, value: Any, folder: Path | None, where: str) -> Any:
     return str(folder / value)
 
 
-@cache
-def _scratch() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="yardstick-", ignore_cleanup_errors=True)
+_scratch = cache(
+    partial(tempfile.TemporaryDirectory, prefix="yardstick-", ignore_cleanup_errors=True)
+)
 
 
 def build_algorithm_kwargs(
@@ -447,20 +405,15 @@ def _build(
 
 def check_action_noise(hyperparams: Hyperparams, algorithm: type[BaseAlgorithm], algo: str) -> None:
     """Make sure that the agent takes the noise that is asked for."""
-    if hyperparams.noise_type is not None and "action_noise" not in constructor_parameters(
-        algorithm
-    ):
+    taken = constructor_parameters(algorithm)
+    if hyperparams.noise_type is not None and "action_noise" not in taken:
         raise UserError(
             f"{algo}: noise_type is for agents that add noise to continuous actions, such as td3"
         )
 
 
 def action_noise(hyperparams: Hyperparams, actions: spaces.Space[Any]) -> dict[str, Any]:
-    """The constructor argument ``action_noise``, as a mapping; empty where none is asked for.
-
-    The noise has mean 0 and standard deviation ``noise_std`` in each component of an action, after
-    actions are scaled to [-1, 1].
-    """
+    """The argument ``action_noise``, of actions scaled to [-1, 1]; empty for none."""
     if hyperparams.noise_type is None:
         return {}
     import numpy as np

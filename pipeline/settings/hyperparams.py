@@ -31,23 +31,24 @@ _SET_ELSEWHERE = {
 _INTERNAL = ("self", "_init_setup_model")
 
 _WRAPPERS = ("env_wrapper", "train_env_wrapper", "vec_env_wrapper", "callback")
-_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
-    "normalize": {
-        "training": bool,
-        "norm_obs": bool,
-        "norm_reward": bool,
-        "clip_obs": float,
-        "clip_reward": float,
-        "gamma": float,
-        "epsilon": float,
-        "norm_obs_keys": list[str] | None,
-    },
-    "monitor_kwargs": {
-        "allow_early_resets": bool,
-        "reset_keywords": tuple[str, ...],
-        "info_keywords": tuple[str, ...],
-        "override_existing": bool,
-    },
+
+
+def _keywords(**kinds: Any) -> Mapping[str, inspect.Parameter]:
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return {name: inspect.Parameter(name, kind, annotation=kinds[name]) for name in kinds}
+
+
+_KEYWORDS: Mapping[str, Mapping[str, inspect.Parameter]] = {
+    "normalize": _keywords(
+        **dict.fromkeys(("training", "norm_obs", "norm_reward"), bool),
+        **dict.fromkeys(("clip_obs", "clip_reward", "gamma", "epsilon"), float),
+        norm_obs_keys=list[str] | None,
+    ),
+    "monitor_kwargs": _keywords(
+        allow_early_resets=bool,
+        **dict.fromkeys(("reset_keywords", "info_keywords"), tuple[str, ...]),
+        override_existing=bool,
+    ),
 }
 
 
@@ -95,16 +96,11 @@ class Hyperparams:
 SPECIAL_KEYS = tuple(key.name for key in fields(Hyperparams) if key.name != "algorithm")
 
 
-@cache  # evaluating the annotations takes longer than reading an entry
-def _special_key_types() -> Mapping[str, Any]:
-    return get_type_hints(Hyperparams)
+_hints = cache(get_type_hints)  # evaluating them takes longer than reading an entry
 
 
 def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperparams:
-    """Separate the special keys of an entry from the algorithm's arguments, and check them.
-
-    A special key that is null counts as left out.
-    """
+    """Separate an entry's special keys, unless null, from the algorithm's arguments; check them."""
     # Without a noise_type, noise_std is an argument of some agents.
     is_action_noise = entry.get("noise_type") is not None
     special_keys = [key for key in SPECIAL_KEYS if key != "noise_std" or is_action_noise]
@@ -112,15 +108,18 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
     special = {key: value for key in special_keys if (value := entry.get(key)) is not None}
     if isinstance(special.get("normalize"), bool):
         special["normalize"] = {} if special["normalize"] else None
-    hints = _special_key_types()
     for key, value in special.items():
         if key in _WRAPPERS:
             special[key] = component_specs(value, f"{where}: {key}")
         else:
-            special[key] = coerce(value, hints[key], f"{where}: {key}")
+            special[key] = coerce(value, _hints(Hyperparams)[key], f"{where}: {key}")
         check_range(key, special[key], where)
-        if isinstance(special[key], dict):
-            special[key] = _checked_keywords(key, special[key], where)
+        if isinstance(special[key], dict) and contains_name(special[key]):
+            raise UserError(
+                f"{where}: {key} takes plain values, not names: put quotes around texts"
+            )
+        if key in _KEYWORDS and special[key] is not None:
+            special[key] = check_arguments(special[key], _KEYWORDS[key], f"{where}: {key}")
     if "n_timesteps" in special and "n_episodes" in special:
         raise UserError(f"{where}: give n_timesteps or n_episodes, not both")
     if "noise_type" in special and "noise_std" not in special:
@@ -134,36 +133,22 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
 
 def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
     """Read wrappers or callbacks in rl_zoo3's forms."""
-    items = spec if isinstance(spec, list | tuple) else [] if spec is None else [spec]
-    return tuple(_component_spec(item, where) for item in items)
-
-
-def _component_spec(item: Any, where: str) -> ComponentSpec:
-    if isinstance(item, ComponentSpec):
-        return item
-    if isinstance(item, dict) and len(item) == 1:
-        ((name, kwargs),) = item.items()
-    else:
-        name, kwargs = item, None
-    kwargs = {} if kwargs is None else kwargs
-    if not (isinstance(name, str) and isinstance(kwargs, dict) and set(map(type, kwargs)) <= {str}):
-        raise UserError(
-            f"{where} must be the dotted name of a class, or that name with its arguments indented "
-            f"below it, or a list of such; not {shown(item)}"
-        )
-    return ComponentSpec(name, kwargs)
-
-
-def _checked_keywords(key: str, keywords: dict[str, Any], where: str) -> dict[str, Any]:
-    if contains_name(keywords):
-        raise UserError(f"{where}: {key} takes plain values, not names: put quotes around texts")
-    if key not in _KEYWORDS:
-        return keywords
-    parameters = {
-        name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
-        for name, annotation in _KEYWORDS[key].items()
-    }
-    return check_arguments(keywords, parameters, f"{where}: {key}")
+    found = []
+    for item in spec if isinstance(spec, list | tuple) else [] if spec is None else [spec]:
+        if isinstance(item, ComponentSpec):
+            found.append(item)
+            continue
+        named = [*item.items()] if isinstance(item, dict) else [(item, None)]
+        name, kwargs = named[0] if len(named) == 1 else (None, None)
+        kwargs = {} if kwargs is None else kwargs
+        is_right = isinstance(kwargs, dict) and all(isinstance(key, str) for key in kwargs)
+        if not (isinstance(name, str) and is_right):
+            raise UserError(
+                f"{where} must be the dotted name of a class, or that name with its arguments "
+                f"indented below it, or a list of such; not {shown(item)}"
+            )
+        found.append(ComponentSpec(name, kwargs))
+    return tuple(found)
 
 
 def check_algorithm_kwargs(
@@ -272,11 +257,8 @@ def _same_environment(
 
 def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:
     env_id = env_id.partition(":")[2] or env_id
-    if env_id in entries:
-        return env_id
-    if _ATARI_ID.fullmatch(env_id) and "atari" in entries:
-        return "atari"
-    return "default" if "default" in entries else None
+    names = (env_id, "atari" if _ATARI_ID.fullmatch(env_id) else "default", "default")
+    return next((name for name in names if name in entries), None)
 
 
 def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
@@ -293,11 +275,9 @@ def _path(algo: str, path: Path | str | None) -> Path:
 
 def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Change an entry; a new budget of training replaces the old one, whatever its unit."""
-    kept = dict(entry)
-    if not {"n_timesteps", "n_episodes"}.isdisjoint(changes):
-        kept.pop("n_timesteps", None)
-        kept.pop("n_episodes", None)
-    return {**kept, **changes}
+    budgets = {"n_timesteps", "n_episodes"}
+    gone = set() if budgets.isdisjoint(changes) else budgets
+    return {**{key: value for key, value in entry.items() if key not in gone}, **changes}
 
 
 def _read_tuned_on(entries: Mapping[str, Any], where: str) -> dict[str, tuple[range, ...]]:

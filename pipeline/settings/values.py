@@ -20,7 +20,7 @@ import types
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -48,13 +48,21 @@ def parse_literal(text: str, where: str = "") -> Any:
     """Read a literal: ``"[64, 64]"``, ``"{'a': 1}"``, ``"dict(net_arch=[64], act=nn.Tanh)"``."""
     text = text.strip()
     try:
-        return _convert(_parse(text))
+        # A deeper or longer expression is no hyperparameter, and could exhaust the parser.
+        if len(text) > _MAX_CHARACTERS:
+            raise ValueError(f"longer than {_MAX_CHARACTERS} characters")
+        with warnings.catch_warnings(action="ignore"):  # an unknown escape such as "\d" stays
+            tree = ast.parse(text, mode="eval").body
+        return _convert(tree)
     except SyntaxError as error:
         line, column = error.lineno or 1, error.offset or 1
         what = f"invalid syntax ({error.msg})"
     except _RefusedError as error:
         what, node = error.args
-        line, column = _position(text, node)
+        # The tree counts columns in bytes.
+        line, offset = getattr(node, "lineno", 1), getattr(node, "col_offset", 0)
+        before = text.splitlines()[line - 1].encode()[:offset].decode(errors="replace")
+        column = len(before) + 1
     except (ValueError, RecursionError, MemoryError) as error:
         line, column, what = 1, 1, f"cannot be read ({one_line(error)})"
     place = f"line {line}, column {column}" if "\n" in text else f"column {column}"
@@ -82,10 +90,8 @@ def parse_assignments(assignments: Iterable[str], where: str = "") -> dict[str, 
     for place, assignment in enumerate(words):
         key, colon, value = assignment.partition(":")
         if not (colon and key.isidentifier() and value.strip()):
-            raise UserError(
-                f"{prefix}{shown(assignment)} does not have the form key:value"
-                f"{_meant(words[place:])}"
-            )
+            what = f"{shown(assignment)} does not have the form key:value"
+            raise UserError(f"{prefix}{what}{_meant(words[place:])}")
         if key in result:
             raise UserError(f"{prefix}{shown(key)} is given twice")
         result[key] = _value_or_text(value)
@@ -114,23 +120,6 @@ def _value_or_text(text: str) -> Any:
         if value is None or isinstance(value, bool) or is_collection:
             return value
     return text
-
-
-def _parse(text: str) -> ast.expr:
-    # A deeper or longer expression is no hyperparameter, and could exhaust the parser.
-    if len(text) > _MAX_CHARACTERS:
-        raise ValueError(f"longer than {_MAX_CHARACTERS} characters")
-    with warnings.catch_warnings():
-        # An unknown escape such as "\d" is left as the user wrote it.
-        warnings.simplefilter("ignore")
-        return ast.parse(text, mode="eval").body
-
-
-def _position(text: str, node: ast.AST) -> tuple[int, int]:
-    """Line and column, counted from 1; the tree counts columns in bytes."""
-    line, offset = getattr(node, "lineno", 1), getattr(node, "col_offset", 0)
-    before = text.splitlines()[line - 1].encode()[:offset].decode(errors="replace")
-    return line, len(before) + 1
 
 
 def _convert(node: ast.expr) -> Any:
@@ -210,11 +199,7 @@ class _MisfitError(Exception):
 
 
 def coerce(value: Any, annotation: Any, where: str) -> Any:
-    """Read a plain value as an annotation asks; of a union the first reading that fits.
-
-    Classes become a `DottedName`, schedules a `ScheduleSpec`. Where the annotation allows a type
-    not known here, what fits no other is left as it was.
-    """
+    """Read a value by the first option of a type that fits; unknown types take it as it is."""
     options = _options(annotation)
     for kind, _, read in _READERS:
         for option in options:
@@ -318,18 +303,14 @@ def _read_schedule(value: Any, option: Any, where: str) -> ScheduleSpec:
     raise _MisfitError
 
 
-def _read_dotted_class(value: Any, option: Any, where: str) -> DottedName:
-    if isinstance(value, str) and "." not in value:
+def _read_class(value: Any, option: Any, where: str, is_dotted: bool = False) -> DottedName:
+    if isinstance(value, DottedName):
+        return value
+    if not (isinstance(value, str) and _CLASS_NAME.fullmatch(value)) or (
+        is_dotted and "." not in value
+    ):
         raise _MisfitError
-    return _read_class(value, option, where)
-
-
-def _read_class(value: Any, option: Any, where: str) -> DottedName:
-    if isinstance(value, str) and _CLASS_NAME.fullmatch(value):
-        return DottedName(value)
-    if not isinstance(value, DottedName):
-        raise _MisfitError
-    return value
+    return DottedName(value)
 
 
 def _read_mapping(value: Any, option: Any, where: str) -> dict[str, Any]:
@@ -373,7 +354,7 @@ _READERS: tuple[tuple[Any, str, Callable[[Any, Any, str], Any]], ...] = (
     (int, "a whole number", _read_int),
     (float, "a number", _read_float),
     (Callable, "a schedule such as lin_0.001", _read_schedule),
-    (type, "the name of a class", _read_dotted_class),
+    (type, "the name of a class", partial(_read_class, is_dotted=True)),
     (str, "a text", _read_as_it_is),
     (type, "the name of a class", _read_class),
     (dict, "a mapping of names to values", _read_mapping),
@@ -440,11 +421,7 @@ def constructor_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
 
 @cache  # a run asks six times, and signatures take long to read
 def algorithm_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
-    """The arguments of an algorithm's constructor, and those that ``**kwargs`` may hand on.
-
-    ``**kwargs`` stays among them, since it may go elsewhere than to the base class. An argument
-    without annotation whose default is a number is read as one wherever it can be.
-    """
+    """A constructor's arguments, with those that ``**kwargs`` may hand on to base classes."""
     own = dict(constructor_parameters(cls))
     rest = next((p for p in own.values() if p.kind is p.VAR_KEYWORD), None)
     owners = [base for base in cls.__mro__[:-1] if "__init__" in vars(base)]
@@ -453,22 +430,16 @@ def algorithm_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
         own = {**algorithm_parameters(owners[1]), **named, rest.name: rest}
         if "env" in named and "policy" not in named:
             own.pop("policy", None)  # which the constructor gives its base class itself
-    return MappingProxyType({name: _annotated(parameter) for name, parameter in own.items()})
-
-
-def _annotated(parameter: inspect.Parameter) -> inspect.Parameter:
-    """The argument, annotated by the type of its default if it has no annotation."""
-    default = parameter.default
-    if set(get_args(parameter.annotation)) == {float, Callable}:
-        # sb3-contrib's TQC annotates a schedule as a function of no kind.
-        return parameter.replace(annotation=float | Callable[[float], float])
-    if parameter.annotation is not parameter.empty or isinstance(default, bool):
-        return parameter
-    kinds: dict[type, Any] = {
-        int: int | float | Any,
-        float: float | Callable[[float], float] | Any,
-    }
-    return parameter.replace(annotation=kinds.get(type(default), parameter.empty))
+    for name, parameter in own.items():
+        if set(get_args(parameter.annotation)) == {float, Callable}:
+            # sb3-contrib's TQC annotates a schedule as a function of no kind.
+            own[name] = parameter.replace(annotation=float | Callable[[float], float])
+        elif parameter.annotation is parameter.empty and type(parameter.default) in (int, float):
+            kind = (
+                int | float if type(parameter.default) is int else float | Callable[[float], float]
+            )
+            own[name] = parameter.replace(annotation=kind | Any)
+    return MappingProxyType(own)
 
 
 def check_arguments(

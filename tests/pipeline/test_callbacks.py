@@ -31,7 +31,7 @@ from pipeline.callbacks import (
     StepCheckpoint,
 )
 from pipeline.evaluation.sampled import Evaluation, evaluate
-from pipeline.models.find import statistics_path
+from pipeline.models.find import checkpoint_file
 from pipeline.runs import Run
 
 TINY_DQN = {
@@ -234,7 +234,7 @@ def test_evaluation_sees_the_normalisation_of_training(run):
     np.testing.assert_array_equal(seen[1], env.obs_rms.mean)
     # The statistics belong to the best model, and lie where they are looked for.
     loaded = VecNormalize.load(
-        str(statistics_path(run.best_model_path)), make_vec_env("CartPole-v1", 1)
+        str(checkpoint_file(run.best_model_path, "vecnormalize")), make_vec_env("CartPole-v1", 1)
     )
     np.testing.assert_array_equal(loaded.obs_rms.mean, seen[1])
 

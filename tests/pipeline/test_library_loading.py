@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import pytest
 import torch as th
 
-from pipeline.library_loading import load_for_optimizer, loading_libraries
+from pipeline import loading_libraries
+from pipeline.preparation import load_for_optimizer
 
 
 @pytest.fixture
