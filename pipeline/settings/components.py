@@ -200,8 +200,8 @@ def find_class(
         raise UserError(f"{where}: {name!r} is not the dotted name of a class")
     packages = (*_PACKAGES, *extra_packages)
     if not any(f"{module_name}.".startswith(f"{package}.") for package in packages):
-        known = f"none of the packages that may be named ({', '.join(packages)})"
-        raise UserError(f"{where}: {name} is in {known}; admit others with --gym-packages")
+        fault = f"none of the packages that may be named ({', '.join(packages)})"
+        raise UserError(f"{where}: {name} is in {fault}; admit others with --gym-packages")
     module = _import(module_name, f"{where}: {name}", extra_packages)
     found = getattr(module, class_name, None)
     if isinstance(found, type) and issubclass(found, bases):
