@@ -768,6 +768,7 @@ class PolicyTraining(NetworkTraining):
             agent._last_obs, agent._last_episode_starts, held.starts[:] = new_obs, dones, dones
             buffer.pos = step + 1
         buffer.full = True
+        self.trained.take_over()
         self.show(agent._last_obs)
         evaluate_rows(self.learner, self.shown, held.last_values)
         estimate_advantages(self.learner, 0.0, 0.0)
@@ -807,6 +808,7 @@ class PolicyTraining(NetworkTraining):
             if infos[i].get("TimeLimit.truncated", False):
                 shown[:] = np.reshape(infos[i]["terminal_observation"], (1, -1))
                 self.check_numbers(shown)
+                self.trained.take_over()  # a callback has been asked since the agent acted
                 evaluate_rows(self.learner, shown, values)
                 lost[i] = np.float32(self.agent.gamma) * values[0]
         return lost

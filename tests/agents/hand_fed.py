@@ -12,49 +12,56 @@ N_STATES, N_ACTIONS = 4, 3
 
 
 class Spaces(gym.Env):
-    """Spaces alone; nothing here is ever stepped."""
+    """Spaces alone, given as such or as numbers; nothing here is ever stepped."""
 
-    def __init__(self, n_states=N_STATES, n_actions=N_ACTIONS):
-        self.observation_space = spaces.Discrete(n_states)
-        self.action_space = spaces.Discrete(n_actions)
+    def __init__(self, observations=N_STATES, actions=N_ACTIONS):
+        is_number = isinstance(observations, int)
+        self.observation_space = spaces.Discrete(observations) if is_number else observations
+        self.action_space = spaces.Discrete(actions)
 
 
-class Fed:
-    """An agent on a table, which does what it is told and learns from it.
+class Told:
+    """An agent on some spaces, which learns from what it is told to have done."""
 
-    It commits to the first best action where its rule needs one.
-    """
-
-    def __init__(self, name, table, epsilon=0.0, **kwargs):
-        table = np.asarray(table, dtype=float)
-        constant = {"exploration_decay": "constant", "exploration_initial_eps": epsilon}
-        self.agent = load_algorithm(name)(
-            env=Spaces(*table.shape), tie_breaking="first", seed=0, **constant, **kwargs
-        )
-        self.table = self.agent.policy.q_tables.numpy()[0]
-        self.table[:] = table
+    def __init__(self, name, observations, n_actions=1, **settings):
+        env = Spaces(observations, n_actions)
+        self.agent = load_algorithm(name)(env=env, **{"seed": 0, **settings})
         self.agent._begin_episodes()
 
     def step(self, obs, action, reward, next_obs, end=""):
-        """Learn from a step, and return the table; ``end`` is "terminated", "truncated" or ""."""
-        transitions = Transitions(
-            np.array([obs]),
-            np.array([action]),
-            np.array([float(reward)]),
-            np.array([end == "terminated"]),
-            np.array([end != ""]),
-            np.array([next_obs]),
-        )
-        self.agent._learn_from(transitions)
+        """Learn from a step; ``end`` is "terminated", "truncated" or ""."""
+        ended = np.array([end == "terminated"]), np.array([end != ""])
+        steps = np.array([obs]), np.array([action]), np.array([float(reward)]), *ended
+        self.agent._learn_from(Transitions(*steps, np.array([next_obs])))
+
+    @property
+    def committed(self):
+        """The action that the agent has committed to, -1 for none."""
+        return int(self.agent._next_actions[0])
+
+
+class Fed(Told):
+    """An agent on a table, which explores by a constant epsilon and breaks no ties at random."""
+
+    def __init__(self, name, table, epsilon=0.0, **settings):
+        table = np.asarray(table, dtype=float)
+        explores = "exploration" in load_algorithm(name).__signature__.parameters
+        constant = {"exploration_decay": "constant", "exploration_initial_eps": epsilon}
+        constant = {**constant, "tie_breaking": "first"} if explores else {}
+        super().__init__(name, *table.shape[-2:], **{"gamma": 0.5, **constant, **settings})
+        self.agent.policy.q_tables.numpy()[:] = table
+        self.table = self.agent.policy.q_tables.numpy()[0]
+
+    def step(self, obs, action, reward, next_obs, end=""):
+        """As above; returns the table."""
+        super().step(obs, action, reward, next_obs, end)
         return self.table.copy()
 
     def episode(self, steps, end):
         """Learn from steps (obs, action, reward), the last of which leads to state 0."""
         following = [*(step[0] for step in steps[1:]), 0]
-        tables = []
-        for k, (step, next_obs) in enumerate(zip(steps, following, strict=True)):
-            tables.append(self.step(*step, next_obs, end if k == len(steps) - 1 else ""))
-        return tables
+        ends = [*[""] * (len(steps) - 1), end]
+        return [self.step(*step, *to) for step, *to in zip(steps, following, ends, strict=True)]
 
     def committed_episode(self, steps, end):
         """As `episode`, but after the first step it does what it has committed to.
@@ -64,7 +71,7 @@ class Fed:
         """
         taken = []
         for k, (obs, action, reward) in enumerate(steps):
-            taken.append((obs, action if k == 0 else int(self.agent._next_actions[0]), reward))
+            taken.append((obs, action if k == 0 else self.committed, reward))
             is_last = k == len(steps) - 1
             self.step(*taken[-1], 0 if is_last else steps[k + 1][0], end if is_last else "")
         return taken

@@ -1,0 +1,453 @@
+"""Which engine trains networks, what it refuses, and the files that it leaves."""
+
+import io
+import subprocess
+import sys
+import zipfile
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from torch import nn
+
+import envs  # noqa: F401  # registers the environments
+from agents import load_algorithm
+from agents.common.callbacks import BlockCallback, EpisodeBudget
+from agents.networks import engine_setting
+from agents.networks.engine_setting import Work
+from envs.wrappers import ActionMasks
+
+SMALL = {"buffer_size": 100, "learning_starts": 10}
+SHORT = {"n_steps": 32, "batch_size": 32}
+
+
+class Plain(BaseCallback):
+    """Has to be asked after each step."""
+
+    def _on_step(self):
+        return True
+
+
+class Sparse(BlockCallback):
+    every_n_steps = 1000
+
+    def _on_step(self):
+        return True
+
+
+class Any(gym.Env):
+    """An environment of any spaces, whose model is not known."""
+
+    def __init__(self, observations=None, actions=None, shown=None, ends=0.1):
+        self.observation_space = observations or spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = actions or spaces.Discrete(2)
+        self.shown, self.ends = shown, ends
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        obs = self.observation_space.sample() if self.shown is None else self.shown
+        return obs, 0.5, bool(self.np_random.random() < self.ends), False, {}
+
+
+def lake(n=8):
+    return make_vec_env("FrozenLake-v1", n, seed=0)
+
+
+def pole():
+    return gym.make("CartPole-v1")
+
+
+def made(name, env, policy="MlpPolicy", **kwargs):
+    return load_algorithm(name)(policy, env, device="cpu", seed=0, **kwargs)
+
+
+# --- which engine --------------------------------------------------------------------------------
+
+LONG, FEW, EPISODES = 200_000, 2_000, 10**12
+TOO_SHORT = "library: so short a training is not worth compiling"
+BRIDGED = "compiled but for the environment: "
+AUTO = {"engine": "auto"}
+PLANS = [
+    # agent, settings, environment, callback, budget, what is chosen
+    *((name, {}, lake, None, LONG, "library") for name in ("ppo", "dqn", "a2c")),
+    *((name, {}, lake, None, LONG, "compiled") for name in ("double_dqn", "deep_qlearning")),
+    ("double_dqn", {"engine": "library"}, lake, None, LONG, "library"),
+    *((name, AUTO, lake, None, LONG, "compiled") for name in ("ppo", "dqn", "a2c")),
+    *((name, AUTO, lake, None, FEW, TOO_SHORT) for name in ("dqn", "a2c")),
+    ("ppo", {**AUTO, "n_steps": 128}, lake, None, FEW, TOO_SHORT),
+    # A rollout is collected to its end, which here takes 16,384 steps.
+    ("ppo", AUTO, lake, None, FEW, "compiled"),
+    ("double_dqn", {}, pole, None, FEW, TOO_SHORT),
+    ("double_dqn", {}, pole, None, LONG, "compiled"),
+    ("double_dqn", {"engine": "compiled"}, lake, None, 1, "compiled"),
+    # Not the steps count, but what is learnt from them.
+    ("dqn", {**AUTO, "learning_starts": LONG}, pole, None, 10_000, TOO_SHORT),
+    ("dqn", {**AUTO, "train_freq": 1}, pole, None, 10_000, "compiled"),
+    ("ppo", {**AUTO, "n_epochs": 40}, lake, None, 12_000, "compiled"),
+    # Callbacks and environments move the environment to Python, and never the engine.
+    ("double_dqn", {}, lake, Sparse, LONG, "compiled"),
+    ("double_dqn", {}, lake, lambda: EvalCallback(lake()), LONG, "compiled"),
+    ("double_dqn", {}, lake, Plain, LONG, f"{BRIDGED}Plain must be asked after each step"),
+    ("double_dqn", {}, lake, Plain, FEW, TOO_SHORT),
+    ("double_dqn", {}, lambda: gym.make("Acrobot-v1"), None, LONG,
+     f"{BRIDGED}the environment's transition model is not known"),
+    ("ppo", AUTO, lambda: VecNormalize(lake(), norm_obs=False), None, LONG,
+     f"{BRIDGED}VecNormalize is not DummyVecEnv"),
+    ("double_dqn", {}, lake, lambda: EpisodeBudget(10), EPISODES, TOO_SHORT),
+    ("double_dqn", {}, lake, lambda: [EpisodeBudget(10)], EPISODES, TOO_SHORT),
+    ("double_dqn", {}, lake, lambda: EpisodeBudget(10_000), EPISODES, "compiled"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", range(len(PLANS)))
+def test_which_engine_trains(case):
+    name, settings, env, callback, budget, chosen = PLANS[case]
+    model = made(name, env(), **settings)
+    assert str(model.engine_plan(budget, callback and callback())) == chosen
+
+
+def test_what_is_worth_compiling():
+    work = Work("q", 0.0, 1, 1.0, 32, 2, 5_000, 5_000)
+    for seconds, is_worth_it in ((engine_setting.WORTH_COMPILING * 1.2, True), (1.0, False)):
+        n_updates = seconds / work.library_seconds
+        assert replace(work, n_updates=n_updates).is_worth_compiling == is_worth_it
+
+
+def test_work_by_hand():
+    ppo = made("ppo", make_vec_env("CartPole-v1", 4), n_steps=100, batch_size=50, n_epochs=3,
+               policy_kwargs={"net_arch": [8]})  # fmt: skip
+    # Three rollouts of 400 steps, each learnt from in three epochs of eight minibatches.
+    n_weights = 4 * 8 + 8 * 2 + 4 * 8 + 8 * 1
+    assert ppo.work(1000) == Work("policy", 1200, 4, 72, 50, 2, n_weights, n_weights)
+    dqn = made("dqn", lake(), learning_starts=200, train_freq=5, gradient_steps=2, batch_size=16,
+               policy_kwargs={"net_arch": [8, 8]})  # fmt: skip
+    # Twice in each 40 of 800 steps; a number as observation needs one column of the first layer.
+    dense = 8 * 8 + 8 * 4
+    assert dqn.work(1000) == Work("q", 1000, 8, 40, 16, 3, 16 * 8 + dense, dense)
+    dqn.gradient_steps = -1  # as many as steps
+    assert dqn.work(1000).n_updates == 800
+
+
+def test_auto_trains_as_the_engine_that_it_chooses():
+    def weights(engine, n_steps):
+        model = made("ppo", lake(2), engine=engine, policy_kwargs={"net_arch": [8]}, **SHORT)
+        model.learn(n_steps)
+        return model.engine_in_use, model.policy.state_dict()
+
+    for n_steps, chosen in ((256, "library"), (12_000, "compiled")):
+        words, learnt = weights("auto", n_steps)
+        assert words.partition(":")[0] == chosen
+        expected = weights(chosen, n_steps)[1]
+        assert all(th.equal(value, expected[name]) for name, value in learnt.items())
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+
+class OwnDQN(load_algorithm("dqn")):
+    """A user's own."""
+
+    def train(self, gradient_steps, batch_size=100):
+        pass
+
+
+DICT = spaces.Dict({"a": spaces.Discrete(2), "b": spaces.Discrete(3)})
+IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
+
+
+def policy(**kwargs):
+    return {"policy_kwargs": kwargs}
+
+
+REFUSALS = {  # reason: agent, environment, settings
+    "it masks actions": (
+        "dqn", lambda: ActionMasks(gym.make("Warehouse-v0")), {"mask_actions": True}),
+    "actions are Box, not Discrete": ("ppo", lambda: gym.make("Pendulum-v1"), {}),
+    "observations are of uint8": ("dqn", lambda: Any(IMAGE), {"policy": "CnnPolicy", **SMALL}),
+    "observations are Dict, not Box or Discrete": (
+        "ppo", lambda: Any(DICT), {"policy": "MultiInputPolicy"}),
+    r"Discrete\(4, start=1\) does not begin with 0": (
+        "dqn", lambda: Any(actions=spaces.Discrete(4, start=1)), SMALL),
+    "observations are of int64": ("ppo", lambda: Any(spaces.Box(0, 9, (3,), np.int64)), {}),
+    "a network has a layer of Hardtanh": ("ppo", Any, policy(activation_fn=nn.Hardtanh)),
+    "a network has a layer of ELU": ("dqn", Any, policy(activation_fn=nn.ELU)),
+    "its optimizer is NAdam, not Adam or RMSprop": (
+        "ppo", Any, policy(optimizer_class=th.optim.NAdam)),
+    "its optimizer has amsgrad True": ("dqn", Any, policy(optimizer_kwargs={"amsgrad": True})),
+    "OwnDQN may do things in Python of its own": (OwnDQN, Any, {}),
+    "its replay buffer is of another kind": (
+        "dqn", Any, {"optimize_memory_usage": True,
+                     "replay_buffer_kwargs": {"handle_timeout_termination": False}, **SMALL}),
+    "train_freq counts the episodes of several environments": (
+        "dqn", lambda: make_vec_env(Any, 2), {"train_freq": (1, "episode"), **SMALL}),
+    "some of its parameters are frozen": ("ppo", Any, {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reason", REFUSALS)
+def test_compiled_says_why_not_and_auto_falls_back(reason):
+    name, env, settings = REFUSALS[reason]
+    settings = {"policy": "MlpPolicy", **(SHORT if name == "ppo" else {}), **settings}
+    algorithm = name if isinstance(name, type) else load_algorithm(name)
+    model = algorithm(env=env(), engine="compiled", **settings)
+    if "frozen" in reason:
+        model.policy.value_net.weight.requires_grad_(False)
+    with pytest.raises(ValueError, match=f"^engine: compiled is not possible: {reason}$"):
+        model.learn(30)
+    assert model.num_timesteps == 0
+    if reason.endswith(("begin with 0", "several environments")):  # nor does the library
+        return
+    model.engine = "auto"
+    model.learn(30)
+    assert model.engine_in_use == f"library: {reason}".replace("\\", "")
+    assert model.num_timesteps >= 30
+
+
+def test_an_unknown_engine_is_refused():
+    with pytest.raises(ValueError, match="engine"):
+        made("ppo", Any(), engine="fast")
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+@pytest.mark.parametrize("name", ["dqn", "ppo"])
+def test_states_that_networks_have_no_weights_for_are_refused(name, at_end):
+    """Compiled code would read whatever lies behind the weights."""
+    model = made(name, Any(spaces.Discrete(3), shown=3, ends=float(at_end)), engine="compiled")
+    if name == "ppo" and at_end:
+        model.learn(100)  # nobody looks at what an episode has ended with
+        assert model.num_timesteps >= 100
+        return
+    with pytest.raises(ValueError, match=r"observation 3 is not in Discrete\(3\)"):
+        model.learn(100)
+
+
+def test_a_training_that_diverges_is_ended():
+    broken = np.full(2, np.nan, np.float32)
+    for name in ("ppo", "a2c"):
+        model = made(name, Any(shown=broken, ends=0), n_steps=64, engine="compiled")
+        with pytest.raises(ValueError, match="training has diverged"):
+            model.learn(100)
+    model = made("dqn", Any(shown=broken, ends=0), engine="compiled", **SMALL).learn(100)
+    assert all(bool(p.isnan().all()) for p in model.q_net.parameters())
+
+
+# --- compiled but for the environment ------------------------------------------------------------
+
+FUNCTION = {"learning_rate": lambda remaining: 0.01 * remaining}
+FALLBACKS = {
+    "the environment's transition model is not known": (Any, {}, None),
+    "Plain must be asked after each step": (lambda: lake(1), {}, Plain),
+    "a function must be asked after each step": (lambda: lake(1), {}, lambda: lambda *_: True),
+    "a schedule is a Python function": (lambda: lake(1), FUNCTION, None),
+}
+
+
+@pytest.mark.parametrize("name", ["dqn", "ppo"])
+@pytest.mark.parametrize("reason", FALLBACKS)
+def test_environments_are_called_where_they_have_to_be(reason, name):
+    env, kwargs, callback = FALLBACKS[reason]
+    own = SHORT if name == "ppo" else SMALL
+    model = made(name, env(), engine="compiled", **own, **kwargs)
+    callback = callback and callback()
+    model.learn(64, callback=callback)
+    assert model.engine_in_use == BRIDGED + reason
+    assert model._n_updates > 0
+    assert str(model.engine_plan(10**6, callback, "auto")) == model.engine_in_use
+
+
+def test_processes_of_their_own():
+    forks = {"start_method": "fork"}  # they would import for seconds
+    env = make_vec_env("CartPole-v1", 2, 0, vec_env_cls=SubprocVecEnv, vec_env_kwargs=forks)
+    model = made("a2c", env, engine="compiled").learn(50)
+    env.close()
+    assert model.engine_in_use == f"{BRIDGED}SubprocVecEnv is not DummyVecEnv"
+
+
+def test_clip_ranges_in_python_are_asked_at_each_training():
+    asked = []
+
+    def clip_range(remaining):
+        asked.append(round(remaining, 6))
+        return 0.1 + 0.1 * remaining
+
+    model = made("ppo", lake(1), engine="compiled", clip_range=clip_range, **SHORT).learn(96)
+    assert model.engine_in_use.endswith("a schedule is a Python function")
+    assert set(asked) >= {round(i / 3, 6) for i in range(3)}
+    assert model.logger.name_to_value["train/clip_range"] == pytest.approx(0.1)
+
+
+class Watch(BaseCallback):
+    """What the library's loop shows of a step."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def _on_step(self):
+        original = self.training_env.get_original_obs()
+        parts = self.model._last_obs, self.locals["rewards"], original, self.locals["new_obs"]
+        self.seen.append([part.copy() for part in parts])
+        return True
+
+
+@pytest.mark.parametrize("name", ["ppo", "a2c", "dqn", "double_dqn"])
+def test_normalised_environments(name):
+    """Rollouts hold what was normalised on the way; replay holds what was there before."""
+    env, watch = VecNormalize(make_vec_env("CartPole-v1", 2, seed=0)), Watch()
+    own = {**SMALL, "buffer_size": 400} if "dqn" in name else {"n_steps": 64}
+    model = made(name, env, engine="compiled", **own).learn(256, callback=watch)
+    assert model.engine_in_use.startswith(BRIDGED)
+    assert env.obs_rms.count == pytest.approx(256 + 2, abs=0.01)
+    assert model._n_updates > 0
+    last_obs, rewards, original, new_obs = (
+        np.array(part) for part in zip(*watch.seen, strict=True)
+    )
+    assert np.abs(original - new_obs).max() > 0.01
+    if "dqn" in name:
+        buffer = model.replay_buffer
+        np.testing.assert_array_equal(buffer.observations[1:128], original[:-1])
+        np.testing.assert_array_equal(buffer.rewards[:128], 1)
+        return
+    buffer = model.rollout_buffer
+    np.testing.assert_array_equal(buffer.observations, last_obs[-64:].astype(np.float32))
+    # No time limit has run out: these are the rewards as they were normalised.
+    np.testing.assert_array_equal(buffer.rewards, rewards[-64:])
+    assert np.abs(buffer.rewards - 1).max() > 0.01
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+Q = {"learning_starts": 50, "buffer_size": 400, "target_update_interval": 20}
+AGENTS = {
+    "dqn": ("DQN", "FrozenLake-v1", Q),
+    "double_dqn": ("DQN", "CartPole-v1", Q),
+    "deep_qlearning": ("DQN", "FrozenLake-v1", {**Q, "n_steps": 3}),
+    "ppo": ("PPO", "FrozenLake-v1", {"n_steps": 64}),
+    "a2c": ("A2C", "CartPole-v1", {}),
+}
+# Wherever the project is installed, its packages are out of reach here.
+ELSEWHERE = """
+import sys
+
+class Nothing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"agents", "envs", "machine_code", "mdp", "pipeline"}:
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Nothing())
+import gymnasium, stable_baselines3, torch
+for line in sys.stdin.read().splitlines():
+    kind, path, env = line.split("|")
+    model = getattr(stable_baselines3, kind).load(path, env=gymnasium.make(env), device="cpu")
+    steps = {float(s["step"]) for s in model.policy.optimizer.state.values()}
+    before = torch.cat([p.detach().flatten() for p in model.policy.parameters()])
+    model.learn(200, reset_num_timesteps=False)
+    after = torch.cat([p.detach().flatten() for p in model.policy.parameters()])
+    print(path, steps, bool((before != after).any()), bool(after.isfinite().all()), sep="|")
+"""
+
+
+def saved(name, folder, env=None, engine="compiled", asked=()):
+    """A model after a training with a checkpoint, which has been saved."""
+    _, usual, settings = AGENTS[name]
+    model = made(name, make_vec_env(env or usual, seed=0), engine=engine, **settings)
+    model.learn(300, callback=[CheckpointCallback(200, folder), *asked]).save(folder / "after")
+    assert model.engine_in_use.startswith(engine)
+    return model
+
+
+def tensors(path, member):
+    with zipfile.ZipFile(path) as archive:
+        return th.load(io.BytesIO(archive.read(member)), weights_only=True)
+
+
+def steps_of(states):
+    return {float(kept["step"]) for kept in states.values()}
+
+
+def test_files_open_where_this_project_is_not(tmp_path):
+    lines, expected = [], []
+    for name, (kind, env, _) in AGENTS.items():
+        model = saved(name, tmp_path / name)
+        for path in (tmp_path / name / "rl_model_200_steps.zip", tmp_path / name / "after.zip"):
+            lines.append(f"{kind}|{path}|{env}")
+            steps = steps_of(tensors(path, "policy.optimizer.pth")["state"])
+            expected.append(f"{path}|{steps}|True|True")
+        assert steps == steps_of(model.policy.optimizer.state)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", ELSEWHERE],
+        input="\n".join(lines),
+        cwd=tmp_path,
+        env={"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == expected
+
+
+def shapes(path):
+    """What the tensors of a file are like, each of which has memory of its own."""
+    found, kept = {}, []
+
+    def look(name, value):
+        for key, part in value.items() if isinstance(value, dict) else ():
+            look(f"{name}.{key}", part)
+        found[name] = type(value)
+        if isinstance(value, th.Tensor):
+            assert value.is_contiguous(), name
+            assert value.untyped_storage().nbytes() == value.nbytes, name
+            kept.append(value)
+            found[name] = value.shape, value.dtype
+
+    for member in ("policy.pth", "policy.optimizer.pth"):
+        look(member, tensors(path, member))
+    assert len({tensor.untyped_storage().data_ptr() for tensor in kept}) == len(kept)
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored")  # the library's, of its own choice
+@pytest.mark.parametrize(("name", "asked"), [*((n, ()) for n in AGENTS), ("ppo", (Plain,))])
+def test_files_are_like_the_librarys_and_go_on_in_either_engine(name, asked, tmp_path):
+    model = None
+    for engine in ("library", "compiled"):
+        callbacks = [kind() for kind in asked]
+        model = saved(name, tmp_path / engine, "CartPole-v1", engine, callbacks)
+    names = ("rl_model_200_steps.zip", "after.zip")
+    for theirs, ours in ((tmp_path / "library" / n, tmp_path / "compiled" / n) for n in names):
+        assert ours.stat().st_size == pytest.approx(theirs.stat().st_size, rel=0.02)
+        assert shapes(ours) == shapes(theirs)
+    for engine in ("library", "compiled"):
+        env = make_vec_env("CartPole-v1", seed=1)
+        loaded = load_algorithm(name).load(tmp_path / "compiled" / "after", env, engine=engine)
+        weights = loaded.policy.state_dict(), model.policy.state_dict()
+        assert all(map(th.equal, *(each.values() for each in weights)))
+        before = steps_of(model.policy.optimizer.state)
+        assert steps_of(loaded.policy.optimizer.state) == before
+        loaded.learn(200, reset_num_timesteps=False)
+        assert loaded.num_timesteps >= 500
+        assert min(steps_of(loaded.policy.optimizer.state)) > max(before)
+
+
+def test_tensors_have_memory_of_their_own_and_optimizers_remember_what_they_did():
+    model = made("dqn", pole(), engine="compiled", learning_starts=1000).learn(100)
+    assert not model.policy.optimizer.state
+    model.learning_starts = 100
+    model.learn(200, reset_num_timesteps=False)
+    kept = model.policy.optimizer.state.values()
+    moments = [value for each in kept for value in each.values() if isinstance(value, th.Tensor)]
+    assert len(moments) > 10
+    for tensor in [*model.policy.parameters(), *moments]:
+        assert tensor.is_contiguous()
+        assert tensor.untyped_storage().nbytes() == tensor.nbytes

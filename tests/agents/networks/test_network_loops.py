@@ -1,0 +1,531 @@
+"""Networks trained in three loops: the library's, the same with compiled parts, the compiled one.
+
+The library, made to draw the numbers that compiled code draws, agrees up to rounding. The other two
+end in the same bits, wherever blocks of steps end and whatever callbacks there are.
+"""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CheckpointCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from torch.distributions import Categorical
+
+import envs  # noqa: F401  # registers the environments
+from agents import load_algorithm
+from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon
+from envs.wrappers import OneHotObservation
+
+TOLERANCE = 1e-4  # what rounding comes to after a few hundred steps
+REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+ROLLOUT = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
+ROLLOUT += ("advantages", "returns")
+
+
+def lake(steps=6):
+    return gym.make("FrozenLake-v1", max_episode_steps=steps)
+
+
+def vectors(steps=6):
+    return OneHotObservation(lake(steps))
+
+
+def pole(steps=9):
+    return gym.make("CartPole-v1", max_episode_steps=steps)
+
+
+class Plain(BaseCallback):
+    """Has to be asked after each step, so that the library's loop runs."""
+
+    def _on_step(self):
+        return True
+
+
+class Every(BlockCallback):
+    """Does something on every so many calls, and lets blocks be no longer than that."""
+
+    def __init__(self, calls, do=lambda model: None):
+        super().__init__()
+        self.calls, self.do = calls, do
+
+    def horizon(self):
+        return Horizon(calls=self.calls - self.n_calls % self.calls)
+
+    def _on_step(self):
+        return self.n_calls % self.calls != 0 or self.do(self.model) is not False
+
+
+def networks(name, env, n_envs, engine="compiled", rate=(1e-2, 1e-3, 0.8), width=(16,), **kwargs):
+    return load_algorithm(name)(
+        "MlpPolicy",
+        make_vec_env(env, n_envs, seed=3),
+        seed=5,
+        engine=engine,
+        learning_rate=LinearSchedule(*rate),
+        policy_kwargs={"net_arch": list(width)},
+        **kwargs,
+    )
+
+
+# --- against the library -------------------------------------------------------------------------
+
+
+class Lists(KVWriter):
+    """Keeps what is logged, but for times."""
+
+    def __init__(self):
+        self.dumps = []
+
+    def write(self, key_values, key_excluded, step=0):
+        times = ("time/fps", "time/time_elapsed")
+        kept = {k: v for k, v in sorted(key_values.items()) if k not in times}
+        self.dumps.append((step, kept))
+
+    def close(self):
+        pass
+
+
+class Diary(BlockCallback):
+    """Writes down what can be seen after each step: as it is, and up to rounding."""
+
+    def __init__(self):
+        super().__init__()
+        self.exact, self.close = [], []
+
+    def horizon(self):
+        return Horizon(calls=1)
+
+    def _on_step(self):
+        model, told = self.model, self.locals
+        buffer = getattr(model, "replay_buffer", None)
+        self.exact.append(
+            {
+                "n": (self.n_calls, self.num_timesteps, model._n_updates, model._episode_num),
+                "told": [told[k].tolist() for k in ("actions", "rewards", "dones", "new_obs")],
+                "infos": [self._info(info) for info in told["infos"]],
+                "last_obs": model._last_obs.tolist(),
+                "starts": np.array(model._last_episode_starts).tolist() * (buffer is None),
+                "episodes": [(info["r"], info["l"]) for info in model.ep_info_buffer],
+                "calls": getattr(model, "_n_calls", 0),
+                "ring": buffer and (buffer.pos, buffer.full),
+            }
+        )
+        rates = model._current_progress_remaining, getattr(model, "exploration_rate", 0)
+        weights = [p.detach().numpy().ravel() for p in model.policy.parameters()]
+        learning_rate = model.policy.optimizer.param_groups[0]["lr"]
+        self.close.append(np.concatenate([[*rates, learning_rate], *weights]))
+        return True
+
+    def _info(self, info):
+        end, episode = info.get("terminal_observation"), info.get("episode")
+        ended = None if end is None else np.array(end).tolist()
+        return info["TimeLimit.truncated"], ended, episode and (episode["r"], episode["l"])
+
+
+class Rollouts(BlockCallback):
+    """Writes down what rollouts begin and end with."""
+
+    def __init__(self):
+        super().__init__()
+        self.exact, self.close = [], []
+
+    def _look(self, *arrays):
+        weights = [p.detach().numpy().ravel() for p in self.model.policy.parameters()]
+        self.exact.append((self.n_calls, self.model._n_updates))
+        self.close.append(np.concatenate([*weights, *map(np.ravel, arrays)]))
+
+    def _on_rollout_start(self):
+        self._look()
+
+    def _on_rollout_end(self):
+        if hasattr(self.model, "replay_buffer"):
+            self._look([self.model.replay_buffer.pos])
+        else:
+            assert self.model.rollout_buffer.full
+            self._look(*(getattr(self.model.rollout_buffer, name) for name in ROLLOUT))
+
+    def _on_step(self):
+        return True
+
+
+def draw_as_compiled(patch, model):
+    """Let the library's agent draw from its generator for compiled code, in the same order."""
+    rng, drawn = model.rng, []
+
+    def randint(low, high=None, size=None):
+        if not drawn:
+            limits = model.replay_buffer.size(), model.n_envs
+            drawn.extend((rng.random((model.batch_size, 2)) * limits).astype(int).T)
+        return drawn.pop(0)
+
+    def permutation(n):
+        numbers, n_envs = np.arange(n), model.n_envs
+        for i in range(n - 1, 0, -1):
+            j = int(rng.random() * (i + 1))
+            numbers[[i, j]] = numbers[[j, i]]
+        return numbers % n_envs * model.n_steps + numbers // n_envs
+
+    def sample(distribution):
+        cumulative = distribution.probs.double().cumsum(dim=1).numpy()
+        uniform = rng.random(len(cumulative))[:, np.newaxis]
+        return th.as_tensor((cumulative[:, :-1] <= uniform).sum(axis=1))
+
+    patch.setattr(np.random, "rand", rng.random)
+    patch.setattr(np.random, "randint", randint)
+    patch.setattr(np.random, "permutation", permutation)
+    patch.setattr(Categorical, "sample", sample)
+    n_actions = int(model.action_space.n)
+    patch.setattr(model.action_space, "sample", lambda: int(rng.random() * n_actions))
+
+
+def unflattened(buffer, name):
+    """An array of the rollout buffer, as it was before the library took it apart."""
+    array, (n_steps, n_envs) = getattr(buffer, name), buffer.rewards.shape
+    if len(array) == n_steps * n_envs and n_envs > 1:
+        return array.reshape(n_envs, n_steps, -1).swapaxes(0, 1)
+    return array.reshape(n_steps, n_envs, -1)
+
+
+def followed(mode, case):
+    """What can be seen of a training, in a list that is exact and in one up to rounding."""
+    name, env, n_envs, log_interval, settings = CASES[case]
+    model = networks(name, env, n_envs, "library" if mode == "library" else "compiled", **settings)
+    lists, diary, rollouts = Lists(), Diary(), Rollouts()
+    model.set_logger(Logger(None, [lists]))
+    with pytest.MonkeyPatch.context() as patch:
+        if mode == "library":
+            draw_as_compiled(patch, model)
+        asked = [diary] if mode == "blocks" else [diary, rollouts]
+        model.learn(303, callback=asked, log_interval=log_interval)
+    assert (model.engine_in_use == "compiled") == (mode != "library")
+    exact = [diary.exact, [(step, list(record)) for step, record in lists.dumps]]
+    logged = [value for _, record in lists.dumps for value in record.values()]
+    close = [*diary.close, *(value.numpy() for value in model.policy.state_dict().values())]
+    if name.startswith(("dqn", "do", "de")):
+        exact += [getattr(model.replay_buffer, array).tolist() for array in REPLAY]
+        assert model.replay_buffer.timeouts.any() == ("replay_buffer_kwargs" not in settings)
+    else:
+        close += [unflattened(model.rollout_buffer, array) for array in ROLLOUT]
+    assert model.num_timesteps >= 303
+    return (exact, close, logged), (rollouts.exact, rollouts.close)
+
+
+Q = {"learning_starts": 20, "buffer_size": 120, "batch_size": 8, "target_update_interval": 10}
+PPO = {"n_steps": 24, "batch_size": 16, "n_epochs": 2}
+UNLIMITED = {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "gamma": 0.9}
+CASES = {  # agent, environment, how many, episodes between two records, settings
+    "dqn": ("dqn", lake, 1, 3, Q),
+    "two environments": ("dqn", lake, 2, 3, {**Q, "gradient_steps": -1, "tau": 0.5}),
+    "episodes": ("dqn", pole, 1, 3, {**Q, "train_freq": (2, "episode"), "gradient_steps": -1}),
+    "steps": ("dqn", vectors, 2, 3, {**Q, "n_steps": 3, "train_freq": 3, "gradient_steps": 2}),
+    "double": ("double_dqn", pole, 2, 3, {**Q, "tau": 0.5}),
+    "deep": ("deep_qlearning", lake, 1, 3, {**Q, "exploration_fraction": 0.5}),
+    "no time limits": ("dqn", lake, 1, 3, {**Q, **UNLIMITED}),
+    "greedy at once": ("dqn", vectors, 1, 3, {**Q, "exploration_fraction": 0.0}),
+    "ppo": ("ppo", lake, 2, 3, {**PPO, "clip_range": LinearSchedule(0.3, 0.1, 1.0)}),
+    "ppo on vectors": ("ppo", vectors, 1, 1, {**PPO, "batch_size": 8, "clip_range_vf": 0.1}),
+    "ppo on poles": ("ppo", pole, 2, 3, {**PPO, "target_kl": 0.003}),
+    "a2c": ("a2c", lake, 2, 1, {"gamma": 0.9, "gae_lambda": 0.8}),
+    "a2c on poles": ("a2c", pole, 1, 3, {"normalize_advantage": True, "ent_coef": 0.1}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_compiled_training_does_what_the_library_does(case):
+    library, at_rollouts = followed("library", case)
+    for mode in ("blocks", "rollouts"):
+        (exact, close, logged), found = followed(mode, case)
+        assert exact == library[0]
+        for ours, theirs in zip(close, library[1], strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=TOLERANCE, atol=TOLERANCE)
+        np.testing.assert_allclose(logged, library[2], rtol=1e-3, atol=1e-4)
+    assert len(library[0][1]) > (5 if CASES[case][4].get("learning_starts") else 1)
+    assert found[0] == at_rollouts[0]
+    for ours, theirs in zip(found[1], at_rollouts[1], strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=TOLERANCE, atol=TOLERANCE)
+
+
+# --- compiled parts against the compiled loop ----------------------------------------------------
+
+ENVS = {
+    "lake": partial(lake, 12),
+    "vectors": partial(vectors, 12),
+    "pole": partial(pole, 30),
+    "Warehouse": partial(gym.make, "Warehouse-v0", max_episode_steps=20),
+    "Taxi": partial(gym.make, "Taxi-v4", max_episode_steps=25),
+}
+Q_OFTEN = {**Q, "learning_starts": 50, "buffer_size": 150, "batch_size": 16}
+KINDS = {
+    "dqn": ("dqn", 1, {**Q_OFTEN, "train_freq": 1, "tau": 0.5}),
+    "dqn, two": ("dqn", 2, {**Q_OFTEN, "train_freq": 3, "gradient_steps": -1, "n_steps": 3}),
+    "dqn, episodes": ("dqn", 1, {**Q_OFTEN, "train_freq": (1, "episode"), "gradient_steps": 5}),
+    "double": ("double_dqn", 2, {**Q_OFTEN, "n_steps": 2}),
+    "deep": ("deep_qlearning", 1, Q_OFTEN),
+    "ppo": ("ppo", 1, {"n_steps": 64, "n_epochs": 3, "target_kl": 0.02}),
+    "ppo, two": ("ppo", 2, {"n_steps": 50, "batch_size": 25, "clip_range_vf": 0.2}),
+    "a2c": ("a2c", 2, {"normalize_advantage": True}),
+}
+MODES = ("parts", "compiled")
+
+
+def make(env, kind, **kwargs):
+    name, n_envs, settings = KINDS[kind]
+    return networks(
+        name, ENVS[env], n_envs, rate=(0.01, 0.001, 1.0), width=(24, 8), **{**settings, **kwargs}
+    )
+
+
+def learn(model, mode, steps, *callbacks, **kwargs):
+    model.learn(steps, callback=[*callbacks, *[Plain()] * (mode == "parts")], **kwargs)
+    expected = "compiled but for" if mode == "parts" else "compiled"
+    assert model.engine_in_use.partition(" the")[0] == expected
+    return model
+
+
+def state(model):
+    """All that training has changed."""
+    found = {f"policy.{key}": value.numpy() for key, value in model.policy.state_dict().items()}
+    optimizer = model.policy.optimizer.state_dict()
+    for i, kept in optimizer["state"].items():
+        found |= {f"optimizer.{i}.{key}": np.asarray(value) for key, value in kept.items()}
+    buffer = model.replay_buffer if hasattr(model, "replay_buffer") else model.rollout_buffer
+    if hasattr(model, "replay_buffer") or buffer.full:  # a rollout that is given up is nothing
+        names = {name for name in (*REPLAY, *ROLLOUT) if hasattr(buffer, name)}
+        found |= {name: getattr(buffer, name) for name in names}
+    names = ("num_timesteps", "_n_updates", "_episode_num", "_last_obs", "_n_calls")
+    names += ("exploration_rate", "_current_progress_remaining", "_last_episode_starts")
+    found |= {name: np.asarray(getattr(model, name)) for name in names if hasattr(model, name)}
+    found["rate"] = np.asarray(optimizer["param_groups"][0]["lr"])
+    found["episodes"] = np.array([(info["r"], info["l"]) for info in model.ep_info_buffer])
+    generators = [model.rng, *(env.unwrapped.np_random for env in model.env.envs)]
+    found["draws"] = np.array([g.bit_generator.state["state"]["state"] % 2**62 for g in generators])
+    bases = [env.unwrapped for env in model.env.envs]
+    found["places"] = np.array([base.s if hasattr(base, "s") else base.state for base in bases])
+    return found
+
+
+def assert_same(ours, theirs):
+    ours, theirs = state(ours), state(theirs)
+    assert ours.keys() == theirs.keys()
+    assert [name for name in ours if not np.array_equal(ours[name], theirs[name])] == []
+
+
+LONGER = [(env, kind) for env in ("Warehouse", "Taxi") for kind in ("dqn, two", "ppo, two")]
+
+
+@pytest.mark.parametrize(("env", "kind"), [*(("lake", kind) for kind in KINDS), *LONGER])
+def test_both_end_in_the_same_bits_wherever_blocks_end(env, kind):
+    parts = learn(make(env, kind), "parts", 500)
+    assert parts._n_updates > 0
+    assert len(parts.ep_info_buffer) > 5
+    blocks = ((), (Every(1),), (Every(7), Every(30))) if env == "lake" else ((),)
+    for callbacks in blocks:
+        assert_same(learn(make(env, kind), "compiled", 500, *callbacks), parts)
+
+
+class LogReader(BlockCallback):
+    """Keeps what the log says now and then, and has it written down and forgotten now and then."""
+
+    every_n_steps = 37
+
+    def __init__(self):
+        super().__init__()
+        self.read = []
+
+    def _on_step(self):
+        said = self.logger.name_to_value.items()
+        self.read.append({k: v for k, v in said if k.startswith(("train/", "rollout/expl"))})
+        if len(self.read) % 2:
+            self.logger.dump(self.num_timesteps)
+        return True
+
+
+@pytest.mark.parametrize(
+    ("env", "kind"),
+    [("vectors", "dqn, two"), ("vectors", "ppo, two"), *(("pole", kind) for kind in KINDS)],
+)
+def test_a_training_that_was_stopped_goes_on_and_its_log_is_the_same(env, kind):
+    models, readers = [], []
+    for mode in MODES:
+        reader = LogReader()
+        stop = Every(123, lambda model: False)
+        model = learn(make(env, kind), mode, 1000, stop, reader, log_interval=None)
+        assert model.num_timesteps == 123 * model.n_envs
+        models.append(learn(model, mode, 300, reader, reset_num_timesteps=False, log_interval=None))
+        readers.append(reader.read)
+    assert_same(*models)
+    assert len(readers[1]) == models[0].num_timesteps // 37
+    for read, expected in zip(readers[1], readers[0], strict=True):
+        assert read == pytest.approx(expected, nan_ok=True)
+    if env == "pole" and kind != "dqn, episodes":  # which end elsewhere: the library's differ
+        library, model = LogReader(), make(env, kind, engine="library")
+        model.learn(123 * model.n_envs, callback=library, log_interval=None)
+        n = 123 * model.n_envs // 37
+        expected = [read.keys() for read in library.read[:n]]
+        assert [read.keys() for read in readers[1][:n]] == expected
+
+
+CALLBACKS = {
+    "checkpoints": lambda folder: CheckpointCallback(77, folder),
+    "evaluation": lambda folder: EvalCallback(
+        make_vec_env(ENVS["pole"], seed=9), eval_freq=110, n_eval_episodes=2
+    ),
+    "budget": lambda folder: EpisodeBudget(15),
+    "at most so many": lambda folder: StopTrainingOnMaxEpisodes(8),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Training and eval env are not of the same type")
+@pytest.mark.parametrize("kind", ["dqn, two", "ppo, two"])
+@pytest.mark.parametrize("what", CALLBACKS)
+def test_callbacks_find_and_leave_the_same(what, kind, tmp_path):
+    models, scores, files = [], [], []
+    for mode in MODES:
+        callback = CALLBACKS[what](tmp_path / mode)
+        models.append(learn(make("pole", kind), mode, 700, callback))
+        scores.append(getattr(callback, "last_mean_reward", None))
+        files.append(sorted(path.name for path in (tmp_path / mode).glob("*")))
+    assert_same(*models)
+    assert scores[0] == scores[1]
+    assert (models[0].num_timesteps < 700) == (what in {"budget", "at most so many"})
+    assert files[0] == files[1]
+    assert len(files[0]) == (what == "checkpoints") * (700 // models[0].n_envs // 77)
+
+
+class Counting(BlockCallback):
+    """Changes what is learnt at the end of each rollout, and counts what it is told."""
+
+    def __init__(self):
+        super().__init__()
+        self.n_starts = self.n_ends = 0
+
+    def _on_rollout_start(self):
+        self.n_starts += 1
+
+    def _on_rollout_end(self):
+        self.n_ends += 1
+        self.model.gamma = 0.5 + 0.4 * (self.n_ends % 2)
+        self.model.lr_schedule = FloatSchedule(0.01 / self.n_ends)
+        if hasattr(self.model, "rollout_buffer"):
+            self.model.rollout_buffer.advantages *= self.n_ends % 3
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("kind", ["dqn", "dqn, two", "dqn, episodes", "ppo, two", "a2c"])
+def test_rollouts_are_told_of_where_they_are_heeded(kind):
+    counts = [Counting(), Counting()]
+    models = [learn(make("pole", kind), *at) for at in zip(MODES, (600, 600), counts, strict=True)]
+    assert_same(*models)
+    assert counts[0].n_starts == counts[1].n_starts > 3
+    assert counts[0].n_ends == counts[1].n_ends > 3
+
+
+# --- changes by hand -----------------------------------------------------------------------------
+
+
+def load_another_optimizer_state(model):
+    """As of an optimizer that has come far."""
+    optimizer, rng = model.policy.optimizer, np.random.default_rng(8)
+    state = optimizer.state_dict()
+    for kept in state["state"].values():
+        kept["step"] = kept["step"] + 1000
+        for name in ("exp_avg", "exp_avg_sq"):
+            noise = rng.random(tuple(kept[name].shape), np.float32)
+            kept[name] = th.from_numpy(noise).square() / 100
+    optimizer.load_state_dict(state)
+
+
+def put_other_weights_in_place(model):
+    for parameter in model.policy.parameters():
+        parameter.data = parameter.data * 0.7
+
+
+def take(optimizer_class):
+    def change(model):
+        parameters = model.policy.optimizer.param_groups[0]["params"]
+        model.policy.optimizer = optimizer_class(parameters, lr=0.01)
+
+    return change
+
+
+def load_other_weights(model):
+    weights = {name: value * 0.5 for name, value in model.policy.state_dict().items()}
+    model.policy.load_state_dict(weights)
+
+
+def put(**attributes):
+    return lambda model: vars(model).update(attributes)
+
+
+CHANGES = {
+    "optimizer's state": load_another_optimizer_state,
+    "weights in place": put_other_weights_in_place,
+    "another optimizer": take(th.optim.RMSprop),
+    "optimizer's settings": lambda model: model.policy.optimizer.param_groups[0].update(
+        weight_decay=0.3, betas=(0.5, 0.7)
+    ),
+    "all parameters": lambda model: model.set_parameters(model.get_parameters()),
+    "gamma": put(gamma=0.3),
+    "norm": put(max_grad_norm=0.01),
+    "rate": put(lr_schedule=FloatSchedule(0.03)),
+    "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
+    "environment's generator": lambda model: setattr(
+        model.env.envs[0].unwrapped, "np_random", np.random.default_rng(3)
+    ),
+    "weights": load_other_weights,
+    "clipping": put(clip_range=FloatSchedule(0.01)),
+}
+
+
+@pytest.fixture(scope="module")
+def unchanged():
+    return {k: learn(make("lake", k), "compiled", 250).policy.state_dict() for k in ("dqn", "ppo")}
+
+
+@pytest.mark.parametrize(("what", "kind"), [(w, k) for w in CHANGES for k in ("dqn", "ppo")])
+def test_a_change_counts_in_both_ways(what, kind, unchanged):
+    calls = 128 if what.endswith("rollout") else 150
+    change = CHANGES[what]
+    models = [learn(make("lake", kind), mode, 250, Every(calls, change)) for mode in MODES]
+    assert_same(*models)
+    ours = models[0].policy.state_dict()
+    is_same = all(th.equal(value, unchanged[kind][name]) for name, value in ours.items())
+    assert is_same == (what == "all parameters" or (what, kind) == ("clipping", "dqn"))
+
+
+def test_a_state_that_is_loaded_before_the_first_update_stays():
+    taught = learn(make("lake", "dqn"), "compiled", 200).policy.optimizer.state_dict()
+    model = make("lake", "dqn", learning_starts=10_000)
+    load = Every(150, lambda model: model.policy.optimizer.load_state_dict(taught))
+    found = learn(model, "compiled", 200, load).policy.optimizer.state_dict()["state"]
+    for i, kept in taught["state"].items():
+        assert all(th.equal(found[i][name], value) for name, value in kept.items())
+
+
+FATAL = {
+    "its optimizer is SGD, not Adam or RMSp": ("dqn", take(th.optim.SGD)),
+    "some of its parameters are frozen": (
+        "ppo",
+        lambda model: model.policy.action_net.weight.requires_grad_(False),
+    ),
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("reason", FATAL)
+def test_what_cannot_be_gone_on_with_ends_the_training(reason, mode):
+    kind, change = FATAL[reason]
+    with pytest.raises(ValueError, match=f"cannot go on: {reason}"):
+        learn(make("lake", kind), mode, 400, Every(150, change))

@@ -1,0 +1,442 @@
+"""Returns over several steps: n-step targets, traces and Monte Carlo, against the book's boxes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.env_util import make_vec_env
+
+import envs  # noqa: F401  # registers the environments
+from agents import load_algorithm
+from agents.common.exploration import EPSILON_GREEDY, action_probabilities
+from agents.tabular.traces import SMALLEST_TRACE
+from tests.agents.hand_fed import (
+    ACTIONS,
+    ENDS,
+    N_ACTIONS,
+    N_STATES,
+    REWARDS,
+    SHARES,
+    Fed,
+    episodes,
+    greedy,
+    tables,
+)
+
+GAMMA, ALPHA = 0.75, 0.25
+USUAL = {"gamma": GAMMA, "learning_rate": ALPHA}
+
+
+def assert_close(found, expected):
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+# --- n steps -------------------------------------------------------------------------------------
+
+
+def textbook_table(table, steps, end, n, ahead, backed_up):
+    """The table after an episode that ends in state 0, by the boxes of chapter 7.
+
+    Args:
+        ahead: value of (table, state, action), where a target ends.
+        backed_up: value of (table, state, action, later return), where it goes on.
+    """
+    table, total = np.array(table, dtype=float), len(steps)
+    for time in range(total + n - 1):
+        if time == total - 1:
+            last = 0, greedy(table, 0)
+        start = time - n + 1
+        if start < 0:
+            continue
+        stop = min(start + n, total)
+        later = 0.0
+        if stop < total or end == "truncated":
+            later = ahead(table, *(steps[stop][:2] if stop < total else last))
+        for k in range(stop - 1, start - 1, -1):
+            if k < stop - 1:
+                later = backed_up(table, *steps[k + 1][:2], later)
+            later = steps[k][2] + GAMMA * later
+        table[steps[start][:2]] += ALPHA * (later - table[steps[start][:2]])
+    return table
+
+
+@settings(max_examples=50)
+@given(table=tables(), steps=episodes(), end=ENDS, n=st.integers(1, 5))
+def test_n_step_sarsa(table, steps, end, n):
+    fed = Fed("n_step_sarsa", table, n_steps=n, **USUAL)
+    for _ in range(2):  # nothing is left over from the first episode
+        before = fed.table.copy()
+        taken = fed.committed_episode(steps, end)
+        values = lambda table, *place: table[place]  # noqa: E731
+        later = lambda table, state, action, later: later  # noqa: E731
+        assert_close(fed.table, textbook_table(before, taken, end, n, values, later))
+
+
+@settings(max_examples=50)
+@given(table=tables(), steps=episodes(), end=ENDS, n=st.integers(1, 5), epsilon=SHARES)
+@pytest.mark.parametrize("target_policy", ["exploring", "greedy"])
+def test_tree_backup(table, steps, end, n, epsilon, target_policy):
+    def policy(table, state):
+        if target_policy == "greedy":
+            # Tied actions are worth the same: any share of them gives the same mean.
+            return np.eye(len(table[state]))[greedy(table, state)]
+        return action_probabilities(EPSILON_GREEDY, table, epsilon, random_ties=False)[state]
+
+    def mean(table, state, action):
+        return policy(table, state) @ table[state]
+
+    def tree(table, state, action, later):
+        shares = policy(table, state)
+        if target_policy == "greedy" and table[state, action] == table[state].max():
+            shares = np.eye(len(shares))[action]
+        leaves = [shares[b] * table[state, b] for b in range(len(shares)) if b != action]
+        return sum(leaves) + shares[action] * later
+
+    own = {"n_steps": n, "target_policy": target_policy}
+    fed = Fed("n_step_tree_backup", table, epsilon, **USUAL, **own)
+    for _ in range(2):
+        expected = textbook_table(fed.table, steps, end, n, mean, tree)
+        fed.episode(steps, end)
+        assert_close(fed.table, expected)
+
+
+HALF = {"learning_rate": 0.5, "gamma": 0.5}
+
+
+def test_two_steps_by_hand():
+    # 1 + .5 * 2 + .25 * Q(2, 0) = 2 + .25 * 8 = 4, half-way from 10 on: 7.
+    table = [[10, 0], [0, 0], [8, 0]]
+    fed = Fed("n_step_sarsa", table, n_steps=2, **HALF)
+    assert fed.step(0, 0, 1, 1).tolist() == table
+    assert fed.agent.mean_td_error == 0
+    assert fed.step(1, 0, 2, 2)[0, 0] == 7
+    assert fed.agent.mean_td_error == 6
+    # The end: 2 + .5 * 4 = 4 from state 1 on, half-way from 0 on; 4 from state 2 on.
+    assert fed.step(2, 0, 4, 0, "terminated").tolist() == [[7, 0], [2, 0], [6, 0]]
+    # Another episode's first step is not learnt from: the last errors, 4 and 4, go on standing.
+    fed.step(0, 0, 1, 1)
+    assert fed.agent.mean_td_error == 4
+    # A greedy tree: in state 1 action 1 is best with 6, so that action 0 tells nothing beyond.
+    table = [[10, 0], [0, 6], [8, 0]]
+    fed = Fed("n_step_tree_backup", table, n_steps=2, target_policy="greedy", **HALF)
+    fed.step(0, 0, 1, 1)
+    assert fed.step(1, 0, 2, 2)[0, 0] == 10 + 0.5 * (1 + 0.5 * 6 - 10)
+
+
+# --- traces --------------------------------------------------------------------------------------
+
+TRACES = ("sarsa_lambda", "q_lambda")
+
+
+def ahead(table, steps, k, end):
+    """What the step after the k-th is worth; both agents take a best action's value here."""
+    if k + 1 < len(steps):
+        return table[steps[k + 1][0]].max()
+    return table[0].max() if end == "truncated" else 0.0
+
+
+def is_cut(name, table, state, action):
+    return name == "q_lambda" and table[state, action] < table[state].max()
+
+
+def by_the_box(name, table, steps, end, decay, trace_type):
+    """The table after an episode, with a trace for each entry."""
+    table, traces = np.array(table, dtype=float), np.zeros((N_STATES, N_ACTIONS))
+    for k, (state, action, reward) in enumerate(steps):
+        traces *= 0.0 if is_cut(name, table, state, action) else GAMMA * decay
+        traces[state, action] = 1 + (trace_type == "accumulating") * traces[state, action]
+        td_error = reward + GAMMA * ahead(table, steps, k, end) - table[state, action]
+        table += ALPHA * td_error * traces
+    return table
+
+
+def lambda_return(steps, values, decay, start, horizon):
+    """From step ``start``, with values of the states after each step, up to the horizon."""
+    total, discounted, weight = 0.0, 0.0, 1.0
+    for k in range(start, horizon):
+        discounted += GAMMA ** (k - start) * steps[k][2]
+        target = discounted + GAMMA ** (k - start + 1) * values[k]
+        total += weight * (1.0 if k == horizon - 1 else 1.0 - decay) * target
+        weight *= decay
+    return total
+
+
+def by_online_lambda_returns(name, table, steps, end, decay, step_sizes):
+    """The table after an episode, all of whose updates, since a cut, are done anew each step."""
+    now = np.array(table, dtype=float)
+    first, start, values = 0, now.copy(), []
+    for k, (state, action, _) in enumerate(steps):
+        if is_cut(name, now, state, action):
+            first, start = k, now.copy()
+        values.append(ahead(now, steps, k, end))
+        now = start.copy()
+        for j in range(first, k + 1):
+            error = lambda_return(steps, values, decay, j, k + 1) - now[steps[j][:2]]
+            now[steps[j][:2]] += step_sizes[j] * error
+    return now
+
+
+def taken_by(fed, name, steps, end):
+    if name == "sarsa_lambda":
+        return fed.committed_episode(steps, end)
+    fed.episode(steps, end)
+    return steps
+
+
+@settings(max_examples=50)
+@given(table=tables(), steps=episodes(), end=ENDS, decay=SHARES)
+@pytest.mark.parametrize("trace_type", ["accumulating", "replacing"])
+@pytest.mark.parametrize("name", TRACES)
+def test_traces_of_the_box(name, trace_type, table, steps, end, decay):
+    fed = Fed(name, table, trace_type=trace_type, trace_decay=decay, **USUAL)
+    for _ in range(2):
+        before = fed.table.copy()
+        taken = taken_by(fed, name, steps, end)
+        assert_close(fed.table, by_the_box(name, before, taken, end, decay, trace_type))
+
+
+@settings(max_examples=50)
+@given(table=tables(), steps=episodes(), end=ENDS, decay=SHARES)
+# With a step size of 3 traces become negative.
+@pytest.mark.parametrize("learning_rate", [ALPHA, 3.0, "sample_average"])
+@pytest.mark.parametrize("name", TRACES)
+def test_dutch_traces_are_the_online_lambda_return(name, learning_rate, table, steps, end, decay):
+    own = {"learning_rate": learning_rate, "gamma": GAMMA, "trace_decay": decay}
+    fed = Fed(name, table, trace_type="dutch", **own)
+    counts = fed.agent.policy.visit_counts.numpy()[0]
+    for _ in range(2):
+        before, visits, sizes = fed.table.copy(), counts.copy(), []
+        taken = taken_by(fed, name, steps, end)
+        for state, action, _ in taken:
+            visits[state, action] += 1
+            is_average = learning_rate == "sample_average"
+            sizes.append(1 / visits[state, action] if is_average else learning_rate)
+        assert_close(fed.table, by_online_lambda_returns(name, before, taken, end, decay, sizes))
+
+
+@given(
+    table=tables(),
+    states=st.permutations(range(N_STATES)),
+    action=ACTIONS,
+    rewards=st.lists(REWARDS, min_size=N_STATES, max_size=N_STATES),
+)
+@pytest.mark.parametrize("trace_type", ["accumulating", "replacing", "dutch"])
+def test_whole_traces_are_monte_carlo(trace_type, table, states, action, rewards):
+    """Where no entry is visited twice, learning on the way comes to the same."""
+    fed = Fed("sarsa_lambda", table, trace_type=trace_type, trace_decay=1.0, **USUAL)
+    steps = [(state, action, reward) for state, reward in zip(states, rewards, strict=True)]
+    taken = fed.committed_episode(steps, "terminated")
+    other = Fed("monte_carlo", table, **USUAL)
+    other.episode(taken, "terminated")
+    assert_close(fed.table, other.table)
+
+
+@pytest.mark.parametrize(
+    ("trace_type", "value"), [("replacing", 4.0), ("accumulating", 3.5), ("dutch", 3.875)]
+)
+def test_sarsa_lambda_by_hand(trace_type, value):
+    """Twice the same state and action; step size and discount are a half, lambda is 1."""
+    fed = Fed("sarsa_lambda", [[4, 0]], trace_type=trace_type, trace_decay=1.0, **HALF)
+    # 4 + .5 * 4 - 4 = 2, half of it; then 3 - 5 = -2, times half of the trace.
+    assert fed.step(0, 0, 4, 0).tolist() == [[5, 0]]
+    assert fed.step(0, 0, 3, 0, "terminated").tolist() == [[value, 0]]
+
+
+def test_watkins_cut_by_hand():
+    # Greedy in state 0, and then in state 1 not: only that entry learns of what follows.
+    fed = Fed("q_lambda", [[4, 0], [0, 8]], trace_decay=1.0, **HALF)
+    # 2 + .5 * 8 - 4 = 2, half of it.
+    assert fed.step(0, 0, 2, 1).tolist() == [[5, 0], [0, 8]]
+    assert fed.step(1, 0, 6, 0, "terminated").tolist() == [[5, 0], [3, 8]]
+    # And where it is greedy: 6 - 8 = -2, half of it, and half of that for state 0.
+    fed = Fed("q_lambda", [[4, 0], [0, 8]], trace_decay=1.0, **HALF)
+    fed.step(0, 0, 2, 1)
+    assert fed.step(1, 1, 6, 0, "terminated").tolist() == [[4.5, 0], [0, 7]]
+
+
+def test_a_trace_that_has_faded_is_forgotten():
+    """A trace of 0.02 ** 8 is: what comes eight steps later says nothing of the first step."""
+    assert 0.02**8 < SMALLEST_TRACE < 0.02**7
+    settings_ = {"learning_rate": 1.0, "gamma": 1.0, "trace_decay": 0.02}
+    for later, is_told in ((7, True), (8, False)):
+        fed = Fed("sarsa_lambda", np.zeros((11, 1)), **settings_)
+        for k in range(later):
+            fed.step(k, 0, 0, k + 1)
+        assert bool(fed.step(later, 0, 1e15, 0, "terminated")[0, 0]) == is_told
+
+
+# --- Monte Carlo ---------------------------------------------------------------------------------
+
+
+@settings(max_examples=50)
+@given(table=tables(), steps=episodes(), end=ENDS)
+@pytest.mark.parametrize("every_visit", [False, True])
+@pytest.mark.parametrize("learning_rate", [ALPHA, "sample_average"])
+def test_returns_after_visits(table, steps, end, every_visit, learning_rate):
+    own = {"gamma": GAMMA, "learning_rate": learning_rate, "every_visit": every_visit}
+    fed = Fed("monte_carlo", table, **own)
+    expected, visits = fed.table.copy(), np.zeros_like(fed.table)
+    for _ in range(2):
+        # The best value in state 0 stands for what was cut off.
+        later, pairs = expected[0].max() if end == "truncated" else 0.0, [s[:2] for s in steps]
+        for k in reversed(range(len(steps))):
+            later = steps[k][2] + GAMMA * later
+            if every_visit or pairs.index(pairs[k]) == k:
+                visits[pairs[k]] += 1
+                size = ALPHA if learning_rate == ALPHA else 1 / visits[pairs[k]]
+                expected[pairs[k]] += size * (later - expected[pairs[k]])
+        fed.episode(steps, end)
+        assert_close(fed.table, expected)
+    assert np.array_equal(fed.agent.policy.visit_counts.numpy()[0], visits)
+
+
+@pytest.mark.parametrize(("every_visit", "twice_visited"), [(False, 6.5), (True, 5.0)])
+def test_monte_carlo_by_hand(every_visit, twice_visited):
+    """Returns from the end: 4, 2 + .5 * 4 = 4, 1 + .5 * 4 = 3; the step size is a half."""
+    fed = Fed("monte_carlo", [[10, 0], [0, 0]], every_visit=every_visit, **HALF)
+    tables = fed.episode([(0, 0, 1), (1, 1, 2), (0, 0, 4)], "terminated")
+    assert tables[1].tolist() == [[10, 0], [0, 0]]
+    # 10 + .5 * (3 - 10), or first 10 + .5 * (4 - 10) = 7 and then 7 + .5 * (3 - 7).
+    assert tables[2].tolist() == [[twice_visited, 0], [0, 2]]
+
+
+def test_an_episode_that_fills_the_record_is_learnt_from():
+    settings_ = {"gamma": 0.5, "longest_episode": 2, "learning_rate": "sample_average"}
+    fed = Fed("monte_carlo", [[0, 0], [0, 0], [8, 0]], **settings_)
+    fed.step(0, 0, 1, 1)
+    # 1 + .5 * (2 + .5 * 8), and what is left counts as another episode.
+    assert fed.step(1, 1, 2, 2).tolist() == [[4, 0], [0, 6], [8, 0]]
+    # Its rest began with what the last target counted on.
+    assert fed.committed == 0
+    assert fed.step(2, 0, 6, 0, "terminated").tolist() == [[4, 0], [0, 6], [6, 0]]
+
+
+class Weighed(Fed):
+    """Off-policy Monte Carlo, which chooses by itself; or is told that it chose something."""
+
+    def __init__(self, table, epsilon, **settings):
+        super().__init__("off_policy_monte_carlo", table, epsilon, **settings)
+
+    def act(self, obs):
+        self.agent._last_obs = np.array([obs])
+        return int(self.agent._choose_actions()[0])
+
+    def tell(self, **fields):
+        """What the agent has noted of its last choice: action and probability."""
+        for name, value in fields.items():
+            self.agent._workspace_for(self.agent.rng, 1).fields[name][:] = value
+
+
+@settings(max_examples=50)
+@given(
+    table=tables(),
+    places=st.lists(st.integers(0, N_STATES - 1), min_size=1, max_size=8),
+    end=ENDS,
+    seed=st.integers(0, 1000),
+)
+def test_weighted_importance_sampling(table, places, end, seed):
+    """The box of section 5.7, with the probabilities that the agent acts by."""
+    fed = Weighed(table, 0.8, gamma=GAMMA, seed=seed)  # off the greedy policy rather often
+    expected, weights = fed.table.copy(), np.zeros_like(fed.table)
+    for _ in range(3):
+        policy, steps = fed.agent.action_probabilities(), []
+        later = expected[0].max() if end == "truncated" else 0.0
+        for k, place in enumerate(places):
+            steps.append((place, fed.act(place), (k * 7) % 5 - 2))
+            is_last = k == len(places) - 1
+            fed.step(*steps[-1], 0 if is_last else places[k + 1], end if is_last else "")
+        weight = 1.0
+        for state, action, reward in reversed(steps):
+            later = reward + GAMMA * later
+            weights[state, action] += weight
+            share = weight / weights[state, action]
+            expected[state, action] += share * (later - expected[state, action])
+            if action != greedy(expected, state):
+                break
+            weight /= policy[state, action]
+        assert_close(fed.table, expected)
+        assert_close(fed.agent.policy.weights[0].numpy(), weights)
+
+
+def test_off_policy_monte_carlo_by_hand():
+    """Epsilon is a half, so that a greedy action has a probability of 3/4, another one of 1/4."""
+    fed = Weighed(np.zeros((2, 2)), 0.5)
+    sums = fed.agent.policy.weights.numpy()[0]
+
+    def learn(second_action, second_reward, second_probability):
+        fed.tell(probability=0.75)
+        fed.step(0, 0, 1, 1)
+        fed.tell(probability=second_probability)
+        return fed.step(1, second_action, second_reward, 0, "terminated").tolist()
+
+    # What led to the end by an action that is the best one now counts four times.
+    assert learn(1, 4, 0.25) == [[3, 0], [0, 4]]
+    assert sums.tolist() == [[4, 0], [0, 1]]
+    # 4 + 1/2 * (1 - 4); 3 + (4/3) / (4 + 4/3) * (1.5 - 3).
+    assert learn(1, 1, 0.75) == [[pytest.approx(2.625), 0], [0, 2.5]]
+    # An action that the greedy policy would not have taken tells nothing of what came before.
+    assert learn(0, 0, 0.25) == [[pytest.approx(2.625), 0], [0, 2.5]]
+    np.testing.assert_allclose(sums, [[16 / 3, 0], [1, 2]], rtol=1e-15)
+
+
+def test_weights_that_would_overflow_end_the_learning():
+    fed = Weighed(np.zeros((1, N_ACTIONS)), 1.0, gamma=1.0)
+    for k in range(2000):
+        fed.act(0)
+        # Told that it did the greedy action each time, which it does once in three times.
+        fed.tell(action=0)
+        fed.step(0, 0, 0, 0, "terminated" if k == 1999 else "")
+    assert np.isfinite(fed.agent.policy.weights.numpy()).all()
+    assert np.isfinite(fed.table).all()
+    # 3 to the power of 314 is below 1e150.
+    assert int(fed.agent.policy.visit_counts.sum()) == 315
+
+
+def test_what_was_not_chosen_by_the_agent_is_not_weighed():
+    fed = Weighed(np.zeros((4, 3)), 0.5)
+    table = fed.episode([(1, 0, 1), (2, 0, 1), (3, 0, 2)], "terminated")[-1]
+    assert table.tolist() == [[0] * 3] * 3 + [[2, 0, 0]]
+
+
+# --- what they come down to ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "one_step", "own", "shared"),
+    [
+        ("n_step_sarsa", "sarsa", {"n_steps": 1}, {"exploration": "gaussian_noise"}),
+        ("n_step_tree_backup", "expected_sarsa", {"n_steps": 1}, {"exploration": "boltzmann"}),
+        ("n_step_tree_backup", "qlearning", {"n_steps": 1, "target_policy": "greedy"}, {}),
+        ("sarsa_lambda", "sarsa", {"trace_decay": 0.0, "trace_type": "accumulating"}, {}),
+        ("sarsa_lambda", "sarsa", {"trace_decay": 0.0, "trace_type": "dutch"}, {}),
+        ("q_lambda", "qlearning", {"trace_decay": 0.0, "trace_type": "replacing"}, {}),
+        ("dyna_q", "qlearning", {"planning_steps": 0}, {"learning_rate": "sample_average"}),
+    ],
+)
+def test_at_one_end_it_is_the_one_step_agent_to_the_bit(name, one_step, own, shared):
+    models = []
+    for each, settings_ in ((name, {**own, **shared}), (one_step, shared)):
+        env = make_vec_env("envs:Warehouse-v0", 3, seed=3, env_kwargs={"slip": 0.2})
+        models.append(load_algorithm(each)(env=env, seed=1, **settings_).learn(4000))
+    model, other = models
+    assert np.array_equal(model.policy.q_table, other.policy.q_table)
+    assert np.array_equal(model.policy.visit_counts, other.policy.visit_counts)
+    assert model.mean_td_error == other.mean_td_error
+    assert model.rng.bit_generator.state == other.rng.bit_generator.state
+
+
+@pytest.mark.parametrize(
+    ("name", "own"),
+    [
+        ("n_step_sarsa", {"learning_rate": "sample_average", "n_steps": 3}),
+        ("n_step_tree_backup", {"learning_rate": "sample_average", "n_steps": 3}),
+        ("monte_carlo", {}),
+        ("off_policy_monte_carlo", {}),
+    ],
+)
+def test_prediction_on_the_random_walk(name, own):
+    """Example 6.2: its one action is all policies', true values of five states are 1/6 to 5/6."""
+    env = make_vec_env("envs:RandomWalk-v0", seed=0)
+    model = load_algorithm(name)(env=env, seed=0, gamma=1.0, **own).learn(100_000)
+    # Over 10,000 episodes a mean of returns of 0 and 1 has a standard error below 0.005.
+    np.testing.assert_allclose(model.policy.q_table[1:-1, 0], np.arange(1, 6) / 6, atol=0.02)
