@@ -20,6 +20,13 @@ class Spaces(gym.Env):
         self.action_space = spaces.Discrete(actions)
 
 
+def feed(agent, obs, action, reward, next_obs, end=""):
+    """Let the agent learn from a step; ``end`` is "terminated", "truncated" or ""."""
+    ended = np.array([end == "terminated"]), np.array([end != ""])
+    steps = np.array([obs]), np.array([action]), np.array([float(reward)]), *ended
+    agent._learn_from(Transitions(*steps, np.array([next_obs])))
+
+
 class Told:
     """An agent on some spaces, which learns from what it is told to have done."""
 
@@ -29,10 +36,8 @@ class Told:
         self.agent._begin_episodes()
 
     def step(self, obs, action, reward, next_obs, end=""):
-        """Learn from a step; ``end`` is "terminated", "truncated" or ""."""
-        ended = np.array([end == "terminated"]), np.array([end != ""])
-        steps = np.array([obs]), np.array([action]), np.array([float(reward)]), *ended
-        self.agent._learn_from(Transitions(*steps, np.array([next_obs])))
+        """As `feed`."""
+        feed(self.agent, obs, action, reward, next_obs, end)
 
     @property
     def committed(self):

@@ -125,16 +125,15 @@ def _monitor(env):
     return env
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize(
-    ("algo", "env_id", "wrapper", "settings"),
+    ("algo", "env_id", "wrapper", "settings", "n_envs"),
     [
-        ("qlearning", LAKE, None, {}),
-        ("qlearning", LAKE, None, {"deterministic": False}),
-        ("double_qlearning", WAREHOUSE, None, {"deterministic": False, "tie_breaking": "first"}),
-        ("sarsa", CART, IN_BINS, {}),
-        ("dyna_q", LAKE, None, {"deterministic": False, "exploration": "gaussian_noise"}),
-        ("semi_gradient_sarsa", "MountainCar-v0", None, {}),
+        ("qlearning", LAKE, None, {}, 1),
+        ("qlearning", LAKE, None, {"deterministic": False}, 3),
+        ("double_qlearning", WAREHOUSE, None, {"deterministic": False, "tie_breaking": "first"}, 2),
+        ("sarsa", CART, IN_BINS, {}, 3),
+        ("dyna_q", LAKE, None, {"deterministic": False, "exploration": "gaussian_noise"}, 1),
+        ("semi_gradient_sarsa", "MountainCar-v0", None, {}, 2),
     ],
 )
 def test_tables_find_what_is_found_in_python(

@@ -1,11 +1,16 @@
-"""Action choice: exact where the random numbers are given, counted where they are not."""
+"""Action choice and schedules: exact where random numbers are given, counted where they are not."""
+
+import math
 
 import numpy as np
 import pytest
+import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from agents import load_algorithm
 from agents.common.exploration import (
     BOLTZMANN,
     EPSILON_GREEDY,
@@ -20,6 +25,14 @@ from agents.common.exploration import (
     greedy_action,
     noisy_greedy_action,
 )
+from agents.common.schedules import (
+    EXPONENTIAL,
+    LINEAR,
+    ExponentialSchedule,
+    schedule_row,
+    schedule_value,
+)
+from tests.agents.hand_fed import Spaces
 
 N_DRAWS = 20_000
 VALUES = np.array([1.0, 3.0, 3.0, 2.0])
@@ -29,46 +42,27 @@ finite_values = arrays(
 )
 
 
-@pytest.mark.parametrize(("uniform", "action"), [(0.0, 1), (0.49, 1), (0.5, 2), (0.99, 2)])
-def test_ties_share_the_unit_interval(uniform, action):
-    assert greedy_action(VALUES, uniform) == action
-
-
-@given(finite_values)
-def test_uniform_zero_is_argmax(values):
+@given(finite_values, st.floats(0, 1, exclude_max=True))
+def test_greedy_action_is_a_best_one_and_the_first_at_0(values, uniform):
+    assert values[greedy_action(values, uniform)] == values.max()
     assert greedy_action(values, 0.0) == values.argmax()
 
 
-@given(finite_values, st.floats(0, 1, exclude_max=True))
-def test_greedy_action_is_a_best_one(values, uniform):
-    assert values[greedy_action(values, uniform)] == values.max()
-
-
-@pytest.mark.parametrize(
-    ("draws", "action"),
-    [
-        ([0.29, 0.0], 0),
-        ([0.29, 0.99], 3),
-        ([0.3, 0.0], 1),
-        ([0.3, 0.99], 2),
-    ],
-)
-def test_epsilon_greedy_explores_below_epsilon(draws, action):
-    assert epsilon_greedy_action(VALUES, 0.3, 1.0, np.array(draws)) == action
-
-
-def test_tie_scale_zero_takes_the_first():
+def test_choices_by_given_numbers():
+    # Ties share the unit interval.
+    assert [greedy_action(VALUES, u) for u in (0.0, 0.49, 0.5, 0.99)] == [1, 1, 2, 2]
+    # Below epsilon it explores; a tie scale of 0 takes the first of the best.
+    draws = np.array([[0.29, 0.0], [0.29, 0.99], [0.3, 0.0], [0.3, 0.99]])
+    assert [epsilon_greedy_action(VALUES, 0.3, 1.0, row) for row in draws] == [0, 3, 1, 2]
     assert epsilon_greedy_action(VALUES, 0.3, 0.0, np.array([0.9, 0.99])) == 1
-
-
-def test_boltzmann_inverts_the_cumulative_probabilities():
+    # The cumulative probabilities are inverted, and do not overflow.
     values = np.log([1.0, 2.0, 5.0])
     chosen = [boltzmann_action(values, 1.0, np.array([u])) for u in (0.0, 0.12, 0.13, 0.37, 0.38)]
     assert chosen == [0, 0, 1, 1, 2]
-
-
-def test_boltzmann_does_not_overflow():
     assert boltzmann_action(np.array([1e6, 0.0]), 1e-3, np.array([0.999])) == 0
+    # Noise is added to the values.
+    draws = np.array([0.0, -1.0, 0.0, 1.5])
+    assert [noisy_greedy_action(VALUES, scale, draws) for scale in (1.0, 0.1)] == [3, 2]
 
 
 def test_a_temperature_that_has_fallen_to_0_is_the_limit():
@@ -116,6 +110,8 @@ def test_expected_value_is_the_mean_under_the_probabilities(values, rate):
 def test_noise_has_no_probabilities():
     with pytest.raises(ValueError, match="closed-form"):
         action_probabilities(GAUSSIAN_NOISE, VALUES[None], 1.0, random_ties=True)
+    with pytest.raises(ValueError, match="no closed-form action probabilities"):
+        agent_of(np.eye(2), exploration="gaussian_noise").action_probabilities()
 
 
 @pytest.mark.parametrize("random_ties", [True, False])
@@ -130,3 +126,197 @@ def test_one_probability_is_that_of_the_matrix(strategy, rate, random_ties):
             for action in range(4)
         ]
         np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+
+# --- what agents would do, row by row -------------------------------------------------------------
+
+# Four states and four actions above all: there, a row mistaken for a column raises no error.
+SHAPES = [(4, 4), (2, 2), (3, 5), (5, 3), (1, 3), (3, 1)]
+
+
+def agent_of(values, **arguments):
+    """A Q-learning agent with a table of values."""
+    agent = load_algorithm("qlearning")(env=Spaces(*values.shape), seed=0, **arguments)
+    agent.policy.q_tables.copy_(th.as_tensor(values))
+    return agent
+
+
+def distinct(shape):
+    """Values without ties, whose rows have their best in different places and heights."""
+    return np.random.default_rng(3).normal(size=shape) + 3 * np.arange(shape[0])[:, None]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
+def test_epsilon_greedy_row_by_row(shape, epsilon):
+    values = distinct(shape)
+    agent = agent_of(values, exploration_initial_eps=epsilon, exploration_final_eps=epsilon)
+    n_actions = shape[1]
+    expected = np.full(shape, epsilon / n_actions)
+    for state, row in enumerate(values.tolist()):
+        expected[state, row.index(max(row))] += 1 - epsilon
+    np.testing.assert_allclose(agent.action_probabilities(), expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("temperature", [0.2, 1.0, 5.0])
+def test_boltzmann_row_by_row(shape, temperature):
+    values = distinct(shape)
+    agent = agent_of(values, exploration="boltzmann", temperature=temperature)
+    expected = []
+    for row in values.tolist():
+        weights = [math.exp((value - row[0]) / temperature) for value in row]
+        expected.append([weight / sum(weights) for weight in weights])
+    np.testing.assert_allclose(agent.action_probabilities(), expected, rtol=1e-12)
+
+
+def test_tied_actions_share_or_the_first_has_all():
+    values = np.array([[1.0, 2, 2, 0], [3, 3, 3, 3], [5, 4, 5, 5], [0, 0, 0, 9]])
+    arguments = {"exploration_initial_eps": 0.4, "exploration_final_eps": 0.4}
+    shared = agent_of(values, tie_breaking="random", **arguments).action_probabilities()
+    np.testing.assert_allclose(
+        shared,
+        [
+            [0.1, 0.1 + 0.6 / 2, 0.1 + 0.6 / 2, 0.1],
+            [0.25, 0.25, 0.25, 0.25],
+            [0.1 + 0.6 / 3, 0.1, 0.1 + 0.6 / 3, 0.1 + 0.6 / 3],
+            [0.1, 0.1, 0.1, 0.7],
+        ],
+    )
+    alone = agent_of(values, tie_breaking="first", **arguments).action_probabilities()
+    np.testing.assert_allclose(
+        alone,
+        [[0.1, 0.7, 0.1, 0.1], [0.7, 0.1, 0.1, 0.1], [0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7]],
+    )
+
+
+def test_values_that_are_large_do_not_overflow():
+    values = np.array([[1e6, 1e6 + 1], [-1e6, -1e6 - 1]])
+    found = agent_of(values, exploration="boltzmann", temperature=1.0).action_probabilities()
+    likely = 1 / (1 + math.exp(-1))
+    np.testing.assert_allclose(found, [[1 - likely, likely], [likely, 1 - likely]], rtol=1e-9)
+
+
+EXPONENTIALLY = {"exploration_decay": "exponential", "exploration_fraction": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rates"),
+    [
+        ({"exploration_decay": "constant", "exploration_initial_eps": 0.3}, [0.3, 0.3, 0.3]),
+        ({"exploration_initial_eps": 1.0, "exploration_final_eps": 0.2}, [1.0, 0.2, 0.2]),
+        ({"exploration_fraction": 1.0, "exploration_final_eps": 0.0}, [1.0, 0.5, 0.0]),
+        (
+            {**EXPONENTIALLY, "exploration_initial_eps": 0.9, "exploration_final_eps": 0.1},
+            [0.9, 0.3, 0.1],
+        ),
+        ({"exploration": "boltzmann", "temperature": 2.5}, [2.5, 2.5, 2.5]),
+        ({"exploration": "gaussian_noise", "noise_std": 3.0}, [3.0, 3.0, 3.0]),
+    ],
+)
+def test_how_much_agents_explore(arguments, rates):
+    model = load_algorithm("qlearning")(env="FrozenLake-v1", **arguments)
+    measured = []
+    for remaining in (1.0, 0.5, 0.0):
+        model._current_progress_remaining = remaining
+        measured.append(model.exploration_rate)
+    assert measured == pytest.approx(rates)
+    model._episode_num = 3  # noise falls by the episode
+    is_noise = "noise_std" in arguments
+    assert model.exploration_rate == pytest.approx(rates[-1] / (4 if is_noise else 1))
+
+
+@pytest.mark.parametrize("engine", ["compiled", "interpreted"])
+def test_a_temperature_may_fall_to_0(engine):
+    falling = {"exploration": "boltzmann", "temperature": LinearSchedule(1.0, 0.0, 1.0)}
+    model = load_algorithm("expected_sarsa")(env="FrozenLake-v1", seed=0, engine=engine, **falling)
+    assert model.learn(200).exploration_rate == 0.0
+    assert np.isfinite(model.policy.q_table).all()
+    np.testing.assert_allclose(model.action_probabilities().sum(axis=1), 1.0)
+
+
+# --- schedules ------------------------------------------------------------------------------------
+
+# Training may run past its end, by a rollout or an episode.
+progress = st.floats(-0.5, 1)
+values = st.floats(-1e6, 1e6)
+positive = st.floats(1e-9, 1e9)
+shares = st.floats(1e-3, 1)
+
+linear = st.builds(LinearSchedule, values, values, shares)
+exponential = st.builds(ExponentialSchedule, positive, positive, shares)
+constant = st.builds(ConstantSchedule, values)
+schedules = st.one_of(
+    linear,
+    exponential,
+    constant,
+    st.builds(FloatSchedule, values | st.integers(-9, 9) | linear | exponential | constant),
+)
+
+
+@given(schedules, st.lists(progress, min_size=20, max_size=20))
+def test_a_row_gives_what_the_schedule_gives_bit_for_bit(schedule, points):
+    row = schedule_row(schedule)
+    # Of one type, so that compiled code takes them all.
+    assert [type(number) for number in row] == [float] * 4
+    for point in [*points, 0.0, 0.5, 1.0]:
+        assert schedule_value(row, point) == schedule(point)
+
+
+def test_every_step_of_a_run_bit_for_bit():
+    schedule = LinearSchedule(1.0, 0.05, 0.37)
+    row = schedule_row(schedule)
+    points = [1.0 - step / 30_011 for step in range(30_011 + 1)]
+    assert [schedule_value(row, point) for point in points] == list(map(schedule, points))
+
+
+def test_rows():
+    half = LinearSchedule(1, 0, 0.5)
+    assert schedule_row(ExponentialSchedule(0.5, 0.25, 0.75)) == (EXPONENTIAL, 0.5, 0.25, 0.75)
+    assert schedule_row(half) == schedule_row(FloatSchedule(FloatSchedule(half)))
+    assert schedule_row(half) == (LINEAR, 1, 0, 0.5)
+    assert schedule_row(ConstantSchedule(3)) == (LINEAR, 3, 3, 1)
+    assert schedule_row(0.1) == (LINEAR, 0.1, 0.1, 1)
+    for foreign in (lambda point: point, FloatSchedule(lambda point: point), "lin_0.1"):
+        assert schedule_row(foreign) is None
+
+
+def test_exponential_decay_worked_by_hand():
+    # From 16 to 1 over the first half: a factor of 2 for each eighth of the training.
+    points = [1.0, 0.875, 0.75, 0.625, 0.5, 0.25, 0.0, -0.1]
+    decay = ExponentialSchedule(16.0, 1.0, 0.5)
+    assert list(map(decay, points)) == pytest.approx([16, 8, 4, 2, 1, 1, 1, 1], rel=1e-14)
+
+
+@given(positive, positive, shares, st.floats(0, 1))
+def test_exponential_decay_in_closed_form(start, end, end_fraction, point):
+    elapsed = min((1.0 - point) / end_fraction, 1.0)
+    expected = math.exp((1.0 - elapsed) * math.log(start) + elapsed * math.log(end))
+    value = ExponentialSchedule(start, end, end_fraction)(point)
+    assert value == pytest.approx(expected, rel=1e-12)
+    assert type(value) is float
+
+
+def test_the_end_of_a_decay_is_exact():
+    schedule = ExponentialSchedule(0.7, 0.003, 0.6)
+    assert schedule(1.0) == 0.7
+    assert schedule(0.399) == schedule(0.0) == 0.003
+
+
+@pytest.mark.parametrize("start", [0.0, -1.0, math.nan])
+@pytest.mark.parametrize("swap", [False, True])
+def test_a_decay_from_or_to_nothing_is_refused(start, swap):
+    ends = (1.0, start) if swap else (start, 1.0)
+    with pytest.raises(ValueError, match=f"start and end above 0, not {ends[0]} and {ends[1]}"):
+        ExponentialSchedule(*ends)
+
+
+@pytest.mark.parametrize("share", [0.0, -0.5, 1.0000001, math.nan])
+def test_a_share_outside_of_training_is_refused(share):
+    with pytest.raises(ValueError, match=r"end_fraction must lie in \(0, 1\], not "):
+        ExponentialSchedule(1.0, 0.5, share)
+
+
+def test_its_text_makes_it_again():
+    schedule = ExponentialSchedule(1.0, 0.5, 0.25)
+    assert repr(schedule) == "ExponentialSchedule(start=1.0, end=0.5, end_fraction=0.25)"

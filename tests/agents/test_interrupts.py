@@ -15,22 +15,31 @@ from agents.compiled.engine import interrupts_held
 N_ENVS = 2
 
 
-def work_interrupted(times, seen):
+@contextmanager
+def handling(number, handler):
+    previous = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        signal.signal(number, previous)
+
+
+def work_interrupted(number, times, seen):
     with interrupts_held() as waiting:
         seen.append(waiting())
         for _ in range(times):
-            signal.raise_signal(signal.SIGINT)
-        seen.append(waiting())
+            signal.raise_signal(number)
+            seen.append(waiting())
     seen.append("the end")
 
 
 def test_the_first_interrupt_waits_and_the_second_does_not():
     seen = {times: [] for times in range(3)}
-    work_interrupted(0, seen[0])
+    work_interrupted(signal.SIGINT, 0, seen[0])
     for times in (1, 2):
         with pytest.raises(KeyboardInterrupt):
-            work_interrupted(times, seen[times])
-    assert seen == {0: [False, False, "the end"], 1: [False, True], 2: [False]}
+            work_interrupted(signal.SIGINT, times, seen[times])
+    assert seen == {0: [False, "the end"], 1: [False, True], 2: [False, True]}
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -42,46 +51,25 @@ def test_a_handler_of_ones_own_is_called_at_once_and_what_it_raises_waits(number
         order.append(given)
         raise RuntimeError("handled")
 
-    def work():
-        with interrupts_held() as waiting:
-            signal.raise_signal(number)
-            order.append(waiting())
-
-    previous = signal.signal(number, handle)
-    try:
+    with handling(number, handle):
         with pytest.raises(RuntimeError, match="handled"):
-            work()
-        assert order == [number, True]
+            work_interrupted(number, 1, order)
+        assert order == [False, number, True]
         assert signal.getsignal(number) is handle
-    finally:
-        signal.signal(number, previous)
 
 
 def test_a_handler_that_raises_nothing_stops_nothing():
     """What it raises on a second signal does not wait, even if that is its first exception."""
-    handled = []
+    handled, seen = [], []
 
     def handle(number, frame):
         handled.append(number)
         if len(handled) > 1:
             raise KeyboardInterrupt
 
-    seen = []
-
-    def work():
-        with interrupts_held() as waiting:
-            signal.raise_signal(signal.SIGTERM)
-            seen.append(waiting())
-            signal.raise_signal(signal.SIGTERM)
-            seen.append("not reached")
-
-    previous = signal.signal(signal.SIGTERM, handle)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            work()
-    finally:
-        signal.signal(signal.SIGTERM, previous)
-    assert seen == [False]
+    with handling(signal.SIGTERM, handle), pytest.raises(KeyboardInterrupt):
+        work_interrupted(signal.SIGTERM, 2, seen)
+    assert seen == [False, False]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -91,32 +79,19 @@ def test_what_the_system_does_by_itself_is_left_to_it(number):
 
 
 def test_other_threads_hold_nothing():
-    waiting = []
-
-    def work():
-        with interrupts_held() as held:
-            waiting.append(held())
-
-    thread = threading.Thread(target=work)
+    seen = []
+    thread = threading.Thread(target=work_interrupted, args=(signal.SIGINT, 0, seen))
     thread.start()
     thread.join()
-    assert waiting == [False]
+    assert seen == [False, "the end"]
 
 
 class Interrupter(BlockCallback):
-    """Lets an interrupt come some time after a block of steps has begun.
-
-    The clock is that of the process's own work: however busy the machine is, it comes no later.
-
-    Args:
-        n_calls: calls to wait for before that, so that some training has been done by then.
-        seconds: from then on.
-    """
+    """Lets an interrupt come so many seconds of the process's own work after that call."""
 
     def __init__(self, n_calls, seconds):
         super().__init__()
-        self.after = n_calls
-        self.seconds = seconds
+        self.after, self.seconds = n_calls, seconds
 
     def horizon(self):
         return Horizon(calls=max(self.after - self.n_calls, 1))
@@ -125,26 +100,6 @@ class Interrupter(BlockCallback):
         if self.n_calls == self.after:
             signal.setitimer(signal.ITIMER_VIRTUAL, self.seconds)
         return True
-
-
-@pytest.fixture
-def alarms_interrupt():
-    """Let the end of a timer be an interrupt."""
-    previous = signal.signal(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGINT))
-    yield
-    signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-    signal.signal(signal.SIGVTALRM, previous)
-
-
-def train_until_interrupted(model, n_calls, seconds):
-    """Train without end until an interrupt comes; whether it was one that ended the training."""
-    try:
-        model.learn(
-            10**9, Interrupter(n_calls, seconds), reset_num_timesteps=False, log_interval=20
-        )
-    except KeyboardInterrupt:
-        return True
-    return False
 
 
 class Stop(BlockCallback):
@@ -166,11 +121,8 @@ class Stop(BlockCallback):
 def check(model, folder):
     """Counters, tables, Monitor and environments tell of the same steps."""
     steps = model.num_timesteps
-    rows = [
-        line.split(",")
-        for i in range(N_ENVS)
-        for line in (folder / f"{i}.monitor.csv").read_text().splitlines()[2:]
-    ]
+    files = [folder / f"{i}.monitor.csv" for i in range(N_ENVS)]
+    rows = [line.split(",") for path in files for line in path.read_text().splitlines()[2:]]
     under_way = sum(len(env.get_wrapper_attr("rewards")) for env in model.env.envs)
     assert sum(int(length) for _, length, _ in rows) + under_way == steps
     assert sum(env.get_wrapper_attr("total_steps") for env in model.env.envs) == steps
@@ -187,25 +139,24 @@ def made(folder=None, n_envs=N_ENVS):
         yield load_algorithm("sarsa")(env=env, seed=0, engine="compiled")
 
 
-@pytest.mark.usefixtures("alarms_interrupt")
 def test_interrupts_at_any_moment(tmp_path):
     rng = np.random.default_rng(0)
-    with made(tmp_path) as model:
+    moments = zip(rng.integers(1, 400, 40).tolist(), rng.uniform(0.0, 0.004, 40), strict=True)
+    alarm = handling(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    with made(tmp_path) as model, alarm:
         # Twice, so that all is compiled before the first interrupt comes.
         model.learn(100).learn(50, reset_num_timesteps=False)
-        # However busy the machine is, these many steps are done before it.
-        for n_calls, seconds in zip(
-            rng.integers(1, 400, 40).tolist(), rng.uniform(0.0, 0.004, 40), strict=True
-        ):
+        for n_calls, seconds in moments:
             before = model.num_timesteps
-            assert train_until_interrupted(model, n_calls, seconds)
+            with pytest.raises(KeyboardInterrupt):
+                model.learn(10**9, Interrupter(n_calls, seconds), 20, reset_num_timesteps=False)
+            # However busy the machine is, these many steps are done before it.
             assert model.num_timesteps >= before + n_calls * N_ENVS
             check(model, tmp_path)
             after = model.num_timesteps
             model.learn(50, reset_num_timesteps=False)
             check(model, tmp_path)
             assert model.num_timesteps == after + 50
-        assert model.num_timesteps > 10_000
 
 
 @pytest.mark.parametrize("n_envs", [1, N_ENVS])

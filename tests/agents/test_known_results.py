@@ -1,54 +1,194 @@
-"""Results that a correct program reproduces: example 6.6 of the book, and a course's warehouse.
+"""What is known exactly, or from books and long campaigns: plans, mazes, cliffs, deep seas.
 
-The warehouse figures were measured over 30 seeds with programs of their own, written after a
-coursework's code: shelf reward -1, at most 1000 steps, 1000 episodes, ties on the first index.
+The coursework warehouse's figures were measured over 30 seeds with programs of their own, written
+after a coursework's code: shelf reward -1, at most 1000 steps, 1000 episodes, ties on the first.
 """
 
+import re
+
+import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 
-import envs  # noqa: F401
+import envs  # noqa: F401  # registers the environments
+from agents import load_algorithm
 from agents.common.callbacks import EpisodeBudget
-from agents.tabular.one_step import SARSA, QLearning
-from envs.known_models import transition_model
-from mdp import policy_return
+from agents.common.schedules import ExponentialSchedule
+from envs.known_models import time_limit, transition_model
+from mdp import (
+    TransitionModel,
+    finite_horizon_optimum,
+    policy_iteration,
+    policy_return,
+    value_iteration,
+)
 
 N_SEEDS = 10
+CONSTANT = {"exploration_decay": "constant", "exploration_initial_eps": 0.1}
 
 
-def trained(algorithm, env_id, seed, n_episodes, env_kwargs=None, **kwargs):
+def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
+    env = make_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs)
+    return load_algorithm(name)(env=env, seed=seed, **settings)
+
+
+# --- planning ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "by_values", "optimum"),
+    [
+        ("Warehouse-v0", {}, 79, 79),
+        ("MineMaze-v0", {}, 91, 91),
+        ("FrozenLake-v1", {}, 0.7402, 0.7442),
+        ("FrozenLake8x8-v1", {}, 0.8630, 0.9132),
+        ("CliffWalking-v1", {"max_episode_steps": 200}, -13, -13),
+    ],
+)
+def test_the_known_returns(env_id, kwargs, by_values, optimum):
+    env = gym.make(env_id, **kwargs)
+    model, horizon = transition_model(env), time_limit(env)
+    for name, expected in (("value_iteration", by_values), ("optimal", optimum)):
+        agent = made(name, env_id, env_kwargs=kwargs).learn(1)
+        steps = np.arange(horizon)[:, None]
+        policy = agent.policy.actions_after(np.arange(model.n_states)[None], steps)
+        result = policy_return(model, policy, horizon).expected_return
+        assert result == pytest.approx(expected, abs=5e-5)
+
+
+def test_policy_iteration_by_hand():
+    """To stay in state 0 earns 1, in state 1 it earns 3; to go over earns nothing."""
+    next_state = np.array([[[0], [1]], [[1], [1]]])
+    model = TransitionModel(
+        prob=np.ones(next_state.shape),
+        next_state=next_state,
+        reward=np.array([[[1.0], [0.0]], [[3.0], [3.0]]]),
+        terminated=np.zeros(next_state.shape, dtype=bool),
+        initial=np.array([1.0, 0.0]),
+    )
+    plan = policy_iteration(model, 0.5)
+    assert plan.values == pytest.approx([3, 6])
+    assert plan.action_values[0] == pytest.approx([2.5, 3])
+    assert (plan.policy[0], plan.iterations) == (1, 2)
+
+
+WITH_A_MODEL = ["FrozenLake-v1", "Taxi-v4", "WindyGridworld-v0", "GamblersProblem-v0"]
+WITH_A_MODEL += ["MaximizationBias-v0", "RiverSwim-v0", "CliffWalking-v1"]
+
+
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+@pytest.mark.parametrize("env_id", WITH_A_MODEL)
+def test_plans_by_values_and_by_policies_are_worth_the_same(env_id, gamma):
+    """From each state, also where ties let the two choose other actions."""
+    model = transition_model(gym.make(env_id))
+    try:
+        optimum = value_iteration(model, gamma).values[model.reachable]
+    except ValueError as refusal:  # an undiscounted optimum that is not finite
+        with pytest.raises(ValueError, match=re.escape(str(refusal))):
+            made("policy_iteration", env_id, gamma=gamma).learn(1)
+        return
+    for name in ("value_iteration", "policy_iteration"):
+        actions = made(name, env_id, gamma=gamma).learn(1).policy.actions.numpy()[0]
+        # Where one action is allowed, the optimum is what the policy is worth.
+        alone = np.eye(model.n_actions, dtype=bool)[actions[: model.n_states]]
+        worth = value_iteration(model, gamma, mask=alone).values[model.reachable]
+        np.testing.assert_allclose(worth, optimum, atol=1e-8, rtol=1e-9)
+
+
+def test_the_optimal_agent_keeps_the_time_of_each_episode_apart():
+    agent = made("optimal", "FrozenLake-v1").learn(1)
+    plan = finite_horizon_optimum(transition_model(gym.make("FrozenLake-v1")), 100)
+    # A state whose best action changes towards the end of the time.
+    changing = np.flatnonzero((plan.policy != plan.policy[0]).any(axis=0))[0]
+    state = None
+    for step in range(100):
+        # The second episode begins anew at each call.
+        starts = np.array([step == 0, True])
+        actions, state = agent.predict(np.array([changing, changing]), state, starts)
+        assert actions.tolist() == [plan.policy[step][changing], plan.policy[0][changing]]
+
+
+def test_training_plays_the_optimal_return():
+    agent = made("optimal", "Warehouse-v0").learn(220)
+    assert [episode["r"] for episode in agent.ep_info_buffer] == [79.0] * 10
+    assert evaluate_policy(agent, agent.env, 3)[0] == 79
+
+
+def test_plans_need_a_model_and_the_optimum_a_time_limit():
+    unknown = gym.wrappers.TransformReward(gym.make("FrozenLake-v1"), float)
+    with pytest.raises(ValueError, match="transition model is known"):
+        load_algorithm("value_iteration")(env=unknown).learn(1)
+    with pytest.raises(ValueError, match="needs a time limit"):
+        load_algorithm("optimal")(env=gym.make("CliffWalking-v1")).learn(1)
+
+
+# --- learning ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["qlearning", "sarsa", "expected_sarsa", "double_qlearning"])
+def test_the_shortest_way_through_the_warehouse(name):
+    rates = {"exploration_initial_eps": 1.0 if name == "double_qlearning" else 0.1}
+    rates |= {"exploration_final_eps": 0.01, "exploration_fraction": 0.8}
+    model = made(name, "Warehouse-v0", learning_rate=ExponentialSchedule(0.3, 0.05), **rates)
+    evaluated = evaluate_policy(model.learn(100_000), Monitor(gym.make("Warehouse-v0")), 1)
+    assert evaluated[0] == 79
+
+
+FALLING = {"exploration_initial_eps": 0.3, "exploration_final_eps": 0.01, "learning_rate": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("n_step_sarsa", FALLING),
+        ("n_step_tree_backup", CONSTANT),
+        ("sarsa_lambda", {**CONSTANT, "trace_type": "dutch"}),
+        ("q_lambda", {**CONSTANT, "trace_type": "accumulating"}),
+        ("monte_carlo", CONSTANT),
+        ("off_policy_monte_carlo", CONSTANT),
+    ],
+)
+def test_a_short_way_through_the_books_maze(name, settings):
+    model = made(name, "DynaMaze-v0", n_envs=2, gamma=0.95, **settings).learn(50_000)
+    maze = Monitor(gym.make("DynaMaze-v0"))
+    (length,) = evaluate_policy(model, maze, 1, return_episode_rewards=True)[1]
+    # The shortest takes 14 steps, the next 16; moving at random takes hundreds.
+    assert length <= 16
+
+
+def returns_of(name, env_id, seed, n_episodes, env_kwargs=None, **settings):
     """The agent after ``n_episodes``, and the return of each of them."""
-    env = make_vec_env(env_id, 1, seed=seed, env_kwargs=env_kwargs)
-    agent = algorithm(env=env, seed=seed, exploration_decay="constant", **kwargs)
+    agent = made(name, env_id, seed, 1, env_kwargs, exploration_decay="constant", **settings)
     agent.learn(10**9, callback=EpisodeBudget(n_episodes), log_interval=None)
-    return agent, np.array(env.envs[0].get_wrapper_attr("get_episode_rewards")())
+    return agent, np.array(agent.env.envs[0].get_wrapper_attr("get_episode_rewards")())
 
 
-def greedy_return(agent, horizon):
-    model = transition_model(agent.env.envs[0])
+def worth(agent, env_id, kwargs, horizon=None):
+    """What the greedy policy earns, and what the best one does, exactly."""
+    env = gym.make(env_id, **kwargs)
+    model, horizon = transition_model(env), horizon or time_limit(env)
     policy = agent.predict(np.arange(model.n_states), deterministic=True)[0]
-    return policy_return(model, policy, horizon).expected_return
+    optimum = finite_horizon_optimum(model, horizon).start_value
+    return policy_return(model, policy, horizon).expected_return, optimum
 
 
 def test_cliff_walking_as_in_the_book():
     """Sutton and Barto, example 6.6: epsilon 0.1, step size 0.1, undiscounted, 500 episodes."""
     settings = {"learning_rate": 0.1, "gamma": 1.0, "exploration_initial_eps": 0.1}
-    runs = {
-        algorithm: [
-            trained(algorithm, "CliffWalking-v1", seed, 2000, **settings) for seed in range(N_SEEDS)
-        ]
-        for algorithm in (QLearning, SARSA)
-    }
-    best = [greedy_return(agent, 200) for agent, _ in runs[QLearning]]
-    safe = [greedy_return(agent, 200) for agent, _ in runs[SARSA]]
-    assert best == [-13] * N_SEEDS
-    assert all(-17 <= value <= -15 for value in safe)
+    found, online = {}, {}
+    for name in ("qlearning", "sarsa"):
+        runs = [returns_of(name, "CliffWalking-v1", s, 2000, **settings) for s in range(N_SEEDS)]
+        found[name] = [worth(agent, "CliffWalking-v1", {}, 200)[0] for agent, _ in runs]
+        online[name] = [returns[-1000:].mean() for _, returns in runs]
+    assert found["qlearning"] == [-13] * N_SEEDS
+    assert all(-17 <= value <= -15 for value in found["sarsa"])
     # While learning it is the other way round, on every seed.
-    online = {key: [returns[-1000:].mean() for _, returns in value] for key, value in runs.items()}
-    assert all(s > q for s, q in zip(online[SARSA], online[QLearning], strict=True))
-    assert -59 < np.mean(online[QLearning]) < -47
-    assert -28 < np.mean(online[SARSA]) < -20
+    assert all(s > q for s, q in zip(online["sarsa"], online["qlearning"], strict=True))
+    assert -59 < np.mean(online["qlearning"]) < -47
+    assert -28 < np.mean(online["sarsa"]) < -20
 
 
 @pytest.mark.parametrize(
@@ -63,19 +203,46 @@ def test_cliff_walking_as_in_the_book():
     ],
 )
 def test_the_coursework_warehouse(learning_rate, gamma, epsilon, early, middle, late):
-    settings = {
-        "learning_rate": learning_rate,
-        "gamma": gamma,
-        "exploration_initial_eps": epsilon,
-        "tie_breaking": "first",
-        "env_kwargs": {"shelf_reward": -1},
-    }
-    returns = np.array(
-        [trained(QLearning, "Warehouse-v0", seed, 1000, **settings)[1] for seed in range(N_SEEDS)]
-    ).mean(axis=0)
+    settings = {"learning_rate": learning_rate, "gamma": gamma, "exploration_initial_eps": epsilon}
+    settings |= {"tie_breaking": "first", "env_kwargs": {"shelf_reward": -1}}
+    runs = [returns_of("qlearning", "Warehouse-v0", s, 1000, **settings) for s in range(N_SEEDS)]
+    returns = np.mean([returns for _, returns in runs], axis=0)
     for part, (expected, tolerance) in (
         (returns[:100], early),
         (returns[200:300], middle),
         (returns[-100:], late),
     ):
         assert part.mean() == pytest.approx(expected, abs=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "bound"),
+    [("DeepSea-v0", {"size": 10}, 1.0), ("RiverSwim-v0", {}, 100.0)],
+)
+def test_it_finds_what_epsilon_greedy_never_sees(env_id, kwargs, bound):
+    """On each of ten seeds the optimum, and next to nothing.
+
+    Where time is short one would not swim on at the end, which is worth .02 % and no table can say.
+    """
+    for seed in range(N_SEEDS):
+        optimist = made("qlearning_ucb", env_id, seed, 1, kwargs, value_bound=bound)
+        found, optimum = worth(optimist.learn(10_000), env_id, kwargs)
+        assert found == pytest.approx(optimum, rel=3e-4)
+        greedy = made("qlearning", env_id, seed, 1, kwargs).learn(10_000)
+        assert worth(greedy, env_id, kwargs)[0] < 0.04 * optimum
+
+
+@pytest.mark.parametrize("env_id", ["DynaMaze-v0", "WindyGridworld-v0", "DeepSea-v0"])
+def test_one_try_is_enough_where_nothing_is_random(env_id):
+    """Each episode on which R-max is not optimal makes a pair known: no more episodes than pairs.
+
+    With value_bound at the optimum of the best state, what it goes for is never less than the
+    best; an episode that meets nothing new is therefore as good as the best one.
+    """
+    model = transition_model(gym.make(env_id))
+    plan = value_iteration(model, 0.99)
+    bound = max(float(plan.values[model.reachable].max()), 0.0)
+    agent = made("r_max", env_id, known_after=1, value_bound=bound, tolerance=1e-9)
+    agent.learn(int(model.reachable.sum()) * model.n_actions * 20)
+    greedy = np.eye(model.n_actions, dtype=bool)[agent.policy.q_table.argmax(axis=1)]
+    assert value_iteration(model, 0.99, mask=greedy).start_value == pytest.approx(plan.start_value)

@@ -1,6 +1,7 @@
-"""The table of agents: where they live, and what spaces they fit."""
+"""The table of agents: where they live, what spaces they fit, and how others are added."""
 
 import importlib.util
+import subprocess
 import sys
 
 import gymnasium as gym
@@ -9,36 +10,47 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+import agents
 from agents import ALGORITHMS, fitting_algorithms, load_algorithm
+from pipeline.settings.values import algorithm_parameters
 
-DISCRETE = spaces.Discrete(4)
-BOX = spaces.Box(-1, 1, (4,))
+DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "policy_iteration", "optimal"]
 TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
 TILED = [name for name, entry in ALGORITHMS.items() if entry.family == "linear"]
-DEEP_Q = ["dqn", "double_dqn", "deep_qlearning"]
+BANDITS = [name for name, entry in ALGORITHMS.items() if entry.for_bandits]
+LINEAR = ["linucb", "lin_thompson", "lin_epsilon_greedy", "mabwiser_linucb"]
 CONTRIB = ["qrdqn", "tqc", "crossq", "trpo", "ars", "ppo_lstm", "ppo_mask"]
 # What learns on any observation and acts in Discrete spaces, in the order of the table.
+DEEP_Q = ["dqn", "double_dqn", "deep_qlearning"]
 NETWORKS = [*DEEP_Q, "ppo", "a2c", "qrdqn", "trpo", "ars", "ppo_lstm"]
 CONTINUOUS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "trpo", "ars", "ppo_lstm"]
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_name_stands_for_an_algorithm(name):
-    algorithm = load_algorithm(name)
-    assert issubclass(algorithm, BaseAlgorithm)
-    assert ALGORITHMS[name].entry_point.endswith(f":{algorithm.__name__}")
-    assert algorithm.policy_aliases
+@pytest.fixture(autouse=True)
+def table():
+    """Whatever is added goes away again."""
+    before = dict(ALGORITHMS)
+    yield
+    ALGORITHMS.clear()
+    ALGORITHMS.update(before)
 
 
-def test_no_two_names_stand_for_the_same():
-    assert len({load_algorithm(name) for name in ALGORITHMS}) == len(ALGORITHMS)
+def test_every_name_stands_for_an_algorithm_of_its_own():
+    classes = {name: load_algorithm(name) for name in ALGORITHMS}
+    assert len(set(classes.values())) == len(ALGORITHMS)
+    for name, entry in ALGORITHMS.items():
+        assert issubclass(classes[name], BaseAlgorithm)
+        assert entry.entry_point.endswith(f":{classes[name].__name__}")
+        assert classes[name].policy_aliases
+        # What `--engine` offers without importing a class is what its constructor takes.
+        parameter = algorithm_parameters(classes[name]).get("engine")
+        default = parameter and parameter.default
+        assert (len(entry.engines) > 1) == (default is not None), name
+        assert default in {None, *entry.engines[:1]}, name
     summaries = [entry.summary for entry in ALGORITHMS.values()]
     assert all(summary == summary.strip() != "" for summary in summaries)
     assert len(set(summaries)) == len(summaries)
-
-
-def test_an_unknown_name():
     with pytest.raises(KeyError):
         load_algorithm("qlerning")
 
@@ -46,14 +58,8 @@ def test_an_unknown_name():
 @pytest.mark.parametrize(
     ("env_id", "names"),
     [
-        (
-            "CartPole-v1",
-            [*TILED, *NETWORKS, "random", "angle"],
-        ),
-        (
-            "FrozenLake-v1",
-            [*TABULAR, *TILED, *NETWORKS, *PLANNING, "random"],
-        ),
+        ("CartPole-v1", [*TILED, *NETWORKS, "random", "angle"]),
+        ("FrozenLake-v1", [*TABULAR, *TILED, *NETWORKS, *PLANNING, "random"]),
         ("MountainCarContinuous-v0", [*CONTINUOUS, "random"]),
         # Four numbers are observed in CartPole, two here.
         ("MountainCar-v0", [*TILED, *NETWORKS, "random"]),
@@ -63,18 +69,24 @@ def test_an_unknown_name():
 def test_which_agents_fit(env_id, names):
     env = gym.make(env_id)
     assert fitting_algorithms(env.observation_space, env.action_space) == names
-    env.close()
+    reason = "it is for bandits, where a pull changes nothing but its own reward"
+    assert {ALGORITHMS[name].env_misfit(env) for name in BANDITS} == {reason}
+
+
+def test_which_bandit_agents_fit():
+    segments, linear = gym.make("SegmentBandit-v0"), gym.make("LinearBandit-v0")
+    assert not [name for name in BANDITS if ALGORITHMS[name].env_misfit(segments)]
+    assert [name for name in BANDITS if not ALGORITHMS[name].env_misfit(linear)] == LINEAR
+    reason = "it observes Discrete spaces, not Box"
+    assert ALGORITHMS["ucb"].env_misfit(linear).startswith(reason)
+    two = spaces.Discrete(2), spaces.Discrete(3)
+    assert not set(fitting_algorithms(*two)) & set(BANDITS)
+    assert set(fitting_algorithms(*two, bandit=True)) > set(BANDITS)
 
 
 def test_masks_make_one_more_fit():
-    assert fitting_algorithms(DISCRETE, DISCRETE, masks=True) == [
-        *TABULAR,
-        *TILED,
-        *NETWORKS,
-        "ppo_mask",
-        *PLANNING,
-        "random",
-    ]
+    expected = [*TABULAR, *TILED, *NETWORKS, "ppo_mask", *PLANNING, "random"]
+    assert fitting_algorithms(DISCRETE, DISCRETE, masks=True) == expected
     env = OneStep(DISCRETE, DISCRETE)
     assert ALGORITHMS["ppo_mask"].env_misfit(env) == ""
     # A method of the environment serves through wrappers as well.
@@ -85,56 +97,33 @@ def test_masks_make_one_more_fit():
     )
 
 
+ANY = "Box or Discrete or MultiDiscrete or MultiBinary"
+
+
 @pytest.mark.parametrize(
     ("name", "observations", "actions", "misfit"),
     [
         ("qlearning", DISCRETE, DISCRETE, ""),
         ("ppo", BOX, BOX, ""),
         ("sac", BOX, BOX, ""),
-        ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
         ("ppo", spaces.Dict({"a": BOX}), DISCRETE, ""),
         ("angle", BOX, spaces.Discrete(2), ""),
+        ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
         ("qlearning", BOX, DISCRETE, f"it observes Discrete spaces, not {BOX}"),
         ("qlearning", DISCRETE, BOX, f"it acts in Discrete spaces, not {BOX}"),
         ("dqn", BOX, BOX, f"it acts in Discrete spaces, not {BOX}"),
-        (
-            "sarsa",
-            spaces.Discrete(4, start=1),
-            DISCRETE,
-            "it needs Discrete spaces that start at 0, not Discrete(4, start=1)",
-        ),
-        (
-            "a2c",
-            BOX,
-            spaces.Discrete(2, start=-1),
-            "it needs Discrete spaces that start at 0, not Discrete(2, start=-1)",
-        ),
-        (
-            "random",
-            spaces.Tuple([DISCRETE]),
-            DISCRETE,
-            (
-                "it observes Box or Discrete or MultiDiscrete or MultiBinary or Dict spaces, "
-                "not Tuple(Discrete(4))"
-            ),
-        ),
-        (
-            "ppo",
-            BOX,
-            spaces.Dict({"a": DISCRETE}),
-            (
-                "it acts in Box or Discrete or MultiDiscrete or MultiBinary spaces, "
-                "not Dict('a': Discrete(4))"
-            ),
-        ),
-        (
-            "angle",
-            spaces.Box(-1, 1, (2,)),
-            DISCRETE,
-            "it needs observations of shape (4,), not (2,)",
-        ),
+        ("sarsa", spaces.Discrete(4, start=1), DISCRETE,
+         "it needs Discrete spaces that start at 0, not Discrete(4, start=1)"),
+        ("a2c", BOX, spaces.Discrete(2, start=-1),
+         "it needs Discrete spaces that start at 0, not Discrete(2, start=-1)"),
+        ("random", spaces.Tuple([DISCRETE]), DISCRETE,
+         f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
+        ("ppo", BOX, spaces.Dict({"a": DISCRETE}),
+         f"it acts in {ANY} spaces, not Dict('a': Discrete(4))"),
+        ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
+         "it needs observations of shape (4,), not (2,)"),
     ],
-)
+)  # fmt: skip
 def test_why_an_agent_does_not_fit(name, observations, actions, misfit):
     assert ALGORITHMS[name].misfit(observations, actions) == misfit
 
@@ -143,8 +132,7 @@ class OneStep(gym.Env):
     """An environment of any spaces whose episodes last one step."""
 
     def __init__(self, observation_space, action_space):
-        self.observation_space = observation_space
-        self.action_space = action_space
+        self.observation_space, self.action_space = observation_space, action_space
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -170,11 +158,10 @@ SPACES = {
 }
 ON_POLICY = {"n_steps": 4, "batch_size": 4}
 SMALL = {
-    **dict.fromkeys(["ppo", "ppo_mask"], ON_POLICY),
+    **dict.fromkeys(["ppo", "ppo_mask", "trpo"], ON_POLICY),
     # Two of each of their networks, and a memory: smaller, as time goes with their size.
     "ppo_lstm": {**ON_POLICY, "n_epochs": 1, "policy_kwargs": {"lstm_hidden_size": 4}},
     "crossq": {"policy_kwargs": {"net_arch": [8]}},
-    "trpo": {"n_steps": 4, "batch_size": 4},
     "ars": {"n_delta": 2},
 }
 
@@ -186,8 +173,7 @@ def test_the_table_tells_the_truth(name):
     for kind in entry.observations:
         for acts in entry.actions:
             policy = next(iter(algorithm.policy_aliases))
-            if kind == "Dict":
-                policy = policy.replace("Mlp", "MultiInput")
+            policy = policy.replace("Mlp", "MultiInput") if kind == "Dict" else policy
             env = OneStep(SPACES[kind], SPACES[acts])
             assert entry.misfit(env.observation_space, env.action_space) == ""
             model = algorithm(policy, env, seed=0, **SMALL.get(name, {}))
@@ -202,13 +188,90 @@ def test_the_table_tells_the_truth(name):
 def test_an_optional_package_that_is_missing(monkeypatch):
     find_spec = importlib.util.find_spec
     assert all(entry.is_installed for entry in ALGORITHMS.values())
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "sb3_contrib" else find_spec(name)
-    )
+    missing = lambda name: None if name == "sb3_contrib" else find_spec(name)  # noqa: E731
+    monkeypatch.setattr(importlib.util, "find_spec", missing)  # as where it is not installed
     assert [name for name, entry in ALGORITHMS.items() if not entry.is_installed] == CONTRIB
-    assert {ALGORITHMS[name].extra for name in CONTRIB} == {"contrib"}
+    assert {ALGORITHMS[name].install_command for name in CONTRIB} == {
+        "pip install 'rl-yardstick[contrib]'"
+    }
     # What fits does not depend on what is installed.
     assert "qrdqn" in fitting_algorithms(BOX, DISCRETE)
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)
     with pytest.raises(ModuleNotFoundError, match="sb3_contrib"):
         load_algorithm("qrdqn")
+
+
+# --- agents that are added -----------------------------------------------------------------------
+
+
+def test_an_entry_says_what_it_fits_and_fits_all_where_it_says_nothing():
+    for _ in range(2):  # the same twice is harmless
+        agents.register("mine", "some_module:Mine")
+    entry = ALGORITHMS["mine"]
+    assert list(ALGORITHMS)[-1] == "mine"
+    assert (entry.summary, entry.is_installed, entry.family) == ("Mine", True, "")
+    for space in (spaces.Discrete(3, start=1), spaces.Tuple([spaces.Discrete(2)]), spaces.Text(3)):
+        assert entry.misfit(space, space) == ""
+        assert "mine" in fitting_algorithms(space, space)
+    fields = {"observations": ["Box"], "actions": "Discrete", "for_bandits": True}
+    agents.register("own", "some_module:Own", package="no_such_package_of_mine", **fields)
+    entry = ALGORITHMS["own"]
+    assert entry.misfit(BOX, DISCRETE) == ""
+    assert "it observes Box spaces" in entry.misfit(DISCRETE, DISCRETE)
+    assert "it acts in Discrete spaces" in entry.misfit(BOX, BOX)
+    assert "own" not in fitting_algorithms(BOX, DISCRETE)
+    assert "own" in fitting_algorithms(BOX, DISCRETE, bandit=True)
+    assert not entry.is_installed
+    assert entry.install_command == "pip install no_such_package_of_mine"
+
+
+MINE = "some_module:Mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "entry_point", "fields", "complaint"),
+    [
+        ("ppo", MINE, {}, "an agent ppo already (agents.library:PPO)"),
+        ("PPO", MINE, {}, "there is an agent ppo already"),
+        ("taken", "some_module:Other", {}, "register some_module:Other under another name"),
+        ("taken", MINE, {"actions": ["Box"]}, "there is an agent taken already"),
+        ("../up", MINE, {}, "the name of an agent holds letters, digits and _"),
+        ("a/b", MINE, {}, "not 'a/b'"),
+        ("", MINE, {}, "not ''"),
+        ("mine", "some_module.Mine", {}, "is named as 'module:Class', not 'some_module.Mine'"),
+        ("mine", dict, {}, "is named as 'module:Class'"),
+        ("mine", MINE, {"action": ["Box"]}, "mine: an entry has no action"),
+        ("mine", MINE, {"actions": "Bx"}, "actions are names of Gymnasium's spaces"),
+        ("mine", MINE, {"observations": [spaces.Box]}, "observations are names"),
+    ],
+)
+def test_what_cannot_be_registered(name, entry_point, fields, complaint):
+    agents.register("taken", MINE)
+    before = dict(ALGORITHMS)
+    with pytest.raises(ValueError, match=r".") as caught:
+        agents.register(name, entry_point, **fields)
+    assert complaint in str(caught.value)
+    assert before == ALGORITHMS
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "complaint"),
+    [
+        ("gymnasium:Typo", "mine is registered as gymnasium:Typo, which does not exist"),
+        ("gymnasium:Env", "which is no subclass of BaseAlgorithm"),
+    ],
+)
+def test_a_class_that_is_none(entry_point, complaint):
+    agents.register("mine", entry_point)
+    with pytest.raises(ValueError, match=complaint):
+        load_algorithm("mine")
+
+
+def test_registering_is_light():
+    code = (
+        "import sys, agents\n"
+        "agents.register('mine', 'some_module:Mine')\n"
+        "print({'torch', 'numba', 'stable_baselines3', 'some_module'} & {*sys.modules})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

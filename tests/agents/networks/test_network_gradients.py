@@ -188,11 +188,16 @@ def test_q_gradient(name, observations, net_arch, function, batch_size, place, n
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
 
 
-Q_NETWORKS = [(name, "relu", space) for name in Q_NAMES for space in ("numbers", "vectors")]
-Q_NETWORKS += [("dqn", function, "vectors") for function in sorted(FUNCTIONS)]
+Q_NETWORKS = [
+    ("dqn", "relu", "numbers"),
+    ("dqn", "identity", "vectors"),
+    ("dqn", "tanh", "vectors"),
+    ("double_dqn", "relu", "vectors"),
+    ("deep_qlearning", "relu", "numbers"),
+]
 
 
-@pytest.mark.parametrize(("name", "function", "space"), dict.fromkeys(Q_NETWORKS))
+@pytest.mark.parametrize(("name", "function", "space"), Q_NETWORKS)
 def test_q_weights_after_100_updates(name, function, space, **kwargs):
     ours, theirs, _ = train_q_agents(
         name,
@@ -270,8 +275,8 @@ def shuffle_as_compiled(monkeypatch, model, rng):
     monkeypatch.setattr(np.random, "permutation", permutation)
 
 
-def train_policy_agents(name, observations, n_envs=2, **kwargs):
-    """Both engines after one training, the compiled one with its last gradient."""
+def train_policy_agents(name, observations, n_envs=2, seeds=(1,), **kwargs):
+    """Both engines after a training on each rollout, the compiled one with its last gradient."""
     ours, theirs = (
         make(name, engine, observations, n_envs, device="cpu", **kwargs)
         for engine in ("compiled", "library")
@@ -281,17 +286,20 @@ def train_policy_agents(name, observations, n_envs=2, **kwargs):
     rng.bit_generator.state = ours.rng.bit_generator.state
     for model in (ours, theirs):
         model._setup_learn(1)
-        last_values, dones = fill_rollout(model, seed=1)
-    with ours._learning_compiled():
-        held = ours._shared_training().held
-        held.last_values[:], held.starts[:] = last_values, dones
-        estimate_advantages(ours._shared_training().learner, 0.0, 0.0)
-        ours.train()
-        slopes = as_library(ours._shared_training().networks, held.gradient, names)
-    with pytest.MonkeyPatch.context() as patch:
-        shuffle_as_compiled(patch, theirs, rng)
-        theirs.rollout_buffer.compute_returns_and_advantage(th.as_tensor(last_values), dones)
-        theirs.train()
+    for seed in seeds:
+        for model in (ours, theirs):
+            last_values, dones = fill_rollout(model, seed)
+        with ours._learning_compiled():
+            held = ours._shared_training().held
+            held.last_values[:], held.starts[:] = last_values, dones
+            estimate_advantages(ours._shared_training().learner, 0.0, 0.0)
+            ours.train()
+            slopes = as_library(ours._shared_training().networks, held.gradient, names)
+        with pytest.MonkeyPatch.context() as patch:
+            shuffle_as_compiled(patch, theirs, rng)
+            last = th.as_tensor(last_values)
+            theirs.rollout_buffer.compute_returns_and_advantage(last, dones)
+            theirs.train()
     return ours, theirs, slopes
 
 
@@ -402,22 +410,7 @@ def test_a2c_after_100_updates(optimizer, decay, normalize, observations):
     optimizer_kwargs = {"eps": 1e-5, "weight_decay": decay}
     kwargs = {"optimizer_class": optimizer, "optimizer_kwargs": optimizer_kwargs}
     arguments = {"n_steps": 5, "policy_kwargs": kwargs, "normalize_advantage": normalize}
-    ours, theirs = (
-        make("a2c", engine, observations, **arguments) for engine in ("compiled", "library")
-    )
-    for model in (ours, theirs):
-        model._setup_learn(1)
-    for seed in range(100):
-        for model in (ours, theirs):
-            last_values, dones = fill_rollout(model, seed)
-        with ours._learning_compiled():
-            held = ours._shared_training().held
-            held.last_values[:], held.starts[:] = last_values, dones
-            estimate_advantages(ours._shared_training().learner, 0.0, 0.0)
-            ours.train()
-        buffer = theirs.rollout_buffer
-        buffer.compute_returns_and_advantage(th.as_tensor(last_values), dones)
-        theirs.train()
+    ours, theirs, _ = train_policy_agents("a2c", observations, seeds=range(100), **arguments)
     assert_same(parameters(ours), parameters(theirs))
     assert_same_optimizers(ours, theirs)
     assert_same_logs(ours, theirs)
@@ -426,8 +419,12 @@ def test_a2c_after_100_updates(optimizer, decay, normalize, observations):
 # --- returns over several steps ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", [(9, False), (9, True), (0, True), (29, True)])
-@pytest.mark.parametrize("n_steps", [2, 5, 40])
+PLACES = [(9, False), (9, True), (0, True), (29, True)]
+
+
+@pytest.mark.parametrize(
+    ("n_steps", "place"), [(2, PLACES[3]), *((5, place) for place in PLACES), (40, PLACES[1])]
+)
 def test_returns_over_several_steps(n_steps, place):
     """Made-up values of next states would hide what a minibatch holds: it is looked at itself."""
     model = make("dqn", "compiled", NUMBERS, buffer_size=60, n_steps=n_steps, batch_size=400)

@@ -2,9 +2,15 @@
 
 import enum
 import json
+import pickletools
 import string
+import subprocess
+import sys
+import zipfile
+from base64 import b64decode
 from collections import OrderedDict, deque, namedtuple
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -13,8 +19,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from agents import load_algorithm
 from agents.common.model_files import CODECS, UnknownTypeError, decode, encode
-from agents.common.schedules import ExponentialSchedule
+from agents.common.schedules import ExponentialSchedule, library_schedule
+from agents.tabular.dyna import MOST_BYTES, DatedModelPolicy, ModelPolicy
+from agents.tabular.optimism import CountedModelPolicy
+from pipeline.settings.components import build_algorithm_kwargs
+from safe_files.files import MAX_ARCHIVE_BYTES
 
 ARRAY_DTYPES = [
     npst.boolean_dtypes(),
@@ -384,3 +395,115 @@ OUT_OF_RANGE = {
 def test_fields_out_of_range_are_refused(damage):
     with pytest.raises(ValueError, match=r"."):
         decode(OUT_OF_RANGE[damage])
+
+
+# --- files of agents of the library ---------------------------------------------------------------
+
+EXPONENTIAL = {
+    name: {"learning_rate": "exp_0.1_0.001"}
+    for name in ("ppo", "a2c", "dqn", "double_dqn", "deep_qlearning", "qrdqn")
+}
+EXPONENTIAL["ppo"] |= {"clip_range": "exp_0.4_0.1"}
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.1, 0.001), (0.001, 0.1), (0.5, 0.5)])
+def test_a_librarys_schedule_is_ours(start, end):
+    ours = ExponentialSchedule(start, end)
+    theirs = library_schedule(ours)
+    for remaining in np.linspace(0.0, 1.0, 11).tolist():
+        assert float(theirs(remaining)) == pytest.approx(ours(remaining), rel=1e-12)
+
+
+def zip_with_exponential_schedule(name, tmp_path):
+    algorithm = load_algorithm(name)
+    kwargs = build_algorithm_kwargs(algorithm, {"policy": "MlpPolicy", **EXPONENTIAL[name]}, name)
+    model = algorithm(env=gym.make("CartPole-v1"), **kwargs)
+    model.save(tmp_path / name)
+    return tmp_path / f"{name}.zip"
+
+
+@pytest.mark.parametrize("name", EXPONENTIAL)
+def test_a_library_agents_zip_names_no_module_of_this_project(name, tmp_path):
+    with zipfile.ZipFile(zip_with_exponential_schedule(name, tmp_path)) as archive:
+        data = json.loads(archive.read("data"))
+    words = [
+        str(argument)
+        for value in data.values()
+        if isinstance(value, dict) and ":serialized:" in value
+        for _, argument, _ in pickletools.genops(b64decode(value[":serialized:"]))
+    ]
+    assert any(word.startswith("stable_baselines3") for word in words)
+    ours = {"agents", "envs", "mdp", "pipeline", "experiments", "commands"}
+    assert ours.isdisjoint(word.partition(".")[0] for word in words)
+
+
+def test_a_library_agents_zip_opens_where_this_project_is_not(tmp_path):
+    path = zip_with_exponential_schedule("ppo", tmp_path)
+    code = (
+        "import sys\n"
+        f"sys.path = [p for p in sys.path if 'site-packages' in p or 'lib/python' in p]\n"
+        "sys.meta_path = [f for f in sys.meta_path if 'editable' not in repr(f)]\n"
+        "import importlib.util\n"
+        "assert importlib.util.find_spec('agents') is None\n"
+        "from stable_baselines3 import PPO\n"
+        f"model = PPO.load({str(path)!r})\n"
+        "print(model.lr_schedule(0.5), model.clip_range(0.5))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-I", "-W", "error", "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert [float(word) for word in done.stdout.split()] == pytest.approx([0.01, 0.2])
+
+
+# --- what is replaced on the way -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["qlearning", "reinforce", "ucb", "optimal", "random"])
+def test_custom_objects_replace_what_the_file_holds_and_nothing_else(name, tmp_path):
+    env = "SegmentBandit-v0" if name == "ucb" else "FrozenLake-v1"
+    model = load_algorithm(name)(env=env, seed=0)
+    model.save(tmp_path / "agent")
+    replaced = {"stats_window_size": 7, "predict": "shadowed", "no_such_thing": 1}
+    loaded = type(model).load(tmp_path / "agent", custom_objects=replaced)
+    assert loaded._stats_window_size == model._stats_window_size
+    assert not {"predict", "no_such_thing"} & set(vars(loaded))
+    loaded = type(model).load(tmp_path / "agent", custom_objects={"_stats_window_size": 7})
+    assert loaded._stats_window_size == 7
+    with pytest.raises(ValueError, match="custom_objects must be a dictionary"):
+        type(model).load(tmp_path / "agent", custom_objects=["learning_rate"])
+
+
+def test_what_is_replaced_need_not_be_readable(tmp_path):
+    model = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0)
+    model.save(tmp_path / "agent")
+    with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    rate = b'"learning_rate": '
+    members["data"] = members["data"].replace(rate + b"0.1", rate + b'{"type": "?"}')
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    with pytest.raises(ValueError, match="unknown type '\\?'"):
+        type(model).load(tmp_path / "other")
+    loaded = type(model).load(tmp_path / "other", custom_objects={"learning_rate": 0.25})
+    assert loaded.lr_schedule(0.5) == 0.25
+
+
+@pytest.mark.parametrize("kind", [ModelPolicy, DatedModelPolicy, CountedModelPolicy])
+def test_the_largest_model_fits_into_a_file_that_is_read_again(kind):
+    policy = kind(spaces.Discrete(1000), spaces.Discrete(4))
+    with pytest.raises(ValueError, match="of each") as refusal:
+        policy.keep_outcomes(10**9)
+    most = int(str(refusal.value).split("at most ")[1].split()[0])
+    policy.keep_outcomes(most)
+    size = sum(array.nbytes for array in policy.buffers())
+    per_outcome = sum(array[..., 0].nbytes for array in policy.buffers() if array.shape[-1] == most)
+    # Numbers of which there is one are counted for each state.
+    assert MOST_BYTES - per_outcome - 16_000 <= size <= MOST_BYTES < MAX_ARCHIVE_BYTES
+    with pytest.raises(ValueError, match=f"at most {most} of each"):
+        policy.keep_outcomes(most + 1)

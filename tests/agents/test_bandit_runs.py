@@ -1,0 +1,314 @@
+"""Runs of bandit agents: feedback, the compiled batch, MABWiser's agents, and known results.
+
+The figures that are asserted were measured over many more runs than here, or are those of the
+textbook (Sutton and Barto, 2nd edition, chapter 2); tolerances are four standard errors or more.
+"""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+
+import envs  # noqa: F401  # registers the bandits
+from agents import ALGORITHMS, load_algorithm
+from agents.bandits.runs import run_batch, run_one_by_one
+from agents.compiled.worlds import NotCompilable
+
+COINS, NORMAL, SEGMENTS = "BernoulliBandit-v0", "GaussianBandit-v0", "SegmentBandit-v0"
+
+# --- feedback ------------------------------------------------------------------------------------
+
+
+class Script(gym.Env):
+    """Tells the given infos one after the other; the reward is 1 for arm 1."""
+
+    observation_space, action_space = spaces.Discrete(1), spaces.Discrete(2)
+
+    def __init__(self, infos):
+        self.infos, self.steps = infos, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return 0, {}
+
+    def step(self, action):
+        self.steps += 1
+        return 0, float(action), False, self.steps == len(self.infos), self.infos[self.steps - 1]
+
+
+def told(key, values):
+    return [{key: bool(value)} for value in values]
+
+
+@pytest.mark.parametrize(
+    ("infos", "numbers"),
+    [
+        # At the end of the episode, what is there comes in.
+        (told("feedback_due", [0, 0, 1, 0, 1, 1, 0]), [0, 0, 3, 3, 5, 6, 7]),
+        ([{}] * 4, [1, 2, 3, 4]),
+        (told("matched", [1, 0, 0, 1]), [1, 1, 1, 2]),
+    ],
+)
+def test_what_is_learnt_after_each_pull(infos, numbers):
+    env = Script(infos)
+    check_env(env, skip_render_check=True)
+    model, found = load_algorithm("ucb")(env=Monitor(env), seed=0), []
+    for _ in infos:
+        model.learn(1, reset_num_timesteps=False)
+        found.append(int(model.policy.counts.sum()))
+    assert found == numbers
+    assert model._n_updates == numbers[-1]
+    assert model.num_timesteps == len(infos)
+
+
+def test_feedback_of_each_environment_waits_for_its_own():
+    infos = [told("feedback_due", [0, 0, 1, 0]), told("feedback_due", [1] * 4)]
+    env = make_vec_env(lambda: Monitor(Script(infos.pop())), 2)
+    model = load_algorithm("ucb")(env=env, seed=0).learn(2)
+    assert model._n_updates == 1
+    assert model.learn(4, reset_num_timesteps=False)._n_updates == 6
+
+
+def test_exp3_remembers_how_likely_a_late_reward_was():
+    """Both pulls of a batch were made with the same probabilities, 1/2."""
+    env = Script(told("feedback_due", [0, 1]))
+    model = load_algorithm("exp3")(env=Monitor(env), seed=0).learn(2)
+    wins = model.policy.sums[0, 1].item()
+    assert wins > 0
+    assert model.policy.scores[0, 1].item() == pytest.approx(wins * 0.1 / 2 / 0.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["epsilon_greedy", "thompson", "lin_thompson", "exp3"])
+def test_exploring_predictions_differ(name):
+    model = load_algorithm(name)(env=make_vec_env(SEGMENTS, seed=0), seed=0).learn(50)
+    arms = model.predict(np.zeros(200, dtype=np.int64))[0]
+    assert len(set(arms.tolist())) > 1
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("thompson", "Thompson as it is set learns from rewards that are 0 or 1, not"),
+        ("kl_ucb", "KLUCB as it is set learns from rewards that are between 0 and 1, not 1.5"),
+        ("exp3", "Exp3 as it is set learns from rewards that are between 0 and 1, not 1.5"),
+    ],
+)
+def test_rewards_that_do_not_fit(name, line):
+    shifted = gym.wrappers.TransformReward(Script([{}] * 9), lambda reward: reward + 0.5)
+    with pytest.raises(ValueError, match=line):
+        load_algorithm(name)(env=Monitor(shifted), seed=0).learn(50)
+    with pytest.raises(ValueError, match="this environment's have normal noise"):
+        load_algorithm(name)(env=NORMAL, seed=0).learn(1)
+
+
+def test_mabwisers_coins_are_coins():
+    with pytest.raises(ValueError, match="MABWiserThompson as it is set learns from rewards that"):
+        load_algorithm("mabwiser_thompson")(env=NORMAL, seed=0).learn(10)
+    assert load_algorithm("thompson")(env=NORMAL, likelihood="gaussian").learn(20)._n_updates == 20
+
+
+# --- the compiled batch --------------------------------------------------------------------------
+
+CLICKS = [(COINS, {}), (SEGMENTS, {}), (SEGMENTS, {"batch_size": 7, "pulls": 240})]
+DRIFT = {"drift_std": 0.1, "n_arms": 4, "means": [0, 0, 0, 0]}
+NUMBERED = [*CLICKS, (NORMAL, {}), (NORMAL, DRIFT)]
+FALLING = {
+    "learning_rate": 0.1,
+    "initial_q": 2.0,
+    "exploration_decay": "exponential",
+    "exploration_initial_eps": 0.9,
+    "tie_breaking": "first",
+}
+COVERED = [
+    ("epsilon_greedy", {}, CLICKS),
+    ("epsilon_greedy", FALLING, NUMBERED),
+    ("boltzmann", {"temperature": 0.2}, NUMBERED),
+    ("ucb", {}, NUMBERED[2:]),
+    ("ucb", {"variant": "sutton_barto", "tie_breaking": "first"}, NUMBERED),
+    ("gradient_bandit", {}, NUMBERED),
+    ("gradient_bandit", {"baseline": False, "ignore_context": True}, CLICKS),
+    ("thompson", {"likelihood": "gaussian", "ignore_context": True}, NUMBERED),
+    ("linucb", {}, [*NUMBERED, ("LinearBandit-v0", {})]),
+    ("lin_thompson", {"alpha": 0.3, "tie_breaking": "first"}, [*CLICKS, ("LinearBandit-v0", {})]),
+    ("lin_epsilon_greedy", {"exploration_decay": "linear"}, [*CLICKS, ("LinearBandit-v0", {})]),
+]
+COVERED += [
+    (name, {}, CLICKS)  # coins alone for some, and what comes later
+    for name, entry in ALGORITHMS.items()
+    if entry.family == "bandits" and name not in {known for known, *_ in COVERED} - {"thompson"}
+]
+CASES = [(name, kwargs, *world) for name, kwargs, worlds in COVERED for world in worlds]
+ARRAYS = ("seeds", "arms", "rewards", "regrets", "contexts", "estimates", "coefficients")
+
+
+@pytest.mark.parametrize(("name", "kwargs", "env_id", "env_kwargs"), CASES)
+def test_a_batch_is_its_runs_one_by_one(name, kwargs, env_id, env_kwargs):
+    batch = run_batch(name, kwargs, env_id, env_kwargs, [0, 7], 240)
+    single = run_one_by_one(name, kwargs, env_id, env_kwargs, [0, 7], 240)
+    for array in ARRAYS:
+        ours, theirs = getattr(batch, array), getattr(single, array)
+        assert (ours is None) == (theirs is None), array
+        if ours is not None:
+            assert ours.dtype == theirs.dtype
+            assert np.array_equal(ours, theirs, equal_nan=ours.dtype.kind == "f"), array
+    assert batch.arms.shape == (2, 240)
+    assert len(set(batch.arms[0].tolist())) > 1
+
+
+def test_a_run_that_ends_inside_a_batch_of_feedback():
+    """The last pulls have had no feedback then."""
+    for pulls, learnt in ((20, 14), (21, 21), (1000, 1000)):
+        args = ("ucb", {}, SEGMENTS, {"batch_size": 7}, [3])
+        batch, single = run_batch(*args, pulls), run_one_by_one(*args, pulls)
+        assert np.array_equal(batch.estimates, single.estimates, equal_nan=True)
+        agent = load_algorithm("ucb")(env=gym.make(SEGMENTS, batch_size=7), seed=3)
+        assert agent.learn(pulls).policy.counts.sum() == learnt
+
+
+def test_posteriors_at_some_moments():
+    args = ("thompson", {}, COINS, {})
+    result = run_batch(*args, range(3), moments=(100, 10, 5000))
+    assert result.moments == (10, 100, 1000)
+    assert result.posteriors.shape == (3, 3, 1, 3, 2)
+    for index, moment in enumerate(result.moments):
+        for run in range(3):
+            arms, rewards = result.arms[run, :moment], result.rewards[run, :moment]
+            wins, pulls = np.bincount(arms, rewards, minlength=3), np.bincount(arms, minlength=3)
+            expected = np.stack([1 + wins, 1 + pulls - wins], axis=1)
+            assert result.posteriors[run, index, 0].tolist() == expected.tolist()
+    assert run_batch(*args, [0], moments=()).moments == (1000,)
+    assert run_batch("ucb", {}, COINS, {}, [0]).posteriors is None
+
+
+class OwnUCB(load_algorithm("ucb")):
+    """Learns in Python."""
+
+    def _learn(self, pull):
+        super()._learn(pull)
+
+
+FUNCTION = {"learning_rate": lambda _: 0.1}
+REFUSED = [
+    (OwnUCB, {}, COINS, {}, "OwnUCB has a _learn of its own in Python"),
+    (load_algorithm("qlearning"), {}, COINS, {}, "QLearning acts and learns in Python"),
+    ("gradient_bandit", FUNCTION, COINS, {}, "a schedule is a Python function"),
+    ("ucb", {}, "FrozenLake-v1", {}, "there is no compiled copy of FrozenLakeEnv"),
+    ("ucb", {}, COINS, {"pulls": 1001}, "pulls must lie between 1 and 1000, an episode, not 1001"),
+    ("thompson", {}, NORMAL, {}, "rewards that are 0 or 1, and this environment's have"),
+]
+
+
+@pytest.mark.parametrize(("name", "kwargs", "env_id", "more", "line"), REFUSED)
+def test_what_cannot_be_compiled_is_refused(name, kwargs, env_id, more, line):
+    with pytest.raises((NotCompilable, ValueError), match=line):
+        run_batch(name, kwargs, env_id, {}, [0], **more)
+
+
+def test_wrappers_are_not_compiled_away():
+    gym.register("Twice-v0", lambda: gym.wrappers.TransformReward(gym.make(COINS), lambda r: 2 * r))
+    try:
+        with pytest.raises(NotCompilable, match="TransformReward may change what the environment"):
+            run_batch("ucb", {}, "Twice-v0", {}, [0])
+    finally:
+        gym.registry.pop("Twice-v0")
+
+
+def test_agents_of_the_library_run_one_by_one():
+    settings = {"policy": "MlpPolicy", "n_steps": 32, "batch_size": 32}
+    result = run_one_by_one("ppo", settings, SEGMENTS, {}, [0, 1], pulls=50)
+    assert result.arms.shape == result.contexts.shape == (2, 50)
+    means = np.array([[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]])
+    expected = means.max(axis=1)[result.contexts] - means[result.contexts, result.arms]
+    assert result.regrets == pytest.approx(expected)
+    assert result.estimates is None
+    assert np.array_equal(result.optimal, expected == 0)
+
+
+# --- MABWiser ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "env_id", "kwargs"),
+    [
+        ("ucb", "mabwiser_ucb1", COINS, {}),
+        ("ucb", "mabwiser_ucb1", NORMAL, {"c": 0.5}),
+        ("linucb", "mabwiser_linucb", "LinearBandit-v0", {}),
+        ("linucb", "mabwiser_linucb", SEGMENTS, {"alpha": 0.5}),
+    ],
+)
+def test_ours_and_theirs_pull_the_same_arms(ours, theirs, env_id, kwargs):
+    """1,500 pulls: the update is the same to the last digit that a decision can hang on."""
+    args = env_id, {"pulls": 1500}, [0]
+    first = run_batch(ours, {**kwargs, "tie_breaking": "first"}, *args)
+    second = run_one_by_one(theirs, kwargs, *args)
+    assert np.array_equal(first.arms, second.arms)
+    assert np.array_equal(first.rewards, second.rewards)
+    assert len(set(first.arms[0].tolist())) > 2
+
+
+def test_what_mabwiser_has_learnt_is_known():
+    linear = load_algorithm("mabwiser_linucb")(env=make_vec_env(SEGMENTS, seed=0), seed=0)
+    # Core users click on the second treatment, casual ones on the first.
+    assert linear.learn(2000).predict(np.array([0, 1]), deterministic=True)[0].tolist() == [1, 0]
+    coins = load_algorithm("mabwiser_thompson")(env=make_vec_env(COINS, seed=0), seed=0).learn(500)
+    assert coins.predict(0, deterministic=True)[0] == 2
+    won, lost = coins.policy.parts.T
+    assert coins.policy.judged(np.ones((1, 1)))[0] == pytest.approx(won / (won + lost))
+    result = run_one_by_one("mabwiser_ucb1", {}, NORMAL, {}, [3], pulls=12)
+    assert result.arms[0, :10].tolist() == list(range(10))
+
+
+# --- known results -------------------------------------------------------------------------------
+
+
+def on_testbed(name, kwargs, mean_loc=0.0):
+    return run_batch(name, kwargs, NORMAL, {"mean_loc": mean_loc}, range(2000))
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "mean_loc", "reward", "optimal"),
+    [
+        ("epsilon_greedy", {"exploration_initial_eps": 0.0}, 0, 1.030, 34.9),
+        ("epsilon_greedy", {"exploration_initial_eps": 0.01}, 0, 1.321, 60.1),
+        ("epsilon_greedy", {"exploration_initial_eps": 0.1}, 0, 1.361, 79.7),
+        ("ucb", {"variant": "sutton_barto", "c": 2.0}, 0, 1.491, 85.6),
+        ("gradient_bandit", {}, 4, 5.507, 85.3),
+        ("gradient_bandit", {"baseline": False}, 4, 5.215, 49.4),
+    ],
+)
+def test_testbed_at_the_last_pull(name, kwargs, mean_loc, reward, optimal):
+    """Figures 2.2, 2.4 and 2.5; one mean of 2000 runs spreads by .025 to .04, and by 1 per cent."""
+    result = on_testbed(name, kwargs, mean_loc)
+    assert result.rewards[:, -1].mean() == pytest.approx(reward, abs=0.15)
+    assert 100 * result.optimal[:, -1].mean() == pytest.approx(optimal, abs=4)
+
+
+def test_ucb_jumps_when_every_arm_is_tried():
+    """Exercise 2.8: 1.08 at pull 11, after ten pulls of nothing on average, and less after it."""
+    rewards = on_testbed("ucb", {"variant": "sutton_barto"}).rewards.mean(axis=0)
+    assert rewards[10] == pytest.approx(1.08, abs=0.12)
+    assert np.abs(rewards[:10]).max() < 0.15
+    assert rewards[10] > rewards[11] > rewards[12]
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "env_id", "regret", "tolerance"),
+    [
+        ("thompson", {}, COINS, 14.8, 3.0),
+        ("ucb", {}, COINS, 82.0, 6.0),  # well below Auer's bound of 432.1
+        ("epsilon_greedy", {"exploration_initial_eps": 0.1}, COINS, 275.5, 8.0),
+        ("epsilon_greedy", {"exploration_initial_eps": 1.0}, COINS, 2666.7, 20.0),
+        # What a pooled test loses, and what agents win that look at the segment.
+        ("thompson", {"ignore_context": True}, SEGMENTS, 443, 5),
+        ("thompson", {}, SEGMENTS, 37, 4.5),
+        ("linucb", {"alpha": 1.0}, SEGMENTS, 31, 4.5),
+        ("epsilon_greedy", {"exploration_initial_eps": 1.0}, SEGMENTS, 653, 6),
+    ],
+)
+def test_regrets_of_10_000_pulls(name, kwargs, env_id, regret, tolerance):
+    result = run_batch(name, kwargs, env_id, {"pulls": 10_000}, range(100))
+    assert result.regrets.sum(axis=1).mean() == pytest.approx(regret, abs=tolerance)

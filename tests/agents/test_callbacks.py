@@ -1,0 +1,470 @@
+"""Callbacks and logs beside compiled trainings: the same steps, agents and records."""
+
+import csv
+import json
+import math
+import struct
+import zipfile
+from functools import partial
+
+import numpy as np
+import pytest
+from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    CheckpointCallback,
+    ConvertCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    LogEveryNTimesteps,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnRewardThreshold,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import DISABLED, KVWriter, Logger, configure
+
+import envs  # noqa: F401  # registers the environments
+from agents import load_algorithm
+from agents.common.callbacks import (
+    NEVER,
+    BlockCallback,
+    EpisodeBudget,
+    Horizon,
+    calls_until_multiple,
+    horizon,
+    members,
+    unknown_callbacks,
+)
+from agents.compiled.records import event_bytes, window_means
+from pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
+from pipeline.evaluation.sampled import Evaluation
+from pipeline.runs import Run
+
+ENGINES = ("interpreted", "compiled")
+OF_THE_CLOCK = {"time/fps", "time/time_elapsed"}
+LAKE = "FrozenLake-v1"
+
+
+def without_clock(record):
+    return {key: value for key, value in record.items() if key not in OF_THE_CLOCK}
+
+
+def lake(engine="compiled", n_envs=1, name="qlearning", **kwargs):
+    env = make_vec_env(LAKE, n_envs, seed=0)
+    return load_algorithm(name)(env=env, seed=0, engine=engine, **kwargs)
+
+
+# --- every callback ------------------------------------------------------------------------------
+
+
+def snapshot(model):
+    """What a callback can see of the agent."""
+    return {
+        "tables": model.policy.q_tables.numpy().tobytes(),
+        "visits": model.policy.visit_counts.numpy().tobytes(),
+        "generator": model.rng.bit_generator.state,
+        "rates": (model._current_progress_remaining, model.exploration_rate),
+        "counts": (model.num_timesteps, model._episode_num, model._n_updates),
+        "error": model.mean_td_error,
+        "observations": model._last_obs.tolist(),
+        "pending actions": model._next_actions.tolist(),
+        "returns": [(info["r"], info["l"]) for info in model.ep_info_buffer],
+    }
+
+
+class Recorder(BaseCallback):
+    """Notes what it sees whenever the callback that it is part of acts."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def _on_step(self):
+        names = ("new_obs", "actions", "dones", "rewards")
+        step = {name: self.locals[name].tolist() for name in names}
+        infos = [
+            (bool(info["TimeLimit.truncated"]), info.get("terminal_observation"),
+             info.get("episode", {}).get("r"))
+            for info in self.locals["infos"]
+        ]  # fmt: skip
+        self.seen.append({**snapshot(self.model), **step, "infos": infos})
+        return True
+
+
+class Watcher(BlockCallback):
+    """Acts on every fortieth call."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def horizon(self):
+        return Horizon(calls=calls_until_multiple(self.n_calls, 40))
+
+    def _on_step(self):
+        if self.n_calls % 40 == 0:
+            self.seen.append((self.num_timesteps, self.locals["new_obs"].tolist()))
+        return True
+
+
+def every_kind(folder, evaluated):
+    """One callback of every kind that the compiled engine knows."""
+    env = make_vec_env(LAKE, 1, seed=9)
+
+    def evaluator(model):
+        evaluated.append(snapshot(model))
+        return Evaluation(np.array([float(len(evaluated))]), np.array([1]), None)
+
+    run = Run.claim(folder / "logs", "sarsa", LAKE)
+    return [
+        EvalCallback(env, eval_freq=90, n_eval_episodes=2, log_path=str(folder), verbose=0),
+        CheckpointCallback(110, str(folder), name_prefix="library"),
+        EveryNTimesteps(70, Recorder()),
+        LogEveryNTimesteps(130),
+        EvaluationCallback(run, env, evaluator, 55),
+        StepCheckpoint(85, folder / "steps"),
+        EpisodeCheckpoint(9, folder / "episodes"),
+        ProgressBarCallback(),
+        CallbackList([Watcher(), StopTrainingOnMaxEpisodes(60)]),
+    ]
+
+
+def saved(path):
+    """What a checkpoint holds, but for the name of the engine and the times."""
+    with zipfile.ZipFile(path) as archive:
+        data = json.loads(archive.read("data"))
+        assert archive.read("policy.pth")
+    for name in ("engine", "engine_in_use", "ep_info_buffer"):
+        data.pop(name)
+    return data
+
+
+def trained(engine, folder, n_envs):
+    """Everything that happened in a training with all callbacks."""
+    for name in ("steps", "episodes"):
+        (folder / name).mkdir(parents=True)
+    model, evaluated = lake(engine, n_envs, "sarsa", exploration_final_eps=0.3), []
+    model.set_logger(configure(str(folder / "log"), ["json"]))
+    callbacks = every_kind(folder, evaluated)
+    model.learn(2000, callback=callbacks, log_interval=11)
+    model.logger.close()
+    assert model.engine_in_use.startswith(engine)
+    evaluations = np.load(folder / "evaluations.npz")
+    lines = (folder / "log" / "progress.json").read_text().splitlines()
+    everyone = [member for callback in callbacks for member in members(callback)]
+    return {
+        "evaluated": evaluated,
+        "recorded": callbacks[2].callback.seen,
+        "watched": callbacks[-1].callbacks[0].seen,
+        "evaluations": evaluations["timesteps"].tolist(),
+        "results": evaluations["results"].tolist(),
+        "files": {str(p.relative_to(folder)): saved(p) for p in folder.rglob("*_steps.zip")},
+        "log": [without_clock(json.loads(line)) for line in lines],
+        "calls": [(type(each).__name__, each.n_calls, each.num_timesteps) for each in everyone],
+        "bar": callbacks[-2].pbar.n,
+        "steps": model.num_timesteps,
+    }
+
+
+# The library's progress bar rests on an experimental one.
+@pytest.mark.filterwarnings("ignore::tqdm.std.TqdmExperimentalWarning")
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_every_callback_at_the_same_steps(n_envs, tmp_path):
+    interpreted, compiled = (trained(engine, tmp_path / engine, n_envs) for engine in ENGINES)
+    for name, happened in interpreted.items():
+        assert compiled[name] == happened, name
+    # All of them did act.
+    assert 300 < interpreted["steps"] < 2000 + n_envs
+    for name in ("recorded", "watched", "evaluations", "evaluated", "log"):
+        assert len(interpreted[name]) >= 3, name
+    folders = {name.rpartition("/")[0] for name in interpreted["files"]}
+    assert folders == {"", "steps", "episodes"}
+
+
+# --- when callbacks act --------------------------------------------------------------------------
+
+
+class Foreign(BaseCallback):
+    def _on_step(self):
+        return True
+
+
+class LoudCheckpoint(CheckpointCallback):
+    """A subclass may do anything on any step."""
+
+
+def test_unknown_callbacks_are_named(tmp_path):
+    env = make_vec_env(LAKE, 1)
+    known = [EveryNTimesteps(5, Foreign()), EpisodeBudget(3), ConvertCallback(None)]
+    unknown = [
+        Foreign(),
+        LoudCheckpoint(5, str(tmp_path)),
+        ConvertCallback(lambda *_: True),
+        CallbackList([CallbackList([StopTrainingOnRewardThreshold(1.0)])]),
+    ]
+    assert unknown_callbacks(CallbackList([*known, EvalCallback(env)])) == []
+    names = ["Foreign", "LoudCheckpoint", "ConvertCallback", "StopTrainingOnRewardThreshold"]
+    assert unknown_callbacks(CallbackList([*known, *unknown])) == names
+
+
+def test_calls_until_multiple():
+    calls = {(0, 5): 5, (1, 5): 4, (4, 5): 1, (5, 5): 5, (7, 1): 1, (3, 0): NEVER, (3, -1): NEVER}
+    assert {case: calls_until_multiple(*case) for case in calls} == calls
+
+
+def test_the_nearest_horizon_counts(tmp_path):
+    model = load_algorithm("qlearning")(env=make_vec_env(LAKE, 3))
+    model.num_timesteps = 30
+    # Step 40 is passed on the fourth call from now, at step 42.
+    steps, checkpoint = EveryNTimesteps(40, Foreign()), CheckpointCallback(7, str(tmp_path))
+    budget = EpisodeBudget(8)
+    for callback in (steps, checkpoint, budget):
+        callback.init_callback(model)
+        callback.n_calls, callback.num_timesteps = 10, 30
+    assert horizon(steps) == Horizon(calls=4)
+    assert horizon(checkpoint) == Horizon(calls=4)
+    checkpoint.n_calls = 12
+    assert horizon(budget) == Horizon(episodes=8)
+    assert horizon(CallbackList([steps, checkpoint, budget])) == Horizon(calls=2, episodes=8)
+    assert horizon(CallbackList([])) == Horizon(NEVER, NEVER)
+
+
+class Sparse(BlockCallback):
+    def __init__(self, every, answers=()):
+        super().__init__()
+        self.every_n_steps = every
+        self.answers, self.seen = list(answers), []
+
+    def _on_step(self):
+        table = getattr(self.model.policy, "q_table", np.zeros(1))
+        self.seen.append((self.num_timesteps, self.n_calls, float(np.sum(table))))
+        return self.answers.pop(0) if self.answers else True
+
+
+def both(n_envs, make):
+    """What a sparse callback saw, in either engine, also where others act in between."""
+    seen = {}
+    for engine in ENGINES:
+        callback, model = make(), lake(engine, n_envs)
+        model.learn(2_000, callback=callback)
+        model.learn(333, callback=callback, reset_num_timesteps=False)
+        assert model.engine_in_use.startswith(engine)
+        sparse = callback.callbacks[0] if isinstance(callback, CallbackList) else callback
+        seen[engine] = sparse.seen
+    assert seen["compiled"] == seen["interpreted"]
+    return seen["compiled"]
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_sparse_callbacks_are_asked_at_their_steps_and_no_others(n_envs):
+    seen = both(n_envs, lambda: Sparse(70))
+    steps = [step for step, _, _ in seen]
+    last = 2 * n_envs * -(-2_000 // n_envs)
+    expected = [n_envs * -(-due // n_envs) for due in range(70, last, 70)]
+    assert steps == expected[: len(steps)]
+    assert len(steps) == 2_333 // 70
+    assert [calls for _, calls, _ in seen] == [step // n_envs for step in steps]
+    others = [EveryNTimesteps(13, Sparse(1)), StopTrainingOnMaxEpisodes(10**6)]
+    assert both(n_envs, lambda: CallbackList([Sparse(70), *others])) == seen
+
+
+def test_more_environments_than_steps_in_between():
+    assert [step for step, _, _ in both(8, lambda: Sparse(3))][:3] == [8, 16, 24]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_sparse_callback_can_stop_the_training(engine):
+    model = lake(engine).learn(2_000, callback=Sparse(100, [True, True, False]))
+    assert model.num_timesteps == 300
+    for every in (0, -5, 2.5, "10"):
+        with pytest.raises(ValueError, match=r"Sparse.every_n_steps must be a number from 1 on"):
+            lake(engine).learn(10, callback=Sparse(every))
+
+
+def test_algorithms_of_the_library_ask_at_these_steps_too():
+    callback = Sparse(20)
+    DQN("MlpPolicy", "CartPole-v1", learning_starts=1000).learn(70, callback=callback)
+    assert [step for step, _, _ in callback.seen] == [20, 40, 60]
+
+
+# --- logs ----------------------------------------------------------------------------------------
+
+
+class Reader(BlockCallback):
+    """Records something and reads what is there, every fifty calls."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def horizon(self):
+        return Horizon(calls=calls_until_multiple(self.n_calls, 50))
+
+    def _on_step(self):
+        if self.n_calls % 50 == 0:
+            self.seen.append((self.n_calls, dict(self.logger.name_to_value)))
+            self.logger.record("mine", self.n_calls)
+            self.logger.record_mean("mean", self.n_calls)
+        return True
+
+
+class Writer(KVWriter):
+    def __init__(self):
+        self.rows = []
+
+    def write(self, key_values, key_excluded, step=0):
+        self.rows.append((step, key_values["train/n_updates"]))
+
+
+class Watched(Logger):
+    """A logger of one's own."""
+
+    dumped = 0
+
+    def dump(self, step=0):
+        self.dumped += 1
+        super().dump(step)
+
+
+def read_beside(engine, logger=None, log_interval=7, level=None):
+    callback, model = Reader(), lake(engine)
+    if logger is not None:
+        model.set_logger(logger)
+    if level is not None:
+        logger.set_level(level)
+    model.learn(1_500, callback=callback, log_interval=log_interval)
+    return callback.seen
+
+
+def test_what_callbacks_record_is_forgotten_when_a_log_is_due_though_nobody_reads_it():
+    read = read_beside("interpreted", Watched(None, []))
+    assert read_beside("compiled") == read_beside("interpreted") == read
+    assert any(not there for _, there in read[1:]), "forgotten"
+    never = read_beside("compiled", log_interval=None)
+    assert all(there for _, there in never[1:])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_whoever_reads_the_log_gets_all_of_it(engine):
+    writer, watched, disabled = Writer(), Watched(None, []), Logger(None, [])
+    read_beside(engine, Logger(None, [writer]))
+    assert len(writer.rows) > 10
+    read_beside(engine, watched)
+    assert watched.dumped == len(writer.rows)
+    seen = read_beside(engine, disabled, level=DISABLED)
+    assert "train/n_updates" in seen[-1][1], "a logger that is disabled keeps what is recorded"
+
+
+class Own(BlockCallback):
+    """Records something of its own now and then, which goes into the next record alone."""
+
+    every_n_steps = 130
+
+    def _on_step(self):
+        self.logger.record("mine", self.num_timesteps)
+        self.logger.record_mean("mean", self.n_calls)
+        self.logger.record("text", "said", exclude="tensorboard")
+        return True
+
+
+def beside():
+    """What dumps the logger by itself."""
+    evaluation = EvalCallback(make_vec_env(LAKE, 1, seed=9), eval_freq=701, verbose=0)
+    return [evaluation, LogEveryNTimesteps(1111), Own()]
+
+
+def events_in(folder):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    found = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    tags = set(found.Tags()["scalars"]) - OF_THE_CLOCK
+    return {tag: [(event.step, event.value) for event in found.Scalars(tag)] for tag in tags}
+
+
+LOGGED = {  # agent, environment, how many, episodes between two records, callbacks, settings
+    "one": ("qlearning", LAKE, 1, 100, list, {}),
+    "three": ("qlearning", LAKE, 3, 4, list, {}),
+    "callbacks": ("qlearning", LAKE, 1, 7, beside, {}),
+    "a window": ("double_qlearning", "Warehouse-v0", 2, 1, list, {"stats_window_size": 5}),
+    "noise": ("sarsa", LAKE, 1, 5, list, {"exploration": "gaussian_noise", "noise_std": 3.0}),
+    "tiles": ("semi_gradient_sarsa", LAKE, 2, 5, list, {}),
+    "gradients": ("actor_critic", LAKE, 1, 5, list, {}),
+}
+
+
+def logs(case, engine, folder):
+    """All that the logger's outputs have written of two trainings, one after the other."""
+    algo, env_id, n_envs, log_interval, callbacks, settings = LOGGED[case]
+    env = make_vec_env(env_id, n_envs, seed=1)
+    model = load_algorithm(algo)(env=env, seed=2, engine=engine, **settings)
+    model.set_logger(configure(str(folder), ["tensorboard", "csv", "json", "log"]))
+    learn = partial(model.learn, log_interval=log_interval)
+    learn(3000, callback=callbacks())
+    learn(1000, callback=callbacks(), reset_num_timesteps=False)
+    assert model.engine_in_use.startswith(engine)
+    model.logger.close()
+    with (folder / "progress.csv").open() as file:
+        rows = [without_clock(row) for row in csv.DictReader(file)]
+    lines = (folder / "progress.json").read_text().splitlines()
+    shown = [line.split() for line in (folder / "log.txt").read_text().splitlines()]
+    text = [words for words in shown if words[0] == "|" and words[1] not in ("fps", "time_elapsed")]
+    return events_in(folder), rows, [without_clock(json.loads(line)) for line in lines], text
+
+
+@pytest.mark.parametrize("case", LOGGED)
+def test_each_output_has_the_same_records(case, tmp_path):
+    interpreted, compiled = (logs(case, engine, tmp_path / engine) for engine in ENGINES)
+    np.testing.assert_equal(compiled, interpreted)
+    assert len(compiled[1]) >= 2
+    assert len(compiled[0]["rollout/ep_rew_mean"]) >= 2
+
+
+def test_a_block_holds_many_records():
+    """Callbacks that act now and then are told of long blocks, although the log is due often."""
+
+    class Blocks(BlockCallback):
+        every_n_steps, takes_blocks, n = 5000, True, 0
+
+        def _on_rollout_start(self):
+            self.n += 1
+
+        def _on_step(self):
+            return True
+
+    model, blocks = lake("auto"), Blocks()
+    model.set_logger(configure(None, ["log"]))
+    model.learn(10_000, log_interval=1, callback=blocks)
+    assert blocks.n == 2
+    model.logger.close()
+
+
+def test_means_are_those_of_windows_added_up_one_by_one():
+    values = np.random.default_rng(0).normal(size=700) * 10.0 ** np.arange(700).clip(0, 12)
+    for size in (1, 3, 100, 130, 300):
+        ends = np.array([1, 2, 99, 100, 101, 350, 700])
+        expected = [float(np.mean(values[max(end - size, 0) : end].tolist())) for end in ends]
+        assert window_means(values, ends, size) == expected
+
+
+def test_events_are_those_that_tensorboard_writes():
+    """Byte for byte, the framing and its checksums too."""
+    from tensorboard.compat.proto.event_pb2 import Event
+    from tensorboard.compat.proto.summary_pb2 import Summary
+    from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import masked_crc32c
+
+    tags, steps = ["a", "rollout/ep_rew_mean", "über"], np.array([0, 1, 127, 128, 2**40])
+    numbers = np.array([[0.0, -1.5, math.inf, 1e-40, 3.4e38]] * 3, dtype="<f4")
+    numbers[2] = np.nan
+    times = 1.7e9 + np.arange(5) / 3
+    expected = b""
+    for k, step in enumerate(steps.tolist()):
+        for tag, number in zip(tags, numbers[:, k].tolist(), strict=True):
+            value = Summary.Value(tag=tag, simple_value=number)
+            event = Event(wall_time=times[k], step=step, summary=Summary(value=[value]))
+            data = event.SerializeToString()
+            head = struct.pack("<Q", len(data))
+            expected += head + struct.pack("<I", masked_crc32c(head))
+            expected += data + struct.pack("<I", masked_crc32c(data))
+    assert event_bytes(tags, numbers, steps, times) == expected

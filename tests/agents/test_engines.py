@@ -1,0 +1,482 @@
+"""The compiled loop ends in the same bits as the interpreted one: agents, worlds, settings."""
+
+import copy
+import gc
+import itertools
+import pickle
+from functools import partial
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium.wrappers import ClipReward, PassiveEnvChecker
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+
+import envs  # noqa: F401  # registers the environments
+from agents import ALGORITHMS, load_algorithm
+from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon, calls_until_multiple
+from agents.common.schedules import ExponentialSchedule
+from agents.tabular.one_step import QLearning
+from agents.tabular.updates import td_learning
+from envs.grid import GridWorld
+from envs.wrappers import (
+    ActionMasks,
+    DiscretizeObservation,
+    FlattenToDiscrete,
+    IdleActionMasks,
+    ScaleReward,
+    TerminationReward,
+)
+from machine_code.compiling import inlined
+
+ENGINES = ("interpreted", "compiled")
+IN_BINS = partial(
+    DiscretizeObservation, bins=50, low=[-0.42, -0.87], high=[0.42, 0.87], dims=[2, 3]
+)
+SWING = {"low": [-2.4, -3, -0.21, -3], "high": [2.4, 3, 0.21, 3], "n_tiles": [2, 3, 6, 6]}
+
+
+def world(env_id, wrapper=None, **kwargs):
+    return env_id, kwargs, wrapper
+
+
+WORLDS = {
+    "slippery Warehouse": world("Warehouse-v0", slip=0.2, random_start=True),
+    "FrozenLake": world("FrozenLake-v1"),
+    "Taxi": world("Taxi-v4"),
+    "CliffWalking": world("CliffWalking-v1"),
+    "CartPole": world("CartPole-v1", IN_BINS),
+    "coins": world("BernoulliBandit-v0", probabilities=[0.0, 0.1, 1.0], pulls=33),
+    "segments": world("SegmentBandit-v0", batch_size=8, pulls=50),
+}
+for spec in list(gym.registry.values()):
+    if str(spec.entry_point).startswith("envs.") and "Bandit" not in spec.id:
+        base = gym.make(spec.id).unwrapped
+        WORLDS |= {spec.id: world(spec.id)} if isinstance(base, GridWorld) else {}
+EXPLORATION = {
+    "linear": {},
+    "constant": {"exploration_decay": "constant", "exploration_initial_eps": 0.1},
+    "exponential": {"exploration_decay": "exponential", "exploration_fraction": 0.7},
+    "boltzmann": {"exploration": "boltzmann", "temperature": LinearSchedule(5.0, 0.2, 0.8)},
+    "gaussian": {"exploration": "gaussian_noise", "noise_std": 20.0},
+}
+CONSTANTLY_GREEDY = {**EXPLORATION["constant"], "exploration_initial_eps": 0.0}
+STEP_SIZES = {
+    "constant": 0.2,
+    "falling": LinearSchedule(0.8, 0.05, 0.9),
+    "exponential": ExponentialSchedule(0.8, 0.01),
+    "average": "sample_average",
+}
+NEEDING_PROBABILITIES = {"expected_sarsa", "n_step_tree_backup", "off_policy_monte_carlo"}
+OWN = {
+    "dyna_q": {"outcomes_kept": 3, "skip_terminal_update": True},
+    "prioritized_sweeping": {"planning_steps": 1, "initial_q_std": 1.0},
+    "r_max": {"known_after": 3, "value_bound": 1.0},
+    "qlearning_ucb": {"value_bound": 1.0, "horizon": 30.0},
+}
+TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
+
+
+def settings_of(name, exploration, step_size, ties):
+    """Those of the table that the agent has, and its own."""
+    parameters = load_algorithm(name).__signature__.parameters
+    chosen = {**EXPLORATION[exploration], "tie_breaking": ties, **OWN.get(name, {})}
+    if name != "off_policy_monte_carlo":
+        chosen["learning_rate"] = STEP_SIZES[step_size]
+    return {key: value for key, value in chosen.items() if key in parameters}
+
+
+def rows():
+    """Each agent on three worlds, each world with one agent or more; settings take turns."""
+    turns = [itertools.cycle(each) for each in (EXPLORATION, STEP_SIZES, ("random", "first"))]
+    places, numbers = itertools.cycle(WORLDS), itertools.cycle((1, 3, 8))
+    for name in [*TABULAR, *TABULAR, *TABULAR]:
+        exploration, step_size, ties = map(next, turns)
+        if name in NEEDING_PROBABILITIES and exploration == "gaussian":
+            exploration = "linear"
+        place = next(places)
+        if place == "CartPole" and name not in ("qlearning", "sarsa"):
+            place = "FrozenLake"  # what agents remember has nothing to do with what they observe
+        settings = settings_of(name, exploration, step_size, ties)
+        yield (
+            f"{name} {place} {exploration} {step_size}",
+            name,
+            WORLDS[place],
+            next(numbers),
+            settings,
+        )
+    for name, ties in (("qlearning", "random"), ("sarsa", "first")):
+        settings = settings_of(name, "linear", "falling", ties)
+        yield f"{name} CartPole", name, WORLDS["CartPole"], 2, settings
+    masked = {"mask_actions": True}
+    tiny = world("Warehouse-v0", desc=["S.", "#G"], max_episode_steps=5)
+    still = world("FrozenLake-v1", IdleActionMasks, is_slippery=False)
+    for i, name in enumerate(TABULAR):
+        place = (WORLDS["Taxi"], world("Taxi-v4", ActionMasks), tiny, still)[i % 4]
+        yield f"{name} masked", name, place, 1 + i % 3, {**masked, **OWN.get(name, {})}
+    yield "gaussian masked", "qlearning", tiny, 1, {**masked, **EXPLORATION["gaussian"]}
+    for name in ("semi_gradient_sarsa", "semi_gradient_q", "actor_critic"):
+        schedule = {"learning_rate": STEP_SIZES["falling"]}
+        yield f"{name} FrozenLake", name, WORLDS["FrozenLake"], 2, {"gamma": 0.9, **schedule}
+    yield "tiles MountainCar", "semi_gradient_sarsa", world("MountainCar-v0"), 2, {}
+    yield (
+        "tiles CartPole",
+        "semi_gradient_q",
+        world("CartPole-v1"),
+        1,
+        {**SWING, "learning_rate": 0.3},
+    )
+    left_at_first = {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}
+    corridor = world(
+        "ShortCorridor-v0"
+    )  # episodes of 82 steps, more than there is room for at first
+    yield "reinforce", "reinforce", corridor, 2, left_at_first
+    yield "reinforce value", "reinforce", corridor, 2, {**left_at_first, "baseline": "value"}
+
+
+ROWS = {row[0]: row[1:] for row in rows()}
+
+
+def make(name, place, n_envs=1, folder=None, **settings):
+    env_id, env_kwargs, wrapper = place
+    folder = None if folder is None else str(folder)
+    env = make_vec_env(
+        env_id, n_envs, 3, env_kwargs=env_kwargs, wrapper_class=wrapper, monitor_dir=folder
+    )
+    return load_algorithm(name)(env=env, **{"seed": 1, **settings})
+
+
+def state_of(model):
+    """Everything that what comes next depends on, and everything that statistics are made of."""
+    policy = model.policy
+    state = {key: value.numpy().tobytes() for key, value in policy.state_dict().items()}
+    state |= {
+        "generator": model.rng.bit_generator.state,
+        "action generator": model.action_space.np_random.bit_generator.state,
+        "observations": np.asarray(model._last_obs).tolist(),
+        "episode starts": model._last_episode_starts.tolist(),
+        "pending actions": model._next_actions.tolist(),
+        "memory": [array.tobytes() for array in getattr(model, "_memory", ())],
+        "counts": (model.num_timesteps, model._total_timesteps, model._episode_num),
+        "updates": model._n_updates,
+        "progress": model._current_progress_remaining,
+        "error": model.mean_td_error,
+        "returns": [(info["r"], info["l"]) for info in model.ep_info_buffer],
+        "successes": [bool(success) for success in model.ep_success_buffer],
+    }
+    names = ("episode_returns", "episode_lengths", "rewards", "total_steps", "needs_reset")
+    for i, env in enumerate(model.env.envs):
+        places = ("s", "state", "context", "pulls_done", "place")
+        found = {name: np.asarray(vars(env.unwrapped).get(name)).tolist() for name in places}
+        found |= {name: env.get_wrapper_attr(name) for name in names}
+        found["elapsed"] = env.has_wrapper_attr("_elapsed_steps") and env.get_wrapper_attr(
+            "_elapsed_steps"
+        )
+        found["generator"] = env.unwrapped.np_random.bit_generator.state
+        state |= {f"env {i} {key}": value for key, value in found.items()}
+    return state
+
+
+def assert_same(states):
+    for other in states[1:]:
+        assert states[0].keys() == other.keys()
+        assert [key for key in other if other[key] != states[0][key]] == []
+
+
+def assert_engines_agree(make_model, train):
+    """The state after training is the same on either engine; returns the two models."""
+    models = []
+    for engine in ENGINES:
+        models.append(make_model(engine=engine))
+        train(models[-1])
+        assert models[-1].engine_in_use.startswith(engine)
+    assert_same([state_of(model) for model in models])
+    return models
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_same_bits_also_where_engines_take_turns(row, tmp_path):
+    name, place, n_envs, settings = ROWS[row]
+    states = []
+    for engines in (("interpreted",) * 2, ("compiled",) * 2, ("compiled", "interpreted")):
+        folder = tmp_path / "-".join(engines)
+        model = make(name, place, n_envs, folder, **settings)
+        for engine in engines:  # neither call ends where an episode does
+            model.engine = engine
+            model.learn(1511, reset_num_timesteps=False)
+            assert model.engine_in_use.startswith(engine)
+        model.env.close()
+        files = sorted(folder.glob("*.csv"))
+        lines = [path.read_text().splitlines()[1:] for path in files]
+        rows = [[line.split(",")[:2] for line in each] for each in lines]
+        states.append({**state_of(model), "rows": rows})
+    assert_same(states)
+    assert states[0]["rows"][0][0] == ["r", "l"]
+    table = getattr(model.policy, "q_tables", None)
+    changed = model.policy.weights if table is None else model.policy.visit_counts
+    assert changed.any()
+    if settings.get("mask_actions"):
+        masks = model.policy.masks
+        masked = ~masks & masks.any(axis=1, keepdims=True)
+        assert not model.policy.visit_counts.numpy()[:, masked].any()
+
+
+@pytest.mark.parametrize(("tiled", "name"), [("semi_gradient_sarsa", "sarsa"),
+                                             ("semi_gradient_q", "qlearning")])  # fmt: skip
+def test_tiles_of_numbers_are_the_table_to_the_bit(tiled, name):
+    models = []
+    for each in (tiled, name):
+        model = make(each, WORLDS["FrozenLake"], 3, gamma=0.97, learning_rate=0.3)
+        model.set_random_seed(1)  # the table has drawn its first entries
+        models.append(model.learn(4000))
+    weights, table = models[0].policy.weights.numpy(), models[1].policy.q_table
+    assert weights.any()
+    assert np.array_equal(weights, table)
+    assert models[0].rng.bit_generator.state == models[1].rng.bit_generator.state
+    assert models[0].mean_td_error == models[1].mean_td_error
+    np.testing.assert_array_equal(*(model.action_probabilities() for model in models))
+
+
+def both_shaped(env):
+    return TerminationReward(ClipReward(ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "changes"),
+    [
+        (partial(ScaleReward, scale=0.01), True),
+        (partial(TerminationReward, reward=-7.7), True),
+        (both_shaped, True),
+        (FlattenToDiscrete, False),
+        (PassiveEnvChecker, False),
+    ],
+)
+def test_wrappers_are_folded_in(wrapper, changes):
+    env_id, env_kwargs, _ = WORLDS["slippery Warehouse"]
+    learn = partial(make, "sarsa", n_envs=2, learning_rate=0.3)
+    wrapped = partial(learn, (env_id, env_kwargs, wrapper))
+    shaped, _ = assert_engines_agree(wrapped, lambda model: model.learn(4000))
+    plain = learn((env_id, env_kwargs, None)).learn(4000)
+    assert np.array_equal(shaped.policy.q_table, plain.policy.q_table) != changes
+
+
+@pytest.mark.parametrize(("decay", "name", "n_envs"), [("linear", "qlearning", 1),
+                                                       ("exponential", "sarsa", 3)])  # fmt: skip
+def test_schedules_by_episodes(decay, name, n_envs):
+    learn = partial(make, name, WORLDS["FrozenLake"], n_envs, exploration_decay=decay)
+    models = assert_engines_agree(
+        partial(learn, exploration_fraction=0.9),
+        lambda model: model.learn(10**9, callback=EpisodeBudget(300)),
+    )
+    assert 300 <= models[0]._episode_num < 300 + n_envs
+    assert models[0]._current_progress_remaining == pytest.approx(0.0, abs=n_envs / 300)
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_stopping_after_some_episodes_of_each_environment(n_envs):
+    models = assert_engines_agree(
+        partial(make, "double_qlearning", WORLDS["FrozenLake"], n_envs),
+        lambda model: model.learn(10**9, callback=StopTrainingOnMaxEpisodes(60)),
+    )
+    assert 60 * n_envs <= models[0]._episode_num < 61 * n_envs
+
+
+def test_what_follows_without_an_agent_is_the_same():
+    played = []
+    for engine in ENGINES:
+        model = make("sarsa", WORLDS["slippery Warehouse"], 2, engine=engine).learn(1111)
+        steps = [model.env.step(np.array([0, 3])) for _ in range(1200)]
+        played.append([[part.tolist() for part in step[:3]] for step in steps])
+    assert played[0] == played[1]
+
+
+# --- changes in the middle of a training ---------------------------------------------------------
+
+
+class Change(BlockCallback):
+    """Does something to the agent on a call."""
+
+    def __init__(self, change, call=500):
+        super().__init__()
+        self.change, self.call = change, call
+
+    def horizon(self):
+        return Horizon(calls=calls_until_multiple(self.n_calls, self.call))
+
+    def _on_step(self):
+        if self.n_calls == self.call:
+            self.change(self.model)
+            gc.collect()  # nobody else keeps what was replaced
+        return True
+
+
+def put(**attributes):
+    def change(model):
+        for name, value in attributes.items():
+            setattr(model, name, value)
+
+    return change
+
+
+def replace_by_loading(model):
+    state = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.policy.load_state_dict(state, assign=True)
+
+
+def put_zeros(model):
+    parameters = model.get_parameters()["policy"]
+    model.set_parameters({"policy": {key: value * 0 for key, value in parameters.items()}})
+
+
+def seed_the_environment_anew(model):
+    model.env.envs[0].unwrapped.np_random = np.random.default_rng(3)
+
+
+def double_the_tables(model):
+    model.policy.q_tables = model.policy.q_tables * 2
+
+
+CHANGES = {
+    "gamma": put(gamma=0.3),
+    "step size": put(lr_schedule=FloatSchedule(0.5)),
+    "sample averages": put(learning_rate="sample_average"),
+    "epsilon": put(exploration_schedule=FloatSchedule(0.9)),
+    "ties": put(tie_breaking="first"),
+    "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
+    "environment's generator": seed_the_environment_anew,
+    "tables": double_the_tables,
+    "zeros in the tables": lambda model: model.policy.q_tables.zero_(),
+    "zeros that are loaded": put_zeros,
+    "tables of the same values": replace_by_loading,
+}
+
+
+@pytest.mark.parametrize("name", ["sarsa", "double_qlearning"])
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_change_counts_in_both_loops(name, what):
+    start = {"initial_q": 0.5 * what.startswith("zeros"), **EXPLORATION["constant"]}
+    lake = partial(make, name, WORLDS["FrozenLake"], **start)
+    change = CHANGES[what]
+    models = assert_engines_agree(lake, lambda m: m.learn(2000, callback=Change(change, 1000)))
+    same = np.array_equal(models[0].policy.q_tables, lake().learn(2000).policy.q_tables)
+    assert same == (what == "tables of the same values")
+    if what == "zeros that are loaded":  # the step on which they were is learnt from afterwards
+        assert int(models[0].policy.visit_counts.sum()) == 1001
+
+
+@pytest.mark.parametrize("name", ["ucb", "thompson", "epsilon_greedy"])
+def test_tables_of_a_bandit_that_are_replaced_go_on_learning(name):
+    model = make(name, world("BernoulliBandit-v0"))
+    model.learn(1500, callback=Change(replace_by_loading, 1000))
+    assert int(model.policy.counts.sum()) == 1500
+
+
+REFUSED = {
+    r"tables must be 1 or 2, of shape \(1, 16, 4\), not": lambda model: setattr(
+        model.policy, "q_tables", th.zeros(1, 2, 4, dtype=th.float64)
+    ),
+    "the agent works on 1 environments, not 5": lambda model: setattr(
+        model, "env", make_vec_env("FrozenLake-v1", 5)
+    ),
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_what_does_not_fit_any_more_is_refused(line):
+    model = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0)
+    REFUSED[line](model)
+    with pytest.raises(ValueError, match=line):
+        model.learn(10)
+
+
+@pytest.mark.parametrize(
+    "duplicate", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))]
+)
+def test_a_copy_made_during_training_is_independent(duplicate):
+    copies = []
+
+    def take_copy(model):
+        # Neither the environment nor the logger's open files belong into a copy.
+        model.env, env = None, model.env
+        model._logger, logger = None, model._logger
+        copies.append(duplicate(model))
+        model.env, model._logger = env, logger
+
+    model = make("qlearning", WORLDS["FrozenLake"], engine="interpreted", **CONSTANTLY_GREEDY)
+    model.learn(1000, callback=Change(take_copy))
+    (twin,) = copies
+    assert int(twin.policy.visit_counts.sum()) == 499
+    # Exploring reads the tables through the same door as training does.
+    twin.policy.q_tables.zero_()
+    twin.policy.q_tables[0, :, 2] = 1.0
+    assert twin.predict(np.arange(16), deterministic=False)[0].tolist() == [2] * 16
+    assert int(model.policy.visit_counts.sum()) == 1000
+
+
+# --- a memory of an agent's own ------------------------------------------------------------------
+
+
+class Footprints(NamedTuple):
+    """How often each environment was in each state, shape (n_envs, S)."""
+
+    visits: np.ndarray
+
+
+@inlined
+def learning_with_footprints(agent, worlds, progress):
+    """Q-learning that notes where it was, and is paid for having been there before."""
+    for i in range(len(worlds)):
+        agent.memory.visits[i, worlds[i].obs] += 1
+        worlds[i].reward += 0.001 * agent.memory.visits[i, worlds[i].obs]
+    td_learning(agent, worlds, progress)
+
+
+class Walker(QLearning):
+    """An agent with a memory."""
+
+    learn_from_step = learning_with_footprints
+
+    def _make_memory(self):
+        return Footprints(np.zeros((self.n_envs, int(self.observation_space.n)), dtype=np.int64))
+
+
+def walker(engine="compiled"):
+    return Walker(env=make_vec_env("FrozenLake-v1", 2, seed=3), seed=1, engine=engine)
+
+
+def replaced(values):
+    return lambda model: setattr(model, "_memory", Footprints(values.copy()))
+
+
+@pytest.mark.parametrize("change", [None, replaced(np.zeros((2, 16), dtype=np.int64))])
+def test_both_loops_work_on_a_memory_in_place(change, tmp_path):
+    models = assert_engines_agree(
+        walker, lambda model: model.learn(2000, callback=change and Change(change))
+    )
+    # The step on which a callback acts is learnt from after it.
+    share = 1000 if change is None else 501
+    assert models[1]._memory.visits.sum(axis=1).tolist() == [share, share]
+    # Another training begins with nothing, as does what was loaded; one that goes on keeps it.
+    assert models[1].learn(200)._memory.visits.sum() == 200
+    assert models[1].learn(200, reset_num_timesteps=False)._memory.visits.sum() == 400
+    models[1].save(tmp_path / "model")
+    loaded = Walker.load(tmp_path / "model", make_vec_env("FrozenLake-v1", 3))
+    assert loaded._memory.visits.tolist() == np.zeros((3, 16)).tolist()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("values", [np.zeros((1, 16), dtype=np.int64), np.zeros((2, 16))])
+def test_a_memory_of_another_shape_is_refused(engine, values):
+    with pytest.raises(ValueError, match=r"visits must be of shape \(2, 16\) and int64, not \("):
+        walker(engine).learn(2000, callback=Change(replaced(values)))
+
+
+def test_a_memory_of_another_kind_is_refused():
+    model = walker()
+    model._memory = (model._memory.visits,)
+    with pytest.raises(ValueError, match="the agent's memory must be a Footprints"):
+        model.predict(0)

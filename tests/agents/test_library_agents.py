@@ -1,0 +1,254 @@
+"""Agents on the library's classes, by hand and against it; and the two that do not learn."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sb3_contrib
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch import nn
+from torch.nn.utils import parameters_to_vector
+
+from agents.common.callbacks import EpisodeBudget
+from agents.library import DeepQLearning, DoubleDQN, double_q_values
+from agents.random_search import ARS
+from agents.reference import AngleAgent, RandomAgent
+
+# --- deep Q-learning -----------------------------------------------------------------------------
+
+SETTINGS = {"learning_starts": 50, "train_freq": 4, "batch_size": 16, "buffer_size": 500, "seed": 0}
+
+
+def test_target_by_hand():
+    online, target = nn.Linear(1, 3, bias=False), nn.Linear(1, 3, bias=False)
+    with th.no_grad():
+        online.weight[:] = th.tensor([[1.0], [3.0], [2.0]])
+        target.weight[:] = th.tensor([[7.0], [-5.0], [9.0]])
+        # For a positive observation the online network prefers action 1, for a negative one 0.
+        values = double_q_values(online, target, th.tensor([[2.0], [-1.0]]))
+    assert values.tolist() == [[-10.0], [-7.0]]
+
+
+@pytest.mark.parametrize(
+    ("discounts", "loss"),
+    [
+        # Errors -10 - 2 = -12 and 1 + 0.5 * 8 - 3 = 2: (144 + 4) / 2 / 2.
+        (None, 37.0),
+        # Returns of several steps bring their own discounts: 1 + 0.25 * 8 - 3 = 0.
+        (th.tensor([[0.25], [0.25]]), 36.0),
+    ],
+)
+def test_squared_loss_by_hand(discounts, loss):
+    """Of a terminal transition and one that goes on; rewards are -10 and 1."""
+    model = DeepQLearning("MlpPolicy", "FrozenLake-v1", gamma=0.5)
+    model.q_net = lambda obs: th.tensor([[5.0, 2.0], [3.0, 4.0], [8.0, 7.0]])[obs[:, 0]]
+    batch = ReplayBufferSamples(
+        observations=th.tensor([[0], [1]]),
+        actions=th.tensor([[1], [0]]),
+        next_observations=th.tensor([[2], [2]]),
+        dones=th.tensor([[1.0], [0.0]]),
+        rewards=th.tensor([[-10.0], [1.0]]),
+        discounts=discounts,
+    )
+    assert model._loss(batch).item() == loss
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env_id", "settings", "is_same"),
+    [
+        # Synchronised before each update, the online network's best action is the target network's.
+        (DoubleDQN, "CartPole-v1", {"target_update_interval": 1}, True),
+        (DoubleDQN, "CartPole-v1", {"target_update_interval": 9_999, "learning_rate": 0.01}, False),
+        # Huber's loss is half the squared error below 1, which no error on the lake exceeds here.
+        (DeepQLearning, "FrozenLake-v1", {"target_update_interval": 1}, True),
+        # Of two updates in a row DQN's second aims at what the network was before the first.
+        (DeepQLearning, "FrozenLake-v1", {"target_update_interval": 1, "gradient_steps": 2}, False),
+    ],
+)  # fmt: skip
+def test_where_it_is_dqn_to_the_bit(algorithm, env_id, settings, is_same):
+    arguments = {**SETTINGS, "exploration_fraction": 1, **settings}
+    models = [each("MlpPolicy", env_id, **arguments).learn(600) for each in (DQN, algorithm)]
+    weights = [parameters_to_vector(model.q_net.parameters()) for model in models]
+    assert th.equal(*weights) == is_same
+
+
+def test_target_network_is_given_back_after_a_failure(tmp_path):
+    model = DoubleDQN("MlpPolicy", "CartPole-v1", **SETTINGS).learn(100)
+    model.save(tmp_path / "agent")
+    observations = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    expected = model.predict(observations, deterministic=True)[0]
+    loaded = DoubleDQN.load(tmp_path / "agent").predict(observations, deterministic=True)[0]
+    np.testing.assert_array_equal(loaded, expected)
+    target = model.q_net_target
+    model.replay_buffer.reset()
+    with pytest.raises(ValueError, match="high <= 0"):
+        model.train(gradient_steps=1)
+    assert model.q_net_target is target
+
+
+# --- augmented random search ---------------------------------------------------------------------
+
+
+class Watch(BaseCallback):
+    """Keeps the number of steps done, and the episodes that ended, at each call."""
+
+    def __init__(self):
+        super().__init__()
+        self.steps, self.ended, self.left = [], [], []
+
+    def _on_step(self):
+        self.steps.append(self.num_timesteps)
+        self.ended.append(int(np.sum(self.locals["dones"])))
+        assert len(self.locals["infos"]) == len(self.locals["rewards"]) == len(self.locals["dones"])
+        return True
+
+    def _on_rollout_start(self):
+        self.left.append(self.model._current_progress_remaining)
+
+    def _on_training_end(self):
+        self.ended.append("end")
+
+
+def ars(n_envs=1, env="CartPole-v1", **kwargs):
+    env = make_vec_env(env, n_envs, seed=0)
+    return ARS("LinearPolicy", env, **{"seed": 0, "n_delta": 2, **kwargs})
+
+
+@pytest.mark.parametrize(("n_envs", "n_eval_episodes"), [(1, 1), (1, 2), (3, 1), (3, 4)])
+def test_each_step_of_the_environments_is_counted_once(n_envs, n_eval_episodes):
+    """With several environments, the library counts one for each whose episode is not over."""
+    calls = []
+
+    class Step(gym.Wrapper):
+        def step(self, action):
+            calls.append(1)
+            return super().step(action)
+
+    watch = Watch()
+    model = ars(n_envs, lambda: Step(gym.make("CartPole-v1")), n_eval_episodes=n_eval_episodes)
+    model.learn(100, callback=watch)
+    assert model.num_timesteps == len(calls)
+    assert watch.steps == list(range(n_envs, model.num_timesteps + 1, n_envs))
+    assert watch.n_calls == len(watch.steps)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_budget_of_episodes_ends_the_search_and_schedules_follow_it(n_envs):
+    watch = Watch()
+    model = ars(n_envs).learn(10**12, callback=[watch, EpisodeBudget(7)])
+    assert watch.ended.pop() == "end"
+    assert sum(watch.ended) >= 7 > sum(watch.ended[:-1])
+    assert model.num_timesteps == watch.steps[-1]
+    watch = Watch()
+    ars().learn(10**12, callback=[watch, EpisodeBudget(16)])
+    # Four updates of four episodes each.
+    assert watch.left == pytest.approx([1, 0.75, 0.5, 0.25], abs=0.01)
+
+
+@pytest.mark.parametrize("zero_policy", [True, False])
+def test_what_was_loaded_goes_on_from_its_weights(zero_policy, tmp_path):
+    """In the library the search begins at new random ones where zero_policy is off."""
+    model = ars(zero_policy=zero_policy).learn(300)
+    learnt, done = parameters_to_vector(model.policy.parameters()), model.num_timesteps
+    assert learnt.abs().max() > 0
+    assert th.equal(model.weights, learnt)
+    model.save(tmp_path / "ars")
+    loaded = ARS.load(tmp_path / "ars", env=model.get_env(), seed=1, learning_rate=0.0)
+    assert th.equal(loaded.weights, learnt)
+    loaded.learn(50, reset_num_timesteps=False)
+    assert th.equal(parameters_to_vector(loaded.policy.parameters()), learnt)
+    model.learn(300, reset_num_timesteps=False)  # schedules go on, too
+    assert 0 < model._current_progress_remaining <= 1 - done / (done + 300)
+
+
+def test_the_search_itself_is_the_librarys():
+    ours = ars().learn(200)
+    env = make_vec_env("CartPole-v1", 1, seed=0)
+    theirs = sb3_contrib.ARS("LinearPolicy", env, seed=0, n_delta=2).learn(200)
+    assert ours.num_timesteps == theirs.num_timesteps
+    assert th.equal(ours.weights, theirs.weights)
+
+
+# --- agents that do not learn --------------------------------------------------------------------
+
+N = 20_000
+
+
+class Still(gym.Env):
+    """Nothing happens here, whatever is done."""
+
+    observation_space = spaces.Discrete(1)
+
+    def __init__(self, action_space):
+        self.action_space = action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+
+def assert_uniform(choices, n_options):
+    frequencies = np.bincount(choices, minlength=n_options) / len(choices)
+    share = 1 / n_options
+    # Four standard errors of a frequency.
+    tolerance = 4 * np.sqrt(share * (1 - share) / len(choices))
+    np.testing.assert_allclose(frequencies, share, atol=tolerance)
+
+
+BOX = spaces.Box(np.array([-1, 0], np.float32), np.array([1, 10], np.float32))
+NUMBERED = {  # a space: its shape, its options, and the number of the one that was chosen
+    "Discrete": (spaces.Discrete(5), (), 5, lambda actions: actions),
+    "MultiDiscrete": (spaces.MultiDiscrete([2, 3]), (2,), 6, lambda a: 3 * a[:, 0] + a[:, 1]),
+    "MultiBinary": (spaces.MultiBinary(3), (3,), 8, lambda a: a @ np.array([4, 2, 1])),
+    "Box": (BOX, (2,), 4, lambda a: np.floor((a - BOX.low) / [1, 5]).astype(int) @ [2, 1]),
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERED)
+def test_random_actions_are_uniform_independent_and_follow_the_seed(kind):
+    space, shape, n_options, number = NUMBERED[kind]
+
+    def drawn(seed, deterministic=False):
+        agent = RandomAgent("RandomPolicy", Still(space), seed=seed)
+        many, hidden = agent.predict(np.zeros(N, dtype=np.int64), deterministic=deterministic)
+        assert hidden is None
+        assert many.shape == (N, *shape)
+        assert agent.predict(0)[0].shape == shape
+        return many
+
+    actions = drawn(7)
+    assert_uniform(number(actions), n_options)
+    # And each is independent of the one before.
+    numbers = number(actions)
+    assert_uniform(n_options * numbers[:-1] + numbers[1:], n_options**2)
+    np.testing.assert_array_equal(drawn(7), actions)
+    assert (drawn(8) != actions).any()
+    assert_uniform(number(drawn(3, deterministic=True)), n_options)
+
+
+@pytest.mark.parametrize("angle", [-0.2, -1e-6, 0.0, 1e-6, 0.2])
+def test_the_cart_is_pushed_to_where_the_pole_leans(angle):
+    agent = AngleAgent("AnglePolicy", "CartPole-v1")
+    # Whatever the position and the velocities say.
+    for others in (-2.0, 0.0, 2.0):
+        action, _ = agent.predict(np.array([others, others, angle, others], np.float32))
+        assert action == (1 if angle > 0 else 0)
+
+
+@pytest.mark.parametrize(
+    ("agent_class", "policy", "mean", "std"),
+    [(AngleAgent, "AnglePolicy", 42.1, 8.8), (RandomAgent, "RandomPolicy", 22.3, 11.9)],
+)
+def test_returns_on_cartpole(agent_class, policy, mean, std):
+    """Mean and standard deviation of an episode as measured over 1000 episodes elsewhere."""
+    env = make_vec_env("CartPole-v1", 50, seed=0)
+    agent = agent_class(policy, env, seed=0)
+    returns, lengths = evaluate_policy(agent, env, 1000, return_episode_rewards=True)
+    assert returns == lengths
+    assert np.mean(returns) == pytest.approx(mean, abs=3 * std / np.sqrt(1000))
+    assert np.std(returns) == pytest.approx(std, rel=0.2)

@@ -1,0 +1,423 @@
+"""Tiles, semi-gradient control and policy gradients: by hand, and against exact gradients."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.env_util import make_vec_env
+
+import envs  # noqa: F401  # registers the environments
+from agents import load_algorithm
+from agents.linear.tiles import MOST_WEIGHTS, make_tiles, tiles_of_all, vectors_of
+from tests.agents.hand_fed import Told
+
+# --- tiles ---------------------------------------------------------------------------------------
+
+UNIT = spaces.Box(0.0, 1.0, (2,))
+
+
+def active(tiles, *vectors):
+    return tiles_of_all(tiles, np.array(vectors, dtype=np.float64)).tolist()
+
+
+def test_two_tilings_of_a_square_by_hand():
+    """Two tilings of 4 x 4 tiles: the second is displaced by half a tile in both directions.
+
+    It has five tiles a side, as has the first, which leaves its last row and column empty. At
+    (0.3, 0.6) the first is in tile (1, 2), which is 1 * 5 + 2; the second, whose tiles begin an
+    eighth earlier, at (0.425, 0.725): the same tile, 25 further. At (0.4, 0.6) it is in (2, 2).
+    """
+    tiles = make_tiles(UNIT, n_tilings=2, n_tiles=4)
+    assert (tiles.n_tilings, tiles.n_in_tiling, tiles.n_tiles) == (2, 25, 50)
+    assert active(tiles, (0.3, 0.6)) == [[7, 32]]
+    assert active(tiles, (0.4, 0.6)) == [[7, 25 + 2 * 5 + 2]]
+    assert active(tiles, (0.0, 0.0), (1.0, 1.0)) == [[0, 25], [18, 25 + 24]]
+
+
+def test_four_tilings_of_a_line_by_hand():
+    """Tiles of width 1 from 0 to 3, displaced by quarters: the tiles change once a quarter."""
+    tiles = make_tiles(spaces.Box(0.0, 3.0, (1,)), n_tilings=4, n_tiles=3)
+    places = [0.1, 0.3, 0.6, 0.9, 1.1]
+    in_tiling = np.array(active(tiles, *([place] for place in places))) - 4 * np.arange(4)
+    expected = [[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 1], [0, 1, 1, 1], [1, 1, 1, 1]]
+    assert in_tiling.tolist() == expected
+
+
+def test_displacements_are_odd_multiples():
+    """Of eight tilings, the second is displaced by 1, 3 and 5 eighths in three dimensions.
+
+    So the first place where it enters its next tile lies 7, 5 and 3 eighths of a tile from low.
+    """
+    tiles = make_tiles(spaces.Box(0.0, 1.0, (3,)), n_tilings=8, n_tiles=1)
+    for d, eighths in enumerate((7, 5, 3)):
+        before, after = np.zeros(3), np.zeros(3)
+        before[d], after[d] = eighths / 8 - 1e-9, eighths / 8
+        (first, second) = active(tiles, before, after)
+        assert first[1] == active(tiles, np.zeros(3))[0][1]
+        assert second[1] - first[1] == 2 ** (2 - d)
+
+
+def test_each_number_of_a_discrete_space_is_a_tile_of_its_own():
+    for n in (1, 7, 1000):
+        space = spaces.Discrete(n)
+        tiles = make_tiles(space, n_tilings=8, n_tiles=3)
+        assert (tiles.n_tilings, tiles.n_tiles) == (1, n)
+        assert active(tiles, *vectors_of(space, np.arange(n))) == [[i] for i in range(n)]
+
+
+TILINGS = st.fixed_dictionaries(
+    {
+        "n_tilings": st.integers(1, 16),
+        "n_tiles": st.lists(st.integers(1, 9), min_size=2, max_size=2),
+    }
+)
+BOUNDS = spaces.Box(np.array([-1.2, -0.07], "f4"), np.array([0.6, 0.07], "f4"))
+PLACES = st.tuples(st.floats(-2, 2, width=32), st.floats(-0.125, 0.125, width=32))
+
+
+@given(TILINGS, PLACES)
+def test_one_tile_of_each_tiling_is_active(settings, place):
+    tiles = make_tiles(BOUNDS, **settings)
+    (found,) = active(tiles, place)
+    assert [tile // tiles.n_in_tiling for tile in found] == list(range(settings["n_tilings"]))
+    assert max(found) < tiles.n_tiles
+
+
+@given(TILINGS, PLACES, PLACES)
+def test_places_share_as_many_tiles_as_the_displacements_say(settings, first, second):
+    """In rationals: tiling t has an edge every tile, displaced by (2 d + 1) t / n tiles."""
+    tiles = make_tiles(BOUNDS, **settings)
+    n, shared = settings["n_tilings"], 0
+    for t in range(n):
+        cells = []
+        for place in (first, second):
+            steps = [
+                min(max(math.floor((x - low) * per_unit), 0), count * n - 1)
+                for x, low, per_unit, count in zip(
+                    place,
+                    BOUNDS.low.astype(float),
+                    tiles.dimensions["steps"],
+                    settings["n_tiles"],
+                    strict=True,
+                )
+            ]
+            cells.append([(step + t * (2 * d + 1) % n) // n for d, step in enumerate(steps)])
+        shared += cells[0] == cells[1]
+    one, other = active(tiles, first, second)
+    assert len(set(one) & set(other)) == shared
+
+
+@given(TILINGS, st.floats(0, 1), st.floats(-1, 1))
+def test_places_less_than_a_tile_apart_share_tiles_in_proportion(settings, place, shift):
+    """Along one dimension, k n-ths of a tile away, all but k of the n tilings agree, or k + 1."""
+    n, (count, _) = settings["n_tilings"], settings["n_tiles"]
+    tiles = make_tiles(spaces.Box(0.0, 1.0, (1,)), n_tilings=n, n_tiles=count)
+    other = min(max(place + shift / count, 0.0), 1.0)
+    one, two = active(tiles, [place], [other])
+    apart = abs(other - place) * count * n
+    assert n - apart - 1 <= len(set(one) & set(two)) + 1e-9
+    assert len(set(one) & set(two)) <= max(n - apart + 1, 0) + 1e-9
+
+
+def test_bounds_belong_to_the_space_and_what_lies_outside_to_the_bounds():
+    tiles = make_tiles(BOUNDS, n_tilings=8, n_tiles=8)
+    low, high = BOUNDS.low.astype(float), BOUNDS.high.astype(float)
+    nearly = high - 1e-9
+    assert active(tiles, high, high + 5, np.full(2, np.inf)) == 3 * active(tiles, nearly)
+    assert active(tiles, low, low - 5, np.full(2, -np.inf), np.full(2, np.nan)) == 4 * active(
+        tiles, low
+    )
+    assert set(active(tiles, low)[0]).isdisjoint(active(tiles, high)[0])
+
+
+def test_observations_count_in_single_precision():
+    space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
+    assert vectors_of(space, [0.1, 0.2]).tolist() == [
+        [float(np.float32(0.1)), float(np.float32(0.2))]
+    ]
+    with pytest.raises(ValueError, match=r"observation 5 is not in Discrete\(5\), the agent's sp"):
+        vectors_of(spaces.Discrete(5), np.array([0, 5]))
+
+
+UNBOUNDED = spaces.Box(np.array([-4.8, -np.inf], "f4"), np.array([4.8, np.inf], "f4"))
+
+
+def test_bounds_are_the_spaces_own_unless_given():
+    given = make_tiles(UNBOUNDED, low=[None, -3], high=[None, 3])
+    assert given.dimensions["low"].tolist() == [float(np.float32(-4.8)), -3.0]
+    assert given.dimensions["n_steps"].tolist() == [64, 64]
+    assert given.dimensions["steps"].tolist() == [64 / (2 * float(np.float32(4.8))), 64 / 6]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "dimension 1 of the observations has no bounds: give low and high, a number or 2 of"),
+        ({"low": -1}, "dimension 1 of the observations has no bounds: give low and high"),
+        ({"low": -1, "high": [1, 2, 3]}, r"high must be a number or 2 numbers, not \[1, 2, 3\]"),
+        ({"low": 1, "high": [2, 1]}, r"low must be below high, not 1 and 1 \(dimension 1\)"),
+        ({"low": "a", "high": 1}, "low must be finite numbers, not 'a'"),
+        ({"low": math.nan, "high": 1}, "low must be finite numbers, not nan"),
+        ({"low": True, "high": 1}, "low must be finite numbers, not True"),
+        ({"low": -1, "high": 1, "n_tiles": 0}, "n_tiles must be from 1 to 20,000,000, not 0"),
+        ({"low": -1, "high": 1, "n_tiles": [8]}, r"n_tiles must be a number or 2 numbers"),
+        ({"low": -1, "high": 1, "n_tilings": 2.5}, "n_tilings must be whole numbers, not 2.5"),
+        ({"low": -1, "high": 1, "n_tilings": [4]}, r"n_tilings must be whole numbers, not \[4\]"),
+        ({"low": -1, "high": 1, "n_tilings": True}, "n_tilings must be whole numbers, not True"),
+        ({"low": -1, "high": 1, "n_tiles": 3000}, r"make 216,144,024 weights for 3 actions, more"),
+        ({"low": -1, "high": 1, "n_tiles": 10**9}, f"n_tiles must be from 1 to {MOST_WEIGHTS:,}"),
+    ],
+)
+def test_settings_that_make_no_tiling(settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_tiles(UNBOUNDED, **settings, n_actions=3)
+
+
+# --- semi-gradient control -----------------------------------------------------------------------
+
+LINE = spaces.Box(0.0, 4.0, (1,))
+HERE, THERE = np.array([0.25], "f4"), np.array([2.25], "f4")
+
+
+def on_a_line(name, n_tilings, epsilon, **settings):
+    rates = {"exploration_initial_eps": epsilon, "exploration_final_eps": epsilon}
+    told = Told(name, LINE, 2, n_tilings=n_tilings, n_tiles=2, gamma=0.5, **rates, **settings)
+    return told, told.agent.policy.weights.numpy()
+
+
+@pytest.mark.parametrize("name", ["semi_gradient_sarsa", "semi_gradient_q"])
+@pytest.mark.parametrize(("end", "target"), [("", 2 + 0.5 * 6), ("terminated", 2.0)])
+def test_an_update_by_hand(name, end, target):
+    """From 0.25 to 2.25 by action 1, with reward 2, gamma .5 and a step size of .2.
+
+    Two tilings of two tiles (three, as they are displaced by half a tile, which is 1). At 0.25
+    tiles 0 and 3 are active, at 2.25 tiles 1 and 4. There, the actions are worth 3 + 1 and 5 + 1;
+    at 0.25 action 1 is worth 1 + 2.
+    """
+    told, weights = on_a_line(name, 2, 0.0, learning_rate=0.2)
+    weights[0], weights[3], weights[1], weights[4] = (0, 1), (0, 2), (3, 5), (1, 1)
+    before = weights.copy()
+    told.step(HERE, 1, 2, THERE, end)
+    change = weights - before
+    # The step size is shared out between the two tilings.
+    assert change[[0, 3], 1] == pytest.approx([0.1 * (target - 3)] * 2, rel=1e-14)
+    assert np.count_nonzero(change) == 2
+    assert told.agent.mean_td_error == pytest.approx(abs(target - 3))
+    assert told.committed == (1 if (name, end) == ("semi_gradient_sarsa", "") else -1)
+
+
+def test_semi_gradient_sarsa_judges_by_the_action_that_it_commits_to():
+    chosen = set()
+    for seed in range(9):
+        told, weights = on_a_line("semi_gradient_sarsa", 1, 1.0, learning_rate=1.0, seed=seed)
+        weights[1] = 4, 6
+        told.step(HERE, 0, 2, THERE)
+        assert weights[0, 0] == 2 + 0.5 * weights[1, told.committed]
+        chosen.add(told.committed)
+    assert chosen == {0, 1}
+
+
+def test_values_begin_where_they_are_told_to():
+    told, _ = on_a_line("semi_gradient_q", 4, 0.0, initial_q=3.0)
+    np.testing.assert_allclose(told.agent.policy.sums(np.array([[0.1], [3.9]])), 3.0, rtol=1e-15)
+
+
+# --- policy gradients ----------------------------------------------------------------------------
+
+
+def softmax(preferences):
+    weights = np.exp(preferences - preferences.max(axis=-1, keepdims=True))
+    return weights / weights.sum(axis=-1, keepdims=True)
+
+
+def test_a_step_of_one_goes_along_the_gradient_of_the_logarithm():
+    """Against central differences; tiles share the step, so that it is a third at each."""
+    told = Told(
+        "reinforce", spaces.Box(0.0, 1.0, (2,)), 3, n_tilings=3, n_tiles=2, learning_rate=1.0
+    )
+    weights = told.agent.policy.weights.numpy()
+    weights[:] = before = np.random.default_rng(0).normal(size=weights.shape)
+    obs, action, tiny = np.array([0.3, 0.8], "f4"), 2, 1e-6
+
+    def log_probability():
+        return np.log(softmax(told.agent.policy.sums(obs[None])))[0, action]
+
+    gradient = np.zeros_like(weights)
+    for place in np.ndindex(*weights.shape):
+        weights[place] += tiny
+        above = log_probability()
+        weights[place] -= 2 * tiny
+        gradient[place] = (above - log_probability()) / (2 * tiny)
+        weights[place] = before[place]
+    before = weights.copy()
+    told.step(obs, action, 1.0, obs, "terminated")
+    np.testing.assert_allclose(weights - before, gradient / 3, atol=1e-9)
+    assert np.count_nonzero(np.abs(gradient) > 1e-6) == 3 * 3
+
+
+class Layers:
+    """Three layers of two states, through which an episode goes: no state is met twice."""
+
+    discount = 0.9
+
+    def __init__(self, seed):
+        rng = np.random.default_rng(seed)
+        self.start = np.array([0.3, 0.7])
+        self.prob = rng.dirichlet([1, 1], size=(6, 2))  # of the two states of the next layer
+        self.reward = rng.normal(size=(6, 2))
+        self.preferences = rng.normal(size=(6, 2))
+        self.values = rng.normal(size=6)
+
+    def episodes(self):
+        """Every episode: its probability, and its states and actions."""
+        policy = softmax(self.preferences)
+        for sides in itertools.product((0, 1), repeat=3):
+            states = [2 * layer + side for layer, side in enumerate(sides)]
+            for actions in itertools.product((0, 1), repeat=3):
+                steps = list(zip(states, actions, strict=True))
+                prob = self.start[sides[0]] * np.prod([policy[step] for step in steps])
+                prob *= np.prod([self.prob[steps[t]][sides[t + 1]] for t in range(2)])
+                yield prob, steps
+
+    def gradient(self):
+        """By the policy gradient theorem: visits times gradients of pi times action values."""
+        policy, q = softmax(self.preferences), np.zeros((6, 2))
+        for state in range(5, -1, -1):
+            q[state] = self.reward[state]
+            if state < 4:
+                ahead = slice(2 * (state // 2) + 2, 2 * (state // 2) + 4)
+                values = (policy[ahead] * q[ahead]).sum(axis=1)
+                q[state] += self.discount * self.prob[state] @ values
+        visits = np.zeros(6)
+        visits[:2] = self.start
+        for state in range(4):
+            ahead = slice(2 * (state // 2) + 2, 2 * (state // 2) + 4)
+            visits[ahead] += self.discount * visits[state] * (policy[state] @ self.prob[state])
+        advantage = q - (policy * q).sum(axis=1, keepdims=True)
+        return visits[:, None] * policy * advantage
+
+
+@pytest.mark.parametrize("baseline", ["none", "value"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_mean_update_of_all_episodes_is_the_exact_gradient(baseline, seed):
+    world, step_size = Layers(seed), 0.25
+    told = Told(
+        "reinforce",
+        spaces.Discrete(7),
+        gamma=world.discount,
+        learning_rate=step_size,
+        baseline=baseline,
+    )
+    mean, total = np.zeros((6, 2)), 0.0
+    weights, values = told.agent.policy.weights.numpy(), told.agent.policy.state_weights.numpy()
+    for prob, steps in world.episodes():
+        weights[:6], values[:6] = world.preferences, world.values[: 6 * len(values)]
+        for t, (state, action) in enumerate(steps):
+            following = steps[t + 1][0] if t < 2 else 6
+            reward = world.reward[state, action]
+            told.step(state, action, reward, following, "terminated" if t == 2 else "")
+        mean += prob * (weights[:6] - world.preferences)
+        total += prob
+    assert total == pytest.approx(1, rel=1e-12)
+    np.testing.assert_allclose(mean / step_size, world.gradient(), atol=1e-12)
+
+
+def test_reinforce_by_hand():
+    """Rewards 1 and 2, gamma .5: returns 2 and 2; the second counts by a half."""
+    for gamma_power, second in ((True, 0.5), (False, 1.0)):
+        settings = {"gamma": 0.5, "learning_rate": 0.1, "gamma_power": gamma_power}
+        told = Told("reinforce", spaces.Discrete(3), **settings)
+        told.step(0, 1, 1, 1)
+        weights = told.agent.policy.weights.numpy()
+        assert not weights.any()  # nothing before the end
+        told.step(1, 0, 2, 2, "terminated")
+        expected = [[-0.1, 0.1], [second * 0.1, -second * 0.1], [0, 0]]
+        np.testing.assert_allclose(weights, expected, rtol=1e-14)
+        assert told.agent.mean_td_error == 2
+
+
+def test_where_an_episode_is_truncated_the_baseline_goes_on():
+    for baseline, returns in (("none", 2.0), ("value", 2.0 + 0.5 * 6)):
+        settings = {"gamma": 0.5, "learning_rate": 0.1, "value_step_size": 0.5}
+        told = Told("reinforce", spaces.Discrete(3), baseline=baseline, **settings)
+        values = told.agent.policy.state_weights.numpy()
+        values[:] = np.array([1, 2, 6])[: len(values)]
+        told.step(1, 0, 2, 2, "truncated")
+        compared = 2 if baseline == "value" else 0
+        change = 0.1 * (returns - compared) * 0.5
+        np.testing.assert_allclose(
+            told.agent.policy.weights.numpy()[1], [change, -change], rtol=1e-14
+        )
+        assert values.tolist() == ([1, 2 + 0.5 * 3, 6] if baseline == "value" else [])
+
+
+def test_actor_critic_by_hand():
+    """TD error 2 + .5 * 4 - 1 = 3; of the second step, 1 + .5 * 0 - 4 = -3, by a half."""
+    settings = {"gamma": 0.5, "learning_rate": 0.1, "value_step_size": 0.2}
+    for gamma_power, second in ((True, 0.5), (False, 1.0)):
+        told = Told("actor_critic", spaces.Discrete(3), gamma_power=gamma_power, **settings)
+        values, weights = told.agent.policy.state_weights.numpy(), told.agent.policy.weights.numpy()
+        values[:] = 1, 4, 0
+        told.step(0, 1, 2, 1)
+        np.testing.assert_allclose(values, [1.6, 4, 0], rtol=1e-14)
+        np.testing.assert_allclose(weights, [[-0.15, 0.15], [0, 0], [0, 0]], rtol=1e-14)
+        told.step(1, 1, 1, 2)
+        np.testing.assert_allclose(values, [1.6, 3.4, 0], rtol=1e-14)
+        np.testing.assert_allclose(weights[1], [0.15 * second, -0.15 * second], rtol=1e-14)
+        # The third step ends it: what follows counts for nothing, whatever it is worth.
+        told.step(2, 0, 4, 1, "terminated")
+        assert values[2] == pytest.approx(0.8)
+        third = 0.1 * 4 * 0.5 * (0.25 if gamma_power else 1)
+        np.testing.assert_allclose(weights[2], [third, -third], rtol=1e-14)
+        assert told.agent._discounts.tolist() == [1]
+        # Truncated, it counts.
+        values[:] = 0, 2, 0
+        told.step(0, 0, 1, 1, "truncated")
+        assert values[0] == pytest.approx(0.2 * (1 + 0.5 * 2))
+
+
+def test_preferences_begin_where_they_are_told_to():
+    told = Told("reinforce", spaces.Discrete(2), initial_preferences=[np.log(19), 0])
+    np.testing.assert_allclose(told.agent.action_probabilities(), [[0.95, 0.05]] * 2, rtol=1e-12)
+    drawn = told.agent.predict(np.zeros(20_000, dtype=int))[0]
+    assert drawn.mean() == pytest.approx(0.05, abs=5 * np.sqrt(0.05 * 0.95 / 20_000))
+    assert told.agent.predict(np.array([0, 1]), deterministic=True)[0].tolist() == [0, 0]
+
+
+LEFT_AT_FIRST = {"initial_preferences": [1.47, -1.47]}
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("reinforce", {"learning_rate": 2**-11}),
+        ("reinforce", {"learning_rate": 2**-9, "baseline": "value", "value_step_size": 2**-6}),
+    ],
+)
+def test_the_corridor_is_learnt_to_be_left_by_chance(name, settings):
+    settings = {**LEFT_AT_FIRST, **settings}
+    model = load_algorithm(name)(env="ShortCorridor-v0", seed=0, engine="compiled", **settings)
+    model.learn(60_000)
+    right = model.action_probabilities()[0, 1]
+    # Within a tenth of the best, -11.66.
+    assert (4 - 2 * right) / (right * (1 - right)) < 1.1 * 11.66
+
+
+def test_the_corridor_defeats_bootstrapping():
+    """Where all states look alike, the TD error says -1 of every step but the last."""
+    settings = {"learning_rate": 2**-6, "value_step_size": 2**-4}
+    model = load_algorithm("actor_critic")(env="ShortCorridor-v0", seed=0, **settings)
+    right = model.learn(60_000).action_probabilities()[0, 1]
+    assert (4 - 2 * right) / (right * (1 - right)) > 10 * 11.66
+
+
+def test_actor_critic_finds_the_way_over_a_lake_that_is_not_slippery():
+    env = make_vec_env("FrozenLake-v1", 1, seed=0, env_kwargs={"is_slippery": False})
+    model = load_algorithm("actor_critic")(env=env, seed=0, gamma=0.95, learning_rate=0.5)
+    model.learn(50_000)
+    assert model.engine_in_use == "compiled"
+    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.9

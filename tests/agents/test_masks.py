@@ -1,0 +1,635 @@
+"""Agents among the actions that the environment allows: tables, bandits and deep Q-learning."""
+
+import json
+import math
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import stable_baselines3
+import torch as th
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import envs  # noqa: F401  # registers the environments
+from agents import ALGORITHMS, load_algorithm
+from agents.bandits.algorithm import Pull
+from agents.bandits.runs import run_batch, run_one_by_one
+from agents.bandits.upper_bounds import kl_ucb_index
+from agents.compiled.worlds import NotCompilable
+from agents.library import DQN, DoubleDQN, MaskedReplayBuffer
+from envs.bandits import SegmentBandit
+from envs.known_models import action_masks_of_states
+from envs.wrappers import ActionMasks
+from tests.agents.hand_fed import feed
+
+BANDITS = [name for name, entry in ALGORITHMS.items() if entry.family == "bandits"]
+TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
+UNIFORM = {"exploration_decay": "constant", "exploration_initial_eps": 1.0}
+C, A = 3, 4
+BY_CONTEXT = np.array([[1, 0, 1, 1], [0, 1, 1, 0], [0, 0, 0, 1]], bool)
+EVERYTHING = np.ones((C, A), bool)
+
+
+class Ring(gym.Env):
+    """States in a ring; any action moves on by its number. What is masked must not be done."""
+
+    observation_space, action_space = spaces.Discrete(C), spaces.Discrete(A)
+
+    def __init__(self, masks, limit=7):
+        self.masks, self.limit = np.asarray(masks, bool), limit
+        self.s = self.steps = 0
+
+    def action_masks(self):
+        return self.masks[self.s]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = self.steps = 0
+        return self.s, {}
+
+    def step(self, action):
+        assert self.masks[self.s, action], f"{action} is masked in {self.s}"
+        self.steps += 1
+        self.s = (self.s + int(action) + 1) % C
+        return self.s, float(action), False, self.steps >= self.limit, {}
+
+
+class Shop(gym.Env):
+    """Customers of three segments; rewards are coins, and come in after every ``batch`` pulls.
+
+    Args:
+        masks: what is on sale, by segment and, cyclically, by the day; shape (days, C, A).
+        vectors: whether segments are shown as vectors.
+    """
+
+    action_space = spaces.Discrete(A)
+
+    def __init__(self, masks=BY_CONTEXT, batch=1, vectors=False):
+        self.masks = np.reshape(masks, (-1, C, A))
+        self.batch, self.vectors = batch, vectors
+        self.observation_space = spaces.Box(0, 1, (C,)) if vectors else spaces.Discrete(C)
+        self.day = self.context = 0
+
+    def action_masks(self):
+        return self.masks[self.day % len(self.masks), self.context]
+
+    def _observation(self):
+        self.context = int(self.np_random.integers(C))
+        return np.eye(C, dtype=np.float32)[self.context] if self.vectors else self.context
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.day = 0
+        return self._observation(), {}
+
+    def step(self, action):
+        assert self.action_masks()[action], f"{action} is sold out in {self.context}"
+        self.day += 1
+        reward = float(self.np_random.random() < 0.2 * (1 + action))
+        due = self.day % self.batch == 0
+        return self._observation(), reward, False, False, {"feedback_due": due}
+
+
+def on_ring(name, masks, n_envs=1, limit=7, **kwargs):
+    env = DummyVecEnv([lambda: Ring(masks, limit)] * n_envs)
+    return load_algorithm(name)(env=env, **{"seed": 0, "mask_actions": True, **kwargs})
+
+
+def in_shop(name, masks=BY_CONTEXT, n_envs=1, batch=1, vectors=False, **kwargs):
+    env = DummyVecEnv([lambda: Shop(masks, batch, vectors)] * n_envs)
+    return load_algorithm(name)(env=env, **{"seed": 0, "mask_actions": True, **kwargs})
+
+
+@st.composite
+def masks_of(draw, n):
+    rows = st.lists(st.booleans(), min_size=A, max_size=A).filter(any)
+    return np.array(draw(st.lists(rows, min_size=n, max_size=n)))
+
+
+def few(n):
+    return settings(max_examples=n, deadline=None, derandomize=True)
+
+
+# --- what is masked is not done ------------------------------------------------------------------
+
+EXPLORATION = {
+    "epsilon": {"exploration_initial_eps": 0.5, "exploration_decay": "constant"},
+    "boltzmann": {"exploration": "boltzmann", "temperature": 0.5},
+    "gaussian": {"exploration": "gaussian_noise", "noise_std": 20.0},
+}
+TRIED = [(name, "epsilon") for name in TABULAR if name not in ("r_max", "qlearning_ucb")]
+TRIED += [(name, kind) for name in ("sarsa", "q_lambda") for kind in ("boltzmann", "gaussian")]
+
+
+@pytest.mark.parametrize(("name", "exploration"), TRIED)
+def test_a_masked_action_is_never_chosen(name, exploration):
+    @few(8)
+    @given(masks_of(C), st.sampled_from(["random", "first"]))
+    def holds(allowed, ties):
+        # Tables full of noise: what is best is mostly masked. The environment itself refuses.
+        noisy = {"tie_breaking": ties, "initial_q_std": 5.0, **EXPLORATION[exploration]}
+        agent = on_ring(name, allowed, 2, **noisy).learn(60)
+        counts = agent.policy.visit_counts.numpy().sum(axis=0)
+        assert 0 < counts.sum() <= 60
+        assert not counts[~allowed].any()
+        obs = np.arange(C).repeat(20)
+        for deterministic in (True, False):
+            told = agent.predict(obs, deterministic=deterministic, action_masks=allowed[obs])[0]
+            assert allowed[obs, told].all()
+        if exploration != "gaussian":
+            met = agent.policy.masks.any(axis=1)
+            probabilities = agent.action_probabilities()
+            assert not probabilities[met][~allowed[met]].any()
+            np.testing.assert_allclose(probabilities.sum(axis=1), 1)
+
+    holds()
+
+
+@pytest.mark.parametrize("name", BANDITS)
+def test_a_masked_arm_is_never_pulled(name):
+    @few(8)
+    @given(masks_of(2 * C), st.sampled_from(["random", "first"]), st.integers(1, 3))
+    def holds(masks, ties, batch):
+        model = in_shop(name, masks, 2, batch, tie_breaking=ties).learn(60)  # the shop refuses
+        assert model._n_updates == sum(60 // 2 // batch * batch for _ in range(2))
+        contexts = np.arange(C).repeat(10)
+        for told in (masks[contexts], None):
+            allowed = model.policy.kept_masks(contexts) if told is None else told
+            for deterministic in (True, False):
+                arms, _ = model.predict(contexts, None, None, deterministic, told)
+                assert allowed[np.arange(len(arms)), arms].all()
+
+    holds()
+
+
+@pytest.mark.parametrize("name", ["sarsa", *BANDITS])
+def test_where_everything_is_allowed_masks_change_no_bit(name):
+    ends = []
+    for mask_actions in (False, True):
+        place, more = (on_ring, ()) if name == "sarsa" else (in_shop, (2, 5))
+        model = place(name, EVERYTHING, *more, mask_actions=mask_actions).learn(400)
+        tables = {key: value.numpy().tobytes() for key, value in model.policy.state_dict().items()}
+        tables.pop("allowed_actions", None)
+        ends.append((tables, model.rng.bit_generator.state, model._last_obs.tolist()))
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("name", ["dyna_q_plus", "qlearning", *BANDITS])
+def test_a_zip_brings_the_masks_back_and_training_goes_on(name, tmp_path):
+    env = on_ring(name, BY_CONTEXT).env if name in TABULAR else in_shop(name, batch=3).env
+    model = load_algorithm(name)(env=env, seed=0, mask_actions=True).learn(200)
+    model.save(tmp_path / "agent")
+    loaded = load_algorithm(name).load(tmp_path / "agent")
+    assert loaded.mask_actions
+    assert np.array_equal(loaded.policy.masks, BY_CONTEXT)
+    for agent in (model, loaded):
+        agent.set_env(env)
+        agent.env.seed(3)
+        agent.learn(100, reset_num_timesteps=False)
+    for key, value in model.policy.state_dict().items():
+        assert np.array_equal(value, loaded.policy.state_dict()[key]), key
+
+
+@pytest.mark.parametrize(("name", "kind"), [("qlearning", Ring), ("ucb", Shop)])
+def test_an_agent_can_begin_to_go_by_masks_and_cease_to(name, kind, tmp_path):
+    algorithm, env = load_algorithm(name), DummyVecEnv([lambda: kind(EVERYTHING)])
+    algorithm(env=env, seed=0).learn(50).save(tmp_path / "plain")
+    masked_env = DummyVecEnv([lambda: kind(BY_CONTEXT)])
+    masked = algorithm.load(tmp_path / "plain", env=masked_env, mask_actions=True)
+    assert not masked.policy.masks.any()
+    assert masked.learn(100).policy.masks.any()
+    masked.save(tmp_path / "masked")
+    plain = algorithm.load(tmp_path / "masked", env=env, mask_actions=False).learn(50)
+    assert plain.policy.state_dict().keys() == algorithm(env=env).policy.state_dict().keys()
+
+
+# --- updates of tables ---------------------------------------------------------------------------
+
+# Of the next state's values the best one, of action 3, is masked, and so is that of action 0.
+VALUES, OTHERS = [10.0, 4.0, 2.0, 50.0], [0.0, -7.0, 8.0, 90.0]
+NEXT_MASKS = np.array([[1, 1, 1, 1], [0, 1, 1, 0], [1, 1, 1, 1]], bool)
+SOFTMAX = 1 / (1 + np.exp(-1.0))  # of action 1 at temperature 2
+TARGETS = [
+    ("qlearning", {}, {3 + 0.5 * 4}),
+    # Half of the time a random one of two, of mean 3, else the better, 4.
+    ("expected_sarsa", {**UNIFORM, "exploration_initial_eps": 0.5}, {3 + 0.5 * 3.5}),
+    ("expected_sarsa", {"exploration": "boltzmann", "temperature": 2.0},
+     {3 + 0.5 * (4 * SOFTMAX + 2 * (1 - SOFTMAX))}),
+    ("sarsa", UNIFORM, {3 + 0.5 * 4, 3 + 0.5 * 2}),
+    # Of the allowed, the first table prefers action 1 and the second action 2.
+    ("double_qlearning", {}, {3 + 0.5 * -7, 3 + 0.5 * 2}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "own", "targets"), TARGETS)
+def test_targets_are_those_of_the_allowed_actions(name, own, targets):
+    found = set()
+    for seed in range(9):
+        table = np.zeros((C, A))
+        agent = on_ring(name, NEXT_MASKS, learning_rate=1.0, gamma=0.5, **{**own, "seed": seed})
+        agent.learn(0)
+        q_tables = agent.policy.q_tables.numpy()
+        for q_table, values in zip(q_tables, (VALUES, OTHERS), strict=False):
+            q_table[:], q_table[1] = table, values
+        agent.policy.note_masks(np.arange(C), NEXT_MASKS)
+        agent.masks_are_known = True
+        feed(agent, 0, 1, 3, 1)
+        (value,) = q_tables[:, 0, 1][q_tables[:, 0, 1] != 0]
+        found.add(round(value, 12))
+        if name == "sarsa":
+            assert value == 3 + 0.5 * VALUES[agent._next_actions[0]]
+    assert found == {round(target, 12) for target in targets}
+
+
+def test_where_nothing_is_known_everything_counts():
+    agent = on_ring("qlearning", NEXT_MASKS)
+    agent.policy.q_tables[0, 1] = th.tensor(VALUES)
+    assert agent.predict(1, deterministic=True)[0] == 3
+    assert agent.predict(1, deterministic=True, action_masks=NEXT_MASKS[1])[0] == 1
+    assert not agent.policy.masks[1].any(), "what is told to predict is not kept"
+
+
+def test_the_last_state_of_an_episode_that_is_cut_off_is_told_by_info():
+    """After two steps of 1 the episode is cut off in state 2, in which nothing is ever done."""
+    allowed = [[True, False, False, False], [True, False, False, False], [False, True, True, True]]
+    for wrap, expected in ((ActionMasks, allowed), (lambda e: e, [*allowed[:2], [False] * A])):
+        env = DummyVecEnv([lambda wrap=wrap: wrap(Ring(allowed, limit=2))])
+        agent = load_algorithm("qlearning")(env=env, seed=0, mask_actions=True)
+        assert agent.learn(10).policy.masks.tolist() == expected
+
+
+def test_what_is_masked_is_not_planned_for():
+    env = make_vec_env("Warehouse-v0", 2, seed=0)
+    agent = load_algorithm("dyna_q_plus")(env=env, seed=0, mask_actions=True).learn(3000)
+    allowed, model = agent.policy.masks, agent.policy.model
+    considered = np.zeros(allowed.size, dtype=bool)
+    considered[model.pairs[: model.n_pairs[0]]] = True
+    met = model.counts.any(axis=1)
+    assert (considered.reshape(allowed.shape) == (allowed & met[:, None])).all()
+    assert model.n_pairs[0] == considered.sum() > 100
+
+
+# --- rules of bandits ----------------------------------------------------------------------------
+
+
+def knowing(name, scores, counts=(1,) * A, **kwargs):
+    """An agent with these scores, taken for average rewards, in context 0."""
+    model = in_shop(name, **kwargs)
+    tables = model.policy.tables
+    tables.scores[0], tables.counts[0] = scores, counts
+    tables.sums[0] = np.where(tables.counts[0], tables.scores[0], 0) * tables.counts[0]
+    return model
+
+
+def shares(model, mask, n=20_000):
+    """How often an exploring agent pulls each arm in context 0."""
+    masks = np.tile(np.array(mask, bool), (n, 1))
+    arms = model.predict(np.zeros(n, int), deterministic=False, action_masks=masks)[0]
+    return np.bincount(arms, minlength=A) / n
+
+
+def softmax(values):
+    weights = np.exp(np.array(values) - max(values))
+    return weights / weights.sum()
+
+
+GREEDY, OFTEN = {"exploration_initial_eps": 0.0}, {"exploration_initial_eps": 0.3}
+FIRST = {**GREEDY, "tie_breaking": "first"}
+FEW, MANY = softmax([0.5, 1.5])
+EXP3 = 0.7 * softmax([5.0, 0.2, 0.7]) + 0.1
+CHOICES = [
+    ("epsilon_greedy", [9, 3, 3, 1], GREEDY, [0, 1, 1, 1], [0, 0.5, 0.5, 0]),
+    ("epsilon_greedy", [9, 3, 3, 1], GREEDY, [0, 0, 1, 1], [0, 0, 1, 0]),
+    ("epsilon_greedy", [9, 3, 3, 1], FIRST, [0, 1, 1, 1], [0, 1, 0, 0]),
+    ("epsilon_greedy", [9, 3, 2, 1], OFTEN, [0, 1, 1, 1], [0, 0.8, 0.1, 0.1]),
+    ("boltzmann", [9, 0.5, 7, 1.5], {"temperature": 1.0}, [0, 1, 0, 1], [0, FEW, 0, MANY]),
+    ("gradient_bandit", [9, 0.5, 7, 1.5], {}, [0, 1, 0, 1], [0, FEW, 0, MANY]),
+    ("exp3", [5, 0.2, 9, 0.7], {"mixing": 0.3}, [1, 1, 0, 1], [*EXP3[:2], 0, EXP3[2]]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", range(len(CHOICES)))
+def test_choices_among_the_allowed(case):
+    name, scores, kwargs, mask, expected = CHOICES[case]
+    assert shares(knowing(name, scores, **kwargs), mask) == pytest.approx(expected, abs=0.015)
+
+
+@pytest.mark.parametrize("name", ["ucb", "kl_ucb"])
+def test_bounds_count_all_pulls_of_the_context(name):
+    """Source: the awake upper estimated rewards of Kleinberg, Niculescu-Mizil and Sharma, 2010."""
+    means, counts = np.array([0.6, 0.3, 0.9, 0.0]), np.array([50, 20, 9000, 1000])
+    if name == "kl_ucb":
+        counts = np.array([60, 10, 9000, 10_000])
+
+    def best(pulls):
+        if name == "kl_ucb":
+            return np.argmax([kl_ucb_index(means[i], counts[i], pulls, 0.0) for i in (0, 1)])
+        return np.argmax(means[:2] + np.sqrt(2 * math.log(pulls) / counts[:2]))
+
+    # After the pulls of the allowed arms alone it would be the first.
+    assert (best(counts[:2].sum()), best(counts.sum())) == (0, 1)
+    assert shares(knowing(name, means, counts), [1, 1, 0, 0], 10).tolist() == [0, 1, 0, 0]
+    # An arm that was not tried yet waits until it is allowed.
+    model = knowing(name, [0.1, 0.9, -np.inf, -np.inf], [5, 5, 0, 0])
+    assert shares(model, [1, 1, 0, 0], 10).tolist() == [0, 1, 0, 0]
+    assert shares(model, [1, 1, 0, 1], 10).tolist() == [0, 0, 0, 1]
+    # All that is allowed has the score of no arm tried.
+    assert model.predict(0, deterministic=True, action_masks=[0, 0, 1, 1])[0] == 2
+
+
+def test_gradient_step_among_the_arms_of_the_pull():
+    model = knowing("gradient_bandit", [2.0, 0.5, -1.0, 1.0], [2, 1, 0, 1], learning_rate=0.5)
+    model.policy.tables.sums[0] = [1.0, 3.0, 0.0, 4.0]
+    model._learn(Pull(0, 3, 5.0, 1.0, [False, True, False, True]))
+    less, more = softmax([0.5, 1.0])
+    advantage = 0.5 * (5.0 - 2.0)  # the average of four rewards, two of them of a masked arm
+    expected = [2.0, 0.5 - advantage * less, -1.0, 1.0 + advantage * (1 - more)]
+    assert model.policy.scores[0].tolist() == pytest.approx(expected, rel=1e-14)
+    assert model.policy.counts[0].tolist() == [2, 1, 0, 2]
+    assert model.policy.sums[0].tolist() == [1.0, 3.0, 0.0, 9.0]
+
+
+def test_exp3_weighs_by_the_probability_among_the_arms_of_the_pull():
+    model = knowing("exp3", [5.0, 0.2, 9.0, 0.7], mixing=0.3)
+    model._learn(Pull(0, 3, 0.5, 0.25, [True, True, False, True]))
+    # exp(gamma / K * reward / probability), with three arms.
+    moved = [5.0, 0.2, 9.0, 0.7 + 0.3 / 3 * 0.5 / 0.25]
+    assert model.policy.scores[0].tolist() == pytest.approx(moved, rel=1e-14)
+
+
+def test_late_feedback_remembers_what_was_allowed_and_how_likely_the_pull_was():
+    """Two days of other masks, and feedback on the second; nothing was learnt before."""
+    days = [[[True, True, False, False]] * C, EVERYTHING.tolist()]
+    model, learnt = in_shop("exp3", days, batch=2), []
+    model._learn = learnt.append
+    model.learn(2)
+    assert [pull.mask for pull in learnt] == [days[0][0], days[1][0]]
+    assert [pull.probability for pull in learnt] == pytest.approx([1 / 2, 1 / 4], rel=1e-15)
+    model, learnt = in_shop("exp3", n_envs=2), []
+    model._learn = learnt.append
+    model.learn(40)
+    assert [pull.mask for pull in learnt] == [BY_CONTEXT[pull.context].tolist() for pull in learnt]
+
+
+def test_thompson_draws_for_the_allowed_alone():
+    model = in_shop("thompson")
+    model.policy.tables.sums[0], model.policy.tables.counts[0] = [90, 2, 0, 1], [90, 3, 1, 1]
+    draws = np.random.default_rng(5).beta([3, 1, 2], [2, 2, 1], size=(200_000, 3))
+    expected = np.bincount(draws.argmax(axis=1)) / 200_000
+    assert shares(model, [0, 1, 1, 1])[1:] == pytest.approx(expected, abs=0.015)
+
+
+@pytest.mark.parametrize("vectors", [False, True])
+def test_linear_models_among_the_allowed(vectors):
+    context = np.eye(C, dtype=np.float32)[1] if vectors else 1
+    kwargs = {"vectors": vectors, "exploration_initial_eps": 0.3}
+    greedy, ucb, thompson = (
+        in_shop("lin_epsilon_greedy", **kwargs),
+        in_shop("linucb", vectors=vectors),
+        in_shop("lin_thompson", vectors=vectors, alpha=2.0),
+    )
+    for model in (greedy, ucb, thompson):
+        for arm, reward in ((0, 9.0), (1, 3.0), (1, 3.0), (1, 3.0), (2, 3.0), (3, 1.0)):
+            model._learn(Pull([0.0, 1.0, 0.0], arm, reward, 1.0))
+    # Predictions are 4.5, 9/4, 3/2 and 1/2; deviations 1/sqrt(2), 1/2, 1/sqrt(2), 1/sqrt(2).
+
+    def share(model, mask, n=20_000):
+        many = np.tile(context, (n, 1)) if vectors else np.full(n, 1)
+        masks = np.tile(np.array(mask, bool), (n, 1))
+        return np.bincount(model.predict(many, action_masks=masks)[0], minlength=A) / n
+
+    assert share(greedy, [0, 1, 1, 1]) == pytest.approx([0, 0.8, 0.1, 0.1], abs=0.015)
+    assert share(ucb, [0, 1, 1, 1], 5).tolist() == [0, 1, 0, 0]
+    ucb.alpha = 5.0  # 3/2 + 5/sqrt(2) is more than 9/4 + 5/2
+    assert share(ucb, [0, 1, 1, 1], 5).tolist() == [0, 0, 1, 0]
+    z = np.random.default_rng(5).standard_normal((200_000, 2)) * 2 * [0.5, math.sqrt(0.5)]
+    first = np.mean(9 / 4 + z[:, 0] > 3 / 2 + z[:, 1])
+    assert share(thompson, [0, 1, 1, 0]) == pytest.approx([0, first, 1 - first, 0], abs=0.015)
+
+
+def test_a_batch_of_masked_runs_goes_one_by_one(monkeypatch):
+    masks = np.array([[True, False, True], [True, True, False]])
+    args = {"mask_actions": True}, "SegmentBandit-v0", {}
+    # As a user's own kind of the environment has it.
+    told = lambda self: masks[self.context]  # noqa: E731
+    monkeypatch.setattr(SegmentBandit, "action_masks", told, raising=False)
+    with pytest.raises(NotCompilable, match=r"^the environment is asked for its action masks"):
+        run_batch("ucb", *args, [0])
+    for name in ("ucb", "linucb"):
+        result = run_one_by_one(name, *args, [0, 5], 150)
+        assert masks[result.contexts, result.arms].all()
+        model = load_algorithm(name)(env=gym.make("SegmentBandit-v0"), seed=5, mask_actions=True)
+        judged = model.learn(150).policy.judged(np.arange(2))
+        assert np.array_equal(result.estimates[1], judged)
+
+
+# --- deep Q-learning -----------------------------------------------------------------------------
+
+BOTH = pytest.mark.parametrize("algorithm", [DQN, DoubleDQN])
+SMALL = {"seed": 0, "learning_starts": 50, "policy_kwargs": {"net_arch": [8]}}
+MASKED = {"policy": "MlpPolicy", "mask_actions": True, "buffer_size": 1000, **SMALL}
+
+
+def warehouse(n_envs=1):
+    env_kwargs = {"max_episode_steps": 25}
+    return make_vec_env("Warehouse-v0", n_envs, 0, env_kwargs=env_kwargs, wrapper_class=ActionMasks)
+
+
+@BOTH
+def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(algorithm, tmp_path):
+    env = warehouse(n_envs=2)
+    agent = algorithm(env=env, exploration_final_eps=0.5, **MASKED).learn(900)
+    agent.save(tmp_path / "agent")
+    loaded = algorithm.load(tmp_path / "agent", env=env).learn(60)
+    assert loaded.mask_actions
+    masks = action_masks_of_states(env.envs[0])
+    for one in (agent, loaded):
+        buffer = one.replay_buffer
+        seen = slice(0, buffer.pos)
+        obs, after = buffer.observations[seen, :, 0], buffer.next_observations[seen, :, 0]
+        actions, kept = buffer.actions[seen, :, 0], buffer.actions[seen, :, 1:]
+        assert masks[obs, actions].all()
+        going_on = buffer.dones[seen] * (1 - buffer.timeouts[seen]) == 0
+        np.testing.assert_array_equal(kept[going_on], masks[after][going_on])
+    # Cut-off episodes too, whose environments have been reset by then.
+    assert agent.replay_buffer.timeouts.sum() > 20
+
+
+@BOTH
+def test_deep_agents_predict_among_the_allowed(algorithm):
+    agent = algorithm(env=warehouse(), **MASKED)
+    masks = np.random.default_rng(0).random((100, 4)) < 0.4
+    masks[:, 2] |= ~masks.any(axis=1)
+    obs = np.arange(100)
+    with th.no_grad():
+        values = agent.q_net(agent.policy.obs_to_tensor(obs)[0]).numpy()
+    best = np.where(masks, values, -np.inf).argmax(axis=1)
+    chosen, _ = agent.predict(obs, deterministic=True, action_masks=masks)
+    np.testing.assert_array_equal(chosen, best)
+    assert int(agent.predict(5, deterministic=True, action_masks=masks[5])[0]) == best[5]
+    agent.exploration_rate = 1.0
+    for _ in range(10):
+        chosen, _ = agent.predict(obs, action_masks=masks)
+        assert masks[obs, chosen].all()
+
+
+class TwoStates(gym.Env):
+    """Action 1 leads to state 1, in which only actions 0 and 1 are allowed, or none."""
+
+    observation_space, action_space = spaces.Discrete(2), spaces.Discrete(3)
+
+    def __init__(self, allowed=(True, True, False)):
+        self.allowed = allowed
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 0
+        return 0, {}
+
+    def action_masks(self):
+        return np.array([True] * 3 if self.s == 0 else self.allowed)
+
+    def step(self, action):
+        self.s = int(action == 1)
+        return self.s, 1.0, False, False, {}
+
+
+# The target network's best allowed value in state 1; or its value of the action that the online
+# network prefers of the allowed.
+@pytest.mark.parametrize(("algorithm", "expected"), [(DQN, 6.0), (DoubleDQN, -2.0)])
+def test_deep_targets_by_hand(algorithm, expected):
+    agent = algorithm(env=ActionMasks(TwoStates()), **{**MASKED, "learning_starts": 0}).learn(40)
+    online, target = th.tensor([[0.0] * 3, [1.0, 3.0, 9.0]]), th.tensor([[0.0] * 3, [6.0, -2, 70]])
+    agent.q_net = lambda obs: online[obs[:, 0].long()]
+    batch = agent.replay_buffer.sample(64)
+    values = agent._next_values(lambda obs: target[obs[:, 0].long()])(batch.next_observations)
+    in_state_1 = batch.next_observations[:, 0] == 1
+    assert 0 < in_state_1.sum() < 64
+    assert set(values.amax(dim=1)[in_state_1].tolist()) == {expected}
+    assert set(values.amax(dim=1)[~in_state_1].tolist()) == {0.0}
+
+
+def test_updates_with_masks_are_dqns_own_where_all_is_allowed():
+    class Free(gym.Wrapper):
+        def action_masks(self):
+            return np.ones(2, bool)
+
+    def free():
+        return ActionMasks(Free(gym.make("CartPole-v1")))
+
+    own = {**MASKED, "learning_starts": 1000}
+    masked = DQN(env=make_vec_env(free, seed=0), **own).learn(60)
+    plain = DQN(env="CartPole-v1", **{**own, "mask_actions": False}).learn(60)
+    # The same transitions: what is drawn to explore differs.
+    masked.set_parameters(plain.get_parameters())
+    for name in ("observations", "next_observations", "rewards", "dones", "timeouts"):
+        getattr(masked.replay_buffer, name)[:] = getattr(plain.replay_buffer, name)
+    masked.replay_buffer.actions[..., :1] = plain.replay_buffer.actions
+    for agent in (masked, plain):
+        np.random.seed(0)  # noqa: NPY002  # what the library's buffers draw from
+        agent.train(5, 16)
+    for ours, theirs in zip(masked.policy.parameters(), plain.policy.parameters(), strict=True):
+        assert th.equal(ours, theirs)
+
+
+def test_without_masks_it_is_the_librarys_agent_and_file(tmp_path):
+    kinds, data = (DQN, stable_baselines3.DQN), []
+    agents = [kind("MlpPolicy", "CartPole-v1", **SMALL).learn(300) for kind in kinds]
+    for ours, theirs in zip(*(agent.policy.parameters() for agent in agents), strict=True):
+        assert th.equal(ours, theirs)
+    for i, agent in enumerate(agents):
+        agent.save(tmp_path / str(i))
+        data.append(zipfile.ZipFile(tmp_path / f"{i}.zip").read("data"))
+    assert json.loads(data[0]).keys() == json.loads(data[1]).keys()
+    assert b"agents." not in data[0]
+    assert not hasattr(stable_baselines3.DQN.load(tmp_path / "0"), "mask_actions")
+    assert not DQN.load(tmp_path / "1").mask_actions
+
+
+def test_a_plain_file_can_go_on_with_masks_and_a_masked_one_without(tmp_path):
+    DQN(env=warehouse(), **{**MASKED, "mask_actions": False}).save(tmp_path / "plain")
+    loaded = DQN.load(tmp_path / "plain", env=warehouse(), mask_actions=True).learn(60)
+    loaded.save(tmp_path / "masked")
+    assert isinstance(loaded.replay_buffer, MaskedReplayBuffer)
+    again = DQN.load(tmp_path / "masked", env=warehouse(), mask_actions=False).learn(60)
+    assert type(again.replay_buffer) is stable_baselines3.common.buffers.ReplayBuffer
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+VECTOR = np.eye(C, dtype=np.float32)[0]
+NO_METHOD = r"mask_actions: the environment has no method action_masks\(\); where its info"
+SHAPE = r"has shape \(5,\), it must be \(4,\), a bool for each action"
+HER = {"replay_buffer_class": stable_baselines3.her.HerReplayBuffer}
+
+
+class OwnChoice(load_algorithm("ucb")):
+    """Chooses in Python, among all arms."""
+
+    def _choose(self, contexts, rng):
+        return super()._choose(contexts, rng)
+
+
+def told(name, masks):
+    """An agent whose environment says this in states other than 0."""
+    agent = on_ring(name, EVERYTHING) if name in TABULAR else in_shop(name, EVERYTHING)
+    env = agent.env.envs[0]
+    env.action_masks = lambda: masks(env) if getattr(env, "s", 1) else np.ones(A)
+    return agent
+
+
+def elsewhere(agent, env_id):
+    agent.env = DummyVecEnv([lambda: gym.make(env_id)])
+    return agent
+
+
+REFUSALS = [
+    (lambda: in_shop("ucb").predict(3, deterministic=True), r"context 3 is not in Discrete\(3\)"),
+    (lambda: in_shop("ucb").predict([0, 1], action_masks=BY_CONTEXT),
+     r"action_masks must be of shape \(2, 4\), not \(3, 4\)"),
+    (lambda: in_shop("ucb").predict(2, action_masks=[True] * 5),
+     f"the action mask for observation 2 {SHAPE}"),
+    (lambda: in_shop("linucb", vectors=True).predict(VECTOR, deterministic=True),
+     "mask_actions: predict needs action_masks where contexts are vectors"),
+    (lambda: in_shop("ucb", mask_actions=False).predict(0, action_masks=[True] * A),
+     "action_masks: the agent was made without mask_actions"),
+    *((lambda name=name: told(name, lambda env: np.zeros(A)).learn(99),
+       r"the action mask for observation \d allows no action") for name in ("sarsa", "ucb")),
+    *((lambda name=name: told(name, lambda env: np.ones(A + 1)).learn(99),
+       rf"the action mask for observation \d {SHAPE}") for name in ("sarsa", "ucb")),
+    (lambda: told("sarsa", lambda env: np.arange(A) != env.steps % A).learn(100),
+     r"observation \d comes with different action masks"),
+    (lambda: elsewhere(on_ring("sarsa", EVERYTHING), "FrozenLake-v1").learn(10), NO_METHOD),
+    (lambda: elsewhere(in_shop("ucb"), "SegmentBandit-v0").learn(10), NO_METHOD),
+    (lambda: on_ring("sarsa", EVERYTHING, engine="compiled").learn(10),
+     "engine: compiled is not possible: the action masks are not known of all states"),
+    (lambda: OwnChoice(env=Shop(), mask_actions=True),
+     "mask_actions: OwnChoice chooses among all arms"),
+    (lambda: DQN(env=warehouse(), n_steps=3, **MASKED), "mask_actions needs n_steps of 1, not 3"),
+    (lambda: DQN(env=warehouse(), **HER, **MASKED),
+     "mask_actions brings its own replay buffer: leave replay_buffer_class"),
+    (lambda: DQN(env="CartPole-v1", **MASKED), NO_METHOD),
+    (lambda: DQN(env="Warehouse-v0", **MASKED).learn(10),
+     "mask_actions of DQN: info holds no action_mask, "),
+    (lambda: DQN(env=ActionMasks(TwoStates([False] * 3)), **MASKED).learn(100),
+     "the action mask for observation 1 allows no action"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", range(len(REFUSALS)))
+def test_refused_in_one_line(case):
+    call, line = REFUSALS[case]
+    with pytest.raises(ValueError, match=f"^{line}") as refusal:
+        call()
+    assert "\n" not in str(refusal.value)
+
+
+def test_masks_behind_a_vector_wrapper():
+    env = VecNormalize(DummyVecEnv([lambda: Shop(vectors=True)]))
+    model = load_algorithm("linucb")(env=env, seed=0, mask_actions=True).learn(100)
+    assert model.predict(VECTOR, deterministic=True, action_masks=[0, 0, 1, 0])[0] == 2
