@@ -463,7 +463,7 @@ def test_a_library_agents_zip_opens_where_this_project_is_not(tmp_path):
 # --- what is replaced on the way -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["qlearning", "reinforce", "ucb", "optimal", "random"])
+@pytest.mark.parametrize("name", ["qlearning", "reinforce", "ucb", "optimal"])
 def test_custom_objects_replace_what_the_file_holds_and_nothing_else(name, tmp_path):
     env = "SegmentBandit-v0" if name == "ucb" else "FrozenLake-v1"
     model = load_algorithm(name)(env=env, seed=0)

@@ -239,6 +239,7 @@ def test_sarsa_lambda_by_hand(trace_type, value):
     fed = Fed("sarsa_lambda", [[4, 0]], trace_type=trace_type, trace_decay=1.0, **HALF)
     # 4 + .5 * 4 - 4 = 2, half of it; then 3 - 5 = -2, times half of the trace.
     assert fed.step(0, 0, 4, 0).tolist() == [[5, 0]]
+    assert fed.agent.mean_td_error == 2
     assert fed.step(0, 0, 3, 0, "terminated").tolist() == [[value, 0]]
 
 
@@ -298,6 +299,7 @@ def test_monte_carlo_by_hand(every_visit, twice_visited):
     assert tables[1].tolist() == [[10, 0], [0, 0]]
     # 10 + .5 * (3 - 10), or first 10 + .5 * (4 - 10) = 7 and then 7 + .5 * (3 - 7).
     assert tables[2].tolist() == [[twice_visited, 0], [0, 2]]
+    assert fed.agent.mean_td_error == pytest.approx((6 + 4 + 4) / 3 if every_visit else (4 + 7) / 2)
 
 
 def test_an_episode_that_fills_the_record_is_learnt_from():

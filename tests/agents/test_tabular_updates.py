@@ -228,6 +228,7 @@ def test_planning_repeats_the_update():
     """Only one pair is known: one real update and three imagined ones, from 0 towards 2 + 4."""
     fed = Fed("dyna_q", [[0, 0], [4, 8]], planning_steps=3, learning_rate=0.1)
     assert fed.step(0, 1, 2, 1)[0, 1] == pytest.approx(6 * (1 - 0.9**4), rel=1e-14)
+    assert fed.agent.mean_td_error == 6  # of the real one
     assert fed.agent.policy.visit_counts[0].tolist() == [[0, 1], [0, 0]]
 
 
@@ -315,7 +316,10 @@ def chain(planning_steps, **settings):
 
 
 def test_news_of_the_goal_runs_backwards():
-    assert chain(5)[1] == [2, 4, 8, 0]
+    fed, values = chain(5)
+    assert values == [2, 4, 8, 0]
+    assert fed.agent.mean_td_error == 8
+    assert fed.agent.policy.visit_counts.ravel().tolist() == [1, 1, 1, 0]
     fed, values = chain(2)
     assert values == [0, 4, 8, 0]
     # The first state is next: its error is half of 4.
@@ -387,6 +391,7 @@ def test_queue_and_lists_hold_through_a_training():
 def test_r_max_by_hand():
     fed = Fed("r_max", np.full((2, 2), 10.0), known_after=2, value_bound=10.0)
     assert (fed.step(0, 0, 1, 0) == 10).all()
+    assert fed.agent.mean_td_error == abs(1 + 0.5 * 10 - 10)
     # Once back, once on: 0.5 * (1 + .5 V(0)) + 0.5 * (3 + .5 V(1)), where both are worth 10.
     assert fed.step(0, 0, 3, 1).tolist() == [[7, 10], [10, 10]]
     # The other action ends the episode: V(0) = max(Q(0, 0), 4), Q(0, 0) = 4.5 + .25 V(0) = 6.
