@@ -147,6 +147,8 @@ def test_what_is_best_depends_on_the_steps_left():
     assert found.values.tolist() == [10.0, 10.0]
     assert found.policy[:, 0].tolist() == [0, 0, 1]
     assert [found.actions(step)[0] for step in range(3)] == [0, 0, 1]
+    short = finite_horizon_optimum(model, 2)
+    assert [short.actions(step)[0] for step in range(2)] == [0, 1]
 
 
 @PLANNERS
