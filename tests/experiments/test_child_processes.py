@@ -1,19 +1,26 @@
-"""Work in child processes: what comes back, what is tried again, and what is left behind."""
+"""Work in child processes: what comes back, what is tried again, shared, limited, left behind."""
 
+import contextlib
+import copy
+import mmap
 import multiprocessing
 import os
 import runpy
 import signal
 import subprocess
 import sys
-import threading
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from experiments import child_processes
+import compare
+from experiments import child_processes, run_limits
 from experiments.child_processes import (
     StoppedError,
     TaskDiedError,
@@ -22,18 +29,31 @@ from experiments.child_processes import (
     stop_all,
     supervise,
 )
-from experiments.run_limits import RunLimits
+from experiments.launching import execute, local_launcher
+from experiments.plan import plan
+from experiments.run_folders import draft_path
+from experiments.run_in_child import do_run
+from experiments.run_limits import RunLimits, memory, resident_memory, seconds
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
+from pipeline.evaluation.exact import evaluator_of, exact_evaluator
+from pipeline.settings.hyperparams import ComponentSpec
+from pipeline.train_spec import is_plain
+
+ROOT = Path(compare.__file__).parent
 
 # What the children are to do; they import it by its name.
 CHORES = """
-import os, signal, time
+import ctypes, os, signal, time
 from pathlib import Path
 
-def add(first, second):
-    return first + second, os.getpid()
+def who(*_):
+    return os.getpid()
 
-def fail(folder, words):
-    (Path(folder) / f"try_{os.getpid()}").touch()
+def add(first, second):
+    return first + second, os.getpid(), os.environ["OMP_NUM_THREADS"]
+
+def fail(words):
     raise ValueError(words)
 
 def die(folder, times):
@@ -41,7 +61,7 @@ def die(folder, times):
     (Path(folder) / f"try_{os.getpid()}").touch()
     if tries < times:
         os.kill(os.getpid(), signal.SIGKILL)
-    return tries
+    return os.getpid()
 
 def leave(code):
     os._exit(code)
@@ -56,15 +76,15 @@ def interrupt_itself():
     time.sleep(0.05)
     return "still here"
 
-def say_why_it_ends(kind, *words):
+def end_program(kind, *words):
     raise {"exit": SystemExit, "interrupt": KeyboardInterrupt}[kind](*words)
 
 def crash():
-    import ctypes
     ctypes.string_at(0)
 
-def hold_on():
-    time.sleep(600)
+def nap(seconds=600):
+    time.sleep(seconds)
+    return os.getpid()
 
 def grow():
     kept = bytearray(b"x") * 800_000_000
@@ -76,22 +96,31 @@ def write_and_wait(folder, text):
         time.sleep(0.01)
     return text
 
-def threads():
-    return os.environ["OMP_NUM_THREADS"]
-
 def clean_up(folder):
     with (Path(folder) / "cleaned").open("a") as file:
         file.write(".")
 """
 
 
-@pytest.fixture(params=["forkserver", "spawn"], autouse=True)
+@pytest.fixture(autouse=True)
+def ready():
+    """Another test may have stopped everything; and none may leave anything behind."""
+    child_processes.start_server()
+    yield
+    with local_executor(1):
+        pass
+    assert multiprocessing.active_children() == []
+
+
+def use(monkeypatch, method):
+    monkeypatch.setattr(child_processes, "context", multiprocessing.get_context(method))
+    child_processes.start_server()
+
+
+@pytest.fixture(params=["forkserver", "spawn"])
 def method(request, monkeypatch):
     """Children of Linux, and those of Windows and macOS."""
-    context = multiprocessing.get_context(request.param)
-    monkeypatch.setattr(child_processes, "context", context)
-    # Another test may have stopped everything.
-    monkeypatch.setattr(child_processes, "_stopping", threading.Event())
+    use(monkeypatch, request.param)
     return request.param
 
 
@@ -106,11 +135,8 @@ def chores(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def light_server(method, monkeypatch):
+def light_server(monkeypatch):
     """What children are forked from has imported nothing, for tests that end it."""
-    if method == "spawn":
-        yield
-        return
     preloaded, heavy = child_processes.PRELOADED, child_processes.server_pid()
     child_processes.end_server()
     monkeypatch.setattr(child_processes, "PRELOADED", [])
@@ -129,204 +155,178 @@ def nothing():
     pass
 
 
-def test_the_value_comes_back_from_another_process(chores):
-    with local_executor(2) as executor:
-        futures = [executor.submit(supervise, chores.add, n, 1, clean_up=nothing) for n in range(4)]
-        answers = [future.result() for future in futures]
-    assert [value for value, _ in answers] == [1, 2, 3, 4]
-    assert len({pid for _, pid in answers} | {os.getpid()}) == 5
-
-
-def test_one_thread_in_each_process(chores):
-    with local_executor(1) as executor:
-        assert executor.submit(supervise, chores.threads, clean_up=nothing).result() == "1"
-
-
-def test_an_exception_is_not_tried_again_and_its_traceback_is_kept(chores, tmp_path):
-    clean_up = partial(chores.clean_up, str(tmp_path))
-    with pytest.raises(TaskFailedError) as error:
-        supervise(chores.fail, str(tmp_path), "too\n  hot", clean_up=clean_up, tries=3)
-    assert str(error.value) == "too hot"
-    assert "Traceback" in error.value.details
-    assert "in fail" in error.value.details
-    assert error.value.details.endswith("ValueError: too\n  hot\n")
-    assert len(list(tmp_path.glob("try_*"))) == 1
-    assert (tmp_path / "cleaned").read_text() == "."
-
-
-def test_a_process_that_is_killed_costs_one_retry(chores, tmp_path):
-    clean_up = partial(chores.clean_up, str(tmp_path))
-    assert supervise(chores.die, str(tmp_path), 1, clean_up=clean_up) == 1
-    assert len(list(tmp_path.glob("try_*"))) == 2
-    assert (tmp_path / "cleaned").read_text() == ".."
-
-
-def test_a_process_that_always_dies_fails_with_the_signals_name(chores, tmp_path):
-    with pytest.raises(TaskFailedError, match=r"^its process died 2 times \(SIGKILL\)$"):
-        supervise(chores.die, str(tmp_path), 9, clean_up=nothing)
-    assert len(list(tmp_path.glob("try_*"))) == 2
-    with pytest.raises(TaskFailedError, match=r"^its process died 1 times \(exit code 3\)$"):
-        supervise(chores.leave, 3, clean_up=nothing, tries=1)
+alone = partial(supervise, clean_up=nothing)
+shared = partial(supervise, clean_up=nothing, shares_process=True)
 
 
 def is_alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
+    status = Path(f"/proc/{pid}/stat")
+    return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def wait_for(condition, seconds=30):
+def wait_for(condition, seconds=60):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
+def waiting_in(folder):
+    return [int(path.name.partition("_")[2]) for path in folder.glob("waiting_*")]
+
+
+@pytest.mark.usefixtures("method")
+def test_the_value_comes_back_from_another_process(chores):
+    with local_executor(2) as executor:
+        futures = [executor.submit(alone, chores.add, n, 1) for n in range(2)]
+        values, pids, threads = zip(*(future.result() for future in futures), strict=True)
+    assert values == (1, 2)
+    assert len({*pids, os.getpid()}) == 3
+    assert set(threads) == {"1"}
+
+
+# The chore and what it is given, limits, how often it may be tried, and what is said: in a line,
+# and at length.
+KILLED = "its process died 2 times (SIGKILL)"
+SEGMENTATION = ("Fatal Python error: Segmentation fault", "in crash\n")
+TIMED, SIZED = RunLimits(seconds=0.5), RunLimits(memory=700_000_000)
+FAULTS = {
+    "an exception": ("fail", ["too\n  hot"], {"tries": 3}, "too hot", ["ValueError: too\n  hot\n"]),
+    "exit with words": ("end_program", ["exit", "bye"], {}, "SystemExit: bye", ()),
+    "exit with 0": ("end_program", ["exit", 0], {}, "SystemExit: 0", ()),
+    "exit": ("end_program", ["exit"], {}, "SystemExit", ()),
+    "interrupt": ("end_program", ["interrupt"], {}, "KeyboardInterrupt", ()),
+    "interrupt with words": (
+        "end_program",
+        ["interrupt", "a\n b"],
+        {},
+        "KeyboardInterrupt: a b",
+        (),
+    ),
+    "killed": ("die", [".", 9], {}, KILLED, ()),
+    "leaving": ("leave", [3], {"tries": 1}, "its process died 1 times (exit code 3)", ()),
+    "a crash": ("crash", [], {"tries": 1}, "its process died 1 times (SIGSEGV)", SEGMENTATION),
+    "time": ("nap", [], {"limits": TIMED}, "took longer than --run-timeout allows, 0.5 s", ()),
+    "memory": ("grow", [], {"limits": SIZED}, "; --run-memory allows 700 MB", ()),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults(chores, tmp_path, fault):
+    name, given_to, options, reason, details = FAULTS[fault]
+    given_to = [str(tmp_path) if each == "." else each for each in given_to]
+    clean_up = partial(chores.clean_up, str(tmp_path))
+    with pytest.raises(TaskFailedError) as error:
+        supervise(getattr(chores, name), *given_to, clean_up=clean_up, **options)
+    assert str(error.value).endswith(reason)
+    if fault != "memory":
+        assert str(error.value) == reason
+    assert all(words in error.value.details for words in details)
+    has_died = reason.startswith("its process died")
+    assert isinstance(error.value, TaskDiedError) == has_died
+    # Only a process that dies is tried again; after each try there is cleaned up.
+    n_tries = options.get("tries", 2) if has_died else 1
+    assert (tmp_path / "cleaned").read_text() == "." * n_tries
+    if has_died:
+        assert error.value.details.endswith(f"{reason.partition('(')[2][:-1]}, {n_tries} times\n")
+    elif "limits" in options:
+        assert f"in {name}\n" in error.value.details
+        assert error.value.details.endswith(f"{error.value}\n")
+    else:
+        assert "Traceback" in error.value.details
+        assert f"in {name}" in error.value.details
+    assert "Extension modules" not in error.value.details
+
+
+def test_a_process_that_is_killed_costs_one_retry(chores, tmp_path):
+    clean_up = partial(chores.clean_up, str(tmp_path))
+    assert supervise(chores.die, str(tmp_path), 1, clean_up=clean_up) > 0
+    assert len(list(tmp_path.glob("try_*"))) == 2
+    assert (tmp_path / "cleaned").read_text() == ".."
+
+
+def test_a_crash_is_told_where_nothing_forks(chores, monkeypatch):
+    use(monkeypatch, "spawn")
+    with pytest.raises(TaskDiedError, match="SIGSEGV") as error:
+        alone(chores.crash, tries=1)
+    assert all(words in error.value.details for words in SEGMENTATION)
+
+
+def test_within_its_limits_a_task_is_left_alone(chores):
+    assert alone(chores.add, 1, 1, limits=RunLimits(seconds=300, memory=10**12))[0] == 2
+
+
 def test_leaving_early_ends_the_children(chores, tmp_path):
     clean_up = partial(chores.clean_up, str(tmp_path))
+    outcomes = []
 
     def run_and_leave():
         with local_executor(2) as executor:
-            futures = [
-                executor.submit(supervise, chores.wait, str(tmp_path), clean_up=clean_up)
-                for _ in range(3)
-            ]
-            wait_for(lambda: len(list(tmp_path.glob("waiting_*"))) == 2)
-            outcomes.extend(futures)
+            wait = partial(supervise, chores.wait, str(tmp_path), clean_up=clean_up)
+            outcomes.extend(executor.submit(wait) for _ in range(3))
+            wait_for(lambda: len(waiting_in(tmp_path)) == 2)
             raise KeyboardInterrupt
 
-    outcomes = []
     with pytest.raises(KeyboardInterrupt):
         run_and_leave()
-    pids = [int(path.name.partition("_")[2]) for path in tmp_path.glob("waiting_*")]
-    assert not any(map(is_alive, pids))
+    assert not any(map(is_alive, waiting_in(tmp_path)))
     assert (tmp_path / "cleaned").read_text() == ".."
     assert [type(future.exception()) for future in outcomes[:2]] == [StoppedError] * 2
     assert outcomes[2].cancelled()
     # The next block starts afresh.
     with local_executor(1) as executor:
-        assert executor.submit(supervise, chores.add, 1, 1, clean_up=nothing).result()[0] == 2
+        assert executor.submit(alone, chores.add, 1, 1).result()[0] == 2
 
 
 def test_nothing_is_started_after_the_end(chores):
     with local_executor(1) as executor:
         stop_all()
-        future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)
-        assert isinstance(future.exception(), StoppedError)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("exit", "bye"), "SystemExit: bye"),
-        (("exit", 0), "SystemExit: 0"),
-        (("exit",), "SystemExit"),
-        (("interrupt",), "KeyboardInterrupt"),
-        (("interrupt", "from\n inside"), "KeyboardInterrupt: from inside"),
-    ],
-)
-def test_what_ends_a_program_is_a_failure_like_others(chores, arguments, words):
-    with pytest.raises(TaskFailedError) as error:
-        supervise(chores.say_why_it_ends, *arguments, clean_up=nothing)
-    assert str(error.value) == words
-    assert "in say_why_it_ends" in error.value.details
-
-
-def test_a_crash_leaves_its_traceback(chores):
-    with pytest.raises(TaskDiedError, match=r"SIGSEGV") as error:
-        supervise(chores.crash, clean_up=nothing, tries=1)
-    assert "Fatal Python error: Segmentation fault" in error.value.details
-    assert "in crash\n" in error.value.details
-    assert "Extension modules" not in error.value.details
-
-
-@pytest.mark.parametrize(
-    ("chore", "limits", "reason"),
-    [
-        ("hold_on", RunLimits(seconds=0.5), "took longer than --run-timeout allows, 0.5 s"),
-        ("grow", RunLimits(memory=700_000_000), "--run-memory allows 700 MB"),
-    ],
-)
-def test_what_exceeds_a_limit_is_ended_where_it_is(chores, tmp_path, chore, limits, reason, method):
-    if method == "spawn" and chore == "hold_on":
-        limits, reason = RunLimits(seconds=5), "--run-timeout allows, 5 s"
-    clean_up = partial(chores.clean_up, str(tmp_path))
-    with pytest.raises(TaskFailedError) as error:
-        supervise(getattr(chores, chore), clean_up=clean_up, limits=limits)
-    assert reason in str(error.value)
-    assert f"in {chore}\n" in error.value.details
-    assert error.value.details.endswith(f"{error.value}\n")
-    assert not isinstance(error.value, TaskDiedError)
-    assert (tmp_path / "cleaned").read_text() == "."
-
-
-def test_within_its_limits_a_task_is_left_alone(chores):
-    limits = RunLimits(seconds=300, memory=10**12)
-    assert supervise(chores.add, 1, 1, clean_up=nothing, limits=limits)[0] == 2
+        assert isinstance(executor.submit(alone, chores.add, 1, 1).exception(), StoppedError)
 
 
 @pytest.mark.usefixtures("light_server")
-def test_when_the_server_is_killed_all_go_on(chores, tmp_path, method, caplog):
-    if method == "spawn":
-        return
+def test_when_the_server_is_killed_all_go_on(chores, tmp_path, caplog):
     with local_executor(2) as executor:
-        first = executor.submit(
-            supervise, chores.write_and_wait, str(tmp_path), "first", clean_up=nothing
-        )
-        wait_for(lambda: list(tmp_path.glob("waiting_*")))
+        first = executor.submit(alone, chores.write_and_wait, str(tmp_path), "first")
+        wait_for(lambda: waiting_in(tmp_path))
         server = child_processes.server_pid()
         child_processes.end_server()
-        wait_for(lambda: not is_alive(server) or is_zombie(server))
-        assert executor.submit(supervise, chores.add, 1, 1, clean_up=nothing).result()[0] == 2
+        wait_for(lambda: not is_alive(server))
+        assert executor.submit(alone, chores.add, 1, 1).result()[0] == 2
         (tmp_path / "go").touch()
         assert first.result() == "first"
-    assert caplog.messages == [
-        "the process that runs are forked from was killed; it is started anew"
-    ]
-
-
-def is_zombie(pid):
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    told = "the process that runs are forked from was killed; it is started anew"
+    assert caplog.messages == [told]
 
 
 @pytest.mark.usefixtures("light_server")
-def test_a_stop_does_not_wait_for_a_server_that_imports(chores, tmp_path, method, monkeypatch):
+def test_a_stop_does_not_wait_for_a_server_that_imports(chores):
     """Where it is still at that, no child can be started, and the one who waits is let go."""
-    if method == "spawn":
-        return
     with local_executor(1) as executor:
         os.kill(child_processes.server_pid(), signal.SIGSTOP)
-        future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)
-        wait_for(child_processes._lock.locked)
+        future = executor.submit(alone, chores.add, 1, 1)
+        time.sleep(0.5)  # until it asks the server
         began = time.monotonic()
         stop_all()
         assert isinstance(future.exception(), StoppedError)
         assert time.monotonic() - began < 2
 
 
-def test_programs_that_a_task_starts_can_be_ended_as_usual(chores):
-    assert supervise(subprocess.getoutput, "kill $$; echo still here", clean_up=nothing) == ""
-
-
-def test_ctrl_c_does_not_reach_the_children(chores, tmp_path):
-    """The terminal sends it to the whole group; what it means is decided above."""
+def test_signals_of_a_whole_group_do_not_reach_the_children(chores, tmp_path):
+    """The terminal sends Ctrl-C to all; what it means is decided above."""
+    assert alone(chores.interrupt_itself, tries=1) == "still here"
+    # Programs that a task starts can be ended as usual.
+    assert alone(subprocess.getoutput, "kill $$; echo still here") == ""
     with local_executor(1) as executor:
-        waiting = executor.submit(supervise, chores.wait, str(tmp_path), clean_up=nothing)
-        wait_for(lambda: list(tmp_path.glob("waiting_*")))
-        (path,) = tmp_path.glob("waiting_*")
-        pid = int(path.name.partition("_")[2])
+        waiting = executor.submit(alone, chores.wait, str(tmp_path))
+        wait_for(lambda: waiting_in(tmp_path))
+        (pid,) = waiting_in(tmp_path)
         os.kill(pid, signal.SIGINT)
         time.sleep(0.2)
         assert is_alive(pid)
         assert not waiting.done()
         stop_all()
         assert isinstance(waiting.exception(), StoppedError)
-
-
-def test_a_child_works_through_ctrl_c(chores):
-    assert supervise(chores.interrupt_itself, clean_up=nothing, tries=1) == "still here"
 
 
 # A supervisor of its own, which is to be killed.
@@ -345,16 +345,16 @@ if __name__ == "__main__":
 """
 
 
-def test_a_child_ends_with_its_supervisor_and_cleans_up(chores, tmp_path, method):
-    driver = tmp_path / "driver.py"
-    driver.write_text(DRIVER)
+@pytest.mark.usefixtures("chores")
+def test_a_child_ends_with_its_supervisor_and_cleans_up(tmp_path, method):
+    (tmp_path / "driver.py").write_text(DRIVER)
     paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
-    command = [sys.executable, str(driver), method, str(tmp_path)]
+    command = [sys.executable, str(tmp_path / "driver.py"), method, str(tmp_path)]
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}) as process:
-        wait_for(lambda: list(tmp_path.glob("waiting_*")))
+        wait_for(lambda: waiting_in(tmp_path))
         process.kill()
-    (path,) = tmp_path.glob("waiting_*")
-    wait_for(lambda: not is_alive(int(path.name.partition("_")[2])))
+    (pid,) = waiting_in(tmp_path)
+    wait_for(lambda: not is_alive(pid))
     assert (tmp_path / "cleaned").read_text() == "."
 
 
@@ -368,7 +368,265 @@ def test_only_linux_forks(monkeypatch, platform, expected):
         monkeypatch.setitem(sys.modules, "multiprocessing.forkserver", None)
         monkeypatch.delattr(signal, "pthread_sigmask")
     loaded = runpy.run_path(child_processes.__file__)
-    assert loaded["START_METHOD"] == expected
-    assert loaded["context"].get_start_method() == expected
+    assert loaded["START_METHOD"] == loaded["context"].get_start_method() == expected
     if platform != "linux":
         loaded["start_server"]()
+
+
+# --- Tasks that share a process.
+
+
+def test_tasks_that_may_share_a_process_do_and_others_do_not(chores):
+    with local_executor(1) as executor:
+        ask = [executor.submit(shared, chores.who) for _ in range(3)]
+        assert len({each.result() for each in ask}) == 1
+        by_itself = executor.submit(alone, chores.who).result()
+        limited = executor.submit(shared, chores.who, limits=RunLimits(memory=10**12)).result()
+        again = executor.submit(shared, chores.who).result()
+    assert len({ask[0].result(), by_itself, limited, again}) == 4
+    assert multiprocessing.active_children() == []
+
+
+def test_after_a_fault_the_next_begins_afresh(chores, tmp_path):
+    first = shared(chores.who)
+    with pytest.raises(TaskFailedError, match="thin ice"):
+        shared(chores.fail, "thin ice")
+    second = shared(chores.who)
+    third = shared(chores.die, str(tmp_path), 1)  # it is tried again
+    assert shared(chores.who) not in {first, second}
+    assert len({first, second, third}) == 3
+    os.kill(shared(chores.who), signal.SIGKILL)  # while it waits
+    assert shared(chores.who) > 0
+
+
+def test_a_limit_of_time_is_that_of_the_task_alone(chores):
+    limits = RunLimits(seconds=3)
+    first = shared(chores.nap, 1.2, limits=limits)
+    for _ in range(2):
+        assert shared(chores.nap, 1.2, limits=limits) == first
+    with pytest.raises(TaskFailedError, match="--run-timeout allows, 3 s") as error:
+        shared(chores.nap, 60, limits=limits)
+    assert not isinstance(error.value, TaskDiedError)
+    assert "in nap\n" in error.value.details
+    assert shared(chores.who) != first
+
+
+def test_a_stop_ends_those_that_work_and_those_that_wait(chores):
+    with local_executor(2) as executor:
+        ask = [executor.submit(shared, chores.nap, 0.3) for _ in range(2)]
+        pids = {each.result() for each in ask}
+        working = executor.submit(shared, chores.nap, 60)
+        time.sleep(0.2)
+        stop_all()
+        assert isinstance(working.exception(), StoppedError)
+    assert not any(map(is_alive, pids))
+
+
+# --- Runs that share a process: to the same bits, and which those are.
+
+SMALL = {"engine": "compiled", "n_timesteps": 600, "policy_kwargs": {"net_arch": [8]}}
+Q = {**SMALL, "learning_starts": 50, "buffer_size": 300, "batch_size": 16}
+CLIPPED = [{"gymnasium.wrappers.ClipReward": {"min_reward": 0, "max_reward": 0.5}}]
+HOUSE = EnvironmentSpec("house", "Warehouse-v0", {"n_episodes": 60, "env_kwargs": {"slip": 0.1}})
+MINES = EnvironmentSpec("mines", "MineMaze-v0", {"n_timesteps": 3000})
+LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"train_env_wrapper": CLIPPED})
+TABLES = {
+    "qlearning": {},
+    "sarsa": {"learning_rate": 0.3, "mask_actions": True},
+    "double_qlearning": {"n_envs": 2},
+}
+NETWORKS = {"ppo": {**SMALL, "n_steps": 64, "n_envs": 2}, "dqn": Q}
+
+
+def runs_of(root, agents=TABLES, environments=(HOUSE, MINES), n_seeds=2):
+    specs = [AgentSpec(algo, algo, settings, tuned=False) for algo, settings in agents.items()]
+    return plan(StudySpec("s", "S", tuple(specs), environments, n_seeds=n_seeds), root)
+
+
+def do_together(root, runs):
+    root.mkdir()
+    assert not execute(runs, root, partial(local_launcher, root, "c", 1), lambda *_: None)
+
+
+@pytest.mark.parametrize(
+    ("agents", "environments"),
+    [(TABLES, (HOUSE, MINES)), (NETWORKS, (LAKE,))],
+    ids=["tables", "networks"],
+)
+def test_runs_in_one_process_leave_what_each_leaves_alone(tmp_path, agents, environments):
+    """Of the last seed, whose runs come after all others, one of each agent."""
+    contents = runpy.run_path(str(ROOT / "benchmarks/_run_contents.py"))["contents"]
+    together = runs_of(tmp_path / "together", agents, environments)
+    last = slice(-len(together) // 2, None, len(environments))
+    others = runs_of(tmp_path / "alone", agents, environments)[last]
+    assert all(is_plain(run.spec) for run in together)
+    do_together(tmp_path / "together", together)
+    for run in others:
+        alone(do_run, run, draft_path(tmp_path / "alone", run), "c")
+    assert {run.agent for run in others} == set(agents)
+    for mine, its in zip(together[last], others, strict=True):
+        assert mine.run.read_info()["engine"] == "compiled"
+        ours, theirs = contents(mine.path), contents(its.path)
+        assert ours.keys() == theirs.keys()
+        for name, found in ours.items():
+            assert repr(found) == repr(theirs[name]), (mine.path, name)
+
+
+def test_seconds_of_runs_that_share_a_process_are_their_own(tmp_path):
+    lake = (EnvironmentSpec("lake", "FrozenLake-v1", {}),)
+    budgets = {"qlearning": {"n_timesteps": 1000}, "sarsa": {"n_timesteps": 6_000_000}}
+    runs = runs_of(tmp_path / "s", budgets, lake)
+    do_together(tmp_path / "s", runs)
+    short, long, *again = [run.run.read_info()["cpu_seconds"] for run in runs]
+    assert max(short, again[0]) < min(long, again[1]) / 3
+
+
+def test_what_a_run_must_not_share_its_process_with():
+    spec = runs_of(Path("x"))[0].spec
+    special = spec.hyperparams
+    library = replace(special, algorithm={"engine": "library"})
+    for other in (
+        {"gym_packages": ("mine",)},
+        {"tensorboard_log": Path("t")},
+        {"trained_agent": Path("a.zip")},
+        {"algo": "dqn"},
+        {"algo": "ppo", "hyperparams": library},
+        {"algo": "sac", "hyperparams": replace(special, algorithm={"engine": "compiled"})},
+        {"algo": "no_such_agent"},
+        {"hyperparams": replace(special, callback="mine.Callback")},
+        {"hyperparams": replace(special, env_wrapper="mine.Wrapper")},
+        {"hyperparams": replace(special, train_env_wrapper=(ComponentSpec("mine.Wrapper"),))},
+        {"hyperparams": replace(special, normalize={})},
+        {"vec_env": "subproc"},
+        {"env_id": "Nowhere-v0"},
+    ):
+        assert not is_plain(replace(spec, **other)), other
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """The warehouse's entry, which may be changed."""
+    entry = copy.deepcopy(gym.registry["Warehouse-v0"])
+    monkeypatch.setitem(gym.registry, "Warehouse-v0", entry)
+    return entry
+
+
+def test_an_environment_registered_by_somebody_else_is_no_plain_one(registered):
+    spec = runs_of(Path("x"))[0].spec
+    registered.entry_point = "mine.houses:Warehouse"
+    assert not is_plain(spec)
+
+
+def test_an_evaluator_is_kept_for_runs_on_the_very_same_environment(registered):
+    house, mines = (runs_of(Path("x"), environments=(e,))[0].spec for e in (HOUSE, MINES))
+    first = evaluator_of(house)
+    assert evaluator_of(replace(house, seed=5)) is first
+    assert first.yardstick == exact_evaluator(house).yardstick
+    slippery = replace(house.hyperparams, eval_env_kwargs={"slip": 0.4})
+    assert evaluator_of(replace(house, hyperparams=slippery)).yardstick != first.yardstick
+    masked = replace(house.hyperparams, algorithm={"mask_actions": True})
+    assert evaluator_of(replace(house, hyperparams=masked)) is not first
+    assert evaluator_of(mines).model.n_states != first.model.n_states
+    registered.kwargs["shelf_reward"] = -7
+    assert evaluator_of(house).yardstick != first.yardstick
+
+
+# --- Limits: how they are written, and what a process takes.
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "value"),
+    [
+        (seconds, "90", 90),
+        (seconds, "0.5 s", 0.5),
+        (seconds, "10m", 600),
+        (seconds, "10min", 600),
+        (seconds, "1.5h", 5400),
+        (seconds, "2D", 172800),
+        (seconds, "4", 4),
+        (memory, "4gb", 4e9),
+        (memory, "1.5 GB", 1.5e9),
+        (memory, "500MB", 5e8),
+        (memory, "4GiB", 2**32),
+        (memory, "5000000", 5e6),
+        (memory, "4", None),
+        *(
+            (read, text, None)
+            for read in (seconds, memory)
+            for text in (
+                "",
+                "0",
+                "-1",
+                "nan",
+                "1e3s",
+                "10 parsecs",
+                "m",
+                "10m5",
+                "\u0663m",
+                "9" * 40,
+            )
+        ),
+    ],
+)
+def test_times_and_sizes(read, text, value):
+    if value is None:
+        with pytest.raises(ValueError, match=r"must be a (time|size)"):
+            read(text)
+    else:
+        assert read(text) == value
+        assert isinstance(memory("1MB"), int)
+
+
+@given(st.text())
+def test_whatever_is_written_is_a_limit_or_refused(text):
+    for read, most in ((seconds, 10**9), (memory, 10**18)):
+        with contextlib.suppress(ValueError):
+            assert 0 < read(text) <= most
+
+
+@pytest.mark.parametrize(
+    ("limits", "elapsed", "words"),
+    [
+        ({}, 1e9, ""),
+        ({"seconds": 5}, 5, ""),
+        ({"seconds": 5}, 5.1, "took longer than --run-timeout allows, 5 s"),
+        ({"memory": 10**15}, 1e9, ""),
+        ({"memory": 2 * 10**6}, 3, "of memory after 3 s; --run-memory allows 2 MB"),
+        ({"is_wanted": lambda: True}, 1, ""),
+        ({"is_wanted": lambda: False}, 1, "nobody waits for it any more"),
+    ],
+)
+def test_which_limit_is_exceeded(limits, elapsed, words):
+    found = RunLimits(**limits)
+    told = found.exceeded(os.getpid(), elapsed)
+    assert words in told
+    assert bool(told) == bool(words)
+    assert found.pause == (run_limits.SECONDS_BETWEEN_LOOKS if limits else None)
+
+
+def test_the_memory_that_a_process_takes():
+    before = resident_memory(os.getpid())
+    # Of the system: what Python asks for may be memory that this process has had before.
+    with mmap.mmap(-1, 50_000_000) as kept:
+        for start in range(0, len(kept), mmap.PAGESIZE):
+            kept[start] = 1
+        assert 45e6 < resident_memory(os.getpid()) - before < 60e6
+    assert resident_memory(2**31 - 2) == 0
+
+
+def test_where_there_is_no_proc_another_program_tells(monkeypatch):
+    def ps(command, **options):
+        assert command == ["ps", "-o", "rss=", "-p", "7"]
+        return subprocess.CompletedProcess(command, 0, b" 1234\n")
+
+    exists = Path.exists
+    monkeypatch.setattr(Path, "exists", lambda path: "/proc/self" not in str(path) and exists(path))
+    monkeypatch.setattr(run_limits.subprocess, "run", ps)
+    assert resident_memory(7) == 1234 * 1024
+
+
+def test_windows_refuses_what_it_cannot_measure(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "win32")
+    RunLimits(seconds=3)
+    with pytest.raises(UserError, match="not measured on Windows"):
+        RunLimits(memory=10**9)

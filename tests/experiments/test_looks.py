@@ -24,87 +24,85 @@ from report.conclusions import conclusion
 from verdicts import level_of_look
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
+TWO, THREE = ("qlearning", "sarsa"), ("qlearning", "sarsa", "expected_sarsa")
 # The first is far ahead; the others overlap, and need more seeds.
 ENDS = {
     "qlearning": [90 + k % 7 for k in range(60)],
     "sarsa": [(37 * k) % 50 for k in range(60)],
     "expected_sarsa": [(29 * k) % 50 + 1 for k in range(60)],
 }
+FEWER = {**ENDS, "sarsa": [None, *ENDS["sarsa"][1:]]}
+OTHERS = {**ENDS, "sarsa": [99, *ENDS["sarsa"][1:]]}
 
 
-def study_of(*agents, n_seeds=10, **fields):
-    specs = tuple(AgentSpec(name, name) for name in agents or ("qlearning", "sarsa"))
-    return StudySpec("s", "S", specs, (LAKE,), n_seeds, **fields)
+def study_of(agents=TWO, n_seeds=10, **fields):
+    specs = tuple(AgentSpec(name, name) for name in agents)
+    return StudySpec("s", "S", specs, fields.pop("environments", (LAKE,)), n_seeds, **fields)
 
 
 def results_of(study, root, ends=ENDS, counts=None):
     """A study whose runs ended so, by agent and seed; None for one that is missing."""
     planned = plan(study, root, counts)
-    rows = [
-        {
-            "agent": run.agent,
-            "environment": run.environment,
-            "env_id": run.spec.env_id,
-            "seed": run.seed,
-            "final": float(ends[run.agent][run.seed]),
-            "score": ends[run.agent][run.seed] / 100,
-            "area": float(ends[run.agent][run.seed]),
-            "exact": True,
-            "optimum": 100.0,
-            "baseline": 0.0,
-        }
-        for run in planned
-        if ends[run.agent][run.seed] is not None
-    ]
+    rows = []
+    for run in planned:
+        end = ends[run.agent][run.seed]
+        if end is not None:
+            row = {"agent": run.agent, "environment": run.environment, "env_id": run.spec.env_id}
+            row |= {"seed": run.seed, "final": float(end), "area": float(end), "score": end / 100}
+            rows.append({**row, "exact": True, "optimum": 100.0, "baseline": 0.0})
     tables = pd.DataFrame(rows, columns=RUN_COLUMNS), pd.DataFrame(columns=CURVE_COLUMNS)
     return StudyResults(study, root, *tables, tuple(planned))
 
 
-def look(root, *agents, ends=ENDS, **fields):
-    """Which look it is, and its level."""
-    standing = take_looks(results_of(study_of(*agents, **fields), root, ends))["lake"]
-    return standing.number, standing.level
-
-
-def everything_said(analysis):
-    """All sentences on the one environment."""
-    return " ".join(conclusion(analysis.study, analysis.environments[0]).everything)
-
-
-def number_of_looks(root):
-    return len(read_looks(root).get("lake", Looks()).taken)
+def look(root, ends=ENDS, **fields):
+    """Which look it is, and at the level of which."""
+    standing = take_looks(results_of(study_of(**fields), root, ends))["lake"]
+    levels = {level(k): k for k in range(1, 9)} | {level(1) / 4: "a quarter"}
+    return standing.number, levels[standing.level]
 
 
 def level(k):
     return level_of_look(0.05, k)
 
 
+def number_of_looks(root, environment="lake"):
+    return len(read_looks(root).get(environment, Looks()).taken)
+
+
+def everything_said(analysis):
+    return " ".join(conclusion(analysis.study, analysis.environments[0]).everything)
+
+
 def test_a_look_counts_when_the_runs_or_the_question_are_others(tmp_path):
-    three = ("qlearning", "sarsa", "expected_sarsa")
-    assert look(tmp_path) == (1, level(1))
-    assert look(tmp_path) == (1, level(1))
-    assert look(tmp_path, n_seeds=20) == (2, level(2))
-    assert look(tmp_path, n_seeds=10) == (1, level(1))
-    assert look(tmp_path, n_seeds=20, metric="area") == (3, level(3))
-    assert look(tmp_path, n_seeds=20, margin=1.0) == (4, level(4))
-    assert look(tmp_path, n_seeds=20, threshold=0.5) == (5, level(5))
-    assert look(tmp_path, *three, n_seeds=20) == (6, level(6))
-    assert look(tmp_path, *three, n_seeds=20) == (6, level(6))
-    assert look(tmp_path, n_seeds=20, first_seed=30) == (7, level(7))
-    assert number_of_looks(tmp_path) == 7
+    dry = replace(LAKE, label="dry")
+    for place, fields in [
+        (1, {}),
+        (1, {}),
+        (2, {"n_seeds": 20}),
+        (1, {"n_seeds": 10}),
+        (3, {"n_seeds": 20, "metric": "area"}),
+        (4, {"n_seeds": 20, "margin": 1.0}),
+        (5, {"n_seeds": 20, "threshold": 0.5}),
+        (6, {"n_seeds": 20, "agents": THREE}),
+        (6, {"n_seeds": 20, "agents": THREE}),
+        (7, {"n_seeds": 20, "first_seed": 30}),
+        (8, {"n_seeds": 25, "environments": (LAKE, dry)}),
+    ]:
+        assert look(tmp_path, **fields) == (place, place)
+    # Environments are counted by themselves.
+    assert (number_of_looks(tmp_path), number_of_looks(tmp_path, "dry")) == (8, 1)
     (tmp_path / LOOKS_FILE).unlink()
-    assert look(tmp_path, n_seeds=20) == (1, level(1))
+    assert look(tmp_path, n_seeds=20) == (1, 1)
 
 
 def test_too_few_seeds_to_say_anything_are_no_look(tmp_path):
-    assert look(tmp_path, n_seeds=4) == (1, level(1))
+    assert look(tmp_path, n_seeds=4) == (1, 1)
     assert not (tmp_path / LOOKS_FILE).exists()
-    assert look(tmp_path, n_seeds=5) == (1, level(1))
+    assert look(tmp_path, n_seeds=5) == (1, 1)
     # At the level of the second look it takes nine seeds.
-    assert look(tmp_path, n_seeds=8) == (2, level(2))
-    assert number_of_looks(tmp_path) == 1
-    assert look(tmp_path, n_seeds=9) == (2, level(2))
-    assert number_of_looks(tmp_path) == 2
+    for n_seeds, n_looks in ((8, 1), (9, 2)):
+        assert look(tmp_path, n_seeds=n_seeds) == (2, 2)
+        assert number_of_looks(tmp_path) == n_looks
 
 
 def test_what_is_no_look_claims_nothing_of_failures_either(tmp_path):
@@ -116,69 +114,56 @@ def test_what_is_no_look_claims_nothing_of_failures_either(tmp_path):
 
 
 def test_a_run_that_is_damaged_since_costs_no_look_and_one_that_is_new_does(tmp_path):
-    fewer = {**ENDS, "sarsa": [None, *ENDS["sarsa"][1:]]}
-    other = {**ENDS, "sarsa": [99, *ENDS["sarsa"][1:]]}
-    assert look(tmp_path) == (1, level(1))
-    assert look(tmp_path, ends=fewer) == (1, level(1))
-    assert look(tmp_path, ends=other) == (2, level(2))
+    assert look(tmp_path) == look(tmp_path, FEWER) == (1, 1)
+    assert look(tmp_path, OTHERS) == (2, 2)
     (tmp_path / LOOKS_FILE).unlink()
-    assert look(tmp_path, ends=fewer) == (1, level(1))
-    assert look(tmp_path) == (2, level(2))
-
-
-def test_environments_are_counted_by_themselves(tmp_path):
-    study = study_of()
-    dry = EnvironmentSpec("dry", "FrozenLake-v1", {"n_timesteps": 10})
-    assert look(tmp_path) == (1, level(1))
-    both = take_looks(results_of(replace(study, environments=(LAKE, dry)), tmp_path))
-    assert [(name, each.number) for name, each in both.items()] == [("lake", 1), ("dry", 1)]
-    assert look(tmp_path, n_seeds=11) == (2, level(2))
-    assert len(read_looks(tmp_path)["dry"].taken) == 1
+    assert look(tmp_path, FEWER) == (1, 1)
+    assert look(tmp_path) == (2, 2)
 
 
 def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
     tmp_path, monkeypatch
 ):
-    assert look(tmp_path) == (1, level(1))
+    assert look(tmp_path) == (1, 1)
     before = (tmp_path / LOOKS_FILE).read_bytes()
 
     def cut_off(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.files.put_in_place", cut_off)
+        patch.setattr("pipeline.files.put_in_place", cut_off)  # Ctrl-C at the worst moment
         with pytest.raises(KeyboardInterrupt):
             look(tmp_path, n_seeds=20)
     assert [path.name for path in tmp_path.iterdir()] == [LOOKS_FILE]
     assert (tmp_path / LOOKS_FILE).read_bytes() == before
-    assert look(tmp_path, n_seeds=20) == (2, level(2))
+    assert look(tmp_path, n_seeds=20) == (2, 2)
 
 
 def test_page_and_terminal_say_which_look_it_is(tmp_path):
-    results = results_of(study_of(), tmp_path)
-    assert "look" not in everything_said(analyse(results, looks=take_looks(results)))
-    results = results_of(study_of(n_seeds=20), tmp_path)
-    text = everything_said(analyse(results, looks=take_looks(results)))
-    assert "This is the second look at this study: claims at 0.25 %." in text
-    results = results_of(study_of(n_seeds=8), tmp_path)
-    text = everything_said(analyse(results, looks=take_looks(results)))
+    def said(n_seeds):
+        results = results_of(study_of(n_seeds=n_seeds), tmp_path)
+        return everything_said(analyse(results, looks=take_looks(results)))
+
+    assert "look" not in said(10)
+    assert "This is the second look at this study: claims at 0.25 %." in said(20)
+    text = said(8)
     assert "8 seeds cannot tell 2 agents apart, whatever they score; it takes 11 or more" in text
     assert "This would be the third look at this study, with claims at 0.083 %; runs that" in text
     assert "This is the" not in text
 
 
+# --- The file.
+
+
 def damages(data):
     """The data of a file, each time with something that was not written so."""
     lake = data["environments"]["lake"]
-    first = lake["taken"][0]
-    yield {}
-    yield []
-    yield {**data, "format": 2}
-    yield {**data, "environments": {"lake": []}}
-    for key in lake:
-        yield {**data, "environments": {"lake": {k: v for k, v in lake.items() if k != key}}}
-    yield {**data, "environments": {"lake": {**lake, "taken": lake["taken"][1:]}}}
-    yield {**data, "environments": {"lake": {**lake, "taken": lake["taken"][::-1]}}}
+    first, *others = lake["taken"]
+    question = first["question"]
+    design = {"question": question, "sizes": [10, 20], "seeds": {"a": 10}, "after": 0}
+    yield from ({}, [], {**data, "format": 2})
+    changed = [[], *({k: v for k, v in lake.items() if k != key} for key in lake)]
+    changed += [{**lake, "taken": others}, {**lake, "taken": lake["taken"][::-1]}]
     for key, value in [
         ("level", 0.05),
         ("level", None),
@@ -188,16 +173,14 @@ def damages(data):
         ("seeds", {"qlearning": 10}),
         ("runs", {"qlearning": True, "sarsa": 10}),
         ("digests", {"qlearning": 1, "sarsa": "2"}),
-        ("question", {**first["question"], "metric": "luck"}),
-        ("question", {**first["question"], "margin": 10**400}),
-        ("question", {**first["question"], "margin": "1"}),
+        ("question", {**question, "metric": "luck"}),
+        ("question", {**question, "margin": 10**400}),
+        ("question", {**question, "margin": "1"}),
         ("question", {}),
         ("date", 5),
         ("more", 5),
     ]:
-        looks = [{**first, key: value}, *lake["taken"][1:]]
-        yield {**data, "environments": {"lake": {**lake, "taken": looks}}}
-    design = {"question": first["question"], "sizes": [10, 20], "seeds": {"a": 10}, "after": 0}
+        changed.append({**lake, "taken": [{**first, key: value}, *others]})
     for key, value in [
         ("sizes", []),
         ("sizes", [20, 10]),
@@ -208,24 +191,20 @@ def damages(data):
         ("after", -1),
         ("after", 0),  # right in itself, but the first look had the level of the first
     ]:
-        changed = {**lake, "design": {**design, key: value}}
-        yield {**data, "environments": {"lake": changed}}
+        changed.append({**lake, "design": {**design, key: value}})
+    yield from ({**data, "environments": {"lake": each}} for each in changed)
 
 
 def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
     look(tmp_path)
     look(tmp_path, n_seeds=20)
     path = tmp_path / LOOKS_FILE
-    data = json.loads(path.read_text())
-    found = list(damages(data))
-    assert len(found) > 25
-    for each in found:
-        path.write_text(json.dumps(each))
-        with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
-            read_looks(tmp_path)
-    for text in ("", "{", "[" * 100_000, "\x00", '{"format": 1e999}', "9" * 10_000):
+    texts = [json.dumps(each) for each in damages(json.loads(path.read_text()))]
+    assert len(texts) > 25
+    texts += ["", "{", "[" * 100_000, "\x00", '{"format": 1e999}', "9" * 10_000]
+    for text in texts:
         path.write_text(text)
-        with pytest.raises(UserError, match=r"looks\.json is damaged: "):
+        with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
             read_looks(tmp_path)
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match="it is no JSON"):
@@ -234,6 +213,9 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
     path.mkdir()
     with pytest.raises(UserError, match="is no regular file"):
         read_looks(tmp_path)
+
+
+# --- Studies that grow.
 
 
 def grow(study, root, most=None, steps=99, ends=ENDS):
@@ -250,99 +232,89 @@ def grow(study, root, most=None, steps=99, ends=ENDS):
     return counts, taken
 
 
-THREE = ("qlearning", "sarsa", "expected_sarsa")
-
-
 def test_a_study_grows_where_it_is_undecided_and_remembers_each_look(tmp_path):
-    study = study_of(*THREE)
-    counts, steps = grow(study, tmp_path, most=40)
-    assert {name: n for (name, _), n in counts.items()} == {
-        "qlearning": 10,
-        "sarsa": 40,
-        "expected_sarsa": 40,
-    }
+    counts, steps = grow(study_of(THREE), tmp_path, most=40)
+    assert {name: n for (name, _), n in counts.items()} == dict(
+        zip(THREE, (10, 40, 40), strict=True)
+    )
     assert [step.growth.n_looks for (step,) in steps] == [1, 2, 3, 4]
     assert steps[-1][0].undecided == [("sarsa", "expected_sarsa")]
-    looks = read_looks(tmp_path)["lake"]
-    assert [dict(each.seeds)["sarsa"] for each in looks.taken] == [10, 16, 25, 40]
-    assert [dict(each.seeds)["qlearning"] for each in looks.taken] == [10] * 4
-    assert {each.level for each in looks.taken} == {level(1) / 4}
-    assert all(each.planned for each in looks.taken)
+    taken = read_looks(tmp_path)["lake"].taken
+    assert [dict(each.seeds)["sarsa"] for each in taken] == [10, 16, 25, 40]
+    assert [dict(each.seeds)["qlearning"] for each in taken] == [10] * 4
+    assert {(each.level, each.planned) for each in taken} == {(level(1) / 4, True)}
     # Grown by hand, it is looked at with what is left.
-    assert look(tmp_path, *THREE, n_seeds=50) == (5, level(2))
-    assert look(tmp_path, *THREE, n_seeds=60) == (6, level(3))
+    assert look(tmp_path, agents=THREE, n_seeds=50) == (5, 2)
+    assert look(tmp_path, agents=THREE, n_seeds=60) == (6, 3)
     # The same runs as at a look that was settled are that look.
-    assert look(tmp_path, *THREE, n_seeds=10) == (1, level(1) / 4)
+    assert look(tmp_path, agents=THREE, n_seeds=10) == (1, "a quarter")
 
 
 @pytest.mark.parametrize("stop", range(1, 4))
 def test_interrupted_at_any_look_it_ends_the_same(tmp_path, stop):
-    study = study_of(*THREE)
+    study = study_of(THREE)
     whole = grow(study, tmp_path / "whole", most=40)
     grow(study, tmp_path / "parts", most=40, steps=stop)
     parts = grow(study, tmp_path / "parts")
     assert parts[0] == whole[0]
     assert parts[1][-1][0].growth == whole[1][-1][0].growth
-    undated = [
-        [replace(each, date="") for each in read_looks(tmp_path / name)["lake"].taken]
-        for name in ("whole", "parts")
-    ]
+    taken = [read_looks(tmp_path / name)["lake"].taken for name in ("whole", "parts")]
+    undated = [[replace(each, date="") for each in looks] for looks in taken]
     assert undated[0] == undated[1]
 
 
 def test_after_a_look_by_hand_the_settled_ones_share_what_is_left(tmp_path):
-    assert look(tmp_path, *THREE) == (1, level(1))
-    grow(study_of(*THREE), tmp_path, most=40)
+    assert look(tmp_path, agents=THREE) == (1, 1)
+    grow(study_of(THREE), tmp_path, most=40)
     design = read_looks(tmp_path)["lake"].design
     # At so low a level, ten seeds could not decide anything.
     assert (design.after, design.sizes[0] > 10, design.level) == (1, True, level(2))
-    assert look(tmp_path, *THREE, n_seeds=50)[1] == level(3)
+    assert look(tmp_path, agents=THREE, n_seeds=50)[1] == 3
 
 
 @pytest.mark.parametrize(
-    ("study", "most", "words"),
+    ("changes", "most", "words"),
     [
-        (study_of(*THREE), 60, "looks at seeds [10, 16, 25, 40], now [10, 16, 24, 38, 60]"),
-        (study_of(*THREE, n_seeds=12), None, "looks at seeds"),
-        (study_of(*THREE, metric="area"), None, "metric final, now area"),
-        (study_of(*THREE, margin=3.0), None, "margin None, now 3.0"),
-        (study_of(*THREE, first_seed=5), None, "first_seed 0, now 5"),
-        (study_of(), None, "agents ['expected_sarsa', 'qlearning', 'sarsa'], now "),
+        ({}, 60, "looks at seeds [10, 16, 25, 40], now [10, 16, 24, 38, 60]"),
+        ({"n_seeds": 12}, None, "looks at seeds"),
+        ({"metric": "area"}, None, "metric final, now area"),
+        ({"margin": 3.0}, None, "margin None, now 3.0"),
+        ({"first_seed": 5}, None, "first_seed 0, now 5"),
+        ({"agents": TWO}, None, "agents ['expected_sarsa', 'qlearning', 'sarsa'], now "),
     ],
 )
-def test_what_was_settled_cannot_change(tmp_path, study, most, words):
-    grow(study_of(*THREE), tmp_path, most=40)
+def test_what_was_settled_cannot_change(tmp_path, changes, most, words):
+    grow(study_of(THREE), tmp_path, most=40)
     before = (tmp_path / LOOKS_FILE).read_bytes()
     with pytest.raises(UserError, match="looks were fixed before the first") as refusal:
-        settled_looks(study, tmp_path, most)
+        settled_looks(study_of(**{"agents": THREE, **changes}), tmp_path, most)
     assert words in str(refusal.value)
     assert (tmp_path / LOOKS_FILE).read_bytes() == before
 
 
 def test_nothing_is_settled_that_could_not_be(tmp_path):
     with pytest.raises(UserError, match="two agents or more"):
-        settled_looks(study_of("qlearning"), tmp_path, None)
+        settled_looks(study_of(["qlearning"]), tmp_path, None)
     with pytest.raises(UserError, match="--max-seeds is 9, the study begins with 10 seeds"):
         settled_looks(study_of(), tmp_path, 9)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_runs_that_were_looked_at_and_are_others_now_are_refused(tmp_path):
-    study = study_of(*THREE)
+    study = study_of(THREE)
     grow(study, tmp_path, most=40, steps=2)
     with pytest.raises(UserError, match="on lake, runs have changed since they were looked at"):
-        grow(study, tmp_path, ends={**ENDS, "sarsa": [99, *ENDS["sarsa"][1:]]})
+        grow(study, tmp_path, ends=OTHERS)
     # One that is missing now makes no such claim, nor one that was missing then.
-    grow(study, tmp_path, ends={**ENDS, "sarsa": [None, *ENDS["sarsa"][1:]]}, steps=1)
+    grow(study, tmp_path, ends=FEWER, steps=1)
     grow(study, tmp_path, steps=1)
 
 
 def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp_path):
-    study = study_of(*THREE)
+    study = study_of(THREE)
     counts, steps = grow(study, tmp_path, most=40)
     results = results_of(grown(study, counts), tmp_path, counts=counts)
-    looks = {step.environment: step.standing for step in steps[-1]}
-    analysis = analyse(results, looks=looks)
+    analysis = analyse(results, looks={step.environment: step.standing for step in steps[-1]})
     text = everything_said(analysis)
     assert text.startswith("qlearning is best: ")
     assert "qlearning is better than " in text
@@ -353,11 +325,9 @@ def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp
     assert "missing" not in text
     # What was decided is what was said of those seeds then.
     first = analyse(results_of(study, tmp_path), looks={"lake": steps[0][0].standing})
-    pairs = [
+    now, then = (
         {frozenset((p.first, p.second)): p.difference for p in each.environments[0].pairs}
         for each in (analysis, first)
-    ]
-    for other in ("sarsa", "expected_sarsa"):
-        assert (
-            pairs[0][frozenset(("qlearning", other))] == pairs[1][frozenset(("qlearning", other))]
-        )
+    )
+    for pair in (frozenset(("qlearning", other)) for other in THREE[1:]):
+        assert now[pair] == then[pair]

@@ -91,14 +91,10 @@ def test_a_study_reads_plans_and_fits(path, tmp_path):
     assert len(short) < len(planned)
 
 
-@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
-def test_the_guide_gives_the_command_of_each_study(path):
-    assert f"python compare.py studies/{path.name}\n" in GUIDE
-
-
-def test_the_guide_names_no_study_that_is_not_there():
-    named = set(re.findall(r"studies/([\w-]+\.yml)", GUIDE))
+def test_the_guide_gives_the_command_of_each_study():
+    named = set(re.findall(r"python compare.py studies/([\w-]+\.yml)\n", GUIDE))
     assert named == {path.name for path in STUDIES}
+    assert set(re.findall(r"studies/([\w-]+\.yml)", GUIDE)) == named
 
 
 def test_the_course_s_search_begins_inside_its_space():
@@ -109,19 +105,6 @@ def test_the_course_s_search_begins_inside_its_space():
     # Three values of three settings, and what it begins with.
     assert math.prod(map(len, space.grid(3).values())) + 1 == 28
     assert GUIDE.count("--trials 28") == 2
-
-
-@pytest.fixture(scope="module")
-def cart_pole(tmp_path_factory):
-    """Training returns by agent; the final evaluation is the slow part."""
-    part = shrunk(
-        study("cartpole-qlearning-vs-sarsa"),
-        ("Q-learning as printed", "SARSA as printed"),
-        n_seeds=6,
-        eval_freq=-1,
-    )
-    results = run(part, tmp_path_factory.mktemp("cart_pole"))
-    return {agent.label: training_returns(results, agent.label) for agent in part.agents}
 
 
 # Mean and standard deviation over 100 seeds of the mean return of 500 episodes, by the last one.
@@ -138,19 +121,12 @@ def cart_pole(tmp_path_factory):
         ),
     ],
 )
-def test_the_table_of_the_slides(cart_pole, agent, rows):
-    returns = cart_pole[agent]
-    assert returns.shape == (6, 5000)
+def test_the_table_of_the_slides(tmp_path, agent, rows):
+    part = shrunk(study("cartpole-qlearning-vs-sarsa"), (agent,), n_seeds=4, eval_freq=-1)
+    returns = training_returns(run(part, tmp_path), agent)
+    assert returns.shape == (4, 5000)
     for end, (expected, spread) in rows.items():
         assert_mean(returns[:, end - 500 : end].mean(axis=1), expected, spread, 100)
-
-
-def test_one_seed_cannot_tell_the_slides_agents_apart(cart_pole):
-    """The agents differ by less than the seeds of one agent do."""
-    last = {agent: returns[:, 4000:4500].mean(axis=1) for agent, returns in cart_pole.items()}
-    spread = [values.max() - values.min() for values in last.values()]
-    difference = np.mean(last["Q-learning as printed"]) - np.mean(last["SARSA as printed"])
-    assert abs(difference) < min(spread)
 
 
 def test_the_warehouse_with_the_rewards_of_the_text(tmp_path):
@@ -204,13 +180,13 @@ def test_the_8x8_lake_with_decaying_noise(tmp_path):
 
 
 def test_values_of_the_small_grid(tmp_path):
-    part = shrunk(study("small-grid"), ("qlearning", "sarsa"), n_seeds=5)
+    part = shrunk(study("small-grid"), ("qlearning", "sarsa"), n_seeds=3)
     results = run(part, tmp_path)
     corner = {agent.label: [] for agent in part.agents}
     for one in results.planned:
         model = load_model(one.agent, one.run.model_path)
         corner[one.agent].append(model.policy.q_table[0].max())
-    assert corner["qlearning"] == pytest.approx([0.95**5] * 5, abs=1e-9)
+    assert corner["qlearning"] == pytest.approx([0.95**5] * 3, abs=1e-9)
     assert np.mean(corner["sarsa"]) < 0.95**5 - 0.02
     assert set(results.summary["optimum"]) == {1.0}
 

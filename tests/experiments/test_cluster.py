@@ -1,0 +1,742 @@
+"""Runs on a cluster: what is sent and taken, who is spoken to, what becomes of lost runs."""
+
+import asyncio
+import contextlib
+import gc
+import io
+import ipaddress
+import json
+import math
+import os
+import runpy
+import socket
+import ssl
+import subprocess
+import sys
+import warnings
+import zipfile
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from distributed import Client, LocalCluster
+from distributed.scheduler import KilledWorker
+from hypothesis import given
+from hypothesis import strategies as st
+
+import compare
+from experiments.child_processes import NO_LIMITS
+from experiments.cluster import answers, cluster_launcher, schedulers
+from experiments.cluster.answers import (
+    Answer,
+    RefusedAnswerError,
+    check_in_place,
+    files_in,
+    packed,
+    receive,
+    sealed,
+    unpacked,
+)
+from experiments.cluster.cluster_launcher import MOST_SENDS, ClusterLauncher
+from experiments.cluster.schedulers import (
+    SECONDS_TO_RESTART,
+    Connection,
+    JobQueue,
+    Jobs,
+    LocalWorkers,
+    SchedulerAddress,
+    check_address,
+    checked_cluster,
+    is_loopback,
+    opened,
+    opened_queue,
+    read_cluster,
+)
+from experiments.cluster.working import LEAVING, Probe, RunOrder, probing
+from experiments.launching import execute
+from experiments.plan import plan
+from experiments.run_folders import draft_path
+from experiments.run_in_child import do_run
+from experiments.run_limits import RunLimits
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
+from pipeline.settings.hyperparams import split
+from pipeline.user_modules import UserModule, import_typed
+
+ROOT = Path(compare.__file__).parent
+
+
+def runs_of(root, modules=(), tensorboard=False, **marks):
+    """Two runs on a lake, and two more for each environment that kills, by the file of its mark."""
+    environments = [EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 100})]
+    for label, mark in marks.items():
+        settings = {"n_timesteps": 40, "env_kwargs": {"mark": str(mark)}}
+        environments.append(EnvironmentSpec(label, "Deadly-v0", settings))
+    agents = (AgentSpec("mine", "qlearning", tuned=False),)
+    names = {"gym_packages": tuple(module.name for module in modules), "user_modules": modules}
+    study = StudySpec("s", "S", agents, tuple(environments), 2, tensorboard=tensorboard, **names)
+    return plan(study, root)
+
+
+# --- What a worker may answer, and what is refused before anything of it is written.
+
+FILES = {"run/run.json": b"{}", "run/a/b.zip": b"\0\1", "tensorboard/x": b""}
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        Answer("done"),
+        Answer("done", files={}),
+        Answer("done", files=FILES),
+        Answer("failed", "thin ice", "Traceback"),
+        Answer("stopped"),
+    ],
+)
+def test_what_is_packed_is_unpacked(answer):
+    assert unpacked(packed(answer)) == answer
+
+
+@given(st.binary(max_size=200))
+def test_bytes_are_an_answer_or_refused(content):
+    for read in (content, sealed(content)):
+        with pytest.raises(RefusedAnswerError):
+            unpacked(read)
+
+
+@given(st.data())
+def test_a_bit_that_is_turned_is_noticed(data):
+    content = bytearray(packed(Answer("done", files=FILES)))
+    place = data.draw(st.integers(0, len(content) - 1))
+    content[place] ^= 1 << data.draw(st.integers(0, 7))
+    with pytest.raises(RefusedAnswerError, match="damaged"):
+        unpacked(bytes(content))
+
+
+def raw(files=(), **changes):
+    head = {"kind": "done", "reason": "", "details": "", "has_files": True, **changes}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive, warnings.catch_warnings(action="ignore"):
+        for name in ("answer.json", *files):
+            archive.writestr(name, json.dumps(head))
+    return sealed(buffer.getvalue())
+
+
+ELSEWHERE = ["/etc/passwd", "run/../../x", "run/..", "run//x", "run/./x", "run/x/", "x", "run/a\\b"]
+ELSEWHERE += ["run/a\nb", "run/c:x", "run/nul", "run/x.", f"run/{'d/' * 9}x", f"run/{'x' * 300}"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        *((raw([name]), None) for name in ELSEWHERE),
+        (raw(["run/x", "run/x"]), "twice"),
+        (raw(["run/x", "run/X"]), "twice"),
+        (raw(["run/x", "run/X/y"]), "folder too"),
+        (raw(kind="fine"), "no way to end"),
+        (raw(reason=3), "lacks a text"),
+        (raw(details=None), "lacks a text"),
+        (raw(reason="x" * 300_000), "too large"),
+        (None, "not bytes"),
+        ("text", "not bytes"),
+        (bytearray(packed(Answer("done"))), "not bytes"),
+    ],
+    ids=[*map(repr, ELSEWHERE), *map(str, range(10))],
+)
+def test_answers_that_are_refused(content, words):
+    with pytest.raises(RefusedAnswerError, match=words):
+        unpacked(content)
+
+
+def test_there_are_bounds_on_what_is_sent_and_taken(tmp_path, monkeypatch):
+    (tmp_path / "x").write_bytes(bytes(100))
+    (tmp_path / "link").symlink_to("/etc/passwd")
+    assert files_in(tmp_path, "run/") == {"run/x": bytes(100)}
+    content = packed(Answer("done", files={"run/x": bytes(100)}))
+    monkeypatch.setattr(answers, "LARGEST", 99)  # a quarter of a gigabyte takes long
+    with pytest.raises(ValueError, match="let it share"):
+        files_in(tmp_path, "run/")
+    with pytest.raises(RefusedAnswerError, match="too large"):
+        unpacked(content)
+
+
+# --- What comes back of a run is put in place if it is that very run, whole, and nothing else.
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """What a worker sends of the first run, by name."""
+    root = tmp_path_factory.mktemp("worker")
+    run = runs_of(root)[0]
+    do_run(run, draft_path(root, run), "c")
+    return files_in(run.path, "run/")
+
+
+def test_a_run_is_put_in_place_to_the_last_bit(tmp_path, done, monkeypatch):
+    run = runs_of(tmp_path)[0]
+    monkeypatch.setattr(answers, "SECONDS_TO_APPEAR", 0.0)  # a folder that is never late
+    with pytest.raises(RefusedAnswerError, match="not in its folder"):
+        check_in_place(run)
+    receive(run, tmp_path, done)
+    assert run.is_finished
+    assert files_in(run.path, "run/") == done
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+    check_in_place(run)
+
+
+def lacking(name):
+    return lambda files: {key: data for key, data in files.items() if key != name}
+
+
+def with_record(change):
+    return lambda files: {**files, "run/run.json": change(files["run/run.json"])}
+
+
+def unfinished(record):
+    data = json.loads(record)
+    del data["files"]
+    return json.dumps({**data, "state": "running"}).encode()
+
+
+LIES = {
+    "nothing": lambda files: {},
+    "no record": lacking("run/run.json"),
+    "no evaluations": lacking("run/evaluations.npz"),
+    "unfinished": with_record(unfinished),
+    "an empty record": with_record(lambda record: b"{}"),
+    "a changed record": with_record(lambda record: record.replace(b"seconds", b"secondS")),
+    "another run": with_record(lambda record: record.replace(b'"seed": 0', b'"seed": 1')),
+    "a stray file": lambda files: {**files, "run/more.txt": b"x"},
+    "other content": lambda files: {**files, "run/evaluations.npz": b"x"},
+    "a file elsewhere": lambda files: {**files, "elsewhere/x": b"x"},
+    "a log": lambda files: {**files, "tensorboard/x": b"x"},
+    "no file name": lambda files: {**files, "run/\ud800": b"x"},
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_whatever_else_comes_is_refused_and_leaves_nothing(tmp_path, done, lie):
+    with pytest.raises(RefusedAnswerError, match="another run" if lie == "another run" else None):
+        receive(runs_of(tmp_path)[0], tmp_path, LIES[lie](done))
+    assert not tmp_path.exists() or not list(tmp_path.rglob("*"))
+
+
+def test_logs_go_to_their_own_folder(tmp_path, done):
+    run = runs_of(tmp_path, tensorboard=True)[0]
+    run.spec.tensorboard_log.mkdir(parents=True)
+    (run.spec.tensorboard_log / "old").touch()
+    receive(run, tmp_path, {**done, "tensorboard/events": b"x"})
+    assert [path.name for path in run.spec.tensorboard_log.iterdir()] == ["events"]
+
+
+# --- Orders travel as plain data, and arrive as they were.
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(exclude_categories=["Cs"])),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.integers() | st.sampled_from(["1e-4", "yes", "0"]), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+PLAIN = runs_of(Path("a b/logs"))[0]
+
+
+def order_of(planned, limits=NO_LIMITS, root=Path("r")):
+    return RunOrder(
+        planned, "compare.py 'x y'", limits, Probe(Path("/h"), root, "n", "c"), "t", "v"
+    )
+
+
+@given(st.dictionaries(st.text(st.characters(codec="ascii"), min_size=1), VALUES, max_size=4))
+def test_whatever_an_environment_is_given_arrives_as_it_was(arguments):
+    raw = {**PLAIN.spec.saved_hyperparams, "env_kwargs": arguments}
+    spec = replace(PLAIN.spec, hyperparams=split(raw), saved_hyperparams=raw)
+    order = order_of(replace(PLAIN, spec=spec))
+    assert RunOrder.unpacked(order.packed()) == order
+
+
+def test_modules_folders_and_limits_arrive():
+    modules = (UserModule("./my envs.py", "my_envs", "/x/my envs.py"), UserModule("gym", "gym"))
+    folders = {"tensorboard_log": Path("tb"), "trained_agent": Path("a.zip")}
+    spec = replace(PLAIN.spec, user_modules=modules, gym_packages=("my_envs", "gym"), **folders)
+    order = order_of(replace(PLAIN, spec=spec), RunLimits(math.inf, 10**9))
+    assert RunOrder.unpacked(order.packed()) == order
+
+
+def test_an_order_holds_no_code(tmp_path):
+    mark = tmp_path / "mark"
+    code = f"x: !!python/object/apply:os.mkdir ['{mark}']\ncommand:".encode()
+    with pytest.raises(yaml.constructor.ConstructorError):
+        RunOrder.unpacked(order_of(PLAIN).packed().replace(b"command:", code))
+    assert not mark.exists()
+
+
+def test_a_shared_folder_is_known_by_what_lies_in_it(tmp_path):
+    with probing(tmp_path) as probe:
+        assert probe.is_there
+        assert not replace(probe, content="x").is_there
+        assert not replace(probe, root=tmp_path / "x").is_there
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("root", "inside"), [("logs/s", "logs/s"), ("/far/s", "study"), ("../s", "study")]
+)
+def test_paths_of_a_worker_apart_stay_within_its_folder(root, inside):
+    found = order_of(runs_of(Path(root), tensorboard=True)[0], root=Path(root)).apart()
+    assert found.probe.root == Path(inside)
+    assert found.planned.path.is_relative_to(Path(inside, "runs"))
+    assert found.planned.spec.tensorboard_log.is_relative_to(Path(inside, "tensorboard"))
+
+
+# --- What --cluster may say, and which schedulers are spoken to.
+
+
+def test_the_four_forms(tmp_path):
+    assert read_cluster("local:8") == LocalWorkers(8)
+    assert read_cluster("tls://node:8786") == SchedulerAddress("tls://node:8786")
+    assert read_cluster("127.0.0.1:8786").read() == "tcp://127.0.0.1:8786"
+    file, jobs = tmp_path / "scheduler.json", tmp_path / "slurm.yml"
+    file.write_text(json.dumps({"address": "tls://10.0.0.1:8786"}))
+    assert read_cluster(str(file)).read() == "tls://10.0.0.1:8786"
+    jobs.write_text("jobqueue:\n  slurm: {cores: 4, memory: 8GB, walltime: '01:00:00'}\n")
+    queue = read_cluster(str(jobs))
+    assert (type(queue), queue.system, queue.n_cores) == (JobQueue, "slurm", 4)
+
+
+ADDRESS = "no scheduler's file|holds no scheduler's address"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        *((text, None, "--cluster") for text in ("local:", "local:0", "local:-1", "local:x")),
+        *((text, None, "--cluster") for text in ("local:9999", "local:٣", "nowhere", "a b:c")),
+        *(("s.json", c, ADDRESS) for c in ("", "[]", "{}", '{"address": 3}', '{"address": "x"}')),
+        *(("s.json", content, ADDRESS) for content in ("[" * 10**5, "\xff")),
+        ("gone.json", None, "cannot be read"),
+        ("q.yml", "jobqueue: {slurm: {cores: 4}}", "how many cores and how much memory"),
+        ("q.yml", "jobqueue: {slurm: {cores: many, memory: 8GB}}", "whole number"),
+        ("q.yml", "jobqueue: {slurm: {cores: 0, memory: 8GB}}", "whole number"),
+        ("q.yml", "jobqueue: {cloud: {cores: 4, memory: 8GB}}", "none of htcondor"),
+        ("q.yml", "jobqueue: {slurm: {cores: 4, memory: 8GB}, pbs: {}}", "one queueing system"),
+        ("q.yml", "jobqueue: !!python/name:os.system", "not allowed here"),
+        ("q.yml", "slurm: {cores: 4, memory: 8GB}", "must hold the key jobqueue"),
+    ],
+)
+def test_what_is_no_cluster(tmp_path, monkeypatch, name, content, words):
+    monkeypatch.chdir(tmp_path)
+    if content is not None:
+        Path(name).write_text(content)
+    with pytest.raises(UserError, match=words):
+        read_cluster(name).read()
+
+
+@given(st.ip_addresses())
+def test_an_address_is_open_unless_it_is_of_this_machine_alone(address):
+    host = f"[{address}]" if address.version == 6 else str(address)
+    assert is_loopback(f"tcp://{host}:8786") is ipaddress.ip_address(address).is_loopback
+
+
+OPEN = ["10.0.0.1", "node", "localhost.example.org", "0.0.0.0", "127.0.0.1@10.0.0.1"]  # noqa: S104
+
+
+@pytest.mark.parametrize(
+    ("address", "has_certificates", "is_insecure", "words"),
+    [
+        *((f"tcp://{host}:8786", True, False, "without TLS") for host in OPEN),
+        *((f"tcp://{host}:8786", False, True, None) for host in OPEN),
+        ("tcp://localhost:8786", False, False, None),
+        ("tls://10.0.0.1:8786", True, False, None),
+        ("tls://10.0.0.1:8786", False, True, "ca-file"),
+        ("ws://127.0.0.1:8786", True, True, "begins with"),
+    ],
+)
+def test_who_is_spoken_to(address, has_certificates, is_insecure, words):
+    if words is None:
+        check_address(address, has_certificates, is_insecure)
+    else:
+        with pytest.raises(UserError, match=words):
+            check_address(address, has_certificates, is_insecure)
+
+
+def test_a_command_checks_before_it_connects(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="without TLS"):
+        checked_cluster("192.0.2.1:8786", is_insecure=False)
+    monkeypatch.setattr(schedulers, "SECONDS_TO_CONNECT", 0.2)  # eight take long
+    nowhere = SchedulerAddress("127.0.0.1:1")
+    with (
+        pytest.raises(UserError, match="there is no scheduler"),
+        cluster_launcher.cluster_launcher(nowhere, tmp_path, "c"),
+    ):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("is_insecure", [False, True])
+@pytest.mark.parametrize(
+    ("scheduler", "worker"),
+    [("tcp://10.0.0.1:8786", "tls://10.0.0.2:1"), ("tcp://127.0.0.1:2", "tcp://0.0.0.0:8786")],
+)
+def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, is_insecure):
+    client = SimpleNamespace(
+        scheduler_info=lambda n_workers: {"address": scheduler, "id": "s"},
+        nthreads=lambda: {"tls://10.0.0.2:1": 1, worker: 2},
+        status="running",
+        close=lambda timeout: None,
+    )
+    connection = Connection(lambda: client, lambda client: None, is_insecure)
+    refused = contextlib.nullcontext() if is_insecure else pytest.raises(UserError, match="TLS")
+    with refused:
+        connection.begin()
+        assert connection.n_threads() == client.nthreads()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"walltime": "1-01:10:30"}, "--lifetime 90330s --lifetime-stagger 150s"),
+        ({"walltime": "00:10:00"}, "--lifetime 540s --lifetime-stagger 30s"),
+        ({"walltime": "01:00:00", "worker-extra-args": ["--lifetime", "1h"]}, "--lifetime 1h"),
+        ({"walltime": "90"}, ""),
+        ({"walltime": 3600}, None),  # YAML takes 01:00:00 for a number
+    ],
+)
+def test_workers_retire_before_their_job_ends(tmp_path, settings, words):
+    settings |= {"cores": 1, "memory": "1GB", "shared-temp-directory": str(tmp_path)}
+    asked = JobQueue("slurm", {**settings, "interface": "lo"}, 1, tmp_path / "slurm.yml")
+    if words is None:
+        with pytest.raises(UserError, match="quotes"):
+            opened_queue(asked)
+        return
+    with opened_queue(asked) as queue:
+        script = queue.job_script()
+    assert words in script
+    assert script.count("--lifetime ") == bool(words)
+
+
+# --- Jobs of a queue that have ended are sent again, and others are left alone.
+
+
+class Queue:
+    """Two jobs of dask-jobqueue, of one worker each or of two."""
+
+    def __init__(self):
+        self.worker_spec = {"job-1": {}, "job-10": {}}
+        self.workers, self.closed, self.n_sent, self._futures = {}, [], 0, set()
+        self.scheduler = SimpleNamespace(workers={})
+        self.loop = SimpleNamespace(add_callback=lambda function, *args: function(*args))
+
+    def scale(self, jobs):
+        assert jobs == 2
+        for name in self.worker_spec.keys() - self.workers.keys():
+            self.n_sent += 1
+            self.workers[name] = SimpleNamespace(close=lambda name=name: self.close(name))
+
+    async def close(self, name):
+        self.closed.append(name)
+
+
+# Workers that arrive, by address; those that are lost, and those that left in good order; seconds
+# that pass; and which jobs have been closed by then.
+SENT_AGAIN = {
+    # The other still waits in the queue, however long that takes, and so does the new one.
+    "at once where its worker has retired": [
+        ({"a": "job-1"}, "", "", 0, []),
+        ({}, "a", "a", 0, ["job-1"]),
+        ({}, "", "a", 10 * SECONDS_TO_RESTART, ["job-1"]),
+    ],
+    "after a while where it was lost": [
+        ({"a": "job-10"}, "", "", 0, []),
+        ({}, "a", "", SECONDS_TO_RESTART, []),
+        ({"b": "job-10"}, "", "", 0, []),
+        ({}, "b", "", SECONDS_TO_RESTART, []),
+        ({}, "", "", 1, ["job-10"]),
+    ],
+    "with the last of its workers": [
+        ({"a": "job-1-0", "b": "job-1-1", "c": "job-10-0"}, "", "", 0, []),
+        ({}, "a", "a", 0, []),
+        ({}, "b", "ab", 0, ["job-1"]),
+    ],
+}
+
+
+@pytest.mark.parametrize("case", SENT_AGAIN)
+def test_a_job_that_has_ended_is_sent_again(monkeypatch, case):
+    async def play():
+        queue, now = Queue(), [100.0]
+        monkeypatch.setattr(schedulers, "time", SimpleNamespace(monotonic=lambda: now[0]))
+        jobs = Jobs(queue, 2)
+        for arriving, lost, left, seconds, closed in SENT_AGAIN[case]:
+            for address, name in arriving.items():
+                worker = SimpleNamespace(name=name, address=address)
+                queue.scheduler.workers[address] = worker
+            for address in lost:
+                del queue.scheduler.workers[address]
+            now[0] += seconds
+            jobs.replace(set(left))
+            await asyncio.gather(*queue._futures)
+            assert (queue.closed, queue.n_sent) == (closed, 2 + len(closed))
+
+    asyncio.run(play())
+
+
+# --- What a launcher makes of what schedulers say of runs: sent again, blamed, or given up.
+
+
+class Task:
+    """One that has ended as it is told to."""
+
+    def __init__(self, client, end):
+        self.client, self.end = client, end
+        self.status = "cancelled" if end == "cancelled" else "finished"
+        if isinstance(end, Exception):
+            self.status = "error"
+
+    def add_done_callback(self, function):
+        function(self)
+
+    def result(self, timeout):
+        if self.end == "lost":
+            raise CancelledError
+        return self.end
+
+    def exception(self):
+        return self.end
+
+    def cancel(self):
+        pass
+
+    release = cancel
+
+
+class Scheduler:
+    """Ends runs as a list says, the last for ever; a worker begins each before, or leaves after."""
+
+    def __init__(self, ends, begins, leaves):
+        self.ends, self.begins, self.leaves = list(ends), begins, leaves
+        self.n_sent, self.n_lost, self.handlers = 0, 0, {}
+
+    def subscribe_topic(self, topic, handler):
+        self.handlers[topic] = handler
+
+    def register_plugin(self, plugin):
+        pass
+
+    def tell(self, is_leaving, event):
+        for topic, handler in self.handlers.items():
+            if (topic == LEAVING) == is_leaving:
+                handler(event)
+
+    def submit(self, function, order, *, key, pure):
+        self.n_sent += 1
+        worker = f"tcp://w:{self.n_sent}"
+        for odd in (None, (), (0, {}), (0, {"run": 3, "at": 4}), (0, {"at": 3})):
+            self.tell(False, odd)
+            self.tell(True, odd)
+        if self.begins:
+            self.tell(False, (0.0, {"run": key, "at": worker}))
+        if self.leaves:
+            self.tell(True, (0.0, {"at": worker}))
+        return Task(self, self.ends.pop(0) if len(self.ends) > 1 else self.ends[0])
+
+    def client(self):
+        return self
+
+    def lose(self, client):
+        self.n_lost += 1
+
+    def close(self):
+        pass
+
+
+FAILED = packed(Answer("failed", "thin ice", "at length"))
+STOPPED = packed(Answer("stopped"))
+KILLED = KilledWorker("run", SimpleNamespace(address="tcp://w:1"), 3)
+NEVER, NO_RUN = "never came back", "3 times it did not come back as a run: "
+BEGUN, LEFT, WAITED = (True, False), (True, True), (False, False)
+# Ends, whether a worker begins and leaves, what is said in the end, and how often it was sent.
+OUTCOMES = {
+    "a failure": ([FAILED], BEGUN, "thin ice", 1),
+    "a failure without a word": ([packed(Answer("failed"))], BEGUN, "it does not say why", 1),
+    "stopped": ([STOPPED] * 5 + [FAILED], WAITED, "thin ice", 6),
+    "stopped for ever": ([STOPPED], BEGUN, NEVER, MOST_SENDS),
+    "killed before it began": ([KILLED] * 5 + [FAILED], WAITED, "thin ice", 6),
+    "left in good order": ([KILLED] * 5 + [FAILED], LEFT, "thin ice", 6),
+    "killed": ([KILLED], BEGUN, "the worker that did it was lost 3 times (tcp://w:3)", 3),
+    "scheduler lost": (["cancelled"] * 5 + [FAILED], BEGUN, "thin ice", 6),
+    "answer lost": (["lost"] * 5 + [FAILED], BEGUN, "thin ice", 6),
+    "an error": ([ValueError("odd")], BEGUN, NO_RUN + "odd", 3),
+    "nothing": ([b""], BEGUN, NO_RUN, 3),
+    "damaged": ([packed(Answer("done"))[:-1]], BEGUN, NO_RUN, 3),
+    "a stray file": ([packed(Answer("done", files=FILES))], BEGUN, NO_RUN, 3),
+    "other code": ([packed(Answer("unfit", "w has other code"))], BEGUN, "start it anew", 1),
+}
+
+
+@pytest.mark.parametrize("case", OUTCOMES)
+def test_how_a_run_ends_at_a_scheduler(tmp_path, case):
+    ends, behaviour, reason, n_sent = OUTCOMES[case]
+    scheduler = Scheduler(ends, *behaviour)
+    with probing(tmp_path) as probe:
+        launcher = ClusterLauncher(probe, "c", NO_LIMITS, 0)
+        launcher.connection = scheduler
+        launcher.prepare(None, scheduler)
+        try:
+            future = launcher.submit(runs_of(tmp_path)[0])
+            if case == "other code":
+                with pytest.raises(UserError, match=reason):
+                    future.result(timeout=30)
+                return
+            failure = future.result(timeout=30)
+        finally:
+            launcher.close()
+    assert reason in failure.reason
+    assert failure.log.read_text() == ("at length" if FAILED in ends else f"{failure.reason}\n")
+    assert scheduler.n_sent == n_sent
+    assert scheduler.n_lost == 5 * (case == "scheduler lost")
+
+
+# --- On a cluster of two workers on this machine.
+
+DEADLY = """
+import multiprocessing, os, pathlib, signal
+import gymnasium as gym
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+
+class Deadly(FrozenLakeEnv):
+    def __init__(self, mark, **kwargs):
+        super().__init__(**kwargs)
+        self.mark = pathlib.Path(mark)
+
+    def reset(self, **kwargs):
+        parent = multiprocessing.parent_process()
+        if parent is not None and self.mark.suffix == ".each":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if parent is not None and not self.mark.exists():
+            self.mark.touch()
+            os.kill(parent.pid, signal.SIGKILL)
+        return super().reset(**kwargs)
+
+gym.register("Deadly-v0", Deadly, max_episode_steps=20)
+"""
+
+
+def test_a_cluster_does_what_this_machine_does_whatever_dies(tmp_path, monkeypatch):
+    """All in one: several processes of the suite would start a cluster each."""
+    contents = runpy.run_path(str(ROOT / "benchmarks/_run_contents.py"))["contents"]
+
+    def done(name, **more):
+        """What runs leave, by name; and the failures, by environment."""
+        root = tmp_path / name
+        root.mkdir()
+        where = SchedulerAddress(cluster.scheduler_address)
+        launchers = partial(cluster_launcher.cluster_launcher, where, root, "c")
+        failures = execute(runs_of(root, **more), root, launchers, lambda *_: None)
+        assert sorted({path.name for path in root.iterdir()} - {"failures"}) == ["runs"]
+        failed = {(each.planned.environment, each.planned.seed): each for each in failures}
+        return contents(root / "runs"), failed
+
+    @contextlib.contextmanager
+    def elsewhere(root):
+        yield Probe(Path("/nowhere"), root, ".probe", "x")
+
+    for run in runs_of(tmp_path / "here"):
+        do_run(run, draft_path(tmp_path / "here", run), "c")
+    here = contents(tmp_path / "here" / "runs")
+    assert here
+    (tmp_path / "deadly_lake.py").write_text(DEADLY)
+    modules = import_typed([str(tmp_path / "deadly_lake.py")])
+    marks = {"once": tmp_path / "once", "poison": tmp_path / "x.each"}
+    with LocalCluster(2, threads_per_worker=1, dashboard_address=":0", memory_limit=0) as cluster:
+        # A run that kills its worker is tried again; one that dies each time fails alone.
+        found, failures = done("shared", modules=modules, **marks)
+        assert (tmp_path / "once").exists()
+        assert failures.keys() == {("poison", 0), ("poison", 1)}
+        assert failures["poison", 0].reason == "its process died 2 times (SIGKILL)"
+        assert failures["poison", 0].log.read_text()
+        # Beside the copies of the module.
+        assert {name: found.get(name) for name in here} == here
+        assert len({name for name in found if "once_" in name and "run.json" in name}) == 2
+        # Where no folder is shared, as on a machine of its own, files come back.
+        monkeypatch.setattr(cluster_launcher, "probing", elsewhere)
+        assert done("apart") == (here, {})
+
+
+def listening_in(pid):
+    """The ports that a process and those that it has started listen to, with whose they are."""
+    owners, pids = {}, [pid]
+    for one in pids:
+        for file in Path(f"/proc/{one}").glob("task/*/children"):
+            pids += map(int, file.read_text().split())
+        for link in Path(f"/proc/{one}/fd").glob("*"):
+            with contextlib.suppress(OSError):
+                owners[str(link.readlink())] = one
+    ports = {}
+    for name in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
+            _, local, _, state, *_, inode = line.split()[:10]
+            if state == "0A" and f"socket:[{inode}]" in owners:
+                ports[int(local.rpartition(":")[2], 16)] = owners[f"socket:[{inode}]"]
+    return ports
+
+
+def answer_of(port, context=None):
+    """What a port says to somebody who has no certificate; nothing if it closes."""
+    try:
+        with contextlib.ExitStack() as stack:
+            asker = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10))
+            if context is not None:
+                asker = stack.enter_context(context.wrap_socket(asker))
+            asker.sendall(b"GET /json/identity.json HTTP/1.0\r\n\r\n")
+            return asker.recv(100)
+    except (ConnectionError, ssl.SSLError):
+        return b""
+
+
+def check_ports(n_processes, before):
+    """All sockets of so many processes speak TLS, with those alone who have a certificate."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    ports = {port: pid for port, pid in listening_in(os.getpid()).items() if port not in before}
+    assert len(set(ports.values())) == n_processes
+    for port in ports:
+        assert answer_of(port) == answer_of(port, context) == b""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_all_ports_of_workers_here_want_a_certificate():
+    before = listening_in(os.getpid())  # of servers that other tests have left
+    with opened(LocalWorkers(1)) as (connect, _), connect() as client:
+        client.wait_for_workers(1, timeout=60)
+        assert client.dashboard_link == ""
+        check_ports(2, before)  # this one, with the scheduler and the nanny, and the worker
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file")  # dask-jobqueue's, which hold the keys
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_all_ports_of_jobs_want_a_certificate(tmp_path):
+    """The queue is played by a shell, which does what the script of a job says."""
+    before = listening_in(os.getpid())
+    settings = {"cores": 1, "memory": "1GB", "shared-temp-directory": str(tmp_path)}
+    settings |= {"interface": "lo", "python": sys.executable, "local-directory": str(tmp_path)}
+    queue = opened_queue(JobQueue("slurm", settings, 1, tmp_path / "slurm.yml"))
+    with queue, Client(queue, set_as_default=False) as client:
+        job = subprocess.Popen(["bash", "-c", queue.job_script()], stderr=subprocess.DEVNULL)
+        try:
+            client.wait_for_workers(1, timeout=60)
+            check_ports(3, before)  # this one, with the scheduler, the nanny and the worker
+        finally:
+            client.shutdown()
+            job.wait(30)
+    del queue, client
+    gc.collect()
