@@ -143,16 +143,12 @@ FAULTS = {
 }
 
 class Faulty(FrozenLakeEnv):
-    def __init__(self, fault="", only_seed=None, root=""):
+    def __init__(self, fault="", root=""):
         super().__init__()
-        self.fault, self.only_seed, self.root, self.seed = fault, only_seed, root, None
-
-    def reset(self, *, seed=None, options=None):
-        self.seed = self.seed if seed is None else seed
-        return super().reset(seed=seed, options=options)
+        self.fault, self.root = fault, root
 
     def step(self, action):
-        if self.fault and self.only_seed in (None, self.seed):
+        if self.fault:
             for draft in pathlib.Path(self.root, ".drafts").glob("*"):
                 (draft / "state").mkdir(exist_ok=True)
                 (draft / "state" / "odd.state").touch()
@@ -175,12 +171,15 @@ def faulty_lake(tmp_path_factory):
 
 @pytest.fixture
 def faulty(tmp_path, faulty_lake):
-    """Runs on an environment that fails, in the folder of their study."""
+    """Runs on environments that fail so, or not at all, in the folder of their study."""
 
-    def runs(n_seeds, **kwargs):
-        kwargs = {**kwargs, "root": str(tmp_path)}
-        place = EnvironmentSpec("faulty", "Faulty-v0", {"n_timesteps": 20, "env_kwargs": kwargs})
-        study = replace(study_of(environment=place, n_seeds=n_seeds), user_modules=faulty_lake)
+    def runs(*faults):
+        settings = [{"fault": fault, "root": str(tmp_path)} for fault in faults]
+        places = [
+            EnvironmentSpec(f"lake {n}", "Faulty-v0", {"n_timesteps": 20, "env_kwargs": kwargs})
+            for n, kwargs in enumerate(settings)
+        ]
+        study = replace(study_of(n_seeds=1), environments=tuple(places), user_modules=faulty_lake)
         return tmp_path, plan(replace(study, gym_packages=("faulty_lake",)), tmp_path)
 
     return runs
@@ -198,7 +197,7 @@ def faulty(tmp_path, faulty_lake):
     ],
 )
 def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(faulty, fault, is_kept):
-    root, (planned,) = faulty(1, fault=fault)
+    root, (planned,) = faulty(fault)
     draft = draft_path(root, planned)
     with pytest.raises(Exception, match=r".*"):
         do_run(planned, draft, "c")
@@ -208,18 +207,18 @@ def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(faulty, fault, i
 
 def test_every_run_is_told_of_and_failures_are_kept(faulty):
     child_processes.start_server()
-    root, runs = faulty(2, fault="library", only_seed=1)
+    root, runs = faulty("", "library")
     log = failure_log(root, runs[0])
     log.parent.mkdir()
     log.write_text("of an earlier try")
     told = {}
     launchers = partial(local_launcher, root, "c", 2)
     (failure,) = execute(
-        runs, root, launchers, lambda run, failure: told.update({run.seed: failure})
+        runs, root, launchers, lambda run, failure: told.update({run.path: failure})
     )
-    assert told == {0: None, 1: failure}
+    assert told == {runs[0].path: None, runs[1].path: failure}
     assert (failure.planned, failure.reason) == (runs[1], "thin ice")
-    assert failure.log == root / "failures" / "mine@faulty_2.txt"
+    assert failure.log == root / "failures" / "mine@lake_1_1.txt"
     # What an earlier try left of a run that has now been done is gone.
     assert list(log.parent.iterdir()) == [failure.log]
     assert failure.log.read_text().endswith("RuntimeError: thin ice\n")
