@@ -2,12 +2,7 @@
 
 import importlib.util
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
 import zipfile
 from pathlib import Path
 
@@ -21,7 +16,6 @@ from commands.compare import study_spec
 from commands.train import build_parser, train_spec
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline import files
 from pipeline.environments import training_kwargs
 from pipeline.errors import UserError
 from pipeline.playing import FRAMES_PER_SECOND, check_film_path, write_film
@@ -364,40 +358,6 @@ def test_a_log_folder_that_cannot_be_written(type_command, tmp_path):
     assert "cannot make a run folder in logs/qlearning" in err
 
 
-def test_a_full_disk(type_command, tmp_path, monkeypatch):
-    def no_space(*_, **__):
-        raise OSError(28, "No space left on device", "run.json")
-
-    monkeypatch.setattr(files.os, "replace", no_space)
-    code, _, err = type_command("train.py", *QUICK)
-    assert (code, err.count("\n")) == (2, 1)
-    assert "No space left on device" in err
-    assert contents(tmp_path) == []
-
-
-def test_ctrl_c_saves_what_was_learnt(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, str(ROOT / "train.py"), *QUICK[:-1], "100000000"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        if (run / "0.monitor.csv").exists() and (run / "0.monitor.csv").stat().st_size > 2000:
-            break
-        time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, "")
-    assert "interrupted" in out
-    assert str(run.relative_to(tmp_path)) in out
-    assert json.loads((run / "run.json").read_text())["state"] == "interrupted"
-    assert (run / "FrozenLake-v1.zip").exists()
-
-
 def test_a_file_of_one_default_entry_is_enough(type_command, monkeypatch, tmp_path):
     """For listing, training, playing and comparing."""
     folder = tmp_path / "hyperparams"
@@ -414,44 +374,6 @@ def test_a_file_of_one_default_entry_is_enough(type_command, monkeypatch, tmp_pa
     agent = AgentSpec("qlearning", "qlearning")
     study = StudySpec("s", "S", (agent,), (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1"),))
     assert plan(study, tmp_path)[0].spec.hyperparams.n_timesteps == 60
-
-
-HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib")
-
-
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["train.py", "--help"], 0),
-        (["train.py", "--list"], 0),
-        (["enjoy.py", "--help"], 0),
-        (["train.py", "--env", "Warehose-v0"], 2),
-        (["train.py", "--algo", "pppo"], 2),
-        (["train.py", "--nonsense"], 2),
-        (["train.py", "--conf-file", "missing.yml"], 2),
-        (["enjoy.py", "missing.zip"], 2),
-        (["enjoy.py", "--algo", "ppo", "--env", "CartPole-v1"], 2),
-    ],
-)
-def test_answers_without_loading_anything_heavy(words, code, tmp_path):
-    program = (
-        f"import sys; sys.path.insert(0, {str(ROOT)!r}); import {words[0][:-3]} as command; "
-        + (
-            "from commands.cli import run_command\n"
-            "try: run_command(command.main)\n"
-            "finally: print([name for name in sys.modules if name in {heavy}], file=sys.stderr)"
-        ).replace("{heavy}", repr(HEAVY))
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", program, *words[1:]],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-    )
-    assert result.returncode == code
-    assert result.stderr.splitlines()[-1] == "[]"
 
 
 def test_where_tensorboard_is_missing_it_is_named_beforehand(type_command, tmp_path, monkeypatch):

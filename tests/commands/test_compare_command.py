@@ -1,7 +1,6 @@
 """compare.py as a user types it: what is run, what is skipped, and what survives."""
 
 import contextlib
-import importlib.util
 import json
 import os
 import re
@@ -520,16 +519,6 @@ def test_where_nothing_can_be_forked_a_killed_worker_costs_nothing(spawning, fol
     assert not (study / ".drafts").exists()
 
 
-def test_where_nothing_can_be_forked_ctrl_c_leaves_nothing(spawning, folder):
-    process, study = begin_slowly(folder, n_seeds=1)
-    started = session_of(process.pid)
-    os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, "compare.py: interrupted\n")
-    wait_for(lambda: not any(map(is_alive, started)))
-    assert not study.exists()
-
-
 STUDY = "agents: {qlearning: {gamma: 2}}\nenvironments: [FrozenLake-v1]\nn_timesteps: 9\n"
 MISTAKES = {
     "nothing": ([], "what to compare? give --env and --algos, or a study file"),
@@ -569,29 +558,6 @@ def test_a_mistake_ends_in_one_line_and_leaves_nothing(type_command, folder, mis
     assert out.count("\n") == mistake.startswith("setting")
     assert err.startswith("compare.py: error: ")
     assert complaint in err
-    assert [p for p in sorted(folder.rglob("*")) if "__pycache__" not in str(p)] == before
-
-
-@pytest.mark.parametrize("n_seeds", [1, 3])
-def test_settings_are_checked_before_the_first_run(type_command, folder, n_seeds):
-    before = sorted(folder.rglob("*"))
-    code, out, err = type_command(*PAIR, "--seeds", n_seeds, "--hyperparams", "gamma:1.5")
-    assert (code, out, err.count("\n")) == (2, "qlearning, sarsa on FrozenLake-v1\n", 1)
-    assert "gamma" in err
-    assert [p for p in sorted(folder.rglob("*")) if "__pycache__" not in str(p)] == before
-
-
-def test_where_tensorboard_is_missing_it_is_named_beforehand(type_command, folder, monkeypatch):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util,
-        "find_spec",
-        lambda name, *more: None if name == "tensorboard" else find(name, *more),
-    )
-    before = sorted(folder.rglob("*"))
-    code, out, err = type_command(*PAIR, "-tb")
-    assert (code, out) == (2, "")
-    assert err == "compare.py: error: -tb needs: pip install 'rl-yardstick[tensorboard]'\n"
     assert [p for p in sorted(folder.rglob("*")) if "__pycache__" not in str(p)] == before
 
 
@@ -639,48 +605,3 @@ def test_films_of_training(type_command, folder):
     pair = [rows(folder / "studies" / name) for name in (study.name, "plain")]
     pair = [table.drop(columns=["path", "seconds", "cpu_seconds"]) for table in pair]
     assert pair[0].equals(pair[1])
-
-
-HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib")
-
-
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["--help"], 0),
-        (["--nonsense"], 2),
-        (["--env", "Taxy-v4", "--algos", "dqn"], 2),
-        (["--env", "Taxi-v4", "--algos", "dqnn"], 2),
-        (["--env", "MountainCarContinuous-v0", "--algos", "sarsa"], 2),
-        (["missing.yml"], 2),
-    ],
-)
-def test_answers_without_loading_anything_heavy(folder, words, code):
-    program = (
-        f"import sys, resource; sys.path.insert(0, {str(ROOT)!r}); import compare\n"
-        "from commands.cli import run_command\n"
-        "try: run_command(compare.main)\n"
-        f"finally: print([name for name in sys.modules if name in {HEAVY}], file=sys.stderr)\n"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", program, *words], capture_output=True, text=True, check=False
-    )
-    assert result.returncode == code
-    assert result.stderr.splitlines()[-1] == "[]"
-
-
-def test_help_is_instant(folder):
-    program = (
-        "import resource, subprocess, sys\n"
-        f"subprocess.run([sys.executable, {str(ROOT / 'compare.py')!r}, '--help'], check=True)\n"
-        "usage = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
-        "print('CPU', usage.ru_utime + usage.ru_stime)\n"
-    )
-    seconds = []
-    for _ in range(3):
-        out = subprocess.run(
-            [sys.executable, "-c", program], capture_output=True, text=True, check=True
-        )
-        seconds.append(float(re.search(r"CPU ([\d.e-]+)", out.stdout)[1]))
-        assert "--render-every" in out.stdout
-    assert min(seconds) < 0.3

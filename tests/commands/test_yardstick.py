@@ -1,9 +1,7 @@
 """The installed command: what it runs, and how messages name it."""
 
-import os
 import runpy
 import shlex
-import subprocess
 import sys
 from functools import partial
 from importlib.metadata import version
@@ -130,29 +128,6 @@ def test_help_and_version(type_command):
     assert code == 0
     assert all(f"  yardstick {command}" in out for command in COMMANDS)
     assert type_command("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
-
-
-HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib", "gymnasium")
-
-
-@pytest.mark.parametrize(
-    "words", [["--help"], ["train", "--help"], ["enjoy", "--help"], ["compare", "--help"]]
-)
-def test_help_loads_nothing_heavy(words, tmp_path):
-    program = (
-        "import sys; from commands import main\n"
-        "try: main()\n"
-        f"finally: print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
-    assert (done.returncode, done.stderr) == (0, "[]\n")
 
 
 def test_a_study_of_ours_is_found_by_its_name(type_command, tmp_path):

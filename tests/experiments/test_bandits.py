@@ -77,13 +77,6 @@ def test_any_agent_leaves_its_pulls(algorithm, kwargs, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["pulls.npz"]
 
 
-def test_contexts_that_are_vectors_are_left_out(tmp_path):
-    pulls = recorded(load_algorithm("linucb"), tmp_path, "LinearBandit-v0", n_envs=1)
-    assert "contexts" not in pulls
-    assert pulls["arms"].shape == (1, 100)
-    assert (pulls["regrets"] >= 0).all()
-
-
 def test_a_log_knows_rewards_and_matches_alone(tmp_path):
     log_uniformly(gym.make("SegmentBandit-v0"), 300, 0, tmp_path / "log.csv")
     env = make_vec_env("ReplayBandit-v0", env_kwargs={"log": str(tmp_path / "log.csv")}, seed=0)

@@ -245,17 +245,6 @@ def test_a_process_that_is_killed_costs_one_retry(chores, tmp_path):
     assert (tmp_path / "cleaned").read_text() == ".."
 
 
-def test_a_crash_is_told_where_nothing_forks(chores, monkeypatch):
-    use(monkeypatch, "spawn")
-    with pytest.raises(TaskDiedError, match="SIGSEGV") as error:
-        alone(chores.crash, tries=1)
-    assert all(words in error.value.details for words in SEGMENTATION)
-
-
-def test_within_its_limits_a_task_is_left_alone(chores):
-    assert alone(chores.add, 1, 1, limits=RunLimits(seconds=300, memory=10**12))[0] == 2
-
-
 def test_leaving_early_ends_the_children(chores, tmp_path):
     clean_up = partial(chores.clean_up, str(tmp_path))
     outcomes = []

@@ -381,14 +381,6 @@ def test_a_draft_is_kept_for_a_run_that_is_still_to_do(tmp_path, owners):
     assert not tmp_path.exists()
 
 
-def test_what_this_process_has_left_without_a_state_is_removed(tmp_path):
-    draft = draft_of(tmp_path, OWN)
-    leave_drafts(tmp_path, "another run")
-    assert draft.is_dir()
-    leave_drafts(tmp_path, RUN)
-    assert not draft.exists()
-
-
 def test_the_next_process_takes_over_what_a_dead_one_has_left(tmp_path, owners):
     own = tmp_path / ".drafts" / f"{OWN}@{HERE}@{RUN}"
     assert not take_over(own)
@@ -638,12 +630,6 @@ def test_after_a_tenth_of_the_runs_it_is_right_within_a_factor_of_two(n_workers,
         }
         found = played(runs, takes, n_workers, expected, (0.1, 0.25, 0.5))
         assert all(0.5 < ratio < 2 for ratio in found.values()), found
-
-
-def test_equal_runs_of_which_nothing_is_known():
-    runs = [run for run in runs_to_time(10) if run.agent == "qlearning"]
-    found = played(runs, [3.0] * len(runs), 2, {}, (0.1, 0.5))
-    assert found == pytest.approx({0.1: 1, 0.5: 1}, rel=0.1)
 
 
 def test_a_run_may_take_the_whole_time_that_is_left():

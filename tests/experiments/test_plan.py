@@ -136,16 +136,6 @@ def test_what_cannot_be_trained_is_refused_beforehand(tmp_path, algo, settings, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_batch_of_bandit_runs_is_checked_as_well(tmp_path):
-    bandit = EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 10})
-    agent = AgentSpec("ucb", "ucb", {"bonus": 3, "boons": 1})
-    study = study_of(agent, environments=(bandit,), n_seeds=3)
-    planned = plan(study, tmp_path)
-    assert [run.is_batch for run in planned] == [True]
-    with pytest.raises(UserError, match="bonus"):
-        check_settings(study, planned)
-
-
 # --- Which run it is that a folder holds.
 
 

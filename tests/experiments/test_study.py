@@ -1,6 +1,5 @@
 """Study files: what they may say, and how each mistake is told."""
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,17 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import compare
-from agents import ALGORITHMS
 from experiments.plan import plan
 from experiments.study import (
     METRICS,
-    AgentSpec,
     QuickSpec,
     file_name,
     find_study,
     layered,
     read_study,
-    swept,
     write_study,
 )
 from pipeline.environments import training_changes
@@ -172,19 +168,6 @@ def test_agents_and_environments(read):
     assert dry.settings == {"n_episodes": 50, "env_kwargs": {"is_slippery": False}}
 
 
-def test_a_list_is_short_for_a_mapping(read):
-    names = ", ".join(ALGORITHMS)
-    short = read(f"{TAXI}agents: [{names}]\n")
-    long = read(
-        f"agents: {{{', '.join(f'{name}: {{algo: {name}}}' for name in ALGORITHMS)}}}\n"
-        "environments: {Taxi-v4: {id: Taxi-v4}}\n"
-    )
-    assert [agent.algo for agent in short.agents] == list(ALGORITHMS)
-    unplaced = [[replace(agent, where="") for agent in each.agents] for each in (short, long)]
-    assert unplaced[0] == unplaced[1]
-    assert short.environments == long.environments
-
-
 def test_settings_of_an_environment_go_over_those_of_the_file(read):
     study = read(
         "agents: [qlearning]\nn_timesteps: 500\n"
@@ -261,26 +244,11 @@ NAMES = st.text("abcdef_", min_size=1, max_size=6)
 VALUES = st.integers() | st.floats(allow_nan=False) | st.booleans()
 
 
-@given(st.dictionaries(NAMES, st.lists(VALUES, min_size=1, max_size=3), max_size=3))
-def test_a_sweep_has_each_combination_once(sweep):
-    agents = swept(AgentSpec("one", "qlearning", {"kept": 1}), sweep)
-    assert len(agents) == math.prod(map(len, sweep.values()))
-    for agent in agents:
-        assert agent.settings["kept"] == 1
-        assert all(agent.settings[name] in values for name, values in sweep.items())
-    assert len({agent.label for agent in agents}) == len({str(a.swept) for a in agents})
-
-
 def test_a_sweep_is_counted_before_it_is_made(read):
     values = f"[{', '.join(map(str, range(100)))}]"
     sweep = ", ".join(f"{name}: {values}" for name in "abcdef")
     with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents up to here; .* 10,000 at"):
         read(f"{TAXI}agents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
-
-
-def test_a_swept_budget_replaces_the_other():
-    agents = swept(AgentSpec("one", "qlearning", {"n_timesteps": 500}), {"n_episodes": [5, 9]})
-    assert [agent.settings for agent in agents] == [{"n_episodes": 5}, {"n_episodes": 9}]
 
 
 BUDGETS = {"n_timesteps", "n_episodes"}
@@ -311,11 +279,6 @@ def test_a_label_makes_a_plain_file_name(label):
     assert name == file_name(name) == portable_name(name)
     assert re.fullmatch(r"[\w.=+,-]+", name)
     assert name not in (".", "..")
-
-
-@pytest.mark.parametrize("label", ["Eis_glatt", "ε=0.1, k", "qlearning learning_rate=0.01, g=0.9"])
-def test_ordinary_labels_keep_the_folders_that_they_had(label):
-    assert file_name(label) == re.sub(r"[^\w.=+,-]+", "_", label)
 
 
 def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
