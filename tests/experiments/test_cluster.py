@@ -503,7 +503,8 @@ class Task:
             self.status = "error"
 
     def add_done_callback(self, function):
-        function(self)
+        if self.end != "never":
+            function(self)
 
     def result(self, timeout):
         if self.end == "lost":
@@ -520,7 +521,7 @@ class Task:
 
 
 class Scheduler:
-    """Ends runs as a list says, the last for ever; a worker begins each before, or leaves after."""
+    """Ends runs as a list says, the last for ever; so many workers begin each, and may leave it."""
 
     def __init__(self, ends, begins, leaves):
         self.ends, self.begins, self.leaves = list(ends), begins, leaves
@@ -539,14 +540,13 @@ class Scheduler:
 
     def submit(self, function, order, *, key, pure):
         self.n_sent += 1
-        worker = f"tcp://w:{self.n_sent}"
         for odd in (None, (), (0, {}), (0, {"run": 3, "at": 4}), (0, {"at": 3})):
             self.tell(False, odd)
             self.tell(True, odd)
-        if self.begins:
-            self.tell(False, (0.0, {"run": key, "at": worker}))
-        if self.leaves:
-            self.tell(True, (0.0, {"at": worker}))
+        for number in range(self.n_sent, self.n_sent + self.begins):
+            self.tell(False, (0.0, {"run": key, "at": f"tcp://w:{number}"}))
+            if self.leaves:
+                self.tell(True, (0.0, {"at": f"tcp://w:{number}"}))
         return Task(self, self.ends.pop(0) if len(self.ends) > 1 else self.ends[0])
 
     def client(self):
@@ -563,8 +563,8 @@ FAILED = packed(Answer("failed", "thin ice", "at length"))
 STOPPED = packed(Answer("stopped"))
 KILLED = KilledWorker("run", SimpleNamespace(address="tcp://w:1"), 3)
 NEVER, NO_RUN = "never came back", "3 times it did not come back as a run: "
-BEGUN, LEFT, WAITED = (True, False), (True, True), (False, False)
-# Ends, whether a worker begins and leaves, what is said in the end, and how often it was sent.
+BEGUN, LEFT, WAITED = (1, False), (1, True), (0, False)
+# Ends, how many workers begin and whether they leave, what is said, and how often it was sent.
 OUTCOMES = {
     "a failure": ([FAILED], BEGUN, "thin ice", 1),
     "a failure without a word": ([packed(Answer("failed"))], BEGUN, "it does not say why", 1),
@@ -573,6 +573,8 @@ OUTCOMES = {
     "killed before it began": ([KILLED] * 5 + [FAILED], WAITED, "thin ice", 6),
     "left in good order": ([KILLED] * 5 + [FAILED], LEFT, "thin ice", 6),
     "killed": ([KILLED], BEGUN, "the worker that did it was lost 3 times (tcp://w:3)", 3),
+    "begun elsewhere": ([FAILED], (4, True), "thin ice", 1),
+    "lost elsewhere": (["never"], (4, False), "that did it was lost 3 times (tcp://w:3)", 1),
     "scheduler lost": (["cancelled"] * 5 + [FAILED], BEGUN, "thin ice", 6),
     "answer lost": (["lost"] * 5 + [FAILED], BEGUN, "thin ice", 6),
     "an error": ([ValueError("odd")], BEGUN, NO_RUN + "odd", 3),
