@@ -1,8 +1,9 @@
-"""What an agent is trained on, and what it is evaluated on."""
+"""What an agent is trained on and evaluated on: arguments, limits, wrappers, files, memory."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from rich.console import Console
 from stable_baselines3.common import vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
@@ -19,10 +20,13 @@ from pipeline.environments import (
     training_changes,
     training_kwargs,
     trains_on_variant,
+    with_logs_located,
+    with_maps_read,
 )
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
+from pipeline.training import train
 
 
 def spec_of(env_id, entry=None, **kwargs):
@@ -57,38 +61,29 @@ ENTRY = {
 }
 
 
-def test_which_arguments_reach_training_and_which_evaluation():
-    spec = spec_of("Warehouse-v0", ENTRY)
-    assert training_kwargs(spec) == {
-        "step_reward": -2,
-        "goal_reward": 60,
-        "random_start": True,
-        "max_episode_steps": 30,
-    }
-    assert evaluation_kwargs(spec) == {
-        "step_reward": -2,
-        "goal_reward": 50,
-        "slip": 0.1,
-        "max_episode_steps": 40,
-    }
-
-
-def test_the_environments_get_their_arguments(tmp_path):
+def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
     spec = spec_of("Warehouse-v0", {**ENTRY, "n_envs": 2})
+    shared = {"step_reward": -2}
+    own = {"goal_reward": 60, "random_start": True, "max_episode_steps": 30}
+    assert training_kwargs(spec) == {**shared, **own}
+    own = {"goal_reward": 50, "slip": 0.1, "max_episode_steps": 40}
+    assert evaluation_kwargs(spec) == {**shared, **own}
     training, evaluation = make_training_env(spec, tmp_path), make_evaluation_env(spec, 3)
     assert (training.num_envs, evaluation.num_envs) == (2, 3)
     for env, goal_reward, limit in ((training, 60, 30), (evaluation, 50, 40)):
-        for single in env.envs:
-            kwargs = single.unwrapped.spec.kwargs
+        single = make_single_env(spec, training=env is training)
+        for each in (*env.envs, single):
+            kwargs = each.unwrapped.spec.kwargs
             assert (kwargs["step_reward"], kwargs["goal_reward"]) == (-2, goal_reward)
-            assert time_limit(single) == limit
+            assert time_limit(each) == limit
+            assert ("slip" in kwargs) == (env is evaluation)
         # Only training begins anywhere.
         starts = {int(env.reset()[0]) for _ in range(20)}
         assert (len(starts) > 1) == (env is training)
-    assert "slip" not in training.envs[0].unwrapped.spec.kwargs
     training.close()
-    assert make_single_env(spec, training=True).unwrapped.spec.kwargs["goal_reward"] == 60
-    assert make_single_env(spec).unwrapped.spec.kwargs["goal_reward"] == 50
+    # Only training is recorded.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.monitor.csv", "1.monitor.csv"]
+    assert all(isinstance(env, Monitor) for env in evaluation.envs)
 
 
 SHAPED = {"shelf_reward": -10}
@@ -158,15 +153,6 @@ def test_arguments_of_a_registration_are_usual_too():
     assert not trains_on_variant(spec_of("FrozenLake-v1", other))
 
 
-def test_only_training_is_recorded(tmp_path):
-    spec = spec_of("Warehouse-v0", {"n_envs": 2})
-    make_training_env(spec, tmp_path).close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.monitor.csv", "1.monitor.csv"]
-    evaluation = make_evaluation_env(spec, 2)
-    assert len(list(tmp_path.iterdir())) == 2
-    assert all(isinstance(env, Monitor) for env in evaluation.envs)
-
-
 def test_training_environments_follow_the_seed_each_with_its_own():
     def starts(spec):
         env = make_training_env(spec, None)
@@ -188,12 +174,7 @@ def test_training_environments_follow_the_seed_each_with_its_own():
         ("CliffWalking-v1", {}, None, EVALUATION_TIME_LIMIT),
         ("CliffWalking-v1", {"eval_env_kwargs": {"max_episode_steps": 200}}, None, 200),
         ("CliffWalking-v1", {"env_kwargs": {"max_episode_steps": 50}}, 50, 50),
-        (
-            "CliffWalking-v1",
-            {"train_env_kwargs": {"max_episode_steps": 70}},
-            70,
-            EVALUATION_TIME_LIMIT,
-        ),
+        ("CliffWalking-v1", {"train_env_kwargs": {"max_episode_steps": 70}}, 70, 1000),
         # With one.
         ("FrozenLake-v1", {}, 100, 100),
         ("FrozenLake-v1", {"train_env_kwargs": {"max_episode_steps": 7}}, 7, 100),
@@ -245,15 +226,11 @@ def test_wrappers_stand_in_their_order():
 
 
 def test_rewards_are_changed_for_training_and_recorded_unchanged():
-    entry = {
-        "env_kwargs": {"desc": ["SG"]},
-        "train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 0.5}},
-    }
+    scaled = {"envs.wrappers.ScaleReward": {"scale": 0.5}}
+    entry = {"env_kwargs": {"desc": ["SG"]}, "train_env_wrapper": scaled}
     spec = spec_of("Warehouse-v0", entry)
-    for env, reward in (
-        (make_training_env(spec, None), 50.0),
-        (make_evaluation_env(spec, 1), 100.0),
-    ):
+    made = {50.0: make_training_env(spec, None), 100.0: make_evaluation_env(spec, 1)}
+    for reward, env in made.items():
         env.reset()
         _, rewards, dones, infos = env.step([3])
         assert (rewards[0], dones[0]) == (reward, True)
@@ -272,11 +249,6 @@ def test_a_wrapper_put_innermost_is_inside_monitor():
     chain = layers(env.envs[0])
     assert chain.index(ScaleReward) == chain.index(Monitor) + 1
     assert len(made) == 2
-
-
-def test_extra_arguments_reach_evaluation():
-    env = make_evaluation_env(spec_of("FrozenLake-v1"), 1, render_mode="ansi")
-    assert env.envs[0].render_mode == "ansi"
 
 
 def test_a_wrapper_that_does_not_fit_is_told_in_one_line():
@@ -307,15 +279,15 @@ def test_normalisation(given, training, evaluation):
 
 
 def test_evaluation_leaves_the_statistics_alone_and_reports_rewards_as_they_are():
-    eval_env = make_evaluation_env(spec_of("CartPole-v1", {"normalize": True}), 1)
+    eval_env = make_evaluation_env(
+        spec_of("CartPole-v1", {"normalize": True}), 1, render_mode="rgb_array"
+    )
+    assert eval_env.get_attr("render_mode") == ["rgb_array"]
     eval_env.reset()
     before = eval_env.obs_rms.mean.copy()
     rewards = [eval_env.step([0])[1][0] for _ in range(5)]
     assert rewards == [1.0] * 5
     np.testing.assert_array_equal(eval_env.obs_rms.mean, before)
-
-
-def test_nothing_is_normalised_or_stacked_unless_asked_for():
     for env in (
         make_training_env(spec_of("CartPole-v1", {"normalize": False}), None),
         make_evaluation_env(spec_of("CartPole-v1"), 1),
@@ -333,19 +305,6 @@ def test_observations_are_stacked_outside_of_normalisation():
         np.testing.assert_array_equal(first[0, :8], 0)
         second, _, _, _ = env.step([0])
         np.testing.assert_array_equal(second[0, 4:8], first[0, 8:])
-
-
-def test_wrappers_of_the_vectorised_environment_are_inside_normalisation():
-    spec = spec_of(
-        "CartPole-v1",
-        {
-            "normalize": True,
-            "vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan",
-        },
-    )
-    for env in (make_training_env(spec, None), make_evaluation_env(spec, 1)):
-        assert isinstance(env, VecNormalize)
-        assert type(env.venv).__name__ == "VecCheckNan"
 
 
 def test_pictures_are_turned_for_networks():
@@ -400,10 +359,97 @@ def test_environments_are_known_by_name_with_or_without_their_module():
     ],
 )
 def test_wrong_arguments_are_told_in_one_line(env_id, kwargs, complaint):
-    try:
+    with pytest.raises(UserError, match=complaint) as caught:
         make_env(env_id, kwargs)
-    except UserError as error:
-        message = str(error)
-    assert message.startswith(f"{env_id}: ")
-    assert complaint in message
-    assert "\n" not in message
+    assert str(caught.value).startswith(f"{env_id}: ")
+    assert "\n" not in str(caught.value)
+
+
+# --- files that arguments name -------------------------------------------------------------------
+
+ROWS = ["S..", ".#.", "..G"]
+
+
+@pytest.fixture
+def map_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
+
+
+@pytest.mark.usefixtures("map_file")
+@pytest.mark.parametrize("env_id", ["Warehouse-v0", "MineMaze-v0", "envs:Warehouse-v0"])
+@pytest.mark.parametrize("key", ["env_kwargs", "train_env_kwargs", "eval_env_kwargs"])
+def test_a_maps_rows_take_the_place_of_its_path(env_id, key):
+    settings = {"gamma": 0.9, key: {"desc": "map.txt", "slip": 0.1}}
+    read = {"gamma": 0.9, key: {"desc": ROWS, "slip": 0.1}}
+    assert with_maps_read(env_id, settings) == read
+    assert settings[key]["desc"] == "map.txt"
+    settings[key]["desc"] = "S..\n.#.\n..G"
+    assert with_maps_read(env_id, settings) == read
+
+
+@pytest.mark.usefixtures("map_file")
+def test_what_is_no_map_file_is_left_alone_and_a_missing_one_is_named():
+    rows = {"env_kwargs": {"desc": ROWS}, "eval_env_kwargs": None}
+    assert with_maps_read("Warehouse-v0", rows) == rows
+    assert with_maps_read("Warehouse-v0", {}) == {}
+    lake = {"env_kwargs": {"desc": "map.txt"}}
+    assert with_maps_read("FrozenLake-v1", lake) == lake
+    with pytest.raises(UserError, match=r"Warehouse-v0: desc: cannot read the map file no\.txt"):
+        with_maps_read("Warehouse-v0", {"env_kwargs": {"desc": "no.txt"}})
+
+
+@pytest.mark.usefixtures("map_file")
+def test_a_log_is_found_from_other_folders(tmp_path):
+    settings = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
+    found = with_logs_located("ReplayBandit-v0", settings)
+    place = str(tmp_path / "pulls.csv")
+    assert found == {"env_kwargs": {"log": place}, "eval_env_kwargs": {"log": "/a.csv"}}
+    assert settings["env_kwargs"]["log"] == "pulls.csv"
+    assert with_logs_located("FrozenLake-v1", settings) == settings
+    assert with_logs_located("ReplayBandit-v0", {"env_kwargs": None}) == {"env_kwargs": None}
+
+
+# --- memory --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("key", "wrapper", "argument"),
+    [
+        ("env_wrapper", "gymnasium.wrappers.FrameStackObservation", "stack_size"),
+        ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecFrameStack", "n_stack"),
+    ],
+)
+def test_stacks_of_wrappers_are_bounded(key, wrapper, argument):
+    spec = spec_of("CartPole-v1", {key: {wrapper: {argument: 10**9}}})
+    with pytest.raises(UserError, match=f"{argument} must be at most 10,000"):
+        make_evaluation_env(spec, 1)
+
+
+class Greedy(gym.Env):
+    def __init__(self):
+        np.empty(2**50)
+
+
+@pytest.mark.parametrize(
+    ("algo", "entry", "said"),
+    [
+        ("ppo", {"n_envs": 10**9}, "n_envs 1,000,000,000 would take 18,626 GB of memory at least"),
+        ("ppo", {"n_steps": 10**12}, "Unable to allocate"),
+        ("dqn", {"buffer_size": 10**12}, "Unable to allocate"),
+        ("ppo", {"policy_kwargs": "dict(net_arch=[1000000, 1000000])"}, "allocate memory"),
+        ("ppo", {"env_id": "Greedy-v0"}, r"Greedy-v0: .*allocate"),
+    ],
+)
+def test_numbers_beyond_all_memory_end_in_one_line_and_leave_nothing(
+    tmp_path, monkeypatch, algo, entry, said
+):
+    greedy = gym.envs.registration.EnvSpec("Greedy-v0", Greedy, max_episode_steps=9)
+    monkeypatch.setitem(gym.registry, "Greedy-v0", greedy)
+    raw = {"n_timesteps": 10, **entry}
+    env_id = raw.pop("env_id", "CartPole-v1")
+    spec = TrainSpec(algo, env_id, split(raw), raw, seed=0, log_folder=tmp_path / "logs")
+    with pytest.raises(UserError, match=said) as caught:
+        train(spec, Console(quiet=True), {}, "")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "logs").exists()

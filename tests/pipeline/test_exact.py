@@ -14,7 +14,7 @@ from mdp import policy_return, value_iteration
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation import policies
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.policies import OfLastPolicy, policy_matrix
+from pipeline.evaluation.policies import policy_matrix
 from pipeline.evaluation.sampled import Yardstick, evaluate
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -31,6 +31,7 @@ ENVS = {
     "still FrozenLake": ("FrozenLake-v1", {"is_slippery": False}),
     "still MineMaze": ("MineMaze-v0", {}),
 }
+POSITION = {"observation": "position", "max_episode_steps": 60, "slip": 0.1}
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
 AGENTS = {
     "qlearning": {"learning_rate": 0.5, "exploration_final_eps": 0.3},
@@ -88,8 +89,10 @@ def assert_mean_is(expected, std, returns):
 # every environment one that is a table and one that is a network.
 @pytest.mark.parametrize(
     ("name", "env"),
-    [(name, "FrozenLake") for name in AGENTS]
-    + [(name, env) for name in ("qlearning", "ppo") for env in ("Warehouse", "MineMaze")],
+    [
+        *((name, "FrozenLake") for name in AGENTS),
+        *((name, env) for name in ("qlearning", "ppo") for env in ("Warehouse", "MineMaze")),
+    ],
 )
 def test_the_exact_return_is_that_of_sampled_episodes(name, env):
     spec = spec_of(env)
@@ -106,35 +109,24 @@ def test_the_exact_return_is_that_of_sampled_episodes(name, env):
         assert returns.std() == pytest.approx(exact.std_return, rel=0.15, abs=0.01)
 
 
-@pytest.mark.parametrize("name", ["qlearning", "ppo", "dqn", "random"])
-@pytest.mark.parametrize("deterministic", [True, False])
-def test_the_exact_return_is_that_of_the_agents_own_actions(name, deterministic):
-    spec = spec_of("FrozenLake")
-    evaluator = exact_evaluator(spec)
-    agent = briefly_trained(name, spec)
-    exact = evaluator(agent, deterministic)
-    played = evaluate(agent, make_evaluation_env(spec, 50), 1000, 5, deterministic)
-    assert_mean_is(exact.mean_return, exact.std_return, played.returns)
-    assert played.lengths.mean() == pytest.approx(exact.lengths[0], rel=0.15)
-
-
-def test_a_hidden_natural_is_judged_by_what_the_agent_sees():
-    spec = spec_of("Blackjack-v1", env_wrapper="envs.wrappers.FlattenToDiscrete")
-    exact = exact_evaluator(spec)(agent := briefly_trained("qlearning", spec))
-    played = evaluate(agent, make_evaluation_env(spec, 50), 3000, 5)
-    assert_mean_is(exact.mean_return, exact.std_return, played.returns)
-
-
-@pytest.mark.parametrize("env", ["still Warehouse", "still FrozenLake", "still MineMaze"])
-@pytest.mark.parametrize("name", ["qlearning", "ppo", "a2c", "dqn"])
-def test_where_nothing_is_random_one_episode_says_it_all(name, env):
-    spec = spec_of(env)
-    agent = briefly_trained(name, spec)
-    exact = exact_evaluator(spec)(agent)
-    played = evaluate(agent, make_evaluation_env(spec, 1), 1, 0)
-    assert exact.mean_return == pytest.approx(played.mean_return, abs=1e-4)
-    assert exact.lengths[0] == pytest.approx(played.lengths[0], abs=1e-9)
-    assert exact.std_return == pytest.approx(0, abs=1e-4)
+@pytest.mark.parametrize(
+    ("name", "env", "entry", "n_episodes"),
+    [
+        ("qlearning", "FrozenLake", {}, 1000),
+        ("ppo", "FrozenLake", {}, 1000),
+        # A hidden natural is judged by what the agent sees.
+        ("qlearning", "Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}, 3000),
+        ("dqn", "Warehouse-v0", {"env_kwargs": POSITION}, 200),
+    ],
+)
+def test_the_exact_return_is_that_of_the_agents_own_actions(name, env, entry, n_episodes):
+    spec = spec_of(env, **entry)
+    agent, evaluator = briefly_trained(name, spec), exact_evaluator(spec)
+    for deterministic in (True, False):
+        exact = evaluator(agent, deterministic)
+        played = evaluate(agent, make_evaluation_env(spec, 50), n_episodes, 5, deterministic)
+        assert_mean_is(exact.mean_return, exact.std_return, played.returns)
+        assert played.lengths.mean() == pytest.approx(exact.lengths[0], rel=0.15)
 
 
 # --- observations --------------------------------------------------------------------------------
@@ -182,31 +174,15 @@ def test_other_observations_of_the_same_states(encoding):
         assert seen.summary() == expected.summary()
 
 
-@pytest.mark.parametrize("name", ["ppo", "dqn"])
-def test_networks_on_other_observations(name):
-    kwargs = {"observation": "position", "max_episode_steps": 60, "slip": 0.1}
-    spec = spec_of("Warehouse-v0", env_kwargs=kwargs)
-    evaluator, agent = exact_evaluator(spec), briefly_trained(name, spec)
-    exact = evaluator(agent)
-    played = evaluate(agent, make_evaluation_env(spec, 20), 200, 5)
-    assert_mean_is(exact.mean_return, exact.std_return, played.returns)
-
-
 @pytest.mark.parametrize(
     ("env", "entry"),
     [
         ("CartPole-v1", {}),
         ("FrozenLake-v1", {"normalize": {"norm_obs": False}}),
         ("FrozenLake-v1", {"frame_stack": 2}),
-        (
-            "FrozenLake-v1",
-            {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"},
-        ),
+        ("FrozenLake-v1", {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"}),
         # Twenty-two thousand states of as many numbers each are two gigabytes.
-        (
-            "envs:RandomWarehouse-v0",
-            {"env_kwargs": {"size": 150, "observation": "one_hot"}},
-        ),
+        ("envs:RandomWarehouse-v0", {"env_kwargs": {"size": 150, "observation": "one_hot"}}),
     ],
 )
 def test_where_episodes_must_be_sampled(env, entry):
@@ -226,14 +202,17 @@ def test_what_takes_longer_than_playing_is_said(monkeypatch):
     assert evaluator.obstacle(agents["qlearning"], deterministic=False).startswith("random")
 
 
-@pytest.mark.parametrize("name", ["dqn", "ppo"])
-def test_a_network_is_asked_in_parts_where_states_are_many(name, monkeypatch):
+def test_a_network_is_asked_in_parts_where_states_are_many(monkeypatch):
     spec = spec_of("Warehouse")
-    evaluator, agent = exact_evaluator(spec), briefly_trained(name, spec)
-    at_once = [evaluator(agent, sure) for sure in (True, False)]
-    monkeypatch.setattr(policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
-    for sure, expected in zip((True, False), at_once, strict=True):
-        assert evaluator(agent, sure).mean_return == pytest.approx(expected.mean_return, rel=1e-5)
+    evaluator = exact_evaluator(spec)
+    for name in ("dqn", "ppo"):
+        agent = briefly_trained(name, spec)
+        for sure in (True, False):
+            at_once = evaluator(agent, sure).mean_return
+            with monkeypatch.context() as patch:
+                patch.setattr(policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
+                in_parts = exact_evaluator(spec)(agent, sure).mean_return
+            assert in_parts == pytest.approx(at_once, rel=1e-5)
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.1])
@@ -255,17 +234,12 @@ def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
             return 3 - actions, state
 
     rng, states = np.random.default_rng(0), np.arange(16)
-    for tables, algorithm in (
-        (1, load_algorithm("qlearning")),
-        (2, load_algorithm("double_qlearning")),
-    ):
-        agent = algorithm(env="FrozenLake-v1")
-        assert len(agent.policy.q_tables) == tables
+    for name, tables in (("qlearning", 1), ("double_qlearning", 2)):
+        agent = load_algorithm(name)(env="FrozenLake-v1")
         agent.policy.q_tables.numpy()[:] = rng.normal(size=(tables, 16, 4)).round(1)
         expected, _ = agent.predict(states, deterministic=True)
         assert (policies.best_actions(agent, states) == expected).all()
-    contrary = Contrary(env="FrozenLake-v1")
-    assert (policies.best_actions(contrary, states) == 3).all()
+    assert (policies.best_actions(Contrary(env="FrozenLake-v1"), states) == 3).all()
 
 
 def test_what_an_unknown_agent_samples_from_is_not_guessed():
@@ -315,26 +289,6 @@ def test_figures_of_the_yardstick():
     assert (nearly.score(np.nextafter(0.3, 0)), nearly.score(0.29)) == (1.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("other", "is_same"),
-    [
-        (np.array([0, 1, 1]), True),
-        (np.array([0, 1, 2]), False),
-        (np.array([0.0, 1.0, 1.0]), False),
-        (np.array([[0, 1, 1]]), False),
-    ],
-)
-def test_what_follows_from_a_policy_is_worked_out_again_only_for_another(other, is_same):
-    asked = []
-    worth = OfLastPolicy(lambda policy: asked.append(policy.tolist()) or len(asked))
-    policy = np.array([0, 1, 1])
-    assert worth(policy) == 1
-    assert worth(other) == (1 if is_same else 2)
-    policy[0] = 2  # an agent may hand over its own array
-    assert worth(policy) == len(asked) == (2 if is_same else 3)
-    assert asked[-1] == [2, 1, 1]
-
-
 def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
     spec = spec_of("FrozenLake")
     evaluator, agent = exact_evaluator(spec), briefly_trained("qlearning", spec)
@@ -373,12 +327,6 @@ def boltzmann(row, agent):
     return [weight / sum(weights) for weight in weights]
 
 
-STRATEGIES = {
-    "epsilon_greedy": (epsilon_greedy, {"exploration_final_eps": 0.25}),
-    "boltzmann": (boltzmann, {"exploration": "boltzmann", "temperature": 0.3}),
-}
-
-
 def added_up(agent, choose, env):
     """Mean return and mean length of an episode, by going through all of them at once."""
     outcomes = env.unwrapped.P
@@ -400,10 +348,14 @@ def added_up(agent, choose, env):
 
 
 @pytest.mark.parametrize("cells", MAPS)
-@pytest.mark.parametrize("strategy", STRATEGIES)
-@pytest.mark.parametrize("name", ["qlearning", "sarsa"])
-def test_the_worth_of_exploring(name, strategy, cells):
-    choose, arguments = STRATEGIES[strategy]
+@pytest.mark.parametrize(
+    ("name", "choose", "arguments"),
+    [
+        ("qlearning", epsilon_greedy, {"exploration_final_eps": 0.25}),
+        ("sarsa", boltzmann, {"exploration": "boltzmann", "temperature": 0.3}),
+    ],
+)
+def test_the_worth_of_exploring(name, choose, arguments, cells):
     env_kwargs = {"desc": MAPS[cells], "is_slippery": False}
     spec, agent = trained(name, env_kwargs, **arguments)
     found = exact_evaluator(spec)(agent, deterministic=False)

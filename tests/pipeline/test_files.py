@@ -5,7 +5,6 @@ import json
 import math
 import os
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from pipeline import files
-from pipeline.digests import FIELD
 from pipeline.files import (
     json_text,
     naming,
@@ -26,7 +24,6 @@ from pipeline.files import (
     write_text,
 )
 from pipeline.locks import folder_lock
-from pipeline.runs import FINISHED, Run
 
 
 def names(folder):
@@ -38,13 +35,13 @@ def test_a_file_is_made_and_replaced(tmp_path):
     for text in ("first", "zweiter ± 1"):
         write_text(path, text)
         assert path.read_text(encoding="utf-8") == text
-        assert names(tmp_path) == ["notes.txt"]
-
-
-def test_json_comes_back(tmp_path):
-    data = {"returns": [1.5, None], "name": "ä"}
-    write_json(tmp_path / "run.json", data)
-    assert json.loads((tmp_path / "run.json").read_text(encoding="utf-8")) == data
+    assert names(tmp_path) == ["notes.txt"]
+    write_json(path, data := {"returns": [1.5, None], "name": "ä"})
+    assert json.loads(path.read_text(encoding="utf-8")) == data
+    with pytest.raises(TypeError):
+        write_json(path, {"state": object()})
+    assert json.loads(path.read_text(encoding="utf-8")) == data
+    assert names(tmp_path) == ["notes.txt"]
 
 
 def test_the_draft_lies_beside_and_the_old_file_stays_until_the_end(tmp_path):
@@ -59,18 +56,12 @@ def test_the_draft_lies_beside_and_the_old_file_stays_until_the_end(tmp_path):
         assert path.read_text() == "old"
     assert path.read_text() == "new"
     assert names(tmp_path) == ["model.zip"]
+    # Nobody can tell its name: a link there would lead what is written to another's file.
+    with replacing(path), replacing(path):
+        assert len({draft, *names(tmp_path)}) == 4
 
 
-def test_nobody_can_tell_the_name_of_a_draft(tmp_path):
-    """A link of that name would lead what is written to another's file."""
-    found = set()
-    for _ in range(20):
-        with replacing(tmp_path / "model.zip"):
-            found.add(names(tmp_path)[0])
-    assert len(found) == 20
-
-
-@pytest.mark.parametrize("error", [OSError, ValueError, KeyboardInterrupt])
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
 @pytest.mark.parametrize("old", ["old", None])
 def test_a_writer_that_fails_changes_nothing(tmp_path, error, old):
     path = tmp_path / "model.zip"
@@ -127,15 +118,16 @@ def test_a_disk_that_fails_changes_nothing(tmp_path, monkeypatch):
 def test_a_folder_that_cannot_be_flushed_is_passed_over_and_a_broken_disk_is_not(
     tmp_path, monkeypatch
 ):
-    def failing(code):
-        def fsync(_):
-            raise OSError(code, "no")
+    with pytest.raises(FileNotFoundError):
+        files.sync(tmp_path / "missing", *[tmp_path] * 20)
+    code = [errno.EINVAL]
 
-        return fsync
+    def fsync(_):
+        raise OSError(code[0], "no")
 
-    monkeypatch.setattr(files.os, "fsync", failing(errno.EINVAL))
+    monkeypatch.setattr(os, "fsync", fsync)
     files.sync(tmp_path)
-    monkeypatch.setattr(files.os, "fsync", failing(errno.EIO))
+    code[0] = errno.EIO
     with pytest.raises(OSError, match="no"):
         files.sync(tmp_path)
 
@@ -147,49 +139,6 @@ def test_a_disk_that_is_full_is_named_and_another_error_is_left_alone(tmp_path):
     with pytest.raises(BrokenPipeError) as caught, naming(tmp_path):
         raise BrokenPipeError(errno.EPIPE, "gone")
     assert caught.value.filename is None
-
-
-def test_what_cannot_be_json_leaves_the_old_file(tmp_path):
-    path = tmp_path / "run.json"
-    write_json(path, {"state": "running"})
-    with pytest.raises(TypeError):
-        write_json(path, {"state": object()})
-    assert json.loads(path.read_text()) == {"state": "running"}
-    assert names(tmp_path) == ["run.json"]
-
-
-def test_a_reader_never_meets_a_half_written_file(tmp_path):
-    path = tmp_path / "evaluations"
-    texts = ["a" * 200_000, "b" * 200_000]
-    write_text(path, texts[0])
-    met = set()
-    done = threading.Event()
-
-    def read():
-        while not done.is_set():
-            met.add(path.read_text(encoding="utf-8"))
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    for i in range(100):
-        write_text(path, texts[i % 2])
-    done.set()
-    reader.join()
-    assert met <= set(texts)
-    assert met
-
-
-def test_what_is_flushed_may_be_written(tmp_path, monkeypatch):
-    """Windows flushes no file that was opened for reading."""
-    fsync = os.fsync
-
-    def as_on_windows(descriptor):
-        os.write(descriptor, b"")
-        fsync(descriptor)
-
-    monkeypatch.setattr(files.os, "fsync", as_on_windows)
-    write_text(tmp_path / "notes.txt", "whole")
-    assert (tmp_path / "notes.txt").read_text() == "whole"
 
 
 @pytest.fixture
@@ -209,15 +158,17 @@ def refusals(monkeypatch):
     return left, tried
 
 
-@pytest.mark.parametrize(("n", "platform"), [(0, "linux"), (0, "win32"), (3, "win32")])
-def test_what_a_scanner_holds_is_renamed_soon(tmp_path, monkeypatch, refusals, n, platform):
+@pytest.mark.parametrize(
+    ("n", "platform", "tries"), [(0, "linux", 1), (0, "win32", 1), (3, "win32", 4)]
+)
+def test_what_a_scanner_holds_is_renamed_soon(tmp_path, monkeypatch, refusals, n, platform, tries):
     monkeypatch.setattr(sys, "platform", platform)
     left, tried = refusals
     left[0] = n
     (tmp_path / "draft").write_text("new")
     put_in_place(tmp_path / "draft", tmp_path / "file")
     assert (tmp_path / "file").read_text() == "new"
-    assert len(tried) == n + 1
+    assert len(tried) == tries
 
 
 @pytest.mark.parametrize(("platform", "n"), [("linux", 1), ("win32", 6)])
@@ -283,11 +234,6 @@ def test_a_folder_that_is_gone_is_not_made_anew(tmp_path):
     assert not path.parent.exists()
 
 
-def test_what_the_disk_cannot_be_asked_for_is_told(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        files.sync(tmp_path / "missing", *[tmp_path] * 20)
-
-
 leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 values = st.recursive(
     leaves, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=10
@@ -327,13 +273,3 @@ def test_what_is_no_json_is_written_as_the_nearest_that_is():
     }
     with pytest.raises(TypeError, match="object"):
         plain([object()])
-
-
-def test_a_record_of_odd_values_is_valid_and_whole(tmp_path):
-    run = Run(tmp_path, "FrozenLake-v1")
-    run.end(state=FINISHED, spec={"clip": math.inf, "scale": np.float32(0.5)}, final=math.nan)
-    record = strictly(run.info_path.read_text(encoding="utf-8"))
-    assert record == run.read_info()  # which holds it against its own digest
-    assert record["spec"] == {"clip": math.inf, "scale": 0.5}
-    assert record["final"] is None
-    assert FIELD in record

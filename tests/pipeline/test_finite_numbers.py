@@ -1,9 +1,11 @@
-"""A run that meets nan or infinity fails, says where, and leaves no broken model."""
+"""A run that meets nan, infinity or settings that no library takes fails and says where."""
 
 import io
 import json
 import math
+import types
 import zipfile
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -18,6 +20,7 @@ from hypothesis.extra import numpy as arrays
 from agents.bandits.tables import BanditPolicy
 from experiments.bandits import _check_rewards
 from pipeline.callbacks import NumberWatch
+from pipeline.failures import LibraryError, blame_settings
 from pipeline.finite_numbers import NotFiniteError, check_model, check_rows, is_finite
 
 
@@ -49,13 +52,8 @@ class Broken(gym.Env):
         self.steps += 1
         due = self.steps == self.at
         reward = self.value if due and self.what == "reward" else 1.0
-        return (
-            self._observation(due and self.what == "obs"),
-            reward,
-            self.steps % 10 == 0,
-            False,
-            {},
-        )
+        obs = self._observation(due and self.what == "obs")
+        return obs, reward, self.steps % 10 == 0, False, {}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -83,54 +81,30 @@ def train_on_broken(type_in_own_folder, own_folder):
 PPO = ("-params", "n_steps:8", "batch_size:8", "n_epochs:1")
 STEP = "reward of environment 0 at step 25 is nan"
 # Agent, environment, further flags, and the line.
+AT_25 = "observation of environment 0 at step 25 is nan"
 CASES = {
     "a table": ("qlearning", {"what": "reward", "kind": "discrete"}, (), STEP),
     "a network": ("ppo", {"what": "reward"}, PPO, STEP),
-    "a buffer": ("dqn", {"what": "obs"}, (), "observation of environment 0 at step 25 is nan"),
-    "infinity": (
-        "dqn",
-        {"what": "obs", "value": -math.inf},
-        (),
-        "observation of environment 0 at step 25 is -inf",
-    ),
+    "a buffer": ("dqn", {"what": "obs"}, (), AT_25),
+    "infinity": ("dqn", {"what": "obs", "value": -math.inf}, (), AT_25.replace("nan", "-inf")),
     "no single precision": (
         "td3",
         {"what": "reward", "value": 1e39, "continuous": True},
         (),
         "reward of environment 0 at step 25 is inf",
     ),
-    "by name": (
-        "ppo",
-        {"what": "obs", "kind": "dict"},
-        PPO,
-        "observation 'eye' of environment 0 at step 25 is nan",
-    ),
+    "by name": ("ppo", {"what": "obs", "kind": "dict"}, PPO, AT_25.replace("n of", "n 'eye' of")),
     "before a reset": (
         "dqn",
         {"what": "obs", "at": 20},
         (),
-        "last observation of an episode of environment 0 at step 20 is nan",
+        "last observation of an episode of e",
     ),
-    "after a reset": (
-        "ppo",
-        {"what": "reset", "at": 20},
-        PPO,
-        "observation of environment 0 at step 20 is nan",
-    ),
+    "after a reset": ("ppo", {"what": "reset", "at": 20}, PPO, AT_25.replace("25", "20")),
     "at the start": ("dqn", {"what": "reset", "at": 0}, (), "observation of environment 0 at ste"),
     "whole episodes": ("ars", {"what": "reward"}, (), STEP),
-    "several": (
-        "ppo",
-        {"what": "reward"},
-        (*PPO, "n_envs:2"),
-        "reward of environment 0 at step 50 is nan",
-    ),
-    "statistics": (
-        "ppo",
-        {"what": "obs"},
-        (*PPO, "normalize:true"),
-        "observation of environment 0 at step 25 is nan",
-    ),
+    "several": ("ppo", {"what": "reward"}, (*PPO, "n_envs:2"), STEP.replace("25", "50")),
+    "statistics": ("ppo", {"what": "obs"}, (*PPO, "normalize:true"), AT_25),
     "evaluation sees": (
         "dqn",
         {},
@@ -156,6 +130,7 @@ def test_a_run_fails_at_the_first_number_that_is_none(train_on_broken, algo, kwa
     assert info["state"] == "failed"
     assert line in info["reason"]
     assert not (folder / "Broken-v0.zip").exists()
+    assert ("keeps best_model.zip" in said) == (folder / "best_model.zip").exists()
 
 
 @pytest.mark.parametrize(
@@ -174,12 +149,6 @@ def test_weights_that_are_none_are_never_saved(train_on_broken, algo, flags):
         assert all(th.isfinite(tensor).all() for tensor in weights.values())
 
 
-def test_the_best_model_before_the_break_stays(train_on_broken):
-    _, said, folder, _ = train_on_broken("dqn", {"what": "reward"})
-    assert f"keeps {(folder / 'best_model.zip').name}" in said
-    assert (folder / "best_model.zip").exists()
-
-
 @given(
     arrays.arrays(
         st.sampled_from([np.float64, np.float32, np.float16, np.int64, np.uint8, np.bool_]),
@@ -188,9 +157,7 @@ def test_the_best_model_before_the_break_stays(train_on_broken):
 )
 def test_the_quick_look_is_numpys(values):
     assert is_finite(values) == bool(np.isfinite(values).all())
-
-
-def test_large_numbers_are_no_infinity():
+    # Large numbers add up to no infinity.
     assert is_finite(np.array([1e300, -1e300]))
     assert is_finite(np.array([3e38], dtype=np.float32))
 
@@ -275,3 +242,47 @@ def test_a_batch_of_bandits_is_looked_at_too():
     rewards[1, 3] = np.nan
     with pytest.raises(NotFiniteError, match=r"^reward of seed 1 at step 4 is nan$"):
         _check_rewards(SimpleNamespace(rewards=rewards), first_seed=0)
+
+
+STOPPED_AT = types.SimpleNamespace(num_timesteps=1234)
+
+
+def test_the_step_and_the_line_of_the_library_are_named(type_in_own_folder, own_folder):
+    code, _, said = type_in_own_folder(
+        *("train.py", "--env", "FrozenLake-v1", "--algo", "ppo", "-n", "64", "--verbose", "0"),
+        *("-params", "clip_range:1e308", "n_steps:32", "batch_size:32", "n_envs:1"),
+    )
+    assert (code, said.count("\n")) == (2, 1)
+    assert "ppo at step 32: value cannot be converted to type float without overflow (" in said
+    record = next((own_folder / "logs").rglob("run.json"))
+    assert json.loads(record.read_text(encoding="utf-8"))["state"] == "failed"
+
+
+CODE = """
+def of_torch(): th.nn.Linear(2, 2)(th.zeros(3))
+def of_itself(): [].pop()
+def of_memory(): raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "function", "is_blamed"),
+    [
+        ("agents.library", "of_torch", True),
+        ("agents.library", "of_itself", False),
+        ("torch.nn", "of_itself", True),
+        ("torch.nn", "of_memory", False),
+        ("someones_environment", "of_torch", False),
+    ],
+)
+def test_only_what_went_through_no_code_of_the_users_is_blamed(module, function, is_blamed):
+    names = {"__name__": module, "th": th}
+    exec(CODE, names)  # noqa: S102  # ours
+    try:
+        names[function]()
+    except (RuntimeError, IndexError) as error:
+        # The first line is this file's, where that of a training is one of ours.
+        mistake = error.with_traceback(error.__traceback__.tb_next)
+    words = r"^dqn at step 1,234: .* \((torch, .+\.py|torch, <string>):\d+\)$"
+    with pytest.raises(LibraryError, match=words) if is_blamed else nullcontext():
+        blame_settings("dqn", STOPPED_AT, mistake)

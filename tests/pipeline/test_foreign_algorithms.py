@@ -8,18 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from rich.console import Console
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 import agents
-from agents.common.model_files import JsonAlgorithm
 from pipeline import training
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.models.load import _JSON_FAMILIES, hand_written_algorithm, load_model, read_model
+from pipeline.models.load import hand_written_algorithm, load_model, read_model
 from pipeline.settings.components import build_algorithm_kwargs, default_policy, needs_policy
 from pipeline.settings.hyperparams import split
 from pipeline.settings.values import algorithm_parameters
@@ -170,11 +168,6 @@ def test_what_has_no_annotation_is_read_as_its_default(given, wanted):
     assert kwargs == {"policy": "FirstPolicy", **(wanted or given)}
 
 
-def test_a_schedule_where_the_default_is_a_number():
-    kwargs = build_algorithm_kwargs(Plain, {"policy": "FirstPolicy", "weight": "lin_0.5"}, "plain")
-    assert kwargs["weight"](0.5) == pytest.approx(0.25)
-
-
 @pytest.mark.parametrize(
     ("algorithm", "kwargs", "complaint"),
     [
@@ -243,24 +236,6 @@ def test_a_class_that_is_none_is_told_before_anything_is_made(tmp_path):
     with pytest.raises(UserError, match=r"typo is registered as .*:Typo, which does not exist"):
         train(spec_of("typo", tmp_path / "logs"))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_any_space_may_be_refused_by_the_class(tmp_path):
-    assert agents.ALGORITHMS["rising"].misfit(spaces.Text(2), spaces.Text(2)) == ""
-    raw = {"n_timesteps": 10}
-    spec = TrainSpec(
-        "rising", "Pendulum-v1", split(raw), raw, 0, log_folder=tmp_path / "logs", verbose=0
-    )
-    with pytest.raises(UserError, match="Discrete"):
-        train(spec)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_agents_that_are_taken_to_hold_no_pickle_do_not():
-    entries = agents.ALGORITHMS.items()
-    known = [name for name, entry in entries if entry.family in _JSON_FAMILIES]
-    assert {"qlearning", "ucb", "mabwiser_ucb1"} <= set(known)
-    assert all(issubclass(agents.load_algorithm(name), JsonAlgorithm) for name in known)
 
 
 @pytest.mark.parametrize(

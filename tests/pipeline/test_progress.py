@@ -1,8 +1,9 @@
-"""What a person watching a training run reads, in a terminal and elsewhere."""
+"""What a person watching reads, in terminals and elsewhere, of trainings and of what takes long."""
 
 import io
 import logging
 import re
+import threading
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -10,16 +11,20 @@ import pytest
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
-import pipeline.progress as module
 from agents import load_algorithm
-from pipeline import signs_of_life
+from pipeline import progress, signs_of_life
 from pipeline.progress import ProgressDisplay
+from pipeline.signs_of_life import COMPILING, Heartbeat, can_move, doing
+
+
+def learner():
+    return load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
 
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled():
     """What the agent needs is compiled before anything is counted."""
-    load_algorithm("qlearning")(env="FrozenLake-v1", engine="interpreted").learn(1)
+    learner().learn(1)
 
 
 @pytest.fixture
@@ -31,30 +36,58 @@ def clock(monkeypatch):
         fake.now += 0.01
         return fake.now
 
-    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=monotonic))
-    # What is due by the clock looks at it without letting it go on, and not by itself.
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=monotonic))
+    # What is due by the clock looks at it without letting it go on.
     monkeypatch.setattr(signs_of_life, "time", SimpleNamespace(monotonic=lambda: fake.now))
-    monkeypatch.setattr(module, "Heartbeat", lambda *_: SimpleNamespace(start=skip, stop=skip))
     return fake
 
 
-def skip():
-    pass
+@pytest.fixture(autouse=True)
+def hearts(monkeypatch):
+    """Nothing beats by itself; which hearts do is noted."""
+    beating = []
+
+    class StillHeart(Heartbeat):
+        def start(self):
+            beating.append(self)
+
+        def stop(self):
+            beating.clear()
+
+    for module in (progress, signs_of_life):
+        monkeypatch.setattr(module, "Heartbeat", StillHeart)
+    return beating
 
 
-def watched(n_steps, *, live, terminal, **arguments):
-    """What is written while an agent learns."""
+def console_of(terminal, width=120, **options):
     file = io.StringIO()
-    console = Console(file=file, width=120, force_terminal=terminal, color_system=None)
-    arguments = {"engine": "interpreted", **arguments}
-    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, **arguments)
+    return file, Console(
+        file=file, width=width, force_terminal=terminal, color_system=None, **options
+    )
+
+
+def plain(text):
+    """Without the codes that move the cursor."""
+    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
+
+
+def watched(n_steps, *, live):
+    """What is written while an agent learns."""
+    file, console = console_of(live)
     display = ProgressDisplay(console, live=live)
-    agent.learn(n_steps, callback=display)
+    learner().learn(n_steps, callback=display)
     return display, file.getvalue()
 
 
+def compile_something():
+    logging.getLogger("machine_code").info("compiling run_block")
+
+
+# --- a training ----------------------------------------------------------------------------------
+
+
 def test_elsewhere_ten_plain_lines(clock):
-    _, text = watched(1000, live=False, terminal=False)
+    _, text = watched(1000, live=False)
     lines = text.splitlines()
     assert len(lines) == 10
     shares = [int(re.match(r" *(\d+)%  ", line)[1]) for line in lines]
@@ -72,33 +105,29 @@ def test_elsewhere_ten_plain_lines(clock):
         assert int(left or 0) == pytest.approx((100 - share) / 10, abs=1.5)
     assert lines[-1].startswith("100%  1,000 steps")
     assert "\x1b" not in text
-    assert re.search(r"mean return in training 0\.\d\d$", lines[-1])
-
-
-def test_no_return_is_shown_before_an_episode_has_ended(clock):
-    _, text = watched(5, live=False, terminal=False)
-    assert re.fullmatch(r"100%  5 steps\n", text)
+    # No return is shown before an episode has ended.
+    assert watched(5, live=False)[1] == "100%  5 steps\n"
 
 
 def test_a_second_training_counts_its_own_steps_alone(clock):
-    console = Console(file=io.StringIO(), force_terminal=False)
-    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
-    agent.learn(1000)
+    file, console = console_of(terminal=False)
+    agent = learner().learn(1000)
     agent.learn(1000, callback=ProgressDisplay(console, live=False), reset_num_timesteps=False)
-    *lines, last = console.file.getvalue().splitlines()
+    *lines, last = file.getvalue().splitlines()
     assert "2,000 steps" in last
     left = {line[:3]: re.search(r"about (\d+) s left", line) for line in lines}
     assert int(left[" 60"][1]) == pytest.approx(8, abs=1)
 
 
 def test_in_a_terminal_a_bar(clock):
-    display, text = watched(1000, live=True, terminal=True)
-    plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
-    shown = [int(share) for share in re.findall(r"(\d+)% ", plain)]
+    display, text = watched(1000, live=True)
+    shown = [int(share) for share in re.findall(r"(\d+)% ", plain(text))]
     assert shown == sorted(shown)
     assert len(set(shown)) > 20
     assert shown[-1] == 100
-    assert re.search(r"100% +1,000 steps  mean return in training 0\.\d\d", plain)
+    # Ten seconds, by a clock of which every reading takes a hundredth: ten times a second at most.
+    assert len(shown) <= 110
+    assert re.search(r"100% +1,000 steps  mean return in training 0\.\d\d", plain(text))
     # The bar lets go of the terminal: the cursor is shown again, and closing twice is harmless.
     assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
     assert display.bar is None
@@ -108,48 +137,35 @@ def test_in_a_terminal_a_bar(clock):
     assert display.console.file.getvalue() == text
 
 
-def test_a_bar_moves_ten_times_a_second_at_most(clock):
-    _, text = watched(1000, live=True, terminal=True)
-    plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
-    # Ten seconds, by a clock of which every reading takes a hundredth.
-    assert len(re.findall(r"\d+% ", plain)) <= 110
-
-
 class Slow(BaseCallback):
-    """Lets time go by in one step, and the display look at it every second."""
+    """Lets 24 seconds go by in one step, and the display look at it every second."""
 
-    def __init__(self, display, clock, at, seconds, activity=None):
+    def __init__(self, display, clock):
         super().__init__()
-        self.display, self.clock, self.at, self.seconds = display, clock, at, seconds
-        self.activity = activity
+        self.display, self.clock = display, clock
 
     def _on_step(self):
-        if self.num_timesteps == self.at:
-            with self.display.doing(self.activity) if self.activity else nullcontext():
-                for _ in range(self.seconds):
+        if self.num_timesteps == 30:
+            with self.display.doing("evaluating"):
+                for _ in range(24):
                     self.clock.now += 1
                     self.display.look()
         return True
 
 
-def slow_training(clock, live=False, **options):
-    """What is written of five steps, of which one takes 24 seconds."""
-    file = io.StringIO()
+def slow_training(clock, live=False):
     # A line is one line, however narrow the console is that rich assumes in a pipe.
-    width = 120 if live else 20
-    console = Console(file=file, width=width, force_terminal=live, color_system=None)
-    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
+    file, console = console_of(live, width=120 if live else 20)
     display = ProgressDisplay(console, live=live)
-    agent.learn(1000, callback=[display, Slow(display, clock, seconds=24, **options)])
-    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", file.getvalue())
+    learner().learn(1000, callback=[display, Slow(display, clock)])
+    return plain(file.getvalue())
 
 
 def test_a_line_comes_early_and_then_every_ten_seconds_also_while_no_step_ends(clock):
-    lines = slow_training(clock, at=30, activity="evaluating").splitlines()
+    lines = slow_training(clock).splitlines()
     # Two seconds after the beginning, and then ten after each line.
-    assert re.fullmatch(
-        r"  \d%  2\d steps  mean return in training 0.00  evaluating, 2 s", lines[0]
-    )
+    first = r"  \d%  2\d steps  mean return in training 0.00  evaluating, 2 s"
+    assert re.fullmatch(first, lines[0])
     assert "left by the clock" in lines[3]
     assert [re.search(r"evaluating, (\d+) s", line)[1] for line in lines[:3]] == ["2", "12", "22"]
     # Thereafter nothing of it is left.
@@ -158,75 +174,197 @@ def test_a_line_comes_early_and_then_every_ten_seconds_also_while_no_step_ends(c
     assert len(lines) == 13
 
 
-def test_before_the_first_step_there_is_a_line_too(clock):
-    file = io.StringIO()
-    display = ProgressDisplay(Console(file=file, force_terminal=False), live=False)
-    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
-    agent._setup_learn(10, display)
-    display.init_callback(agent)
-    display.on_training_start({}, {})
-    clock.now += 3
-    display.look()
-    display.close()
-    assert file.getvalue() == "  0%\n"
-
-
 def test_what_goes_on_besides_training_stands_beside_the_bar(clock):
-    text = slow_training(clock, live=True, at=30, activity="evaluating")
+    text = slow_training(clock, live=True)
     assert "evaluating, 12 s" in text
     assert "evaluating" not in text[text.index("50%") :]
 
 
-def test_learning_between_two_rollouts_is_said(clock):
-    console = Console(file=io.StringIO(), width=120, force_terminal=False)
-    display = ProgressDisplay(console, live=False)
+@pytest.mark.parametrize(("moment", "said"), [("start", "  0%\n"), ("end", "  learning, 2 s\n")])
+def test_before_the_first_step_and_between_two_rollouts_there_is_a_line_too(clock, moment, said):
+    class LooksBesides(BaseCallback):
+        def _on_training_start(self):
+            self.look("start")
 
-    class LooksWhileItLearns(BaseCallback):
         def _on_step(self):
             return True
 
         def _on_rollout_end(self):
-            for _ in range(3):
+            self.look("end")
+
+        def look(self, now):
+            for _ in range(3 * (now == moment)):
                 clock.now += 1
                 display.look()
 
+    file, console = console_of(terminal=False)
+    display = ProgressDisplay(console, live=False)
     agent = load_algorithm("ppo")("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8, seed=0)
-    agent.learn(8, callback=[display, LooksWhileItLearns()])
-    assert "  learning, 2 s\n" in console.file.getvalue()
+    agent.learn(8, callback=[display, LooksBesides()])
+    assert said in file.getvalue()
 
 
-def test_returns_of_a_variant_are_called_so(clock):
-    file = io.StringIO()
-    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
-    display = ProgressDisplay(Console(file=file, width=120), live=False, on_variant=True)
-    agent.learn(100, callback=display)
-    assert re.search(
-        r"in training \(there the environment is changed\) 0\.\d\d$", file.getvalue().rstrip()
-    )
+@pytest.mark.parametrize("times", [2, 0])
+def test_compiling_is_said_once_and_a_variant_is_called_so(clock, times):
+    class Compiling(BaseCallback):
+        def _on_step(self):
+            for _ in range(times):
+                compile_something()
+            return True
+
+    file, console = console_of(terminal=False)
+    display = ProgressDisplay(console, live=False, on_variant=True)
+    learner().learn(100, callback=[Compiling(), display])
+    compile_something()  # afterwards nobody listens any more
+    said = "compiling the training loop (the first time, some seconds)\n" * bool(times)
+    assert file.getvalue().startswith(said)
+    assert file.getvalue().count("compiling") == bool(times)
+    variant = r"in training \(there the environment is changed\) 0\.\d\d$"
+    assert re.search(variant, file.getvalue().rstrip())
 
 
-class Compiling(BaseCallback):
-    """Stands for a loop that has to be compiled, or for more than one."""
+# --- anything that takes long --------------------------------------------------------------------
 
-    def __init__(self, times):
-        super().__init__()
-        self.times = times
 
-    def _on_step(self):
-        for _ in range(self.times):
-            logging.getLogger("machine_code").info("compiling run_block")
-        return True
+def test_what_takes_long_is_said_after_five_seconds_and_then_every_ten(clock):
+    file, console = console_of(terminal=False)
+    said = []
+    with doing(console, "drawing [all]") as activity:
+        for second in range(1, 40):
+            clock.now += 1
+            activity.look()
+            if len(file.getvalue().splitlines()) > len(said):
+                said.append(second)
+            if second == 20:
+                activity.now("writing")
+                activity.at("section 2 of 3")
+    assert said == [6, 17, 28, 39]
+    assert file.getvalue().splitlines() == [
+        "drawing [all], 6 s",
+        "drawing [all], 17 s",
+        "writing: section 2 of 3, 8 s",
+        "writing: section 2 of 3, 19 s",
+    ]
+
+
+def test_a_line_that_is_printed_meanwhile_breaks_the_silence(clock):
+    file, console = console_of(terminal=False)
+    with doing(console, "playing") as activity:
+        for _ in range(9):
+            clock.now += 4
+            activity.say("episode [1]")
+            activity.look()
+    assert file.getvalue() == "episode [1]\n" * 9
+
+
+def test_compiling_is_said_at_once_and_once(clock):
+    file, console = console_of(terminal=False)
+    with doing(console, "loading") as activity:
+        compile_something()
+        compile_something()
+        clock.now += 9
+        activity.look()
+    compile_something()
+    assert file.getvalue() == f"loading: {COMPILING}\n"
+
+
+def test_a_quiet_console_gets_no_line_and_no_thread(clock, hearts):
+    file, console = console_of(terminal=True, quiet=True)
+    with doing(console, "loading") as activity:
+        assert not hearts
+        clock.now += 100
+        activity.look()
+        compile_something()
+    assert file.getvalue() == ""
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt, ValueError])
+def test_on_a_terminal_one_line_moves_and_is_gone_in_the_end(clock, hearts, error):
+    file, console = console_of(terminal=True)
+
+    def work():
+        with doing(console, "loading [x]") as activity:
+            assert hearts
+            # It is there at once, and does not wait for its heart.
+            assert "loading [x]" in plain(file.getvalue())
+            activity.at("2 of 3")
+            activity.look()
+            assert "loading [x]: 2 of 3" in plain(file.getvalue())
+            compile_something()
+            activity.look()
+            assert f"loading [x]: {COMPILING}" in plain(file.getvalue())
+            activity.say("a line")
+            if error:
+                raise error
+
+    with pytest.raises(error) if error else nullcontext():
+        work()
+    text = file.getvalue()
+    assert "\na line" in plain(text).replace("\r", "\n")
+    # The line was erased after it had been drawn for the last time, and the cursor is back.
+    assert text.rindex("\x1b[2K") > text.rindex("loading")
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
+    assert not hearts
+    compile_something()
+    assert file.getvalue() == text
 
 
 @pytest.mark.parametrize(
-    ("times", "said"),
-    [(2, "compiling the training loop (the first time, some seconds)\n"), (0, "")],
+    ("terminal", "term", "moves"),
+    [(True, "xterm", True), (True, "dumb", False), (False, "", False)],
 )
-def test_compiling_is_said_once(clock, times, said):
-    console = Console(file=io.StringIO(), width=120, force_terminal=False)
-    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
-    agent.learn(3, callback=[Compiling(times), ProgressDisplay(console, live=False)])
-    assert console.file.getvalue().partition("100%")[0] == said
-    # Afterwards nobody listens any more.
-    logging.getLogger("machine_code").info("compiling run_block")
-    assert console.file.getvalue().count("compiling") == bool(times)
+def test_a_line_moves_on_a_terminal_that_can(monkeypatch, terminal, term, moves):
+    monkeypatch.setenv("TERM", term)
+    assert can_move(Console(file=io.StringIO(), force_terminal=terminal)) is moves
+
+
+# --- the heart -----------------------------------------------------------------------------------
+
+
+def test_a_heart_beats_until_it_is_stopped_and_may_begin_again():
+    beats = threading.Semaphore(0)
+    heart = Heartbeat(beats.release, 0.001)
+    for _ in range(2):
+        heart.start()
+        for _ in range(3):
+            assert beats.acquire(timeout=30)
+        heart.stop()
+        heart.stop()
+        while beats.acquire(blocking=False):
+            pass
+        assert not beats.acquire(timeout=0.02)
+
+
+def test_a_heart_that_is_stopped_has_ended_its_last_call_and_may_stop_itself():
+    begun, may_end, calls = threading.Event(), threading.Event(), []
+
+    def call():
+        begun.set()
+        may_end.wait(30)
+        calls.append(1)
+
+    heart = Heartbeat(call, 0.001)
+    heart.start()
+    assert begun.wait(30)
+    threading.Timer(0.05, may_end.set).start()
+    heart.stop()
+    assert calls == [1]
+    stopped = threading.Event()
+    suicidal = Heartbeat(lambda: (suicidal.stop(), stopped.set()), 0.001)
+    suicidal.start()
+    assert stopped.wait(30)
+
+
+def test_a_heart_that_cannot_write_stands_still_without_a_word(capfd):
+    tried = threading.Semaphore(0)
+
+    def fail():
+        tried.release()
+        raise OSError(28, "No space left on device")
+
+    heart = Heartbeat(fail, 0.001)
+    heart.start()
+    assert tried.acquire(timeout=30)
+    heart.stop()
+    assert not tried.acquire(blocking=False)
+    assert capfd.readouterr() == ("", "")

@@ -5,7 +5,6 @@ import platform
 import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from uuid import uuid4
 
@@ -14,7 +13,7 @@ import pytest
 from pipeline import runs
 from pipeline.errors import UserError
 from pipeline.locks import mark
-from pipeline.runs import NoRunError, Run, environment_name, numbered_runs
+from pipeline.runs import NoRunError, Run, environment_name
 
 ROOT = Path(runs.__file__).parent.parent
 
@@ -32,35 +31,26 @@ def test_runs_are_numbered_from_one(tmp_path):
     assert Run.claim(tmp_path / "logs", "sarsa", "Taxi-v3").path.name == "Taxi-v3_1"
 
 
-def test_a_claimed_folder_holds_the_folder_of_its_settings(tmp_path):
+def test_a_claimed_folder_holds_the_folder_of_its_settings_and_gaps_are_not_filled(tmp_path):
     run = Run.claim(tmp_path, "sarsa", "Taxi-v4")
     assert run.path == tmp_path / "sarsa" / "Taxi-v4_1"
     assert sorted(path.name for path in run.path.iterdir()) == ["Taxi-v4", "run.json"]
     assert run.params_path.is_dir()
-
-
-def test_a_gap_is_not_filled(tmp_path):
-    (tmp_path / "sarsa" / "Taxi-v4_10").mkdir(parents=True)
+    (tmp_path / "sarsa" / "Taxi-v4_10").mkdir()
     (tmp_path / "sarsa" / "Taxi-v4_9").mkdir()
     assert claim_names(tmp_path, "Taxi-v4", 2) == ["Taxi-v4_11", "Taxi-v4_12"]
+    assert Run.find(tmp_path, "sarsa", "Taxi-v4").path == run.path.with_name("Taxi-v4_12")
+    assert Run.find(tmp_path, "sarsa", "Taxi-v4", 1) == run
+    shutil.rmtree(tmp_path / "sarsa" / "Taxi-v4_9")
+    with pytest.raises(UserError, match=r"no run 2 of sarsa on .*: there is 1, 10, 11, 12$"):
+        Run.find(tmp_path, "sarsa", "Taxi-v4", 2)
 
 
-@pytest.mark.parametrize(
-    "neighbour",
-    [
-        "Taxi-v4",
-        "Taxi-v4_",
-        "Taxi-v4_0",
-        "Taxi-v4_x",
-        "Taxi-v4_7_old",
-        "Taxi-v4_7.zip",
-        "Taxi-v4_-7",
-        "MyTaxi-v4_7",
-        "taxi-v4_7",
-        "Taxi-v40_7",
-        "Taxi-v4_2_7",
-    ],
-)
+OTHERS = ["Taxi-v4", "Taxi-v4_", "Taxi-v4_0", "Taxi-v4_x", "Taxi-v4_7_old", "Taxi-v4_7.zip"]
+OTHERS += ["Taxi-v4_-7", "MyTaxi-v4_7", "taxi-v4_7", "Taxi-v40_7", "Taxi-v4_2_7"]
+
+
+@pytest.mark.parametrize("neighbour", OTHERS)
 def test_folders_of_other_names_do_not_count(tmp_path, neighbour):
     (tmp_path / "sarsa" / neighbour).mkdir(parents=True)
     with pytest.raises(UserError, match="no run of sarsa on Taxi-v4"):
@@ -73,23 +63,6 @@ def test_a_number_taken_meanwhile_is_passed_over(tmp_path, monkeypatch):
     # As if the other runs had been started after this one looked.
     monkeypatch.setattr(runs, "numbered_runs", lambda parent, name: [])
     assert claim_names(tmp_path, "Taxi-v4", 1) == ["Taxi-v4_4"]
-
-
-def test_threads_never_share_a_folder(tmp_path):
-    n_threads, n_claims = 5, 10
-    together = threading.Barrier(n_threads)
-    names = []
-
-    def claim():
-        together.wait()
-        names.extend(claim_names(tmp_path, "Taxi-v4", n_claims))
-
-    threads = [threading.Thread(target=claim) for _ in range(n_threads)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert sorted(names) == sorted(f"Taxi-v4_{n}" for n in range(1, n_threads * n_claims + 1))
 
 
 def test_processes_never_share_a_folder(tmp_path):
@@ -121,15 +94,12 @@ for _ in range(25):
     assert sorted(names) == sorted(f"Taxi-v4_{n}" for n in range(1, 51))
 
 
-def test_a_file_in_the_way(tmp_path):
+def test_what_no_folder_can_be_made_of(tmp_path):
     (tmp_path / "sarsa").write_text("not a folder")
     with pytest.raises(UserError, match=f"cannot make a run folder in {tmp_path}/sarsa: "):
         Run.claim(tmp_path, "sarsa", "Taxi-v4")
-
-
-def test_a_name_that_no_file_system_takes(tmp_path):
     with pytest.raises(UserError, match=r"cannot make a run folder in .*: File name too long"):
-        Run.claim(tmp_path, "sarsa", "Taxi-v4", suffix="x" * 300)
+        Run.claim(tmp_path, "dqn", "Taxi-v4", suffix="x" * 300)
 
 
 def test_discarding_leaves_the_other_runs(tmp_path):
@@ -141,13 +111,6 @@ def test_discarding_leaves_the_other_runs(tmp_path):
 
 
 # --- finding -------------------------------------------------------------------------------------
-
-
-def test_the_newest_run_is_found_by_number_not_by_name(tmp_path):
-    claim_names(tmp_path, "Taxi-v4", 11)
-    run = Run.find(tmp_path, "sarsa", "Taxi-v4")
-    assert run == Run(tmp_path / "sarsa" / "Taxi-v4_11", "Taxi-v4")
-    assert Run.find(tmp_path, "sarsa", "Taxi-v4", 2).path.name == "Taxi-v4_2"
 
 
 def test_runs_with_a_unique_suffix_count_and_are_found(tmp_path):
@@ -190,17 +153,6 @@ def test_no_run_yet_says_what_to_train(tmp_path):
         assert str(error.value) == f"no run of sarsa on Warehouse-v0 in {folder}"
         asked = (error.value.algo, error.value.env_id, error.value.log_folder)
         assert asked == ("sarsa", "envs:Warehouse-v0", folder)
-
-
-def test_a_number_that_there_is_not_names_those_that_there_are(tmp_path):
-    claim_names(tmp_path, "Taxi-v4", 3)
-    shutil.rmtree(tmp_path / "sarsa" / "Taxi-v4_2")
-    with pytest.raises(UserError, match=r"no run 2 of sarsa on Taxi-v4 in .*: there is 1, 3$"):
-        Run.find(tmp_path, "sarsa", "Taxi-v4", 2)
-
-
-def test_numbered_runs_of_a_folder_that_is_not_there(tmp_path):
-    assert numbered_runs(tmp_path / "nowhere", "Taxi-v4") == []
 
 
 # --- what lies inside ----------------------------------------------------------------------------
@@ -250,23 +202,8 @@ def test_a_damaged_info_is_told_and_not_written_over(tmp_path, content):
     assert run.info_path.read_bytes() == content
 
 
-@pytest.mark.parametrize(
-    ("content", "processor"),
-    [
-        ("processor\t: 0\nmodel name\t: Fast CPU @ 3GHz\nmodel name\t: other\n", "Fast CPU @ 3GHz"),
-        ("processor\t: 0\n", "arm"),
-        (None, "arm"),
-    ],
-)  # fmt: skip
-def test_the_processor_is_named_where_it_is_told(tmp_path, monkeypatch, content, processor):
-    if content is not None:
-        (tmp_path / "cpuinfo").write_text(content)
-    monkeypatch.setattr(runs, "_PROCESSORS", tmp_path / "cpuinfo")
-    monkeypatch.setattr(platform, "processor", lambda: "arm")
-    runs.recorded_machine.cache_clear()
+def test_a_machine_is_recorded_without_its_name():
     machine = runs.recorded_machine()
-    runs.recorded_machine.cache_clear()
-    assert machine["processor"] == processor
     assert machine["system"].startswith(platform.system())
     assert int(machine["cores"]) >= 1
     assert platform.node() not in str(machine)

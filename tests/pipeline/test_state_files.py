@@ -1,27 +1,40 @@
-"""A state is unpickled only if this user signed it: a table of what others may put in its place."""
+"""A state is unpickled only if this user signed it; when it is saved, and what lies beside it."""
 
+import gc
 import hashlib
 import hmac
 import io
 import json
 import os
 import pickle
+import stat
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3.common.logger import Logger
 
-from pipeline import state_files
+from agents import load_algorithm
+from pipeline import state_files, state_saver
 from pipeline.errors import UserError
+from pipeline.runs import Run
 from pipeline.state_files import (
     MAGIC,
     BadStateError,
+    SavedState,
     newest_state,
     read_state,
     save_state,
     user_key,
     write_state,
 )
-from pipeline.states import Pickled, pickled
+from pipeline.state_saver import StateSaver, put_back, user_state
+from pipeline.states import Pickled, pickled, unpickled
+from pipeline.unfinished_runs import SaveInterval, StateKeeping, cut_back, log_positions
+from pipeline.user_modules import import_typed
 
 KEY = b"k" * 32
 
@@ -37,7 +50,7 @@ def written(value, key=KEY, **note):
     file = io.BytesIO()
     file.fileno = lambda: 0
     with pytest.MonkeyPatch.context() as context:
-        context.setattr(os, "fsync", lambda _: None)
+        context.setattr(os, "fsync", lambda _: None)  # which memory cannot do
         write_state(file, pickled({"it": value}), note, key)
     return file.getvalue()
 
@@ -54,69 +67,63 @@ def home(monkeypatch, tmp_path):
     return tmp_path / "config"
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def no_pickle_is_loaded(monkeypatch):
     """Reading and checking a file is not loading it."""
-    monkeypatch.setattr(pickle, "Unpickler", lambda *_, **__: pytest.fail("it was unpickled"))
-    monkeypatch.setattr(pickle, "loads", lambda *_, **__: pytest.fail("it was unpickled"))
-    monkeypatch.setattr(pickle, "load", lambda *_, **__: pytest.fail("it was unpickled"))
+    for name in ("Unpickler", "loads", "load"):
+        monkeypatch.setattr(pickle, name, lambda *_, **__: pytest.fail("it was unpickled"))
 
 
-def test_every_flipped_bit_is_noticed(tmp_path):
-    content = bytearray(written([np.arange(1, 3), "a"]))
+@pytest.mark.usefixtures("no_pickle_is_loaded")
+def test_every_flipped_bit_every_truncation_and_every_appendix_is_noticed(tmp_path):
+    content = bytearray(written([np.arange(1, 3), "a"], spec="abc"))
     for place in range(len(content)):
         content[place] ^= 1
         with pytest.raises(BadStateError):
             read(tmp_path, content)
         content[place] ^= 1
-    assert read(tmp_path, content).note == {}
-
-
-def test_every_truncation_and_every_appendix_is_noticed(tmp_path):
-    content = written([np.arange(1, 3), "a"])
-    for length in range(len(content)):
         with pytest.raises(BadStateError):
-            read(tmp_path, content[:length])
+            read(tmp_path, content[:place])
     with pytest.raises(BadStateError, match="goes on after its end"):
         read(tmp_path, content + b"\0")
+    assert read(tmp_path, content).note == {"spec": "abc"}  # without unpickling
 
 
-def test_a_header_that_promises_gigabytes_takes_none(tmp_path):
-    with pytest.raises(BadStateError):
-        read(tmp_path, MAGIC + bytes(32) + b"\xff" * 8 + b"{}")
-
-
+@pytest.mark.usefixtures("no_pickle_is_loaded")
 def test_another_key_is_refused_before_anything_is_parsed(tmp_path, monkeypatch):
     content = written(1)
     monkeypatch.setattr(json, "loads", lambda *_: pytest.fail("it was parsed"))
     with pytest.raises(BadStateError, match="another user or machine made it"):
         read(tmp_path, content, b"x" * 32)
+    with pytest.raises(BadStateError):  # nor are the gigabytes read that it promises
+        read(tmp_path, MAGIC + bytes(32) + b"\xff" * 8 + b"{}")
 
 
 def strangers(content):
     """What somebody may put there who has no key, and knows a state of this user's."""
     evil = pickle.dumps(RunsCode())
     (length,) = np.frombuffer(content[48:56], "<u8")
-    header = json.loads(content[56 : 56 + length])
+    head, parts = content[: 56 + int(length)], content[56 + int(length) :]
+    header = json.loads(head[56:])
     header["parts"] = [[len(evil), hashlib.sha256(evil).hexdigest(), len(evil), False]]
     text = json.dumps(header).encode()
-    size = len(text).to_bytes(8, "little")
-    by_no_key = hmac.digest(b"", MAGIC + size + text, "sha256")
+    text = len(text).to_bytes(8, "little") + text
+    by_no_key = hmac.digest(b"", MAGIC + text, "sha256")
     return {
         "a bare pickle": evil,
         "a pickle after the magic": MAGIC + evil,
-        "a header signed with no key": MAGIC + by_no_key + size + text + evil,
+        "a header signed with no key": MAGIC + by_no_key + text + evil,
         "a header signed with a key of theirs": written(RunsCode(), b"s" * 32),
-        "a header under an old signature": content[:48] + size + text + evil,
-        "another pickle under an old header": content[: 56 + int(length)] + evil,
-        "another pickle before the old one": content[: 56 + int(length)] + evil + content[-9:],
-        "the header of another state": written([2])[: 56 + int(length)]
-        + content[56 + int(length) :],
+        "a header under an old signature": content[:48] + text + evil,
+        "another pickle under an old header": head + evil,
+        "another pickle before the old one": head + evil + content[-9:],
+        "the header of another state": written([2])[: len(head)] + parts,
         "a format of before": b"snapshot 3\n".ljust(16, b"\0") + content[16:],
         "nothing": b"",
     }
 
 
+@pytest.mark.usefixtures("no_pickle_is_loaded")
 @pytest.mark.parametrize("attack", strangers(written([1])))
 def test_a_strangers_file_is_refused_and_never_unpickled(tmp_path, home, attack):
     own = user_key(state_files.APPLICATION)
@@ -143,14 +150,23 @@ def test_a_strangers_file_is_refused_and_never_unpickled(tmp_path, home, attack)
 )
 def test_without_the_users_own_key_nothing_is_read(tmp_path, home, change, said):
     save_state(tmp_path / "state", 1, pickled({"it": 1}), {})
-    change(home / "yardstick" / "snapshots.key")
+    path = home / state_files.APPLICATION / "snapshots.key"
+    change(path)
     with pytest.raises(UserError, match=said):
         newest_state(tmp_path / "state", pytest.fail)
+    assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_pipe_in_the_place_of_a_state_is_not_waited_for(tmp_path, home):
-    os.mkfifo(tmp_path / "odd.state")
-    assert newest_state(tmp_path, pytest.fail) is None
+def test_a_key_is_one_for_all_processes_and_for_nobody_else(home):
+    with ThreadPoolExecutor(16) as pool:
+        (key,) = set(pool.map(lambda _: user_key("a"), range(64)))
+    assert len(key) == 32
+    assert user_key("b") != key
+    path = home / "a" / "snapshots.key"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert list(path.parent.iterdir()) == [path]
+    path.symlink_to(path.rename(home / "elsewhere"))
+    assert user_key("a") == key
 
 
 def test_the_newest_of_two_counts_and_the_older_where_that_is_damaged(tmp_path, home):
@@ -161,8 +177,20 @@ def test_the_newest_of_two_counts_and_the_older_where_that_is_damaged(tmp_path, 
         file.write(b"\0")
     told = []
     assert newest_state(tmp_path, told.append).note["number"] == 8
-    assert len(told) == 1
-    assert told[0].endswith("the state before it is taken")
+    (line,) = told
+    assert line.endswith("the state before it is taken")
+
+
+def test_what_lies_in_the_place_of_a_state(tmp_path, home):
+    """A pipe is not waited for; a link is judged by the content elsewhere."""
+    save_state(tmp_path / "mine", 1, pickled({"it": 1}), {})
+    (tmp_path / "other").mkdir()
+    place = tmp_path / "other" / "odd.state"
+    os.mkfifo(place)
+    assert newest_state(tmp_path / "other", pytest.fail) is None
+    place.unlink()
+    place.symlink_to(tmp_path / "mine" / "odd.state")
+    assert newest_state(tmp_path / "other", pytest.fail).note["number"] == 1
 
 
 def test_functions_of_another_python_are_refused_and_all_else_is_not(tmp_path, home, monkeypatch):
@@ -174,25 +202,176 @@ def test_functions_of_another_python_are_refused_and_all_else_is_not(tmp_path, h
     assert newest_state(tmp_path / "1", pytest.fail) is not None
 
 
-def test_without_room_on_the_disk_the_last_state_stays(tmp_path, home, monkeypatch):
+def test_without_room_on_the_disk_the_last_state_stays(tmp_path, home, small_disk):
     save_state(tmp_path, 1, pickled({"it": 1}), {})
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(state_files, "write_state", full)
-    with pytest.raises(OSError, match="No space"):
-        save_state(tmp_path, 3, Pickled(b"", (), ()), {})
+    noise = np.random.default_rng(0).bytes(100_000)
+    with small_disk(10_000), pytest.raises(OSError, match="File too large"):
+        save_state(tmp_path, 3, pickled({"it": noise}), {})
     assert newest_state(tmp_path, pytest.fail).note["number"] == 1
 
 
-def test_the_note_is_there_before_anything_is_unpickled(tmp_path):
-    assert read(tmp_path, written(1, spec="abc")).note == {"spec": "abc"}
+# --- how often -----------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")
-def test_a_link_to_a_state_elsewhere_is_judged_by_its_content(tmp_path, home):
-    save_state(tmp_path / "mine", 1, pickled({"it": 1}), {})
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "odd.state").symlink_to(tmp_path / "mine" / "odd.state")
-    assert newest_state(tmp_path / "other", pytest.fail).note["number"] == 1
+@pytest.fixture
+def saver_of(tmp_path, monkeypatch):
+    """Makes savers of states that take half a second, and a clock that they go by."""
+    clock = [0.0]
+    monkeypatch.setattr("pipeline.state_saver.time.monotonic", lambda: clock[0])
+    model = load_algorithm("qlearning")("QTablePolicy", "FrozenLake-v1")
+    model.set_logger(Logger(None, []))
+
+    def write(*_):
+        assert not gc.isenabled()  # a search through all that libraries hold takes longer
+        clock[0] += 0.5
+
+    def make(note=None, seconds=0.0, was_cut_off=False):
+        state = None if note is None else SavedState(Pickled(b"", (), ()), note)
+        keeping = StateKeeping(SaveInterval(seconds), state, was_cut_off=was_cut_off)
+        saver = StateSaver(Run.claim(tmp_path, "a", "X-v0"), keeping, pytest.fail)
+        saver.init_callback(model)
+        return saver
+
+    monkeypatch.setattr(state_saver, "save_state", write)
+    yield make, clock
+    assert gc.isenabled()
+
+
+def test_saving_by_time_takes_its_share(saver_of):
+    """However long a state takes, the next is saved fifty times as long after it."""
+    make, clock = saver_of
+    saver = make()
+    begun = clock[0] = saver.saved_at
+    for pause in (2.5, 25.0):
+        assert saver.pause == pause
+        clock[0] = begun + pause - 0.1
+        assert not saver.wants_position()
+        clock[0] = begun + pause + 0.1
+        assert saver.wants_position()
+        saver.save()
+        begun = clock[0]
+
+
+def test_what_was_cut_off_is_saved_sooner(saver_of):
+    """Where it is cut off every few seconds, it gets ahead all the same."""
+    make, _ = saver_of
+    assert make(was_cut_off=True).pause == 0.1  # it was cut off before its first state
+    assert make({"pause": 25.0}, was_cut_off=True).pause == 0.5  # what saving took
+    assert make({"pause": 25.0}, 30.0, was_cut_off=True).pause == 30.0
+    saver = make({"number": 3}, was_cut_off=True)
+    pauses = [saver.pause]
+    for _ in range(6):
+        saver.save()
+        pauses.append(saver.pause)
+    assert pauses == pytest.approx([0.1, 1.2, 3.4, 7.8, 16.6, 25.0, 25.0])
+
+
+# --- files that are only appended to, and what the user's modules hold ---------------------------
+
+ROWS = b"r,l,t\n1.0,5,0.1\n2.0,6,0.2\n"
+
+
+@pytest.fixture
+def logs(tmp_path):
+    run, log = tmp_path / "run", tmp_path / "log"
+    run.mkdir()
+    log.mkdir()
+    for name in ("0.monitor.csv", "all.monitor.csv"):
+        (run / name).write_bytes(ROWS)
+    (log / "events.out.tfevents.1").write_bytes(b"\x00events")
+    return run, str(log)
+
+
+def test_what_was_appended_since_is_removed(logs):
+    """But a wrapper of the settings begins its file anew."""
+    run, log = logs
+    positions = log_positions(run, log)
+    for path in (run / "0.monitor.csv", *Path(log).iterdir()):
+        path.write_bytes(path.read_bytes() + b"more")
+    (run / "1.monitor.csv").touch()
+    (run / "all.monitor.csv").write_bytes(b"r\n")
+    cut_back(run, log, positions)
+    assert {path.name for path in run.iterdir()} == {"0.monitor.csv", "all.monitor.csv"}
+    assert log_positions(run, log) == positions
+    assert (run / "0.monitor.csv").read_bytes() == ROWS
+    assert (run / "all.monitor.csv").read_bytes() == b"r\n"
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [None, b"", ROWS[:-1], ROWS.replace(b"2.0", b"9.0"), ROWS.replace(b"r,l,t", b"t,l,r") + b"3.0"],
+)
+def test_what_was_changed_is_refused_and_left_alone(logs, rows):
+    run, log = logs
+    positions, path = log_positions(run, log), run / "0.monitor.csv"
+    path.unlink()
+    if rows is not None:
+        path.write_bytes(rows)
+    with pytest.raises(UserError, match=r"0\.monitor\.csv is not as the run left it"):
+        cut_back(run, log, positions)
+    assert (path.read_bytes() if path.exists() else None) == rows
+
+
+SOURCE = """
+import random
+from functools import lru_cache
+from typing import TypeVar
+from numpy import mean
+from torch import tanh
+
+T = TypeVar("T")
+steps = 0
+seen = []
+rng = random.Random(1)
+draw = random.Random(2).random
+
+@lru_cache
+def double(x):
+    return 2 * x
+
+class Thing:
+    made = 0
+    names = ["a"]
+
+    @lru_cache
+    def triple(self, x):
+        return 3 * x
+
+    def step(self):
+        global steps
+        steps += 1
+        seen.append((rng.random(), draw()))
+        Thing.made += 1
+        self.names.append("b")
+"""
+
+
+def test_globals_of_the_users_modules_go_back(tmp_path, monkeypatch):
+    path = tmp_path / "things_with_globals.py"
+    path.write_text(SOURCE)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    modules = import_typed([str(path)])
+    module = sys.modules["things_with_globals"]
+    thing = module.Thing()
+    assert pickled({"it": user_state(modules)}).lost == []
+    module.double(1)
+    module.Thing.triple(None, 1)
+    thing.step()
+    held = pickled({"it": user_state(modules)})
+    saved = replace(
+        held, pickled=bytes(held.pickled), memories=[memory.copy() for memory in held.memories]
+    )
+    assert [line.partition("]")[2] for line in saved.lost] == ["['double']", "['triple']"]
+    thing.step()
+    after = list(module.seen)
+    put_back(modules, unpickled(saved, {"it": user_state(modules)})["it"])
+    assert (module.steps, module.Thing.made, module.Thing.names) == (1, 1, ["a", "b"])
+    assert module.seen == after[:1]
+    thing.step()
+    assert module.seen == after
+    assert (module.Thing, module.double(1)) == (type(thing), 2)
+    del sys.modules["things_with_globals"]
+
+
+def test_what_is_installed_is_left_alone():
+    assert user_state(import_typed(["json"])) == {}

@@ -1,22 +1,34 @@
-"""What a training leaves beside its results, and what a trained agent is played on."""
+"""What settings do to a training, what it leaves, and what a trained agent is played on."""
 
+import builtins
+import gc
 import io
 import pickle
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from rich.console import Console
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
+from pipeline import loading_libraries
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
 from pipeline.models.choose import ChosenModel, with_statistics
 from pipeline.models.load import ModelFile
 from pipeline.playing import playing_env
+from pipeline.preparation import load_for_optimizer
 from pipeline.settings.hyperparams import split
 from pipeline.stopping import stops_noticed
 from pipeline.train_spec import TrainSpec
@@ -47,18 +59,13 @@ class Trouble(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("every", [1, 10])
+@pytest.mark.parametrize("every", [-1, 10])
 def test_checkpoints_after_so_many_episodes(tmp_path, every):
     run = train_to(tmp_path, save_every_n_episodes=every).run
     lines = (run.path / "0.monitor.csv").read_text().splitlines()[2:]
     ends = np.cumsum([int(line.split(",")[1]) for line in lines])
-    assert [int(path.stem.split("_")[2]) for path in run.checkpoints()] == ends[
-        every - 1 :: every
-    ].tolist()
-
-
-def test_no_checkpoints_unless_asked_for(tmp_path):
-    assert train_to(tmp_path).run.checkpoints() == []
+    expected = ends[every - 1 :: every].tolist() if every > 0 else []
+    assert [int(path.stem.split("_")[2]) for path in run.checkpoints()] == expected
 
 
 @pytest.mark.parametrize(("verbose", "shown"), [(0, False), (1, False), (2, True)])
@@ -142,24 +149,17 @@ def test_observations_are_normalised_as_in_training_and_rewards_left_alone(tmp_p
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("content", "complaint"),
-    [
-        (b"broken", r"vecnormalize\.pkl cannot be read"),
-        (pickle.dumps(["a list"]), "holds no statistics of VecNormalize"),
-    ],
-)
-def test_statistics_that_are_broken(tmp_path, content, complaint):
+def test_statistics_that_are_broken_or_of_other_observations(tmp_path):
     spec = spec_of(tmp_path, "CartPole-v1", entry={"normalize": True})
     path = tmp_path / "vecnormalize.pkl"
-    path.write_bytes(content)
-    with pytest.raises(UserError, match=complaint):
-        playing_env(chosen_of(spec, path), None)
-
-
-def test_statistics_of_other_observations(tmp_path):
-    path = tmp_path / "vecnormalize.pkl"
-    saved_statistics(spec_of(tmp_path, "CartPole-v1", entry={"normalize": True}), path)
+    for content, complaint in (
+        (b"broken", r"vecnormalize\.pkl cannot be read"),
+        (pickle.dumps(["a list"]), "holds no statistics of VecNormalize"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=complaint):
+            playing_env(chosen_of(spec, path), None)
+    saved_statistics(spec, path)
     with pytest.raises(UserError, match=r"of shape \(4,\); the environment gives \(2,\)"):
         playing_env(chosen_of(spec_of(tmp_path, "MountainCar-v0"), path), None)
 
@@ -184,3 +184,161 @@ def test_what_cannot_be_drawn_so_is_refused(tmp_path):
     said = pytest.warns(UserWarning, match="not in the possible render_modes")
     with said, pytest.raises(UserError, match="CartPole-v1 cannot be rendered as ansi"):
         playing_env(chosen_of(spec_of(tmp_path, "CartPole-v1")), "ansi")
+
+
+TINY = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [4]}, "buffer_size": 1000}
+
+
+def prepared(folder, algo, env_id, **entry):
+    entry = {**TINY, **entry}
+    spec = TrainSpec(
+        algo, env_id, split(entry), entry, seed=0, log_folder=folder, eval_freq=-1, pictures=False
+    )
+    return prepare(spec, Console(quiet=True), {}, "train.py")
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_noise_is_added_to_what_the_policy_does(tmp_path, n_envs):
+    """A policy that learns nothing, and its actions as they stand in the buffer."""
+    noise = {"noise_type": "normal", "noise_std": 0.1}
+    still = {"learning_rate": 0.0, "learning_starts": 0, "n_timesteps": 500 * n_envs}
+    training = prepared(tmp_path, "td3", "Pendulum-v1", n_envs=n_envs, **noise, **still)
+    carry_out(training)
+    model = training.model
+    assert isinstance(model.action_noise, VectorizedActionNoise) == (n_envs > 1)
+    buffer = model.replay_buffer
+    observations = buffer.observations[:400].reshape(-1, 3)
+    without = model.policy.scale_action(model.predict(observations, deterministic=True)[0])
+    added = buffer.actions[:400].reshape(-1, 1) - without
+    # Where the sum would leave [-1, 1] it is cut off: a policy near 0, so hardly anywhere.
+    assert np.abs(without).max() < 0.6
+    assert added.std() == pytest.approx(0.1, rel=0.1)
+    assert added.mean() == pytest.approx(0, abs=0.02)
+
+
+def test_hindsight_replay_as_rl_zoo3_writes_it(tmp_path):
+    """Its entry for robots, on an environment with goals that needs no robot."""
+    gym.register(
+        "BitFlipping-v0", lambda: BitFlippingEnv(n_bits=3, continuous=True), max_episode_steps=3
+    )
+    try:
+        training = prepared(
+            *(tmp_path, "sac", "BitFlipping-v0"),
+            n_timesteps=60,
+            policy="MultiInputPolicy",
+            learning_starts=20,
+            train_freq=[1, "episode"],
+            gradient_steps=-1,
+            replay_buffer_class="HerReplayBuffer",
+            replay_buffer_kwargs="dict(goal_selection_strategy='future', n_sampled_goal=4)",
+        )
+        outcome = carry_out(training)
+    finally:
+        del gym.registry["BitFlipping-v0"]
+    assert outcome.state == "finished"
+    assert isinstance(training.model.replay_buffer, HerReplayBuffer)
+    assert training.model.replay_buffer.her_ratio == 0.8
+    # As many updates as steps, after whole episodes.
+    assert 0 < training.model._n_updates <= 60
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_fused_optimizer_is_a_matter_of_settings_and_noise_none_unless_asked_for(tmp_path, fused):
+    policy_kwargs = {"net_arch": [4], "optimizer_kwargs": {"fused": fused}}
+    training = prepared(tmp_path, "td3", "Pendulum-v1", n_timesteps=10, policy_kwargs=policy_kwargs)
+    assert training.model.actor.optimizer.defaults["fused"] is fused
+    assert training.model.action_noise is None
+    training.model.env.close()
+
+
+def test_denormals_are_flushed_in_the_runs_that_ask_for_it(tmp_path):
+    def halved():
+        return float(th.tensor([1.5e-38]) / 2)
+
+    try:
+        for flushes in (True, False):
+            training = prepared(
+                tmp_path, "dqn", "CartPole-v1", n_timesteps=10, flush_denormal=flushes
+            )
+            training.model.env.close()
+            assert (halved() == 0) is flushes
+    finally:
+        th.set_flush_denormal(False)
+
+
+@pytest.fixture
+def collector():
+    before = gc.isenabled()
+    yield
+    (gc.enable if before else gc.disable)()
+
+
+@pytest.mark.usefixtures("collector")
+@pytest.mark.parametrize("was_on", [True, False])
+def test_libraries_are_imported_without_the_collector_which_is_as_it_was_afterwards(was_on):
+    (gc.enable if was_on else gc.disable)()
+    with loading_libraries():
+        assert not gc.isenabled()
+    assert gc.isenabled() == was_on
+
+
+@pytest.fixture
+def imported(monkeypatch):
+    """What is imported, and whether garbage was looked for meanwhile."""
+    found, load = [], builtins.__import__
+
+    def noted(name, *args):
+        if name == "torch._dynamo":
+            found.append(gc.isenabled())
+        return load(name, *args)
+
+    monkeypatch.setattr(builtins, "__import__", noted)
+    return found
+
+
+@pytest.mark.usefixtures("collector")
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"optimizer": "Adam", "engine": "library"}, [False]),
+        ({"optimizer": "Adam", "engine": "compiled"}, []),
+        ({"optimizer": "Adam", "engine": "auto"}, []),
+        ({"optimizer": None}, []),
+    ],
+)
+def test_only_what_steps_an_optimizer_loads_what_that_needs(imported, fields, expected):
+    gc.enable()
+    model = SimpleNamespace(policy=SimpleNamespace(optimizer=fields.get("optimizer")))
+    if "engine" in fields:
+        model.engine = fields["engine"]
+    load_for_optimizer(model)
+    assert imported[:1] == expected  # which imports parts of itself by that name
+
+
+COMPILED_TRAINING = """
+import sys
+from agents import load_algorithm
+model = load_algorithm("ppo")("MlpPolicy", "CartPole-v1", n_steps=32, engine="compiled")
+model.learn(64)
+model.save(sys.argv[1])
+load_algorithm("ppo").load(sys.argv[1])
+print("torch._dynamo" in sys.modules)
+import torch
+torch._dynamo.reset()
+model.policy.optimizer.zero_grad()
+kept_out = getattr(torch.optim.Optimizer.zero_grad.__wrapped__, "__dynamo_disable")
+print(getattr(kept_out, "func", None) is None)
+"""
+
+
+def test_compiled_networks_do_without_pytorchs_compiler(tmp_path):
+    command = [sys.executable, "-c", COMPILED_TRAINING, str(tmp_path / "model")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    # Once somebody has imported it, methods are kept out of it as ever.
+    assert done.stdout.splitlines()[-2:] == ["False", "True"]
+
+
+def test_optimizers_import_it_still(imported):
+    weight = th.nn.Parameter(th.zeros(1))
+    th.optim.Adam([weight]).step()
+    assert imported, "if not, there is nothing to load beforehand any more"

@@ -5,15 +5,12 @@ import importlib
 import importlib.metadata
 import os
 import shutil
-import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from pipeline import user_modules
 from pipeline.environments import check_env_id, make_env
 from pipeline.errors import UserError
 from pipeline.user_modules import (
@@ -81,17 +78,6 @@ def test_what_is_installed_has_no_path():
     assert import_typed(["gymnasium.wrappers"]) == (
         UserModule("gymnasium.wrappers", "gymnasium.wrappers"),
     )
-
-
-def test_a_library_beside_us_is_not_ours(tmp_path):
-    """As where all are installed into one folder."""
-    shutil.copytree(Path(user_modules.__file__).parent, tmp_path / "pipeline")
-    (tmp_path / "neighbour.py").touch()
-    code = "from pipeline.user_modules import import_typed\nprint(import_typed(['neighbour']))"
-    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, env=env, cwd=tmp_path.parent, capture_output=True, check=True)
-    assert b"name='neighbour'" in done.stdout
 
 
 def test_our_own_need_not_be_kept(own_folder):
@@ -267,12 +253,6 @@ def test_a_run_that_lies_is_quoted(tmp_path):
     told = complaint_of(check_recorded, recorded, tmp_path)
     assert told.endswith(r"add --gym-packages ../x 'a\x1b[2Jb'")
     assert "\x1b" not in told
-
-
-def test_a_large_file_is_not_copied(write, tmp_path):
-    write(my_first="#" * 1_000_001)
-    keep_copies(import_typed(["my_first"]), tmp_path)
-    assert not (tmp_path / "modules").exists()
 
 
 def test_worker_processes_of_a_training_know_the_modules(write):

@@ -1,0 +1,560 @@
+"""Sampled evaluation: it repeats, leaves training alone, takes its share, and has a yardstick."""
+
+import io
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium.utils import seeding
+from gymnasium.wrappers import RecordEpisodeStatistics
+from rich.console import Console
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents import load_algorithm
+from agents.compiled import greedy_play
+from commands.enjoy import print_returns
+from commands.terminal import describe
+from envs.brackets import OptimumBracket
+from envs.wrappers import DiscretizeObservation
+from pipeline import callbacks
+from pipeline.agent_settings import resolved_spec, without_auto
+from pipeline.environments import make_evaluation_env, make_training_env
+from pipeline.evaluation import sampled
+from pipeline.evaluation.sampled import (
+    Evaluation,
+    SampledEvaluator,
+    Yardstick,
+    allowed_steps,
+    bracketed_yardstick,
+    compiled_copy,
+    evaluate,
+    evaluate_compiled,
+    evaluation_seed,
+    is_sure,
+    shares_of,
+)
+from pipeline.models.load import load_model
+from pipeline.settings import hyperparams
+from pipeline.settings.hyperparams import TUNED_ON, read_hyperparams, split
+from pipeline.settings.yaml import read_yaml
+from pipeline.train_spec import TrainSpec
+from pipeline.training import train
+
+CART, CAR, LAKE = "CartPole-v1", "MountainCar-v0", "FrozenLake-v1"
+PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
+
+
+def agent(name="random", env_id=LAKE, **kwargs):
+    algorithm = load_algorithm(name)
+    return algorithm(next(iter(algorithm.policy_aliases)), env_id, seed=0, **kwargs)
+
+
+def spec_of(folder=None, algo="random", env_id=CART, entry=None, n_timesteps=3000, **fields):
+    entry = {"n_timesteps": n_timesteps, **(entry or {})}
+    fields = {"eval_episodes": None, "final_episodes": None, "pictures": False, **fields}
+    return TrainSpec(
+        algo, env_id, split(entry), entry, 0, log_folder=folder, verbose=0, device="cpu", **fields
+    )
+
+
+def run_of(spec):
+    return train(spec, Console(quiet=True), {}, "")
+
+
+def figures(evaluation):
+    return evaluation.returns.tolist(), evaluation.lengths.tolist()
+
+
+def episodes(*returns, length=10, yardstick=None, successes=None):
+    lengths = np.full(len(returns), length)
+    return Evaluation(np.array(returns, float), lengths, successes).measured_by(yardstick)
+
+
+def test_figures_worked_by_hand():
+    evaluation = Evaluation(np.array([1.0, 3.0]), np.array([10, 20]), np.array([True, False]))
+    summary = {"mean_return": 2.0, "std_return": 1.0, "mean_length": 15.0, "success_rate": 0.5}
+    assert evaluation.summary() == {**summary, "exact": False, "n_episodes": 2}
+    assert {type(value) for value in evaluation.summary().values()} == {float, int, bool}
+    unknown = replace(evaluation, successes=None)
+    assert unknown.summary() == {**evaluation.summary(), "success_rate": None}
+
+
+# --- seeds ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile(n_envs):
+    model = agent("qlearning").learn(2000)
+    env = make_vec_env(LAKE, n_envs)
+    first, more = (figures(evaluate(model, env, 12, seed)) for seed in (5, None))
+    others = [figures(evaluate(model, env, 12, evaluation_seed(0, p))) for p in PURPOSES]
+    assert len(first[0]) == 12
+    for again in (env, make_vec_env(LAKE, n_envs)):
+        assert [figures(evaluate(model, again, 12, seed)) for seed in (5, None)] == [first, more]
+    different = [first, more, *others]
+    assert all(a != b for i, a in enumerate(different) for b in different[:i])
+
+
+def test_seeds_of_all_purposes_lie_apart():
+    """From each other's and from training's, whose environments count up from the run's seed."""
+    n_seeds, n_envs = 500, 100
+    starts = [[seed, *(evaluation_seed(seed, p) for p in PURPOSES)] for seed in range(n_seeds)]
+    evaluations = [start for row in starts for start in row[1:]]
+    assert all(0 <= seed < 2**31 for seed in evaluations)
+    assert len(set(evaluations)) == len(evaluations)
+    assert all(min(np.diff(sorted(row))) > n_envs for row in starts)
+
+
+def seeds_of_run(n_envs, seed, n_eval_envs=TrainSpec.n_eval_envs):
+    """All seeds of environments, of action spaces and of the agent."""
+    starts = [evaluation_seed(seed, purpose) for purpose in PURPOSES]
+    evaluations = (range(start, start + n_eval_envs) for start in starts)
+    return set(range(seed, seed + n_envs)).union(*evaluations)
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings"), [("qlearning", {}), ("ppo", {"n_steps": 4, "batch_size": 4})]
+)
+def test_a_run_takes_the_seeds_that_are_said(algo, settings, monkeypatch):
+    taken, make = set(), seeding.np_random
+
+    def watched(seed=None):
+        taken.update([] if seed is None else [seed])
+        return make(seed)
+
+    monkeypatch.setattr(seeding, "np_random", watched)
+    raw = {**read_hyperparams(algo, LAKE), "n_envs": 3, "n_timesteps": 12}
+    spec = resolved_spec(raw, algo=algo, env_id=LAKE, seed=7)
+    model = agent(algo, make_training_env(spec, None), **settings)
+    model.set_random_seed(7)
+    taken.clear()
+    model.learn(12)
+    assert taken <= {7, 8, 9}
+    taken.clear()
+    evaluate(model, make_evaluation_env(spec, 2), 4, evaluation_seed(7, 1))
+    assert taken == {evaluation_seed(7, 1), evaluation_seed(7, 1) + 1}
+    assert {7, 8, 9} | taken <= seeds_of_run(3, 7, 2)
+
+
+def test_tuning_and_judgement_share_no_stream():
+    """With every shipped entry, and with any two of them: runs of one study may be of several."""
+    files = sorted((Path(hyperparams.__file__).parents[2] / "hyperparams").glob("*.yml"))
+    entries = [entry for path in files for key, entry in read_yaml(path).items() if key != TUNED_ON]
+    numbers = {split(without_auto(entry)).n_envs for entry in entries}
+    assert numbers == {1, 4, 8, 16, 32}
+    tuned, judged = (
+        set().union(*(seeds_of_run(n_envs, seed) for n_envs in numbers for seed in seeds))
+        for seeds in (range(10), range(1000, 1010))
+    )
+    assert not tuned & judged
+    # Neighbours share seeds of environments: docs/statistics.md says how much that matters.
+    assert len(seeds_of_run(8, 0) & seeds_of_run(8, 1)) == 7
+    assert not seeds_of_run(8, 0) & seeds_of_run(8, 8)
+
+
+# --- what is played ------------------------------------------------------------------------------
+
+
+def test_deterministic_play_is_the_policys_best():
+    model = agent("qlearning", exploration_initial_eps=1.0)
+    model.policy.q_tables.zero_()
+    model.policy.q_tables[..., 2] = 1.0
+    env = make_vec_env(LAKE, 1, env_kwargs={"is_slippery": False})
+    # Always to the right: along the upper edge until the time limit.
+    best, exploring = (evaluate(model, env, 5, 0, sure) for sure in (True, False))
+    assert best.lengths.tolist() == [100] * 5 != exploring.lengths.tolist()
+    assert best.successes is None
+    assert best.success_rate is None
+
+
+def test_returns_are_those_of_the_environment_itself():
+    env = VecNormalize(make_vec_env(CART, 2), training=False, norm_reward=True)
+    evaluation = evaluate(agent("angle", CART), env, 6, seed=0)
+    assert evaluation.returns.tolist() == evaluation.lengths.tolist()
+    assert evaluation.returns.dtype == np.float64
+
+
+def test_successes_are_counted_where_the_environment_tells_them():
+    env_kwargs = {"slip": 0.3, "shelf_reward": -1, "max_episode_steps": 40}
+    model = agent("qlearning", "envs:Warehouse-v0", learning_rate=0.3).learn(60_000)
+    env = make_vec_env("envs:Warehouse-v0", 4, env_kwargs=env_kwargs)
+    evaluation = evaluate(model, env, 200, seed=0)
+    # Each move costs 1, and the last one brings 100 if it succeeds.
+    failed = evaluation.returns == -evaluation.lengths
+    np.testing.assert_array_equal(evaluation.successes, ~failed)
+    assert evaluation.successes.dtype == bool
+    np.testing.assert_array_equal(evaluation.returns[~failed], 101.0 - evaluation.lengths[~failed])
+    assert (evaluation.lengths[failed] == 40).all()
+    assert 0.05 < evaluation.success_rate == evaluation.successes.mean() < 0.95
+
+
+TINY = {
+    "qlearning": {"policy": "QTablePolicy"},
+    "dqn": {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [8]}, "buffer_size": 500}
+    | {"learning_starts": 50, "batch_size": 8},
+    "ppo": {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [8]}, "n_steps": 32}
+    | {"batch_size": 32, "n_epochs": 2, "n_envs": 2, "normalize": True},
+}
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_training_is_the_same_with_and_without_evaluations(name, tmp_path):
+    env_id = CART if name == "ppo" else LAKE
+    evaluated, unevaluated = (
+        run_of(spec_of(tmp_path, name, env_id, TINY[name], 400, eval_freq=freq, eval_episodes=3))
+        for freq in (40, -1)
+    )
+    assert len(np.load(evaluated.run.evaluations_path)["timesteps"]) >= 10
+    assert not unevaluated.run.evaluations_path.exists()
+    assert (evaluated.final is None, unevaluated.final is None) == (False, True)
+    first, second = (
+        load_model(name, outcome.run.model_path, device="cpu").policy.state_dict()
+        for outcome in (evaluated, unevaluated)
+    )
+    assert len(first) > 0
+    assert all(th.equal(first[key], value) for key, value in second.items())
+    rows = [
+        [
+            [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()[2:]]
+            for path in sorted(outcome.run.path.glob("*.monitor.csv"))
+        ]
+        for outcome in (evaluated, unevaluated)
+    ]
+    assert rows[0] == rows[1]
+    assert sum(map(len, rows[0])) > 5
+    if name == "ppo":
+        one, other = (
+            VecNormalize.load(str(outcome.run.vecnormalize_path), make_vec_env(CART, 1))
+            for outcome in (evaluated, unevaluated)
+        )
+        np.testing.assert_array_equal(one.obs_rms.mean, other.obs_rms.mean)
+        np.testing.assert_array_equal(one.ret_rms.var, other.ret_rms.var)
+
+
+# --- how much of it ------------------------------------------------------------------------------
+
+
+def test_when_a_mean_is_sure():
+    assert is_sure(episodes(*[7.0] * 10), 0.01)
+    assert not is_sure(episodes(*[7.0] * 5), 0.01), "five may be alike by chance"
+    # 9 and 11 in turn: mean 10, standard deviation sqrt(10/9), standard error 1/3.
+    assert is_sure(episodes(*[9.0, 11.0] * 5), 0.0334)
+    assert not is_sure(episodes(*[9.0, 11.0] * 5), 0.0333)
+    assert not is_sure(episodes(*[-1.0, 1.0] * 5), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("algo", "engine_in_use", "plays_compiled", "of_long", "of_short"),
+    [
+        ("ppo", "library", False, 250_000, 2500),
+        ("ppo", "library: it masks actions", False, 250_000, 2500),
+        ("a2c", "library", False, 100_000, 2000),
+        ("ppo", "compiled", True, 250_000, 2500),
+        ("ppo", "compiled", False, 31_250, 2000),
+        ("ppo", "compiled but for the environment: none is known", False, 31_250, 2000),
+        ("qlearning", "interpreted: asked for", False, 10_000, 2000),
+        ("qlearning", "compiled", True, 100_000, 2500),
+        ("qlearning", "compiled", False, 2000, 2000),
+    ],
+)
+def test_what_is_allowed(algo, engine_in_use, plays_compiled, of_long, of_short):
+    model = agent(algo)
+    model.engine_in_use = engine_in_use
+    found = shares_of(model, plays_compiled=plays_compiled)
+    assert [allowed_steps(n, found) for n in (1e6, 5000, 1)] == [of_long, of_short, 2000]
+
+
+class Model:
+    num_timesteps = 0
+    _num_timesteps_at_start = 0
+    policy = None
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """Makes up the episodes of evaluators, and lists how many were asked for."""
+
+    def make_up(returns, length):
+        asked, left = [], list(returns)
+
+        def evaluate(model, env, n_episodes, seed):
+            asked.append((n_episodes, seed is None))
+            return episodes(*[left.pop(0) for _ in range(n_episodes)], length=length)
+
+        monkeypatch.setattr(sampled, "evaluate", evaluate)
+        return asked
+
+    return make_up
+
+
+# Of so few steps of training, 2,000 steps of evaluation are allowed.
+@pytest.mark.parametrize(
+    ("returns", "length", "expected"),
+    [
+        ([1.0] * 100, 1, [10]),
+        ([0.0, 9.0] * 50, 1, [10, 15, 25, 50]),
+        ([0.0, 9.0] * 50, 50, [10, 15]),  # the next 25 would make it 2,500 steps
+        ([0.0, 9.0] * 50, 190, [5]),  # the evaluation before took 1,900
+        ([0.0, 9.0] * 50, 900, [5]),  # five there are in any case
+    ],
+)
+def test_the_last_evaluation_ends_when_it_is_sure_or_dear(played, returns, length, expected):
+    asked = played([*[3.0] * 10, *returns], length)
+    evaluator = SampledEvaluator(spec_of(), None)
+    assert len(evaluator(Model()).returns) == 10
+    asked.clear()
+    found = evaluator.at_the_end(Model())
+    assert asked == [(n, i > 0) for i, n in enumerate(expected)]  # the first alone has a seed
+    assert len(found.returns) == sum(expected)
+    assert evaluator.n_steps == (10 + sum(expected)) * length
+
+
+def test_where_no_length_is_known_the_last_evaluation_begins_with_five(played):
+    asked = played([0.0, 9.0] * 50, length=100)
+    SampledEvaluator(spec_of(), None).at_the_end(Model())
+    assert [n for n, _ in asked] == [5, 5]
+
+
+@pytest.mark.parametrize(
+    ("trained_on", "expected"),
+    [([], [2000, 20_000, 30_000, 40_000]), ([900, *[200] * 5], [10_000, 20_000, 30_000, 40_000])],
+)
+def test_evaluations_are_left_out_while_they_are_too_dear(played, trained_on, expected):
+    asked = played([1.0, 5.0] * 500, length=200)
+    evaluator, model = SampledEvaluator(spec_of(n_timesteps=40_000), None), Model()
+    model.ep_info_buffer = [{"l": length} for length in trained_on]
+    done = []
+    for step in range(2000, 40_001, 2000):
+        model.num_timesteps = step
+        if evaluator.can_afford(model, 0):
+            evaluator(model)
+            done.append(step)
+    # Five episodes are 1,000 steps, and half of 8,000 are allowed over the whole training. How long
+    # the first takes, training's episodes tell, if there are any.
+    assert done == expected
+    assert [n for n, _ in asked] == [5] * 4
+    assert evaluator.n_steps == 4000
+
+
+# --- what a run records --------------------------------------------------------------------------
+
+
+def test_what_is_asked_for_is_done(tmp_path):
+    run = run_of(spec_of(tmp_path, eval_episodes=3, final_episodes=3)).run
+    evaluations = np.load(run.evaluations_path)
+    assert evaluations["results"].shape == (20, 3)
+    assert "n_episodes" not in evaluations, "all have as many as there are columns"
+    assert json.loads(run.info_path.read_text())["final"]["n_episodes"] == 3
+    often = run_of(spec_of(tmp_path, eval_freq=10, n_timesteps=500)).run
+    assert len(np.load(often.evaluations_path)["timesteps"]) == 50
+
+
+def test_a_run_says_what_its_evaluations_took(tmp_path):
+    entry = {"policy": "MlpPolicy", "n_steps": 50, "batch_size": 50, "n_epochs": 1}
+    outcome, again = (run_of(spec_of(tmp_path, "ppo", CART, entry, 500)) for _ in range(2))
+    info = json.loads(outcome.run.info_path.read_text())
+    assert info["evaluation_steps"] == outcome.evaluation_steps > 0
+    evaluations = np.load(outcome.run.evaluations_path)
+    final, n_columns = info["final"], evaluations["results"].shape[1]
+    counts = np.array(evaluations.get("n_episodes", [n_columns] * len(evaluations["timesteps"])))
+    during = (evaluations["ep_lengths"].mean(axis=1) * counts).sum()
+    assert outcome.evaluation_steps == during + final["mean_length"] * final["n_episodes"]
+    assert info["best_episodes"] in counts
+    assert outcome.evaluating.cpu_seconds > 0
+    # Rows of fewer episodes are repeated, so that all tools read them.
+    assert set(n_columns % counts) == {0}
+    for name, array in np.load(again.run.evaluations_path).items():
+        np.testing.assert_array_equal(array, evaluations[name])
+
+
+def test_the_file_is_not_written_at_each_evaluation(tmp_path, monkeypatch):
+    writes = []
+    replacing = callbacks.replacing
+    monkeypatch.setattr(callbacks, "replacing", lambda path: writes.append(path) or replacing(path))
+    monkeypatch.setattr(callbacks, "SECONDS_BETWEEN_WRITES", 1e9)
+    outcome = run_of(spec_of(tmp_path, "qlearning", LAKE, n_timesteps=2000))
+    assert [path.name for path in writes] == ["evaluations.npz"] * 2, "the first, and at the end"
+    assert len(np.load(outcome.run.evaluations_path)["timesteps"]) == 20
+
+
+# --- measured by a bracket -----------------------------------------------------------------------
+
+POLE = Yardstick(optimum=500.0, baseline=20.0, at_least=480.0)
+FEW = {"eval_episodes": 2, "final_episodes": 10}
+
+
+def pendulum(folder=None, env_id="Pendulum-v1", **entry):
+    return spec_of(folder, "random", env_id, entry, 400, **FEW)
+
+
+def test_the_upper_end_measures_and_the_lower_stands_beside_it():
+    found = episodes(260.0, 260.0, yardstick=POLE)
+    figures = found.summary()
+    assert (figures["optimum"], figures["optimum_at_least"]) == (500, 480)
+    assert (figures["gap"], figures["gap_at_least"]) == (240, 220)
+    assert (figures["score"], figures["score_at_most"]) == (0.5, pytest.approx(240 / 460))
+    assert not figures["exact"]
+    assert "beats_optimum" not in figures
+    assert describe(found) == (
+        "return 260.00 ± 0.00 over 2 episodes, optimum between 480.00 and 500.00, "
+        "best random or constant policy 20.00, score 0.50 to 0.52 (bracketed)"
+    )
+    least = episodes(20.0, 20.0, yardstick=POLE)
+    assert describe(least).endswith("score 0.00 (bracketed)")
+    known = episodes(80.0, yardstick=Yardstick(100.0, 60.0)).summary()
+    assert known["score"] == 0.5
+    assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
+
+
+@pytest.mark.parametrize(
+    ("returns", "yardstick", "alarm"),
+    [
+        ([501.0] * 10, POLE, True),
+        ([500.0] * 10, POLE, False),  # the end itself
+        ([500.0000004] * 10, POLE, False),  # as Monitor rounds
+        ([490.0, 530.0] * 5, POLE, False),  # starts that were easy
+        ([530.0] * 9, POLE, False),  # of so few all may have been
+        ([120.0] * 10, Yardstick(100.0, 60.0), False),  # a known optimum
+    ],
+)
+def test_more_than_any_policy_can_reach_is_said_aloud_and_not_clipped(returns, yardstick, alarm):
+    found = episodes(*returns, yardstick=yardstick)
+    assert found.beats_optimum is alarm
+    assert ("THIS IS MORE THAN ANY POLICY CAN REACH" in describe(found)) is alarm
+    assert found.summary().get("beats_optimum", False) is alarm
+    if alarm:
+        assert found.summary()["score"] == pytest.approx(481 / 480)
+
+
+def test_what_is_played_is_measured_too():
+    console = Console(file=io.StringIO(), width=200)
+    show = SimpleNamespace(returns=[-700.0, -600.0], lengths=[200, 200])
+    print_returns(console, pendulum(), show)
+    print_returns(console, pendulum(env_kwargs={"g": 5.0}), show)
+    said, measured, again = console.file.getvalue().splitlines()
+    assert said == again == "return -650.00 ± 50.00 over 2 episodes, length 200.0"
+    assert measured.startswith("optimum between -140.86 and -134.44, best random")
+
+
+@pytest.mark.parametrize(
+    ("entry", "holds"),
+    [
+        ({}, True),
+        ({"normalize": True, "frame_stack": 2}, True),
+        ({"train_env_kwargs": {"g": 5.0}}, True),
+        ({"env_kwargs": {"g": 10.0}}, True),
+        ({"env_kwargs": {"g": 5.0}}, False),
+        ({"eval_env_kwargs": {"g": 5.0}}, False),
+        ({"env_kwargs": {"max_episode_steps": 100}}, False),
+        ({"env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 0.5}}}, False),
+        ({"env_wrapper": "gymnasium.wrappers.FlattenObservation"}, True),
+        ({"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"}, False),
+        ({"env_id": LAKE}, False),
+    ],
+)
+def test_where_a_bracket_holds(entry, holds):
+    assert (bracketed_yardstick(pendulum(**entry)) is not None) == holds
+
+
+def test_a_run_records_the_bracket(tmp_path, monkeypatch):
+    def final(**entry):
+        return json.loads(run_of(pendulum(tmp_path, **entry)).run.info_path.read_text())["final"]
+
+    recorded, known = final(), bracketed_yardstick(pendulum())
+    assert (recorded["optimum"], recorded["optimum_at_least"]) == (known.optimum, known.at_least)
+    assert recorded["baseline"] == known.baseline
+    assert recorded["score"] == pytest.approx(known.score(recorded["mean_return"]))
+    assert not recorded["exact"]
+    other = final(env_kwargs={"g": 5.0})
+    assert not {"optimum", "baseline", "gap", "score", "optimum_at_least"} & other.keys()
+    wrong = OptimumBracket(lower=-5000.0, upper=-4000.0, baseline=-6000.0)
+    monkeypatch.setattr(sampled, "optimum_bracket", lambda env: wrong)
+    beaten = final()
+    assert beaten["beats_optimum"] is True
+    assert beaten["score"] > 1
+
+
+# --- in compiled code: the episodes that evaluation in Python plays ------------------------------
+
+WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}
+IN_BINS = partial(DiscretizeObservation, bins=[1, 6, 12, 6], **WIDTHS)
+SMALL = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}
+
+
+def environments(env_id, wrapper=None, n=5):
+    return make_vec_env(env_id, n, wrapper_class=wrapper)
+
+
+def compiled(algo, env_id, wrapper, n_timesteps, **settings):
+    env = environments(env_id, wrapper, 1)
+    model = load_algorithm(algo)(env=env, seed=1, engine="compiled", **settings)
+    return model.learn(n_timesteps)
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id", "wrapper", "n_timesteps", "settings"),
+    [
+        ("qlearning", CART, IN_BINS, 30_000, {}),
+        ("double_qlearning", CART, IN_BINS, 30_000, {}),
+        ("semi_gradient_sarsa", CAR, None, 20_000, {}),
+        ("reinforce", CART, None, 5000, WIDTHS),
+        ("ppo", CART, None, 3000, {**SMALL, "n_steps": 256}),
+        ("dqn", CAR, None, 3000, SMALL),
+    ],
+)
+def test_compiled_play_is_the_same_to_the_bit(
+    monkeypatch, algo, env_id, wrapper, n_timesteps, settings
+):
+    model = compiled(algo, env_id, wrapper, n_timesteps, **settings)
+    ours, plain = environments(env_id, wrapper), environments(env_id, wrapper)
+    copy = compiled_copy(ours)
+    # More than one go, and further episodes that go on from where the generators were left.
+    for i, play in enumerate([(5, 1), (23, None), (2, None), (5, 0)]):
+        if i == 2:
+            monkeypatch.setattr(greedy_play, "STEPS_AT_ONCE", 7)
+        found, expected = evaluate_compiled(model, copy, *play), evaluate(model, plain, *play)
+        assert figures(found) == figures(expected)
+        assert (found.returns.dtype, found.lengths.dtype) == (expected.returns.dtype, np.int64)
+        assert found.successes is expected.successes is None
+
+
+def test_a_network_is_played_as_it_is_now():
+    model = compiled("dqn", CART, None, 200, **SMALL)
+    copy = compiled_copy(environments(CART))
+    for bias in ([9.0, 0.0], [0.0, 9.0]):
+        with th.no_grad():
+            model.q_net.q_net[-1].bias[:] = th.tensor(bias)
+        ours = evaluate_compiled(model, copy, 5, 3)
+        assert figures(ours) == figures(evaluate(model, environments(CART), 5, 3))
+        assert ours.mean_return < 12
+
+
+def test_what_is_not_compiled_is_played_in_python():
+    assert compiled_copy(environments("Acrobot-v1")) is None
+    assert compiled_copy(environments(CART, RecordEpisodeStatistics)) is None
+    assert compiled_copy(environments(LAKE)) is None, "there, evaluation is exact"
+    assert compiled_copy(environments(CART)) is not None
+
+
+@pytest.mark.parametrize(
+    ("engine", "used"), [("compiled", "evaluate_compiled"), ("interpreted", "evaluate")]
+)
+def test_an_agent_is_evaluated_by_the_engine_that_trained_it(engine, used, monkeypatch):
+    model = load_algorithm("qlearning")(
+        env=environments(CART, IN_BINS, 1), seed=1, engine=engine
+    ).learn(100)
+    calls = []
+    for name in ("evaluate_compiled", "evaluate"):
+        found = getattr(sampled, name)
+        monkeypatch.setattr(
+            sampled, name, lambda *args, found=found, name=name: calls.append(name) or found(*args)
+        )
+    spec = spec_of(None, "qlearning", eval_episodes=5)
+    SampledEvaluator(spec, environments(CART, IN_BINS))(model)
+    assert calls == [used]

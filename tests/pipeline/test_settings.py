@@ -1,0 +1,442 @@
+"""Every text of settings that is read, and every mistake in one line: the table is settings.txt."""
+
+import contextlib
+import inspect
+import math
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+import stable_baselines3 as sb3
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.type_aliases import Schedule
+
+from agents import ALGORITHMS, load_algorithm
+from pipeline.errors import UserError, did_you_mean, one_line, unknown
+from pipeline.settings.components import (
+    build_algorithm_kwargs,
+    build_value,
+    callbacks,
+    wrapper_factory,
+)
+from pipeline.settings.hyperparams import (
+    Hyperparams,
+    check_algorithm_kwargs,
+    entry_names,
+    read_hyperparams,
+    split,
+)
+from pipeline.settings.values import (
+    RANGES,
+    DottedName,
+    ScheduleSpec,
+    algorithm_parameters,
+    coerce,
+    constructor_parameters,
+    contains_name,
+    parse_assignments,
+    parse_literal,
+    parse_schedule,
+)
+from pipeline.settings.yaml import parse_yaml
+
+PARAMETERS = {
+    "PPO": constructor_parameters(sb3.PPO),
+    "DQN": constructor_parameters(sb3.DQN),
+    "TD3": constructor_parameters(sb3.TD3),
+    "TQC": algorithm_parameters(load_algorithm("tqc")),  # which does not say what schedules take
+    "QLEARNING": constructor_parameters(load_algorithm("qlearning")),
+}
+
+
+def table():
+    """Rows of section, text, mark and what is expected."""
+    section = ""
+    for line in Path(__file__).with_name("settings.txt").read_text(encoding="utf-8").splitlines():
+        if line.startswith("[") and " " not in line:
+            section = line[1:-1]
+        elif line and not line.startswith("#"):
+            mark = "=>" if " => " in line else "!!"
+            text, _, expected = line.partition(f" {mark} ")
+            yield section, text.replace("\\n", "\n").replace("\\t", "\t"), mark, expected
+
+
+def from_yaml(text):
+    return parse_yaml(text, "yaml")
+
+
+def read_argument(text):
+    name, _, kwargs = text.partition(" ")
+    read = check_algorithm_kwargs(from_yaml(kwargs), PARAMETERS[name], "arguments")
+    return next(iter(read.values()))
+
+
+def read_agent(text):
+    kwargs = from_yaml(text)
+    return build_algorithm_kwargs(sb3.PPO, kwargs and {"policy": "MlpPolicy", **kwargs}, "agent")
+
+
+def in_file(text, folder):
+    (folder / "ppo.yml").write_text(text, encoding="utf-8")
+    return read_hyperparams("ppo", "A", folder / "ppo.yml")
+
+
+READERS = {
+    "yaml": from_yaml,
+    "literal": lambda text: parse_literal(text, "literal"),
+    "assignment": lambda text: next(iter(parse_assignments([text], "assignment").values())),
+    "entry": lambda text: split(from_yaml(text), "entry"),
+    "schedule": lambda text: parse_schedule(text, "schedule"),
+    "arguments": read_argument,
+    "wrapper": lambda text: wrapper_factory(from_yaml(text)),
+    "callback": lambda text: callbacks(from_yaml(text)),
+    "name": lambda text: build_value(DottedName(text), where="name"),
+    "agent": read_agent,
+}
+
+
+@pytest.mark.parametrize(("section", "text", "mark", "expected"), [*table()])
+def test_each_text_is_read_or_refused(section, text, mark, expected, tmp_path):
+    def read():
+        return in_file(text, tmp_path) if section == "file" else READERS[section](text)
+
+    if mark == "=>":
+        assert repr(read()) == expected
+        return
+    with pytest.raises(UserError) as caught:
+        read()
+    begins = {"file": f"{tmp_path / 'ppo.yml'}:", "wrapper": "env_wrapper"}.get(section, section)
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(begins)
+    assert expected in line
+    assert len(line) < 400
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"", ": must map environment ids to hyperparameters"),
+        (b"A: " + b"[" * 3000, ":1:53: is nested too deeply, or too large"),
+        (b"A: {b: " + b"9" * 5000 + b"}", "is too long for a number"),
+        (b"A: {b: 0x" + b"f" * 5000 + b"}", "is too long for a number"),
+        (b"A: {b: " + b":".join([b"1"] * 5000) + b"}", "is too long for a number"),
+        (b"\x00\x01\x02", ": is not a text file"),
+        (b"PK\x03\x04\xff\xfe", ": is not a text file"),
+        (b"A: \xff", ": is not a text file"),
+        (b"# " + b"x" * 600_000, "is larger than 262,144 bytes"),
+    ],
+    ids=["empty", "deep", "9", "0xf", "1:1", "nul", "zip", "latin", "large"],
+)
+def test_a_broken_file_is_told_with_its_place(tmp_path, content, complaint):
+    path = tmp_path / "ppo.yml"
+    path.write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        read_hyperparams("ppo", "A", path)
+    assert str(caught.value).startswith(f"{path}")
+    assert complaint in str(caught.value)
+    if len(content) > 100_000:
+        with pytest.raises(UserError, match=complaint):
+            entry_names("ppo", path)
+
+
+def test_what_is_no_readable_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yml")
+    for path, said in {
+        tmp_path / "missing.yml": r"missing\.yml: cannot be read: No such file",
+        tmp_path: "is no regular file",
+        tmp_path / "pipe.yml": "is no regular file",
+        "a\0b": "cannot be read: embedded null byte",
+        tmp_path / "config.py": "Python files are not run",
+    }.items():
+        with pytest.raises(UserError, match=said):
+            read_hyperparams("ppo", "A", path)
+
+
+def test_anchors_and_merge_keys(tmp_path):
+    text = "A: &a {gamma: 0.5, n_envs: 2}\nB: &b {<<: *a, gamma: 0.6}\nC: {<<: *b}\n"
+    read = parse_yaml(text, "file")
+    assert read["B"] == read["C"] == {"gamma": 0.6, "n_envs": 2}
+
+
+@pytest.mark.parametrize(
+    ("first", "form", "place"),
+    [("[x, x, x, x]", "[{}]", "5"), ("{x: 1}", "{{<<: [{}]}}", "5")],
+    ids=["lists", "merge keys"],
+)
+def test_anchors_cannot_unfold_without_end(first, form, place):
+    lines = [f"a0: &a0 {first}"]
+    lines += [f"a{i}: &a{i} " + form.format(", ".join([f"*a{i - 1}"] * 9)) for i in range(1, 10)]
+    with pytest.raises(UserError, match=rf"^bomb:{place}:\d+: .*too large"):
+        parse_yaml("\n".join(lines), "bomb")
+
+
+def test_what_is_shared_adds_to_the_depth_too():
+    lines = ["a0: &a0 [x]", *(f"a{i}: &a{i} [*a{i - 1}]" for i in range(1, 60))]
+    with pytest.raises(UserError, match=r"^deep:49:\d+: is nested too deeply"):
+        parse_yaml("\n".join(lines), "deep")
+    assert parse_yaml("\n".join(lines[:40]), "deep")["a1"] == [["x"]]
+
+
+# --- literals and assignments --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("(" * 500, "column"),
+        ("-" * 9_000 + "1", "cannot be read"),
+        ("a" + ".a" * 4_900, "cannot be read"),
+        ("1" * 20_000, "longer than 10000 characters"),
+        ("9" * 6_000, "column 1"),
+        ("", "invalid syntax"),
+    ],
+    ids=lambda text: f"{text[:3]} x {len(text)}",
+)
+def test_long_texts_are_refused_in_one_short_line(text, complaint):
+    with pytest.raises(UserError, match=f"^ppo: .*{complaint}") as caught:
+        parse_literal(text, "ppo")
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('touch {}')",
+        "(lambda: open('{}', 'w'))()",
+        "[open('{}', 'w')]",
+        "[].__class__.__base__.__subclasses__()",
+        "dict(a=dict.__base__)",
+        "[x for x in [open('{}', 'w')]]",
+        "dict(a=open('{}', 'w'))",
+        "f\"{{open('{}', 'w')}}\"",
+        "'a'.upper()",
+        "(y := open('{}', 'w'))",
+        "a[open('{}', 'w')]",
+    ],
+)
+def test_nothing_is_ever_run(text, tmp_path):
+    target = tmp_path / "made"
+    text = text.replace("{}", str(target))
+    with pytest.raises(UserError):
+        parse_literal(text)
+    # As an argument it is a text like any other, refused where a mapping or number is wanted.
+    assert parse_assignments([f"policy_kwargs:{text}"]) == {"policy_kwargs": text}
+    assert not target.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("learning_rate=0.1 gamma:0.9", "learning_rate:0.1"),
+        ("learning_rate 0.1", "learning_rate:0.1"),
+        ("learning_rate = 0.1", "learning_rate:0.1"),
+        ("learning_rate =0.1", "learning_rate:0.1"),
+        ("learning_rate: 0.1 gamma:0.9", "learning_rate:0.1"),
+        ("ent_coef=-1", "ent_coef:-1"),
+        ("a=b=c", "a:b=c"),
+        ("p=dict(a=[64,8])", "'p:dict(a=[64,8])'"),
+        ("learning_rate gamma:0.9", ""),
+        ("gamma", ""),
+        ("a-b=1", ""),
+    ],
+)
+def test_an_assignment_in_another_spelling_gets_ours(words, meant):
+    with pytest.raises(UserError) as raised:
+        parse_assignments(words.split())
+    hint = str(raised.value).partition("key:value")[2]
+    assert hint == (f": did you mean {meant}?" if meant else "")
+
+
+def test_a_key_given_twice_is_refused():
+    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
+        parse_assignments(["gamma:0.9", "gamma:0.8"])
+
+
+def test_numbers_beyond_all_bounds():
+    assert parse_literal("-1e999") == -math.inf
+    with pytest.raises(UserError, match=r"^here: gamma must be a number, not 1000"):
+        check_algorithm_kwargs({"gamma": 10**400}, PARAMETERS["PPO"], "here")
+
+
+# --- entries and an agent's arguments ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "normalize"),
+    [
+        (True, {}),
+        (False, None),
+        (None, None),
+        ({"norm_obs": False}, {"norm_obs": False}),
+        ("{'norm_obs': False, 'gamma': 0.5}", {"norm_obs": False, "gamma": 0.5}),
+    ],
+)
+def test_normalisation_takes_the_agents_discount(value, normalize):
+    entry = {"normalize": value, "gamma": 0.9}
+    assert split({"normalize": value}).normalize == normalize
+    wanted = None if normalize is None else {"gamma": 0.9} | normalize
+    assert split(entry).normalize == wanted
+    assert entry == {"normalize": value, "gamma": 0.9}
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_an_algorithms_own_defaults_pass(name):
+    parameters = constructor_parameters(load_algorithm(name))
+    elsewhere = {"policy", "env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
+    defaults = {
+        name: parameter.default
+        for name, parameter in parameters.items()
+        if name not in elsewhere and not name.startswith("_")
+    }
+    assert check_algorithm_kwargs(defaults, parameters, "here") == defaults
+
+
+def test_every_range_is_that_of_some_known_name():
+    known = set(Hyperparams.__dataclass_fields__)
+    for algorithm in map(load_algorithm, ALGORITHMS):
+        known |= constructor_parameters(algorithm).keys()
+    assert RANGES.keys() <= known
+
+
+@pytest.mark.parametrize(
+    ("value", "annotation", "read"),
+    [
+        (1, float | int, 1),
+        ("5", float | str, 5.0),
+        ("five", float | str, "five"),
+        ("true", str, "true"),
+        (1, Literal[1, 2], 1),
+        ([1, 2], list[float], [1.0, 2.0]),
+        ((1, 2), list[int], [1, 2]),
+        ([1, 2.0], tuple[int, ...], (1, 2)),
+        ({"pi": [64.0]}, list[int] | dict[str, list[int]] | None, {"pi": [64]}),
+        ("lin_0.5", Schedule, ScheduleSpec("linear", 0.5, 0.0)),
+        ({"a": 1}, dict, {"a": 1}),
+        ("as it is", "float | NotImported", "as it is"),
+        ({1: [2]}, inspect.Parameter.empty, {1: [2]}),
+        (5, Any, 5),
+        ("1e-4", float | Path | None, 1e-4),
+        ("far", float | Path | None, "far"),
+        (True, Literal[1, 2], UserError),
+        (1, Literal[True], UserError),
+        ("ab", list[str], UserError),
+        ([1, 2], tuple[int, int, int], UserError),
+        ("inf", int, UserError),
+        (2, bool, UserError),
+        (0, str | None, UserError),
+        ([1], tuple[int | str, Path], UserError),
+    ],
+)
+def test_values_are_read_as_annotations_ask(value, annotation, read):
+    if read is UserError:
+        with pytest.raises(UserError, match=r"^here must be "):
+            coerce(value, annotation, "here")
+    else:
+        assert repr(coerce(value, annotation, "here")) == repr(read)
+
+
+# --- anything at all -----------------------------------------------------------------------------
+
+SCALARS = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text()
+)
+LITERALS = st.recursive(
+    SCALARS,
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.lists(inner, max_size=4).map(tuple)
+        | st.dictionaries(st.text() | st.integers(), inner, max_size=4)
+    ),
+    max_leaves=15,
+)
+JUNK = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=5,
+)
+# What is close to being a literal finds more than plain noise does.
+PIECES = [
+    *"()[]{},:='\"1*.#\\\n\x00\ud800",
+    *("dict", "-2", "1e-4", "**", "nn.Tanh", "__x", "lambda ", " for ", " in ", " if "),
+    *("f'", "b''", "...", "not "),
+]
+FRAGMENTS = st.lists(st.sampled_from(PIECES), max_size=12).map("".join)
+SCHEDULES = st.from_regex(r"(lin|exp|x)_[-0-9.e]{0,4}(_[-0-9.e]{0,4})?", fullmatch=True)
+
+
+def read_or_refused(read, *args):
+    """The value, or None if it is refused in one line that says where."""
+    try:
+        return read(*args)
+    except UserError as error:
+        (line,) = str(error).splitlines()
+        assert line.startswith(("here", "hyperparameters"))
+        assert len(line) < 400
+        return None
+
+
+@given(LITERALS)
+def test_a_literal_is_read_back_from_its_repr(value):
+    assert repr(parse_literal(repr(value))) == repr(value)
+
+
+@given(st.text() | FRAGMENTS | SCHEDULES, st.binary())
+def test_junk_is_read_or_refused_in_one_line(text, content):
+    read_or_refused(parse_literal, text, "here")
+    for junk in (text, content):
+        read_or_refused(parse_yaml, junk, "here")
+    schedule = read_or_refused(parse_schedule, text, "here")
+    if schedule is not None:
+        assert math.isfinite(schedule.start)
+        assert math.isfinite(schedule.end)
+
+
+@given(st.lists(st.text() | FRAGMENTS.map("key:{}".format), max_size=3))
+def test_junk_assignments_are_read_or_refused(assignments):
+    with contextlib.suppress(UserError):
+        result = parse_assignments(assignments)
+        assert len(result) == len(assignments)
+        assert not contains_name(result)
+
+
+@given(
+    st.sampled_from(sorted(PARAMETERS["DQN"])),
+    st.sampled_from(sorted(Hyperparams.__dataclass_fields__)),
+    JUNK,
+)
+def test_any_value_is_read_or_refused(argument, key, value):
+    read_or_refused(check_algorithm_kwargs, {argument: value}, PARAMETERS["DQN"], "here")
+    read_or_refused(split, {key: value})
+
+
+# --- hints and errors ----------------------------------------------------------------------------
+
+
+def test_hints_name_the_nearest_else_a_short_list_else_nothing():
+    assert did_you_mean("pppo", ["a2c", "ppo"]) == "did you mean 'ppo'?"
+    assert did_you_mean("PPO", ["a2c", "ppo"]) == "did you mean 'ppo'?"
+    assert did_you_mean("gamme", ["gamma", "gammb"], n=2) in {
+        "did you mean 'gamma' or 'gammb'?",
+        "did you mean 'gammb' or 'gamma'?",
+    }
+    assert did_you_mean("xyz", ["a2c", "ppo"]) == "known are a2c, ppo"
+    assert did_you_mean("xyz", map(str, range(50))) == ""
+    assert did_you_mean("xyz", []) == ""
+
+
+def test_an_error_is_one_line():
+    assert str(UserError("one\n  two")) == "one two"
+    said = "unknown agent 'ppoo': did you mean 'ppo'?"
+    assert str(unknown("unknown agent", "ppoo", ["ppo"])) == said
+    assert str(unknown("unknown agent", "x", [])) == "unknown agent 'x'"
+    assert one_line(ValueError("one\n two")) == "one two"
+    assert one_line(AssertionError()) == "AssertionError"
