@@ -318,6 +318,15 @@ def test_statistics_are_those_of_the_batch(batches):
     assert (info["engine"], info["n_runs"], info["n_timesteps"]) == ("compiled batch", 5, 200)
 
 
+def test_of_runs_that_differ_in_length_the_shortest_counts(batches, tmp_path):
+    for n in (4, 3):
+        (tmp_path / str(n)).mkdir()
+        pulls = {"arms": ARMS[:1, :n], "rewards": REWARDS[:1, :n], "regrets": REGRETS[:1, :n]}
+        np.savez(tmp_path / str(n) / PULLS_FILE, **pulls)
+    found = stacked_statistics(batches.planned[0].spec, [tmp_path / "4", tmp_path / "3"])
+    assert found.total_reward.tolist() == [2, 2]
+
+
 def test_what_has_no_compiled_copy_goes_one_by_one(tmp_path, monkeypatch, do_study, batches):
     def refuse(*args):
         raise NotCompilable("of a reason")

@@ -384,10 +384,14 @@ def test_a_command_checks_before_it_connects(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("is_insecure", [False, True])
 @pytest.mark.parametrize(
-    ("scheduler", "worker"),
-    [("tcp://10.0.0.1:8786", "tls://10.0.0.2:1"), ("tcp://127.0.0.1:2", "tcp://0.0.0.0:8786")],
+    ("scheduler", "worker", "is_open"),
+    [
+        ("tcp://10.0.0.1:8786", "tls://10.0.0.2:1", True),
+        ("tcp://127.0.0.1:2", "tcp://0.0.0.0:8786", True),
+        ("tls://10.0.0.1:8786", "tls://10.0.0.2:2", False),
+    ],
 )
-def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, is_insecure):
+def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, is_open, is_insecure):
     client = SimpleNamespace(
         scheduler_info=lambda n_workers: {"address": scheduler, "id": "s"},
         nthreads=lambda: {"tls://10.0.0.2:1": 1, worker: 2},
@@ -395,8 +399,8 @@ def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, is_i
         close=lambda timeout: None,
     )
     connection = Connection(lambda: client, lambda client: None, is_insecure)
-    refused = contextlib.nullcontext() if is_insecure else pytest.raises(UserError, match="TLS")
-    with refused:
+    is_refused = is_open and not is_insecure
+    with pytest.raises(UserError, match="TLS") if is_refused else contextlib.nullcontext():
         connection.begin()
         assert connection.n_threads() == client.nthreads()
 
