@@ -84,7 +84,17 @@ def test_what_came_into_the_folder_stays_and_it_is_let_go_when_the_work_fails(tm
     assert files_in(tmp_path) == ["study/summary.csv"]
 
 
-@pytest.mark.parametrize("owner", ["dead", FOREIGN, "", "{", "[]", '{"pid": "x"}'], ids=str)
+OWNERS = {
+    "dead": "dead",
+    "silent": FOREIGN,
+    "empty": "",
+    "half": "{",
+    "list": "[]",
+    "odd": '{"pid": "x"}',
+}
+
+
+@pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
 def test_the_dead_and_the_silent_hold_nothing(tmp_path, owner, dead):
     """A process of this machine is looked for; of what is elsewhere the signs of life count."""
     if owner == "dead":
