@@ -83,15 +83,6 @@ def test_what_is_refused_by_every_command(algo, words, complaint):
             ask()
 
 
-def test_a_mistake_is_one_line(type_command):
-    code, out, err = type_command("train.py", "--algo", "sac", "--engine", "compiled", "-n", "9")
-    assert (code, out) == (2, "")
-    assert err == "train.py: error: --engine compiled: sac has one engine, which auto means\n"
-    code, _, err = type_command("train.py", "--resume", "logs", "--engine", "auto")
-    assert code == 2
-    assert err == "train.py: error: --engine cannot be given with --resume: the run has its own\n"
-
-
 def test_compare_reaches_every_agent_and_a_study_file_too(tmp_path):
     study = compared(*ENV, "--algos", "qlearning", "ppo", "optimal", "--engine", "auto", "-n", "9")
     planned = plan(study, tmp_path)

@@ -1,15 +1,17 @@
-"""``enjoy.py``: its flags, and one picture that is drawn anew in its place."""
+"""``enjoy.py``: what it plays and refuses, and one picture that is drawn anew in its place."""
 
 import io
 import re
 import shlex
 import shutil
 import time
+import zipfile
 from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import train
 from commands import enjoy
@@ -21,13 +23,34 @@ from pipeline.errors import UserError
 from pipeline.evaluation.policies import ActionFigures
 from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.models.load import load_to_play
+from pipeline.playing import FRAMES_PER_SECOND, check_film_path, write_film
 from pipeline.runs import Run
-
-# --- flags of enjoy.py as users of rl_zoo3 know them, and commands that are printed to be typed----
-
 
 LAKE = ["--algo", "random", "--env", "FrozenLake-v1"]
 QUICK = ["train.py", "--seed", "0", "-n", "100", "--eval-freq", "-1", "--verbose", "1"]
+PLAY = ["enjoy.py", *LAKE, "--no-render"]
+
+
+def train_in(folder, *words):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr("pipeline.training.draw", lambda *_: None)  # it takes longest
+        patch.setattr("sys.argv", ["train.py", "--verbose", "0", "--seed", "0", *words])
+        assert train.main() == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    words = ["-n", "100", "--eval-freq", "-1", "--save-freq", "40"]
+    return train_in(tmp_path_factory.mktemp("lake"), *LAKE, *words)
+
+
+@pytest.fixture
+def lake(type_command, trained, tmp_path):
+    """A run folder of a random agent on ice, with two checkpoints."""
+    shutil.copytree(trained / "logs", tmp_path / "logs")
+    return tmp_path / "logs" / "random" / "FrozenLake-v1_1"
 
 
 def watch_line(out):
@@ -35,29 +58,28 @@ def watch_line(out):
     return shlex.split(line)[2:]
 
 
-@pytest.fixture
-def lake(type_command):
-    assert type_command(*QUICK, *LAKE)[0] == 0
-    return ["enjoy.py", *LAKE, "--render", "none"]
-
-
 def episodes(out):
     return [int(steps) for steps in re.findall(r"^episode \d+: return .*, (\d+) steps$", out, re.M)]
 
 
-def test_so_many_steps_or_so_many_episodes(type_command, lake):
-    lengths = episodes(type_command(*lake)[1])
+@pytest.mark.usefixtures("lake")
+def test_so_many_steps_or_so_many_episodes_in_silence_if_asked(type_command):
+    usual = type_command(*PLAY)
+    lengths = episodes(usual[1])
     assert len(lengths) == 10
-    assert len(episodes(type_command(*lake, "-n", "500")[1])) > 20
-    both = episodes(type_command(*lake, "-n", "500", "--n-episodes", "3")[1])
+    assert len(episodes(type_command(*PLAY, "-n", "500")[1])) > 20
+    both = episodes(type_command(*PLAY, "-n", "500", "--n-episodes", "3")[1])
     assert both == lengths[:3]
-    assert sum(episodes(type_command(*lake, "-n", "60")[1])) <= 60
+    assert sum(episodes(type_command(*PLAY, "-n", "60")[1])) <= 60
+    assert type_command(*PLAY, "--verbose", "0") == (0, "", "")
+    # Flags of rl_zoo3 that ask for what is always done.
+    assert type_command(*PLAY, "--custom-objects", "--deterministic") == usual
 
 
-def test_several_at_once_are_all_printed_and_logged(type_command, lake, tmp_path):
-    _, out, err = type_command(
-        *lake[:-2], "--n-envs", "3", "--n-episodes", "8", "--reward-log", "returns"
-    )
+@pytest.mark.usefixtures("lake")
+def test_several_at_once_are_all_printed_and_logged(type_command, tmp_path):
+    words = ["--n-envs", "3", "--n-episodes", "8", "--reward-log", "returns"]
+    _, out, err = type_command("enjoy.py", *LAKE, *words)
     assert err == ""
     assert len(episodes(out)) == 8
     assert "over 8 episodes" in out
@@ -70,47 +92,126 @@ def test_several_at_once_are_all_printed_and_logged(type_command, lake, tmp_path
     assert Counter(episodes(out)) <= logged
 
 
-def test_nothing_is_said_with_verbose_0(type_command, lake):
-    assert type_command(*lake, "--verbose", "0") == (0, "", "")
+RUN = "logs/random/FrozenLake-v1_1"
+PLAYED = [
+    *(([*LAKE, *which], 100) for which in ([], ["--exp-id", "1"])),
+    ([*LAKE, "--load-checkpoint", "40"], 40),
+    ([*LAKE, "--load-last-checkpoint"], 80),
+    ([RUN], 100),
+    ([f"{RUN}/FrozenLake-v1"], 100),
+    ([f"{RUN}/rl_model_40_steps.zip"], 40),
+]
 
 
-@pytest.mark.parametrize(
-    ("flags", "answer"),
-    [
-        (["-P"], "-P: there is no bar; each episode is printed as it ends"),
-        (["--n-envs", "0"], "--n-envs: must be a whole number of at least 1, not '0'"),
-        (["--n-envs", "2", "--render", "ansi"], "--render ansi shows one environment"),
-        (["--n-envs", "2", "--record", "film.gif"], "--record shows one environment"),
-        (["--exp-id", "-1"], "holds no FrozenLake-v1.zip"),
-        (["--vec-normalize", "x.pkl"], "no such file of statistics: x.pkl"),
-    ],
-)
-def test_one_line_for_what_is_not_done(type_command, lake, flags, answer):
-    code, out, err = type_command(*lake[:-2], *flags)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert answer in err
+@pytest.mark.parametrize(("choice", "n_steps"), PLAYED)
+def test_what_is_chosen_is_played_and_trained_further(type_command, lake, choice, n_steps):
+    code, out, err = type_command("enjoy.py", *choice, "--no-render", "--n-episodes", "3")
+    assert (code, err, len(episodes(out))) == (0, "", 3)
+    assert re.search(r"return \d\.\d\d ± \d\.\d\d over 3 episodes", out)
+    if choice[0] != "--algo":
+        code, out, err = type_command(*QUICK, *LAKE, "-i", *choice)
+        assert (code, err) == (0, "")
+        assert f"trained  {n_steps + 100} steps" in out
 
 
-def test_flags_that_ask_for_what_is_always_done(type_command, lake):
-    assert type_command(*lake, "--custom-objects", "--deterministic") == type_command(*lake)
+REFUSED = [
+    ("--n-envs 2 --render ansi", "--render ansi shows one environment"),
+    ("--n-envs 2 --record film.gif", "--record shows one environment"),
+    ("--exp-id -1", "holds no FrozenLake-v1.zip"),
+    ("--exp-id 9", "9"),
+    ("--vec-normalize x.pkl", "no such file of statistics: x.pkl"),
+    ("--norm-reward", "--norm-reward: no statistics of VecNormalize belong to this model"),
+    ("--load-best", "holds no best_model.zip: its training may not have ended"),
+    (
+        "--load-checkpoint 50",
+        "holds no rl_model_50_steps.zip: there are checkpoints after 40, 80 steps",
+    ),
+    ("truncated.zip", "no whole zip of an agent"),
+    ("text.zip", "no whole zip of an agent"),
+    ("other.zip", "no whole zip of an agent"),
+    ("missing.zip", "no such model file"),
+    (f"{RUN}/FrozenLake-v1.zip --algo sarsa", "cannot be loaded as a sarsa agent"),
+]
 
 
-def test_a_checkpoint_that_is_not_there(type_command):
-    type_command(*QUICK, *LAKE, "--save-freq", "40")
-    code, _, err = type_command("enjoy.py", *LAKE, "--no-render", "--load-checkpoint", "50")
-    assert code == 2
-    assert "holds no rl_model_50_steps.zip: there are checkpoints after 40, 80 steps" in err
+@pytest.mark.parametrize(("words", "complaint"), REFUSED)
+def test_one_line_for_what_is_not_there_or_not_done(type_command, lake, tmp_path, words, complaint):
+    whole = (lake / "FrozenLake-v1.zip").read_bytes()
+    (tmp_path / "truncated.zip").write_bytes(whole[:-200])
+    (tmp_path / "text.zip").write_text("not a zip")
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("readme.txt", "hello")
+    choice = [] if "sarsa" in words else LAKE
+    code, _, err = type_command("enjoy.py", *choice, *words.split())
+    assert (code, err.count("\n")) == (2, 1)
+    assert complaint in err
+    if "sarsa" in words:  # nor is it trained further
+        words = [*QUICK, "--algo", "sarsa", "--env", "FrozenLake-v1", "-i", words.split()[0]]
+        code, _, err = type_command(*words)
+        assert (code, err.count("\n")) == (2, 1)
+        assert complaint in err
+        assert not (tmp_path / "logs" / "sarsa" / "FrozenLake-v1_1").exists()
 
 
-@pytest.mark.parametrize("path", ["", "FrozenLake-v1", "FrozenLake-v1.zip", "rl_model_40_steps"])
-def test_paths_of_all_kinds(type_command, tmp_path, path):
-    type_command(*QUICK, *LAKE, "--save-freq", "40")
-    path = f"logs/random/FrozenLake-v1_1/{path}"
-    code, out, err = type_command("enjoy.py", path, "--no-render")
-    assert (code, err, len(episodes(out))) == (0, "", 10)
-    code, out, err = type_command(*QUICK, *LAKE, "-i", path)
-    assert (code, err) == (0, "")
-    assert f"trained  {140 if '40' in path else 200} steps" in out
+def test_a_run_without_checkpoints_says_so(type_command, lake):
+    for path in lake.glob("rl_model_*"):
+        path.unlink()
+    for choice, complaint in [
+        (["--load-checkpoint", "7"], "holds no rl_model_7_steps.zip: its training may not have"),
+        (["--load-last-checkpoint"], "holds no checkpoint: train with --save-freq"),
+    ]:
+        code, out, err = type_command(*PLAY, *choice)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert complaint in err
+
+
+def test_a_library_zip_from_elsewhere_is_played(type_command, tmp_path):
+    from stable_baselines3 import PPO
+
+    path = tmp_path / "foreign.zip"
+    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(path)
+    words = ["enjoy.py", path, "--algo", "ppo", "--env", "CartPole-v1", "--render", "none"]
+    code, out, _ = type_command(*words, "--n-episodes", "2")
+    assert (code, "over 2 episodes" in out) == (0, True)
+
+
+# --- films ----------------------------------------------------------------------------------------
+
+
+def test_letters_and_films_of_each_step(type_command, tmp_path):
+    house = ["--algo", "random", "--env", "Warehouse-v0"]
+    assert type_command("train.py", *house, "-n", "100", "--eval-freq", "-1")[0] == 0
+    code, out, _ = type_command("enjoy.py", *house, "--render", "ansi", "-n", "5")
+    assert code == 0
+    # The first frame and one for each of the five steps, ten rows of shelves each.
+    assert out.count("#") > 6 * 30
+    for film in ("film.gif", "film.mp4"):
+        code, _, err = type_command("enjoy.py", *house, "--record", film, "-n", "7")
+        assert (code, err) == (0, "")
+    # Equal frames in a row become one that is shown for longer.
+    with Image.open(tmp_path / "film.gif") as picture:
+        durations = []
+        for frame in range(picture.n_frames):
+            picture.seek(frame)
+            durations.append(picture.info["duration"])
+    assert sum(durations) == 8 * 1000 // FRAMES_PER_SECOND
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_where_no_film_can_be_written_nothing_is_played(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *_: False)  # as on a read-only disk, also for root
+    with pytest.raises(UserError, match="--record: nothing can be written in "):
+        check_film_path(tmp_path / "film.gif")
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_a_film_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, small_disk, suffix):
+    film = tmp_path / f"film.{suffix}"
+    film.write_bytes(b"an earlier one")
+    with small_disk(20), pytest.raises(OSError, match=r"too large|no whole film"):
+        write_film(film, [np.zeros((8, 8, 3), np.uint8)])
+    assert [path.name for path in tmp_path.iterdir()] == [film.name]
+    assert film.read_bytes() == b"an earlier one"
 
 
 # --- from another place --------------------------------------------------------------------------
@@ -181,37 +282,31 @@ def test_a_study_remembers_maps_by_their_contents(tmp_path, monkeypatch):
     assert planned.spec.as_data()["hyperparams"]["env_kwargs"]["desc"] == MAP.split()
 
 
-def test_normalised_returns_need_statistics(type_command, lake):
-    code, _, err = type_command(*lake, "--norm-reward")
-    assert (code, err.count("\n")) == (2, 1)
-    assert "--norm-reward: no statistics of VecNormalize belong to this model" in err
-
-
 # --- ``enjoy.py --render ansi`` on a terminal: one picture in its place, with figures beside it----
 
 
 REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty
 
 
-@pytest.fixture
-def on_ice(monkeypatch, tmp_path):
-    """Trains an agent for so many steps on ice that is not slippery."""
-
-    def trained(n_steps):
-        monkeypatch.chdir(tmp_path)
-        words = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", str(n_steps)]
-        words += ["--env-kwargs", "is_slippery:False", "--seed", "0", "--verbose", "0"]
-        monkeypatch.setattr("sys.argv", ["train.py", *words])
-        assert train.main() == 0
-        return choose_model(ModelRequest(algo="qlearning", env_id="FrozenLake-v1"))
-
-    return trained
+ICE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 
 
-@pytest.fixture
-def walker(on_ice):
+def trained_on_ice(folder, n_steps):
+    """An agent that was trained for so many steps on ice that is not slippery."""
+    train_in(folder, *ICE, "-n", n_steps, "--env-kwargs", "is_slippery:False")
+    return choose_model(ModelRequest(algo=ICE[1], env_id=ICE[3], log_folder=folder / "logs"))
+
+
+@pytest.fixture(scope="module")
+def walker(tmp_path_factory):
     """An agent that walks straight to the goal."""
-    return on_ice(3000)
+    return trained_on_ice(tmp_path_factory.mktemp("ice"), "3000")
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    """An agent that has learnt nothing, and walks against the wall until the time limit."""
+    return trained_on_ice(tmp_path_factory.mktemp("ice"), "1")
 
 
 @pytest.fixture
@@ -350,12 +445,6 @@ def test_a_pace_is_for_letters_alone():
     for wrong in ("0", "61", "x"):
         with pytest.raises(SystemExit):
             build_parser().parse_args(["--fps", wrong])
-
-
-@pytest.fixture
-def wall(on_ice):
-    """An agent that has learnt nothing, and walks against the wall until the time limit."""
-    return on_ice(1)
 
 
 def test_what_repeats_itself_is_shown_for_a_while(wall, pauses, monkeypatch):

@@ -124,22 +124,6 @@ def test_runs_that_fail_are_tried_once_and_do_not_hold_a_study_up(type_command, 
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--until-decided", "--quick"], "--until-decided and --quick do not go together"),
-        (["--until-decided", "--replace"], "--until-decided and --replace do not go together"),
-        (["--max-seeds", 9], "--max-seeds belongs to --until-decided"),
-        (["--until-decided", "--max-seeds", 5], "--max-seeds is 5, the study begins with 6 seeds"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_in_a_line(type_command, tmp_path, words, message):
-    code, _, err = type_command("bandits.yml", *words, "-f", "s")
-    assert (code, err.count("\n")) == (2, 1)
-    assert message in err
-    assert not (tmp_path / "s").exists()
-
-
 def test_a_damaged_memory_stops_a_study_before_anything_is_run(type_command, tmp_path):
     folder = tmp_path / "s" / "bandits"
     folder.mkdir(parents=True)

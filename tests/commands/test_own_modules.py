@@ -164,20 +164,3 @@ def test_a_study_in_a_folder_full_of_names(own_folder):
     runs = sorted(own_folder.glob("logs/studies/*/runs/lazy/*/run.json"))
     specs = [json.loads(run.read_text())["spec"] for run in runs]
     assert [spec["hyperparams"] for spec in specs] == [{"n_timesteps": 50, "weight": 0.25}] * 2
-
-
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (["--conf-file", "a.yml"], "--conf-file a.yml: whose hyperparameters? a file has those of"),
-        (["--conf-file", "sarsa:a.yml", "sarsa:a.yml"], "--conf-file names two files for sarsa"),
-        (["--conf-file", "sarsa:no.yml"], "--conf-file: there is no file no.yml"),
-        (["--conf-file", "dqn:a.yml"], "(qlearning, sarsa): qlearning:dqn:a.yml"),
-    ],
-)
-def test_whose_file_it_is(in_own_folder, own_folder, words, complaint):
-    (own_folder / "a.yml").write_text("default:\n  n_timesteps: 9\n")
-    base = ["compare.py", "--env", "FrozenLake-v1", "--algos", "qlearning", "sarsa"]
-    code, _, err = in_own_folder(*base, *words)
-    assert code == 2
-    assert complaint in err

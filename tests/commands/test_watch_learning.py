@@ -46,13 +46,6 @@ def test_a_training_that_is_stopped_is_shown_as_far_as_it_came(type_command, tmp
     assert int(number) in {64, 65}
 
 
-def test_what_cannot_be_written_is_refused_before_the_training(type_command, tmp_path):
-    (tmp_path / "page.html").mkdir()
-    code, out, err = type_command(*TABLE)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert not (tmp_path / "logs").exists()
-
-
 def test_a_page_that_finds_no_room_afterwards_ends_in_one_line(type_command, tmp_path, monkeypatch):
     monkeypatch.setattr("report.page.learning.write_text", fails)
     code, out, err = type_command(*TABLE)

@@ -1,0 +1,168 @@
+"""train.py as a user types it: what a run is, where its settings come from, what is said."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import train
+from commands import compare
+from commands.compare import study_spec
+from commands.train import build_parser, train_spec
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.environments import training_kwargs
+from pipeline.settings import hyperparams
+
+ROOT = Path(train.__file__).parent
+QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
+
+
+def contents(folder):
+    return sorted(path.name for path in folder.rglob("*"))
+
+
+@pytest.mark.usefixtures("pictures")
+def test_a_run_folder_is_whole(type_command, tmp_path):
+    code, out, err = type_command("train.py", *QUICK, "--save-freq", "200")
+    assert (code, err) == (0, "")
+    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    assert contents(run) == sorted(
+        [
+            "0.monitor.csv",
+            "FrozenLake-v1",
+            "FrozenLake-v1.zip",
+            "args.yml",
+            "best_model.zip",
+            "command.txt",
+            "config.yml",
+            "evaluations.npz",
+            "learning_curve.png",
+            "rl_model_200_steps.zip",
+            "rl_model_400_steps.zip",
+            "run.json",
+            "value_map.png",
+            "value_maps.npz",
+        ]
+    )
+    info = json.loads((run / "run.json").read_text())
+    assert info["state"] == "finished"
+    assert info["n_timesteps"] == 500
+    assert info["final"]["exact"]
+    assert info["final"]["optimum"] == pytest.approx(0.7442, abs=1e-4)
+    assert info["engine"] == "compiled"
+    assert f"return {info['final']['mean_return']:.2f} (exact)" in out
+    assert "logs/qlearning/FrozenLake-v1_1" in out
+    config = yaml.safe_load((run / "FrozenLake-v1" / "config.yml").read_text())
+    assert config["n_timesteps"] == 500
+    assert "--seed 0" in (run / "FrozenLake-v1" / "command.txt").read_text()
+    with np.load(run / "evaluations.npz") as evaluations:
+        assert evaluations["results"].shape == (20, 2)
+        assert evaluations["timesteps"][-1] == 500
+
+
+def test_sampled_evaluation_where_the_model_is_not_known(type_command, tmp_path):
+    words = ["--algo", "angle", "--env", "CartPole-v1", "-n", "1000", "--seed", "0"]
+    code, out, _ = type_command("train.py", *words)
+    assert code == 0
+    assert "over 25 episodes" in out
+    run = tmp_path / "logs" / "angle" / "CartPole-v1_1"
+    final = json.loads((run / "run.json").read_text())["final"]
+    assert (final["exact"], final["n_episodes"]) == (False, 25)
+    n_evaluations, n_episodes = np.load(run / "evaluations.npz")["results"].shape
+    # Twenty moments, of which those are left out that there are no steps for.
+    assert (n_evaluations, n_episodes) == (3, 5)
+
+
+def test_the_same_seed_gives_the_same_run_and_training_goes_on(type_command, tmp_path):
+    runs = [tmp_path / "logs" / "qlearning" / f"FrozenLake-v1_{n}" for n in (1, 2, 3)]
+    for more in ([], [], ["-i", runs[0] / "FrozenLake-v1.zip"]):
+        assert type_command("train.py", *QUICK, *more)[0] == 0
+    rows = [(run / "0.monitor.csv").read_text().splitlines()[2:] for run in runs]
+    without_time = [[row.rsplit(",", 1)[0] for row in table] for table in rows]
+    assert without_time[0] == without_time[1]
+    data = [zipfile.ZipFile(run / "FrozenLake-v1.zip").read("policy.pth") for run in runs]
+    assert data[0] == data[1] != data[2]
+    assert json.loads((runs[2] / "run.json").read_text())["n_timesteps"] == 1000
+
+
+def test_a_budget_in_episodes(type_command, tmp_path):
+    arguments = ["--algo", "sarsa", "--env", "FrozenLake-v1", "--seed", "0", "--n-episodes", "70"]
+    assert type_command("train.py", *arguments, "-params", "n_envs:3")[0] == 0
+    run = tmp_path / "logs" / "sarsa" / "FrozenLake-v1_1"
+    rows = sum(len(path.read_text().splitlines()) - 2 for path in run.glob("*.monitor.csv"))
+    # The last step may end an episode in several environments.
+    assert 70 <= rows <= 72
+    assert (run / "best_model.zip").exists()
+    # Every four episodes, which is at most twenty times; two may end at once.
+    with np.load(run / "evaluations.npz") as evaluations:
+        assert 15 <= len(evaluations["timesteps"]) <= 70 // 4
+
+
+def test_environment_arguments_reach_training_and_evaluation(type_command, tmp_path):
+    code, _, _ = type_command(
+        *("train.py", "--algo", "random", "--env", "Warehouse-v0", "-n", "1000", "--seed", "0"),
+        *("--env-kwargs", "shelf_reward:-1", "max_episode_steps:50"),
+        *("--eval-env-kwargs", "max_episode_steps:20"),
+    )
+    assert code == 0
+    run = tmp_path / "logs" / "random" / "Warehouse-v0_1"
+    info = json.loads((run / "run.json").read_text())
+    assert info["final"]["mean_length"] <= 20
+    assert info["final"]["mean_return"] >= -20
+    rows = [line.split(",") for line in (run / "0.monitor.csv").read_text().splitlines()[2:]]
+    assert {int(float(row[1])) for row in rows} == {50}
+    assert min(float(row[0]) for row in rows) == -50
+
+
+def test_a_file_of_one_default_entry_is_enough(type_command, monkeypatch, tmp_path):
+    """For listing, training, playing and comparing."""
+    folder = tmp_path / "hyperparams"
+    folder.mkdir()
+    (folder / "qlearning.yml").write_text("default:\n  n_timesteps: 60\n  policy: QTablePolicy\n")
+    monkeypatch.setattr(hyperparams, "_FOLDER", folder)
+    code, out, err = type_command("train.py", "--list")
+    assert (code, err) == (0, "")
+    assert "qlearning" in out
+    choice = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
+    assert type_command("train.py", *choice, "--seed", "0")[::2] == (0, "")
+    code, out, err = type_command("enjoy.py", *choice, "--render", "none", "--n-episodes", "2")
+    assert (code, err) == (0, "")
+    agent = AgentSpec("qlearning", "qlearning")
+    study = StudySpec("s", "S", (agent,), (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1"),))
+    assert plan(study, tmp_path)[0].spec.hyperparams.n_timesteps == 60
+
+
+def test_the_head_says_what_auto_stands_for_and_what_a_discount_costs(type_command, tmp_path):
+    slipping = ["--algo", "qlearning", "--env", "Warehouse-v0", "--env-kwargs", "slip:0.2"]
+    code, out, _ = type_command("train.py", *slipping, "-n", "500", "--seed", "0")
+    assert code == 0
+    assert "gamma=0.9995 (auto: 1 - 1/(2 x time limit of 1,000))" in " ".join(out.split())
+    assert "exact planning" not in out
+    run = tmp_path / "logs" / "qlearning" / "Warehouse-v0_1"
+    spec = json.loads((run / "run.json").read_text())["spec"]
+    assert (spec["hyperparams"]["gamma"], *spec["origins"]) == (0.9995, "gamma", "learning_rate")
+    assert yaml.safe_load((run / "Warehouse-v0" / "config.yml").read_text())["gamma"] == 0.9995
+    code, out, _ = type_command(
+        *("train.py", *slipping, "-n", "500", "--seed", "0", "-params", "gamma:0.99")
+    )
+    assert code == 0
+    assert "at gamma 0.99 even exact planning scores 0.00 here; 0.9995: 1.00" in out
+
+
+def test_typed_arguments_of_the_environment_win_over_what_an_entry_trains_on():
+    words = ["--algo", "ppo", "--env", "MineMaze-v0", "--env-kwargs", "mine_reward:-1"]
+    spec = train_spec(build_parser().parse_args(words))
+    variant = {"random_start": True, "goal_reward": 20, "power_reward": 3}
+    both = [*words[:4], "-params", "env_kwargs:{'mine_reward': -1}", "--env-kwargs", "slip:0.1"]
+    asked = {**variant, "mine_reward": -1, "slip": 0.1}
+    assert training_kwargs(train_spec(build_parser().parse_args(both))) == asked
+    compared = ["--env", "MineMaze-v0", "--algos", "ppo", *both[4:]]
+    study = study_spec(compare.build_parser().parse_args(compared))
+    assert training_kwargs(plan(study, Path("nowhere"))[0].spec) == asked
+    assert training_kwargs(spec) == {**variant, "mine_reward": -1}
+    assert "without mine_reward: -20" in spec.origins["train_env_kwargs"]
+    assert training_kwargs(train_spec(build_parser().parse_args(words[:4])))["mine_reward"] == -20
