@@ -1,4 +1,4 @@
-"""The commands in the documents: each is accepted as it stands, and what it names exists."""
+"""The documents: their commands are accepted as they stand, and do what the page says of them."""
 
 import re
 import shlex
@@ -11,6 +11,8 @@ from commands import compare, enjoy, train, tune
 from commands.compare import study_spec
 from commands.train import train_spec
 from commands.tune import tuning_spec
+from experiments.plan import plan
+from experiments.study import _STUDY_KEYS, read_study
 
 ROOT = Path(__file__).parent.parent
 sys.path += [str(ROOT / "benchmarks"), str(ROOT / "docs" / "scripts")]
@@ -25,101 +27,99 @@ from recommended_commands import (  # noqa: E402
     with_outcomes,
 )
 
-DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
+README = (ROOT / "README.md").read_text()
+COMPARE = (ROOT / "docs" / "compare.md").read_text()
 COMMAND = re.compile(r"python ((?:train|enjoy|compare|tune)\.py [^`\n)#]*)")
+# Each with the first document that it stands in.
+FOUND_IN = {
+    command.strip(): document.name
+    for document in reversed([ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))])
+    for command in COMMAND.findall(
+        document.read_text().replace("--env\nWarehouse", "--env Warehouse")
+    )
+}
+COMMANDS = [pytest.param(each, id=f"{name}: {each}") for each, name in FOUND_IN.items()]
 
 
-def commands(script):
-    found = [
-        (document.name, command.strip())
-        for document in DOCUMENTS
-        for command in COMMAND.findall(
-            document.read_text().replace("--env\nWarehouse", "--env Warehouse")
-        )
-    ]
-    return [item for item in dict.fromkeys(found) if item[1].startswith(script)]
-
-
-def arguments(command):
-    return shlex.split(command)[1:]
-
-
-@pytest.fixture
-def checkout(tmp_path, monkeypatch):
-    """A folder that holds what the commands take for granted."""
-    (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
-    log = "segment,arm,reward,propensity\ncore,0,1,0.5\ncasual,1,0,0.5\n"
-    (tmp_path / "train.csv").write_text(log)
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.parametrize(("document", "command"), commands("train.py"))
-def test_train_commands_can_be_carried_out(checkout, document, command):
-    parser = train.build_parser()
-    args = parser.parse_args(arguments(command))
-    if args.list:
-        return
-    args.trained_agent = ""
-    spec = train_spec(args)
-    assert spec.env_id == args.env
-
-
-@pytest.mark.parametrize(("document", "command"), commands("enjoy.py"))
-def test_enjoy_commands_are_accepted(document, command):
-    args = enjoy.build_parser().parse_args(arguments(command))
-    assert args.model is not None or args.env == "Warehouse-v0"
-
-
-@pytest.mark.parametrize(("document", "command"), commands("compare.py"))
-def test_compare_commands_are_accepted(monkeypatch, document, command):
-    monkeypatch.chdir(ROOT)
-    args = compare.build_parser().parse_args(arguments(command))
-    assert bool(args.logged) == bool(args.policy)
-    if not args.logged:
-        assert study_spec(args).agents
-
-
-@pytest.mark.parametrize(("document", "command"), commands("tune.py"))
-def test_tune_commands_are_accepted(document, command):
-    args = tune.build_parser().parse_args(arguments(command))
-    assert tuning_spec(args).environment.env_id == args.env
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
+    script, *words = shlex.split(command)
+    if script == "train.py":
+        # What the commands take for granted.
+        (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
+        log = "segment,arm,reward,propensity\ncore,0,1,0.5\ncasual,1,0,0.5\n"
+        (tmp_path / "train.csv").write_text(log)
+        monkeypatch.chdir(tmp_path)
+        args = train.build_parser().parse_args(words)
+        args.trained_agent = ""
+        assert args.list or train_spec(args).env_id == args.env
+    elif script == "enjoy.py":
+        args = enjoy.build_parser().parse_args(words)
+        assert args.model is not None or args.env == "Warehouse-v0"
+    elif script == "tune.py":
+        args = tune.build_parser().parse_args(words)
+        assert tuning_spec(args).environment.env_id == args.env
+    else:
+        monkeypatch.chdir(ROOT)
+        args = compare.build_parser().parse_args(words)
+        assert bool(args.logged) == bool(args.policy)
+        study = None if args.logged else study_spec(args)
+        if study is not None and "map.txt" not in command:
+            assert sum(run.n_runs for run in plan(study, tmp_path)) >= study.n_seeds
 
 
 def test_there_are_commands_to_check():
-    assert len(commands("compare.py")) >= 20
-    assert len(commands("train.py")) >= 6
-    assert len(commands("enjoy.py")) >= 2
+    counts = {
+        script: sum(command.startswith(script) for command in FOUND_IN)
+        for script in ("compare.py", "train.py", "enjoy.py", "tune.py")
+    }
+    assert counts["compare.py"] >= 20
+    assert counts["train.py"] >= 6
+    assert min(counts.values()) >= 2
 
 
 def test_the_readmes_script_prints_what_stands_below_it(capsys):
-    text = (ROOT / "README.md").read_text()
-    (code, printed) = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", text, re.DOTALL).groups()
+    code, printed = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", README, re.DOTALL).groups()
     exec(code, {})  # noqa: S102  # a page of this project
     assert capsys.readouterr().out == printed
 
 
-def test_what_the_readme_points_to_is_there():
-    text = (ROOT / "README.md").read_text()
-    targets = re.findall(r"\]\(([^)#]+)\)", text) + re.findall(r'src="([^"]+)"', text)
-    files = [target for target in targets if not target.startswith("http")]
-    assert len(files) >= 4
-    assert [name for name in files if not (ROOT / name).exists()] == []
-
-
-def test_make_targets_of_the_readme_exist():
-    targets = set(re.findall(r"\bmake ([a-z]+)", (ROOT / "README.md").read_text()))
+def test_what_the_readme_and_the_page_on_compare_point_to_is_there():
+    for text, folder in ((README, ROOT), (COMPARE, ROOT / "docs")):
+        targets = re.findall(r"\]\(([^)#]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+        files = [target for target in targets if not target.startswith("http")]
+        assert len(files) >= 4
+        assert [name for name in files if not (folder / name).exists()] == []
+    targets = set(re.findall(r"\bmake ([a-z]+)", README))
     assert targets == {"train", "test", "docs", "bench"}
     makefile = (ROOT / "Makefile").read_text()
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
 
 
-# --- what the commands reach ---------------------------------------------------------------------
+def test_the_example_of_a_study_is_one_and_every_key_is_documented(tmp_path):
+    (example,) = re.findall(r"```yaml\n(.*?)```", COMPARE, re.DOTALL)
+    path = tmp_path / "example.yml"
+    path.write_text(example)
+    study = read_study(path)
+    assert [agent.label for agent in study.agents] == [
+        *(f"qlearning with α = {value}" for value in (0.01, 0.1, 0.9)),
+        "careful",
+    ]
+    assert len(plan(study, tmp_path)) == 4 * 2 * 20
+    assert len(plan(study.quickened(), tmp_path)) == 4 * 2 * 3
+    table = COMPARE.partition("| key | meaning |")[2].partition("\n\n")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(_STUDY_KEYS)
+
+
+# --- what the commands reach ----------------------------------------------------------------------
 
 ENOUGH = 0.25  # seconds of processor time: trainings that take less are done as they stand
 TASTE = 300  # steps of the others
 
 
 def test_every_training_that_the_text_recommends_has_its_row():
+    """Otherwise: python benchmarks/documented_commands.py --fill."""
     assert set(trainings()) == set(reached())
     assert len(trainings()) > 70
     pages = [path for path in sorted(ROOT.glob("docs/**/*.md")) if path != PAGE]

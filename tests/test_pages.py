@@ -1,4 +1,4 @@
-"""Pages of docs/ can be filled with what follows from code, and have one form."""
+"""Pages are filled by programs with what follows from code and runs, and have one form."""
 
 import importlib.util
 import re
@@ -22,6 +22,9 @@ def script(name, folder="scripts"):
     return module
 
 
+headline = script("headline", "../benchmarks")
+
+
 @pytest.fixture(scope="module")
 def fill_pages():
     before = list(sys.path)
@@ -35,13 +38,6 @@ def test_pages_can_be_filled(fill_pages):
     for path in sorted(path for path in DOCS.rglob("*.md") if path.name not in dear):
         text = fill_pages.filled(path.read_text(), path.parent)
         assert not re.search(r"^\[[^\]]*\]\(\S+ \"[^\"]*\"\)$", text, re.MULTILINE), path
-
-
-def test_commands_say_what_they_reach(fill_pages):
-    """Otherwise: python benchmarks/documented_commands.py --fill."""
-    with_outcomes = fill_pages.with_outcomes
-    texts = {path: path.read_text() for path in DOCS.rglob("*.md")}
-    assert [path.name for path, text in texts.items() if with_outcomes(text) != text] == []
 
 
 def test_every_environment_is_pictured(fill_pages):
@@ -98,3 +94,20 @@ def test_links_that_lead_nowhere_are_found(tmp_path):
         "a.html links to c.html, which is not there",
         "a.html links to #nowhere, where there is no place nowhere",
     ]
+
+
+def test_blocks_of_the_headline_study_are_replaced_and_the_others_stay():
+    page = (
+        "a\n<!-- headline: tuned -->\nold\n<!-- end -->\nb\n"
+        "<!-- headline: what-fell -->\nkept\n<!-- end -->\n"
+    )
+    once = headline.filled(page, {"tuned": "| new \\1 |\n\nlegend\n"})
+    assert once == page.replace("old", "| new \\1 |\n\nlegend")
+    assert headline.filled(once, {"tuned": "old"}) == page
+    assert {
+        path.name: {block[2] for block in headline.BLOCK.finditer(path.read_text(encoding="utf-8"))}
+        for path in headline.PAGES
+    } == {
+        "README.md": {"held-out"},
+        "library-vs-hand-rolled.md": {"held-out", "tuned", "what-fell", "verdicts-held-out"},
+    }

@@ -1,22 +1,30 @@
-"""The page that plays a training: what is in it, how large it may be, and how it is written."""
+"""The page that plays a training: its data, its size; and those of a study, done again and kept."""
 
 import base64
 import gzip
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.child_processes import TaskFailedError
+from experiments.results import difference
+from pipeline.digests import DamagedFileError
+from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
 from report.page import learning
 from report.page.frame import as_json
-from report.page.learning import _layout_of, exactly, write_learning_page
+from report.page.learning import exactly, write_first_pages, write_learning_page
+from tests.report import made_up
+
+HOSTILE = "</script><script>document.title='taken'</script>"
 
 
 @pytest.fixture
@@ -26,22 +34,23 @@ def watch(tmp_path):
     def done(env_id="Warehouse-v0", algo="qlearning", n_timesteps=200, settings=(), **fields):
         entry = {"n_timesteps": n_timesteps, **dict(settings)}
         common = {"seed": 1, "verbose": 0, "pictures": False, "log_folder": tmp_path / "logs"}
-        path = tmp_path / "page.html"
-        spec = TrainSpec(
-            algo, env_id, split(entry), entry, **{**common, "watch_learning": path, **fields}
+        common |= {"watch_learning": tmp_path / "page.html", **fields}
+        training = prepare(
+            TrainSpec(algo, env_id, split(entry), entry, **common), Console(quiet=True), {}, ""
         )
-        training = prepare(spec, Console(quiet=True), {}, "")
         carry_out(training)
-        write_learning_page(spec, training.watch, path)
-        text = path.read_text(encoding="utf-8")
-        return data_in(text), text, training
+        return *again(training), training
 
     return done
 
 
-def data_in(text):
+def again(training, **changes):
+    """The page, written from what was recorded."""
+    path = training.spec.watch_learning
+    write_learning_page(replace(training.spec, **changes), training.watch, path)
+    text = path.read_text(encoding="utf-8")
     (packed,) = re.findall(r'<script type="text/plain" id="data">([^<]*)</script>', text)
-    return json.loads(gzip.decompress(base64.b64decode(packed)))
+    return json.loads(gzip.decompress(base64.b64decode(packed))), text
 
 
 def test_numbers_are_written_to_their_last_digit():
@@ -52,33 +61,22 @@ def test_numbers_are_written_to_their_last_digit():
 
 
 def test_the_data_are_what_was_recorded(watch):
-    data, _, training = watch(settings={"env_kwargs": {"desc": ["S..", "#.G"]}})
+    maps = {"env_kwargs": {"desc": ["S.G"]}, "train_env_kwargs": {"desc": ["S..", "#.G"]}}
+    data, _, training = watch(settings=maps)
     moves, changes = training.watch.moves.rows, training.watch.changes.rows
     assert data["kind"] == "steps"
     assert data["moves"]["td_error"] == moves["td_error"].tolist()
     assert data["moves"]["target"] == moves["target"].tolist()
     assert data["changes"]["after"] == changes["after"].tolist()
     assert data["tables"] == [{"name": "q_tables", "shape": [1, 6, 4], "fill": 0}]
-    assert data["layout"]["rows"] == ["S..", "#.G"]
+    assert data["layout"]["rows"] == ["S..", "#.G"]  # the map of the training
     assert data["layout"]["moves"] == [[-1, 0], [1, 0], [0, -1], [0, 1]]
     assert (data["n_states"], len(data["actions"]), data["is_cut"]) == (6, 4, False)
 
 
-def test_the_map_is_that_of_the_training(watch):
-    settings = {"env_kwargs": {"desc": ["S.G"]}, "train_env_kwargs": {"desc": ["G.S"]}}
-    data, _, _ = watch(settings=settings)
-    assert data["layout"]["rows"] == ["G.S"]
-
-
-def test_where_observations_are_not_the_states_there_is_no_map():
-    class Mirrored(gym.ObservationWrapper):
-        def observation(self, obs):
-            return 15 - obs
-
-    env = gym.make("FrozenLake-v1")
-    assert _layout_of(env, 16).rows[0] == "S..."
-    assert _layout_of(Mirrored(env), 16) is None
-    assert _layout_of(env, 17) is None
+class Mirrored(gym.ObservationWrapper):
+    def observation(self, obs):
+        return 15 - obs
 
 
 def test_without_a_map_states_are_numbers(watch):
@@ -87,6 +85,10 @@ def test_without_a_map_states_are_numbers(watch):
     assert data["actions"][5] == "action 5"
     data, _, _ = watch("LinearBandit-v0", "linucb", n_timesteps=20)
     assert (data["n_states"], data["is_drawn"]) == (0, False)
+    # Nor is there one where observations are not the states.
+    mirrored = {"env_wrapper": {f"{__name__}.Mirrored": {}}}
+    data, _, _ = watch("FrozenLake-v1", settings=mirrored, gym_packages=("tests",))
+    assert (data["layout"], data["n_states"]) == (None, 16)
 
 
 def test_without_a_table_the_policy_in_every_state(watch):
@@ -97,18 +99,14 @@ def test_without_a_table_the_policy_in_every_state(watch):
     assert moments["timesteps"] == rows["timesteps"].tolist()
     assert moments["timesteps"][0] == 0
     assert moments["actions"][-1] == rows["actions"][-1].tolist()
-    assert moments["return"][-1] == rows["values"][-1][0]
+    assert moments["return"][-1] == rows["values"][-1][0] > 0.5
     assert set(moments["loss"]) == {None}
     # Where an episode has ended nothing is done.
     reachable = training.watch.evaluator.model.reachable
     assert [value is not None for value in moments["values"][0]] == reachable.tolist()
-
-
-def test_the_beginning_and_the_end_are_there_without_evaluations(watch):
+    # The beginning and the end are there without evaluations.
     data, _, training = watch("FrozenLake-v1", "value_iteration", 64, eval_freq=-1)
-    moments = data["moments"]
-    assert moments["timesteps"] == [0, 64]
-    assert moments["return"][-1] == training.watch.moments.rows["values"][-1][0] > 0.5
+    assert data["moments"]["timesteps"] == [0, 64]
 
 
 def test_of_a_network_the_page_says_which_updates_it_shows(watch, monkeypatch):
@@ -117,34 +115,34 @@ def test_of_a_network_the_page_says_which_updates_it_shows(watch, monkeypatch):
     assert "from update to update" in text
     assert "20 updates\n" in text.replace("</p>", "\n")
     assert data["moments"]["number"] == [*range(21)]
-    path = training.spec.watch_learning
     # As large as the page is with every second one, and a letter less.
     monkeypatch.setattr(learning, "MOST_BYTES", len(text) - 1)
-    write_learning_page(training.spec, training.watch, path)
-    second = path.read_text(encoding="utf-8")
+    _, second = again(training)
     assert "20 updates, one in 2 of which is shown" in second
     monkeypatch.setattr(learning, "MOST_BYTES", len(second.encode()) - 1)
-    write_learning_page(training.spec, training.watch, path)
-    text = path.read_text(encoding="utf-8")
+    data, text = again(training)
     assert "20 updates, one in 4 of which is shown" in text
-    assert data_in(text)["moments"]["number"] == [0, 4, 8, 12, 16, 20]
-    assert data_in(text)["stride"] == 4
+    assert (data["moments"]["number"], data["stride"]) == ([0, 4, 8, 12, 16, 20], 4)
 
 
-def test_a_page_is_no_larger_than_three_megabytes(watch, monkeypatch):
+def test_a_page_is_no_larger_than_three_megabytes_and_replaced_whole(
+    watch, monkeypatch, small_disk
+):
     _, text, training = watch("Taxi-v4", n_timesteps=2000)
+    path = training.spec.watch_learning
+    with small_disk(1000), pytest.raises(OSError, match="too large"):
+        again(training)
+    assert path.read_text(encoding="utf-8") == text
+    assert [other.name for other in path.parent.glob("*.tmp")] == []
     assert len(text) < learning.MOST_BYTES
     smaller = len(text) - 20_000
     monkeypatch.setattr(learning, "MOST_BYTES", smaller)
-    path = training.spec.watch_learning
-    write_learning_page(training.spec, training.watch, path)
-    cut = data_in(path.read_text(encoding="utf-8"))
+    cut, _ = again(training)
     assert path.stat().st_size <= smaller
     assert cut["is_cut"]
-    asked = replace(training.spec, watch_episodes=3000)
-    write_learning_page(asked, training.watch, path)
+    _, text = again(training, watch_episodes=3000)
     said = r"a page has room for [\d,]+ steps, and ends before the first 3,000 episodes do"
-    assert re.search(said, path.read_text(encoding="utf-8"))
+    assert re.search(said, text)
     n_steps = len(cut["steps"]["timesteps"])
     assert 1 < n_steps < 2000
     assert len(cut["moves"]["step"]) == n_steps
@@ -157,27 +155,109 @@ def test_the_fullest_page_is_no_larger_either(watch):
     recorder, rng = training.watch, np.random.default_rng(0)
     recorder.exact = None  # all that is kept is shown
     recorder.initial = {"q_tables": rng.normal(size=(1, 500, 6))}
-    for rows, n in ((recorder.steps, 20_000), (recorder.moves, 20_000), (recorder.changes, 60_000)):
+    for rows, n, clock in (
+        (recorder.steps, 20_000, "timesteps"),
+        (recorder.moves, 20_000, "step"),
+        (recorder.changes, 60_000, "step"),
+    ):
         more = np.zeros(n - len(rows), dtype=rows.rows.dtype)
         for name in more.dtype.names:
             whole = more.dtype[name] == np.int64
             more[name] = rng.integers(500, size=len(more)) if whole else rng.normal(size=len(more))
-        more["timesteps" if n == 20_000 and rows is recorder.steps else "step"] = np.sort(
-            rng.integers(20, 20_000, size=len(more))
-        )
+        more[clock] = np.sort(rng.integers(20, 20_000, size=len(more)))
         rows.extend(more)
-    more = recorder.changes.rows
-    more["table"] = 0
-    path = training.spec.watch_learning
-    write_learning_page(training.spec, recorder, path)
-    assert learning.MOST_BYTES / 2 < path.stat().st_size < 3_000_000
+    recorder.changes.rows["table"] = 0
+    again(training)
+    assert learning.MOST_BYTES / 2 < training.spec.watch_learning.stat().st_size < 3_000_000
 
 
-def test_a_page_is_replaced_whole(watch, small_disk):
-    _, text, training = watch(n_timesteps=20)
-    path = training.spec.watch_learning
+# --- those of a study -----------------------------------------------------------------------------
 
-    with small_disk(1000), pytest.raises(OSError, match="too large"):
-        write_learning_page(training.spec, training.watch, path)
-    assert path.read_text(encoding="utf-8") == text
-    assert [other.name for other in path.parent.glob("*.tmp")] == []
+
+@pytest.fixture
+def done(monkeypatch):
+    """Writes the pages of a study, in this process; these by agent, and what was trained."""
+    trained = []
+
+    def supervise(function, planned, *args, clean_up, limits, shares_process):
+        trained.append(planned.agent)
+        try:
+            return function(planned, *args)
+        except UserError as error:
+            raise TaskFailedError(str(error), "") from error
+        finally:
+            clean_up()
+
+    # A child process would import all libraries for each of them.
+    monkeypatch.setattr(learning, "supervise", supervise)
+
+    def write(analysis):
+        trained.clear()
+        pages = write_first_pages(analysis, 1)
+        return {page.agent: page for page in pages}, sorted(trained)
+
+    return write
+
+
+@pytest.fixture
+def analysis(one_environment, tmp_path):
+    """The same study, with nothing in the folder that pages are written to."""
+    return replace(one_environment, results=replace(one_environment.results, root=tmp_path))
+
+
+def test_each_agent_that_learns_is_shown_once_and_kept(done, analysis, tmp_path):
+    pages, trained = done(analysis)
+    agents = ["Q-learning & co", "sarsa", HOSTILE]
+    assert ([*pages], trained) == (agents, sorted(agents))
+    shown = pages["Q-learning & co"]
+    assert (shown.seed, shown.place) == (0, "learning/Q-learning_co/FrozenLake-v1_1.html")
+    assert shown.words.startswith("step by step, 2,000 steps, ")
+    page = tmp_path / shown.place
+    text = page.read_text(encoding="utf-8")
+    assert "<h1>Q-learning &amp; co on FrozenLake-v1</h1>" in text
+    assert len(text.encode()) == shown.size < 3_000_000
+    assert (pages[HOSTILE].place, pages[HOSTILE].size) == ("", 0)
+    assert "random on FrozenLake-v1 has neither" in pages[HOSTILE].words
+    # Again, only what cannot be shown is tried.
+    assert done(analysis) == (pages, [HOSTILE])
+    page.write_text(text.replace("2,000", "9,000"), encoding="utf-8")
+    assert done(analysis)[1] == sorted(["Q-learning & co", HOSTILE])
+    assert page.read_text(encoding="utf-8") == text
+    note = page.with_suffix(".json")
+    run = next(run for run in analysis.results.finished if run.agent == "Q-learning & co")
+    for damaged in ("{", "[]", "{}", json.dumps({**json.loads(note.read_text()), "words": 3})):
+        note.write_text(damaged)
+        assert learning.kept_page(tmp_path, run) is None
+    # What comes out otherwise is not shown.
+    other = replace(run, spec=replace(run.spec, seed=7))
+    results = replace(analysis.results, finished=(other,), root=tmp_path / "other")
+    pages, _ = done(replace(analysis, results=results))
+    assert pages["Q-learning & co"].place == ""
+    assert pages["Q-learning & co"].words.startswith("the agent came out otherwise than in the run")
+    assert not list((tmp_path / "other").rglob("*.html"))
+
+
+def test_runs_are_held_against_each_other_to_the_last_bit(analysis, monkeypatch):
+    one, other = (run.run for run in analysis.results.finished if run.agent == "sarsa")
+    assert difference(one, one) == ""
+    assert difference(one, other) == "the agent"
+    monkeypatch.setattr("experiments.results._tensors", lambda run: {})
+    assert difference(one, other) == "the episodes"
+    episodes = SimpleNamespace(steps=np.zeros(1), returns=np.zeros(1))
+    monkeypatch.setattr("experiments.results.read_episodes", lambda run: episodes)
+    assert difference(one, other) == "the evaluations"
+    monkeypatch.undo()
+    monkeypatch.setattr("pipeline.digests.RecordedFiles.read", lambda *_: b"PK")
+    with pytest.raises(DamagedFileError, match="is no whole zip"):
+        difference(one, one)
+
+
+def test_agents_without_a_run_of_their_own_are_named(done, tmp_path):
+    agents = [made_up.agent("ucb", 1.0), made_up.agent("fails", 0.0)]
+    analysis = made_up.analysis([made_up.environment(agents)], ["ucb", "fails"], tmp_path)
+    known = {"is_batch": True, "is_finished": True, "path": tmp_path}
+    batch = SimpleNamespace(agent="ucb", environment="lake", **known)
+    results = replace(analysis.results, planned=(batch,), finished=(batch,))
+    pages, _ = done(replace(analysis, results=results))
+    assert pages["ucb"].words == "its runs were done as one batch, which leaves no agent"
+    assert pages["fails"].words == "no run of it has finished"

@@ -27,29 +27,15 @@ def test_the_kinds(given, kind):
     assert kind_of(given) == kind
 
 
-def test_what_is_no_storage_is_refused_without_its_password():
+def test_passwords_are_left_out_of_refusals_and_commands():
     with pytest.raises(UserError, match=r"'redis://u:\*\*\*@h' is no storage: a file for a "):
         kind_of("redis://u:secret@h")
-
-
-def test_a_database_that_cannot_be_reached_is_refused_without_its_password():
     with pytest.raises(UserError) as error:
         open_storage(None, "postgresql://u:secret@127.0.0.1:1/db")
     assert "secret" not in str(error.value)
     assert "postgresql://u:***@127.0.0.1:1/db" in str(error.value)
-
-
-@pytest.mark.parametrize("text", ["tune.py --storage postgresql://u:se%40cret@h/db -j 2", "no://x"])
-def test_passwords_are_left_out_of_commands(text):
-    assert without_secret(text) == text.replace("se%40cret", "***")
-
-
-def test_a_folder_of_any_name_keeps_its_own_file(tmp_path):
-    root = tmp_path / "a {b} %20 c?d"
-    root.mkdir()
-    storage = open_storage(root, None)
-    storage.create_new_study([1], "s")
-    assert (root / "trials.db").stat().st_size
+    for text in ("tune.py --storage postgresql://u:se%40cret@h/db -j 2", "no://x"):
+        assert without_secret(text) == text.replace("se%40cret", "***")
 
 
 @pytest.mark.parametrize(
@@ -85,12 +71,16 @@ def test_a_database_without_its_package_says_which(monkeypatch):
         open_storage(None, "postgresql://u@h/db")
 
 
-def test_a_storage_that_goes_while_it_is_used_is_one_line(tmp_path):
-    storage = open_storage(tmp_path, None)
-    (tmp_path / "trials.db").write_bytes(b"no database any more")
+def test_a_folder_of_any_name_keeps_its_own_file_and_one_that_is_damaged_is_one_line(tmp_path):
+    root = tmp_path / "a {b} %20 c?d"
+    root.mkdir()
+    storage = open_storage(root, None)
+    storage.create_new_study([1], "s")
+    assert (root / "trials.db").stat().st_size
+    (root / "trials.db").write_bytes(b"no database any more")
     expected = r"^trials\.db: .*; what is done stays, and the same"
     with pytest.raises(UserError, match=expected), failing_in_a_line(None):
-        storage.create_new_study([1], "s")
+        storage.create_new_study([1], "t")
     with pytest.raises(UserError, match=r"^trials\.db is damaged: "), failing_in_a_line(None):
         json.loads("[1")
     with pytest.raises(KeyError), failing_in_a_line(None):  # not the storage's
@@ -100,57 +90,64 @@ def test_a_storage_that_goes_while_it_is_used_is_one_line(tmp_path):
 # --- drivers that share a queue, and drivers that are gone ----------------------------------------
 
 
-STORAGES = ["journal", "sqlite"]
+@pytest.fixture(params=["journal:{}/log", "sqlite:///{}/db"], ids=["journal", "sqlite"])
+def storage(request, tmp_path):
+    return request.param.format(tmp_path)
 
 
-def storage_of(kind, tmp_path):
-    return {"journal": f"journal:{tmp_path / 'log'}", "sqlite": f"sqlite:///{tmp_path / 'db'}"}[
-        kind
-    ]
+@pytest.fixture
+def queue_of(toy, tmp_path):
+    """The queue of a driver, with its places."""
+
+    def queue(storage=None, **changes):
+        found = toy.opened(toy.tuning(**changes), tmp_path, storage).queue
+        found.add_places()
+        return found
+
+    return queue
 
 
-@pytest.mark.parametrize("kind", STORAGES)
-def test_no_two_drivers_take_the_same_trial_and_none_takes_more_than_there_are(toy, kind, tmp_path):
-    drivers = [
-        toy.opened(toy.tuning(n_trials=4), tmp_path, storage_of(kind, tmp_path)).queue
-        for _ in range(3)
-    ]
-    for driver in drivers:
-        driver.add_places()
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """Claims a trial as another process would, of this machine or of a far one."""
+
+    def claim(queue, **changes):
+        mark = locks.mark()
+        with monkeypatch.context() as patch:
+            patch.setattr(locks, "mark", lambda: {**mark, **changes})
+            return queue.claim(lambda _: {})
+
+    return claim
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    seconds = [0.0]
+    monkeypatch.setattr(trial_storage.time, "monotonic", lambda: seconds[0])
+    return seconds
+
+
+def test_no_two_drivers_take_the_same_trial_and_none_takes_more_than_there_are(queue_of, storage):
+    drivers = [queue_of(storage, n_trials=4) for _ in range(3)]
     taken = [driver.claim(lambda _: {}) for _ in range(2) for driver in drivers]
     assert sorted(trial.number for trial in taken if trial is not None) == list(range(4))
     assert len(drivers[0].study.trials) == 4
     assert not drivers[0].is_done()
 
 
-@pytest.mark.parametrize("kind", STORAGES)
-def test_a_trial_of_a_driver_that_is_gone_is_taken_up_again(toy, kind, tmp_path, monkeypatch):
-    storage = storage_of(kind, tmp_path)
-    first = toy.opened(toy.tuning(), tmp_path, storage).queue
-    first.add_places()
-    mark = locks.mark()
-    monkeypatch.setattr(locks, "mark", lambda: {**mark, "began": 1})  # not this process
-    lost = first.claim(lambda _: {})
-    monkeypatch.undo()
-    kept = toy.opened(toy.tuning(), tmp_path, storage).queue
-    mine = kept.claim(lambda _: {})
-    other = toy.opened(toy.tuning(), tmp_path, storage).queue
+def test_a_trial_of_a_driver_that_is_gone_is_taken_up_again(queue_of, storage, elsewhere):
+    lost = elsewhere(queue_of(storage), began=1)  # not this process
+    mine = queue_of(storage).claim(lambda _: {})
+    other = queue_of(storage)
     assert other.free_dead() == [lost.number]
     assert other.claim(lambda _: {}).number == lost.number
     assert mine.number == 1
     assert other.free_dead() == []
 
 
-def test_one_elsewhere_counts_as_gone_once_it_has_been_silent(toy, tmp_path, monkeypatch):
-    far = toy.opened(toy.tuning(), tmp_path).queue
-    far.add_places()
-    mark = locks.mark()
-    monkeypatch.setattr(locks, "mark", lambda: {**mark, "host": "far", "boot": "another"})
-    trial = far.claim(lambda _: {})
-    monkeypatch.undo()
-    clock = [0.0]
-    monkeypatch.setattr(trial_storage.time, "monotonic", lambda: clock[0])
-    here = toy.opened(toy.tuning(), tmp_path).queue
+def test_one_elsewhere_counts_as_gone_once_it_has_been_silent(queue_of, elsewhere, clock):
+    far, here = queue_of(), queue_of()
+    trial = elsewhere(far, host="far", boot="another")
     for now, gives_sign, freed in [
         (0.0, True, []),
         (50.0, True, []),
@@ -163,33 +160,26 @@ def test_one_elsewhere_counts_as_gone_once_it_has_been_silent(toy, tmp_path, mon
         assert here.free_dead() == freed
 
 
-def test_one_that_was_taken_and_not_signed_is_free_after_a_while(toy, tmp_path, monkeypatch):
-    queue = toy.opened(toy.tuning(), tmp_path).queue
-    queue.add_places()
-    place = queue.trials()[0]
-    queue.storage.set_trial_state_values(place._trial_id, TrialState.RUNNING)
-    clock = [0.0]
-    monkeypatch.setattr(trial_storage.time, "monotonic", lambda: clock[0])
+def test_one_that_was_taken_and_not_signed_is_free_after_a_while(queue_of, clock):
+    queue = queue_of()
+    queue.storage.set_trial_state_values(queue.trials()[0]._trial_id, TrialState.RUNNING)
     assert queue.free_dead() == []
     clock[0] = 61.0
     assert queue.free_dead() == [0]
 
 
-def test_what_is_given_back_is_not_taken_from_whoever_has_it_now(toy, tmp_path):
-    queue = toy.opened(toy.tuning(), tmp_path).queue
-    queue.add_places()
+def test_what_is_given_back_is_not_taken_from_whoever_has_it_now(toy, queue_of, tmp_path):
+    queue = queue_of()
     trial = queue.claim(lambda _: {})
     trial.set_user_attr(DRIVER, {"token": "another"})
     queue.give_back(trial)
     assert toy.states(toy.opened(toy.tuning(), tmp_path))[0] == "RUNNING"
 
 
-def test_more_trials_are_added_to_those_that_are_there(toy, tmp_path):
-    toy.search(toy.opened(toy.tuning(n_trials=4), tmp_path), toy.Launcher())
-    more = toy.opened(toy.tuning(n_trials=6), tmp_path)
-    launcher = toy.search(more, toy.Launcher())
-    assert toy.states(more) == ["COMPLETE"] * 6
-    assert len(launcher.done) == 6
+def test_places_beyond_those_that_were_asked_for_are_left_alone(queue_of):
+    more, fewer = queue_of(n_trials=6), queue_of(n_trials=4)
+    assert [fewer.claim(lambda _: {}) is None for _ in range(5)] == [False] * 4 + [True]
+    assert len(more.trials()) == 6
 
 
 @pytest.mark.parametrize(
@@ -198,11 +188,3 @@ def test_more_trials_are_added_to_those_that_are_there(toy, tmp_path):
 def test_figures_that_are_none_are_not_believed(said):
     assert figures_of({"figures": said}) == {}
     assert seconds_of({"seconds": said}) == 0.0 or said == 3
-
-
-def test_places_beyond_those_that_were_asked_for_are_left_alone(toy, tmp_path):
-    more, fewer = (toy.opened(toy.tuning(n_trials=n), tmp_path).queue for n in (6, 4))
-    for queue in (more, fewer):
-        queue.add_places()
-    assert [fewer.claim(lambda _: {}) is None for _ in range(5)] == [False] * 4 + [True]
-    assert len(more.trials()) == 6

@@ -1,0 +1,101 @@
+"""Analyses made up by hand, so that what is drawn and printed can be worked out on paper."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from experiments.bandits import PullStatistics
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from verdicts import Estimate, PairComparison, Summary, ThresholdSummary
+
+NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
+
+
+def estimate(point, low=None, high=None, n=4):
+    """With an interval from a tenth below the point to a fifth above by default."""
+    low = point - 0.1 if low is None else low
+    return Estimate(point, low, point + 0.2 if high is None else high, n)
+
+
+def agent(label, mean, **changes):
+    """An agent whose figures are the mean plus 1, 2, 3 and so on, so that none is another."""
+    share = estimate(0.75, 0.5, 0.9)
+    figures = AgentAnalysis(
+        agent=label,
+        algo="qlearning",
+        n_runs=4,
+        n_missing=0,
+        metric=Summary(estimate(mean), estimate(mean + 1), estimate(mean + 2)),
+        score=Summary(estimate(mean / 100), estimate(mean / 50), estimate(mean / 25)),
+        final=estimate(mean + 3),
+        area=estimate(mean + 4),
+        last_episodes=estimate(mean + 5),
+        regret=estimate(mean + 6),
+        steps_to_threshold=ThresholdSummary(estimate(mean + 7), share),
+        episodes_to_stay=ThresholdSummary(estimate(mean + 8), share),
+        steps_to_stay=ThresholdSummary(estimate(mean + 10), share),
+        success_rate=estimate(0.5, 0.25, 0.625),
+        seconds=estimate(mean + 9),
+    )
+    return replace(figures, **changes)
+
+
+def pair(first, second, verdict, difference=10.0, **changes):
+    gap = estimate(difference, difference - 5, difference + 5)
+    chance = estimate(0.5, 0.25, 0.75)
+    found = PairComparison(first, second, gap, 0.01, 0.02, chance, verdict, None)
+    return replace(found, **changes)
+
+
+def environment(agents=(), label="lake", **changes):
+    known = EnvironmentAnalysis(label, "Lake-v0", 100.0, 20.0, 96.0, 1.6, True, tuple(agents), ())
+    return replace(known, **changes)
+
+
+def study(labels, metric="final", places=("lake",), n_seeds=4):
+    return StudySpec(
+        "s",
+        "S",
+        tuple(AgentSpec(label, "qlearning", tuned=False) for label in labels),
+        tuple(EnvironmentSpec(place, "FrozenLake-v1") for place in places),
+        n_seeds=n_seeds,
+        metric=metric,
+    )
+
+
+def analysis(environments, labels, root=None, pulls=None, overall=None, cpu=(), **fields):
+    """``cpu`` has (agent, environment, seconds) of each run."""
+    asked = study(labels, places=[one.environment for one in environments], **fields)
+    runs = pd.DataFrame(cpu, columns=["agent", "environment", "cpu_seconds"])
+    runs = runs.reindex(columns=RUN_COLUMNS)
+    curves = pd.DataFrame(columns=CURVE_COLUMNS)
+    results = StudyResults(asked, root, runs, curves, (), pulls or {})
+    return StudyAnalysis(results, tuple(environments), overall)
+
+
+def pulls(start, n=(1, 10, 100), n_runs=4):
+    """What a bandit's agent did: figures that begin with ``start``, each ten above the last."""
+    rise, nothing = start + np.arange(float(len(n))), np.empty(0)
+    return PullStatistics(
+        pulls=np.array(n),
+        reward=rise,
+        optimal=rise / 100,
+        regret=rise + 10,
+        cumulative_regret=rise + 20,
+        cumulative_regret_sem=np.arange(float(len(n))),
+        cumulative_regret_quantiles=np.array([rise + 20 + d for d in (-9, -3, -1, 3, 12)]),
+        simple_regret=rise + 30,
+        total_reward=np.zeros(n_runs),
+        total_regret=np.zeros(n_runs),
+        shares=nothing,
+        context_regret=nothing,
+        estimates=nothing,
+        estimates_std=nothing,
+        true_means=nothing,
+        moments=np.empty(0, dtype=np.int64),
+        posteriors=nothing,
+    )

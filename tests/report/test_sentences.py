@@ -1,0 +1,345 @@
+"""What a study says in words: figures, who is best, what is open, how often it was looked at."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from experiments.looks import Design, Look, Looks, Question, Standing
+from report.conclusions import conclusion, pairs_both_ways, places_without_a_run
+from report.documents import duration
+from report.page.frame import p_value, setting
+from report.terminal import says_more, shown
+from report.words import (
+    interval_alone,
+    look_sentences,
+    number,
+    optimum_words,
+    ordinal,
+    seeds,
+)
+from tests.report import made_up
+from verdicts import Estimate, FailureCount, SpeedComparison, Summary, ThresholdSummary
+
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("words", "given", "text"),
+    [
+        (number, [None], "-"),
+        (number, [NAN], "-"),
+        (number, [INF], "never"),
+        (number, [-INF], "-∞"),
+        (number, [0.0], "0"),
+        (number, [-0.00001], "0"),
+        (number, [0.74421], "0.7442"),
+        (number, [-27427.3], "-27,427"),
+        (number, [1234.5], "1,234"),
+        (number, [12.345], "12.35"),
+        (ordinal, [1], "first"),
+        (ordinal, [9], "ninth"),
+        (ordinal, [10], "10th"),
+        (ordinal, [11], "11th"),
+        (ordinal, [13], "13th"),
+        (ordinal, [21], "21st"),
+        (ordinal, [22], "22nd"),
+        (ordinal, [103], "103rd"),
+        (ordinal, [1111], "1,111th"),
+        (seeds, [1], "1 seed"),
+        (seeds, [1000], "1,000 seeds"),
+        (seeds, [10, 40, 22], "10 to 40 seeds"),
+        (seeds, [10, 10], "10 seeds"),
+        (seeds, [0, 1], "0 to 1 seed"),
+        (optimum_words, [None, None], "-"),
+        (optimum_words, [79.0, None], "79"),
+        (optimum_words, [-134.442, -140.856], "-140.9 to -134.4 (bracketed)"),
+        (optimum_words, [99.94951, 99.94921], "99.949 to 99.950 (bracketed)"),
+        (duration, [0.1249], "0.12 s"),
+        (duration, [0.0], "0 s"),
+        (duration, [0.0071], "0.0071 s"),
+        (duration, [9.96], "10.0 s"),
+        (duration, [44.6], "45 s"),
+        (duration, [1234.0], "1,200 s"),
+        (interval_alone, [Estimate(1.0, 0.5, 1.5, 4)], "0.5 to 1.5"),
+        (interval_alone, [Estimate(1.0, 1.0, 1.0, 4)], ""),
+        (interval_alone, [Estimate(1.0, NAN, NAN, 1)], ""),
+        # Two digits of half the interval; without one three digits behind the point.
+        (shown, [Estimate(0.12345, 0.11, 0.1369, 50)], "0.123 ± 0.013"),
+        (shown, [Estimate(12.345, 10.0, 14.69, 50)], "12.3 ± 2.3"),
+        (shown, [Estimate(0.5, 0.5, 0.5, 50)], "0.500 ± 0.000"),
+        (p_value, [0.0004], "< 0.001"),
+        (p_value, [0.0314], "0.031"),
+        (p_value, [NAN], "-"),
+        (setting, [True], "true"),
+        (setting, [None], "null"),
+        (setting, ["lin_0.1"], "lin_0.1"),
+        (setting, [{"a": [1]}], '{"a": [1]}'),
+    ],
+)
+def test_figures_in_words(words, given, text):
+    assert words(*given) == text
+
+
+# --- how often a study was looked at --------------------------------------------------------------
+
+QUESTION = Question("final", None, None, 1000)
+
+
+def look(level, planned=False, **seeds):
+    return Look("2026-11-22 10:00:00", QUESTION, seeds, {}, {}, level, planned)
+
+
+def test_each_look_has_a_line():
+    assert look_sentences(Looks()) == []
+    assert look_sentences(Looks((look(0.045, a=1, b=1),))) == [
+        "These runs have been looked at once.",
+        "2026-11-22: seed 1000; claims at 4.5 %.",
+    ]
+    taken = (look(0.045, a=5, b=5), look(0.0025, a=10, b=5, c=10))
+    assert look_sentences(Looks(taken)) == [
+        "These runs have been looked at twice.",
+        "2026-11-22: seeds 1000 to 1004; claims at 4.5 %.",
+        "2026-11-22: b, seeds 1000 to 1004; a and c, seeds 1000 to 1009; claims at 0.25 %.",
+    ]
+    planned = tuple(look(0.015, planned=True, a=size) for size in (5, 8, 12))
+    first, second, *each = look_sentences(Looks(planned, Design(QUESTION, (5, 8, 12), {}, 0)))
+    assert first == "These runs have been looked at 3 times."
+    assert second == "Fixed before the first of them: looks at 5, 8 and 12 seeds."
+    assert len(each) == 3
+
+
+# --- who is best ----------------------------------------------------------------------------------
+
+SIGNS = {">": "better", "<": "worse", "=": "equivalent", "?": "undecided"}
+MEANS = {"a": 100.0, "b": 90.0, "c": 80.0}
+FIGURE = "return of the final policy 100 [99.9, 100.2], score 1; the optimum is 200"
+A, B, C = "100 [99.9, 100.2]", "90 [89.9, 90.2]", "80 [79.9, 80.2]"
+
+
+def place_of(signs, means=MEANS, medians=None, **changes):
+    """Agents with such means; by two names the verdict on the first of them."""
+    agents = []
+    for name, mean in means.items():
+        figures = [made_up.estimate(value) for value in (mean, (medians or means)[name], mean)]
+        one = made_up.agent(name, mean, metric=Summary(*figures), steps_to_stay=None)
+        agents.append(one)
+    pairs = tuple(made_up.pair(*names, SIGNS[sign]) for names, sign in signs.items())
+    return made_up.environment(agents, **{"pairs": pairs, "optimum": 200.0, **changes})
+
+
+def said(place, metric="final"):
+    names = [agent.agent for agent in place.agents]
+    return conclusion(made_up.study(names, metric=metric), place)
+
+
+@pytest.mark.parametrize(
+    ("signs", "lead"),  # of a on b, a on c, b on c
+    [
+        (">>?", f"a is best: {FIGURE}."),
+        (">?>", f"a is best: {FIGURE}; against c it is undecided."),
+        ("=>>", f"a and b are best, and equivalent: {FIGURE}."),
+        ("===", f"a, b and c are best, and equivalent: {FIGURE}."),
+        ("?>>", f"Best is a ({A}) or b ({B}): that is undecided; the optimum is 200."),
+        ("<?>", f"b is best: return of the final policy {B}, score 0.9; the optimum is 200."),
+        ("??=", f"Best is a ({A}), b ({B}) or c ({C}): that is undecided; the optimum is 200."),
+        ("><>", "No agent is best: for each of them there is another that is better."),
+        ("???", f"Undecided: 4 seeds decide nothing. a has the highest mean so far: {FIGURE}."),
+    ],
+)
+def test_who_is_best(signs, lead):
+    assert said(place_of(dict(zip(("ab", "ac", "bc"), signs, strict=True)))).lead == lead
+
+
+FAILED = "3 of 20 runs of b failed"
+
+
+@pytest.mark.parametrize(
+    ("sign", "lead"),
+    [
+        ("=", f"a and b are best, and equivalent in the typical run: {FIGURE}; {FAILED}."),
+        (">", f"a is best: {FIGURE}."),
+        ("<", (f"b is best: return of the final policy {B}, score 0.9; the optimum is 200; "
+              f"{FAILED}.")),
+        ("?", f"Undecided: 4 seeds decide nothing. a has the highest mean so far: {FIGURE}."),
+    ],
+)  # fmt: skip
+def test_of_those_that_are_best_it_is_said_whose_runs_failed(sign, lead):
+    failures = {"a": FailureCount(0, 20, 0.2), "b": FailureCount(3, 20, 0.4)}
+    found = said(place_of({"ab": sign}, {"a": 100.0, "b": 90.0}, failures=failures))
+    assert found.lead == lead
+    assert found.failed.startswith(FAILED)
+
+
+TWO = {"a": 100.0, "b": 90.0}
+
+
+@pytest.mark.parametrize(
+    ("means", "signs", "changes", "lead"),
+    [
+        ({"a": 100.0}, {}, {}, f"a: {FIGURE}."),
+        (dict(zip("abcde", (100.0, 99.0, 98.0, 97.0, 96.0), strict=True)), {"ae": ">"}, {},
+         "Best is one of a, b, c and d: that is undecided; the optimum is 200."),
+        (TWO, {"ab": "?"}, {"fewest": 7}, ("Undecided: 4 seeds cannot tell 2 agents apart, "
+         f"whatever they score; it takes 7 or more. a has the highest mean so far: {FIGURE}.")),
+        ({"a": NAN}, {}, {}, "No run has a figure for the return of the final policy."),
+        ({"a": 21.0, "b": 21.0}, {}, {}, ("None of the agents has learnt: no typical run is better "
+         "than the best random or constant policy's 20; the highest mean return of the final "
+         "policy is 21 [20.9, 21.2], of a and b.")),
+        ({"a": 200.0}, {}, {}, "a: return of the final policy 200 [199.9, 200.2], the optimum."),
+        ({"a": 100.0}, {}, {"optimum": None}, f"a: return of the final policy {A}."),
+    ],
+    ids=["alone", "many", "few seeds", "no figure", "none learnt", "optimal", "no optimum"],
+)  # fmt: skip
+def test_other_first_lines(means, signs, changes, lead):
+    assert said(place_of(signs, means, **changes)).lead == lead
+
+
+@pytest.mark.parametrize(
+    ("metric", "medians", "by_median"),
+    [
+        ("final", (50.0, 95.0, 60.0), "b (95 against 50)"),
+        ("final", (95.0, 50.0, 60.0), None),
+        ("final", (95.0, 95.0, 60.0), None),
+        # Of regret the lower is the better.
+        ("regret", (95.0, 50.0, 60.0), "b (50 against 95)"),
+        ("regret", (50.0, 95.0, 60.0), None),
+    ],
+)
+def test_where_mean_and_median_differ_it_is_said(metric, medians, by_median):
+    place = place_of({"ab": "?"}, medians=dict(zip("abc", medians, strict=True)))
+    lead = said(place, metric).lead
+    text = f" By the mean a comes first (100 against 90), by the median {by_median}."
+    assert lead.endswith(text) is ("by the median" in lead) is (by_median is not None)
+
+
+# --- pairs, and what else there is to say ---------------------------------------------------------
+
+
+def test_pairs_with_one_verdict_stand_in_one_sentence_of_the_better_agent():
+    # Ranks go by the mean: the first of a pair may be the worse one.
+    assert said(place_of({"ab": "<", "ac": ">", "bc": ">"})).pairs == (
+        "a is better than c (by 10 [5, 15]).",
+        "b is better than a (by -10 [-15, -5]) and c (by 10 [5, 15]).",
+    )
+    open_ = (made_up.pair(*"ab", "undecided", seeds_needed=793), made_up.pair(*"ac", "undecided"))
+    assert said(place_of({}, pairs=open_)).pairs == (
+        (
+            "a is undecided against b (difference 10 [5, 15]; about 793 seeds are needed to "
+            "decide) and c (difference 10 [5, 15])."
+        ),
+    )
+    # Of few runs, what rarely happens is not known: with 4 seeds 1 - 0.05 ** (1 / 4).
+    equal = place_of({"ab": "=", "ac": "?"})
+    assert said(equal).pairs == (
+        (
+            "a and b are equivalent in the typical run within 1.6; what fewer than 53% of runs do, "
+            "4 seeds may not show."
+        ),
+        "a is undecided against c (difference 10 [5, 15]).",
+    )
+    certain = [replace(pair, certain=True) for pair in equal.pairs]
+    assert said(replace(equal, pairs=tuple(certain))).pairs[0] == (
+        "a and b are equivalent within 1.6."
+    )
+    counts = {"a": FailureCount(1, 20, 0.25), "b": FailureCount(2, 20, 0.32)}
+    assert (
+        said(replace(equal, failures=counts))
+        .pairs[0]
+        .endswith(
+            "; 1 of 20 runs of a failed (up to 25% could) and 2 of 20 runs of b failed (up to 32% "
+            "could)."
+        )
+    )
+
+
+def test_the_matrix_has_each_pair_from_both_sides():
+    place = place_of({"ab": "<", "bc": "="})
+    verdicts = {names: pair.verdict for names, pair in pairs_both_ways(place).items()}
+    assert verdicts == {
+        ("a", "b"): "worse",
+        ("b", "a"): "better",
+        ("b", "c"): "equivalent",
+        ("c", "b"): "equivalent",
+    }
+    skewed = replace(place, pairs=(made_up.pair(*"ab", "better"),))
+    chance = replace(skewed.pairs[0], probability_of_improvement=made_up.estimate(0.7, 0.6, 0.9))
+    other = pairs_both_ways(replace(place, pairs=(chance,)))["b", "a"].probability_of_improvement
+    assert (other.point, other.low, other.high) == pytest.approx((0.3, 0.1, 0.4))
+    # Of questions alone, or of two agents, a sentence says as much.
+    assert says_more(place)
+    assert not says_more(place_of({"ab": "?"}))
+    assert not says_more(place_of({"ab": ">"}, TWO))
+
+
+def stays(share, steps):
+    return ThresholdSummary(made_up.estimate(steps), made_up.estimate(share))
+
+
+def test_how_soon_agents_arrive():
+    agents = [
+        made_up.agent("slow", 90.0, steps_to_stay=stays(0.75, 3000.0)),
+        made_up.agent("quick", 80.0, steps_to_stay=stays(1.0, 1000.0)),
+        made_up.agent("late", 70.0, steps_to_stay=stays(0.25, INF)),
+        made_up.agent("never", 60.0, steps_to_stay=stays(0.0, INF)),
+    ]
+    ratio = made_up.estimate(1 / 3, 0.25, 0.5)
+    speeds = (SpeedComparison("slow", "quick", ratio, 0.01, "quick"),)
+    notes = said(made_up.environment(agents, speeds=speeds)).notes
+    assert notes == (
+        (
+            "quick reaches a score of 0.95 and keeps it to the end in 4 of 4 runs, the median one "
+            "from step 1,000 on; slow in 3 of 4 runs, the median one from step 3,000 on; late in "
+            "1 of 4 runs; never in none."
+        ),
+        "quick arrives in fewer steps: slow needs 2 to 4 times as many.",
+    )
+    other = made_up.environment(agents, threshold=50.0)
+    assert said(other).notes[0].startswith("quick reaches a return of 50 and keeps")
+
+
+FEW = {"a": FailureCount(6, 10, 0.9), "b": FailureCount(0, 10, 0.3)}
+GROWN = Standing(2, 0.015, 0.015, Design(QUESTION, (5, 8, 12), {}, 0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "notes"),
+    [
+        ({"optima": {"a": 1.0, "b": 2.0}}, [("The agents do NOT PLAY THE SAME ENVIRONMENT: the "
+          "optimum is 1 for a and 2 for b. Their returns cannot be compared.")]),
+        ({"failures": FEW, "unreliable": (("a", "b"),)},
+         ["a fails more often than b (6 of 10 runs against 0 of 10)."]),
+        # Final returns are 103 and 93 less three times 0.1.
+        ({"optimum": 101.0, "optimum_at_least": 99.0}, [("a has MORE THAN ANY POLICY CAN REACH, "
+          "101: the environment is not the one that the bracket is of, or the bracket is wrong.")]),
+        ({"missing": {"a": 1, "b": 4}}, ["1 of 4 runs of a is missing.",
+                                         "No run of b has finished."]),
+        ({"missing": {"a": 2}, "seeds": {"a": 9}}, ["2 of 9 runs of a are missing."]),
+        ({"advice": ("Wait.",)}, ["Wait."]),
+        ({"look": Standing(3, 0.0025)},
+         ["This is the third look at this study: claims at 0.25 %."]),
+        ({"look": Standing(2, 0.0025, is_counted=False)}, [("This would be the second look at this "
+          "study, with claims at 0.25 %; runs that are too few to claim anything are not counted "
+          "as one.")]),
+        ({"look": GROWN}, [("Agents got more seeds until they were decided, at up to 3 looks that "
+          "were fixed beforehand: claims at 1.5 % each.")]),
+    ],
+)  # fmt: skip
+def test_what_else_is_said(changes, notes):
+    assert list(said(place_of({"ab": "?"}, TWO, **changes)).notes) == notes
+
+
+@pytest.mark.parametrize("metric", ["final", "training", "last_episodes"])
+def test_verdicts_on_training_say_which_agents_had_a_variant(metric):
+    agents = [made_up.agent(name, 90.0, on_variant=name != "a") for name in "abc"]
+    sentence = "b and c were trained on a variant of the environment, with returns of its own."
+    assert (sentence in said(made_up.environment(agents), metric).notes) is (metric != "final")
+    plain = made_up.environment([made_up.agent(name, 90.0) for name in "abc"])
+    assert not any("variant" in text for text in said(plain, metric).notes)
+
+
+def test_an_environment_without_a_run_is_named():
+    found = made_up.analysis([made_up.environment(label="lake")], "a")
+    asked = made_up.study("a", places=("lake", "hill"))
+    found = replace(found, results=replace(found.results, study=asked))
+    assert places_without_a_run(found) == ["On hill, no run has finished."]

@@ -1,0 +1,311 @@
+"""The numbers that figures on paper and on the page share, worked out by hand."""
+
+import math
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import integrate
+
+import envs  # noqa: F401  # registers the bandits
+from experiments.analysis import analyse
+from experiments.bandits import pull_statistics
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from report.page.world_sections import context_tables
+from report.series import (
+    arm_series,
+    auer_bound,
+    best_expected_reward,
+    best_of,
+    best_of_normals,
+    grids,
+    lai_robbins_slope,
+    learning_curves,
+    linear_up_to,
+    mean_regret,
+    regret_of_runs,
+    run_series,
+    study_series,
+    sweeps,
+)
+from tests.report import made_up
+
+
+def curve_rows(agent, kind, seed, values):
+    steps = pd.DataFrame({"step": [10, 20], "episode": [1, 2], "seconds": [0.1, 0.2]})
+    return steps.assign(agent=agent, environment="lake", kind=kind, seed=seed, value=values)
+
+
+@pytest.fixture
+def lake():
+    """Two agents on a lake; by rank the second of the study comes first."""
+    environment = made_up.environment((made_up.agent("b", 90.0), made_up.agent("a", 40.0)))
+    analysis = made_up.analysis([environment], ["a", "b"], n_seeds=3)
+    rows = [
+        curve_rows("a", "evaluation", 0, [1, 5]),
+        curve_rows("a", "evaluation", 1, [3, 7]),
+        curve_rows("b", "evaluation", 0, [2, 8]),
+        curve_rows("b", "training", 0, [-5000, 9]),
+    ]
+    summary = pd.DataFrame(
+        [("a", 0, 4.0), ("a", 2, 6.0), ("b", 0, 8.0), ("b", 1, np.nan)],
+        columns=["agent", "seed", "final"],
+    ).assign(environment="lake")
+    return replace(analysis.results, curves=pd.concat(rows), summary=summary), environment
+
+
+def test_mean_curves_the_best_agent_first(lake):
+    curves = learning_curves(*lake)
+    assert list(curves) == ["evaluation", "training"]
+    by_step = curves["evaluation"].by_axis["step"]
+    assert list(by_step) == ["b", "a"]
+    assert (by_step["a"].x.tolist(), by_step["a"].y.tolist()) == ([10, 20], [2, 6])
+    assert (by_step["b"].y.tolist()) == [2, 8]
+    assert (by_step["a"].low < by_step["a"].y).all()
+    assert (by_step["a"].high > by_step["a"].y).all()
+    assert curves["evaluation"].by_axis["episode"]["a"].x.tolist() == [1, 2]
+    assert curves["evaluation"].by_axis["seconds"]["a"].x.tolist() == [0.1, 0.2]
+    assert list(curves["training"].by_axis["step"]) == ["b"]
+    # Each kind has a scale of its own; that of the other is the optimum.
+    assert (curves["evaluation"].linear_up_to, curves["training"].linear_up_to) == (None, 100)
+    variant = replace(lake[1], agents=(made_up.agent("b", 90.0, on_variant=True),))
+    found = learning_curves(lake[0], variant)
+    assert (found["evaluation"].on_variant, found["training"].on_variant) == ((), ("b",))
+
+
+def test_a_clock_that_was_set_back_costs_the_curve_by_time_alone(lake):
+    results, environment = lake
+    results.curves.loc[results.curves["agent"] == "b", "seconds"] = [0.2, 0.1] * 2
+    by_axis = learning_curves(results, environment)["evaluation"].by_axis
+    assert list(by_axis["step"]) == ["b", "a"]
+    assert list(by_axis["seconds"]) == ["a"]
+
+
+def test_runs_with_a_figure_by_seed(lake):
+    first, second = run_series(*lake)
+    assert (first.agent, second.agent) == ("b", "a")
+    assert (first.seeds.tolist(), first.values.tolist()) == ([0], [8])
+    assert (second.seeds.tolist(), second.values.tolist()) == ([0, 2], [4, 6])
+    assert (first.mean.point, second.mean.point) == (90, 40)
+
+
+@pytest.mark.parametrize(
+    ("curves", "optimum", "expected"),
+    [
+        ([[-5000.0, -50.0, 70.0]], 79.0, 79.0),  # early returns dwarf the optimum
+        ([[-500.0, -50.0, 70.0]], 79.0, None),
+        ([[-300.0, 1.0, 2.0, 2.0]], None, 2.0),  # the end of the curve stands for the optimum
+        ([[np.nan, 1.0], [np.nan]], None, None),
+        ([], 79.0, None),
+        ([[-9.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below ten
+    ],
+)
+def test_where_an_axis_ceases_to_be_linear(curves, optimum, expected):
+    assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected
+
+
+# --- sweeps ---------------------------------------------------------------------------------------
+
+
+def swept(label, value, group="sarsa", name="alpha"):
+    return AgentSpec(label, "sarsa", tuned=False, group=group, swept={name: value})
+
+
+def test_a_sweep_goes_in_the_order_of_its_values():
+    values = {"a": 0.9, "b": 0.1, "c": 0.5}
+    agents = [made_up.agent(label, 10 * value) for label, value in values.items()]
+    specs = [swept(*item, name="learning_rate") for item in values.items()]
+    others = [swept(label, n, "dqn") for n, label in enumerate("acb")]
+    found = sweeps([*specs, *others], made_up.environment(agents))
+    assert list(found) == ["sarsa", "dqn"]
+    assert (found["sarsa"].parameter, found["sarsa"].labels) == ("α", ("b", "c", "a"))
+    assert found["dqn"].means.y.tolist() == [9, 5, 1]
+    curve = found["sarsa"].means
+    assert curve.x.tolist() == [0.1, 0.5, 0.9]
+    assert curve.y.tolist() == [1, 5, 9]
+    assert curve.low == pytest.approx([0.9, 4.9, 8.9])
+    assert curve.high == pytest.approx([1.2, 5.2, 9.2])
+
+
+@pytest.mark.parametrize(
+    "third",
+    [
+        None,  # two values make no line
+        swept("c", 3, group="dqn"),
+        swept("c", 3, name="gamma"),
+        swept("c", "lin_0.5"),  # not a number
+        swept("absent", 3),  # without a run
+        AgentSpec("c", "sarsa", swept={"alpha": 1, "gamma": 2}),
+    ],
+)
+def test_what_makes_no_sweep(third):
+    specs = [swept("a", 1), swept("b", 2), *([third] if third else [])]
+    place = made_up.environment([made_up.agent(label, 1.0) for label in "abc"])
+    assert sweeps(specs, place) == {}
+
+
+def test_two_parameters_make_a_grid():
+    """One agent has no run, and two are the best."""
+    means = {(0.1, "a"): 10.0, (0.1, "b"): 30.0, (0.5, "a"): 30.0}
+    specs = [
+        AgentSpec(f"{rate} {kind}", "sarsa", group="sarsa", swept={"gamma": rate, "kind": kind})
+        for rate in (0.1, 0.5)
+        for kind in "ab"
+    ]
+    agents = [made_up.agent(f"{rate} {kind}", mean) for (rate, kind), mean in means.items()]
+    environment = made_up.environment(sorted(agents, key=lambda a: -a.metric.mean.point))
+    assert sweeps(specs, environment) == {}
+    (grid,) = grids(specs, environment).values()
+    assert (grid.parameters, grid.down, grid.across) == (("γ", "kind"), ["0.1", "0.5"], ["a", "b"])
+    np.testing.assert_equal(grid.means, [[10, 30], [30, np.nan]])
+    assert grid.labels == [["0.1 a", "0.1 b"], ["0.5 a", ""]]
+    np.testing.assert_equal(grid.shares(is_cost=False), [[0, 1], [1, np.nan]])
+    np.testing.assert_equal(grid.shares(is_cost=True), [[1, 0], [0, np.nan]])
+    assert best_of(environment, [spec.label for spec in specs]) == ["0.1 b", "0.5 a"]
+    assert grids(specs[:2], environment) == {}  # a single row is none
+
+
+# --- bandits --------------------------------------------------------------------------------------
+
+# Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
+ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
+REGRETS = np.where(ARMS == 0, 0.3, 0.0)
+
+
+def pulls_of(**known):
+    return pull_statistics(ARMS, np.ones((2, 4), dtype=np.float32), REGRETS, None, 2, **known)
+
+
+def test_regret_as_a_mean_and_as_a_spread_of_runs():
+    """The sums are .3 .3 .3 .6 and 0 0 .3 .3."""
+    mean, runs = mean_regret(pulls_of()), regret_of_runs(pulls_of())
+    assert mean.x.tolist() == runs.x.tolist() == [1, 2, 3, 4]
+    assert mean.y == pytest.approx([0.15, 0.15, 0.3, 0.45])
+    assert mean.low == pytest.approx(mean.y - 1.96 * np.array([0.15, 0.15, 0, 0.15]))
+    assert mean.high == pytest.approx(mean.y + 1.96 * np.array([0.15, 0.15, 0, 0.15]))
+    assert runs.y == pytest.approx([0.15, 0.15, 0.3, 0.45])
+    assert (runs.low[0], runs.high[0]) == pytest.approx((0.015, 0.285))
+
+
+def test_arms_of_agents_that_estimate_them_and_of_others():
+    means = np.array([[0.2, 0.5]])
+    knows = pulls_of(true_means=means, estimates=np.array([[[0.1, 0.4]], [[0.3, 0.6]]]))
+    arms = arm_series({"knows": knows, "does not": pulls_of(true_means=means)})
+    assert (arms.names, arms.means.tolist()) == (["arm 0", "arm 1"], [0.2, 0.5])
+    shares = {agent: shares.tolist() for agent, shares in arms.shares.items()}
+    assert shares == {"knows": [3 / 8, 5 / 8], "does not": [3 / 8, 5 / 8]}
+    assert list(arms.estimates) == ["knows"]
+    mean, std = arms.estimates["knows"]
+    assert mean == pytest.approx([0.2, 0.5])
+    assert std == pytest.approx([0.1, 0.1])
+    assert arm_series({}) is None
+
+
+COINS = (0.2, 0.5, 0.75)
+
+
+def test_auers_bound_and_the_slope_of_lai_and_robbins():
+    """(8 / .55 + 8 / .25) ln n + (1 + pi^2 / 3) (.55 + .25), which is 432.1 at 10,000."""
+    assert float(auer_bound(COINS, 10_000)) == pytest.approx(432.1, abs=0.05)
+    at_once = 0.8 * (1 + math.pi**2 / 3)
+    assert auer_bound(COINS, [1, math.e]) == pytest.approx([at_once, at_once + 8 / 0.55 + 8 / 0.25])
+    assert float(auer_bound((0.5, 0.5), 10)) == 0
+    assert lai_robbins_slope(COINS) == pytest.approx(2.564, abs=0.0005)
+    # By hand for a pair: .25 / (.5 ln(.5 / .75) + .5 ln(.5 / .25)).
+    by_hand = 0.25 / (0.5 * math.log(2 / 3) + 0.5 * math.log(2))
+    assert lai_robbins_slope((0.5, 0.75)) == pytest.approx(by_hand)
+
+
+def test_best_of_normals():
+    """Closed forms for two and three; 1.5388 for the testbed's ten."""
+    by_hand = [0, 1 / math.sqrt(math.pi), 1.5 / math.sqrt(math.pi)]
+    assert [best_of_normals(n) for n in (1, 2, 3)] == pytest.approx(by_hand, abs=1e-9)
+    assert best_of_normals(10) == pytest.approx(1.5388, abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "expected"),
+    [
+        ("BernoulliBandit-v0", {}, 0.75),
+        ("SegmentBandit-v0", {}, 0.3 * 0.25 + 0.7 * 0.12),
+        ("GaussianBandit-v0", {"means": [1.0, 3.0, 2.0]}, 3.0),
+        ("GaussianBandit-v0", {"mean_loc": 4.0, "n_arms": 2}, 4 + 1 / math.sqrt(math.pi)),
+        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
+        ("LinearBandit-v0", {}, None),
+    ],
+)
+def test_best_expected_reward(env_id, kwargs, expected):
+    env = gym.make(env_id, **kwargs)
+    env.reset(seed=0)
+    best = best_expected_reward(env)
+    env.close()
+    assert best == (None if expected is None else pytest.approx(expected))
+
+
+BANDITS = ("BernoulliBandit-v0", "SegmentBandit-v0", "GaussianBandit-v0")
+
+
+@pytest.fixture(scope="module")
+def bandits(tmp_path_factory, do_study):
+    """By environment what agents did that know contexts, that do not, and that are Gaussian."""
+    settings = {"knows": {}, "blind": {"ignore_context": True}}
+    settings["normal"] = {"likelihood": "gaussian"}
+    found = {}
+    for names, env_ids in ((settings, BANDITS[:2]), (["normal"], BANDITS[2:])):
+        agents = [AgentSpec(name, "thompson", settings[name], tuned=False) for name in names]
+        places = [EnvironmentSpec(name, name, {"n_timesteps": 400}) for name in env_ids]
+        study = StudySpec("s", "S", tuple(agents), tuple(places), n_seeds=3, metric="regret")
+        series = study_series(analyse(do_study(study, tmp_path_factory.mktemp("study"))))
+        found |= {one.environment.environment: one for one in series.environments}
+    return found
+
+
+def test_a_bandit_has_its_figures_by_pull(bandits):
+    coins, segments, testbed = (bandits[name].pulls for name in BANDITS)
+    assert [one.curves for one in bandits.values()] == [None] * 3
+    best = [one.best for one in (coins, segments, testbed)]
+    assert best == pytest.approx([0.75, 0.159, 1.5388], abs=1e-4)
+    assert coins.n_runs == 3
+    assert coins.bounds.auer[-1] == pytest.approx(46.545 * np.log(400) + 3.432, rel=1e-3)
+    assert coins.bounds.lai_robbins[[0, -1]] == pytest.approx([0, 2.564 * np.log(400)], rel=1e-3)
+    assert segments.bounds is None
+    # Arms that are drawn anew cannot be told apart over runs.
+    assert (testbed.bounds, testbed.arms, testbed.beliefs) == (None, None, ())
+
+
+def test_beliefs_are_densities(bandits):
+    known = {belief.agent: belief for belief in bandits["BernoulliBandit-v0"].pulls.beliefs}
+    assert set(known) == {"knows", "blind", "normal"}
+    for agent, ends in (("normal", [0.2 - 2, 0.75 + 2]), ("knows", [0, 1])):
+        found = known[agent]
+        assert found.points[[0, -1]] == pytest.approx(ends)
+        for y in found.densities[0, 0]:
+            assert integrate.trapezoid(y, found.points) == pytest.approx(1, abs=0.02)
+        assert found.true_means[0][2] == 0.75
+    by_context = {belief.agent: belief for belief in bandits["SegmentBandit-v0"].pulls.beliefs}
+    assert by_context["knows"].moments.tolist() == [10, 100, 400]
+    assert by_context["knows"].densities.shape[:3] == (3, 2, 3)
+    assert by_context["knows"].true_means == [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]
+    # What an agent believes of an arm over all contexts has no one true mean.
+    assert by_context["blind"].true_means == [[None] * 3]
+
+
+def test_the_table_by_context(bandits):
+    segments = bandits["SegmentBandit-v0"].pulls.pulls["blind"]
+    core, casual = context_tables({"blind": segments})
+    assert (core["name"], casual["name"]) == ("context 0", "context 1")
+    assert [row["mean"] for row in core["rows"]] == [0.10, 0.25, 0.05]
+    assert [row["regret"] for row in casual["rows"]] == pytest.approx([0, 0.06, 0.07])
+    for context, table in enumerate((core, casual)):
+        shares = [row["shares"]["blind"] for row in table["rows"]]
+        assert shares == pytest.approx(segments.shares[context])
+        gaps = [row["regret"] for row in table["rows"]]
+        assert table["regrets"]["blind"] == pytest.approx(np.dot(shares, gaps))
+        # The same as what was summed up pull by pull.
+        known = np.nan_to_num(segments.context_regret[context])
+        assert table["regrets"]["blind"] == pytest.approx(segments.shares[context] @ known)
+    (alone,) = context_tables({"it": bandits["BernoulliBandit-v0"].pulls.pulls["normal"]})
+    assert alone["name"] == ""
+    assert context_tables({"it": bandits["GaussianBandit-v0"].pulls.pulls["normal"]}) == []

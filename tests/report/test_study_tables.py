@@ -1,0 +1,537 @@
+"""A study as tables: in Markdown, in LaTeX, in the terminal; and the columns of the ranking."""
+
+import io
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from experiments.bandits import pull_statistics
+from report.conclusions import conclusion
+from report.documents import (
+    MARKUPS,
+    headline,
+    latex_text,
+    markdown_text,
+    name_of,
+    processor_seconds,
+    ranking,
+    standings,
+    table_as,
+    verdicts_as,
+    write_verdicts,
+)
+from report.page import result_sections
+from report.page.frame import Report
+from report.ranking import BANDIT_COLUMNS, COLUMNS, Row, bar
+from report.series import StudySeries
+from report.terminal import print_analysis, print_episodes_table
+from tests.report import made_up
+from verdicts import Estimate, FailureCount, ThresholdSummary
+
+NAMES = ["low", "same", "open", "first"]
+CHANGES = ("random starts", "rewards x 0.01")
+CPU = [("first", "lake", s) for s in (30.0, 50.0, 40.4)] + [("same", "lake", 0.1249)]
+CPU += [("low", "lake", 1.0), ("low", "lake", None)]  # which was not measured
+
+
+def lake(**changes):
+    """One that leads by its median, one equivalent to it, one undecided, one worse."""
+    agents = [made_up.agent(name, mean) for name, mean in zip(NAMES, (30, 89, 80, 90), strict=True)]
+    pairs = (
+        made_up.pair("first", "same", "equivalent"),
+        made_up.pair("open", "first", "undecided"),
+        made_up.pair("low", "first", "worse"),
+        made_up.pair("same", "low", "better"),
+    )
+    failed = {"first": FailureCount(0, 4, 0.6), "open": FailureCount(1, 4, 0.8)}
+    known = {"agents": agents[::-1], "pairs": pairs, "failures": failed}
+    return made_up.environment(**{**known, **changes})
+
+
+def of_lake(cpu=(), metric="final", **changes):
+    return made_up.analysis([lake(**changes)], NAMES, cpu=cpu, metric=metric)
+
+
+# --- Markdown and LaTeX ---------------------------------------------------------------------------
+
+LEGEND = (
+    "Score of the median run: 1 is the optimum, 0 the best random or constant policy. Bold: "
+    "the highest, and what is shown to be equivalent to it in the typical run. "
+    "?: not told apart from it by 4 seeds. Plain: shown to be worse. In brackets: processor "
+    "time of the median run."
+)
+
+
+def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
+    table, legend = table_as("md", headline(of_lake(cpu=CPU))).split("\n\n")
+    assert table.splitlines() == [
+        "|  | lake |",
+        "| --- | --- |",
+        "| `low` | 0.600 |",
+        "| `same` | **1.780** (0.12 s) |",
+        "| `open` | 1.600 ?, 1 of 4 failed |",
+        "| `first` | **1.800** (40 s) |",
+    ]
+    assert legend == LEGEND
+    assert processor_seconds(of_lake(cpu=CPU).results) == {
+        ("first", "lake"): 40.4,
+        ("same", "lake"): 0.1249,
+    }
+
+
+def test_other_headlines():
+    costs = table_as("md", headline(of_lake(metric="regret")))
+    assert "| `low` | **31** |" in costs
+    assert "| `open` | 81, 1 of 4 failed |" in costs
+    assert "Regret of a run: the median run. Bold: the lowest" in costs
+    assert "processor" not in costs
+    some = made_up.agent("first", 90.0, n_missing=2)
+    absent = table_as("md", headline(of_lake(agents=(some,), pairs=())))
+    assert "| `low` | - |" in absent
+    assert "| `first` | **1.800**, 2 missing |" in absent
+    bracketed = replace(lake(), environment="hill", optimum_at_least=90.0)
+    caption = headline(made_up.analysis([lake(), bracketed], NAMES)).caption
+    assert "policy. On hill the optimum is bracketed: 1 is the upper end. Bold" in caption
+
+
+def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():
+    study = made_up.study(NAMES)
+    assert standings(study, lake()) == {
+        "first": "best",
+        "same": "best",
+        "open": "open",
+        "low": "behind",
+    }
+    assert standings(study, lake(baseline=95.0)) == {}
+    assert standings(study, made_up.environment([made_up.agent("first", math.nan)])) == {}
+
+
+def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_footnote():
+    names = ["plain", "changed", "too"]
+    agents = [made_up.agent(n, 90, changes=() if n == "plain" else CHANGES) for n in names]
+    one, other = made_up.environment(agents), made_up.environment(agents[:1], "other")
+    found = made_up.analysis([one, other], names)
+    what = "(random starts, rewards x 0.01)."
+    told = f"†: trained on a changed environment: changed and too on lake {what}"
+    text, latex = (table_as(markup, headline(found)) for markup in MARKUPS)
+    assert re.findall(r"^\| (`\w+`(?: †)?) \|", text, re.M) == ["`plain`", "`changed` †", "`too` †"]
+    assert text.endswith(told)
+    assert r"\texttt{changed} $\dagger$ &" in latex
+    assert told.replace("†", r"$\dagger$") in latex
+    assert "| `too` † |" in table_as("md", ranking(found.results, one))
+    note = f"†: trained on a changed environment: changed and too {what}"
+    assert conclusion(found.study, one).notes[-1:] == (note,)
+    assert not any("†" in said for said in conclusion(found.study, other).everything)
+
+
+FILE = """\
+# S
+
+`python compare.py a.yml`
+
+Seeds 0 to 3: nothing was tuned on these.
+
+|  | lake |
+| --- | --- |
+| `low` | 0.600 |
+| `first` | **1.800** (40 s) |
+
+LEGEND
+
+## lake
+
+|  | median | mean | score | failed | stays from | processor time |
+| --- | --- | --- | --- | --- | --- | --- |
+| `first` | 91 [90.9, 91.2] | 90 [89.9, 90.2] | 1.8 | 0 of 4 | 100 | 40 s |
+| `low` | 31 [30.9, 31.2] | 30 [29.9, 30.2] | 0.6 | - | 40 | - |
+
+lake: return of the final policy, with 95 % intervals over seeds.
+
+- first is best: return of the final policy 90 [89.9, 90.2], score 0.9; the optimum is 100.
+- first is better than low (by -10 [-15, -5]).
+- low reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the median one from step 40 \
+on; first in 3 of 4 runs, the median one from step 100 on.
+"""
+
+
+def test_a_study_as_files(tmp_path):
+    place = replace(lake(), agents=(lake().agents[0], lake().agents[3]), pairs=lake().pairs[2:3])
+    found = made_up.analysis([place], ["low", "first"], root=tmp_path, cpu=CPU)
+    paths = write_verdicts(found, "python compare.py a.yml")
+    assert [path.name for path in paths] == ["verdicts.md", "verdicts.tex"]
+    markdown, latex = (path.read_text(encoding="utf-8") for path in paths)
+    assert markdown == FILE.replace("LEGEND", LEGEND)
+    # Both languages say the same.
+    words = [re.findall(r"[\d.]+|[a-z]{3,}", one) for one in (markdown, latex)]
+    assert [word for word in words[0] if word not in words[1]] == []
+    assert r"\texttt{first} & \textbf{1.800} (40 s) \\" in latex
+
+
+def test_a_latex_table_has_the_rules_of_booktabs_and_no_others():
+    agents = [made_up.agent(name, 50) for name in "ab"]
+    found = made_up.analysis([made_up.environment(agents)], "ab")
+    lines = table_as("tex", headline(found)).splitlines()
+    assert lines[2].startswith(r"\caption{Score of the median run: ")
+    assert lines[4:] == [
+        r"\begin{tabular}{lr}",
+        r"\toprule",
+        r" & lake \\",
+        r"\midrule",
+        r"\texttt{a} & \textbf{1.000} \\",
+        r"\texttt{b} & 1.000 \\",
+        r"\bottomrule",
+        r"\end{tabular}}",
+        r"\end{table}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("escaped", "text", "safe"),
+    [
+        (latex_text, "double_dqn by 2 [1, 3]", r"double\_dqn by 2 [1, 3]"),
+        (latex_text, "50 % of #1 & {2}", r"50 \% of \#1 \& \{2\}"),
+        (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
+        (latex_text, "<a>|", r"\textless{}a\textgreater{}\textbar{}"),
+        (latex_text, '~ `b "c"', r"\textasciitilde{} {\char96}b {\char34}c{\char34}"),
+        (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
+        (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
+        (latex_text, "[1] *", r"{}[1] *"),
+        (latex_text, "*x", r"{}*x"),
+        (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
+        (latex_text, "· ≤ ≥ †", r"$\cdot$ $\leq$ $\geq$ $\dagger$"),
+        (latex_text, "two\n\nlines \x1b[1m", r"two lines \textbackslash{}x1b[1m"),
+        (latex_text, "café 中", "café 中"),
+        (markdown_text, "double_dqn by 2 [1, 3]", "double_dqn by 2 [1, 3]"),
+        (markdown_text, "a|b <b>*x*</b> [x](y) `c`",
+         "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
+        (markdown_text, "# one\n\ntwo _three_", "\\# one two \\_three\\_"),
+        (name_of, "dqn", "`dqn`"),
+        (name_of, "a`b|", "a\\`b\\|"),
+    ],
+)  # fmt: skip
+def test_nothing_of_a_text_is_markup(escaped, text, safe):
+    assert escaped(text) == safe
+
+
+def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
+    names = [r"\end{table}", "a_b & 50%", "[1]", "*$x^2$", "中"]
+    agents = [made_up.agent(name, 90 - 10 * n) for n, name in enumerate(names)]
+    pairs = (made_up.pair(names[0], names[1], "equivalent"),)
+    found = made_up.analysis([made_up.environment(agents, "lake #1", pairs=pairs)], names)
+    text = verdicts_as("tex", found, "python compare.py 'a_b & 50%' --x")
+    plain = re.sub(r"\\[{}$&#%_]", "", text)
+    assert plain.count("{") == plain.count("}")
+    assert plain.count("$") % 2 == 0
+    begun, ended = (re.findall(rf"\\{which}\{{(\w+)\}}", plain) for which in ("begin", "end"))
+    assert sorted(begun) == sorted(ended)
+    assert begun.count("table") == 2  # the headline, and one environment
+    for rows in re.findall(r"\\midrule\n(.*?)\\bottomrule", plain, re.DOTALL):
+        # What no agent has is left out: runs that failed, and the processor time.
+        assert {line.count("&") for line in rows.splitlines()} <= {1, 4}
+        assert all(line.endswith(r"\\") for line in rows.splitlines())
+    # Comments stand at the top alone, and say what the text needs.
+    needs, signs, *lines = text.splitlines()
+    assert needs == r"% Taken in by \input; above it: \usepackage{booktabs,graphicx}"
+    assert signs == "% With XeLaTeX or LuaLaTeX, and a font that has these signs: 中"
+    assert "%" not in re.sub(r"\\%|\{%$", "", "\n".join(lines), flags=re.MULTILINE)
+
+
+# --- the terminal ---------------------------------------------------------------------------------
+
+ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def lines_of(write, *given, width=120, **options):
+    """What is printed, without colours, as lines without trailing blanks."""
+    file = io.StringIO()
+    write(Console(markup=False, file=file, width=width, **options), *given)
+    assert bool(ESCAPES.search(file.getvalue())) is bool(options)
+    return [line.rstrip() for line in ESCAPES.sub("", file.getvalue()).splitlines()]
+
+
+def cells(lines):
+    """The tables cell by cell, those of a row that goes over several lines joined."""
+    rows, before = [], ""
+    for line in lines:
+        if line.startswith(("┃", "│")):
+            parts = [part.strip() for part in re.split("[┃│]", line)[1:-1]]
+            if (line[0] == "┃" and before.startswith("┃")) or (line[0] == "│" and not parts[0]):
+                rows[-1] = [f"{a} {b}".strip() for a, b in zip(rows[-1], parts, strict=True)]
+            else:
+                rows.append(parts)
+        before = line
+    return rows
+
+
+def below(lines):
+    """Caption and sentences, whose lines are broken at the width, as one line."""
+    end = max(place for place, line in enumerate(lines) if line.startswith("└"))
+    return " ".join(" ".join(lines[end + 1 :]).split())
+
+
+TABLE = """
+lake: optimum 100, best random or constant policy 20
+┏━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━┳━━━━━━━━┳━━━━━━━━━━┓
+┃ agent  ┃            mean ┃             IQM ┃          score ┃        training ┃ stays from ┃ solved ┃ CPU time ┃
+┡━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━╇━━━━━━━━╇━━━━━━━━━━┩
+│ first  │ 90 [89.9, 90.2] │ 92 [91.9, 92.2] │ 0.9 [0.8, 1.1] │ 95 [94.9, 95.2] │        100 │    75% │     99 s │
+│ second │ 40 [39.9, 40.2] │ 42 [41.9, 42.2] │ 0.4 [0.3, 0.6] │ 45 [44.9, 45.2] │         50 │    75% │     49 s │
+└────────┴─────────────────┴─────────────────┴────────────────┴─────────────────┴────────────┴────────┴──────────┘
+"""  # noqa: E501  # as wide as it is printed
+CAPTION = (
+    "mean, IQM: return of the final policy, with 95 % intervals over 4 seeds; training: return of "
+    "the last 100 training episodes; stays from: step from which on the median run stays at a "
+    "return of 96 "
+)
+NARROW_CAPTION = (
+    "mean: return of the final policy, with 95 % intervals over 4 seeds; stays from: step from "
+    "which on the median run stays at a return of 96; a wider terminal shows training and IQM too "
+)
+SENTENCES = (
+    "first is best: return of the final policy 90 [89.9, 90.2], score 0.9; the optimum is 100. "
+    "first is better than second (by 50 [45, 55]). "
+    "second reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the median one from "
+    "step 50 on; first in 3 of 4 runs, the median one from step 100 on. "
+    "1 of 4 runs of second is missing. No run of third has finished. "
+    "Seeds 0 to 3: nothing was tuned on these."
+)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("options", [{}, {"force_terminal": True}], ids=["pipe", "terminal"])
+def test_a_title_a_table_a_caption_and_sentences(width, options):
+    agents = (made_up.agent("first", 90.0), made_up.agent("second", 40.0))
+    pairs = (made_up.pair("first", "second", "better", 50.0),)
+    missing = {"first": 0, "second": 1, "third": 4}
+    place = made_up.environment(agents, pairs=pairs, missing=missing)
+    found = made_up.analysis([place], ["first", "second", "third"])
+    lines = lines_of(print_analysis, found, width=width, **options)
+    wide = TABLE.splitlines()
+    if width == 120:
+        assert lines[:8] == wide
+        assert below(lines) == CAPTION + SENTENCES
+    else:
+        assert cells(lines) == [
+            [cell for n, cell in enumerate(row) if n not in {2, 4}] for row in cells(wide)
+        ]
+        assert below(lines) == NARROW_CAPTION + SENTENCES
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 200])
+@pytest.mark.parametrize("name", ["[red]", "a name that is longer than twenty letters"])
+def test_no_figure_is_cut_and_no_border_lost(name, width):
+    agents = [made_up.agent(label, -27_427.0) for label in (name, "second")]
+    found = made_up.analysis([made_up.environment(agents)], [name, "second"])
+    lines = lines_of(print_analysis, found, width=width)
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+    (top,) = [line for line in lines if line.startswith("┏")]
+    (bottom,) = [line for line in lines if line.startswith("└")]
+    assert top.endswith("┓")
+    assert len(top) == len(bottom)
+    headings, *rows = cells(lines)
+    assert "".join(row[0] for row in rows[:-1]).replace(" ", "") == name.replace(" ", "")
+    assert rows[-1][:2] == ["second", "-27,427 [-27,427, -27,427]"]
+    assert ("training" in headings) is (width == 200)
+
+
+def test_three_agents_have_their_verdicts_in_a_matrix():
+    agents = [made_up.agent(name, mean) for name, mean in (("a", 90.0), ("[b]", 80.0), ("c", 70.0))]
+    pairs = (
+        made_up.pair("a", "[b]", "worse"),
+        made_up.pair("a", "c", "undecided"),
+        made_up.pair("[b]", "c", "equivalent"),
+    )
+    failed = {"a": FailureCount(0, 4, 0.6), "c": FailureCount(1, 4, 0.8)}
+    place = made_up.environment(agents, pairs=pairs, failures=failed)
+    lines = lines_of(print_analysis, made_up.analysis([place], ["a", "[b]", "c"]))
+    at = next(i for i, line in enumerate(lines) if line.split() == ["1", "2", "3"])
+    assert [line.split() for line in lines[at + 1 : at + 4]] == [
+        ["1", "a", "·", "<", "?"],
+        ["2", "[b]", ">", "·", "="],
+        ["3", "c", "?", "=", "·"],
+    ]
+    assert lines[at + 4 : at + 6] == [
+        "> better than the agent of the column, < worse, = equivalent, ? undecided",
+        "1 of 4 runs of c failed: what is equivalent is so in the typical run.",
+    ]
+    assert not any("is undecided against" in line for line in lines)
+
+
+def test_marks_of_trainings_that_were_changed_and_dashes():
+    nothing = ThresholdSummary(made_up.NOTHING, made_up.NOTHING)
+    without = {"score": None, "last_episodes": made_up.NOTHING, "steps_to_stay": nothing}
+    agents = [
+        made_up.agent("with", 90.0, changes=("slip 0.1",), on_variant=True),
+        made_up.agent("without", 1.0, **without),
+    ]
+    found = made_up.analysis([made_up.environment(agents)], ["with", "without"])
+    lines = lines_of(print_analysis, found, width=200)
+    first, second = cells(lines)[1:]
+    assert (first[0], first[4]) == ("with †", "95 [94.9, 95.2] *")
+    assert second == ["without", "1 [0.9, 1.2]", "3 [2.9, 3.2]", *"----", "10 s"]
+    assert "†: trained on a changed environment: with (slip 0.1)." in lines
+    assert "training episodes (*: on a variant of the environment);" in below(lines)
+    # What applies to no agent has no column and no explanation.
+    alone = made_up.agent("alone", 1.0, score=None, steps_to_stay=None, episodes_to_stay=None)
+    place = made_up.environment([alone], optimum=None, baseline=None, threshold=None)
+    lines = lines_of(print_analysis, made_up.analysis([place], ["alone"]))
+    assert lines[1] == "lake"
+    assert cells(lines)[0] == ["agent", "mean", "IQM", "training", "CPU time"]
+    assert "stays from" not in below(lines)
+
+
+# Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
+ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
+REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_bandits_have_a_table_of_their_own(width):
+    pulls = pull_statistics(ARMS, REWARDS, np.where(ARMS == 0, 0.3, 0.0), None, 2)
+    agents = (made_up.agent("first", 1.0), made_up.agent("no pulls", 3.0))
+    place = made_up.environment(agents, "coins", optimum=None)
+    names, found = ["first", "no pulls"], {("first", "coins"): pulls}
+    lines = lines_of(
+        print_analysis,
+        made_up.analysis([place], names, pulls=found, metric="regret"),
+        width=width,
+    )
+    # The sums of regret are .6 and .3, and the last pulls .3 and 0; the last rewards 1 and 0.
+    headings = ["agent", "mean regret", "5% to 95% of runs", "simple regret", "reward", "best arm"]
+    row = ["first", "7 [6.9, 7.2]", "0.315 to 0.585", "0.15", "0.5", "50.0%", "10 s"]
+    wide = width == 120
+    kept = [n for n in range(7) if wide or n != 3]
+    assert cells(lines) == [[each[n] for n in kept] for each in ([*headings, "CPU time"], row)]
+    simple = "simple regret: of recommending the arm pulled most; " if wide else ""
+    more = "" if wide else "; a wider terminal shows simple regret too"
+    assert below(lines).startswith(
+        "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; "
+        f"{simple}reward, best arm: at the last pulls{more} Undecided: 4 seeds decide nothing. "
+        "first has the lowest mean so far: regret of a run 1 [0.9, 1.2]."
+    )
+
+
+EPISODES = ["environment", "agent", "episode", "average", "minimum", "maximum"]
+
+
+def test_blocks_of_episodes_agents_side_by_side():
+    rows = [("lake", "first", 1000, 1.5, 0, 5), ("lake", "first", 2000, -700.0, -800.0, 0.5)]
+    rows += [("lake", "second", 1000, 3, 2, 7), ("island", "first", 1000, 4, 3, 8)]
+    lines = lines_of(print_episodes_table, pd.DataFrame(rows, columns=EPISODES), 1000)
+    titles = " ".join(line for line in lines if not line.startswith(tuple("┏┃┡│└")))
+    what = "return per 1000 episodes (average, min, max; all seeds)"
+    assert " ".join(titles.split()) == f"lake: {what} island: {what}"
+    assert cells(lines) == [
+        ["episode", "first", "second"],
+        ["1,000", "1.5  0  5", "3  2  7"],
+        ["2,000", "-700  -800  0.5", "-"],
+        ["episode", "first"],
+        ["1,000", "4  3  8"],
+    ]
+
+
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_agents_for_whom_there_is_no_room_beside_the_others_come_below(width):
+    names = ["qlearning", "expected_sarsa", "dqn, engine: auto", "a name of more than 20 letters"]
+    rows = [("lake", name, 100, -27_427.5, -30_000.25, n) for n, name in enumerate(names)]
+    table = pd.DataFrame(rows, columns=EPISODES)
+    lines = lines_of(print_episodes_table, table, 100, width=width)
+    assert max(map(len, lines)) <= width
+    found = [cell for row in cells(lines) if row[0] != "episode" for cell in row[1:]]
+    assert found == [f"-27,428  -30,000  {n}" for n in range(len(names))]
+
+
+# --- the ranking of the page ----------------------------------------------------------------------
+
+
+def ranked(agents, metric="final", **changes):
+    """Headings of the page's table and its rows, of agents on an environment."""
+    place = made_up.environment(agents, **changes)
+    found = made_up.analysis([place], [agent.agent for agent in agents], metric=metric)
+    (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
+    return table["headings"], table["rows"]
+
+
+RANKING = """
+Mean       | over seeds          | descending | 90    89.9 to 90.2 | 40    39.9 to 40.2
+IQM        | middle half         | descending | 92    91.9 to 92.2 | 42    41.9 to 42.2
+Median     | over seeds          | descending | 91    90.9 to 91.2 | 41    40.9 to 41.2
+Score      | 1 is optimal        | descending | 0.9   0.8 to 1.1   | 0.4   0.3 to 0.6
+Gap        | to the optimum      | ascending  | 7     6.8 to 7.1   | 57    56.8 to 57.1
+Success    | in the end          | descending | 50.0% 25% to 62%   | 50.0% 25% to 62%
+Stays from | step, at 96         | ascending  | 100   75% of runs  | 50    75% of runs
+Episodes   | to stay at 96       | ascending  | 98    75% of runs  | 48    75% of runs
+CPU time   | seconds of training | ascending  | 99    98.9 to 99.2 | 49    48.9 to 49.2
+Runs       | finished            | descending | 4                  | 4     1 missing
+"""
+
+
+def test_figures_of_each_agent_the_best_first():
+    agents = [made_up.agent("first", 90.0), made_up.agent("second", 40.0, n_missing=1)]
+    headings, rows = ranked(agents)
+    assert [row.agent for row, _ in rows] == ["first", "second"]
+    expected = [[" ".join(x.split()) for x in row.split("|")] for row in RANKING.split("\n")[1:-1]]
+    assert [
+        [*each.values(), *(f"{cells[n].text} {cells[n].note}".strip() for _, cells in rows)]
+        for n, each in enumerate(headings)
+    ] == expected
+    # They are sorted by their figures.
+    cells = rows[0][1]
+    assert [cell.value for cell in cells] == pytest.approx(
+        [90, 92, 91, 0.9, 7, 0.5, 100, 98, 99, 4]
+    )
+    assert [cell.bar for cell in cells] == [None] * 3 + [(0.8, 0.9, 1.0)] + [None] * 6
+    assert cells[6].aside == (
+        "75% of runs are there at some evaluation, the median run first at step 97"
+    )
+    # The lowest regret is the best.
+    orders = [heading["order"] for heading in ranked(agents, metric="regret")[0]]
+    assert orders == ["ascending"] * 3 + ["descending", *[row[2] for row in expected[4:]]]
+
+
+def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
+    one = made_up.agent("first", 90.0, final=made_up.estimate(93.0, 92.0, 95.0))
+    (gap,) = [column for column in COLUMNS if column.page == "Gap"]
+    cell = gap.cell(Row(one, made_up.environment([one], optimum_at_least=97.0)))
+    assert (cell.text, cell.note) == ("7", "2 to 8")  # from one end of the bracket to the other
+    never = ThresholdSummary(Estimate(math.inf, 10, math.inf, 4), Estimate(0.25, 0, 0.5, 4))
+    nothing = ThresholdSummary(made_up.NOTHING, made_up.NOTHING)
+    without = dict.fromkeys(("final", "success_rate", "seconds"), made_up.NOTHING)
+    without |= {"steps_to_threshold": nothing, "steps_to_stay": nothing, "score": None}
+    agents = [
+        made_up.agent("slow", 1.0, steps_to_stay=never),
+        made_up.agent("without", math.nan, **without),
+    ]
+    headings, ((_, slow), (_, absent)) = ranked(agents)
+    titles = [heading["title"] for heading in headings]
+    stays = slow[titles.index("Stays from")]
+    assert (stays.text, stays.value, stays.note) == ("never", math.inf, "25% of runs")
+    for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
+        cell = absent[titles.index(title)]
+        assert (cell.text, cell.value, cell.note, cell.aside) == ("-", None, "", ""), title
+    few = dict.fromkeys(("score", "success_rate", "steps_to_stay", "episodes_to_stay"))
+    headings, _ = ranked([made_up.agent("alone", 1.0, **few)], optimum=None, threshold=None)
+    assert [heading["title"] for heading in headings] == [
+        *("Mean", "IQM", "Median", "CPU time", "Runs")
+    ]
+
+
+def test_no_two_columns_have_one_name():
+    for columns in (COLUMNS, BANDIT_COLUMNS):
+        for names in ([c.page for c in columns], [c.terminal for c in columns]):
+            named = [name for name in names if name]
+            assert len(named) == len(set(named))
+
+
+def test_a_bar_stays_between_the_blind_policy_and_the_optimum():
+    assert bar(Estimate(-3.0, -4.0, 0.25, 4)) == (0, 0, 0.25)
+    assert bar(Estimate(0.5, math.nan, math.nan, 1)) == (0.5, 0.5, 0.5)
+    assert bar(made_up.NOTHING) == (0, 0, 0)

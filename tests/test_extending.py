@@ -1,0 +1,148 @@
+"""Agents and environments of one's own, as extending.md and own-agent.md have them: one file each."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+DOCUMENT = (DOCS / "extending.md").read_text() + (DOCS / "own-agent.md").read_text()
+FILES = re.findall(r"^`(\w+\.\w+)`[^\n]*(?:\n[^\n]+)*\n\n```\w+\n(.*?)```", DOCUMENT, re.M | re.S)
+CHECK = re.findall(r"```python\n((?:(?!```).)*check_transition_model.*?)```", DOCUMENT, re.S)
+COMMANDS = re.findall(r"^python ~/yardstick/(.*)$", DOCUMENT, re.M)
+
+
+def test_the_document_can_be_followed(type_in_own_folder, own_folder):
+    for name, text in FILES:
+        (own_folder / name).write_text(text)
+    assert len(FILES) >= 6
+    assert len(COMMANDS) >= 8
+    for command in COMMANDS:
+        # The comparison with PPO takes a minute as it stands.
+        short = command.replace("-n 100000 --seeds 10", "-n 1000 --seeds 2 --no-report")
+        code, out, err = type_in_own_folder(*shlex.split(short))
+        assert (code, err) == (0, ""), f"{command}\n{out}{err}"
+        if "--algo cautious" in command:  # as the page says of it; its state can be kept
+            assert "return -15.00 (exact), success 100.0%" in out
+            assert "no state can be kept" not in out
+    assert gym.make("my/Corridor-v0").unwrapped.length == 6
+    logs = own_folder / "logs"
+    assert (logs / "qlearning" / "my-Corridor-v0_1" / "modules" / "my_corridor.py").is_file()
+    assert len(list(logs.glob("studies/*/runs/*/my-Corridor-v0_*/run.json"))) == 8
+
+
+def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
+    for name, text in FILES:
+        (own_folder / name).write_text(text)
+    monkeypatch.syspath_prepend(own_folder)
+    (code,) = CHECK
+    exec(code, {})  # noqa: S102  # a page of this project
+    assert capsys.readouterr().out.split() == ["None", "True"]
+    # The page's table with an error in it: the slip is not in the model.
+    changed = code.replace("check = ", "my_known_corridor.KnownCorridor.step = slipping\ncheck = ")
+
+    def slipping(self, action):
+        self.s = min(self.s + int(action), self.observation_space.n - 1)
+        return self.s, -1.0, self.s == self.observation_space.n - 1, False, {}
+
+    exec(changed, {"slipping": slipping})  # noqa: S102
+    assert capsys.readouterr().out.startswith("the environment's P is not what step does: state ")
+
+
+def test_a_wrong_value_of_an_agents_own_setting_is_refused_in_a_line(
+    own_folder, type_in_own_folder
+):
+    (own_folder / "cautious.py").write_text(dict(FILES)["cautious.py"])
+    words = "train.py --gym-packages cautious --env FrozenLake-v1 --algo cautious -n 9"
+    code, _, err = type_in_own_folder(*words.split(), "-params", "caution:2")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "caution" in err
+
+
+# --- one file, whose lines are counted ------------------------------------------------------------
+
+INDEX = '''
+"""MOSS."""
+
+from __future__ import annotations
+
+import math
+
+import agents
+from agents.bandits.choosing import ScoreAgent
+from agents.bandits.upper_bounds import UpperBoundBandit
+from machine_code.compiling import inlined
+
+agents.register("moss", "moss:MOSS", observations="Discrete", for_bandits=True)
+
+
+@inlined
+def moss_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
+    """Mean plus sqrt(max(ln(t / (arms n)), 0) / n) after t pulls."""
+    share = pulls / (len(agent.arms) * count)
+    return mean + math.sqrt(max(math.log(share), 0.0) / count)
+
+
+class MOSS(UpperBoundBandit):
+    """An index that is optimal in the worst case (Audibert and Bubeck, 2009), at any time."""
+
+    upper_bound = moss_bound
+'''
+GRID = '''
+"""A pond: ice all around, and one hole."""
+
+import gymnasium as gym
+
+from envs.grid import GridWorld
+from envs.grid import Tile
+
+gym.register("my/Pond-v0", "pond:Pond", max_episode_steps=50)
+
+
+class Pond(GridWorld):
+    """A robot crosses a pond around a hole, ``H``, that costs it 10 and ends the episode."""
+
+    def __init__(self, slip: float = 0.1, render_mode: str | None = None) -> None:
+        ice = Tile(-1.0)
+        tiles = {
+            ".": ice,
+            "S": ice,
+            "H": Tile(-10.0, terminated=True),
+            "G": Tile(0.0, terminated=True),
+        }
+        super().__init__(
+            ["S...", ".H..", "...G"],
+            tiles,
+            edge=Tile(-1.0, blocked=True),
+            slip=slip,
+            random_start=False,
+            render_mode=render_mode,
+        )
+'''
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "most_lines", "words", "engine"),
+    [
+        ("moss", INDEX, 30, "--env BernoulliBandit-v0 --algo moss -n 200", None),
+        ("pond", GRID, 35, "--env my/Pond-v0 --algo qlearning -n 2000", "compiled"),
+    ],
+)  # fmt: skip
+def test_an_index_or_a_grid_world_is_one_file(
+    own_folder, type_in_own_folder, name, text, most_lines, words, engine
+):
+    assert len(text.strip().splitlines()) <= most_lines
+    (own_folder / f"{name}.py").write_text(text.lstrip())
+    command = ["train.py", "--gym-packages", name, "--seed", "0", *words.split()]
+    assert type_in_own_folder(*command)[::2] == (0, "")
+    (path,) = Path("logs").glob("*/*/run.json")
+    record = json.loads(path.read_text())
+    assert record["final"]["exact"]
+    assert record.get("engine") == engine or engine is None
+    if name == "moss":
+        assert 0 < record["regret"] < 100  # of 200 pulls, each of which can cost half a click
+    else:
+        assert record["final"]["optimum"] > -10

@@ -1,0 +1,561 @@
+"""The checks of the lessons: right answers pass, and each common mistake is named."""
+
+import importlib
+import math
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from scipy import special
+
+from envs.known_models import transition_model
+from mdp import TransitionModel, policy_iteration, value_iteration
+
+# A lesson imports them as a script in its folder does.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "lessons"))
+checker, exploration, traces, networks, figures = map(
+    importlib.import_module,
+    ("checker", "exploration_checks", "trace_checks", "network_checks", "verdict_checks"),
+)
+
+MODEL = transition_model(gym.make("FrozenLake-v1"))
+
+
+RANDOM = np.full((16, 4), 0.25)
+DISCOUNT = 0.9
+
+
+def solved(policy, discount=DISCOUNT):
+    """Values by the matrix of the first lesson."""
+    chance = checker.probabilities(MODEL, policy)[:, :, None] * MODEL.prob
+    matrix = np.zeros((16, 16))
+    going_on = chance * ~MODEL.terminated
+    for state in range(16):
+        np.add.at(matrix[state], MODEL.next_state[state].ravel(), going_on[state].ravel())
+    rewards = (chance * MODEL.reward).sum(axis=(1, 2))
+    return np.linalg.solve(np.eye(16) - discount * matrix, rewards)
+
+
+def q_target(reward, discount, terminated, next_values):
+    return reward if terminated else reward + discount * next_values.max()
+
+
+def sarsa_target(reward, discount, terminated, next_values, next_action):
+    return reward if terminated else reward + discount * next_values[next_action]
+
+
+def expected_target(reward, discount, terminated, next_values, epsilon):
+    mean = epsilon * next_values.mean() + (1 - epsilon) * next_values.max()
+    return reward if terminated else reward + discount * mean
+
+
+def best_left_out(reward, discount, terminated, next_values, epsilon):
+    others = (next_values.sum() - next_values.max()) / 3
+    mean = epsilon * others + (1 - epsilon) * next_values.max()
+    return reward if terminated else reward + discount * mean
+
+
+MEANS = [0.2, 0.9, 0.5]
+ARMS = [0, 1, 2, 0, 1]
+
+
+def divergence(p, q):
+    return special.rel_entr(p, q) + special.rel_entr(1 - p, 1 - q)
+
+
+def bonus_target(bonus, *, at_the_end=True, discounted=False):
+    """Q-learning's target and a bonus."""
+
+    def target(reward, discount, terminated, next_values, count, scale):
+        added = bonus(count, scale) * (discount if discounted else 1)
+        if terminated:
+            return reward + added * at_the_end
+        return reward + added + discount * next_values.max()
+
+    return target
+
+
+WALK = transition_model(gym.make("RandomWalk-v0", n_states=19, left_reward=-1))
+ZEROS = np.zeros(21)
+
+
+def n_step_return(rewards, discount, value_after, *, first=0, powers=None):
+    n = len(rewards)
+    kept = discount ** np.arange(first, n + first)
+    return (kept * np.asarray(rewards)).sum() + discount ** (
+        n if powers is None else powers(n)
+    ) * value_after
+
+
+def n_step_means(values, n):
+    """Means of the n-step returns."""
+    for _ in range(n):
+        values = traces.looked_ahead(WALK, 1.0, values)[:, 0]
+    return values
+
+
+def lambda_means(values, decay, weights=None, n=200):
+    chances = (1 - decay) * decay ** np.arange(n) if weights is None else weights(np.arange(n))
+    means = np.zeros(21)
+    for chance in chances:
+        values = n_step_means(values, 1)
+        means += chance * values
+    return means
+
+
+def replacing(trace, state, discount, decay):
+    trace = discount * decay * trace
+    trace[state] = 1
+    return trace
+
+
+def changed(visited, faded=lambda trace, discount, decay: discount * decay * trace):
+    """A step that differs from the right one in what is given."""
+
+    def step(trace, state, discount, decay):
+        after = faded(trace, discount, decay)
+        after[state] = visited(after[state], discount * decay)
+        return after
+
+    return step
+
+
+def targets(rewards, terminated, values, discount, follows=lambda values: values.max(axis=1)):
+    return rewards + discount * ~terminated * follows(values)
+
+
+ROWS = "A target has to depend on the values of its own next state alone"
+
+
+def doubled(choosing, judging):
+    """Targets that choose by one array of values and judge by another."""
+
+    def told(rewards, terminated, online, lagging, discount):
+        chosen = choosing(online, lagging).argmax(axis=1)
+        values = judging(online, lagging)[np.arange(len(chosen)), chosen]
+        return rewards + discount * ~terminated * values
+
+    return told
+
+
+def online(first, second):
+    return first
+
+
+def lagging(first, second):
+    return second
+
+
+def huber(error):
+    return error**2 / 2 if abs(error) < 1 else abs(error) - 0.5
+
+
+def score(earned, optimum, baseline):
+    return (earned - baseline) / (optimum - baseline)
+
+
+def gain(ratio, advantage, epsilon):
+    bounded = min(max(ratio, 1 - epsilon), 1 + epsilon)
+    return min(ratio * advantage, bounded * advantage)
+
+
+def wins(first, second):
+    return ((first[:, None] > second) + (first[:, None] == second) / 2).mean()
+
+
+# What each check says of an answer.
+CASES = {
+    checker.check_index: [
+        (lambda mean, n, t: mean + np.sqrt(2 * np.log(t) / n), "Right."),
+        (lambda mean, n, t: None, "It cannot be called or gives no number"),
+        (lambda mean, n, t: np.sqrt(2 * np.log(t) / n), "If the mean rises by 0.1"),
+        (lambda mean, n, t: mean, "The index has to lie above the mean"),
+        (lambda mean, n, t: mean + np.log(t) / n, "With four times as many pulls"),
+        (lambda mean, n, t: mean + np.sqrt(2 * t / n), "The bonus has to grow with all pulls"),
+        (lambda mean, n, t: mean + np.sqrt(np.log(t) / n), "The form is right, but a factor"),
+    ],
+    exploration.check_divergence: [
+        (divergence, "Right."),
+        (lambda p, q: None, "Not done yet"),
+        (lambda p: p, "It fails when it is called"),
+        (lambda p, q: p / (q - q), "It fails when it is called: float division"),
+        (lambda p, q: math.inf, "It gives inf"),
+        (lambda p, q: [p, q], "It has to give a number"),
+        (lambda p, q: -p * math.log(q), "For two equal probabilities it has to be 0"),
+        (lambda p, q: -divergence(p, q), "It has to be above 0 wherever p and q differ"),
+        (lambda p, q: p * math.log(p / q), "It falls below 0. A pull can pay 1"),
+        (lambda p, q: abs(p * math.log(p / q)), "Call a success a failure"),
+        (lambda p, q: divergence(p, q) / math.log(2), "The form is right, but"),
+        (lambda p, q: divergence(q, p), "The two are the wrong way round"),
+        (lambda p, q: 2 * (p - q) ** 2, "It is 0 where it has to be"),
+    ],
+    exploration.check_episodes: [
+        (lambda n, e: (2 / e) ** n, "Right."),
+        (lambda n, e: ..., "Not done yet"),
+        (lambda n, e: (e / 2) ** n, "That is the chance that one episode"),
+        (lambda n, e: (2 / e) ** (n - 1), "There is one move too few"),
+        (lambda n, e: (2 / e) ** n - 1, "Those before the first success"),
+        (lambda n, e: math.log(2) * (2 / e) ** n, "Half of all divers"),
+        (lambda n, e: (1 / e) ** n, "A random action is the right one in half"),
+        (lambda n, e: 2**n, "Epsilon is missing"),
+        (lambda n, e: (1 - e / 2) ** -n, "This diver would take the right"),
+        (lambda n, e: 2 * n / e, "For 5 rows and epsilon 0.1 it is too low."),
+        (lambda n, e: 10.0**9, "For 3 rows and epsilon 1 it is too high."),
+    ],
+    exploration.check_bonus_target: [
+        (bonus_target(lambda n, s: s / math.sqrt(n)), "Right."),
+        (lambda *_: None, "Not done yet"),
+        (lambda r, *_: r, "With a scale of 0 it should be the target of Q-learning. If"),
+        (
+            bonus_target(lambda n, s: 1 / math.sqrt(n)),
+            "With a scale of 0 it should be the target of Q-learning. When the episode",
+        ),
+        (bonus_target(lambda n, s: s / math.sqrt(n), at_the_end=False), "There is no bonus at the"),
+        (
+            bonus_target(lambda n, s: s / math.sqrt(n), discounted=True),
+            "The bonus depends on the d",
+        ),
+        (bonus_target(lambda n, s: s * math.sqrt(n)), "What was tried less often"),
+        (bonus_target(lambda n, s: s**2 / math.sqrt(n)), "If the scale is twice"),
+        (bonus_target(lambda n, s: s / n), "The bonus falls too fast"),
+        (bonus_target(lambda n, s: s / (1 + n)), "With four times as many visits"),
+        (bonus_target(lambda n, s: 2 * s / math.sqrt(n)), "The form is right, but"),
+    ],
+    traces.check_return: [
+        (n_step_return, "Right."),
+        (lambda r, d, v: None, "Not done yet"),
+        (lambda r: r, "It fails when it is called"),
+        (lambda r, d, v: 1.0, "Where all rewards and the value are 0"),
+        (lambda r, d, v: sum(r) + d * v, "With 3 steps: the rewards are not discounted"),
+        (lambda r, d, v: n_step_return(r, d, v, first=1), "With 3 steps: the first reward is disc"),
+        (lambda r, d, v: n_step_return(r[::-1], d, v), "With 3 steps: the last reward counts most"),
+        (lambda r, d, v: np.mean(r), "With 3 steps: that is the mean"),
+        (lambda r, d, v: max(r) + d * v, "What one reward counts depends on the others"),
+        (lambda r, d, v: n_step_return(r, d, 0) * v, "What one reward counts"),
+        (lambda r, d, v: r[0] + d**3 * v, "With 3 steps: reward 1 (the first is 0) counts 0 times"),
+        (lambda r, d, v: n_step_return(r, d, 0), "With 3 steps: the value of the state after"),
+        (
+            lambda r, d, v: n_step_return(r, d, v, powers=lambda n: n - 1),
+            "With 3 steps: the value after the last step is discounted too little",
+        ),
+        (
+            lambda r, d, v: n_step_return(r, d, v, powers=lambda n: n + 1),
+            "With 3 steps: the value after the last step is discounted too much",
+        ),
+        (
+            lambda r, d, v: n_step_return(r, d, v, powers=lambda n: 3),
+            "With 1 step: the value after",
+        ),
+        (lambda r, d, v: n_step_return(r[:3], d, v, powers=lambda n: len(r)), "With 5 steps: rew"),
+    ],
+    traces.check_replacing_trace: [
+        (replacing, "Right."),
+        (lambda *_: None, "Not done yet: the function gives nothing back."),
+        (lambda z: z, "It fails when it is called"),
+        (lambda *_: np.ones(3), "The shape has to be (4,)"),
+        (changed(lambda own, _: own + 1), "That is the accumulating trace"),
+        (changed(lambda own, rate: rate), "The state that is visited now"),
+        (changed(lambda own, _: max(own, 1)), "The visited state's trace is not"),
+        (changed(lambda *_: 1, lambda z, *_: 0 * z), "The other states are forgotten"),
+        (changed(lambda *_: 1, lambda z, *_: z), "The traces of the other states have to"),
+        (changed(lambda *_: 1, lambda z, d, _: d * z + 0.1), "A state that was never"),
+        (
+            changed(lambda *_: 1, lambda z, d, _: d * z),
+            "The traces of the other states do not fade enough: lambda",
+        ),
+        (
+            changed(lambda *_: 1, lambda z, _, w: w * z),
+            "The traces of the other states do not fade enough: the discount",
+        ),
+        (
+            changed(lambda *_: 1, lambda z, *_: 0.1 * z),
+            "The traces of the other states do not fade by the right",
+        ),
+    ],
+    networks.check_targets: [
+        (targets, "Right."),
+        (lambda *_: ..., "Not done yet: the function"),
+        (lambda r: r, "It fails when it is called"),
+        (lambda r, t, v, d: (r + d * v.T).T, "The shape has to be (12,), one target for each step"),
+        (lambda r, t, v, d: r + d * v.max(axis=0), "It fails when it is called: operands"),
+        (lambda r, t, v, d: r + d * v.max(), ROWS),
+        (lambda r, t, v, d: r + d * v.max(axis=1), "When the episode has terminated nothing"),
+        (lambda r, t, v, d: r + d * t * v.max(axis=1), "It is the wrong way round"),
+        (lambda r, t, v, d: targets(r, t, v, 1), "With a discount of 0 only the reward"),
+        (lambda r, t, v, d: r, "If the best next value rises by 1"),
+        (lambda r, t, v, d: targets(r, t, v, d, lambda v: v.min(axis=1)), "If the best next value"),
+        (
+            lambda r, t, v, d: targets(r, t, v, d, lambda v: v.mean(axis=1)),
+            "All next actions count",
+        ),
+        (
+            lambda r, t, v, d: targets(r, t, v, d, lambda v: v.max(axis=1) + v.min(axis=1)),
+            "Values of actions count that are not the best.",
+        ),
+    ],
+    networks.check_double_targets: [
+        (doubled(online, lagging), "Right."),
+        (lambda *_: None, "Not done yet: the function"),
+        (doubled(lagging, online), "The roles are the wrong way round"),
+        (doubled(lagging, lagging), "The target network chooses and judges."),
+        (doubled(online, online), "The target network has no part in it"),
+        (doubled(online, np.add), "The values of both networks count. Only one"),
+        (doubled(np.add, lagging), "It is not the discounted value of the chosen action"),
+        (lambda r, t, a, b, d: r + d * b[:, a.argmax(axis=1)][0], ROWS),
+        (lambda r, t, a, b, d: r + d * b.max(axis=1), "When the episode has terminated"),
+        (lambda r, t, a, b, d: doubled(online, lagging)(r, t, a, b, 1.0), "With a discount of 0"),
+    ],
+    networks.check_loss: [
+        (huber, "Right."),
+        (lambda e: None, "Not done yet"),
+        (lambda e: huber(e) + 1, "Without an error there is no loss."),
+        (lambda e: e, "A loss is never below 0."),
+        (lambda e: e**2 / 2 if e < 1 else e - 0.5, "An error above and one below"),
+        (abs, "Between -1 and 1 it has to be half the square"),
+        (lambda e: e**2 / 2, "Beyond 1 it has to be a straight line"),
+        (lambda e: e**2 / 2 if abs(e) < 1 else abs(e), "It jumps where"),
+        (lambda e: e**2 / 2 if abs(e) < 1 else 2 * abs(e) - 1.5, "It bends whe"),
+    ],
+    figures.check_score: [
+        (score, "Right."),
+        (lambda *_: None, "Not done yet"),
+        (lambda x: x, "It fails when it is called"),
+        (lambda x, top, low: top - x, "The optimum has the score 0"),
+        (lambda x, top, low: 1 - score(x, top, low), "The optimum has the sco"),
+        (lambda x, top, low: x / top, "The baseline has to have the score 0"),
+        (lambda x, top, low: (x - low) / top, "The optimum has to have the sc"),
+        (lambda *all_: max(score(*all_), 0), "Who is worse than the baseline"),
+        (lambda *all_: score(*all_) ** 3, "In the middle between baseline and optimum"),
+        (lambda x, *_: (x + 20) / 100, "It is right for one optimum"),
+    ],
+    figures.check_gain: [
+        (gain, "Right."),
+        (lambda *_: ..., "Not done yet"),
+        (lambda r, a, e: r, "Where new and old probability are equal"),
+        (
+            lambda r, a, e: a * (1 if a > 0 else r),
+            "Within the bounds the gain is the ratio times the advantage.",
+        ),
+        (
+            lambda r, a, e: a * (r if a > 0 else 1),
+            "Within the bounds the gain is the ratio times the advantage, below 0",
+        ),
+        (lambda r, a, e: r * a, "Nothing is bounded"),
+        (
+            lambda r, a, e: max(r * a, np.clip(r, 1 - e, 1 + e) * a),
+            "A good action (advantage above",
+        ),
+        (
+            lambda r, a, e: np.clip(r, 1 - e, 1 + e) * a,
+            "A good action that has become much less pr",
+        ),
+        (
+            lambda r, a, e: min(r, 1 + e) * a,
+            "A bad action (advantage below 0) that has become much",
+        ),
+        (lambda r, a, e: gain(r, a, e) if a > 0 else r * a, "A bad action must gain no more"),
+        (lambda r, a, e: gain(r, a, 0.2), "Epsilon is not always 0.2."),
+    ],
+    figures.check_wins: [
+        (wins, "Right."),
+        (lambda *_: None, "Not done yet"),
+        (lambda x, y: np.sum(x[:, None] > y), "A share lies between 0 and 1"),
+        (lambda x, y: np.mean(x > y), "It depends on the order of the seeds."),
+        (lambda x, y: np.mean(x[:, None] > y), "Two agents that always tie win"),
+        (lambda x, y: wins(y, x), "It is the share that the second agent wins."),
+        (lambda x, y: wins(x, y) if y[0] else 0.4, "What the first wins the second loses"),
+        (
+            lambda x, y: 0.5 + np.clip(x.mean() - y.mean(), -5, 5) / 10,
+            "How far a run is ahead must",
+        ),
+        (
+            lambda x, y: 0.5 + np.sign(np.median(x) - np.median(y)) / 2,
+            "Three runs against three ar",
+        ),
+        (
+            lambda x, y: wins(x[: len(y)], y[: len(x)]),
+            "It is right where both have the same number",
+        ),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("check", "answer", "said"),
+    [
+        pytest.param(check, answer, said, id=f"{check.__name__}: {said}")
+        for check, rows in CASES.items()
+        for answer, said in rows
+    ],
+)
+def test_what_is_said_of_an_answer(check, answer, said):
+    assert check(answer).startswith(said)
+
+
+@hypothesis.given(st.integers(0, 2**32 - 1), st.floats(0, 0.99))
+def test_values_of_any_policy_are_right(seed, discount):
+    policy = np.random.default_rng(seed).dirichlet(np.ones(4), size=16)
+    values = solved(policy, discount)
+    assert checker.check_policy_values(MODEL, policy, discount, values) == "Right."
+    state = int(np.random.default_rng(seed).choice(np.flatnonzero(MODEL.reachable)))
+    values[state] += 0.01
+    said = checker.check_policy_values(MODEL, policy, discount, values)
+    assert said != "Right."
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (..., "Not done yet."),
+        (None, "Not done yet."),
+        ("many", "It has to be an array of numbers, one value for each state."),
+        (np.ones(15), "The shape has to be (16,), one value for each state; it is (15,)."),
+        (np.full(16, np.nan), "There are numbers in it that are not finite."),
+        (value_iteration(MODEL, DISCOUNT).values, "They are those of an agent that always takes"),
+        (solved(RANDOM, discount=1 - 1e-12), "The discount is missing"),
+    ],
+)
+def test_mistakes_in_values_are_named(values, said):
+    assert checker.check_policy_values(MODEL, RANDOM, DISCOUNT, values).startswith(said)
+
+
+def test_the_state_that_disagrees_most_is_named_and_no_answer():
+    values = solved(RANDOM)
+    values[9] += 0.5
+    said = checker.check_policy_values(MODEL, RANDOM, DISCOUNT, values)
+    assert "most in state 9: yours is higher" in said
+    assert f"{solved(RANDOM)[9]:.3f}" not in said
+
+
+def test_values_that_go_on_after_the_end_are_named():
+    """One state, whose only step earns 1 and ends the episode."""
+    model = TransitionModel(
+        prob=np.ones((1, 1, 1)),
+        next_state=np.zeros((1, 1, 1), dtype=int),
+        reward=np.ones((1, 1, 1)),
+        terminated=np.ones((1, 1, 1), dtype=bool),
+        initial=np.ones(1),
+    )
+    assert checker.check_policy_values(model, np.zeros(1), 0.5, np.ones(1)) == "Right."
+    for check, more in ((checker.check_policy_values, [[0]]), (checker.check_optimal_values, [])):
+        assert check(model, *more, 0.5, np.full(1, 2.0)).startswith("They go on after the end")
+
+
+def test_optimal_values():
+    best = value_iteration(MODEL, DISCOUNT).values
+    assert checker.check_optimal_values(MODEL, DISCOUNT, best) == "Right."
+    assert policy_iteration(MODEL, DISCOUNT).values == pytest.approx(best)
+    few = np.zeros(16)
+    for _ in range(25):
+        few = checker.looked_ahead(MODEL, DISCOUNT, few).max(axis=1)
+    assert "too few sweeps" in checker.check_optimal_values(MODEL, DISCOUNT, few)
+    said = checker.check_optimal_values(MODEL, DISCOUNT, solved(RANDOM))
+    assert said.startswith("They are those of random actions")
+
+
+def test_action_values():
+    values = solved(RANDOM)
+    right = checker.looked_ahead(MODEL, DISCOUNT, values)
+    assert checker.check_action_values(MODEL, DISCOUNT, values, right) == "Right."
+    undiscounted = checker.looked_ahead(MODEL, 1.0, values)
+    said = checker.check_action_values(MODEL, DISCOUNT, values, undiscounted)
+    assert said == "The discount is missing."
+    right[14, 2] -= 1
+    said = checker.check_action_values(MODEL, DISCOUNT, values, right)
+    assert "at 1 of 64 places, most in state 14, action 2: yours is lower" in said
+
+
+def test_greedy_policies():
+    plan = value_iteration(MODEL, DISCOUNT)
+    assert checker.check_greedy(MODEL, DISCOUNT, plan.values, plan.policy) == "Right."
+    worse = plan.policy.copy()
+    worse[14] = 0
+    said = checker.check_greedy(MODEL, DISCOUNT, plan.values, worse)
+    assert said.startswith(
+        "1 states have a better action by these values. In state 14 the action 0"
+    )
+    said = checker.check_greedy(MODEL, DISCOUNT, plan.values, np.full(16, 4))
+    assert said == "Actions are the numbers 0 to 3."
+
+
+@pytest.mark.parametrize(
+    ("target", "kind", "said"),
+    [
+        (q_target, "qlearning", "Right."),
+        (sarsa_target, "sarsa", "Right."),
+        (expected_target, "expected_sarsa", "Right."),
+        (lambda *_: None, "qlearning", "It cannot be called or gives no number"),
+        (lambda *_: "one", "qlearning", "It cannot be called or gives no number: could not"),
+        (lambda r, d, t, v: v[9], "qlearning", "It cannot be called or gives no number: index 9"),
+        (lambda *_: float("nan"), "qlearning", "It gives a number that is not finite."),
+        (lambda *_, **__: float("nan"), "expected_sarsa", "It gives a number that is not finite."),
+        (lambda r, d, t, v: r + d * v.max(), "qlearning", "When the episode has terminated"),
+        (lambda r, d, t, v: r if t else r + v.max(), "qlearning", "With a discount of 0"),
+        (lambda r, d, t, v: r, "qlearning", "If all next values rise by 1"),
+        (lambda r, d, t, v: r if t else r + d * v.mean(), "qlearning", "If the best next value"),
+        (
+            lambda r, d, t, v, next_action: r if t else r + d * v.max(),
+            "sarsa",
+            "The target has to follow the value of the next action",
+        ),
+        (best_left_out, "expected_sarsa", "With epsilon 1 all actions are equally probable"),
+        (
+            lambda r, d, t, v, epsilon: r if t else r + d * v.mean(),
+            "expected_sarsa",
+            "With epsilon 0 the policy is greedy",
+        ),
+    ],
+)
+def test_targets(target, kind, said):
+    assert checker.check_target(target, kind).startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("regret", "said"),
+    [
+        (np.cumsum([0.7, 0.0, 0.4, 0.7, 0.0]), "Right."),
+        (..., "Not done yet."),
+        (np.ones(3), "The shape has to be (5,)"),
+        ([0.7, 0.0, 0.4, 0.7, 0.0], "Regret never falls, but yours does at pull 2."),
+        (np.cumsum([0.7, 0.1, 0.4, 0.7, 0.1]), "A pull of the best arm loses nothing"),
+        (np.cumsum([1.0, 0.0, 0.4, 0.0, 0.0]), "Pulls of arm 0 add different amounts."),
+        (np.cumsum([0.2, 0.0, 0.4, 0.2, 0.0]), "A pull of arm 0 adds the wrong amount"),
+    ],
+)
+def test_regret(regret, said):
+    assert checker.check_regret(MEANS, ARMS, regret).startswith(said)
+
+
+def test_means_of_the_lambda_return():
+    values = np.random.default_rng(0).normal(size=21)
+    for decay, given in ((0.8, ZEROS), (0.3, values), (0.8, values)):
+        means = lambda_means(given, decay)
+        assert traces.check_lambda_targets(WALK, decay, given, means) == "Right."
+        means[4] += 0.01
+        said = traces.check_lambda_targets(WALK, decay, given, means)
+        assert "places, most in state 4: yours is higher" in said
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (..., "Not done yet."),
+        (np.zeros(19), "The shape has to be (21,)"),
+        (n_step_means(ZEROS, 1), "They look one step ahead only"),
+        ((np.arange(21) - 10) / 10, "No estimate is in them any more"),
+        (lambda_means(ZEROS, 0.8, lambda k: 0.8**k), "The weights have to sum up to 1"),
+        (lambda_means(ZEROS, 0.8, lambda k: 0.2 * 0.8 ** (k + 1)), "All weights are too small"),
+        (n_step_means(ZEROS, 5), "The two sides"),
+    ],
+)
+def test_mistakes_in_means_are_named(answer, said):
+    assert traces.check_lambda_targets(WALK, 0.8, ZEROS, answer).startswith(said)
+
+
+def test_a_sum_that_ends_too_early_is_near():
+    said = traces.check_lambda_targets(WALK, 0.8, ZEROS, lambda_means(ZEROS, 0.8, n=20))
+    assert said.endswith("They are near: perhaps the sum ends too early.")
