@@ -1,4 +1,4 @@
-"""Agents and environments of one's own, as extending.md and own-agent.md have them: one file each."""
+"""Agents and environments of one's own: as two pages write them, and in one file each."""
 
 import json
 import re
@@ -52,18 +52,48 @@ def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("the environment's P is not what step does: state ")
 
 
-def test_a_wrong_value_of_an_agents_own_setting_is_refused_in_a_line(
-    own_folder, type_in_own_folder
-):
-    (own_folder / "cautious.py").write_text(dict(FILES)["cautious.py"])
-    words = "train.py --gym-packages cautious --env FrozenLake-v1 --algo cautious -n 9"
-    code, _, err = type_in_own_folder(*words.split(), "-params", "caution:2")
-    assert (code, err.count("\n")) == (2, 1)
-    assert "caution" in err
-
-
 # --- one file, whose lines are counted ------------------------------------------------------------
 
+RULE = '''
+"""Cautious Q-learning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import agents
+from agents.common.exploration import highest_value
+from agents.common.settings import check_share, settings_of
+from agents.tabular.algorithm import TabularAlgorithm
+from agents.tabular.updates import TabularAgent
+from machine_code.compiling import inlined
+
+agents.register("cautious", "cautious:Cautious", observations="Discrete", actions="Discrete")
+
+
+@inlined
+def cautious_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
+    """The best next action's value, mixed with the mean of all."""
+    mean, caution = agent.room.values.mean(), agent.settings.caution
+    return caution * mean + (1.0 - caution) * highest_value(agent.room.values)
+
+
+class Cautious(TabularAlgorithm):
+    """Q-learning that trusts the best next action only in part: ``caution``, in [0, 1]."""
+
+    parameters = {"caution": np.float64}
+    next_value = cautious_value
+
+    def __init__(self, *args: Any, caution: float = 0.1, **kwargs: Any) -> None:
+        self.caution = caution
+        super().__init__(*args, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_share(settings_of(self, "caution"))
+'''
 INDEX = '''
 """MOSS."""
 
@@ -127,11 +157,13 @@ class Pond(GridWorld):
 @pytest.mark.parametrize(
     ("name", "text", "most_lines", "words", "engine"),
     [
+        ("cautious", RULE, 50, "--env FrozenLake-v1 --algo cautious -n 300 -params caution:0.3",
+         "compiled"),
         ("moss", INDEX, 30, "--env BernoulliBandit-v0 --algo moss -n 200", None),
         ("pond", GRID, 35, "--env my/Pond-v0 --algo qlearning -n 2000", "compiled"),
     ],
 )  # fmt: skip
-def test_an_index_or_a_grid_world_is_one_file(
+def test_a_rule_an_index_or_a_grid_world_is_one_file(
     own_folder, type_in_own_folder, name, text, most_lines, words, engine
 ):
     assert len(text.strip().splitlines()) <= most_lines
@@ -142,7 +174,13 @@ def test_an_index_or_a_grid_world_is_one_file(
     record = json.loads(path.read_text())
     assert record["final"]["exact"]
     assert record.get("engine") == engine or engine is None
-    if name == "moss":
+    if name == "cautious":
+        assert record["spec"]["hyperparams"]["caution"] == 0.3
+        # A wrong value of its setting is refused in a line.
+        code, _, err = type_in_own_folder(*command[:-1], "caution:2")
+        assert (code, err.count("\n")) == (2, 1)
+        assert "caution" in err
+    elif name == "moss":
         assert 0 < record["regret"] < 100  # of 200 pulls, each of which can cost half a click
     else:
         assert record["final"]["optimum"] > -10

@@ -7,7 +7,6 @@ import shutil
 import time
 
 import gymnasium as gym
-import numpy as np
 import pytest
 from gymnasium.envs.toy_text import TaxiEnv
 from rich.console import Console
@@ -124,7 +123,6 @@ class Browser:
               names: plot.data.map((trace) => trace.name).filter((name) => name),
               axes: [plot.layout.xaxis.title?.text, plot.layout.xaxis.type,
                      plot.layout.yaxis.title?.text],
-              tickText: plot.layout.yaxis.ticktext,
               ink: plot.layout.font.color,
               shapes: plot.layout.shapes?.length,
             };
@@ -213,19 +211,6 @@ def test_the_toggles_change_the_curves(page):
     assert page.figure("#curves .plot")["names"] == before["names"]
 
 
-def test_an_axis_for_returns_that_dwarf_the_others(page):
-    assert not page.find('[data-switch="scale"]').is_displayed()
-    page.select("#environment", 1)  # where random actions cost 27,000
-    assert page.find('[data-switch="scale"]').is_displayed()
-    compressed = page.figure("#curves .plot")
-    assert "-10,000" in compressed["tickText"]
-    page.choose("scale", "linear")
-    plain = page.figure("#curves .plot")
-    assert plain["tickText"] is None
-    assert min(v for y in plain["y"] for v in y) < -10_000
-    assert min(v for y in compressed["y"] for v in y) > -10
-
-
 def test_a_heading_sorts_the_ranking(page):
     rows = "#ranking figure:not([hidden]) tbody tr th"
     ranked = page.shown(rows)
@@ -256,35 +241,29 @@ def test_the_environment_changes_everywhere(page):
 
 
 def test_maps_go_through_the_training_and_tell_each_cell(page):
-    slider, (optimum, board, _) = page.find("#progress"), page.all(".board")
+    slider, board = page.find("#progress"), page.all(".board")[1]
     assert slider.get_attribute("aria-valuetext") == "after 2,000 steps"
     last = board.get_attribute("innerHTML")
     slider.send_keys(Keys.HOME)
     label = page.find("#policies output").text
-    assert label.startswith("after ")
     assert slider.get_attribute("aria-valuetext") == label != "after 2,000 steps"
     assert page.all(".board")[1].get_attribute("innerHTML") != last
-    slider.send_keys(Keys.ARROW_RIGHT)
-    assert page.find("#policies output").text != label
     slider.send_keys(Keys.END)
     optimum, *boards = page.all(".board")
     assert boards[0].get_attribute("innerHTML") == last
     # What is not optimal is marked.
-    assert optimum.text.startswith("optimum")
     assert optimum.find_elements(By.CSS_SELECTOR, ".differs") == []
     for each in boards:
         marked = len(each.find_elements(By.CSS_SELECTOR, ".differs"))
         assert f"{11 - marked} of 11 cells" in each.text
-    page.run(
-        "document.querySelector('.board [data-cell=\"14\"]')"
-        ".dispatchEvent(new PointerEvent('pointerover', {bubbles: true}))"
-    )
+    # The arrows go from cell to cell.
     told = page.find("#policies .cell")
+    keys = page.all(".board svg")[1]
+    keys.send_keys(Keys.ARROW_RIGHT)
+    assert told.text.startswith("row 1, column 1: optimum 0.7442 (left)")
+    keys.send_keys(*[Keys.ARROW_DOWN] * 4, *[Keys.ARROW_RIGHT] * 2)
     assert told.text.startswith("row 4, column 3: optimum 0.924 (down)")
-    page.all(".board svg")[1].send_keys(Keys.ARROW_RIGHT)
     assert told.get_attribute("aria-live") == "polite"
-    page.select("#policies .seed select", 1)
-    assert page.all(".board")[1].get_attribute("innerHTML") != last
 
 
 def test_films_play_and_stop_and_stand_still_for_those_who_ask(page, report_study):
@@ -360,11 +339,9 @@ def test_verdicts_and_tables_to_take_along(page, report_study):
         ]
         for markup in MARKUPS
     ]
-    csv = "return report.csv(document.querySelector(arguments[0]))"
-    first, *lines = page.run(csv, "#ranking table").splitlines()
-    assert first.startswith('Agent,"Mean, over seeds",')
-    assert sorted(line[:5] for line in lines) == ["</scr", "Q-lea", "sarsa"]
-    assert 0 <= float(lines[0].split(",")[1]) <= 1
+    csv = page.run("return report.csv(document.querySelector('#ranking table'))").splitlines()
+    assert csv[0].startswith('Agent,"Mean, over seeds",')
+    assert sorted(line[:5] for line in csv[1:]) == ["</scr", "Q-lea", "sarsa"]
     # A label that a spreadsheet would run.
     guarded = page.run(
         """
@@ -426,17 +403,11 @@ def test_a_study_on_bandits(browser, do_study, tmp_path):
     assert regret["axes"][:2] == ["pulls (log scale)", "log"]
     assert "Auer, for UCB1" in regret["names"]
     browser.choose("pull-axis", "linear")
-    assert browser.figure("#pull-regret")["axes"][1] == "linear"
     browser.choose("pull-spread", "runs")
-    assert browser.figure("#pull-regret")["y"] != regret["y"]
-    # One context has nothing to choose from.
-    assert not browser.find(".pick.context").is_displayed()
-    assert len(browser.shown("#bandits figure tbody tr th")) == 4
+    other = browser.figure("#pull-regret")
+    assert (other["axes"][1], other["y"] != regret["y"]) == ("linear", True)
     browser.select("#environment", 1)
-    rows = browser.shown("#bandits figure tbody tr th")
-    assert (len(rows), rows[-1]) == (8, "context 1, regret of a pull")
     last = browser.figure("#pull-posteriors")
-    assert last["names"] == ["arm 0", "arm 1", "arm 2"]
     browser.select(".pick.context select", 1)
     casual = browser.figure("#pull-posteriors")
     assert casual["y"] != last["y"]
@@ -444,9 +415,6 @@ def test_a_study_on_bandits(browser, do_study, tmp_path):
     first = browser.figure("#pull-posteriors")
     # A density that knows less is lower.
     assert max(v for y in first["y"] for v in y) < max(v for y in casual["y"] for v in y)
-    browser.click(browser.find("#bandits .legend button"))
-    assert len(browser.figure("#pull-optimal")["names"]) == 1
-    assert len(browser.figure("#arm-shares")["names"]) == 1
     browser.asks_nobody(path)
 
 
@@ -557,14 +525,6 @@ def test_steps_are_played_forwards_and_back(browser, played):
     browser.press(Keys.HOME)
     assert moment.text == "step 0 of 400"
     assert browser.all(".board .moved") == []
-    # It jumps to episodes and to large errors.
-    moves = recorder.moves.rows
-    ends = np.flatnonzero(moves["end"])
-    browser.press("n")
-    assert moment.text.startswith(f"step {ends[0] + 2} of")
-    for key, episode in (("", "2,"), ("n", "3,"), ("p", "2,")):
-        browser.press(key)
-        assert fact(browser, "episode").startswith(episode)
     # It plays and pauses by the space bar.
     browser.press(Keys.HOME, "+", "+", "+", " ")
     assert browser.find("#play").get_attribute("aria-pressed") == "true"
