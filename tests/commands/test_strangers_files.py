@@ -95,29 +95,23 @@ def check_refused(answer, mark, *words):
 # --- zips ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("where", ["its path", "its folder", "-f"])
-def test_a_zip_is_played(type_in_own_folder, evil_zip, mark, own_folder, where):
-    words = {"its path": [evil_zip], "its folder": [evil_zip.parent]}
-    if where == "-f":
-        (own_folder / "ppo").mkdir()
-        evil_zip.parent.rename(own_folder / "ppo" / f"{ENV}_1")
-    given = words.get(where, ["-f", own_folder, "--algo", "ppo", "--env", ENV])
-    answer = type_in_own_folder("enjoy.py", *given, *PLAY)
-    check_refused(answer, mark, "ep_info_buffer", "posix.mkdir")
-
-
-def test_training_goes_on_from_a_zip(type_in_own_folder, evil_zip, mark, own_folder):
-    words = ["--algo", "ppo", "--env", ENV, "-n", "8", "-i", evil_zip, "-params", "n_steps:8"]
-    check_refused(type_in_own_folder("train.py", *words), mark, "ep_info_buffer")
-    assert not list((own_folder / "logs").rglob("run.json"))
-
-
-def test_a_policy_is_judged_on_a_log(type_in_own_folder, evil_zip, mark, own_folder):
+def test_a_zip_is_played_trained_further_or_judged(type_in_own_folder, evil_zip, mark, own_folder):
     with gym.make(ENV) as env:
         log_uniformly(env, 100, 0, own_folder / "log.csv")
-    for path in (evil_zip, evil_zip.parent):
-        answer = type_in_own_folder("compare.py", "--logged", "log.csv", "--policy", path)
-        check_refused(answer, mark, "ep_info_buffer")
+    choice = ["--algo", "ppo", "--env", ENV]
+    for words in (
+        ["enjoy.py", evil_zip, *PLAY],
+        ["enjoy.py", evil_zip.parent, *PLAY],
+        ["train.py", *choice, "-n", "8", "-i", evil_zip, "-params", "n_steps:8"],
+        ["compare.py", "--logged", "log.csv", "--policy", evil_zip],
+        ["compare.py", "--logged", "log.csv", "--policy", evil_zip.parent],
+    ):
+        check_refused(type_in_own_folder(*words), mark, "ep_info_buffer", "posix.mkdir")
+    assert not list((own_folder / "logs").rglob("run.json"))
+    (own_folder / "ppo").mkdir()
+    evil_zip.parent.rename(own_folder / "ppo" / f"{ENV}_1")
+    answer = type_in_own_folder("enjoy.py", "-f", own_folder, *choice, *PLAY)
+    check_refused(answer, mark, "ep_info_buffer", "posix.mkdir")
 
 
 def test_a_film_is_made_of_a_copied_study(evil_zip, mark):
@@ -224,8 +218,17 @@ STRANGERS = {
 }
 
 
-@pytest.mark.parametrize("road", ["beside a typed module", "PYTHONPATH", "loaded by a typed one"])
-@pytest.mark.parametrize("way", STRANGERS)
+ROADS = ("beside a typed module", "PYTHONPATH", "loaded by a typed one")
+
+
+# Each way by one road, and what looks installed, which is the hardest to tell, by all.
+@pytest.mark.parametrize(
+    ("way", "road"),
+    [
+        *zip(STRANGERS, (*ROADS, *ROADS), strict=False),
+        *(("one that says it is installed", road) for road in ROADS[:2]),
+    ],
+)
 def test_settings_name_a_class_of_a_strangers(
     type_in_own_folder, own_folder, monkeypatch, way, road
 ):

@@ -1,4 +1,4 @@
-"""Output that nobody reads to its end, or that cannot be written."""
+"""What a machine refuses to a command: readers, room for its output, memory."""
 
 import errno
 import io
@@ -69,9 +69,30 @@ def run(monkeypatch):
     return do
 
 
-def test_a_command_that_is_read_to_its_end_is_left_alone(run):
-    main, work = printing(2, ends=1)
-    assert run(main, errno.EPIPE) == (1, "0\n1\n", "")
+FULL = os.strerror(errno.ENOSPC)
+LOST = f"train.py: what it prints is lost: {FULL}\n"
+ENDS = [  # lines printed, whether work goes on unread, the error; exit code, what is said
+    (2, False, errno.EPIPE, 1, ""),  # all of it is read
+    (9, False, errno.EPIPE, 0, ""),  # the output is the work, which ends with its reader
+    (9, True, errno.EPIPE, 1, ""),  # the exit code is that of the work
+    (9, False, errno.ENOSPC, 2, f"train.py: error: {FULL}\n"),
+    (9, True, errno.ENOSPC, 1, LOST),
+]
+
+
+@pytest.mark.parametrize(("n_lines", "goes_on", "number", "code", "said"), ENDS)
+def test_how_a_command_ends_whose_output_is_not_taken(run, n_lines, goes_on, number, code, said):
+    main, work = printing(n_lines, ends=1, goes_on=goes_on)
+    assert run(main, number) == (code, "0\n1\n", said)
+    assert work == ["done"] * (goes_on or n_lines == 2)
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "said"), [(errno.EPIPE, 0, ""), (errno.ENOSPC, 2, LOST)]
+)
+def test_work_that_succeeds_unread_is_lost_only_where_it_cannot_be_written(run, number, code, said):
+    main, work = printing(9, goes_on=True)
+    assert run(main, number) == (code, "0\n1\n", said)
     assert work == ["done"]
 
 
@@ -95,39 +116,6 @@ def test_a_thread_that_says_how_far_it_is_ends_without_a_word(run):
 
     assert run(main, errno.EPIPE, 0) == (0, "", "")
     assert work == []
-
-
-def test_where_the_output_is_the_work_it_ends_with_its_reader(run):
-    main, work = printing(9, ends=1)
-    assert run(main, errno.EPIPE) == (0, "0\n1\n", "")
-    assert work == []
-
-
-def test_where_it_is_not_the_work_goes_on_without_a_word(run):
-    main, work = printing(9, goes_on=True)
-    assert run(main, errno.EPIPE) == (0, "0\n1\n", "")
-    assert work == ["done"]
-
-
-def test_the_exit_code_is_that_of_the_work(run):
-    main, _ = printing(9, ends=1, goes_on=True)
-    assert run(main, errno.EPIPE)[0] == 1
-    main, _ = printing(9, ends=1, goes_on=True)
-    assert run(main, errno.ENOSPC)[0] == 1
-
-
-def test_output_that_cannot_be_written_ends_in_one_line(run):
-    main, work = printing(9)
-    message = f"train.py: error: {os.strerror(errno.ENOSPC)}\n"
-    assert run(main, errno.ENOSPC) == (2, "0\n1\n", message)
-    assert work == []
-
-
-def test_or_the_work_goes_on_after_that_line(run):
-    main, work = printing(9, goes_on=True)
-    message = f"train.py: what it prints is lost: {os.strerror(errno.ENOSPC)}\n"
-    assert run(main, errno.ENOSPC) == (2, "0\n1\n", message)
-    assert work == ["done"]
 
 
 def test_a_mistake_is_told_where_nobody_hears_it(monkeypatch):
@@ -161,6 +149,44 @@ def test_streams_that_were_closed_are_opened_on_nothing(monkeypatch):
         assert output.name == os.devnull
         print("to nobody")  # noqa: T201  # as a library might
         output.close()
+
+
+# --- a machine that has no more memory, threads or processes -----------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (MemoryError(), "this machine gives no more memory"),
+        (MemoryError("Unable to allocate 4 GiB"), "no more memory: Unable to allocate 4 GiB"),
+        (
+            RuntimeError("[enforce fail at alloc_cpu.cpp:1]\nDefaultCPUAllocator: can't allocate "),
+            None,
+        ),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory:\nyou tried 9 bytes"),
+            "no more memory: DefaultCPUAllocator: can't allocate memory: you tried 9 bytes",
+        ),
+        (ImportError("libtorch.so: failed to map segment from shared object"), "no more memory: "),
+        (RuntimeError("can't start new thread"), "no more threads or processes: "),
+        (RuntimeError("a bug"), None),
+        (ImportError("No module named 'x'"), None),
+    ],
+)
+def test_what_runs_out_is_named_and_a_bug_is_not_hidden(error, line, capsys):
+    def main():
+        raise error
+
+    if line is None:
+        with pytest.raises(type(error)):
+            run_command(main)
+        return
+    with pytest.raises(SystemExit) as stop:
+        run_command(main)
+    said = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert line in said
+    assert said.count("\n") == 1
 
 
 # --- real processes ------------------------------------------------------------------------------
