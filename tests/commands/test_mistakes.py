@@ -118,10 +118,13 @@ LATE = [
     ("compare.py bad.yml", "bad", "bad.yml:1: qlearning: gamma"),
 ]
 
+CASES = [*((line, "", complaint) for line, complaint in MISTAKES), *LATE]
+
 
 @pytest.mark.parametrize(
     ("line", "head", "complaint"),
-    [*((line, "", complaint) for line, complaint in MISTAKES), *LATE],
+    CASES,
+    ids=[line for line, *_ in CASES],
 )
 def test_one_line_and_nothing_left(type_in_own_folder, own_folder, line, head, complaint):
     for name, text in FILES.items():
