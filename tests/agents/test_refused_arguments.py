@@ -135,7 +135,10 @@ CASES = [(name, *case) for name, cases in REFUSED.items() for case in cases]
 @pytest.mark.parametrize(
     ("name", "arguments", "line"),
     CASES,
-    ids=[f"{name} {next(reversed(arguments.items()))}" for name, arguments, _ in CASES],
+    ids=[
+        f"{name} {key}={value if isinstance(value, str | float) else type(value).__name__}"
+        for name, (*_, (key, value)) in ((name, given.items()) for name, given, _ in CASES)
+    ],
 )
 def test_wrong_arguments(name, arguments, line):
     usual = "SegmentBandit-v0" if ALGORITHMS[name].for_bandits else "FrozenLake-v1"
