@@ -135,8 +135,9 @@ CASES = [(name, *case) for name, cases in REFUSED.items() for case in cases]
 @pytest.mark.parametrize(
     ("name", "arguments", "line"),
     CASES,
+    # Spaces have no text of their own.
     ids=[
-        f"{name} {key}={value if isinstance(value, str | float) else type(value).__name__}"
+        f"{name} {key}={value if isinstance(value, str | float) or key != 'env' else 'spaces'}"
         for name, (*_, (key, value)) in ((name, given.items()) for name, given, _ in CASES)
     ],
 )
