@@ -55,7 +55,7 @@ def moments():
         "training": (StateSaver, "_on_step", lambda *_: next(calls) == 3),
         "evaluating": (callbacks.EvaluationCallback, "_append", always),
         "saving": (files, "put_in_place", lambda draft, path, *_: path.name == "FrozenLake-v1.zip"),
-        "judging": (training, "_final_evaluation", always),
+        "judging": (training, "_judge", always),
         "drawing": (training, "draw_learning_curve", always),
         "recording": (Run, "end", always),
         "closing": (training, "close_environments", always),
