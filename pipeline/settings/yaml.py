@@ -164,7 +164,7 @@ def parse_yaml(content: str | bytes, where: str, loader: type[StrictLoader] = St
 
 @lru_cache(maxsize=32)  # a study asks for the same entries again and again
 def _load(content: str | bytes, loader_class: Any) -> Any:
-    return yaml.load(content, loader_class)  # noqa: S506  # stricter than the safe one
+    return yaml.load(content, loader_class)  # noqa: S506  # a subclass of SafeLoader
 
 
 def read_yaml(path: Path) -> Any:

@@ -97,6 +97,7 @@ PLAYED = [
     *(([*LAKE, *which], 100) for which in ([], ["--exp-id", "1"])),
     ([*LAKE, "--load-checkpoint", "40"], 40),
     ([*LAKE, "--load-last-checkpoint"], 80),
+    ([*LAKE, "--load-best"], 40),  # a checkpoint in its place
     ([RUN], 100),
     ([f"{RUN}/FrozenLake-v1"], 100),
     ([f"{RUN}/rl_model_40_steps.zip"], 40),
@@ -105,6 +106,8 @@ PLAYED = [
 
 @pytest.mark.parametrize(("choice", "n_steps"), PLAYED)
 def test_what_is_chosen_is_played_and_trained_further(type_command, lake, choice, n_steps):
+    if "--load-best" in choice:
+        shutil.copy(lake / "rl_model_40_steps.zip", lake / "best_model.zip")
     code, out, err = type_command("enjoy.py", *choice, "--no-render", "--n-episodes", "3")
     assert (code, err, len(episodes(out))) == (0, "", 3)
     assert re.search(r"return \d\.\d\d ± \d\.\d\d over 3 episodes", out)

@@ -269,10 +269,11 @@ def test_the_command_to_watch_with_names_modules():
     assert command.endswith(" --env Lake-v1 --gym-packages one './my two.py'")
 
 
-def test_a_long_setting_is_cut_short_in_the_header():
+@pytest.mark.parametrize(("length", "shown"), [(200, "S" * 200), (201, "S" * 200 + "...")])
+def test_a_long_setting_is_cut_short_in_the_header(length, shown):
     console = console_of(1000)
-    print_header(console, spec_of(env_kwargs={"desc": ["S" * 100] * 100}, n_timesteps=1))
-    assert len(console.file.getvalue()) < 400
+    print_header(console, spec_of(env_wrapper="S" * length, n_timesteps=1))
+    assert f"env_wrapper={shown}" in console.file.getvalue().replace("\n", "  ").split("  ")
 
 
 # --- into a file or a pipe ------------------------------------------------------------------------

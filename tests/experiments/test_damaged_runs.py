@@ -203,7 +203,13 @@ WRONG_ARRAYS = {
     "flat shares": ("batch", STATISTICS_FILE, "shares", np.ravel),
     "few runs": ("batch", STATISTICS_FILE, "total_reward", lambda total: total[1:]),
     "no actions": ("grid", "value_maps.npz", "actions", None),
-    "actions that there are not": ("grid", "value_maps.npz", "actions", lambda a: a + 9),
+    "actions that there are not": (
+        "grid",
+        "value_maps.npz",
+        "actions",
+        lambda a: a * 0 + 4,
+    ),  # of 0 to 3
+    "actions below 0": ("grid", "value_maps.npz", "actions", lambda a: -a - 1),
     "actions of floats": ("grid", "value_maps.npz", "actions", lambda a: a * 1.0),
     "no values": ("grid", "value_maps.npz", "values", lambda values: values * np.nan),
     "few values": ("grid", "value_maps.npz", "values", lambda values: values[:, 1:]),

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import heapq
 import json
+import math
 import os
 import platform
 import re
@@ -51,7 +52,9 @@ from experiments.run_folders import (
 from experiments.run_in_child import do_run, take_steps, warm_ups
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from machine_code.compiling import inlined
+from pipeline import state_saver
 from pipeline.errors import UserError
+from pipeline.state_files import MAGIC, SOURCES, read_state, state_key, write_state
 from pipeline.user_modules import UserModule, import_typed
 
 LAKE = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_timesteps": 20})
@@ -131,6 +134,7 @@ FAULTY = """
 import errno, pathlib, gymnasium as gym
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from pipeline.errors import UserError
+from pipeline.state_files import MAGIC, SOURCES, read_state, state_key, write_state
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 FAULTS = {
@@ -157,6 +161,26 @@ class Faulty(FrozenLakeEnv):
         return super().step(action)
 
 gym.register("Faulty-v0", Faulty, max_episode_steps=20)
+
+class Counting(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, path=""):
+        self.path = path
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        if self.path:
+            with open(self.path, "a") as steps:
+                steps.write(".")
+                if steps.tell() == 15:
+                    raise MemoryError
+        return 0, 0.0, False, False, {}
+
+gym.register("Counting-v0", Counting, max_episode_steps=4)
 """
 
 
@@ -165,7 +189,7 @@ def faulty_lake(tmp_path_factory):
     path = tmp_path_factory.mktemp("own") / "faulty_lake.py"
     path.write_text(FAULTY)
     yield import_typed([str(path)])
-    del gym.registry["Faulty-v0"]
+    del gym.registry["Faulty-v0"], gym.registry["Counting-v0"]
     del sys.modules["faulty_lake"]
 
 
@@ -203,6 +227,39 @@ def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(faulty, fault, i
         do_run(planned, draft, "c")
     leave_drafts(root, run_name(planned))
     assert draft.exists() == is_kept
+
+
+@pytest.mark.parametrize(("is_of_others", "n_steps"), [(False, 6), (True, 20)])
+def test_a_study_goes_on_from_states_of_its_own_sources_alone(
+    tmp_path, faulty_lake, monkeypatch, is_of_others, n_steps
+):
+    """Of 20 steps, a run that fails within the 15th has saved 14."""
+    monkeypatch.setattr(state_saver, "SHARE_OF_TIME", math.inf)  # it saves whenever it may
+    monkeypatch.setattr(state_saver, "SHORTEST_INTERVAL", 0.0)
+    steps = tmp_path / "steps"
+    settings = {"n_timesteps": 20, "train_env_kwargs": {"path": str(steps)}}
+    study = replace(
+        study_of(n_seeds=1),
+        environments=(EnvironmentSpec("counting", "Counting-v0", settings),),
+        user_modules=faulty_lake,
+        gym_packages=("faulty_lake",),
+    )
+    (planned,) = plan(study, tmp_path)
+    draft = draft_path(tmp_path, planned)
+    with pytest.raises(MemoryError):
+        do_run(planned, draft, "")
+    assert steps.stat().st_size == 15
+    saved = [
+        path for path in draft.rglob("*") if path.is_file() and path.read_bytes().startswith(MAGIC)
+    ]
+    for path in saved if is_of_others else ():
+        with path.open("rb") as file:
+            state = read_state(file, state_key())
+        with path.open("wb") as file:
+            write_state(file, state.content, {**state.note, SOURCES: "older"}, state_key())
+    do_run(planned, draft, "")
+    assert planned.is_finished
+    assert steps.stat().st_size == 15 + n_steps
 
 
 def test_every_run_is_told_of_and_failures_are_kept(faulty):
