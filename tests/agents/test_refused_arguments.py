@@ -128,6 +128,7 @@ REFUSED = {
     ],
     "lin_thompson": [({"alpha": -0.5}, "alpha must be at least 0, not -0.5")],
     "mabwiser_ucb1": [({"tie_breaking": "random"}, "tie_breaking must be first: MABWiser")],
+    "ppo": [({"engine": "fast", "policy": "MlpPolicy"}, "engine must be one of")],
 }
 CASES = [(name, *case) for name, cases in REFUSED.items() for case in cases]
 

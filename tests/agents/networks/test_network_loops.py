@@ -1,24 +1,27 @@
 """Networks trained in three loops: the library's, the same with compiled parts, the compiled one.
 
-The library, made to draw the numbers that compiled code draws, agrees up to rounding. The other two
-end in the same bits, wherever blocks of steps end and whatever callbacks there are.
+The library, made to draw the numbers that compiled code draws, agrees up to rounding, also in every
+weight after every step. The others end in the same bits, wherever blocks of steps end.
 """
 
+import copy
 from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import (
     BaseCallback,
-    CheckpointCallback,
-    EvalCallback,
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 from torch.distributions import Categorical
 
 import envs  # noqa: F401  # registers the environments
@@ -66,13 +69,14 @@ class Every(BlockCallback):
 
 
 def networks(name, env, n_envs, engine="compiled", rate=(1e-2, 1e-3, 0.8), width=(16,), **kwargs):
+    wrap = kwargs.pop("wrap", lambda env: env)
     return load_algorithm(name)(
         "MlpPolicy",
-        make_vec_env(env, n_envs, seed=3),
+        wrap(make_vec_env(env, n_envs, seed=3)),
         seed=5,
         engine=engine,
         learning_rate=LinearSchedule(*rate),
-        policy_kwargs={"net_arch": list(width)},
+        policy_kwargs={"net_arch": list(width), **kwargs.pop("policy_kwargs", {})},
         **kwargs,
     )
 
@@ -207,7 +211,8 @@ def followed(mode, case):
             draw_as_compiled(patch, model)
         asked = [diary] if mode == "blocks" else [diary, rollouts]
         model.learn(303, callback=asked, log_interval=log_interval)
-    assert (model.engine_in_use == "compiled") == (mode != "library")
+    expected = "library" if mode == "library" else "compiled"
+    assert model.engine_in_use.partition(" but")[0].partition(":")[0] == expected
     exact = [diary.exact, [(step, list(record)) for step, record in lists.dumps]]
     logged = [value for _, record in lists.dumps for value in record.values()]
     close = [*diary.close, *(value.numpy() for value in model.policy.state_dict().values())]
@@ -223,23 +228,86 @@ def followed(mode, case):
 Q = {"learning_starts": 20, "buffer_size": 120, "batch_size": 8, "target_update_interval": 10}
 PPO = {"n_steps": 24, "batch_size": 16, "n_epochs": 2}
 UNLIMITED = {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "gamma": 0.9}
+IDENTITY = {"activation_fn": nn.Identity}
+
+
+def policy(optimizer=None, net_arch=(16,), activation_fn=None, **kwargs):
+    """Settings of networks and of what moves their weights."""
+    found = {"net_arch": net_arch} | ({"activation_fn": activation_fn} if activation_fn else {})
+    if optimizer is not None:
+        found |= {"optimizer_class": optimizer, "optimizer_kwargs": kwargs}
+    return {"policy_kwargs": found}
+
+
+class Matrices(gym.Env):
+    """Observations of two dimensions in double precision, and no model."""
+
+    observation_space = spaces.Box(-1, 1, (2, 3), np.float64)
+    action_space = spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, (2, 3)), {}
+
+    def step(self, action):
+        obs, _ = self.reset()
+        return obs, float(obs[0, action]), bool(obs[1, 0] < -0.8), bool(obs[1, 1] < -0.8), {}
+
+
+def normalised(env, **kwargs):
+    """Statistics as they might be after a while."""
+    env = VecNormalize(env, clip_obs=1.5, clip_reward=0.8, **kwargs)
+    if env.norm_obs:
+        rng = np.random.default_rng(4)
+        env.obs_rms.mean, env.obs_rms.var = rng.normal(size=(2, 3)), rng.uniform(0.3, 2, (2, 3))
+    env.ret_rms.var = 7.0
+    return env
+
+
 CASES = {  # agent, environment, how many, episodes between two records, settings
     "dqn": ("dqn", lake, 1, 3, Q),
     "two environments": ("dqn", lake, 2, 3, {**Q, "gradient_steps": -1, "tau": 0.5}),
     "episodes": ("dqn", pole, 1, 3, {**Q, "train_freq": (2, "episode"), "gradient_steps": -1}),
     "steps": ("dqn", vectors, 2, 3, {**Q, "n_steps": 3, "train_freq": 3, "gradient_steps": 2}),
+    "more steps than episodes have": ("dqn", lake, 2, 3, {**Q, "n_steps": 40, "gamma": 0.9}),
     "double": ("double_dqn", pole, 2, 3, {**Q, "tau": 0.5}),
     "deep": ("deep_qlearning", lake, 1, 3, {**Q, "exploration_fraction": 0.5}),
     "no time limits": ("dqn", lake, 1, 3, {**Q, **UNLIMITED}),
     "greedy at once": ("dqn", vectors, 1, 3, {**Q, "exploration_fraction": 0.0}),
+    "no hidden layers": ("dqn", vectors, 1, 3, {**Q, **policy(net_arch=[])}),
+    "narrow": ("double_dqn", lake, 1, 3, {**Q, **policy(net_arch=[70, 1, 3], **IDENTITY)}),
+    "tangents": ("deep_qlearning", pole, 1, 3, {**Q, **policy(activation_fn=nn.Tanh)}),
+    "matrices": ("dqn", Matrices, 2, 3, {**Q, "n_steps": 3, "max_grad_norm": 0.1}),
+    "normalised": ("dqn", Matrices, 1, 3, {**Q, "wrap": normalised, "n_steps": 3}),
+    "ppo, normalised": ("ppo", Matrices, 2, 3, {**PPO, "wrap": normalised}),
+    "a2c, normalised": ("a2c", Matrices, 2, 3, {"wrap": normalised}),
+    "ppo, clipped by a function": (
+        "ppo", lake, 1, 3, {**PPO, "clip_range": lambda remaining: 0.05 + 0.2 * remaining}),
+    "normalised rewards": (
+        "deep_qlearning", Matrices, 1, 3, {**Q, "wrap": partial(normalised, norm_obs=False)}),
     "ppo": ("ppo", lake, 2, 3, {**PPO, "clip_range": LinearSchedule(0.3, 0.1, 1.0)}),
     "ppo on vectors": ("ppo", vectors, 1, 1, {**PPO, "batch_size": 8, "clip_range_vf": 0.1}),
     "ppo on poles": ("ppo", pole, 2, 3, {**PPO, "target_kl": 0.003}),
+    "ppo, a remainder of one": ("ppo", vectors, 2, 3, {**PPO, "n_steps": 25, "batch_size": 7}),
+    "ppo on matrices": ("ppo", Matrices, 2, 3, {**PPO, "normalize_advantage": False}),
+    "ppo by RMSprop": ("ppo", lake, 1, 3, {**PPO, **policy(th.optim.RMSprop, weight_decay=0.1)}),
+    "ppo by Adam": (
+        "ppo", lake, 1, 3,
+        {**PPO, **policy(th.optim.Adam, betas=(0.5, 0.9), eps=1e-3, weight_decay=0.1)}),
+    "ppo by AdamW": ("ppo", pole, 1, 3, {**PPO, **policy(th.optim.AdamW, weight_decay=3.0)}),
+    "ppo, two networks": (
+        "ppo", pole, 1, 3,
+        {**PPO, "max_grad_norm": 0.01, "ent_coef": 0.1,
+         **policy(net_arch={"pi": [70, 1], "vf": []}, activation_fn=nn.ReLU)}),
     "a2c": ("a2c", lake, 2, 1, {"gamma": 0.9, "gae_lambda": 0.8}),
     "a2c on poles": ("a2c", pole, 1, 3, {"normalize_advantage": True, "ent_coef": 0.1}),
-}
+    "a2c with decay": (
+        "a2c", pole, 1, 3, policy(RMSpropTFLike, eps=1e-5, weight_decay=0.1)),
+    "a2c by Adam": ("a2c", vectors, 2, 3, policy(th.optim.Adam)),
+}  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 @pytest.mark.parametrize("case", CASES)
 def test_compiled_training_does_what_the_library_does(case):
     library, at_rollouts = followed("library", case)
@@ -375,31 +443,12 @@ def test_a_training_that_was_stopped_goes_on_and_its_log_is_the_same(env, kind):
         assert [read.keys() for read in readers[1][:n]] == expected
 
 
-CALLBACKS = {
-    "checkpoints": lambda folder: CheckpointCallback(77, folder),
-    "evaluation": lambda folder: EvalCallback(
-        make_vec_env(ENVS["pole"], seed=9), eval_freq=110, n_eval_episodes=2
-    ),
-    "budget": lambda folder: EpisodeBudget(15),
-    "at most so many": lambda folder: StopTrainingOnMaxEpisodes(8),
-}
-
-
-@pytest.mark.filterwarnings("ignore:Training and eval env are not of the same type")
 @pytest.mark.parametrize("kind", ["dqn, two", "ppo, two"])
-@pytest.mark.parametrize("what", CALLBACKS)
-def test_callbacks_find_and_leave_the_same(what, kind, tmp_path):
-    models, scores, files = [], [], []
-    for mode in MODES:
-        callback = CALLBACKS[what](tmp_path / mode)
-        models.append(learn(make("pole", kind), mode, 700, callback))
-        scores.append(getattr(callback, "last_mean_reward", None))
-        files.append(sorted(path.name for path in (tmp_path / mode).glob("*")))
+@pytest.mark.parametrize("stop", [EpisodeBudget(15), StopTrainingOnMaxEpisodes(8)])
+def test_episodes_stop_it_at_the_same_step(stop, kind):
+    models = [learn(make("pole", kind), mode, 700, copy.copy(stop)) for mode in MODES]
     assert_same(*models)
-    assert scores[0] == scores[1]
-    assert (models[0].num_timesteps < 700) == (what in {"budget", "at most so many"})
-    assert files[0] == files[1]
-    assert len(files[0]) == (what == "checkpoints") * (700 // models[0].n_envs // 77)
+    assert models[0].num_timesteps < 700
 
 
 class Counting(BlockCallback):
@@ -496,9 +545,8 @@ def unchanged():
 
 @pytest.mark.parametrize(("what", "kind"), [(w, k) for w in CHANGES for k in ("dqn", "ppo")])
 def test_a_change_counts_in_both_ways(what, kind, unchanged):
-    calls = 128 if what.endswith("rollout") else 150
     change = CHANGES[what]
-    models = [learn(make("lake", kind), mode, 250, Every(calls, change)) for mode in MODES]
+    models = [learn(make("lake", kind), mode, 250, Every(150, change)) for mode in MODES]
     assert_same(*models)
     ours = models[0].policy.state_dict()
     is_same = all(th.equal(value, unchanged[kind][name]) for name, value in ours.items())
