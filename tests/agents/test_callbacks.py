@@ -14,28 +14,22 @@ from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
     CheckpointCallback,
-    ConvertCallback,
     EvalCallback,
     EveryNTimesteps,
     LogEveryNTimesteps,
     ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
-    StopTrainingOnRewardThreshold,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import DISABLED, KVWriter, Logger, configure
+from stable_baselines3.common.logger import DISABLED, Logger, configure
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from agents.common.callbacks import (
-    NEVER,
     BlockCallback,
-    EpisodeBudget,
     Horizon,
     calls_until_multiple,
-    horizon,
     members,
-    unknown_callbacks,
 )
 from agents.compiled.records import event_bytes, window_means
 from pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
@@ -186,51 +180,6 @@ def test_every_callback_at_the_same_steps(n_envs, tmp_path):
 # --- when callbacks act --------------------------------------------------------------------------
 
 
-class Foreign(BaseCallback):
-    def _on_step(self):
-        return True
-
-
-class LoudCheckpoint(CheckpointCallback):
-    """A subclass may do anything on any step."""
-
-
-def test_unknown_callbacks_are_named(tmp_path):
-    env = make_vec_env(LAKE, 1)
-    known = [EveryNTimesteps(5, Foreign()), EpisodeBudget(3), ConvertCallback(None)]
-    unknown = [
-        Foreign(),
-        LoudCheckpoint(5, str(tmp_path)),
-        ConvertCallback(lambda *_: True),
-        CallbackList([CallbackList([StopTrainingOnRewardThreshold(1.0)])]),
-    ]
-    assert unknown_callbacks(CallbackList([*known, EvalCallback(env)])) == []
-    names = ["Foreign", "LoudCheckpoint", "ConvertCallback", "StopTrainingOnRewardThreshold"]
-    assert unknown_callbacks(CallbackList([*known, *unknown])) == names
-
-
-def test_calls_until_multiple():
-    calls = {(0, 5): 5, (1, 5): 4, (4, 5): 1, (5, 5): 5, (7, 1): 1, (3, 0): NEVER, (3, -1): NEVER}
-    assert {case: calls_until_multiple(*case) for case in calls} == calls
-
-
-def test_the_nearest_horizon_counts(tmp_path):
-    model = load_algorithm("qlearning")(env=make_vec_env(LAKE, 3))
-    model.num_timesteps = 30
-    # Step 40 is passed on the fourth call from now, at step 42.
-    steps, checkpoint = EveryNTimesteps(40, Foreign()), CheckpointCallback(7, str(tmp_path))
-    budget = EpisodeBudget(8)
-    for callback in (steps, checkpoint, budget):
-        callback.init_callback(model)
-        callback.n_calls, callback.num_timesteps = 10, 30
-    assert horizon(steps) == Horizon(calls=4)
-    assert horizon(checkpoint) == Horizon(calls=4)
-    checkpoint.n_calls = 12
-    assert horizon(budget) == Horizon(episodes=8)
-    assert horizon(CallbackList([steps, checkpoint, budget])) == Horizon(calls=2, episodes=8)
-    assert horizon(CallbackList([])) == Horizon(NEVER, NEVER)
-
-
 class Sparse(BlockCallback):
     def __init__(self, every, answers=()):
         super().__init__()
@@ -257,21 +206,17 @@ def both(n_envs, make):
     return seen["compiled"]
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_sparse_callbacks_are_asked_at_their_steps_and_no_others(n_envs):
-    seen = both(n_envs, lambda: Sparse(70))
+@pytest.mark.parametrize(("n_envs", "every"), [(1, 70), (3, 70), (8, 3)])
+def test_sparse_callbacks_are_asked_at_their_steps_and_no_others(n_envs, every):
+    seen = both(n_envs, lambda: Sparse(every))
     steps = [step for step, _, _ in seen]
     last = 2 * n_envs * -(-2_000 // n_envs)
-    expected = [n_envs * -(-due // n_envs) for due in range(70, last, 70)]
-    assert steps == expected[: len(steps)]
-    assert len(steps) == 2_333 // 70
+    due = dict.fromkeys(n_envs * -(-due // n_envs) for due in range(every, last, every))
+    assert steps == [*due][: len(steps)]
+    assert len(steps) >= 2_333 // max(every, n_envs)
     assert [calls for _, calls, _ in seen] == [step // n_envs for step in steps]
     others = [EveryNTimesteps(13, Sparse(1)), StopTrainingOnMaxEpisodes(10**6)]
-    assert both(n_envs, lambda: CallbackList([Sparse(70), *others])) == seen
-
-
-def test_more_environments_than_steps_in_between():
-    assert [step for step, _, _ in both(8, lambda: Sparse(3))][:3] == [8, 16, 24]
+    assert both(n_envs, lambda: CallbackList([Sparse(every), *others])) == seen
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -310,14 +255,6 @@ class Reader(BlockCallback):
         return True
 
 
-class Writer(KVWriter):
-    def __init__(self):
-        self.rows = []
-
-    def write(self, key_values, key_excluded, step=0):
-        self.rows.append((step, key_values["train/n_updates"]))
-
-
 class Watched(Logger):
     """A logger of one's own."""
 
@@ -328,39 +265,31 @@ class Watched(Logger):
         super().dump(step)
 
 
-def read_beside(engine, logger=None, log_interval=7, level=None):
+def read_beside(engine, logger=None, **kwargs):
     callback, model = Reader(), lake(engine)
     if logger is not None:
         model.set_logger(logger)
-    if level is not None:
-        logger.set_level(level)
-    model.learn(1_500, callback=callback, log_interval=log_interval)
+    model.learn(1_500, callback=callback, **{"log_interval": 7, **kwargs})
     return callback.seen
 
 
 def test_what_callbacks_record_is_forgotten_when_a_log_is_due_though_nobody_reads_it():
-    read = read_beside("interpreted", Watched(None, []))
+    watched = [Watched(None, []) for _ in ENGINES]
+    read = read_beside("interpreted", watched[0])
+    assert read_beside("compiled", watched[1]) == read
+    assert watched[0].dumped == watched[1].dumped > 10, "a logger of one's own is told of all"
     assert read_beside("compiled") == read_beside("interpreted") == read
     assert any(not there for _, there in read[1:]), "forgotten"
     never = read_beside("compiled", log_interval=None)
     assert all(there for _, there in never[1:])
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_whoever_reads_the_log_gets_all_of_it(engine):
-    writer, watched, disabled = Writer(), Watched(None, []), Logger(None, [])
-    read_beside(engine, Logger(None, [writer]))
-    assert len(writer.rows) > 10
-    read_beside(engine, watched)
-    assert watched.dumped == len(writer.rows)
-    seen = read_beside(engine, disabled, level=DISABLED)
+    disabled = Logger(None, [])
+    disabled.set_level(DISABLED)
+    seen = read_beside("compiled", disabled)
     assert "train/n_updates" in seen[-1][1], "a logger that is disabled keeps what is recorded"
 
 
-class Own(BlockCallback):
+class Own(Sparse):
     """Records something of its own now and then, which goes into the next record alone."""
-
-    every_n_steps = 130
 
     def _on_step(self):
         self.logger.record("mine", self.num_timesteps)
@@ -372,7 +301,7 @@ class Own(BlockCallback):
 def beside():
     """What dumps the logger by itself."""
     evaluation = EvalCallback(make_vec_env(LAKE, 1, seed=9), eval_freq=701, verbose=0)
-    return [evaluation, LogEveryNTimesteps(1111), Own()]
+    return [evaluation, LogEveryNTimesteps(1111), Own(130)]
 
 
 def events_in(folder):
@@ -419,25 +348,6 @@ def test_each_output_has_the_same_records(case, tmp_path):
     np.testing.assert_equal(compiled, interpreted)
     assert len(compiled[1]) >= 2
     assert len(compiled[0]["rollout/ep_rew_mean"]) >= 2
-
-
-def test_a_block_holds_many_records():
-    """Callbacks that act now and then are told of long blocks, although the log is due often."""
-
-    class Blocks(BlockCallback):
-        every_n_steps, takes_blocks, n = 5000, True, 0
-
-        def _on_rollout_start(self):
-            self.n += 1
-
-        def _on_step(self):
-            return True
-
-    model, blocks = lake("auto"), Blocks()
-    model.set_logger(configure(None, ["log"]))
-    model.learn(10_000, log_interval=1, callback=blocks)
-    assert blocks.n == 2
-    model.logger.close()
 
 
 def test_means_are_those_of_windows_added_up_one_by_one():

@@ -7,10 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.classic_control import MountainCarEnv
 from gymnasium.envs.toy_text.utils import categorical_sample
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.callbacks import (
     BaseCallback,
+    CallbackList,
+    CheckpointCallback,
     EveryNTimesteps,
     StopTrainingOnMaxEpisodes,
 )
@@ -21,6 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from envs import checking as model_checks
+from envs.grid import Tile
 from envs.known_models import transition_model
 from envs.wrappers import DiscretizeObservation, TerminationReward
 from machine_code.compiling import inlined
@@ -113,6 +117,10 @@ class Curious(BaseCallback):
         return True
 
 
+class LoudCheckpoint(CheckpointCallback):
+    """A subclass may do anything on any step."""
+
+
 def lake(**kwargs):
     return make_vec_env("FrozenLake-v1", 1, seed=0, **kwargs)
 
@@ -142,6 +150,16 @@ def make_lake(**kwargs):
     return gym.make("FrozenLake-v1", **kwargs)
 
 
+def house():
+    return gym.make("Warehouse-v0")
+
+
+def changed_house():
+    env = house()
+    env.unwrapped.dynamics.edge = Tile(-3, blocked=True)
+    return env
+
+
 STATISTICS = gym.wrappers.RecordEpisodeStatistics
 INTERPRETED = {  # reason: environment, settings, callback
     "SubprocVecEnv is not DummyVecEnv": (
@@ -153,6 +171,7 @@ INTERPRETED = {  # reason: environment, settings, callback
     "the environments are not alike": (two(make_lake, partial(make_lake, is_slippery=False)),),
     "environments are not alike": (two(pole, partial(pole, gravity=1.6)),),
     "are not alike": (two(make_lake, lambda: Monitor(make_lake())),),
+    "the environments are not alike$": (two(house, changed_house),),
     "Monitor records further keys": (partial(lake, monitor_kwargs={"info_keywords": ("prob",)}),),
     "a time limit lies outside Monitor": (
         partial(lake, wrapper_class=partial(TimeLimit, max_episode_steps=9)),
@@ -181,10 +200,11 @@ INTERPRETED = {  # reason: environment, settings, callback
     ),
     "Curious must be asked after each step": (lake, {}, Curious),
     "ConvertCallback must be asked after each step": (lake, {}, lambda: lambda local, _: True),
+    "LoudCheckpoint must be asked": (lake, {}, partial(LoudCheckpoint, 5, "nowhere")),
     "Curious must be asked after each step$": (
         lake,
         {},
-        lambda: [Curious(), StopTrainingOnMaxEpisodes(5)],
+        lambda: [CallbackList([Curious()]), StopTrainingOnMaxEpisodes(5)],
     ),
 }
 
@@ -204,10 +224,20 @@ def test_what_is_interpreted_and_why(reason):
     env.close()
 
 
-def test_episodes_that_are_kept_have_to_have_a_limit():
-    env = gym.make("ShortCorridor-v0", max_episode_steps=-1)
-    model = load_algorithm("reinforce")(env=env, seed=0).learn(200)
-    reason = "episodes are kept, and there is no limit to their length"
+class Steeper(MountainCarEnv):
+    pass
+
+
+LIMITED = "episodes are kept, and there is no limit to their length"
+OTHERS = [
+    ("reinforce", partial(gym.make, "ShortCorridor-v0", max_episode_steps=-1), LIMITED),
+    ("semi_gradient_q", in_time(Steeper), "MountainCar compiles as it is, under Monitor alone"),
+]
+
+
+@pytest.mark.parametrize(("name", "make_env", "reason"), OTHERS, ids=["episodes", "own car"])
+def test_what_else_is_interpreted_and_why(name, make_env, reason):
+    model = load_algorithm(name)(env=make_env(), seed=0).learn(200)
     assert model.engine_in_use == f"interpreted: {reason}"
 
 

@@ -11,8 +11,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.wrappers import ClipReward, PassiveEnvChecker
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+from gymnasium.wrappers import ClipReward, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
@@ -22,7 +22,7 @@ from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon, calls
 from agents.common.schedules import ExponentialSchedule
 from agents.tabular.one_step import QLearning
 from agents.tabular.updates import td_learning
-from envs.grid import GridWorld
+from envs.grid import GridWorld, Tile
 from envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,
@@ -276,24 +276,6 @@ def test_schedules_by_episodes(decay, name, n_envs):
     assert models[0]._current_progress_remaining == pytest.approx(0.0, abs=n_envs / 300)
 
 
-@pytest.mark.parametrize("n_envs", [1, 4])
-def test_stopping_after_some_episodes_of_each_environment(n_envs):
-    models = assert_engines_agree(
-        partial(make, "double_qlearning", WORLDS["FrozenLake"], n_envs),
-        lambda model: model.learn(10**9, callback=StopTrainingOnMaxEpisodes(60)),
-    )
-    assert 60 * n_envs <= models[0]._episode_num < 61 * n_envs
-
-
-def test_what_follows_without_an_agent_is_the_same():
-    played = []
-    for engine in ENGINES:
-        model = make("sarsa", WORLDS["slippery Warehouse"], 2, engine=engine).learn(1111)
-        steps = [model.env.step(np.array([0, 3])) for _ in range(1200)]
-        played.append([[part.tolist() for part in step[:3]] for step in steps])
-    assert played[0] == played[1]
-
-
 # --- changes in the middle of a training ---------------------------------------------------------
 
 
@@ -366,6 +348,59 @@ def test_a_change_counts_in_both_loops(name, what):
     assert same == (what == "tables of the same values")
     if what == "zeros that are loaded":  # the step on which they were is learnt from afterwards
         assert int(models[0].policy.visit_counts.sum()) == 1001
+
+
+def house_of(change):
+    return world("Warehouse-v0"), lambda env: change(env.unwrapped.dynamics)
+
+
+def lake_of(change):
+    return world("FrozenLake-v1"), lambda env: change(env.unwrapped)
+
+
+def wrapped(wrapper, **attributes):
+    """FrozenLake under a wrapper of rewards or time, some of whose attributes are set by hand."""
+
+    def change(env):
+        while not isinstance(env, wrapper.func):
+            env = env.env
+        vars(env).update(attributes)
+
+    return world("FrozenLake-v1", None if wrapper.func is TimeLimit else wrapper), change
+
+
+HALVES = [0.5, 0.5]
+BY_HAND = {  # a world, and what is done to it between two trainings
+    "an outcome in place": lake_of(lambda env: env.P[0][2].__setitem__(1, (1 / 3, 5, 0.5, True))),
+    "outcomes": lake_of(lambda env: env.P[0].update({1: [(1.0, 15, 1.0, True)]})),
+    "a model": lake_of(lambda env: setattr(env, "P", FrozenLakeEnv(is_slippery=False).P)),
+    "a start": lake_of(lambda env: env.initial_state_distrib.__setitem__(slice(2), HALVES)),
+    "a reward inside of an array": lake_of(
+        lambda env: env.P[0].update({2: [(1.0, 4, np.float64(0.25), True)]})
+    ),
+    "a tile": house_of(lambda house: house.tiles.update({ord("#"): Tile(-7, blocked=True)})),
+    "the edge": house_of(lambda house: setattr(house, "edge", Tile(-3, blocked=True))),
+    "a scale": wrapped(partial(ScaleReward, scale=2.0), scale=3.0),
+    "the last reward": wrapped(partial(TerminationReward, reward=-1.0), last_reward=-2.0),
+    "the time limit": wrapped(partial(TimeLimit), _max_episode_steps=7),
+}
+
+
+@pytest.mark.parametrize("what", BY_HAND)
+def test_a_change_of_the_environment_by_hand_counts_and_for_it_alone(what):
+    place, change = BY_HAND[what]
+    lasting = partial(make, "sarsa", place, learning_rate=0.3, initial_q=1.0)
+
+    def train(model):
+        model.learn(300)
+        change(model.env.envs[0])
+        model.learn(700, reset_num_timesteps=False)
+
+    changed, _ = assert_engines_agree(lasting, train)
+    alone, _ = assert_engines_agree(
+        lasting, lambda model: model.learn(300).learn(700, reset_num_timesteps=False)
+    )
+    assert not np.array_equal(changed.policy.q_table, alone.policy.q_table)
 
 
 @pytest.mark.parametrize("name", ["ucb", "thompson", "epsilon_greedy"])
@@ -470,13 +505,10 @@ def test_both_loops_work_on_a_memory_in_place(change, tmp_path):
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("values", [np.zeros((1, 16), dtype=np.int64), np.zeros((2, 16))])
-def test_a_memory_of_another_shape_is_refused(engine, values):
+def test_a_memory_of_another_shape_or_kind_is_refused(engine, values):
+    model = walker(engine)
     with pytest.raises(ValueError, match=r"visits must be of shape \(2, 16\) and int64, not \("):
-        walker(engine).learn(2000, callback=Change(replaced(values)))
-
-
-def test_a_memory_of_another_kind_is_refused():
-    model = walker()
-    model._memory = (model._memory.visits,)
+        model.learn(2000, callback=Change(replaced(values)))
+    model._memory = (values,)
     with pytest.raises(ValueError, match="the agent's memory must be a Footprints"):
         model.predict(0)

@@ -1,5 +1,6 @@
 """The library's `EvalCallback` beside a compiled training finds what it finds beside any other."""
 
+import copy
 import warnings
 from functools import partial
 
@@ -240,33 +241,32 @@ def test_what_is_not_covered_is_the_librarys(algo, env_id, wrapper, settings, py
     assert set(map(id, python_steps)) == {id(eval_env)}
 
 
-def test_callbacks_within_and_beside_stop_the_training(python_steps):
-    """By a threshold, by no improvement, and where another callback triggers the evaluation."""
+STOPS = {
+    "a threshold": {
+        "eval_freq": 50,
+        "callback_on_new_best": StopTrainingOnRewardThreshold(0.2, verbose=0),
+    },
+    "no improvement": {
+        "eval_freq": 50,
+        "callback_after_eval": StopTrainingOnNoModelImprovement(3, 2, verbose=0),
+    },
+    "within another": {
+        "eval_freq": 2,
+        "callback_after_eval": StopTrainingOnNoModelImprovement(2, verbose=0),
+    },
+}
 
-    def n_steps(engine, make):
-        model = load_algorithm("qlearning")(
-            env=make_vec_env(LAKE, 1, seed=0), seed=0, engine=engine, initial_q=1.0
-        )
-        return model.learn(5000, callback=make()).num_timesteps
 
-    def evaluation(**callbacks):
-        return EvalCallback(make_vec_env(LAKE, 1, seed=2), verbose=0, **callbacks)
-
-    for make in (
-        lambda: evaluation(
-            eval_freq=50, callback_on_new_best=StopTrainingOnRewardThreshold(0.2, verbose=0)
-        ),
-        lambda: evaluation(
-            eval_freq=50, callback_after_eval=StopTrainingOnNoModelImprovement(3, 2, verbose=0)
-        ),
-        lambda: EveryNTimesteps(
-            70,
-            evaluation(
-                eval_freq=2, callback_after_eval=StopTrainingOnNoModelImprovement(2, verbose=0)
-            ),
-        ),
-    ):
-        stopped = n_steps("interpreted", make)
+@pytest.mark.parametrize("by", STOPS)
+def test_callbacks_within_and_beside_stop_the_training(by, python_steps):
+    stopped = []
+    for engine in ("interpreted", "compiled"):
         python_steps.clear()
-        assert n_steps("compiled", make) == stopped < 5000
-        assert not python_steps
+        env = make_vec_env(LAKE, 1, seed=0)
+        model = load_algorithm("qlearning")(env=env, seed=0, engine=engine, initial_q=1.0)
+        own = copy.deepcopy(STOPS[by])
+        callback = EvalCallback(make_vec_env(LAKE, 1, seed=2), verbose=0, **own)
+        callback = EveryNTimesteps(70, callback) if by == "within another" else callback
+        stopped.append(model.learn(5000, callback=callback).num_timesteps)
+    assert stopped[0] == stopped[1] < 5000
+    assert not python_steps

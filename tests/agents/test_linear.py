@@ -8,7 +8,6 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
@@ -38,15 +37,6 @@ def test_two_tilings_of_a_square_by_hand():
     assert active(tiles, (0.0, 0.0), (1.0, 1.0)) == [[0, 25], [18, 25 + 24]]
 
 
-def test_four_tilings_of_a_line_by_hand():
-    """Tiles of width 1 from 0 to 3, displaced by quarters: the tiles change once a quarter."""
-    tiles = make_tiles(spaces.Box(0.0, 3.0, (1,)), n_tilings=4, n_tiles=3)
-    places = [0.1, 0.3, 0.6, 0.9, 1.1]
-    in_tiling = np.array(active(tiles, *([place] for place in places))) - 4 * np.arange(4)
-    expected = [[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 1], [0, 1, 1, 1], [1, 1, 1, 1]]
-    assert in_tiling.tolist() == expected
-
-
 def test_displacements_are_odd_multiples():
     """Of eight tilings, the second is displaced by 1, 3 and 5 eighths in three dimensions.
 
@@ -62,11 +52,10 @@ def test_displacements_are_odd_multiples():
 
 
 def test_each_number_of_a_discrete_space_is_a_tile_of_its_own():
-    for n in (1, 7, 1000):
-        space = spaces.Discrete(n)
-        tiles = make_tiles(space, n_tilings=8, n_tiles=3)
-        assert (tiles.n_tilings, tiles.n_tiles) == (1, n)
-        assert active(tiles, *vectors_of(space, np.arange(n))) == [[i] for i in range(n)]
+    space = spaces.Discrete(7)
+    tiles = make_tiles(space, n_tilings=8, n_tiles=3)
+    assert (tiles.n_tilings, tiles.n_tiles) == (1, 7)
+    assert active(tiles, *vectors_of(space, np.arange(7))) == [[i] for i in range(7)]
 
 
 TILINGS = st.fixed_dictionaries(
@@ -77,14 +66,6 @@ TILINGS = st.fixed_dictionaries(
 )
 BOUNDS = spaces.Box(np.array([-1.2, -0.07], "f4"), np.array([0.6, 0.07], "f4"))
 PLACES = st.tuples(st.floats(-2, 2, width=32), st.floats(-0.125, 0.125, width=32))
-
-
-@given(TILINGS, PLACES)
-def test_one_tile_of_each_tiling_is_active(settings, place):
-    tiles = make_tiles(BOUNDS, **settings)
-    (found,) = active(tiles, place)
-    assert [tile // tiles.n_in_tiling for tile in found] == list(range(settings["n_tilings"]))
-    assert max(found) < tiles.n_tiles
 
 
 @given(TILINGS, PLACES, PLACES)
@@ -109,18 +90,8 @@ def test_places_share_as_many_tiles_as_the_displacements_say(settings, first, se
         shared += cells[0] == cells[1]
     one, other = active(tiles, first, second)
     assert len(set(one) & set(other)) == shared
-
-
-@given(TILINGS, st.floats(0, 1), st.floats(-1, 1))
-def test_places_less_than_a_tile_apart_share_tiles_in_proportion(settings, place, shift):
-    """Along one dimension, k n-ths of a tile away, all but k of the n tilings agree, or k + 1."""
-    n, (count, _) = settings["n_tilings"], settings["n_tiles"]
-    tiles = make_tiles(spaces.Box(0.0, 1.0, (1,)), n_tilings=n, n_tiles=count)
-    other = min(max(place + shift / count, 0.0), 1.0)
-    one, two = active(tiles, [place], [other])
-    apart = abs(other - place) * count * n
-    assert n - apart - 1 <= len(set(one) & set(two)) + 1e-9
-    assert len(set(one) & set(two)) <= max(n - apart + 1, 0) + 1e-9
+    assert [tile // tiles.n_in_tiling for tile in one] == list(range(n))
+    assert max(one) < tiles.n_tiles
 
 
 def test_bounds_belong_to_the_space_and_what_lies_outside_to_the_bounds():
@@ -388,20 +359,16 @@ def test_preferences_begin_where_they_are_told_to():
     assert told.agent.predict(np.array([0, 1]), deterministic=True)[0].tolist() == [0, 0]
 
 
-LEFT_AT_FIRST = {"initial_preferences": [1.47, -1.47]}
-
-
 @pytest.mark.parametrize(
-    ("name", "settings"),
+    "settings",
     [
-        ("reinforce", {"learning_rate": 2**-11}),
-        ("reinforce", {"learning_rate": 2**-9, "baseline": "value", "value_step_size": 2**-6}),
+        {"learning_rate": 2**-11},
+        {"learning_rate": 2**-9, "baseline": "value", "value_step_size": 2**-6},
     ],
 )
-def test_the_corridor_is_learnt_to_be_left_by_chance(name, settings):
-    settings = {**LEFT_AT_FIRST, **settings}
-    model = load_algorithm(name)(env="ShortCorridor-v0", seed=0, engine="compiled", **settings)
-    model.learn(60_000)
+def test_the_corridor_is_learnt_to_be_left_by_chance(settings):
+    settings = {"initial_preferences": [1.47, -1.47], **settings}
+    model = load_algorithm("reinforce")(env="ShortCorridor-v0", seed=0, **settings).learn(60_000)
     right = model.action_probabilities()[0, 1]
     # Within a tenth of the best, -11.66.
     assert (4 - 2 * right) / (right * (1 - right)) < 1.1 * 11.66
@@ -413,11 +380,3 @@ def test_the_corridor_defeats_bootstrapping():
     model = load_algorithm("actor_critic")(env="ShortCorridor-v0", seed=0, **settings)
     right = model.learn(60_000).action_probabilities()[0, 1]
     assert (4 - 2 * right) / (right * (1 - right)) > 10 * 11.66
-
-
-def test_actor_critic_finds_the_way_over_a_lake_that_is_not_slippery():
-    env = make_vec_env("FrozenLake-v1", 1, seed=0, env_kwargs={"is_slippery": False})
-    model = load_algorithm("actor_critic")(env=env, seed=0, gamma=0.95, learning_rate=0.5)
-    model.learn(50_000)
-    assert model.engine_in_use == "compiled"
-    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.9

@@ -1,11 +1,10 @@
 """What a model file holds beside tables comes back as it was, and nothing else can be built."""
 
+import copy
 import enum
 import json
 import pickletools
-import string
-import subprocess
-import sys
+import re
 import zipfile
 from base64 import b64decode
 from collections import OrderedDict, deque, namedtuple
@@ -33,10 +32,6 @@ ARRAY_DTYPES = [
     npst.unsigned_integer_dtypes(endianness="?"),
     npst.floating_dtypes(endianness="?", sizes=(16, 32, 64)),
 ]
-names = st.text(string.ascii_lowercase, min_size=1, max_size=3)
-seeds = st.integers(0, 2**32)
-shares = st.floats(0.01, 1)
-positive = st.floats(1e-6, 1e6)
 
 
 def through_json(value):
@@ -94,136 +89,88 @@ def test_nested_containers_come_back(value):
     assert same(through_json(value), value)
 
 
-@pytest.mark.parametrize(
-    ("scalar", "number"),
-    [
-        (np.float64(0.1), 0.1),
-        (np.float32(0.1), float(np.float32(0.1))),
-        (np.int64(-(2**63)), -(2**63)),
-        (np.uint64(2**64 - 1), 2**64 - 1),
-        (np.bool_(True), True),
-        (np.str_("x"), "x"),
-    ],
-)
-def test_numpy_scalars_become_plain_numbers(scalar, number):
-    assert same(through_json(scalar), number)
+def drawn_from(kind, *args, **kwargs):
+    """A space that is in the middle of its random numbers."""
+    space = kind(*args, **kwargs, seed=4)
+    space.sample()
+    return space
+
+
+def generator(draws):
+    """Numbers of 32 bits are drawn in pairs: the second one waits inside the generator."""
+    rng = np.random.default_rng(3)
+    rng.integers(2**32, size=draws, dtype=np.uint32)
+    return rng
+
+
+NO_LOW = np.array([[-np.inf, 0.1], [-2, -np.inf]], np.float32)
+BOX = drawn_from(spaces.Box, NO_LOW, np.full((2, 2), 3, np.float32))
+SAMPLES = {
+    "dictionary": {"b": 1, "a": 2, (True, ("x", 3)): None},
+    "tuple": (1, 2),
+    "queue": deque([1], maxlen=2),
+    "array": np.arange(4.0).reshape(2, 2),
+    "generator": generator(4),
+    "generator between two": generator(3),
+    "constant": ConstantSchedule(1.0),
+    "linear": LinearSchedule(1.0, 0.0, 0.5),
+    "exponential": ExponentialSchedule(1.0, 0.5, 0.5),
+    "schedule of one": FloatSchedule(LinearSchedule(0.1, 3.0, 0.7)),
+    "numbers": drawn_from(spaces.Discrete, 3, start=-2),
+    "never sampled": spaces.Discrete(3),
+    "many numbers": drawn_from(spaces.MultiDiscrete, [[2, 3]], dtype=np.int8, start=[[-4, 5]]),
+    "bits": drawn_from(spaces.MultiBinary, [2, 3]),
+    "box": BOX,
+    "bytes": drawn_from(spaces.Box, 0, 255, (2, 1), np.uint8),
+    "tuple of spaces": drawn_from(spaces.Tuple, [spaces.Discrete(2), BOX]),
+    "spaces by name": drawn_from(
+        spaces.Dict, [("b", spaces.Discrete(9)), ("a", spaces.Tuple([spaces.MultiBinary(3)]))]
+    ),
+}
+
+
+def shown(value):
+    """What can be seen of a value and of what it draws or says next."""
+    if isinstance(value, np.random.Generator):
+        numbers = [value.integers(2**32, dtype=np.uint32).item() for _ in range(2)]
+        return numbers, value.standard_normal(8).tolist()
+    if isinstance(value, gym.Space):
+        nested = [shown(part) for part in value.spaces.values()] if hasattr(value, "keys") else []
+        state = value._np_random and [
+            spaces.flatten(value, value.sample()).tolist() for _ in range(3)
+        ]
+        return repr(value), value.shape, value.dtype, nested, state
+    says = [value(progress) for progress in (1.0, 0.6, 0.0)] if callable(value) else []
+    return repr(value), says, getattr(value, "dtype", None)
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_it_comes_back_and_goes_on_where_it_was(name):
+    value = copy.deepcopy(SAMPLES[name])
+    back = through_json(value)
+    assert type(back) is type(value)
+    assert shown(back) == shown(value)
+    text = encode(value)
+    for field in text:
+        less = {key: part for key, part in text.items() if key != field}
+        with pytest.raises(ValueError, match="in an agent's file"):
+            decode(less)
+    with pytest.raises(ValueError, match=f"damaged {text['type']} in an agent's file"):
+        decode({**text, "seed": 1})
+
+
+def test_numpy_scalars_become_plain_numbers():
+    scalars = [np.float64(0.1), np.int64(-(2**63)), np.uint64(2**64 - 1), np.bool_(1), np.str_("x")]
+    assert same(through_json(scalars), [0.1, -(2**63), 2**64 - 1, True, "x"])
 
 
 # --- generators ----------------------------------------------------------------------------------
 
 
-@given(seeds, st.integers(0, 5))
-def test_generators_go_on_where_they_were(seed, draws):
-    rng = np.random.default_rng(seed)
-    # Numbers of 32 bits are drawn in pairs: the second one waits inside the generator.
-    rng.integers(2**32, size=draws, dtype=np.uint32)
-    back = through_json(rng)
-    for _ in range(2):
-        assert back.integers(2**32, dtype=np.uint32) == rng.integers(2**32, dtype=np.uint32)
-    np.testing.assert_array_equal(back.standard_normal(8), rng.standard_normal(8))
-
-
 # --- schedules -----------------------------------------------------------------------------------
-
-schedules = st.recursive(
-    st.builds(ConstantSchedule, st.floats(-10, 10))
-    | st.builds(LinearSchedule, st.floats(-10, 10), st.floats(-10, 10), shares)
-    | st.builds(ExponentialSchedule, positive, positive, shares),
-    lambda inner: st.builds(FloatSchedule, inner),
-    max_leaves=2,
-)
-
-
-@given(schedules, st.lists(st.floats(0, 1), min_size=1))
-def test_schedules_come_back(schedule, progress):
-    back = through_json(schedule)
-    assert type(back) is type(schedule)
-    assert repr(back) == repr(schedule)
-    assert [back(p) for p in progress] == [schedule(p) for p in progress]
 
 
 # --- spaces --------------------------------------------------------------------------------------
-
-
-@st.composite
-def multi_discretes(draw):
-    shape = draw(npst.array_shapes(max_dims=2, max_side=3))
-    dtype = draw(st.sampled_from([np.int8, np.int32, np.int64]))
-    nvec = draw(npst.arrays(dtype, shape, elements=st.integers(1, 9)))
-    start = draw(npst.arrays(dtype, shape, elements=st.integers(-9, 9)))
-    return spaces.MultiDiscrete(nvec, dtype=dtype, start=start)
-
-
-@st.composite
-def boxes(draw):
-    shape = draw(npst.array_shapes(min_dims=0, max_dims=2, max_side=3))
-    dtype, elements, no_bound = draw(
-        st.sampled_from(
-            [
-                (np.float32, st.floats(-9, 9, width=32), np.inf),
-                (np.float64, st.floats(-9, 9), np.inf),
-                (np.uint8, st.integers(0, 255), None),
-                (np.int64, st.integers(-9, 9), None),
-            ]
-        )
-    )
-    first, second = (draw(npst.arrays(dtype, shape, elements=elements)) for _ in range(2))
-    low, high = np.minimum(first, second), np.maximum(first, second)
-    if no_bound is not None:
-        low = np.where(draw(npst.arrays(bool, shape)), dtype(-no_bound), low).astype(dtype)
-        high = np.where(draw(npst.arrays(bool, shape)), dtype(no_bound), high).astype(dtype)
-    return spaces.Box(low, high, dtype=dtype)
-
-
-simple_spaces = (
-    st.builds(spaces.Discrete, st.integers(1, 9), start=st.integers(-9, 9))
-    | multi_discretes()
-    | st.builds(
-        spaces.MultiBinary, st.integers(1, 5) | st.lists(st.integers(1, 3), min_size=1, max_size=3)
-    )
-    | boxes()
-)
-any_space = st.recursive(
-    simple_spaces,
-    lambda inner: (
-        st.lists(inner, min_size=1, max_size=3).map(spaces.Tuple)
-        # As pairs, so that the order of the keys is anything.
-        | st.dictionaries(names, inner, min_size=1, max_size=3).map(
-            lambda parts: spaces.Dict(list(parts.items()))
-        )
-    ),
-    max_leaves=5,
-)
-
-
-def parts(space):
-    """The space, and all that it is made of, in order."""
-    inner = getattr(space, "spaces", ())
-    named = inner.items() if isinstance(inner, dict) else enumerate(inner)
-    return [type(space), *(entry for key, part in named for entry in (key, *parts(part)))]
-
-
-def flat(space, sample):
-    return spaces.flatten(space, sample).tolist()
-
-
-@given(any_space, seeds, st.integers(0, 3))
-def test_spaces_come_back_and_go_on_sampling(space, seed, draws):
-    space.seed(seed)
-    for _ in range(draws):
-        space.sample()
-    back = through_json(space)
-    assert back == space
-    assert parts(back) == parts(space)
-    assert (back.shape, back.dtype) == (space.shape, space.dtype)
-    for _ in range(3):
-        assert flat(back, back.sample()) == flat(space, space.sample())
-
-
-def test_a_space_that_was_never_sampled_has_no_generator_yet():
-    space = spaces.Discrete(3)
-    assert through_json(space)._np_random is None
-    assert space._np_random is None
 
 
 # --- what has no place in the format -------------------------------------------------------------
@@ -231,10 +178,6 @@ def test_a_space_that_was_never_sampled_has_no_generator_yet():
 
 class Level(enum.Enum):
     HIGH = 1
-
-
-class Shadow(list):
-    """Same behaviour, another class."""
 
 
 Point = namedtuple("Point", "x y")
@@ -245,9 +188,8 @@ NamedLikeATuple = type("tuple", (), {})
 UNKNOWN = {
     "set": {1},
     "bytes": b"x",
-    "complex": 1j,
     "object": object(),
-    "function": len,
+    "key": {frozenset(): 1},
     "lambda": lambda progress: progress,
     "class": int,
     "enum": Level.HIGH,
@@ -256,21 +198,16 @@ UNKNOWN = {
     "impostor of a space": Impostor(),
     "impostor of a container": NamedLikeATuple(),
     "text space": spaces.Text(3),
-    "sequence space": spaces.Sequence(spaces.Discrete(2)),
     "space of unknown parts": spaces.Tuple([spaces.Discrete(2), spaces.Text(3)]),
     "schedule of a function": FloatSchedule(lambda progress: progress),
     "other bit generator": np.random.Generator(np.random.Philox(0)),
     "older generator": np.random.RandomState(0),
     "date": np.datetime64("2020-01-01"),
-    "duration": np.timedelta64(1, "s"),
-    "complex scalar": np.complex64(1),
     "wide scalar": np.longdouble(1),
     "array of objects": np.array([1, None]),
     "array of texts": np.array(["x"]),
-    "array of dates": np.array(["2020-01-01"], dtype="M8[ns]"),
     "array of records": np.zeros(1, dtype="i4,f4"),
     "array of wide floats": np.zeros(1, dtype=np.longdouble),
-    "array of complex": np.zeros(1, dtype=np.complex64),
 }
 
 
@@ -282,11 +219,6 @@ def test_other_types_are_refused_wherever_they_stand(kind):
             encode(nested)
 
 
-def test_a_key_of_another_type_is_refused():
-    with pytest.raises(UnknownTypeError, match="frozenset"):
-        encode({frozenset(): 1})
-
-
 # --- damaged files -------------------------------------------------------------------------------
 
 json_values = st.recursive(
@@ -294,26 +226,7 @@ json_values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
     max_leaves=6,
 )
-samples = [
-    encode(value)
-    for value in (
-        {"a": 1},
-        (1, 2),
-        deque([1], maxlen=2),
-        np.arange(4.0).reshape(2, 2),
-        np.random.default_rng(0),
-        ConstantSchedule(1.0),
-        LinearSchedule(1.0, 0.0, 0.5),
-        ExponentialSchedule(1.0, 0.5, 0.5),
-        FloatSchedule(1.0),
-        spaces.Discrete(3, seed=0),
-        spaces.MultiDiscrete([2, 3]),
-        spaces.MultiBinary([2, 3]),
-        spaces.Box(-1, 1, (2,)),
-        spaces.Tuple([spaces.Discrete(2)]),
-        spaces.Dict({"a": spaces.Discrete(2)}),
-    )
-]
+samples = [encode(value) for value in SAMPLES.values()]
 
 
 def nodes(data):
@@ -359,42 +272,28 @@ def test_any_json_is_decoded_or_refused(data):
     json.dumps(encode(value))
 
 
-@pytest.mark.parametrize("sample", samples, ids=lambda sample: sample["type"])
-def test_fields_must_be_those_of_the_type(sample):
-    for field in sample:
-        less = {key: value for key, value in sample.items() if key != field}
-        with pytest.raises(ValueError, match="in an agent's file"):
-            decode(less)
-    with pytest.raises(ValueError, match=f"damaged {sample['type']} in an agent's file"):
-        decode({**sample, "seed": 1})
+OUT_OF_RANGE = [
+    *({"type": name, "n": 3} for name in ("os.system", "Codec", "Text", "", None, 3, [], {})),
+    {"type": "Discrete", "n": 2**70, "start": 0, "rng": None},
+    {"type": "Discrete", "n": 0, "start": 0, "rng": None},
+    {"type": "Discrete", "n": 3, "start": 0, "rng": 7},
+    {"type": "deque", "iterable": [], "maxlen": 2**70},
+    {"type": "ndarray", "dtype": "<i8", "values": [2**70], "shape": [1]},
+    {"type": "ndarray", "dtype": "<i8", "values": [1, 2], "shape": [3]},
+    {"type": "ndarray", "dtype": "|O", "values": [1], "shape": [1]},
+    {"type": "ndarray", "dtype": "(2,,3)i4", "values": [1], "shape": [1]},
+    {"type": "Generator", "state": {"type": "dict", "pairs": []}},
+    {"type": "dict", "pairs": [[[], 1]]},
+    {"type": "FloatSchedule", "value_schedule": "fast"},
+    {"type": "ExponentialSchedule", "start": 0.0, "end": 1.0, "end_fraction": 1.0},
+]
 
 
-@pytest.mark.parametrize("name", ["object", "os.system", "Codec", "Text", "", None, 3, [], {}])
-def test_a_type_that_is_not_in_the_table_is_not_built(name):
-    with pytest.raises(ValueError, match="unknown type"):
-        decode({"type": name, "n": 3})
-
-
-OUT_OF_RANGE = {
-    "huge size": {"type": "Discrete", "n": 2**70, "start": 0, "rng": None},
-    "no size": {"type": "Discrete", "n": 0, "start": 0, "rng": None},
-    "no generator": {"type": "Discrete", "n": 3, "start": 0, "rng": 7},
-    "huge queue": {"type": "deque", "iterable": [], "maxlen": 2**70},
-    "huge entry": {"type": "ndarray", "dtype": "<i8", "values": [2**70], "shape": [1]},
-    "other shape": {"type": "ndarray", "dtype": "<i8", "values": [1, 2], "shape": [3]},
-    "objects": {"type": "ndarray", "dtype": "|O", "values": [1], "shape": [1]},
-    "broken dtype": {"type": "ndarray", "dtype": "(2,,3)i4", "values": [1], "shape": [1]},
-    "empty state": {"type": "Generator", "state": {"type": "dict", "pairs": []}},
-    "list as a key": {"type": "dict", "pairs": [[[], 1]]},
-    "text as a schedule": {"type": "FloatSchedule", "value_schedule": "fast"},
-    "decay from 0": {"type": "ExponentialSchedule", "start": 0.0, "end": 1.0, "end_fraction": 1.0},
-}
-
-
-@pytest.mark.parametrize("damage", OUT_OF_RANGE)
-def test_fields_out_of_range_are_refused(damage):
-    with pytest.raises(ValueError, match=r"."):
-        decode(OUT_OF_RANGE[damage])
+@pytest.mark.parametrize("damage", OUT_OF_RANGE, ids=str)
+def test_what_is_not_in_the_table_or_out_of_range_is_not_built(damage):
+    line = "unknown type" if set(damage) == {"type", "n"} else "."
+    with pytest.raises(ValueError, match=line):
+        decode(damage)
 
 
 # --- files of agents of the library ---------------------------------------------------------------
@@ -414,17 +313,12 @@ def test_a_librarys_schedule_is_ours(start, end):
         assert float(theirs(remaining)) == pytest.approx(ours(remaining), rel=1e-12)
 
 
-def zip_with_exponential_schedule(name, tmp_path):
-    algorithm = load_algorithm(name)
-    kwargs = build_algorithm_kwargs(algorithm, {"policy": "MlpPolicy", **EXPONENTIAL[name]}, name)
-    model = algorithm(env=gym.make("CartPole-v1"), **kwargs)
-    model.save(tmp_path / name)
-    return tmp_path / f"{name}.zip"
-
-
 @pytest.mark.parametrize("name", EXPONENTIAL)
 def test_a_library_agents_zip_names_no_module_of_this_project(name, tmp_path):
-    with zipfile.ZipFile(zip_with_exponential_schedule(name, tmp_path)) as archive:
+    algorithm = load_algorithm(name)
+    kwargs = build_algorithm_kwargs(algorithm, {"policy": "MlpPolicy", **EXPONENTIAL[name]}, name)
+    algorithm(env=gym.make("CartPole-v1"), **kwargs).save(tmp_path / name)
+    with zipfile.ZipFile(tmp_path / f"{name}.zip") as archive:
         data = json.loads(archive.read("data"))
     words = [
         str(argument)
@@ -437,29 +331,6 @@ def test_a_library_agents_zip_names_no_module_of_this_project(name, tmp_path):
     assert ours.isdisjoint(word.partition(".")[0] for word in words)
 
 
-def test_a_library_agents_zip_opens_where_this_project_is_not(tmp_path):
-    path = zip_with_exponential_schedule("ppo", tmp_path)
-    code = (
-        "import sys\n"
-        f"sys.path = [p for p in sys.path if 'site-packages' in p or 'lib/python' in p]\n"
-        "sys.meta_path = [f for f in sys.meta_path if 'editable' not in repr(f)]\n"
-        "import importlib.util\n"
-        "assert importlib.util.find_spec('agents') is None\n"
-        "from stable_baselines3 import PPO\n"
-        f"model = PPO.load({str(path)!r})\n"
-        "print(model.lr_schedule(0.5), model.clip_range(0.5))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-I", "-W", "error", "-c", code],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert [float(word) for word in done.stdout.split()] == pytest.approx([0.01, 0.2])
-
-
 # --- what is replaced on the way -----------------------------------------------------------------
 
 
@@ -467,31 +338,23 @@ def test_a_library_agents_zip_opens_where_this_project_is_not(tmp_path):
 def test_custom_objects_replace_what_the_file_holds_and_nothing_else(name, tmp_path):
     env = "SegmentBandit-v0" if name == "ucb" else "FrozenLake-v1"
     model = load_algorithm(name)(env=env, seed=0)
-    model.save(tmp_path / "agent")
-    replaced = {"stats_window_size": 7, "predict": "shadowed", "no_such_thing": 1}
+    model.save(tmp_path / "whole")
+    with zipfile.ZipFile(tmp_path / "whole.zip") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["data"] = re.sub(
+        rb'("_stats_window_size"): \d+', rb'\1: {"type": "?"}', members["data"]
+    )
+    with zipfile.ZipFile(tmp_path / "agent.zip", "w") as archive:
+        for member, content in members.items():
+            archive.writestr(member, content)
+    with pytest.raises(ValueError, match="unknown type '\\?'"):  # what is replaced is not read
+        type(model).load(tmp_path / "agent")
+    replaced = {"_stats_window_size": 7, "predict": "shadowed", "no_such_thing": 1}
     loaded = type(model).load(tmp_path / "agent", custom_objects=replaced)
-    assert loaded._stats_window_size == model._stats_window_size
-    assert not {"predict", "no_such_thing"} & set(vars(loaded))
-    loaded = type(model).load(tmp_path / "agent", custom_objects={"_stats_window_size": 7})
     assert loaded._stats_window_size == 7
+    assert not {"predict", "no_such_thing"} & set(vars(loaded))
     with pytest.raises(ValueError, match="custom_objects must be a dictionary"):
         type(model).load(tmp_path / "agent", custom_objects=["learning_rate"])
-
-
-def test_what_is_replaced_need_not_be_readable(tmp_path):
-    model = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0)
-    model.save(tmp_path / "agent")
-    with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    rate = b'"learning_rate": '
-    members["data"] = members["data"].replace(rate + b"0.1", rate + b'{"type": "?"}')
-    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    with pytest.raises(ValueError, match="unknown type '\\?'"):
-        type(model).load(tmp_path / "other")
-    loaded = type(model).load(tmp_path / "other", custom_objects={"learning_rate": 0.25})
-    assert loaded.lr_schedule(0.5) == 0.25
 
 
 @pytest.mark.parametrize("kind", [ModelPolicy, DatedModelPolicy, CountedModelPolicy])

@@ -11,11 +11,9 @@ from agents import load_algorithm
 from agents.common.exploration import EPSILON_GREEDY, action_probabilities
 from agents.tabular.traces import SMALLEST_TRACE
 from tests.agents.hand_fed import (
-    ACTIONS,
     ENDS,
     N_ACTIONS,
     N_STATES,
-    REWARDS,
     SHARES,
     Fed,
     episodes,
@@ -214,23 +212,6 @@ def test_dutch_traces_are_the_online_lambda_return(name, learning_rate, table, s
         assert_close(fed.table, by_online_lambda_returns(name, before, taken, end, decay, sizes))
 
 
-@given(
-    table=tables(),
-    states=st.permutations(range(N_STATES)),
-    action=ACTIONS,
-    rewards=st.lists(REWARDS, min_size=N_STATES, max_size=N_STATES),
-)
-@pytest.mark.parametrize("trace_type", ["accumulating", "replacing", "dutch"])
-def test_whole_traces_are_monte_carlo(trace_type, table, states, action, rewards):
-    """Where no entry is visited twice, learning on the way comes to the same."""
-    fed = Fed("sarsa_lambda", table, trace_type=trace_type, trace_decay=1.0, **USUAL)
-    steps = [(state, action, reward) for state, reward in zip(states, rewards, strict=True)]
-    taken = fed.committed_episode(steps, "terminated")
-    other = Fed("monte_carlo", table, **USUAL)
-    other.episode(taken, "terminated")
-    assert_close(fed.table, other.table)
-
-
 @pytest.mark.parametrize(
     ("trace_type", "value"), [("replacing", 4.0), ("accumulating", 3.5), ("dutch", 3.875)]
 )
@@ -425,20 +406,3 @@ def test_at_one_end_it_is_the_one_step_agent_to_the_bit(name, one_step, own, sha
     assert np.array_equal(model.policy.visit_counts, other.policy.visit_counts)
     assert model.mean_td_error == other.mean_td_error
     assert model.rng.bit_generator.state == other.rng.bit_generator.state
-
-
-@pytest.mark.parametrize(
-    ("name", "own"),
-    [
-        ("n_step_sarsa", {"learning_rate": "sample_average", "n_steps": 3}),
-        ("n_step_tree_backup", {"learning_rate": "sample_average", "n_steps": 3}),
-        ("monte_carlo", {}),
-        ("off_policy_monte_carlo", {}),
-    ],
-)
-def test_prediction_on_the_random_walk(name, own):
-    """Example 6.2: its one action is all policies', true values of five states are 1/6 to 5/6."""
-    env = make_vec_env("envs:RandomWalk-v0", seed=0)
-    model = load_algorithm(name)(env=env, seed=0, gamma=1.0, **own).learn(100_000)
-    # Over 10,000 episodes a mean of returns of 0 and 1 has a standard error below 0.005.
-    np.testing.assert_allclose(model.policy.q_table[1:-1, 0], np.arange(1, 6) / 6, atol=0.02)

@@ -1,5 +1,7 @@
 """Updates of tables against numbers worked out by hand: one step, bonuses, learnt models."""
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -132,16 +134,14 @@ class Corridor(gym.Env):
 
 
 class Tracer(BaseCallback):
-    def __init__(self):
-        super().__init__()
-        self.actions, self.commitments = [], []
+    actions, commitments = (), ()
 
     def _on_step(self):
-        self.actions.append(int(self.locals["actions"][0]))
+        self.actions += (int(self.locals["actions"][0]),)
         return True
 
     def _on_rollout_end(self):
-        self.commitments.append(int(self.model._next_actions[0]))
+        self.commitments += (int(self.model._next_actions[0]),)
 
 
 def test_two_episodes_by_hand():
@@ -181,16 +181,7 @@ def test_q_learning_chooses_after_the_update():
         env=Corridor(), tie_breaking="first", seed=0, **settings, **GREEDY
     )
     model.learn(2, callback=tracer)
-    assert tracer.actions == [0, 1]
-
-
-def test_initial_tables():
-    settings = {"env": "Taxi-v4", "initial_q": 5.0, "seed": 0}
-    assert (load_algorithm("qlearning")(**settings).policy.q_table == 5).all()
-    random = load_algorithm("qlearning")(initial_q_std=2.0, **settings).policy.q_table
-    # 3000 entries: mean and standard deviation within four standard errors.
-    assert random.mean() == pytest.approx(5, abs=4 * 2 / 3000**0.5)
-    assert random.std() == pytest.approx(2, abs=4 * 2 / 6000**0.5)
+    assert tracer.actions == (0, 1)
 
 
 # --- optimism ------------------------------------------------------------------------------------
@@ -213,12 +204,23 @@ def test_one_update_by_hand():
     assert fed.agent.policy.visit_counts[0].tolist() == [[0, 3], [0, 0]]
 
 
-def test_optimists_begin_at_the_bound():
-    settings = {"env": "FrozenLake-v1", "gamma": 0.5}
-    assert (load_algorithm("qlearning_ucb")(value_bound=7.0, **settings).policy.q_table == 7).all()
-    # Rewards of at most 1 come to 1 / (1 - gamma) at most.
-    assert (load_algorithm("qlearning_ucb")(**settings).policy.q_table == 2).all()
-    assert (load_algorithm("r_max")(value_bound=3.0, **settings).policy.q_table == 3).all()
+@pytest.mark.parametrize(
+    ("name", "settings", "value"),
+    [
+        ("qlearning", {"initial_q": 5.0}, 5),
+        ("qlearning_ucb", {"value_bound": 7.0}, 7),
+        ("qlearning_ucb", {}, 2),  # rewards of at most 1 come to 1 / (1 - gamma) at most
+        ("r_max", {"value_bound": 3.0}, 3),
+    ],
+)
+def test_tables_begin_where_they_are_told_to(name, settings, value):
+    make = partial(load_algorithm(name), env="Taxi-v4", gamma=0.5, seed=0)
+    assert (make(**settings).policy.q_table == value).all()
+    if name == "qlearning":
+        drawn = make(initial_q_std=2.0, **settings).policy.q_table
+        # 3000 entries: mean and standard deviation within four standard errors.
+        assert drawn.mean() == pytest.approx(5, abs=4 * 2 / 3000**0.5)
+        assert drawn.std() == pytest.approx(2, abs=4 * 2 / 6000**0.5)
 
 
 # --- Dyna-Q --------------------------------------------------------------------------------------

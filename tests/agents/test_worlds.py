@@ -1,18 +1,11 @@
 """Compiled environments are Gymnasium's to the last bit, as they are now, or are refused."""
 
-import sys
-
-import gymnasium as gym
 import numba
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
-from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-from gymnasium.wrappers import ClipReward, TimeAwareObservation, TimeLimit
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import envs  # noqa: F401  # registers the environments
@@ -25,15 +18,12 @@ from agents.compiled.worlds import (
     CART_POLE_ENV,
     MOUNTAIN_CAR_ENV,
     STATE,
-    NotCompilable,
     bin_index,
     compile_envs,
     drive,
     swing,
 )
-from envs.grid import Tile
-from envs.warehouse import WarehouseEnv
-from envs.wrappers import DiscretizeObservation, ScaleReward, TerminationReward
+from envs.wrappers import DiscretizeObservation
 from machine_code.compiling import kernel
 
 # --- physics -------------------------------------------------------------------------------------
@@ -188,12 +178,6 @@ def test_sums_by_either_rule_and_as_this_python_does(values):
         assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
 
 
-def test_the_rules_differ():
-    assert compensated_sum([0.1] * 10) == 1.0
-    assert plain_sum([0.1] * 10) == 0.9999999999999999
-    assert (sum([0.1] * 10) == 1.0) == COMPENSATED_SUM == (sys.version_info >= (3, 12))
-
-
 def test_rows_are_pythons_to_the_last_letter():
     rng, end = np.random.default_rng(0), "1.5e-05\r\n"
     powers = 10.0 ** np.arange(15)
@@ -233,145 +217,3 @@ def test_numbers_are_the_generators_own(kind, skipped):
     assert numbers.tolist() == own.random((1000, skipped + 1))[:, -1].tolist()
     assert str(rng.bit_generator.state) == str(own.bit_generator.state)
     assert rng.integers(9, dtype=np.uint32) == own.integers(9, dtype=np.uint32)
-
-
-# --- changes by hand -----------------------------------------------------------------------------
-
-
-def lake():
-    return make_vec_env("FrozenLake-v1", 1, seed=0)
-
-
-def house():
-    return make_vec_env("Warehouse-v0", 1, seed=0)
-
-
-def wrapped(wrapper):
-    return lambda: DummyVecEnv([lambda: Monitor(wrapper(gym.make("FrozenLake-v1")))])
-
-
-def equal(world, other):
-    return all(np.array_equal(mine, its) for mine, its in zip(world, other, strict=True))
-
-
-def layer(vec_env, kind):
-    env = vec_env.envs[0]
-    while not isinstance(env, kind):
-        env = env.env
-    return env
-
-
-def of_base(change):
-    return lambda vec_env: change(vec_env.envs[0].unwrapped)
-
-
-def of(kind, **attributes):
-    return lambda vec_env: vars(layer(vec_env, kind)).update(attributes)
-
-
-def change_outcome(env):
-    env.P[14][2][1] = (1 / 3, 15, 0.5, True)
-
-
-def set_tile(env):
-    env.dynamics.tiles[ord("#")] = Tile(-7, blocked=True)
-
-
-HALVES = [0.5, 0.5]
-CHANGES = {
-    "an outcome in place": (lake, of_base(change_outcome)),
-    "outcomes": (lake, of_base(lambda env: env.P[0].update({1: [(1.0, 15, 1.0, True)]}))),
-    "a model": (
-        lake, of_base(lambda env: setattr(env, "P", FrozenLakeEnv(is_slippery=False).P))),
-    "a start": (
-        lake, of_base(lambda env: env.initial_state_distrib.__setitem__(slice(2), HALVES))),
-    "a reward inside of an array": (
-        lake, of_base(lambda env: env.P[14].update({2: [(1.0, 15, np.float64(0.25), True)]}))),
-    "a tile": (house, of_base(set_tile)),
-    "the edge": (
-        house, of_base(lambda env: setattr(env.dynamics, "edge", Tile(-3, blocked=True)))),
-    "slipping": (
-        house, of_base(lambda env: setattr(env.dynamics, "outcome_prob", (0.8, 0.1, 0.1)))),
-    "a house's start": (
-        house, of_base(lambda env: env.initial_state_distrib.__setitem__([90, 91], HALVES))),
-    "the map's letters": (
-        house, of_base(lambda env: setattr(
-            env.dynamics, "codes", env.dynamics.codes.replace(b"#", b".")))),
-    "a scale": (wrapped(lambda env: ScaleReward(env, 2.0)), of(ScaleReward, scale=3.0)),
-    "the last reward": (
-        wrapped(lambda env: TerminationReward(env, -1.0)),
-        of(TerminationReward, last_reward=-2.0)),
-    "the time limit": (lake, of(TimeLimit, _max_episode_steps=7)),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", CHANGES)
-def test_a_change_by_hand_counts(what):
-    make, change = CHANGES[what]
-    changed, fresh = make(), make()
-    before = compile_envs(changed)
-    changed.reset()
-    for _ in range(30):  # playing is no change
-        changed.step([changed.action_space.sample()])
-    assert equal(compile_envs(changed), before)
-    change(changed)
-    assert not equal(before, compile_envs(changed))
-    assert equal(compile_envs(fresh), before), "what the others stand for is as it was"
-
-
-def test_bounds_of_rewards_count_where_a_reward_reaches_them():
-    tops = (0.5, 1, 2)
-    worlds = [compile_envs(wrapped(lambda env, t=t: ClipReward(env, -1, t))()) for t in tops]
-    assert not equal(worlds[0], worlds[1])
-    assert equal(worlds[1], worlds[2])
-
-
-def test_a_method_that_was_replaced_counts(monkeypatch):
-    vec_env = house()
-    compile_envs(vec_env)
-    n = len(vec_env.envs[0].unwrapped.map.codes)
-    # As a user does who shows states in another order.
-    monkeypatch.setattr(WarehouseEnv, "observation_of", lambda self, states: states[::-1])
-    assert compile_envs(vec_env).observation[0] == n - 1
-
-
-class Steeper(MountainCarEnv):
-    pass
-
-
-def after(make, change):
-    """An environment that is changed once it has been compiled."""
-    vec_env = make()
-    compile_envs(vec_env)
-    change(vec_env)
-    return vec_env
-
-
-def watch(vec_env):
-    vec_env.envs[0] = gym.wrappers.RecordEpisodeStatistics(vec_env.envs[0])
-
-
-def two_houses():
-    first, second = house().envs[0].unwrapped, house().envs[0].unwrapped
-    set_tile(second)
-    return DummyVecEnv([lambda: first, lambda: second])
-
-
-CLIPPED = wrapped(lambda env: ClipReward(env, -1, 0.5))
-REFUSED = {
-    "reward wrapper": (lambda: after(CLIPPED, of(ClipReward, func=lambda reward: reward)), "."),
-    "watched": (lambda: after(house, watch), "must see every step"),
-    "unlike": (two_houses, "not alike"),
-    "car with time": (
-        lambda: DummyVecEnv([lambda: TimeAwareObservation(gym.make("MountainCar-v0"))]),
-        "MountainCar compiles as it is, under Monitor alone",
-    ),
-    "own car": (lambda: DummyVecEnv([Steeper]), "MountainCar compiles as it is"),
-}
-
-
-@pytest.mark.parametrize("what", REFUSED)
-def test_what_is_not_compiled_says_why(what):
-    make, reason = REFUSED[what]
-    with pytest.raises(NotCompilable, match=reason):
-        compile_envs(make())
