@@ -168,6 +168,9 @@ INTERPRETED = {  # reason: environment, settings, callback
     "VecNormalize is not DummyVecEnv": (lambda: VecNormalize(lake(), norm_obs=False),),
     "the environment's transition model is not known": (partial(lake, wrapper_class=Foreign),),
     "transition model is not known": (in_time(Blank),),
+    "rewards are drawn, and the environment's model holds": (
+        partial(gym.make, "MaximizationBias-v0"),
+    ),
     "the environments are not alike": (two(make_lake, partial(make_lake, is_slippery=False)),),
     "environments are not alike": (two(pole, partial(pole, gravity=1.6)),),
     "are not alike": (two(make_lake, lambda: Monitor(make_lake())),),

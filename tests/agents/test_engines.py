@@ -52,6 +52,9 @@ WORLDS = {
     "CartPole": world("CartPole-v1", IN_BINS),
     "coins": world("BernoulliBandit-v0", probabilities=[0.0, 0.1, 1.0], pulls=33),
     "segments": world("SegmentBandit-v0", batch_size=8, pulls=50),
+    "gambler": world("GamblersProblem-v0", goal=20),
+    "walk": world("RandomWalk-v0", n_states=300, max_jump=30),
+    "wind": world("WindyGridworld-v0", moves="king", stochastic=True, max_episode_steps=99),
 }
 for spec in list(gym.registry.values()):
     if str(spec.entry_point).startswith("envs.") and "Bandit" not in spec.id:

@@ -16,7 +16,6 @@ from stable_baselines3.common.monitor import Monitor
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from agents.common.callbacks import EpisodeBudget
-from agents.common.schedules import ExponentialSchedule
 from envs.known_models import time_limit, transition_model
 from mdp import (
     TransitionModel,
@@ -126,15 +125,6 @@ def test_plans_need_a_model_and_the_optimum_a_time_limit():
 
 
 # --- learning ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["qlearning", "sarsa", "expected_sarsa", "double_qlearning"])
-def test_the_shortest_way_through_the_warehouse(name):
-    rates = {"exploration_initial_eps": 1.0 if name == "double_qlearning" else 0.1}
-    rates |= {"exploration_final_eps": 0.01, "exploration_fraction": 0.8}
-    model = made(name, "Warehouse-v0", learning_rate=ExponentialSchedule(0.3, 0.05), **rates)
-    evaluated = evaluate_policy(model.learn(100_000), Monitor(gym.make("Warehouse-v0")), 1)
-    assert evaluated[0] == 79
 
 
 FALLING = {"exploration_initial_eps": 0.3, "exploration_final_eps": 0.01, "learning_rate": 0.1}

@@ -366,27 +366,6 @@ def test_a_changed_outcome_changes_what_leads_where():
     assert model.first_into.tolist() == [2, NONE, 0]
 
 
-def test_queue_and_lists_hold_through_a_training():
-    """On slippery ground outcomes change all the time; what is loaded is checked."""
-    env = make_vec_env("FrozenLake8x8-v1", 2, seed=3)
-    settings = {"threshold": 1e-9, "initial_q_std": 1.0}
-    agent = load_algorithm("prioritized_sweeping")(env=env, seed=1, **settings).learn(5000)
-    model = agent.policy.model
-    n = int(model.n_queued[0])
-    assert n > 10
-    urgency = model.urgency[model.queue[:n]]
-    assert (urgency[(np.arange(1, n) - 1) // 2] >= urgency[1:]).all()
-    assert (model.place[model.queue[:n]] == np.arange(n)).all()
-    for state, first in enumerate(model.first_into.tolist()):
-        pair, members = first, set()
-        while pair != NONE:
-            members.add(pair)
-            pair = int(model.behind[pair])
-        # All pairs whose last outcome goes on in this state, and no others.
-        leads = (model.next_obs[..., 0] == state) & ~model.terminated[..., 0] & (model.counts > 0)
-        assert members == set(np.flatnonzero(leads.ravel()).tolist())
-
-
 # --- R-max ---------------------------------------------------------------------------------------
 
 

@@ -51,28 +51,19 @@ def replay_clicks(env, shares, rates):
     assert env.np_random.random() == rng.random()
 
 
-def test_draws_of_bernoulli_bandits():
-    # A coin falls on heads below its probability.
-    replay_clicks(BernoulliBandit([0.0, 0.3, 0.75, 1.0]), [1.0], [[0.0, 0.3, 0.75, 1.0]])
-
-
 @given(
     weights=st.lists(st.integers(0, 9), min_size=1, max_size=5).filter(any),
     n_arms=st.integers(2, 4),
+    batch_size=st.sampled_from([1, 50]),
     data=st.data(),
 )
 @settings(max_examples=25)
-def test_draws_of_any_segments(weights, n_arms, data):
+def test_draws_of_any_segments_and_coins(weights, n_arms, batch_size, data):
     shares = [weight / sum(weights) for weight in weights]
     row = st.lists(st.floats(0, 1), min_size=n_arms, max_size=n_arms)
     rates = data.draw(st.lists(row, min_size=len(shares), max_size=len(shares)))
-    replay_clicks(SegmentBandit(shares, rates), shares, rates)
-
-
-def test_draws_of_the_segments_that_are_the_default():
-    rates = [[0.1, 0.25, 0.05], [0.12, 0.06, 0.05]]
-    replay_clicks(SegmentBandit(), [0.3, 0.7], rates)
-    replay_clicks(SegmentBandit(batch_size=50), [0.3, 0.7], rates)
+    replay_clicks(SegmentBandit(np.array(shares), np.array(rates), batch_size), shares, rates)
+    replay_clicks(BernoulliBandit(rates[0]), [1.0], rates[:1])
 
 
 @pytest.mark.parametrize("drift_std", [0.0, 0.25])
@@ -310,9 +301,3 @@ def test_arguments_out_of_range_are_refused(name, wrong, message):
     with pytest.raises(ValueError, match=message) as refused:
         CLASSES[f"{name}Bandit-v0"][0](**wrong)
     assert "\n" not in str(refused.value)
-
-
-def test_arrays_are_taken_for_lists():
-    assert GaussianBandit(means=np.array([1.0, 2.0])).given_means == (1.0, 2.0)
-    weights = np.array([[1.0, 2.0], [3.0, 4.0]])
-    assert LinearBandit(weights).arm_parameters.tolist() == weights.tolist()

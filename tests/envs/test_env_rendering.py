@@ -19,9 +19,9 @@ import pytest
 from PIL import Image
 
 from envs import drawing
-from envs.bandits import BernoulliBandit, GaussianBandit, ReplayBandit, SegmentBandit
+from envs.bandits import BernoulliBandit, GaussianBandit, ReplayBandit
 from envs.bandits.bandit import Tally, render_chart, render_text
-from envs.drawing import MAX_SIDE, Box, ChartRenderer, GridRenderer, Label, Scene
+from envs.drawing import MAX_SIDE, ChartRenderer, GridRenderer, Label, Scene
 from envs.mine_maze import MineMazeEnv
 from envs.warehouse import WarehouseEnv
 
@@ -147,39 +147,21 @@ def test_different_things_look_different_without_colour_too():
     assert min(np.abs(one - other).mean() for one, other in itertools.combinations(grey, 2)) > 8
 
 
-def test_the_robot_is_drawn_where_it_is_and_faces_where_it_goes():
-    env = WarehouseEnv(desc=["...", ".S.", "..G"], render_mode="rgb_array")
-    facing = []
+def test_the_robot_is_drawn_where_it_is_and_all_is_as_before_after_reset():
+    env = MineMazeEnv(desc=["P..", ".SM", "..G"], render_mode="rgb_array")
+    before, facing = shown(env), []
     for action, (row, column) in enumerate([(0, 1), (2, 1), (1, 0), (1, 2)]):
         drawn = shown(env, action)
         assert count(cell(drawn, row, column), drawing.INK)
         assert not count(cell(drawn, 1, 1), drawing.INK)
         facing.append(cell(drawn, row, column)[20:44, 20:44].astype(int))
     assert min(np.abs(one - other).mean() for one, other in itertools.combinations(facing, 2)) > 5
-
-
-def test_the_way_walked_is_drawn_and_forgotten_at_reset():
-    env = WarehouseEnv(desc=["....", "S..G"], render_mode="rgb_array")
-    before = shown(env)
-    drawn = shown(env, UP, RIGHT, RIGHT)
-    edges = ((32, 4), (32, 60), (60, 32))
-    trail = [[tuple(cell(drawn, 0, column)[y, x]) for y, x in edges] for column in (0, 1)]
-    on, off = drawing.BLUE, drawing.FLOOR
-    assert trail == [[off, on, on], [on, on, off]]
-    assert np.array_equal(cell(drawn, 1, 2), cell(before, 1, 2))
+    assert count(cell(before, 0, 0), drawing.ORANGE)
+    assert not count(cell(shown(env, UP, LEFT, RIGHT), 0, 0), drawing.ORANGE), "collected"
     again = shown(env)
     assert np.array_equal(again, before)
     again[:] = 0  # it belongs to the caller
     assert np.array_equal(shown(env), before)
-
-
-def test_power_is_gone_once_collected_and_a_mine_goes_off():
-    env = MineMazeEnv(desc=["SPG"], render_mode="rgb_array")
-    found = [count(cell(shown(env, *way), 0, 1), drawing.ORANGE) for way in ((), (RIGHT, LEFT), ())]
-    assert [n > 0 for n in found] == [True, False, True]
-    env = MineMazeEnv(desc=["SM", ".G"], render_mode="rgb_array")
-    assert not count(shown(env), drawing.ORANGE)
-    assert count(cell(shown(env, RIGHT), 0, 1), drawing.ORANGE)
 
 
 def scene_of(name):
@@ -229,6 +211,7 @@ def test_a_picture_is_as_it_was(name, tmp_path):
 def test_the_window_shows_the_picture_and_closes():
     env = gym.make("envs:Warehouse-v0", render_mode="human", desc=["S.G"])
     env.reset(seed=0)
+    copies = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
     env.step(RIGHT)
     window = pygame.display.get_surface()
     assert pygame.display.get_caption()[0] == "Warehouse-v0"
@@ -238,20 +221,9 @@ def test_the_window_shows_the_picture_and_closes():
     silent.close()  # which leaves the other's window alone
     assert pygame.display.get_surface() is not None
     env.close()
-    assert pygame.display.get_surface() is None
-    env.reset()
-    assert pygame.display.get_surface() is not None
-    env.close()
-
-
-def test_a_copy_of_a_shown_environment_opens_its_own_window():
-    env = gym.make("envs:Warehouse-v0", render_mode="human", desc=["S.G"])
-    env.reset(seed=0)
-    copies = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
-    env.close()
-    for other in copies:
+    for other in (env, *copies):  # a copy opens a window of its own
         assert pygame.display.get_surface() is None
-        other.step(RIGHT)
+        other.reset()
         assert pygame.display.get_surface() is not None
         other.close()
 
@@ -276,21 +248,6 @@ def test_text_of_coins():
         ">   2        2     1.000     1.000  =============================|\n"
     )
     assert shown(env).startswith("no pull yet\n")
-
-
-def test_text_of_segments_counts_where_the_pull_was_made():
-    env = SegmentBandit([0.0, 1.0], [[0.5, 0.5], [0.0, 1.0]], render_mode="ansi")
-    assert shown(env, 1) == (
-        "pull 1: arm 1, reward 1\n"
-        "context 0\n"
-        "  arm    pulls  observed  true now\n"
-        "    0        0         -     0.500                |\n"
-        "    1        0         -     0.500                |\n"
-        "context 1 (next)\n"
-        "  arm    pulls  observed  true now\n"
-        "    0        0         -     0.000  |\n"
-        ">   1        1     1.000     1.000  =============================|\n"
-    )
 
 
 def test_text_of_a_replay_counts_what_matched():
@@ -325,34 +282,16 @@ def test_of_many_arms_and_contexts_a_part_is_shown():
     assert text.count("... of 50 arms") == 4
     chart = render_chart(tally, None, 19)
     labels = [shape.text for shape in chart.shapes if isinstance(shape, Label)]
-    assert "arms 0-39 of 50" in labels
-    contexts = [label for label in labels if label.startswith("context")]
-    assert contexts == [f"context {i}" for i in range(16, 20)]
-    assert chart.size == (960, 40 + 4 * 248)
-
-
-def test_a_bar_reaches_from_zero_to_the_observed_mean():
-    tally = Tally.empty(1, 2)
-    for arm, reward in ((0, 1.0), (0, 2.0), (1, -1.0)):
-        tally.add(0, arm, reward)
-    boxes = [x for x in render_chart(tally, np.array([[2.0, 1.0]]), 0).shapes if isinstance(x, Box)]
-    bars = [box for box in boxes if box.colour in {drawing.BLUE, drawing.DARK_BLUE}][1:]
-    zero = next(box for box in boxes if box.colour == drawing.SHELF).corner[1]
-    # The panel is 160 pixels high between the lowest value, -1, and the highest, 2.
-    assert [bar.corner[1] for bar in bars] == pytest.approx([zero - 80, zero])
-    assert [bar.size[1] for bar in bars] == pytest.approx([81, 160 / 3 + 1])
-    assert [bar.colour for bar in bars] == [drawing.BLUE, drawing.DARK_BLUE]
+    assert {"arms 0-39 of 50", *(f"context {i}" for i in range(16, 20))} <= set(labels)
+    assert "context 15" not in labels
 
 
 def test_pictures_of_bandits():
     sizes = {n: shown(GaussianBandit(n_arms=n, render_mode="rgb_array")).shape for n in (2, 10, 99)}
     assert sizes == {2: (288, 374, 3), 10: (288, 710, 3), 99: (288, 960, 3)}
-    assert shown(SegmentBandit(render_mode="rgb_array")).shape == (536, 374, 3)
     env = BernoulliBandit([0.2, 1.0], render_mode="rgb_array")
-    before, after = shown(env), shown(env, 1)
-    assert (count(before, drawing.ORANGE) > 300, count(before, drawing.DARK_BLUE)) == (True, 0)
-    assert count(after, drawing.DARK_BLUE) > 1000
-    assert np.array_equal(env.render(), after)
+    assert count(shown(env), drawing.DARK_BLUE) == 0
+    assert count(shown(env, 1), drawing.DARK_BLUE) > 1000
     # What is not known is not drawn.
     replayed = shown(ReplayBandit(LOG, render_mode="rgb_array"), 0)
     assert (count(replayed, drawing.ORANGE), count(replayed, drawing.DARK_BLUE) > 1000) == (0, True)

@@ -30,26 +30,17 @@ def walk(env, letters):
 # --- maps -----------------------------------------------------------------------------------------
 
 
-def read(desc):
-    return GridMap.read(desc, known="#.SG", passable=".S")
-
-
-def test_a_map_is_read_from_rows_and_text():
-    grid_map = read(ROWS)
-    assert (grid_map.rows, grid_map.codes) == (tuple(ROWS), b"..G.#.S..")
-    assert (grid_map.n_rows, grid_map.n_columns, grid_map.n_cells) == (3, 3, 9)
-    assert grid_map.start == 6
-    assert grid_map.distances.tolist() == [2, 1, 0, 3, -1, 1, 4, 3, 2]
-    assert read("..G\n.#.\nS..\n").rows == tuple(ROWS)
-
-
 @pytest.mark.parametrize("start", ["", "\ufeff"], ids=["plain", "marked as UTF-8"])
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 @pytest.mark.parametrize("end", ["", "\n", "\n\n"])
-def test_a_map_is_read_from_a_file(tmp_path, newline, end, start):
+def test_a_map_is_read_from_rows_text_and_files(tmp_path, newline, end, start):
     path = tmp_path / "map.txt"
     path.write_bytes((start + newline.join(ROWS) + end.replace("\n", newline)).encode())
-    assert read(path).rows == read(str(path)).rows == tuple(ROWS)
+    for desc in (ROWS, "\n".join(ROWS) + end, path, str(path)):
+        grid_map = GridMap.read(desc, known="#.SG", passable=".S")
+        assert (grid_map.rows, grid_map.codes) == (tuple(ROWS), b"..G.#.S..")
+        assert grid_map.start == 6
+        assert grid_map.distances.tolist() == [2, 1, 0, 3, -1, 1, 4, 3, 2]
 
 
 BROKEN = [
@@ -132,67 +123,52 @@ def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, da
 # --- steps worked by hand -------------------------------------------------------------------------
 
 
-def test_steps_of_the_warehouse():
-    env = WarehouseEnv()
-    observation, info = env.reset(seed=0)
-    assert (observation, info["position"]) == (90, (9, 0))
+SHORTEST = "RRRRRUURRUULLUURURRRUU"
+OWN = {"desc": ["S#", ".G"], "shelf_reward": -7, "step_reward": -0.5, "goal_reward": 3}
+OWN_MINES = {"step_reward": -2, "mine_reward": -5, "power_reward": 4, "goal_reward": 10}
+STEPS = {  # a world, moves, and what they come to: states, rewards and what was bumped into
     # Against the wall, up, against a shelf, off the map, back.
-    states, rewards, over, infos = walk(env, "DLURLD")
-    assert states == [90, 90, 80, 80, 80, 90]
-    assert rewards == [-1, -1, -1, -100, -1, -1]
-    assert [info["bumped"] for info in infos] == [True, True, False, True, True, False]
-    assert not any(over)
+    "warehouse": (
+        WarehouseEnv(), "DLURLD", [90, 90, 80, 80, 80, 90], [-1, -1, -1, -100, -1, -1], "yynyyn"),
+    # After the end nothing moves.
+    "shortest way": (
+        WarehouseEnv(), SHORTEST + "D", None, [*[-1] * 21, 100, 0], "n" * 23),
+    "own rewards": (WarehouseEnv(**OWN), "RUDR", [0, 0, 2, 3], [-7, -0.5, -0.5, 3], "yynn"),
+    # Off the map, then to the power at (1, 3) and back onto it, then onto the mine at (2, 3). The
+    # power is the first of three: its bit counts 36 * 1.
+    "mines": (
+        MineMazeEnv(), "URRDRLRD", [0, 1, 2, 8, 36 + 9, 36 + 8, 36 + 9, 36 + 15],
+        [-1, -1, -1, -1, 0, -1, -1, -101], "ynnnnnnn"),
+    "way out": (MineMazeEnv(), "RRDRRDDDDR", None, [-1, -1, -1, 0, *[-1] * 5, 99], "n" * 10),
+    "own mines": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "URR", [0, 7, 8], [-2, 2, 8], "ynn"),
+    "a mine of one's own": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "D", [3], [-7], "n"),
+    "collected once": (
+        MineMazeEnv(desc=["SPG"], power_reward=5), "RUDLRR", [4, 4, 4, 3, 4, 5],
+        [4, -1, -1, -1, -1, 99], "nyynnn"),
+    # Bits are numbered row by row.
+    "two powers": (MineMazeEnv(desc=["SP", "PG"]), "RLD", [5, 4, 14], [0, -1, 0], "nnn"),
+    "maze": (DynaMazeEnv(), "DDRRRRURRRRUUU", None, [0] * 13 + [1], "n" * 14),
+}  # fmt: skip
 
 
-def test_the_shortest_way_earns_79_and_then_nothing_moves():
-    env = WarehouseEnv()
-    env.reset(seed=0)
-    _, rewards, over, infos = walk(env, "RRRRRUURRUULLUURURRRUU")
-    assert rewards == [-1] * 21 + [100]
-    assert over == [info["is_success"] for info in infos] == [False] * 21 + [True]
-    assert infos[-1]["position"] == (0, 9)
-    assert env.step(DOWN)[:3] == (9, 0.0, True)
-    assert env.shortest_path_length == 22
-    assert np.count_nonzero(env.map.distances >= 0) == 62
+@pytest.mark.parametrize("name", STEPS)
+def test_steps_by_hand(name):
+    env, letters, states, rewards, bumped = STEPS[name]
+    for _ in range(2):  # all is forgotten at reset
+        first, info = env.reset(seed=0)
+        assert (first, info["position"]) == (env.map.start, divmod(first, env.map.n_columns))
+        found, earned, over, infos = walk(env, letters)
+        assert found == (states or found)
+        assert earned == rewards
+        assert "".join("ny"[info["bumped"]] for info in infos) == bumped
+        at_goal = [env.map.rows[row][column] == "G" for row, column in at(infos)]
+        assert [info["is_success"] for info in infos] == at_goal
+        at_mine = [env.map.rows[row][column] == "M" for row, column in at(infos)]
+        assert over == [goal or mine for goal, mine in zip(at_goal, at_mine, strict=True)]
 
 
-def test_steps_of_the_mine_maze():
-    env = MineMazeEnv()
-    assert env.reset(seed=0)[1]["position"] == (0, 0)
-    # Off the map, then to the power at (1, 3) and back onto it, then onto the mine at (2, 3).
-    states, rewards, over, infos = walk(env, "URRDRLRD")
-    # The power at (1, 3) is the first of three: its bit counts 36 * 1.
-    assert states == [0, 1, 2, 8, 36 + 9, 36 + 8, 36 + 9, 36 + 15]
-    assert rewards == [-1, -1, -1, -1, 0, -1, -1, -101]
-    assert over == [False] * 7 + [True]
-    assert [info["bumped"] for info in infos] == [True] + [False] * 7
-    assert not infos[-1]["is_success"]
-    env.reset()
-    _, rewards, over, infos = walk(env, "RRDRRDDDDR")
-    assert rewards == [-1, -1, -1, 0, -1, -1, -1, -1, -1, 99]
-    assert (over[-1], infos[-1]["is_success"], env.s) == (True, True, 36 + 35)
-
-
-def test_what_was_collected_is_collected_once_and_forgotten_at_reset():
-    env = MineMazeEnv(desc=["SPG"], power_reward=5)
-    for _ in range(2):
-        assert env.reset(seed=0)[0] == 0
-        assert walk(env, "RUDLRR")[:2] == [[4, 4, 4, 3, 4, 5], [4, -1, -1, -1, -1, 99]]
-    env = MineMazeEnv(desc=["SP", "PG"])  # bits are numbered row by row
-    env.reset(seed=0)
-    assert walk(env, "RLD")[0] == [4 + 1, 4 + 0, 4 * 3 + 2]
-
-
-def test_the_rewards_are_arguments():
-    env = WarehouseEnv(desc=["S#", ".G"], shelf_reward=-7, step_reward=-0.5, goal_reward=3)
-    env.reset(seed=0)
-    assert walk(env, "RUDR")[1] == [-7.0, -0.5, -0.5, 3.0]
-    rewards = {"step_reward": -2, "mine_reward": -5, "power_reward": 4, "goal_reward": 10}
-    env = MineMazeEnv(["SPG", "M.."], **rewards)
-    env.reset(seed=0)
-    assert walk(env, "URR")[1] == [-2, 2, 8]
-    env.reset()
-    assert env.step(DOWN)[1:3] == (-7.0, True)
+def at(infos):
+    return [info["position"] for info in infos]
 
 
 def test_slip_goes_to_both_sides_in_the_stated_order():
@@ -230,25 +206,6 @@ def test_what_is_observed():
         assert np.asarray(first).tolist() == seen[0]
         assert observation == "discrete" or first.dtype == batch.dtype == np.float32
         assert np.asarray(walk(env, "DR")[0][-1]).tolist() == seen[1]
-
-
-@pytest.mark.parametrize(
-    ("make", "limit", "best", "n_moves"), [(WarehouseEnv, 1000, 79, 22), (MineMazeEnv, 100, 91, 10)]
-)
-def test_the_best_return_by_stepping_out_of_every_state_once(make, limit, best, n_moves):
-    env = make()
-    shape = int(env.observation_space.n), 4
-    target, reward, goes_on = np.zeros(shape, int), np.zeros(shape), np.zeros(shape)
-    for state, action in np.ndindex(shape):
-        env.s = state
-        _, reward[state, action], terminated, _, _ = env.step(action)
-        target[state, action], goes_on[state, action] = env.s, not terminated
-    values, found = np.zeros(shape[0]), []
-    for _ in range(limit):
-        values = (reward + goes_on * values[target]).max(axis=1)
-        found.append(values[env.map.start])
-    assert found[-1] == best
-    assert found.index(best) + 1 == env.shortest_path_length == n_moves
 
 
 # --- any map --------------------------------------------------------------------------------------
@@ -402,19 +359,13 @@ CHANGING = {"maze": "blocking", "changed": True}
 
 
 def test_shortest_ways_of_the_mazes():
-    found = {
-        (maze, changed): DynaMazeEnv(maze=maze, changed=changed).shortest_path_length
+    found = [
+        DynaMazeEnv(maze=maze, changed=changed).shortest_path_length
         for maze, changed in itertools.product(("blocking", "shortcut"), (False, True))
-    }
-    expected = [("blocking", False), ("blocking", True), ("shortcut", False), ("shortcut", True)]
-    assert found == dict(zip(expected, (10, 16, 16, 10), strict=True))
+    ]
+    assert found == [10, 16, 16, 10]
     env = DynaMazeEnv()
     assert (env.shortest_path_length, env.transition_model().n_states) == (14, 54)
-    env.reset(seed=0)
-    _, rewards, over, infos = walk(env, "DDRRRRURRRRUUU")
-    assert rewards == [0.0] * 13 + [1.0]
-    assert over[-1]
-    assert infos[-1]["is_success"]
 
 
 def test_a_maze_changes_once_after_so_many_steps_over_all_episodes():
@@ -458,7 +409,6 @@ def test_what_a_changing_maze_tells_is_of_the_moment():
 
 REFUSED = [
     ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),
-    ("Warehouse", {"slip": 1.5}, "slip must be a finite number from 0 to 1, not 1.5"),
     ("Warehouse", {"slip": float("nan")}, "slip must be a finite number from 0 to 1, not nan"),
     ("Warehouse", {"slip": "0.1"}, "slip must be a finite number from 0 to 1, not '0.1'"),
     ("Warehouse", {"slip": True}, "slip must be a finite number from 0 to 1, not True"),
@@ -466,26 +416,16 @@ REFUSED = [
     ("MineMaze", {"step_reward": float("inf")}, "step_reward must be a finite number, not inf"),
     ("MineMaze", {"goal_reward": None}, "goal_reward must be a finite number, not None"),
     ("MineMaze", {"random_start": 1}, "random_start must be true or false, not 1"),
-    (
-        "Warehouse",
-        {"observation": "positon"},
-        "unknown observation 'positon': did you mean 'position'? It must be one of discrete, posit",
-    ),
+    ("Warehouse", {"observation": "positon"}, "'positon': did you mean 'position'? It must be one"),
     ("Warehouse", {"observation": "xyz"}, "'xyz': it must be one of discrete, position, one_hot"),
     ("RandomWarehouse", {"size": 1}, "size must be a whole number from 2 to 4096, not 1"),
-    ("RandomWarehouse", {"size": 5000}, "size must be a whole number from 2 to 4096, not 5000"),
     ("RandomWarehouse", {"size": 2.5}, "size must be a whole number from 2 to 4096, not 2.5"),
     ("RandomWarehouse", {"shelf_density": 1.1}, "shelf_density must be a finite number from 0 to"),
     ("RandomWarehouse", {"map_seed": -1}, "map_seed must be a whole number from 0 to 9223372036"),
-    ("RandomWarehouse", {"map_seed": True}, "map_seed must be a whole number from 0 to 92233720"),
     ("DynaMaze", {"maze": "block"}, "unknown maze 'block': did you mean 'blocking'"),
     ("DynaMaze", {"changed": True}, "changed: the maze 'dyna' never changes"),
     ("DynaMaze", {"maze": "blocking", "change_after_steps": 5}, "change_after_steps needs changed"),
-    (
-        "DynaMaze",
-        {**CHANGING, "change_after_steps": 0},
-        "change_after_steps must be a whole number",
-    ),
+    ("DynaMaze", {**CHANGING, "change_after_steps": 0}, "change_after_steps must be a whole num"),
 ]
 
 

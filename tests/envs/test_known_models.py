@@ -193,26 +193,10 @@ def test_a_broken_model_is_not_used():
 
 
 def test_time_limits():
-    registered = {
-        "Warehouse-v0": 1000,
-        "MineMaze-v0": 100,
-        "FrozenLake-v1": 100,
-        "CliffWalking-v1": None,
-        "DeepSea-v0": 1000,
-        "DynaMaze-v0": 100,
-        "GamblersProblem-v0": 1000,
-        "JacksCarRental-v0": 100,
-        "MaximizationBias-v0": 100,
-        "Racetrack-v0": 1000,
-        "RandomWalk-v0": 1000,
-        "RiverSwim-v0": 20,
-        "ShortCorridor-v0": 1000,
-        "WindyGridworld-v0": 1000,
-    }
-    assert {env_id: time_limit(gym.make(env_id)) for env_id in registered} == registered
-    for env_id, limit in (("MineMaze-v0", 100), ("CliffWalking-v1", 5000)):
+    for env_id, limit in (("MineMaze-v0", 100), ("CliffWalking-v1", None)):
         env = gym.make(env_id)
-        assert time_limit(Monitor(TimeLimit(env, 5000))) == limit
+        assert time_limit(env) == limit
+        assert time_limit(Monitor(TimeLimit(env, 5000))) == (limit or 5000)
         assert time_limit(TimeLimit(ScaleReward(env, 0.5), 7)) == 7
 
 

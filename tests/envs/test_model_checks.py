@@ -17,7 +17,6 @@ from gymnasium.envs.toy_text.utils import categorical_sample
 from hypothesis import given
 from hypothesis import strategies as st
 
-import envs
 from envs import check_transition_model, checking
 from envs.known_models import (
     model_check,
@@ -101,16 +100,6 @@ class Corridor(gym.Env):
 # --- right models ---------------------------------------------------------------------------------
 
 
-class Streak(Corridor):
-    """Wind is likelier after wind; both are as frequent as P says in the long run."""
-
-    blew = 0
-
-    def draw(self, row):
-        self.blew = int(self.np_random.random() < (0.6 if self.blew else 0.4))
-        return self.blew
-
-
 class Backwards(Corridor):
     def draw(self, row):
         return int(self.np_random.random() < row[1][0])
@@ -169,21 +158,6 @@ class Deaf(Corridor):
         return result
 
 
-class Torn(Corridor):
-    """Goes on from ``s``, and rewards by where it thinks that it is."""
-
-    place = 0
-
-    def reset(self, *, seed=None, options=None):
-        self.place, info = super().reset(seed=seed)
-        return self.place, info
-
-    def step(self, action):
-        before = self.place
-        self.place, reward, *rest = super().step(action)
-        return self.place, reward - (abs(self.place - before) > 2), *rest
-
-
 class Pictured(Corridor):
     """What is observed is no number."""
 
@@ -195,7 +169,7 @@ class Pictured(Corridor):
         return np.eye(5, dtype=np.float32)[self.s]
 
 
-EVEN, SAME_REWARDS = outcomes(wind=0.5), outcomes(goal_reward=-1.0)
+SAME_REWARDS = outcomes(goal_reward=-1.0)
 # Whether it draws bit for bit as toy_text does, and whether its state can be set.
 RIGHT = {
     "as toy_text": (lambda: Corridor(render_mode="human"), True, True),
@@ -208,11 +182,8 @@ RIGHT = {
         False,
         True,
     ),
-    # A model has no memory, and the check does not ask for any.
-    "wind in streaks": (lambda: Streak(EVEN, EVEN), False, True),
     "unsettable": (Unsettable, True, False),
     "deaf": (Deaf, True, False),
-    "torn": (Torn, True, False),
     "FrozenLake": (lambda: FrozenLakeEnv(map_name="8x8", success_rate=0.6), True, True),
     "CliffWalking": (lambda: gym.make("CliffWalking-v1", is_slippery=True), True, True),
     "Taxi": (lambda: gym.make("Taxi-v4", is_rainy=True), True, True),
@@ -299,10 +270,13 @@ FALSE = {
     "pictures": (lambda: Pictured(altered(reward=10.0)), "state 3, action 1: P says"),
     "unsettable": (lambda: Unsettable(*FAR), "state 3, action 0: P says"),
     "deaf": (lambda: Deaf(*FAR), "state 3, action 0: P says"),
-    "torn": (lambda: Torn(*FAR), "state 3, action 0: P says"),
     "frequency of one row": (
         lambda: Corridor(ONE_ROW, outcomes()),
         r"state 2, action 0: P says state 1 with reward -1\.0 in 60\.0% of cases",
+    ),
+    "frequency everywhere": (
+        lambda: Careless(outcomes(0.4), outcomes()),
+        r" in (40.0% of .* gave it in (2[5-9]|3[0-4])|60.0% of .* in (6[5-9]|7[0-4]))\.\d% of ",
     ),
     "frequency of a start": (lambda: Corridor(start=(0.9, 0.1, 0, 0, 0)), "initial_state_distrib"),
     "storms": (Stormy, "in 30.0% of cases|in 70.0% of cases"),
@@ -335,6 +309,9 @@ FALSE = {
 }
 
 
+AGAIN = {"reward", "frequency everywhere", "storms"}
+
+
 def with_p(told):
     env = Corridor()
     env.P = told
@@ -351,17 +328,12 @@ def with_spaces(n_states, n_actions):
 def test_false_models_are_refused_in_one_line(name):
     make, line = FALSE[name]
     n_steps = 20_000 if "frequency" in name else FEW
-    refusal = check_transition_model(make(), n_steps).refusal
-    assert re.search(line, refusal), refusal
-    assert "\n" not in refusal
-
-
-def test_a_wrong_frequency_is_named_with_what_was_seen():
-    refusal = check_transition_model(Corridor(outcomes(wind=0.4))).refusal
-    found = re.search(r"in (\d+\.\d)% of cases, step gave it in (\d+\.\d)% of [\d,]+$", refusal)
-    said, seen = float(found[1]), float(found[2])
-    assert said in {40.0, 60.0}
-    assert abs(seen - {40.0: 30, 60.0: 70}[said]) < 5
+    check = check_transition_model(make(), n_steps)
+    assert re.search(line, check.refusal), check.refusal
+    assert "\n" not in check.refusal
+    if name in AGAIN:
+        random.seed(1)
+        assert check_transition_model(make(), n_steps) == check
 
 
 class Same(FrozenLakeEnv):
@@ -381,11 +353,6 @@ class Detour(WarehouseEnv):
         return super().step(3 - action)
 
 
-class Renamed(WarehouseEnv):
-    def observation_of(self, states):
-        return (states + 1) % self.dynamics.n_states
-
-
 def replaced_by_hand():
     env = FrozenLakeEnv()
     original = env.step
@@ -393,7 +360,7 @@ def replaced_by_hand():
     return env
 
 
-@pytest.mark.parametrize("make", [Frozen, Detour, Renamed, replaced_by_hand])
+@pytest.mark.parametrize("make", [Frozen, Detour, replaced_by_hand])
 def test_what_differs_from_a_known_class_is_not_believed(make):
     env = make()
     assert model_check(env).refusal is not None
@@ -440,18 +407,6 @@ def test_the_caller_notices_nothing():
     assert state() == before
 
 
-def test_a_check_comes_out_the_same_every_time():
-    checks = []
-    for seed in range(2):
-        # The check leaves the shared generators as they were.
-        random.seed(seed)
-        np.random.seed(seed)  # noqa: NPY002
-        env = Careless(outcomes(0.4), outcomes())
-        checks.append(check_transition_model(env, n_steps=20_000))
-    assert checks[0] == checks[1]
-    assert checks[0].refusal is not None
-
-
 class Locked(Corridor):
     """Cannot be copied."""
 
@@ -485,7 +440,7 @@ def counted():
     return Counted
 
 
-def test_each_environment_is_checked_once():
+def test_each_environment_is_checked_once_until_it_is_changed():
     kind, tried = counted(), set()
     for seed in range(3):
         env = gym.wrappers.TimeLimit(kind(), 50)
@@ -497,18 +452,14 @@ def test_each_environment_is_checked_once():
             assert observations_of_states(env) is not None
             tried.add(kind.tried)
     assert len(tried) == 1
-
-
-def test_an_environment_that_was_changed_is_checked_again():
-    env, goal = counted()(), outcomes(goal_reward=3.0)
-    assert transition_model(env) is not None
+    env, goal = env.unwrapped, outcomes(goal_reward=3.0)
     env.true = outcomes(wind=0.6)
     assert transition_model(env) is None
     env.P = outcomes(wind=0.6)
     assert transition_model(env) is not None
-    before = type(env).tried
-    assert transition_model(type(env)(goal, goal)) is not None
-    assert type(env).tried > before
+    before = kind.tried
+    assert transition_model(kind(goal, goal)) is not None
+    assert kind.tried > before
 
 
 def test_what_cannot_be_written_down_is_told_apart():
@@ -526,44 +477,9 @@ def test_what_cannot_be_written_down_is_told_apart():
     assert transition_model(env) is None
 
 
-def test_the_package_exports_the_check():
-    assert envs.check_transition_model is checking.check_transition_model
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = envs.nothing
-
-
-# --- what counts say against probabilities --------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("count", "trials", "mixture"),
-    [(0, 0, 1.0), (1, 1, 1 / 2), (1, 2, 1 / 8), (2, 2, 3 / 8), (0, 3, 5 / 16)],
-)
-def test_the_mixture_by_hand(count, trials, mixture):
-    # Krichevsky and Trofimov's estimator: (successes + 1/2) / (draws + 1), step by step.
-    for prob in (0.2, 0.5, 0.97):
-        ratio = mixture / (prob**count * (1 - prob) ** (trials - count))
-        found = checking.log_evidence(np.array(count), np.array(trials), np.array(prob))
-        assert math.exp(found) == pytest.approx(ratio)
-
-
 @given(st.floats(0.001, 0.999), st.integers(1, 9))
 def test_under_the_right_probability_it_is_a_fair_bet(prob, n):
     counts = np.arange(n + 1)
     weights = [math.comb(n, k) * prob**k * (1 - prob) ** (n - k) for k in counts]
     ratios = np.exp(checking.log_evidence(counts, np.array(n), np.array(prob)))
     assert np.sum(weights * ratios) == pytest.approx(1)
-
-
-def test_counts_by_group():
-    shared, other = [0.5, 0.5, 0.0], [0.2, 0.3, 0.5]
-    probabilities = np.array([shared, shared, other, other])
-    drawn = np.array([2, 1, 2, 0, 0, 1])
-    found = checking.frequencies(np.array([3, 0, 3, 3, 0, 2]), drawn, probabilities)
-    groups, counts, evidence = found
-    np.testing.assert_array_equal(groups, [0, 2, 3])
-    np.testing.assert_array_equal(counts, [[1, 1, 0], [0, 1, 0], [1, 0, 2]])
-    # What is certain says nothing.
-    assert evidence[0, 2] == -np.inf
-    expected = checking.log_evidence(np.array([1, 0, 2]), np.array(3), probabilities[3])
-    np.testing.assert_allclose(evidence[2], expected)
