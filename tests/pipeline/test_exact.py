@@ -1,4 +1,4 @@
-"""Exact evaluations agree with sampled ones, for every kind of agent whose policy is known."""
+"""Exact evaluation is what the agents' own actions come to; and advice where they failed."""
 
 import math
 from collections import defaultdict
@@ -8,189 +8,105 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
 from mdp import policy_return, value_iteration
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation import policies
+from pipeline.evaluation.advice import advice
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.policies import policy_matrix
+from pipeline.evaluation.policies import action_figures, policy_matrix
 from pipeline.evaluation.sampled import Yardstick, evaluate
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
+from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
+from tests.pipeline.short_runs import spec_of as spec_for
 
 # Two-sided, of the normal distribution.
 WITHIN_999 = 3.2905
-N_EPISODES = 20_000
-
-ENVS = {
-    "Warehouse": ("Warehouse-v0", {"slip": 0.1, "max_episode_steps": 60, "shelf_reward": -3}),
-    "FrozenLake": ("FrozenLake-v1", {}),
-    "MineMaze": ("MineMaze-v0", {"random_start": True, "slip": 0.2, "max_episode_steps": 50}),
-    "still Warehouse": ("Warehouse-v0", {"max_episode_steps": 100}),
-    "still FrozenLake": ("FrozenLake-v1", {"is_slippery": False}),
-    "still MineMaze": ("MineMaze-v0", {}),
-}
-POSITION = {"observation": "position", "max_episode_steps": 60, "slip": 0.1}
+POSITION = {"env_kwargs": {"observation": "position", "max_episode_steps": 60, "slip": 0.1}}
+HOT = {"env_kwargs": {"slip": 0.1, "max_episode_steps": 60}}
+HOT |= {"env_wrapper": "envs.wrappers.OneHotObservation"}
+SLIPPERY = {"env_kwargs": {"slip": 0.1, "max_episode_steps": 60, "shelf_reward": -3}}
+DEEP = {"random_start": True, "slip": 0.2, "max_episode_steps": 50}
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
 AGENTS = {
-    "qlearning": {"learning_rate": 0.5, "exploration_final_eps": 0.3},
-    "ppo": {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2},
-    "a2c": SMALL,
-    "trpo": {**SMALL, "n_steps": 64, "batch_size": 64},
-    "dqn": {**SMALL, "buffer_size": 500, "learning_starts": 50, "exploration_final_eps": 0.2},
-    "random": {},
+    "qlearning": (5000, {"learning_rate": 0.5, "exploration_final_eps": 0.3}),
+    "ppo": (256, {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2}),
+    "a2c": (100, SMALL),
+    "trpo": (128, {**SMALL, "n_steps": 64, "batch_size": 64}),
+    "dqn": (
+        300,
+        {**SMALL, "buffer_size": 500, "learning_starts": 50, "exploration_final_eps": 0.2},
+    ),
+    "random": (0, {}),
 }
-BRIEFLY = {"qlearning": 5000, "ppo": 256, "a2c": 100, "trpo": 128, "dqn": 300, "random": 0}
 
 
-def spec_of(env, **entry):
-    env_id, env_kwargs = ENVS.get(env, (env, {}))
-    entry = {"n_timesteps": 1, "env_kwargs": env_kwargs, **entry}
-    return TrainSpec("qlearning", env_id, split(entry), entry, seed=0)
+def spec_of(env_id, entry=None):
+    return spec_for("qlearning", env_id, entry)
 
 
 def briefly_trained(name, spec):
-    algorithm = load_algorithm(name)
-    env = make_training_env(spec, None)
-    policy = next(iter(algorithm.policy_aliases))
-    return algorithm(policy, env, seed=0, **AGENTS[name]).learn(BRIEFLY[name])
+    n_steps, arguments = AGENTS[name]
+    return agent_of(name, make_training_env(spec, None), **arguments).learn(n_steps)
 
 
-def sampled_returns(evaluator, policy, n_episodes, seed=0):
-    """Returns of many episodes that follow the policy matrix in the model, all at once."""
-    model, rng = evaluator.model, np.random.default_rng(seed)
-    actions_up_to = policy.cumsum(axis=1)
-    outcomes_up_to = model.prob.cumsum(axis=2)
-    states = rng.choice(model.n_states, n_episodes, p=model.initial)
-    returns, playing = np.zeros(n_episodes), np.arange(n_episodes)
-    for _ in range(evaluator.horizon):
-        drawn = rng.random((2, len(playing), 1))
-        # Rounding may leave a last sum just below 1.
-        actions = (actions_up_to[states, :-1] <= drawn[0]).sum(axis=1)
-        outcomes = (outcomes_up_to[states, actions, :-1] <= drawn[1]).sum(axis=1)
-        at = states, actions, outcomes
-        returns[playing] += model.reward[at]
-        going_on = ~model.terminated[at]
-        states, playing = model.next_state[at][going_on], playing[going_on]
-    return returns
-
-
-def assert_mean_is(expected, std, returns):
-    """The mean of sampled returns lies in its 99.9 % interval around the exact one."""
-    margin = WITHIN_999 * std / np.sqrt(len(returns))
-    assert np.mean(returns) == pytest.approx(expected, abs=margin + 1e-4)
-
-
-# --- against sampling ----------------------------------------------------------------------------
-
-
-# What is drawn follows the matrix of the policy: of every kind of agent one is enough, and of
-# every environment one that is a table and one that is a network.
 @pytest.mark.parametrize(
-    ("name", "env"),
+    ("name", "env_id", "entry", "n_episodes"),
     [
-        *((name, "FrozenLake") for name in AGENTS),
-        *((name, env) for name in ("qlearning", "ppo") for env in ("Warehouse", "MineMaze")),
+        *((name, LAKE, {}, 1000) for name in AGENTS),
+        # A hidden natural is judged by what the agent sees.
+        ("qlearning", "Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}, 3000),
+        ("qlearning", WAREHOUSE, SLIPPERY, 200),
+        ("ppo", "MineMaze-v0", {"env_kwargs": DEEP}, 200),
+        ("dqn", WAREHOUSE, POSITION, 200),
+        ("ppo", WAREHOUSE, HOT, 200),
     ],
 )
-def test_the_exact_return_is_that_of_sampled_episodes(name, env):
-    spec = spec_of(env)
-    evaluator = exact_evaluator(spec)
-    agent = briefly_trained(name, spec)
+def test_the_exact_return_is_that_of_the_agents_own_actions(name, env_id, entry, n_episodes):
+    """The mean of sampled returns lies in its 99.9 % interval around the exact one."""
+    spec = spec_of(env_id, entry)
+    agent, evaluator = briefly_trained(name, spec), exact_evaluator(spec)
     for deterministic in (True, False):
         exact = evaluator(agent, deterministic)
         policy = policy_matrix(agent, evaluator.observations, deterministic)
         np.testing.assert_allclose(policy.sum(axis=1), 1, atol=1e-6)
-        returns = sampled_returns(evaluator, policy, N_EPISODES)
-        assert exact.is_exact
-        assert_mean_is(exact.mean_return, exact.std_return, returns)
-        # The standard deviation itself, whose error depends on the tails: loosely.
-        assert returns.std() == pytest.approx(exact.std_return, rel=0.15, abs=0.01)
-
-
-@pytest.mark.parametrize(
-    ("name", "env", "entry", "n_episodes"),
-    [
-        ("qlearning", "FrozenLake", {}, 1000),
-        ("ppo", "FrozenLake", {}, 1000),
-        # A hidden natural is judged by what the agent sees.
-        ("qlearning", "Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}, 3000),
-        ("dqn", "Warehouse-v0", {"env_kwargs": POSITION}, 200),
-    ],
-)
-def test_the_exact_return_is_that_of_the_agents_own_actions(name, env, entry, n_episodes):
-    spec = spec_of(env, **entry)
-    agent, evaluator = briefly_trained(name, spec), exact_evaluator(spec)
-    for deterministic in (True, False):
-        exact = evaluator(agent, deterministic)
         played = evaluate(agent, make_evaluation_env(spec, 50), n_episodes, 5, deterministic)
-        assert_mean_is(exact.mean_return, exact.std_return, played.returns)
+        margin = WITHIN_999 * exact.std_return / math.sqrt(n_episodes)
+        assert exact.is_exact
+        assert played.mean_return == pytest.approx(exact.mean_return, abs=margin + 1e-4)
         assert played.lengths.mean() == pytest.approx(exact.lengths[0], rel=0.15)
 
 
-# --- observations --------------------------------------------------------------------------------
-
-
 class Lookup:
-    """Acts by a table of actions, on whatever it recognises the state by."""
+    """Acts by a table of actions."""
 
-    def __init__(self, actions, state_of):
+    action_space = spaces.Discrete(4)
+
+    def __init__(self, actions):
         self.actions = actions
-        self.state_of = state_of
-        self.action_space = spaces.Discrete(4)
 
     def predict(self, observation, deterministic=True):
-        return self.actions[self.state_of(observation)], None
-
-
-def cell_of(position):
-    return (np.rint(position * 9) @ [10, 1]).astype(int)
-
-
-ENCODINGS = {
-    "position": ({"env_kwargs": {"observation": "position", "slip": 0.1}}, cell_of),
-    "one_hot": (
-        {"env_kwargs": {"observation": "one_hot", "slip": 0.1}},
-        lambda hot: hot.argmax(axis=1),
-    ),
-    "wrapper": (
-        {"env_kwargs": {"slip": 0.1}, "env_wrapper": "envs.wrappers.OneHotObservation"},
-        lambda hot: hot.argmax(axis=1),
-    ),
-}
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_other_observations_of_the_same_states(encoding):
-    entry, state_of = ENCODINGS[encoding]
-    plain = exact_evaluator(spec_of("Warehouse-v0", env_kwargs={"slip": 0.1}))
-    encoded = exact_evaluator(spec_of("Warehouse-v0", **entry))
-    assert encoded.observations.dtype == np.float32
-    plan = value_iteration(plain.model, 1.0)
-    for actions in (plan.policy, np.random.default_rng(0).integers(0, 4, 100)):
-        expected = plain(Lookup(actions, lambda state: state))
-        seen = encoded(Lookup(actions, state_of))
-        assert seen.summary() == expected.summary()
+        return self.actions[observation], None
 
 
 @pytest.mark.parametrize(
-    ("env", "entry"),
+    ("env_id", "entry"),
     [
-        ("CartPole-v1", {}),
-        ("FrozenLake-v1", {"normalize": {"norm_obs": False}}),
-        ("FrozenLake-v1", {"frame_stack": 2}),
-        ("FrozenLake-v1", {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"}),
+        (CART, {}),
+        (LAKE, {"normalize": {"norm_obs": False}}),
+        (LAKE, {"frame_stack": 2}),
+        (LAKE, {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"}),
         # Twenty-two thousand states of as many numbers each are two gigabytes.
         ("envs:RandomWarehouse-v0", {"env_kwargs": {"size": 150, "observation": "one_hot"}}),
     ],
 )
-def test_where_episodes_must_be_sampled(env, entry):
-    assert exact_evaluator(spec_of(env, **entry)) is None
+def test_where_episodes_must_be_sampled(env_id, entry):
+    assert exact_evaluator(spec_of(env_id, entry)) is None
 
 
 def test_what_takes_longer_than_playing_is_said(monkeypatch):
-    spec = spec_of("Warehouse")
+    spec = spec_of(WAREHOUSE, SLIPPERY)
     evaluator = exact_evaluator(spec)
     agents = {name: briefly_trained(name, spec) for name in ("qlearning", "dqn", "random")}
     assert [evaluator.obstacle(agent) for agent in agents.values()] == ["", "", ""]
@@ -202,26 +118,22 @@ def test_what_takes_longer_than_playing_is_said(monkeypatch):
     assert evaluator.obstacle(agents["qlearning"], deterministic=False).startswith("random")
 
 
-def test_a_network_is_asked_in_parts_where_states_are_many(monkeypatch):
-    spec = spec_of("Warehouse")
-    evaluator = exact_evaluator(spec)
-    for name in ("dqn", "ppo"):
-        agent = briefly_trained(name, spec)
-        for sure in (True, False):
-            at_once = evaluator(agent, sure).mean_return
-            with monkeypatch.context() as patch:
-                patch.setattr(policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
-                in_parts = exact_evaluator(spec)(agent, sure).mean_return
-            assert in_parts == pytest.approx(at_once, rel=1e-5)
+@pytest.mark.parametrize("name", ["dqn", "ppo"])
+def test_a_network_is_asked_in_parts_where_states_are_many(monkeypatch, name):
+    spec = spec_of(WAREHOUSE, SLIPPERY)
+    agent = briefly_trained(name, spec)
+    at_once = [exact_evaluator(spec)(agent, sure).mean_return for sure in (True, False)]
+    monkeypatch.setattr(policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
+    in_parts = [exact_evaluator(spec)(agent, sure).mean_return for sure in (True, False)]
+    assert in_parts == pytest.approx(at_once, rel=1e-5)
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.1])
-def test_a_large_warehouse_is_evaluated_exactly(slip):
+def test_a_large_warehouse_is_evaluated_exactly():
     """Against planning and evaluating backwards, which takes a hundred times as long."""
-    spec = spec_of("envs:RandomWarehouse-v0", env_kwargs={"size": 150, "slip": slip})
+    spec = spec_of("envs:RandomWarehouse-v0", {"env_kwargs": {"size": 150, "slip": 0.1}})
     evaluator = exact_evaluator(spec)
     best = value_iteration(evaluator.model, 1.0)
-    found = evaluator(Lookup(best.policy, lambda state: state))
+    found = evaluator(Lookup(best.policy))
     assert found.mean_return == pytest.approx(evaluator.yardstick.optimum, rel=1e-9)
     assert found.summary()["score"] == pytest.approx(1, abs=1e-9)
     assert evaluator.yardstick.optimum == pytest.approx(best.start_value, rel=1e-9)
@@ -242,35 +154,28 @@ def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
     assert (policies.best_actions(Contrary(env="FrozenLake-v1"), states) == 3).all()
 
 
-def test_what_an_unknown_agent_samples_from_is_not_guessed():
-    env = exact_evaluator(spec_of("FrozenLake"))
-    with pytest.raises(TypeError, match="action probabilities of Lookup are not known"):
-        policy_matrix(Lookup(np.zeros(16, int), lambda state: state), env.observations, False)
-
-
 # --- the yardstick -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("env", "optimum", "baseline"),
-    [("Warehouse-v0", 79.0, -1000.0), ("MineMaze-v0", 91.0, None), ("FrozenLake-v1", 0.7442, None)],
+    ("env_id", "optimum", "baseline"),
+    [(WAREHOUSE, 79.0, -1000.0), ("MineMaze-v0", 91.0, None), (LAKE, 0.7442, None)],
 )
-def test_the_best_policy_scores_1_and_the_baseline_one_0(env, optimum, baseline):
-    evaluator = exact_evaluator(spec_of(env))
+def test_the_best_policy_scores_1_and_the_baseline_one_0(env_id, optimum, baseline):
+    evaluator = exact_evaluator(spec_of(env_id))
     n_states, n_actions = evaluator.model.prob.shape[:2]
-    best = Lookup(value_iteration(evaluator.model, 1.0).policy, lambda state: state)
+    best = Lookup(value_iteration(evaluator.model, 1.0).policy)
     assert evaluator.yardstick.optimum == pytest.approx(optimum, abs=5e-5)
     # On the slippery lake the best policy depends on the time that is left.
-    least = 0.95 if env == "FrozenLake-v1" else 1 - 1e-12
+    least = 0.95 if env_id == LAKE else 1 - 1e-12
     assert least <= evaluator(best).summary()["score"] <= 1 + 1e-12
-    policies = [np.eye(n_actions)[[action] * n_states] for action in range(n_actions)]
-    policies.append(np.full((n_states, n_actions), 1 / n_actions))
+    simple = [np.eye(n_actions)[[action] * n_states] for action in range(n_actions)]
+    simple.append(np.full((n_states, n_actions), 1 / n_actions))
     returns = [
         policy_return(evaluator.model, policy, evaluator.horizon).expected_return
-        for policy in policies
+        for policy in simple
     ]
-    scores = [evaluator.yardstick.score(value) for value in returns]
-    assert max(scores) == pytest.approx(0, abs=1e-12)
+    assert max(map(evaluator.yardstick.score, returns)) == pytest.approx(0, abs=1e-12)
     if baseline is not None:
         assert max(returns) == baseline
 
@@ -278,10 +183,8 @@ def test_the_best_policy_scores_1_and_the_baseline_one_0(env, optimum, baseline)
 def test_figures_of_the_yardstick():
     yardstick = Yardstick(optimum=79.0, baseline=-1000.0)
     assert yardstick.gap(70.0) == 9.0
-    assert yardstick.score(79.0) == 1.0
-    assert yardstick.score(-1000.0) == 0.0
-    assert yardstick.score(-460.5) == 0.5
-    assert yardstick.score(-2079.0) == -1.0
+    worths = (79.0, -1000.0, -460.5, -2079.0)
+    assert [yardstick.score(worth) for worth in worths] == [1.0, 0.0, 0.5, -1.0]
     flat = Yardstick(optimum=5.0, baseline=5.0)
     assert (flat.score(5.0), flat.score(4.0)) == (1.0, 0.0)
     # Sums in another order.
@@ -290,7 +193,7 @@ def test_figures_of_the_yardstick():
 
 
 def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
-    spec = spec_of("FrozenLake")
+    spec = spec_of(LAKE)
     evaluator, agent = exact_evaluator(spec), briefly_trained("qlearning", spec)
     before, values = evaluator(agent), evaluator.values(evaluator.policy(agent, True))
     assert evaluator(agent) is before
@@ -303,16 +206,15 @@ def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
 
 
 # With four cells there are as many states as actions, where rows can be mistaken for columns.
+# With four cells there are as many states as actions, where rows can be mistaken for columns.
 MAPS = {"four cells": ["SF", "FG"], "six cells": ["SFF", "FHG"]}
 LIMIT = 12
 
 
-def trained(name, env_kwargs, **arguments):
+def learner_on(name, env_kwargs, **arguments):
     """A run's specification, and an agent that has learned for a while."""
-    entry = {"n_timesteps": 1, "env_kwargs": {**env_kwargs, "max_episode_steps": LIMIT}}
-    spec = TrainSpec(name, "FrozenLake-v1", split(entry), entry, seed=0)
-    agent = load_algorithm(name)(env=make_training_env(spec, None), seed=0, **arguments)
-    return spec, agent.learn(400)
+    spec = spec_of(LAKE, {"env_kwargs": {**env_kwargs, "max_episode_steps": LIMIT}})
+    return spec, agent_of(name, make_training_env(spec, None), **arguments).learn(400)
 
 
 def epsilon_greedy(row, agent):
@@ -357,9 +259,9 @@ def added_up(agent, choose, env):
 )
 def test_the_worth_of_exploring(name, choose, arguments, cells):
     env_kwargs = {"desc": MAPS[cells], "is_slippery": False}
-    spec, agent = trained(name, env_kwargs, **arguments)
+    spec, agent = learner_on(name, env_kwargs, **arguments)
     found = exact_evaluator(spec)(agent, deterministic=False)
-    env = gym.make("FrozenLake-v1", **env_kwargs)
+    env = gym.make(LAKE, **env_kwargs)
     env.reset(seed=0)
     mean_return, mean_length = added_up(agent, choose, env)
     assert found.mean_return == pytest.approx(mean_return, abs=1e-12)
@@ -368,10 +270,155 @@ def test_the_worth_of_exploring(name, choose, arguments, cells):
     assert 0.05 < mean_return < exact_evaluator(spec)(agent).mean_return
 
 
-def test_the_worth_of_noise_is_refused():
-    spec, agent = trained("qlearning", {"desc": MAPS["four cells"]}, exploration="gaussian_noise")
+def test_what_is_not_known_is_not_guessed():
+    map_ = {"desc": MAPS["four cells"]}
+    spec, agent = learner_on("qlearning", map_, exploration="gaussian_noise")
     evaluator = exact_evaluator(spec)
     with pytest.raises(ValueError, match="no closed-form action probabilities"):
         evaluator(agent, deterministic=False)
     # What it has learned can be told all the same.
     assert evaluator(agent).is_exact
+    with pytest.raises(TypeError, match="action probabilities of Lookup are not known"):
+        policy_matrix(Lookup(np.zeros(16, int)), evaluator.observations, False)
+
+
+# --- advice --------------------------------------------------------------------------------------
+UP, DOWN, LEFT, RIGHT = range(4)  # of the warehouse
+PAIRS = 61 * 4  # states of the warehouse that can be reached, times actions
+
+
+def judged(env_id, table, n_steps=10**6, algo="qlearning", env_kwargs=None, **arguments):
+    """Advice on an agent with these values: by state a row, or one row for all."""
+    spec = spec_for(algo, env_id, {"env_kwargs": env_kwargs or {}, **arguments})
+    agent = agent_of(algo, make_training_env(spec, None), **arguments)
+    if table is None:
+        agent.learn(1)
+    else:
+        for state, row in table.items() if isinstance(table, dict) else [(slice(None), table)]:
+            agent.policy.q_tables[0, state] = th.tensor(row, dtype=th.float64)
+    evaluator = exact_evaluator(spec)
+    return advice(spec, agent, evaluator, evaluator(agent), n_steps)
+
+
+LATE = "100% of its episodes run out of time"
+
+
+def prefers(action, low=-1.0, high=0.0):
+    return [high if i == action else low for i in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_kwargs", "table", "instead"),
+    [
+        # Up from the start, to the shelf of the seventh row.
+        ("Warehouse-v0", {}, prefers(UP), f"{LATE}: it stays at row 8, column 1"),
+        (
+            "Warehouse-v0",
+            {},
+            {90: prefers(RIGHT), 91: prefers(LEFT)},
+            f"{LATE}: it goes round between row 10, column 1; row 10, column 2",
+        ),
+        (
+            "FrozenLake-v1",  # here 1 is down and 2 is right: into the hole below the second cell
+            {"is_slippery": False},
+            {0: prefers(2), 1: prefers(1)},
+            "100% of its episodes end before the time limit, 0.0% of all with success",
+        ),
+        # Always south.
+        ("Taxi-v4", {}, [0, 0, 0, 0, 0, -1], f"{LATE}: it never leaves 60 of 400 states"),
+    ],
+)
+def test_what_it_does_instead(env_id, env_kwargs, table, instead):
+    assert judged(env_id, table, env_kwargs=env_kwargs).instead.startswith(instead)
+
+
+@pytest.mark.parametrize(
+    ("start_value", "n_steps", "try_first"),
+    [
+        (-81.0, 400 * PAIRS, "-params gamma:0.9995 (now gamma 0.99)"),
+        (-79.0, 130 * PAIRS, None),
+        (
+            -81.0,
+            400 * PAIRS - 1,
+            ("-n 1000000 -params gamma:0.9995 (now 400 for each state and action; gamma 0.99)"),
+        ),
+        (-79.0, PAIRS, "-n 1000000 (now 1 for each state and action)"),
+    ],
+)
+def test_by_two_signals(start_value, n_steps, try_first):
+    """Standing still costs 1 a step: -100 at a discount of 0.99, of which -80 are four fifths."""
+    table = prefers(UP, low=start_value - 1, high=start_value)
+    assert judged("Warehouse-v0", table, n_steps, gamma=0.99).try_first == try_first
+
+
+def test_a_discount_that_hides_the_goal_from_planning_too_and_nothing_in_vain():
+    found = judged(WAREHOUSE, None, env_kwargs={"slip": 0.2}, gamma=0.99)
+    assert found.try_first == (
+        "-params gamma:0.9995 (now gamma 0.99, where even exact planning scores 0.00)"
+    )
+    # In 60 steps only luck leads to the goal, which no discounted plan knows how to use.
+    table = prefers(UP, low=-100.0, high=-99.0)
+    found = judged(WAREHOUSE, table, 10, env_kwargs={"max_episode_steps": 60, "slip": 0.1})
+    assert found.try_first is None
+    for algo in ("optimal", "random"):
+        assert judged(WAREHOUSE, None, algo=algo) is None
+    # Here the best policy does not end either.
+    assert judged("RiverSwim-v0", [0.0, 1.0]) is None
+    assert advice(spec_for("dqn", CART), None, np.mean, None, 1) is None
+
+
+# --- what agents make of their actions -----------------------------------------------------------
+
+TINY = {"policy_kwargs": {"net_arch": [8]}}
+
+
+def figures_of(name, observation, env_id=LAKE, **arguments):
+    agent = agent_of(name, make_vec_env(env_id, 1, seed=0), **arguments)
+    return agent, action_figures(agent, np.array(observation))
+
+
+def test_of_tables_their_rows_of_tiles_their_sums_and_of_preferences_shares():
+    agent, _ = figures_of("double_qlearning", [3])
+    agent.policy.q_tables[:, 3] = th.tensor([[1.0, 2.0, 3.0, 4.0], [3.0, 2.0, 1.0, 0.0]])
+    word, numbers = action_figures(agent, np.array([3]))
+    assert (word, numbers.tolist()) == ("value", [2.0, 2.0, 2.0, 2.0])
+    for pooled in (False, True):
+        agent, _ = figures_of("epsilon_greedy", [1], "SegmentBandit-v0", ignore_context=pooled)
+        agent.policy.scores[-1] = th.tensor([0.25, 0.5, 0.75])
+        word, numbers = action_figures(agent, np.array([1]))
+        assert (word, numbers.tolist()) == ("score", [0.25, 0.5, 0.75])
+    for env_id, observation in ((LAKE, [5]), ("MountainCar-v0", [[-0.5, 0.01]])):
+        agent, _ = figures_of("semi_gradient_q", observation, env_id)
+        agent.policy.weights[:] = th.arange(agent.policy.weights.shape[1])
+        word, numbers = action_figures(agent, np.array(observation))
+        assert (word, np.unique(np.diff(numbers)).size) == ("value", 1)
+        _, (word, shares) = figures_of("actor_critic", observation, env_id)
+        assert (word, len(np.unique(shares)), shares.sum()) == ("probability", 1, pytest.approx(1))
+
+
+@pytest.mark.parametrize("name", ["dqn", "qrdqn"])
+def test_of_a_network_values_whose_highest_it_takes(name):
+    agent, _ = figures_of(name, [0], buffer_size=10, **TINY)
+    for state in range(16):
+        word, values = action_figures(agent, np.array([state]))
+        assert (word, values.shape, len(set(values.tolist()))) == ("value", (4,), 4)
+        assert values.argmax() == agent.predict(np.array([state]), deterministic=True)[0]
+
+
+def test_of_a_policy_that_samples_its_probabilities():
+    agent, (word, shares) = figures_of("ppo", [5], **TINY)
+    with th.no_grad():
+        _, logs, _ = agent.policy.evaluate_actions(th.full((4,), 5), th.arange(4))
+    assert (word, shares.sum()) == ("probability", pytest.approx(1.0))
+    assert shares == pytest.approx(np.exp(logs.numpy()), rel=1e-5)
+
+
+def test_where_there_is_no_such_figure():
+    lstm = {"n_steps": 8, "policy_kwargs": {"lstm_hidden_size": 4}}
+    for name, observation, env_id, arguments in (
+        ("random", [0], LAKE, {}),
+        ("ppo", [[0.0] * 3], "Pendulum-v1", TINY),
+        ("ppo_lstm", [0], LAKE, lstm),
+        ("linucb", [[0.0] * 5], "envs:LinearBandit-v0", {}),
+    ):
+        assert figures_of(name, observation, env_id, **arguments)[1] is None

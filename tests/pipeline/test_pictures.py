@@ -1,22 +1,251 @@
-"""What is read for a picture, and the picture."""
+"""Maps of policies, by hand and against the agents that a run saves; its pictures."""
 
 import json
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
 from PIL import Image
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.monitor import load_results
 
-from agents import load_algorithm
+from mdp import policy_return
 from pipeline import curve_pictures
-from pipeline.curve_pictures import draw_learning_curve, moving_average, read_monitors
+from pipeline import map_pictures as drawing
+from pipeline.curve_pictures import draw_learning_curve, read_monitors
+from pipeline.environments import make_training_env
+from pipeline.evaluation import value_maps
+from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.sampled import Yardstick
+from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal, value_map
+from pipeline.models.load import load_model
 from pipeline.runs import Run
+from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of, spec_of, trained
+
+UP, DOWN, LEFT, RIGHT = range(4)
+MINUS = "\N{MINUS SIGN}"
+# The cells are 0 S, 1 free, 2 free; 3 free, 4 shelf, 5 goal.
+CORNER = {"desc": ["S..", ".#G"], "max_episode_steps": 10}
+
+
+def made(env_id, name="qlearning", env_kwargs=None, **arguments):
+    """An evaluator, and an agent that has learnt nothing."""
+    spec = spec_of(name, env_id, {"env_kwargs": env_kwargs or {}})
+    return exact_evaluator(spec), agent_of(name, make_training_env(spec, None), **arguments)
+
+
+def map_of(env_id, actions=(), **env_kwargs):
+    """The map of a table that prefers these actions, and action 0 elsewhere."""
+    evaluator, agent = made(env_id, env_kwargs=env_kwargs)
+    agent.policy.q_tables[0, range(len(actions)), list(actions)] = 1.0
+    return value_map(evaluator, agent)
+
+
+# --- one map -------------------------------------------------------------------------------------
+
+# Right, left again; down onto the goal; up against the outer wall from below the start.
+THERE_AND_BACK = [RIGHT, LEFT, DOWN, LEFT, UP, UP]
+
+
+def test_a_map_worked_by_hand():
+    found = map_of(WAREHOUSE, THERE_AND_BACK, **CORNER)
+    assert found.layout.rows == ("S..", ".#G")
+    assert found.matters.tolist() == [True, True, True, True, False, False]
+    assert found.initial.tolist() == [1, 0, 0, 0, 0, 0]
+    assert found.actions[:4].tolist() == [RIGHT, LEFT, DOWN, LEFT]
+    assert found.values.tolist() == [-10, -10, 100, -10, 0, 0]
+    assert found.optimal_values.tolist() == [98, 99, 100, 97, 0, 0]
+    assert found.optimal_actions[:4].tolist() == np.eye(4, dtype=bool)[[3, 3, 1, 0]].tolist()
+    assert found.differs.tolist() == [False, True, False, True, False, False]
+    assert found.visited.tolist() == [True, True, False, False, False, False]
+    assert found.optimal_visited.tolist() == [True, True, True, False, False, False]
+
+
+def test_an_action_among_several_best_ones_does_not_differ():
+    square = {"desc": ["..G", "...", "S.."], "max_episode_steps": 20}
+    for first in (UP, RIGHT):
+        actions = [RIGHT, RIGHT, 0, RIGHT, RIGHT, UP, first, RIGHT, UP]
+        found = map_of(WAREHOUSE, actions, **square)
+        assert not found.differs.any()
+        assert found.values[6] == found.optimal_values[6] == 97
+    assert found.optimal_actions[6].tolist() == [True, False, False, True]
+    evaluator, planner = made("MineMaze-v0", "optimal", {"max_episode_steps": 60})
+    planner.plan()
+    assert not value_map(evaluator, planner).differs.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id", "env_kwargs"),
+    [("dqn", LAKE, {}), ("qlearning", LAKE, {}), ("ppo", WAREHOUSE, {"observation": "position"})],
+)
+def test_values_mean_the_same_for_tables_and_networks(name, env_id, env_kwargs):
+    arguments = {"buffer_size": 10} if name == "dqn" else {}
+    evaluator, agent = made(env_id, name, env_kwargs, **arguments)
+    found = value_map(evaluator, agent)
+    actions, _ = agent.predict(evaluator.observations, deterministic=True)
+    assert found.actions.tolist() == actions.tolist()
+    earned = policy_return(evaluator.model, actions, evaluator.horizon).expected_return
+    assert found.values @ evaluator.model.initial == pytest.approx(earned, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_kwargs", "name"),
+    [
+        ("Taxi-v4", {}, "qlearning"),
+        ("RandomWarehouse-v0", {"size": 51}, "qlearning"),
+        (WAREHOUSE, {}, "random"),
+    ],
+    ids=["no grid", "too large", "no one action"],
+)
+def test_where_there_is_no_map(env_id, env_kwargs, name, tmp_path):
+    evaluator, agent = made(env_id, name, env_kwargs)
+    assert value_map(evaluator, agent) is None
+    too_large = "no value map: 2,601 states are too many to see, it has up to 2,500"
+    assert map_refusal(evaluator) == (too_large if env_kwargs else None)
+    recorder = ValueMapRecorder(tmp_path / "maps.npz", evaluator)
+    recorder.record(agent, 1)
+    recorder.finish(agent, 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- over the training ---------------------------------------------------------------------------
+
+TINY_DQN = {"buffer_size": 500, "learning_starts": 50, "batch_size": 16, "train_freq": 1}
+TINY_DQN |= {"learning_rate": 0.01, "policy_kwargs": {"net_arch": [8]}, "env_kwargs": {"slip": 0.2}}
+
+
+@pytest.mark.parametrize(
+    ("algo", "entry"), [("qlearning", {"learning_rate": 0.5}), ("dqn", TINY_DQN)]
+)
+def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(algo, entry, tmp_path):
+    kept = {"n_timesteps": 450, "eval_freq": 100, "save_freq": 100, "pictures": True}
+    run = trained(algo, WAREHOUSE, entry, log_folder=tmp_path, **kept).run
+    with np.load(run.value_maps_path) as file:
+        maps = dict(file)
+    assert maps["timesteps"].tolist() == [100, 200, 300, 400, 450]
+    evaluator = exact_evaluator(spec_of(algo, WAREHOUSE, entry))
+    paths = [*(run.checkpoint_path(n) for n in (100, 200, 300, 400)), run.model_path]
+    for path, values, actions in zip(paths, maps["values"], maps["actions"], strict=True):
+        found = value_map(evaluator, load_model(algo, path))
+        np.testing.assert_array_equal(values, found.values)
+        np.testing.assert_array_equal(actions, found.actions)
+    np.testing.assert_array_equal(maps["optimal_values"], found.optimal_values)
+    np.testing.assert_array_equal(maps["optimal_actions"], found.optimal_actions)
+    # The agent did change, or there would be nothing to tell apart.
+    assert len(np.unique(maps["values"], axis=0)) > 1
+    with np.load(run.evaluations_path) as evaluations:
+        at_start = maps["values"][:-1] @ evaluator.model.initial
+        np.testing.assert_allclose(at_start, evaluations["results"][:, 0], rtol=1e-12)
+    assert run.value_map_path.read_bytes().startswith(b"\x89PNG")
+
+
+def recorded(recorder):
+    with np.load(recorder.path) as file:
+        return file["timesteps"].tolist()
+
+
+def test_of_very_many_maps_every_second_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(value_maps, "MAX_MAPS", 4)
+    evaluator, agent = made(LAKE)
+    for step, expected in [
+        (40, [10, 20, 30, 40]),
+        (50, [20, 40, 50]),
+        (80, [20, 40, 60, 80]),
+        (90, [40, 80, 90]),
+        (170, [80, 160, 170]),
+    ]:
+        recorder = ValueMapRecorder(tmp_path / "maps.npz", evaluator)
+        for earlier in range(10, step + 1, 10):
+            recorder.record(agent, earlier)
+        recorder.finish(agent, step)
+        assert recorded(recorder) == expected
+
+
+# --- the picture of a map ------------------------------------------------------------------------
+
+
+def test_what_stands_in_the_cells_is_what_the_map_says():
+    """Frames where agent and optimum part, hatching below the scale, arrows, numbers."""
+    policies = drawing.policies_in(map_of(WAREHOUSE, THERE_AND_BACK, **CORNER), 0)
+    scale, colours = Normalize(97, 100), LinearSegmentedColormap.from_list("", ["blue", "red"])
+    axes, places = Figure().subplots(), [(0, 0), (1, 0), (2, 0), (0, 1)]
+    values = (["-10", "-10", "100", "-10"], ["98", "99", "100", "97"])
+    for policy, low, expected in zip(policies, ([(0, 0), (1, 0), (0, 1)], []), values, strict=True):
+        drawing.mark_differing(axes, policy, cell=36)
+        centres = [segment[:4].mean(axis=0) for segment in axes.collections[-1].get_segments()]
+        np.testing.assert_allclose(centres, [(1, 0), (0, 1)])  # columns across, rows down
+        drawing.draw_ground(axes, policy, scale, colours)
+        hatched = axes.collections[-1]
+        assert hatched.get_hatch() == "////"
+        corners = [path.vertices.min(axis=0) + 0.5 for path in hatched.get_paths()]
+        np.testing.assert_array_equal(np.reshape(corners, (-1, 2)), np.reshape(low, (-1, 2)))
+        before = len(axes.texts)
+        drawing.draw_numbers(axes, policy, 8, decimals=0)
+        texts = axes.texts[before:]
+        assert [text.get_text() for text in texts] == [v.replace("-", MINUS) for v in expected]
+        assert [(x, round(y)) for x, y in (text.get_position() for text in texts)] == places
+    # Of the optimum, whose lowest value is below the start and whose highest above the goal.
+    ground = axes.collections[-2].get_array()
+    assert (ground[1, 0].tolist(), ground[0, 2].tolist()) == ([0, 0, 1], [1, 0, 0])
+    drawing.draw_arrows(axes := Figure().subplots(), policies[0], 0.08, with_numbers=False)
+    # Middle and direction of every arrow, with how strong it is: dark where the agent comes to.
+    arrows = [
+        (round(x + u / 2, 6), round(y + v / 2, 6), np.sign(u), np.sign(v), quiver.get_alpha())
+        for quiver in axes.collections
+        for (x, y), u, v in zip(quiver.XY, quiver.U, quiver.V, strict=True)
+    ]
+    right, left = [(0, 0, 1, 0, 1.0), (0, 1, -1, 0, 0.45)], [(1, 0, -1, 0, 1.0), (2, 0, 0, 1, 0.45)]
+    assert sorted(arrows) == right + left
+
+
+SHORT = """79 0 79, -1000 0 -1000, 0.744 2 0.74, -0.004 2 0.00, -0.006 2 -0.01, 57.64 1 57.6,
+-718.7 1 -719, 99.46 1 99.5, 99.6 2 100, 9999.4 2 9999, 9999.6 0 10k, -27427 0 -27k, 999499 0 999k,
+-999500 0 -1.0M, 0 0 0"""
+
+
+def test_numbers_are_short():
+    for row in SHORT.replace("\n", " ").split(", "):
+        value, decimals, text = row.split()
+        assert drawing.short_number(float(value), int(decimals)) == text.replace("-", MINUS)
+    decimals = [drawing.decimals_for(map_of(*env)) for env in [(WAREHOUSE,), (LAKE,)]]
+    assert [*decimals, drawing.decimals_for(map_of(WAREHOUSE, slip=0.1))] == [0, 2, 1]
+    # Nor is rounding below a scale.
+    values = np.array([0.3, 0.1 + 0.2 - 1e-15, 0.2999, 0.8])
+    assert drawing.is_below(values, Normalize(0.3, 0.7)).tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize("desc", [["S..", ".#G"], ["S" + "." * 11, "." * 11 + "G"]])
+def test_rows_and_columns_count_from_one_as_pages_and_advice_do(desc, monkeypatch, tmp_path):
+    figures = []
+    monkeypatch.setattr(drawing, "write_png", lambda figure, path: figures.append(figure))
+    found = map_of(WAREHOUSE, desc=desc)
+    drawing.draw_value_map(tmp_path / "map.png", "title", found)
+    panel, column = figures[0].axes[0], len(desc[0]) - 1
+    labels = panel.get_yticklabels()[-1].get_text(), panel.get_xticklabels()[-1].get_text()
+    assert panel.xaxis.get_ticklocs()[-1] == column
+    expected = f"row {labels[0]}, column {labels[1]}"
+    assert found.layout.place_name(2 * column + 1) == expected == f"row 2, column {column + 1}"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_kwargs", "is_wide"),
+    [
+        (WAREHOUSE, {}, True),
+        (WAREHOUSE, {"desc": ["SG"]}, False),
+        ("RandomWarehouse-v0", {"size": 50}, True),
+        ("MineMaze-v0", {}, False),
+    ],
+)
+def test_every_kind_of_map_can_be_drawn(env_id, env_kwargs, is_wide, tmp_path):
+    drawing.draw_value_map(tmp_path / "map.png", "a title", map_of(env_id, **env_kwargs))
+    with Image.open(tmp_path / "map.png") as image:
+        image.load()
+        width, height = image.size
+    assert (width > height) == is_wide
+    assert max(width, height) < 2000
+    assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
+
+
+# --- the learning curve --------------------------------------------------------------------------
 
 
 def write_monitor(folder, name, rows, start=1000.0):
@@ -25,10 +254,8 @@ def write_monitor(folder, name, rows, start=1000.0):
     (folder / f"{name}.monitor.csv").write_text("\n".join(lines) + "\n")
 
 
-# --- reading -------------------------------------------------------------------------------------
-
-
 def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(tmp_path):
+    assert [array.shape for array in read_monitors(tmp_path)] == [(0,), (0,)]
     # Three environments step together: the second one's first episode ends after 3 x 4 steps.
     write_monitor(tmp_path, 0, [(1, 10, 9.0), (2, 5, 9.5)])
     # Clocks do not count: processes start when they can.
@@ -41,71 +268,9 @@ def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(t
     assert read_monitors(tmp_path)[0].tolist() == [16, 40, 44, 48, 60]
 
 
-@pytest.mark.parametrize("n_monitors", [0, 2])
-def test_no_episode_yet(tmp_path, n_monitors):
-    for n in range(n_monitors):
-        write_monitor(tmp_path, n, [])
-    steps, returns = read_monitors(tmp_path)
-    assert steps.shape == returns.shape == (0,)
-
-
-@pytest.mark.parametrize("n_envs", [1, 11])
-def test_the_monitors_of_a_real_run(tmp_path, n_envs):
-    """The steps are those that the algorithm counts; the rows are those that the library reads."""
-    ended = []
-
-    class Watch(BaseCallback):
-        def _on_step(self):
-            for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
-                if done:
-                    ended.append((self.num_timesteps, info["episode"]["r"]))
-            return True
-
-    env = make_vec_env("CartPole-v1", n_envs, seed=0, monitor_dir=str(tmp_path))
-    load_algorithm("random")("RandomPolicy", env, seed=0).learn(1500, callback=Watch())
-    env.close()
-    steps, returns = read_monitors(tmp_path)
-    # Episodes that end in the same step have no order.
-    assert sorted(zip(steps, returns, strict=True)) == sorted(ended)
-    assert (np.diff(steps) >= 0).all()
-    assert sorted(returns) == sorted(load_results(str(tmp_path))["r"])
-
-
-# --- moving averages -----------------------------------------------------------------------------
-
-
-@given(
-    npst.arrays(np.float64, st.integers(1, 50), elements=st.floats(-1000, 1000)),
-    st.integers(1, 60),
-)
-def test_a_moving_average_is_a_convolution(values, width):
-    averages = moving_average(values, width)
-    assert averages.shape == values.shape
-    # Where there are fewer values, it is the mean of all.
-    counts = np.minimum(np.arange(1, len(values) + 1), width)
-    expected = np.convolve(values, np.ones(width))[: len(values)] / counts
-    np.testing.assert_allclose(averages, expected, rtol=1e-9, atol=1e-9)
-
-
-# --- the picture ---------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def run(tmp_path):
     return Run.claim(tmp_path, "qlearning", "FrozenLake-v1")
-
-
-def picture(run, title="qlearning on FrozenLake-v1, seed 0"):
-    draw_learning_curve(run, title)
-    with Image.open(run.curve_path) as image:
-        image.load()
-        assert image.format == "PNG"
-        return image.size, np.asarray(image.convert("RGB")).reshape(-1, 3)
-
-
-def has_colour(pixels, colour):
-    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-    return bool((pixels == wanted).all(axis=1).any())
 
 
 def write_evaluations(run, results):
@@ -114,115 +279,75 @@ def write_evaluations(run, results):
     np.savez(run.evaluations_path, timesteps=steps, results=results, ep_lengths=results)
 
 
-@pytest.mark.parametrize(("trained", "judged"), [(True, True), (True, False), (False, True)])
-def test_the_picture_of_a_run(run, trained, judged):
-    if trained:
-        write_monitor(run.path, 0, [(r, 10, i) for i, r in enumerate(range(300))])
-    if judged:
+@pytest.mark.parametrize("rows", [None, [], [(1.0, 3, 0.1)], [(r, 10, r) for r in range(300)]])
+@pytest.mark.parametrize("is_judged", [True, False])
+def test_the_picture_of_a_run_with_little_or_much_to_show(run, rows, is_judged):
+    if rows is not None:
+        write_monitor(run.path, 0, rows)
+    if is_judged:
         write_evaluations(run, [[1.0, 2.0]])
-    size, pixels = picture(run)
-    assert size == (960, 540)
-    assert has_colour(pixels, curve_pictures.ORANGE) == trained
-    assert has_colour(pixels, curve_pictures.BLUE) == judged
+    draw_learning_curve(run, "title")
+    with Image.open(run.curve_path) as image:
+        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
+        assert image.size == (960, 540)
+    for colour, is_there in ((curve_pictures.ORANGE, len(rows or ()) > 1), ("#0072B2", is_judged)):
+        wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert (pixels == wanted).all(axis=1).any() == is_there
     assert not list(run.path.glob(".*"))
 
 
-@pytest.mark.parametrize("rows", [None, [], [(1.0, 3, 0.1)]])
-def test_a_run_with_little_to_show_is_drawn_without_warnings(run, rows):
-    if rows is not None:
-        write_monitor(run.path, 0, rows)
-    size, pixels = picture(run)
-    assert size == (960, 540)
-    assert not has_colour(pixels, curve_pictures.BLUE)
-
-
-def test_the_legend_covers_nothing(run, monkeypatch):
+@pytest.fixture
+def figure_of(run, monkeypatch):
+    """The figure of a run with returns above its optimum."""
     drawn = []
-    monkeypatch.setattr("pipeline.curve_pictures.write_png", lambda figure, _: drawn.append(figure))
-    write_monitor(run.path, 0, [(float(i), 10, i) for i in range(50)])
-    write_evaluations(run, [[1.0], [2.0]])
-    draw_learning_curve(run, "title", yardstick=Yardstick(optimum=50, baseline=0))
-    (figure,) = drawn
-    figure.draw_without_rendering()
-    (legend,) = figure.legends
-    texts = [text.get_text() for text in legend.get_texts()]
-    assert texts[3:] == ["optimum", "best random or constant policy"]
-    box, (axes,) = legend.get_window_extent(), figure.axes
-    assert not box.overlaps(axes.get_tightbbox())
-    assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
-    assert figure.bbox.y0 <= box.y0
+    monkeypatch.setattr(curve_pictures, "write_png", lambda figure, _: drawn.append(figure))
 
+    def figure(judged=True, n_episodes=50, returns=None, **options):
+        returns = [89.0] * n_episodes if returns is None else returns
+        write_monitor(run.path, 0, [(one, 10, i) for i, one in enumerate(returns)])
+        run.evaluations_path.unlink(missing_ok=True)
+        if judged:
+            write_evaluations(run, [[70.0], [79.0]])
+        yardstick = Yardstick(optimum=79, baseline=0) if judged else None
+        draw_learning_curve(run, "title", yardstick=yardstick, **options)
+        return drawn[-1]
 
-def axes_drawn(run, monkeypatch, judged=True, n_episodes=50, **options):
-    """The axes of the picture, of a run with returns above its optimum, by their titles."""
-    drawn = []
-    monkeypatch.setattr("pipeline.curve_pictures.write_png", lambda figure, _: drawn.append(figure))
-    write_monitor(run.path, 0, [(89.0, 10, i) for i in range(n_episodes)])
-    if judged:
-        write_evaluations(run, [[70.0], [79.0]])
-    yardstick = Yardstick(optimum=79, baseline=0) if judged else None
-    draw_learning_curve(run, "title", yardstick=yardstick, **options)
-    return drawn[0].axes
+    return figure
 
 
 def names_in(axes):
     return [line.get_label() for line in axes.get_lines() if line.get_label()[0] != "_"]
 
 
-def test_training_on_a_variant_is_drawn_apart(run, monkeypatch):
-    upper, lower = axes_drawn(run, monkeypatch, on_variant=True)
-    judged = ["evaluation, mean return", "optimum", "best random or constant policy"]
-    assert names_in(upper) == judged
-    assert names_in(lower) == ["training, each episode", "training, mean of 50 episodes"]
+JUDGED = ["evaluation, mean return", "optimum", "best random or constant policy"]
+EACH, MEAN = "training, each episode", "training, mean of {} episodes"
+
+
+def test_training_on_a_variant_is_drawn_apart_and_else_with_the_evaluations(figure_of, monkeypatch):
+    upper, lower = figure_of(on_variant=True).axes
+    assert (names_in(upper), names_in(lower)) == (JUDGED, [EACH, MEAN.format(50)])
     assert lower.get_title(loc="left") == "training, on a variant of the environment"
     assert upper.get_title(loc="left") == "title"
     # Steps go together, returns do not.
     assert upper.get_xlim() == lower.get_xlim()
     assert upper.get_ylim()[1] < 89 < lower.get_ylim()[1]
-
-
-def test_training_on_the_environment_itself_is_drawn_with_the_evaluations(run, monkeypatch):
-    (axes,) = axes_drawn(run, monkeypatch)
-    drawn = ["training, each episode", "training, mean of 50 episodes"]
-    drawn += ["evaluation, mean return", "optimum", "best random or constant policy"]
-    assert names_in(axes) == drawn
-    run.evaluations_path.unlink()
-    (axes,) = axes_drawn(run, monkeypatch, judged=False, on_variant=True)
-    on_variant = [name.replace("training", "training on a variant") for name in drawn[:2]]
-    assert names_in(axes) == on_variant
-
-
-def test_the_mean_is_of_as_many_episodes_as_there_are(run, monkeypatch):
-    axes = axes_drawn(run, monkeypatch, n_episodes=1)[0]
-    assert "training, each episode" in names_in(axes)
-    assert not any("mean of" in name for name in names_in(axes))
-    axes = axes_drawn(run, monkeypatch, n_episodes=200)[0]
-    assert "training, mean of 100 episodes" in names_in(axes)
+    for options, expected in (
+        ({}, [EACH, MEAN.format(50), *JUDGED]),
+        ({"n_episodes": 1}, [EACH, *JUDGED]),
+        ({"n_episodes": 200}, [EACH, MEAN.format(100), *JUDGED]),
+    ):
+        assert names_in(figure_of(**options).axes[0]) == expected
+    (axes,) = figure_of(judged=False, on_variant=True).axes
+    assert [name.partition(",")[0] for name in names_in(axes)] == ["training on a variant"] * 2
     monkeypatch.setattr(curve_pictures, "MAX_POINTS", 100)
-    axes = axes_drawn(run, monkeypatch, n_episodes=200)[0]
-    assert "training, 1 episode in 2" in names_in(axes)
-
-
-def scale_of(returns):
-    from matplotlib.figure import Figure
-
-    axes = Figure().subplots()
-    curve_pictures._compress_outliers(axes, np.array(returns, dtype=np.float64))
-    assert ("log beyond" in axes.get_ylabel()) == (axes.get_yscale() == "symlog")
-    return axes.get_yscale()
+    assert "training, 1 episode in 2" in names_in(figure_of(n_episodes=200).axes[0])
 
 
 @pytest.mark.parametrize(
-    ("returns", "scale"),
-    [
-        ([], "linear"),
-        ([0.0], "linear"),
-        ([1.0, 500.0], "linear"),
-        ([-790.0, 79.0, 79.0, 79.0], "linear"),
-        ([-791.0, 79.0, 79.0, 79.0], "symlog"),
-        ([0.0] * 8, "linear"),
-        ([11.0, 0.0, 0.0, 0.0], "symlog"),
-    ],
+    ("first", "last", "scale"),
+    [(-790.0, 79.0, "linear"), (-791.0, 79.0, "symlog"), (10, 0, "linear"), (11, 0, "symlog")],
 )
-def test_early_returns_that_dwarf_the_last_are_compressed(returns, scale):
-    assert scale_of(returns) == scale
+def test_early_returns_that_dwarf_the_last_are_compressed(figure_of, first, last, scale):
+    (axes,) = figure_of(judged=False, returns=[first, *[last] * 3]).axes
+    assert axes.get_yscale() == scale
+    assert ("log beyond" in axes.get_ylabel()) == (scale == "symlog")
