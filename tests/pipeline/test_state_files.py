@@ -21,16 +21,6 @@ from agents import load_algorithm
 from pipeline import state_files, state_saver
 from pipeline.errors import UserError
 from pipeline.runs import Run
-from pipeline.state_files import (
-    MAGIC,
-    BadStateError,
-    SavedState,
-    newest_state,
-    read_state,
-    save_state,
-    user_key,
-    write_state,
-)
 from pipeline.state_saver import StateSaver, put_back, user_state
 from pipeline.states import Pickled, pickled, unpickled
 from pipeline.unfinished_runs import SaveInterval, StateKeeping, cut_back, log_positions
@@ -51,14 +41,14 @@ def written(value, key=KEY, **note):
     file.fileno = lambda: 0
     with pytest.MonkeyPatch.context() as context:
         context.setattr(os, "fsync", lambda _: None)  # which memory cannot do
-        write_state(file, pickled({"it": value}), note, key)
+        state_files.write_state(file, pickled({"it": value}), note, key)
     return file.getvalue()
 
 
 def read(folder, content, key=KEY):
     (folder / "file").write_bytes(content)
     with (folder / "file").open("rb") as file:
-        return read_state(file, key)
+        return state_files.read_state(file, key)
 
 
 @pytest.fixture
@@ -79,12 +69,12 @@ def test_every_flipped_bit_every_truncation_and_every_appendix_is_noticed(tmp_pa
     content = bytearray(written([np.arange(1, 3), "a"], spec="abc"))
     for place in range(len(content)):
         content[place] ^= 1
-        with pytest.raises(BadStateError):
+        with pytest.raises(state_files.BadStateError):
             read(tmp_path, content)
         content[place] ^= 1
-        with pytest.raises(BadStateError):
+        with pytest.raises(state_files.BadStateError):
             read(tmp_path, content[:place])
-    with pytest.raises(BadStateError, match="goes on after its end"):
+    with pytest.raises(state_files.BadStateError, match="goes on after its end"):
         read(tmp_path, content + b"\0")
     assert read(tmp_path, content).note == {"spec": "abc"}  # without unpickling
 
@@ -93,10 +83,10 @@ def test_every_flipped_bit_every_truncation_and_every_appendix_is_noticed(tmp_pa
 def test_another_key_is_refused_before_anything_is_parsed(tmp_path, monkeypatch):
     content = written(1)
     monkeypatch.setattr(json, "loads", lambda *_: pytest.fail("it was parsed"))
-    with pytest.raises(BadStateError, match="another user or machine made it"):
+    with pytest.raises(state_files.BadStateError, match="another user or machine made it"):
         read(tmp_path, content, b"x" * 32)
-    with pytest.raises(BadStateError):  # nor are the gigabytes read that it promises
-        read(tmp_path, MAGIC + bytes(32) + b"\xff" * 8 + b"{}")
+    with pytest.raises(state_files.BadStateError):  # nor are the gigabytes read that it promises
+        read(tmp_path, state_files.MAGIC + bytes(32) + b"\xff" * 8 + b"{}")
 
 
 def strangers(content):
@@ -108,11 +98,11 @@ def strangers(content):
     header["parts"] = [[len(evil), hashlib.sha256(evil).hexdigest(), len(evil), False]]
     text = json.dumps(header).encode()
     text = len(text).to_bytes(8, "little") + text
-    by_no_key = hmac.digest(b"", MAGIC + text, "sha256")
+    by_no_key = hmac.digest(b"", state_files.MAGIC + text, "sha256")
     return {
         "a bare pickle": evil,
-        "a pickle after the magic": MAGIC + evil,
-        "a header signed with no key": MAGIC + by_no_key + text + evil,
+        "a pickle after the magic": state_files.MAGIC + evil,
+        "a header signed with no key": state_files.MAGIC + by_no_key + text + evil,
         "a header signed with a key of theirs": written(RunsCode(), b"s" * 32),
         "a header under an old signature": content[:48] + text + evil,
         "another pickle under an old header": head + evil,
@@ -126,12 +116,12 @@ def strangers(content):
 @pytest.mark.usefixtures("no_pickle_is_loaded")
 @pytest.mark.parametrize("attack", strangers(written([1])))
 def test_a_strangers_file_is_refused_and_never_unpickled(tmp_path, home, attack):
-    own = user_key(state_files.APPLICATION)
+    own = state_files.user_key(state_files.APPLICATION)
     folder = tmp_path / "state"
     folder.mkdir()
     (folder / "odd.state").write_bytes(strangers(written([1], own))[attack])
     with pytest.raises(UserError, match=r"odd\.state: it is .*; remove .* to begin the run again$"):
-        newest_state(folder, pytest.fail)
+        state_files.newest_state(folder, pytest.fail)
 
 
 @pytest.mark.parametrize(
@@ -149,65 +139,41 @@ def test_a_strangers_file_is_refused_and_never_unpickled(tmp_path, home, attack)
     ids=["readable", "of a group", "short", "pipe", "folder", "device", "nowhere", "missing"],
 )
 def test_without_the_users_own_key_nothing_is_read(tmp_path, home, change, said):
-    save_state(tmp_path / "state", 1, pickled({"it": 1}), {})
+    state_files.save_state(tmp_path / "state", 1, pickled({"it": 1}), {})
     path = home / state_files.APPLICATION / "snapshots.key"
     change(path)
     with pytest.raises(UserError, match=said):
-        newest_state(tmp_path / "state", pytest.fail)
+        state_files.newest_state(tmp_path / "state", pytest.fail)
     assert list(path.parent.iterdir()) == [path]
 
 
 def test_a_key_is_one_for_all_processes_and_for_nobody_else(home):
     with ThreadPoolExecutor(16) as pool:
-        (key,) = set(pool.map(lambda _: user_key("a"), range(64)))
+        (key,) = set(pool.map(lambda _: state_files.user_key("a"), range(64)))
     assert len(key) == 32
-    assert user_key("b") != key
+    assert state_files.user_key("b") != key
     path = home / "a" / "snapshots.key"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert list(path.parent.iterdir()) == [path]
     path.symlink_to(path.rename(home / "elsewhere"))
-    assert user_key("a") == key
-
-
-def test_the_newest_of_two_counts_and_the_older_where_that_is_damaged(tmp_path, home):
-    for number in (7, 8, 9):
-        save_state(tmp_path, number, pickled({"it": number}), {})
-    assert newest_state(tmp_path, pytest.fail).note["number"] == 9
-    with (tmp_path / "odd.state").open("ab") as file:
-        file.write(b"\0")
-    told = []
-    assert newest_state(tmp_path, told.append).note["number"] == 8
-    (line,) = told
-    assert line.endswith("the state before it is taken")
-
-
-def test_what_lies_in_the_place_of_a_state(tmp_path, home):
-    """A pipe is not waited for; a link is judged by the content elsewhere."""
-    save_state(tmp_path / "mine", 1, pickled({"it": 1}), {})
-    (tmp_path / "other").mkdir()
-    place = tmp_path / "other" / "odd.state"
-    os.mkfifo(place)
-    assert newest_state(tmp_path / "other", pytest.fail) is None
-    place.unlink()
-    place.symlink_to(tmp_path / "mine" / "odd.state")
-    assert newest_state(tmp_path / "other", pytest.fail).note["number"] == 1
+    assert state_files.user_key("a") == key
 
 
 def test_functions_of_another_python_are_refused_and_all_else_is_not(tmp_path, home, monkeypatch):
     for number, value in enumerate([lambda: 1, 1]):
-        save_state(tmp_path / str(number), 1, pickled({"it": value}), {})
+        state_files.save_state(tmp_path / str(number), 1, pickled({"it": value}), {})
     monkeypatch.setattr("sys.implementation.cache_tag", "cpython-399")
     with pytest.raises(UserError, match=r"were compiled by cpython-3.*, another Python"):
-        newest_state(tmp_path / "0", pytest.fail)
-    assert newest_state(tmp_path / "1", pytest.fail) is not None
+        state_files.newest_state(tmp_path / "0", pytest.fail)
+    assert state_files.newest_state(tmp_path / "1", pytest.fail) is not None
 
 
 def test_without_room_on_the_disk_the_last_state_stays(tmp_path, home, small_disk):
-    save_state(tmp_path, 1, pickled({"it": 1}), {})
+    state_files.save_state(tmp_path, 1, pickled({"it": 1}), {})
     noise = np.random.default_rng(0).bytes(100_000)
     with small_disk(10_000), pytest.raises(OSError, match="File too large"):
-        save_state(tmp_path, 3, pickled({"it": noise}), {})
-    assert newest_state(tmp_path, pytest.fail).note["number"] == 1
+        state_files.save_state(tmp_path, 3, pickled({"it": noise}), {})
+    assert state_files.newest_state(tmp_path, pytest.fail).note["number"] == 1
 
 
 # --- how often -----------------------------------------------------------------------------------
@@ -226,7 +192,7 @@ def saver_of(tmp_path, monkeypatch):
         clock[0] += 0.5
 
     def make(note=None, seconds=0.0, was_cut_off=False):
-        state = None if note is None else SavedState(Pickled(b"", (), ()), note)
+        state = None if note is None else state_files.SavedState(Pickled(b"", (), ()), note)
         keeping = StateKeeping(SaveInterval(seconds), state, was_cut_off=was_cut_off)
         saver = StateSaver(Run.claim(tmp_path, "a", "X-v0"), keeping, pytest.fail)
         saver.init_callback(model)
@@ -295,21 +261,16 @@ def test_what_was_appended_since_is_removed(logs):
     assert log_positions(run, log) == positions
     assert (run / "0.monitor.csv").read_bytes() == ROWS
     assert (run / "all.monitor.csv").read_bytes() == b"r\n"
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [None, b"", ROWS[:-1], ROWS.replace(b"2.0", b"9.0"), ROWS.replace(b"r,l,t", b"t,l,r") + b"3.0"],
-)
-def test_what_was_changed_is_refused_and_left_alone(logs, rows):
-    run, log = logs
-    positions, path = log_positions(run, log), run / "0.monitor.csv"
-    path.unlink()
-    if rows is not None:
-        path.write_bytes(rows)
-    with pytest.raises(UserError, match=r"0\.monitor\.csv is not as the run left it"):
-        cut_back(run, log, positions)
-    assert (path.read_bytes() if path.exists() else None) == rows
+    # What was changed is refused and left alone.
+    path = run / "0.monitor.csv"
+    for rows in (None, b"", ROWS[:-1], ROWS.replace(b"2.0", b"9.0")):
+        path.unlink()
+        if rows is not None:
+            path.write_bytes(rows)
+        with pytest.raises(UserError, match=r"0\.monitor\.csv is not as the run left it"):
+            cut_back(run, log, positions)
+        assert (path.read_bytes() if path.exists() else None) == rows
+        path.touch()
 
 
 SOURCE = """
@@ -354,6 +315,7 @@ def test_globals_of_the_users_modules_go_back(tmp_path, monkeypatch):
     module = sys.modules["things_with_globals"]
     thing = module.Thing()
     assert pickled({"it": user_state(modules)}).lost == []
+    assert user_state(import_typed(["json"])) == {}  # what is installed is left alone
     module.double(1)
     module.Thing.triple(None, 1)
     thing.step()
@@ -371,7 +333,3 @@ def test_globals_of_the_users_modules_go_back(tmp_path, monkeypatch):
     assert module.seen == after
     assert (module.Thing, module.double(1)) == (type(thing), 2)
     del sys.modules["things_with_globals"]
-
-
-def test_what_is_installed_is_left_alone():
-    assert user_state(import_typed(["json"])) == {}
