@@ -1,8 +1,10 @@
-"""What asks a process to stop, ends its workers or fills its disk: it is told and recorded."""
+"""What asks a process to stop, ends its workers, fills its disk or is no number: told, recorded."""
 
 import ctypes
 import errno
+import io
 import json
+import math
 import multiprocessing
 import os
 import pickle
@@ -11,15 +13,27 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+import zipfile
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium as gym
+import numpy as np
 import pytest
+import torch as th
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
+from agents.bandits.tables import BanditPolicy
 from pipeline import files, stopping
+from pipeline.callbacks import NumberWatch
 from pipeline.errors import UserError
-from pipeline.runs import ROOM, ROOM_BYTES, Run
+from pipeline.failures import LibraryError, blame_settings
+from pipeline.finite_numbers import NotFiniteError, check_model, check_rows, is_finite
+from pipeline.runs import ROOM, ROOM_BYTES
 from pipeline.stopping import (
     SIGNALS,
     Stopped,
@@ -32,16 +46,16 @@ from pipeline.stopping import (
 LONG = 30.0  # seconds: nothing here waits so long
 
 
-@pytest.fixture(autouse=True)
-def handlers_are_as_before():
-    """And by default, whatever the tests were started under."""
-    by_default = [
+@pytest.fixture
+def by_default():
+    """Handlers as the system has them, whatever the tests were started under."""
+    handlers = [
         signal.default_int_handler if n == signal.SIGINT else signal.SIG_DFL for n in SIGNALS
     ]
-    before = [signal.signal(*pair) for pair in zip(SIGNALS, by_default, strict=True)]
+    before = [signal.signal(*pair) for pair in zip(SIGNALS, handlers, strict=True)]
     yield
     after = [signal.signal(*pair) for pair in zip(SIGNALS, before, strict=True)]
-    assert after == by_default
+    assert after == handlers
     assert current().number is None
 
 
@@ -57,11 +71,16 @@ def stopped(work, *args):
     return str(caught.value), time.monotonic() - started
 
 
+# --- signals -------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("by_default")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_stops_at_once(number):
     with stops_noticed() as stop:
         assert stopped(send, number)[0] == signal.Signals(number).name
         assert (stop.number, current()) == (number, stop)
+    assert pickle.loads(pickle.dumps(Stopped(number))).number == number
 
 
 def hold(stop):
@@ -120,39 +139,30 @@ def turn_into_another(stop):
             raise ImportError("no module") from error
 
 
-@pytest.mark.parametrize(
-    ("work", "shortest"),
-    [
-        (hold, 0.0),
-        (wait_in_the_midst, 0.3),
-        (ask_twice, 0.0),
-        (begin_without_time, 0.0),
-        (swallow, 0.0),
-        (lose_in_c, 0.0),
-        (turn_into_another, 0.0),
-    ],
-)
-def test_a_stop_comes_in_time_as_itself(work, shortest, monkeypatch, capsys):
+WAYS = (hold, wait_in_the_midst, ask_twice, begin_without_time, swallow, lose_in_c)
+
+
+@pytest.mark.usefixtures("by_default")
+@pytest.mark.parametrize("work", [*WAYS, turn_into_another])
+def test_a_stop_comes_in_time_as_itself(work, monkeypatch, capsys):
     monkeypatch.setattr(stopping, "SECONDS_OF_ONE_REQUEST", 0.0)
     with stops_noticed() as stop:
         name, seconds = stopped(work, stop)
     assert name == "SIGTERM"
-    assert shortest <= seconds < LONG
+    assert (0.3 if work is wait_in_the_midst else 0.0) <= seconds < LONG
     assert capsys.readouterr().err == ""
 
 
-def test_another_failure_is_itself():
-    with stops_noticed() as stop:
-        with pytest.raises(ValueError, match="its own"), stop.waiting(LONG):
-            raise ValueError("its own")
-        assert stop.number is None
-
-
-def test_a_key_that_is_held_down_asks_once():
+@pytest.mark.usefixtures("by_default")
+def test_a_key_that_is_held_down_asks_once_and_another_failure_is_itself():
     with stops_noticed() as stop, stop.held():
         for _ in range(100):
             send(signal.SIGINT)
         assert stop.n_asked == 1
+    with stops_noticed() as stop:
+        with pytest.raises(ValueError, match="its own"), stop.waiting(LONG):
+            raise ValueError("its own")
+        assert stop.number is None
 
 
 def test_in_a_thread_and_inside_another_there_is_nothing_new():
@@ -170,23 +180,7 @@ def test_in_a_thread_and_inside_another_there_is_nothing_new():
     assert seen == [(None, False, False), (signal.SIGTERM, True, True)]
 
 
-@pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda *_: None], ids=["ignored", "handled"])
-def test_what_is_ignored_or_handled_already_stays_so(handler):
-    previous = signal.signal(signal.SIGHUP, handler)
-    try:
-        with stops_noticed() as stop:
-            send(signal.SIGHUP)
-            assert stop.number is None
-    finally:
-        signal.signal(signal.SIGHUP, previous)
-
-
-def test_a_stop_can_be_handed_to_another_process():
-    assert pickle.loads(pickle.dumps(Stopped(signal.SIGHUP))).number == signal.SIGHUP
-
-
 # --- the processes of environments ---------------------------------------------------------------
-
 SCRIPT = """
 import multiprocessing, os, signal, time
 from pipeline.stopping import close_environments, shield_workers, stops_noticed
@@ -231,35 +225,35 @@ def test_workers_outlive_a_signal_to_all_but_not_the_training(tmp_path):
     assert (done.stdout, done.stderr, done.returncode) == ("True 15\nFalse\n", "", 0)
 
 
-def test_a_pipe_that_is_broken_is_an_error_unless_a_stop_was_asked_for():
+@pytest.mark.usefixtures("by_default")
+def test_environments_that_do_not_close_hold_nobody_up(monkeypatch):
     def fail():
         raise BrokenPipeError("a worker has ended")
-
-    with pytest.raises(BrokenPipeError):
-        close_environments(SimpleNamespace(close=fail))
-    with stops_noticed() as stop, stop.held():
-        send()
-        close_environments(SimpleNamespace(close=fail))
-
-
-def test_environments_that_do_not_close_hold_nobody_up(monkeypatch):
-    monkeypatch.setattr(stopping, "SECONDS_FOR_CLOSING", 0.1)
 
     def work():
         with stop.held():
             send()
+            close_environments(SimpleNamespace(close=fail))
             close_environments(SimpleNamespace(close=lambda: time.sleep(LONG)))
         stop.raise_if_asked()
 
+    monkeypatch.setattr(stopping, "SECONDS_FOR_CLOSING", 0.1)
     with stops_noticed() as stop:
         assert stopped(work)[1] < LONG
+    # Without a stop, a pipe that is broken is an error.
+    with pytest.raises(BrokenPipeError):
+        close_environments(SimpleNamespace(close=fail))
 
 
-@pytest.mark.parametrize("error", [EOFError, BrokenPipeError, ConnectionResetError])
 @pytest.mark.parametrize(
-    ("code", "how"), [("exec sleep 9", "SIGKILL"), ("exit 1", "exit code 1"), ("", "exit code 0")]
+    ("error", "code", "how"),
+    [
+        (EOFError, "exec sleep 9", "SIGKILL"),
+        (BrokenPipeError, "exit 1", "exit code 1"),
+        (ConnectionResetError, "", "exit code 0"),
+    ],
 )
-def test_a_process_that_has_ended_is_named(code, how, error):
+def test_a_process_that_has_ended_is_named(error, code, how):
     context = multiprocessing.get_context("fork")
     alive = context.Process(target=time.sleep, args=(LONG,))
     ended = context.Process(target=os.execlp, args=("sh", "sh", "-c", code))
@@ -267,12 +261,11 @@ def test_a_process_that_has_ended_is_named(code, how, error):
         process.start()
     if how == "SIGKILL":
         ended.kill()
-    said = f"environment 1 has ended: {how}$"
     env = SimpleNamespace(unwrapped=SimpleNamespace(processes=[alive, ended]))
-    no_dead = SimpleNamespace(unwrapped=SimpleNamespace(processes=[alive]))
-    with pytest.raises(UserError, match=said), deaths_told(env):
+    with pytest.raises(UserError, match=f"environment 1 has ended: {how}$"), deaths_told(env):
         raise error
-    with pytest.raises(error), deaths_told(no_dead):  # where none has ended
+    env.unwrapped.processes.pop()  # where none has ended
+    with pytest.raises(error), deaths_told(env):
         raise error
     alive.kill()
     alive.join()
@@ -313,7 +306,6 @@ def train_on_full_disk(type_in_own_folder, own_folder, monkeypatch):
     ("name", "n_steps", "kept"),
     [
         ("best_model.zip", 10, "no model"),
-        ("rl_model_100_steps.zip", 100, "best_model.zip"),
         ("rl_model_200_steps.zip", 200, "best_model.zip and 1 checkpoint"),
         ("FrozenLake-v1.zip", 200, "best_model.zip and 2 checkpoints"),
         ("value_map.png", 200, "best_model.zip and 2 checkpoints"),
@@ -341,11 +333,232 @@ def test_before_the_first_step_nothing_is_left(train_on_full_disk):
 
 def test_the_record_stays_whole_where_not_even_that_can_be_written(train_on_full_disk):
     code, _, folder = train_on_full_disk("FrozenLake-v1.zip", room_helps=False)
+    assert (code, json.loads((folder / "run.json").read_text())["state"]) == (2, "running")
+
+
+# --- what is no number ---------------------------------------------------------------------------
+
+
+class Broken(gym.Env):
+    """Episodes of ten steps, in one of which ``what`` is ``value``."""
+
+    def __init__(self, what="", value=math.nan, at=25, kind="box", continuous=False):
+        self.what, self.value, self.at, self.kind = what, value, at, kind
+        box = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.observation_space = {
+            "box": box,
+            "dict": spaces.Dict({"eye": box}),
+            "discrete": spaces.Discrete(3),
+        }[kind]
+        self.action_space = spaces.Box(-1, 1, (1,)) if continuous else spaces.Discrete(2)
+        self.steps = 0
+
+    def _observation(self, broken):
+        if self.kind == "discrete":
+            return self.steps % 3
+        seen = np.array([0.5, self.value if broken else 1.0], dtype=np.float32)
+        return {"eye": seen} if self.kind == "dict" else seen
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._observation(self.what == "reset" and self.steps >= self.at), {}
+
+    def step(self, action):
+        self.steps += 1
+        due = self.steps == self.at
+        reward = self.value if due and self.what == "reward" else 1.0
+        obs = self._observation(due and self.what == "obs")
+        return obs, reward, self.steps % 10 == 0, False, {}
+
+
+@pytest.fixture
+def train_on_broken(type_in_own_folder, own_folder):
+    def train(algo, kwargs, *flags):
+        code, _, said = type_in_own_folder(
+            *("train.py", "--env", "Broken-v0", "--algo", algo, "-n", "60", "--seed", "0"),
+            *("--eval-freq", "20", "--eval-episodes", "1", "--verbose", "0", "--env-kwargs"),
+            *(f"{key}:{value}" for key, value in {"what": "nothing", **kwargs}.items()),
+            *flags,
+        )
+        folder = own_folder / "logs" / algo / "Broken-v0_1"
+        return code, said, folder, json.loads((folder / "run.json").read_text(encoding="utf-8"))
+
+    return train
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _registered():
+    gym.register("Broken-v0", entry_point=Broken, max_episode_steps=20)
+    yield
+    del gym.registry["Broken-v0"]
+
+
+PPO = ("-params", "n_steps:8", "batch_size:8", "n_epochs:1")
+STEP, AT_25 = (f"{what} of environment 0 at step 25 is nan" for what in ("reward", "observation"))
+HUGE = {"what": "reward", "value": 1e39, "continuous": True}  # in single precision
+# Agent, environment, further flags, and the line.
+CASES = {
+    "a table": ("qlearning", {"what": "reward", "kind": "discrete"}, (), STEP),
+    "a network": ("ppo", {"what": "reward"}, PPO, STEP),
+    "infinity": ("dqn", {"what": "obs", "value": -math.inf}, (), AT_25.replace("nan", "-inf")),
+    "no single precision": ("td3", HUGE, (), STEP.replace("nan", "inf")),
+    "by name": ("ppo", {"what": "obs", "kind": "dict"}, PPO, AT_25.replace("n of", "n 'eye' of")),
+    "before a reset": ("dqn", {"what": "obs", "at": 20}, (), "last observation of an episode of e"),
+    "after a reset": ("ppo", {"what": "reset", "at": 20}, PPO, AT_25.replace("25", "20")),
+    "at the start": ("dqn", {"what": "reset", "at": 0}, (), "observation of environment 0 at ste"),
+    "whole episodes": ("ars", {"what": "reward"}, (), STEP),
+    "several": ("ppo", {"what": "reward"}, (*PPO, "n_envs:2"), STEP.replace("25", "50")),
+    "statistics": ("ppo", {"what": "obs"}, (*PPO, "normalize:true"), AT_25),
+    "evaluation sees": (
+        *("dqn", {}, ("--eval-env-kwargs", "what:obs", "at:15")),
+        "observation of environment 0 in the evaluation at step 40 is nan",
+    ),
+    "evaluation counts": (
+        *("dqn", {}, ("--eval-env-kwargs", "what:reward", "at:15")),
+        "return in the evaluation at step 40 is nan",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*(NaN|overflow|invalid value|not within)")
+@pytest.mark.parametrize(("algo", "kwargs", "flags", "line"), CASES.values(), ids=CASES)
+def test_a_run_fails_at_the_first_number_that_is_none(train_on_broken, algo, kwargs, flags, line):
+    code, said, folder, info = train_on_broken(algo, kwargs, *flags)
     assert code == 2
-    assert Run(folder, "FrozenLake-v1").read_info()["state"] == "running"
+    assert line in said
+    assert said.count("\n") == 1
+    assert info["state"] == "failed"
+    assert line in info["reason"]
+    assert not (folder / "Broken-v0.zip").exists()
+    assert ("keeps best_model.zip" in said) == (folder / "best_model.zip").exists()
 
 
-def test_a_run_that_ends_gives_its_room_back(train_on_full_disk):
-    code, said, folder = train_on_full_disk("no such file")
-    assert (code, said) == (0, "")
-    assert not [path.name for path in folder.iterdir() if path.name.startswith(".")]
+@pytest.mark.parametrize(
+    ("algo", "flags"), [("a2c", ()), ("dqn", ("learning_starts:4", "batch_size:4"))]
+)
+def test_weights_that_are_none_are_never_saved(train_on_broken, algo, flags):
+    code, said, folder, info = train_on_broken(
+        algo, {}, "--save-freq", "10", "-params", "learning_rate:1e36", "max_grad_norm:1e30", *flags
+    )
+    assert (code, info["state"]) == (2, "failed")
+    assert "train/" in said or "of the agent at step" in said
+    assert not (folder / "Broken-v0.zip").exists()
+    for path in folder.glob("*.zip"):
+        with zipfile.ZipFile(path) as archive:
+            weights = th.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
+        assert all(th.isfinite(tensor).all() for tensor in weights.values())
+
+
+@given(
+    arrays.arrays(
+        st.sampled_from([np.float64, np.float32, np.float16, np.int64, np.uint8, np.bool_]),
+        arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+    )
+)
+def test_the_quick_look_is_numpys(values):
+    assert is_finite(values) == bool(np.isfinite(values).all())
+    # Large numbers add up to no infinity.
+    assert is_finite(np.array([1e300, -1e300]))
+    assert is_finite(np.array([3e38], dtype=np.float32))
+
+
+def agent(**parts):
+    policy = th.nn.Linear(2, 2)
+    return SimpleNamespace(
+        policy=policy, num_timesteps=1234, get_vec_normalize_env=lambda: None, **parts
+    )
+
+
+def test_the_environment_the_layer_and_the_statistics_are_named():
+    rewards = np.array([1.0, 2.0, np.nan, np.inf])
+    with pytest.raises(NotFiniteError, match=r"^reward of environment 2 at step 9 is nan$"):
+        check_rows(rewards, "reward", "at step 9")
+    fine, broken = (SimpleNamespace(mean=np.zeros(2), var=np.array([1, v])) for v in (1.0, np.inf))
+    for obs_rms, ret_rms in ((fine, broken), (broken, fine)):
+        statistics = SimpleNamespace(obs_rms={"eye": obs_rms}, ret_rms=ret_rms)
+        model = agent()
+        check_model(model)
+        model.get_vec_normalize_env = lambda statistics=statistics: statistics
+        name = "obs_rms" if obs_rms is broken else "ret_rms"
+        with pytest.raises(NotFiniteError, match=f"{name} of VecNormalize.*'variance'.* is inf"):
+            check_model(model)
+    model = agent()
+    with th.no_grad():
+        model.policy.bias[1] = -th.inf
+    with pytest.raises(NotFiniteError, match=r"^a value in bias of the agent at step 1,234 is -"):
+        check_model(model)
+    # An arm that was never pulled has no score.
+    model.policy = policy = BanditPolicy(
+        spaces.Discrete(1), spaces.Discrete(3), initial_score=-math.inf
+    )
+    policy.scores[0, 1], policy.counts[0, 1] = 0.5, 1
+    check_model(model)
+    policy.counts[0, 2] = 1
+    with pytest.raises(NotFiniteError, match="scores of the agent at step 1,234 is -inf"):
+        check_model(model)
+
+
+@pytest.mark.parametrize(
+    ("seen", "logged", "line"),
+    [
+        ({"actions": np.array([[np.nan]])}, {}, "action of environment 0 at step 7 is nan"),
+        (
+            {"dones": np.array([True]), "infos": [{"episode": {"r": math.inf}}]},
+            {},
+            "return of an episode of environment 0 at step 7 is inf",
+        ),
+        ({}, {"train/critic_loss": math.nan}, "train/critic_loss at step 7 is nan"),
+    ],
+)
+def test_actions_returns_and_losses_are_looked_at_and_other_entries_are_not(seen, logged, line):
+    watch, log = NumberWatch(), {"train/explained_variance": math.nan}
+    watch.model = SimpleNamespace(num_timesteps=7, logger=SimpleNamespace(name_to_value=log))
+    watch.update_locals(seen)
+    watch.on_rollout_start()
+    log.update(logged)
+    with pytest.raises(NotFiniteError, match=line):
+        watch.on_rollout_start() if logged else watch.on_step()
+
+
+# --- settings that no library takes --------------------------------------------------------------
+
+
+def test_the_step_and_the_line_of_the_library_are_named(type_in_own_folder, own_folder):
+    code, _, said = type_in_own_folder(
+        *("train.py", "--env", "FrozenLake-v1", "--algo", "ppo", "-n", "64", "--verbose", "0"),
+        *("-params", "clip_range:1e308", "n_steps:32", "batch_size:32", "n_envs:1"),
+    )
+    assert (code, said.count("\n")) == (2, 1)
+    assert "ppo at step 32: value cannot be converted to type float without overflow (" in said
+    record = next((own_folder / "logs").rglob("run.json"))
+    assert json.loads(record.read_text(encoding="utf-8"))["state"] == "failed"
+
+
+CODE = """
+def of_torch(): th.nn.Linear(2, 2)(th.zeros(3))
+def of_itself(): [].pop()
+def of_memory(): raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "function", "is_blamed"),
+    [
+        ("agents.library", "of_torch", True),
+        ("agents.library", "of_itself", False),
+        ("torch.nn", "of_itself", True),
+        ("torch.nn", "of_memory", False),
+        ("someones_environment", "of_torch", False),
+    ],
+)
+def test_only_what_went_through_no_code_of_the_users_is_blamed(module, function, is_blamed):
+    names = {"__name__": module, "th": th}
+    exec(CODE, names)  # noqa: S102  # ours
+    try:
+        names[function]()
+    except (RuntimeError, IndexError) as error:
+        # The first line is this file's, where that of a training is one of ours.
+        mistake = error.with_traceback(error.__traceback__.tb_next)
+    words = r"^dqn at step 1,234: .* \((torch, .+\.py|torch, <string>):\d+\)$"
+    with pytest.raises(LibraryError, match=words) if is_blamed else nullcontext():
+        blame_settings("dqn", SimpleNamespace(num_timesteps=1234), mistake)
