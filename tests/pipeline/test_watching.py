@@ -1,28 +1,36 @@
-"""A training that is watched: what is kept of it is what the agent did, and it is not disturbed."""
+"""What a person watching reads of a training, and what is kept of one that is watched."""
 
+import io
+import logging
+import re
+import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from rich.console import Console
-from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.callbacks import BaseCallback
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from agents.common.callbacks import BlockCallback
-from pipeline import watching
+from pipeline import progress, signs_of_life, watching
 from pipeline.agent_settings import resolved_spec
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.preparation import algorithm_kwargs, make_model
+from pipeline.progress import ProgressDisplay
 from pipeline.settings.hyperparams import read_hyperparams, split
+from pipeline.signs_of_life import COMPILING, Heartbeat, doing
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
-from pipeline.watching import NO_STATE, TERMINATED, TRUNCATED, TableRecorder
+from pipeline.watching import TERMINATED, TableRecorder
 
 LAKE = "FrozenLake-v1"
 
@@ -106,43 +114,6 @@ def test_targets_are_those_of_the_rule_to_the_last_bit(engine):
     assert table.any()
 
 
-@pytest.mark.parametrize(
-    ("name", "n_envs", "engine"), [("sarsa", 1, "compiled"), ("double_qlearning", 3, "interpreted")]
-)
-def test_who_is_watched_learns_the_same(name, n_envs, engine):
-    ended = []
-    for recorder in (None, TableRecorder(4)):
-        env = make_vec_env(LAKE, n_envs, seed=3)
-        agent = load_algorithm(name)(env=env, seed=1, engine=engine).learn(900, recorder)
-        assert agent.engine_in_use.startswith(engine)
-        ended.append((agent.policy.q_tables.numpy().tobytes(), agent.rng.bit_generator.state))
-    assert ended[0] == ended[1]
-    assert recorder.is_full
-    # It goes on to the end of the step in which the fourth episode ends.
-    assert recorder.moves.rows["end"].astype(bool).sum() >= 4
-    assert len(recorder.moves) == n_envs * len(recorder.steps)
-    assert recorder.moves.rows["env"].tolist() == [*range(n_envs)] * len(recorder.steps)
-
-
-def test_where_nothing_is_learnt_there_is_no_target():
-    # Some episodes end in a hole.
-    _, recorder = watched(LAKE, n_timesteps=200, skip_terminal_update=True, initial_q=1.0)
-    moves = recorder.moves.rows
-    ends = moves["end"] == TERMINATED
-    assert ends.any()
-    assert np.array_equal(np.isnan(moves["target"]), ends)
-    assert not np.isin(moves["step"][ends], recorder.changes.rows["step"]).any()
-
-
-def test_an_episode_that_is_cut_off_still_bootstraps():
-    env = gym.make(LAKE, max_episode_steps=3, is_slippery=False)
-    _, recorder = watched(env, n_timesteps=60, initial_q=1.0, gamma=0.5)
-    cut = recorder.moves.rows[recorder.moves.rows["end"] == TRUNCATED]
-    assert len(cut) > 5
-    # Where its best next value is still the first one.
-    assert 0.5 in cut["target"]
-
-
 def test_along_traces_several_entries_move_by_one_error():
     """Step size 1/2, discount 1, lambda 1/2: errors 1, 1, 1; traces 1, then 1/2 and 1, ..."""
     halves = {"learning_rate": 0.5, "gamma": 1.0, "trace_decay": 0.5}
@@ -166,54 +137,6 @@ def test_of_several_steps_the_target_is_told_where_there_is_one():
     assert changes["after"].tolist() == [1.0, 1.0, 0.5]
 
 
-def test_whole_episodes_move_at_their_end():
-    _, recorder = watched(THREE_ONES, "monte_carlo", n_timesteps=6, learning_rate=0.5, gamma=1.0)
-    changes = recorder.changes.rows
-    assert changes["step"].tolist() == [2, 2, 2, 5, 5, 5]
-    assert changes["after"].tolist() == [1.5, 1.0, 0.5, 2.25, 1.5, 0.75]
-    assert np.isnan(recorder.moves.rows["target"]).all()
-
-
-def test_a_table_that_diverges_is_kept_to_the_last_bit_and_nan_moves_once():
-    huge = {"learning_rate": 1e200, "gamma": 1.0, "initial_q": -1e200}
-    with np.errstate(all="ignore"):
-        agent, recorder = watched(Corridor(), n_timesteps=40, **huge)
-    table = recorder.initial["q_tables"].reshape(-1).copy()
-    changes = recorder.changes.rows
-    table[changes["entry"]] = changes["after"]
-    assert table.tobytes() == agent.policy.q_table.tobytes()
-    assert np.isnan(changes["after"]).sum() == np.isnan(table).sum() > 0
-    assert np.isinf(changes["after"]).any()
-
-
-def test_there_is_an_end_to_what_is_kept(monkeypatch):
-    monkeypatch.setattr(watching, "MOVES_UNASKED", 50)
-    monkeypatch.setattr(watching, "MOST_MOVES", 80)
-    for n_episodes, kept in ((0, 50), (10_000, 80)):
-        _, recorder = watched(LAKE, n_timesteps=200, n_episodes=n_episodes)
-        assert (len(recorder.moves), recorder.is_cut) == (kept, True)
-    monkeypatch.setattr(watching, "MOST_CHANGES", 9)
-    _, recorder = watched(Corridor(), n_timesteps=50)
-    assert len(recorder.changes) == 10
-
-
-@pytest.mark.parametrize(
-    ("env_id", "algo"), [("SegmentBandit-v0", "epsilon_greedy"), ("LinearBandit-v0", "linucb")]
-)
-def test_bandits_are_watched_in_their_tables(env_id, algo):
-    agent, recorder = watched(f"envs:{env_id}", algo, n_timesteps=20)
-    assert np.isnan(recorder.moves.rows["target"]).all()
-    knows_contexts = env_id == "SegmentBandit-v0"
-    assert recorder.has_actions == knows_contexts
-    assert (recorder.moves.rows["obs"][0] == NO_STATE) != knows_contexts
-    for number, name in enumerate(recorder.names):
-        table = recorder.initial[name].reshape(-1).copy()
-        for change in recorder.changes.rows:
-            if change["table"] == number:
-                table[change["entry"]] = change["after"]
-        assert np.array_equal(table, getattr(agent.policy, name).numpy().reshape(-1))
-
-
 def episodes_of(folder):
     rows = (folder / "0.monitor.csv").read_text().splitlines()[2:]
     return [row.split(",")[:2] for row in rows]
@@ -233,6 +156,7 @@ SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradie
     ("algo", "settings"),
     [
         ("qlearning", {}),
+        ("double_qlearning", {"n_envs": 3}),
         ("dqn", {**SMALL_DQN, "engine": "compiled", "train_freq": [2, "episode"]}),
         ("double_dqn", {**SMALL_DQN, "engine": "compiled", "n_envs": 2}),
         ("ppo", SMALL_PPO),
@@ -253,8 +177,8 @@ def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     assert one == other
     one, other = (np.load(run.run.evaluations_path) for run in (alone, outcome))
     assert one["results"].tobytes() == other["results"].tobytes()
-    if algo == "qlearning":
-        assert len(training.watch.steps) == 300
+    if "qlearning" in algo:
+        assert len(training.watch.steps) == 300 // settings.get("n_envs", 1)
         return
     assert len(training.watch.moments) > 4
 
@@ -316,12 +240,10 @@ def test_of_many_maps_every_second_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(watching, "MOST_MAPS", 4)
     spec = spec_of(algo="ppo", settings=SMALL_PPO, log_folder=tmp_path)
     training, _ = done(replace(spec, watch_learning=tmp_path / "page.html"))
-    training.watch.finish()
-    training.watch.finish()
-    rows = training.watch.moments.rows
+    for _ in range(2):
+        training.watch.finish()
     # Ten updates; the last one is kept though it is none of every fourth.
-    assert rows["number"].tolist() == [0, 4, 8, 10]
-    assert rows["timesteps"].tolist() == [0, 128, 256, 320]
+    assert training.watch.moments.rows["number"].tolist() == [0, 4, 8, 10]
     assert (training.watch.stride, training.watch.n_units) == (4, 10)
 
 
@@ -367,3 +289,242 @@ def test_what_is_played_covers_the_rise_of_the_greedy_policys_return(env_id):
     # It begins with an episode.
     before = recorder.moves.rows[recorder.moves.rows["step"] == begin - 1]
     assert begin == 0 or before["end"][0] != 0
+
+
+# --- progress, in terminals and elsewhere ---------------------------------------------------------
+
+
+def learner():
+    return load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled():
+    """What the agent needs is compiled before anything is counted."""
+    learner().learn(1)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock on which a step takes 10 milliseconds, as far as the display asks for the time."""
+    fake = SimpleNamespace(now=0.0)
+
+    def monotonic():
+        fake.now += 0.01
+        return fake.now
+
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=monotonic))
+    # What is due by the clock looks at it without letting it go on.
+    monkeypatch.setattr(signs_of_life, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    return fake
+
+
+@pytest.fixture(autouse=True)
+def hearts(monkeypatch):
+    """Nothing beats by itself; which hearts do is noted."""
+    beating = []
+
+    class StillHeart(Heartbeat):
+        def start(self):
+            beating.append(self)
+
+        def stop(self):
+            beating.clear()
+
+    for module in (progress, signs_of_life):
+        monkeypatch.setattr(module, "Heartbeat", StillHeart)
+    return beating
+
+
+def console_of(terminal, width=120, **options):
+    file = io.StringIO()
+    return file, Console(
+        file=file, width=width, force_terminal=terminal, color_system=None, **options
+    )
+
+
+def without_codes(text):
+    """Without the codes that move the cursor."""
+    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
+
+
+def text_shown(n_steps, *, live):
+    """What is written while an agent learns."""
+    file, console = console_of(live)
+    display = ProgressDisplay(console, live=live)
+    learner().learn(n_steps, callback=display)
+    return display, file.getvalue()
+
+
+def compile_something():
+    logging.getLogger("machine_code").info("compiling run_block")
+
+
+# --- a training ----------------------------------------------------------------------------------
+
+
+def test_elsewhere_ten_plain_lines(clock):
+    _, text = text_shown(1000, live=False)
+    lines = text.splitlines()
+    assert len(lines) == 10
+    shares = [int(re.match(r" *(\d+)%  ", line)[1]) for line in lines]
+    # It looks at the clock ten steps apart, and so is late by that much at most.
+    assert [share // 10 for share in shares] == list(range(1, 11))
+    assert max(share % 10 for share in shares) <= 1
+    for line, share in zip(lines[1:], shares[1:], strict=True):
+        steps, left = re.match(
+            r" *\d+%  ([\d,]+) steps  mean return in training 0\.\d\d"
+            r"(?:  about (\d+) s left by the clock)?$",
+            line,
+        ).groups()
+        assert int(steps.replace(",", "")) == pytest.approx(10 * share, abs=6)
+        # A hundred readings of the clock a second, one for each step and more for each line.
+        assert int(left or 0) == pytest.approx((100 - share) / 10, abs=1.5)
+    assert lines[-1].startswith("100%  1,000 steps")
+    assert "\x1b" not in text
+    # No return is shown before an episode has ended.
+    assert text_shown(5, live=False)[1] == "100%  5 steps\n"
+
+
+def test_in_a_terminal_a_bar(clock):
+    display, text = text_shown(1000, live=True)
+    shown = [int(share) for share in re.findall(r"(\d+)% ", without_codes(text))]
+    assert shown == sorted(shown)
+    assert len(set(shown)) > 20
+    assert shown[-1] == 100
+    # Ten seconds, by a clock of which every reading takes a hundredth: ten times a second at most.
+    assert len(shown) <= 110
+    assert re.search(r"100% +1,000 steps  mean return in training 0\.\d\d", without_codes(text))
+    # The bar lets go of the terminal: the cursor is shown again, and closing twice is harmless.
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
+    display.close()
+    display.on_training_end()
+    assert display.console.file.getvalue() == text
+
+
+class Slow(BaseCallback):
+    """Lets 24 seconds go by in one step, and the display look at it every second."""
+
+    def __init__(self, display, clock):
+        super().__init__()
+        self.display, self.clock = display, clock
+
+    def _on_step(self):
+        if self.num_timesteps == 30:
+            with self.display.doing("evaluating"):
+                for _ in range(24):
+                    self.clock.now += 1
+                    self.display.look()
+        return True
+
+
+def slow_training(clock, live=False):
+    # A line is one line, however narrow the console is that rich assumes in a pipe.
+    file, console = console_of(live, width=120 if live else 20)
+    display = ProgressDisplay(console, live=live)
+    learner().learn(1000, callback=[display, Slow(display, clock)])
+    return without_codes(file.getvalue())
+
+
+def test_a_line_comes_early_and_then_every_ten_seconds_also_while_no_step_ends(clock):
+    lines = slow_training(clock).splitlines()
+    # Two seconds after the beginning, and then ten after each line.
+    first = r"  \d%  2\d steps  mean return in training 0.00  evaluating, 2 s"
+    assert re.fullmatch(first, lines[0])
+    assert "left by the clock" in lines[3]
+    assert [re.search(r"evaluating, (\d+) s", line)[1] for line in lines[:3]] == ["2", "12", "22"]
+    # Thereafter nothing of it is left.
+    assert not any("evaluating" in line for line in lines[3:])
+    assert re.match(r" 10%  10\d steps", lines[3])
+    assert len(lines) == 13
+
+
+# --- anything that takes long --------------------------------------------------------------------
+
+
+def test_what_takes_long_is_said_after_five_seconds_and_then_every_ten(clock):
+    file, console = console_of(terminal=False)
+    said = []
+    with doing(console, "drawing [all]") as activity:
+        for second in range(1, 40):
+            clock.now += 1
+            activity.look()
+            if len(file.getvalue().splitlines()) > len(said):
+                said.append(second)
+            if second == 20:
+                activity.now("writing")
+                activity.at("section 2 of 3")
+    assert said == [6, 17, 28, 39]
+    assert file.getvalue().splitlines() == [
+        "drawing [all], 6 s",
+        "drawing [all], 17 s",
+        "writing: section 2 of 3, 8 s",
+        "writing: section 2 of 3, 19 s",
+    ]
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt, ValueError])
+def test_on_a_terminal_one_line_moves_and_is_gone_in_the_end(clock, hearts, error):
+    file, console = console_of(terminal=True)
+
+    def work():
+        with doing(console, "loading [x]") as activity:
+            assert hearts
+            # It is there at once, and does not wait for its heart.
+            assert "loading [x]" in without_codes(file.getvalue())
+            activity.at("2 of 3")
+            activity.look()
+            assert "loading [x]: 2 of 3" in without_codes(file.getvalue())
+            compile_something()
+            activity.look()
+            assert f"loading [x]: {COMPILING}" in without_codes(file.getvalue())
+            activity.say("a line")
+            if error:
+                raise error
+
+    with pytest.raises(error) if error else nullcontext():
+        work()
+    text = file.getvalue()
+    assert "\na line" in without_codes(text).replace("\r", "\n")
+    # The line was erased after it had been drawn for the last time, and the cursor is back.
+    assert text.rindex("\x1b[2K") > text.rindex("loading")
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
+    assert not hearts
+    compile_something()
+    assert file.getvalue() == text
+
+
+# --- the heart -----------------------------------------------------------------------------------
+
+
+def test_a_heart_beats_until_it_is_stopped_which_waits_for_its_last_call(capfd):
+    beats = threading.Semaphore(0)
+    heart = Heartbeat(beats.release, 0.001)
+    for _ in range(2):  # it may begin again
+        heart.start()
+        for _ in range(3):
+            assert beats.acquire(timeout=30)
+        heart.stop()
+        heart.stop()
+        while beats.acquire(blocking=False):
+            pass
+        assert not beats.acquire(timeout=0.02)
+    begun, may_end, calls = threading.Event(), threading.Event(), []
+
+    def call():
+        begun.set()
+        may_end.wait(30)
+        calls.append(1)
+        raise OSError(28, "No space left on device")  # it stands still without a word
+
+    heart = Heartbeat(call, 0.001)
+    heart.start()
+    assert begun.wait(30)
+    threading.Timer(0.05, may_end.set).start()
+    heart.stop()
+    assert calls == [1]
+    stopped = threading.Event()
+    suicidal = Heartbeat(lambda: (suicidal.stop(), stopped.set()), 0.001)
+    suicidal.start()
+    assert stopped.wait(30)
+    assert capfd.readouterr() == ("", "")

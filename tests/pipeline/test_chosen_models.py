@@ -1,0 +1,528 @@
+"""Which model is played or trained further, what belongs to it, and folders of others that lie."""
+
+import hashlib
+import json
+import os
+import pathlib
+import pickle
+import shutil
+from collections import OrderedDict
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from stable_baselines3 import A2C
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
+
+from pipeline.errors import UserError
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.models.choose import ModelRequest, agent_to_continue, choose_model, model_of_run
+from pipeline.models.find import model_at, replay_buffer_of, run_around, run_of
+from pipeline.models.load import load_model, load_to_play, with_normalised_rewards
+from pipeline.playing import play_episodes, playing_env
+from pipeline.runs import Run
+from pipeline.settings.yaml import read_saved_settings
+from pipeline.training import prepare
+from tests.pipeline.short_runs import CART, LAKE, spec_of, trained
+
+SMALL_A2C = {"policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}
+SMALL_DQN = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 10, "buffer_size": 500}
+SMALL_DQN |= {"batch_size": 4}
+BRIEFLY = {"eval_episodes": 2, "n_eval_envs": 1}
+
+
+def train_to(folder, algo, entry, n_timesteps=200, **fields):
+    common = {"n_timesteps": n_timesteps, "log_folder": folder, **BRIEFLY}
+    return trained(algo, CART, entry, **{**common, **fields}).run
+
+
+def read(path):
+    return pickle.loads(path.read_bytes())
+
+
+def seen(path):
+    """How many observations the statistics are of, the start of 1e-4 left out."""
+    return round(read(path).obs_rms.count)
+
+
+# --- statistics of normalisation -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def normalised(tmp_path_factory):
+    """A run of 200 steps with checkpoints after 60, 120 and 180."""
+    entry = {**SMALL_A2C, "normalize": {"clip_obs": 3.0}}
+    logs = tmp_path_factory.mktemp("logs")
+    return train_to(logs, "a2c", entry, save_freq=60, eval_freq=40)
+
+
+@pytest.mark.parametrize(
+    ("which", "name", "n_seen"),
+    [
+        # Two observations at the beginning, and two for each step of both environments.
+        ("final", "CartPole-v1/vecnormalize.pkl", [202]),
+        ("best", "best_model_vecnormalize.pkl", range(42, 203, 40)),
+        ("last checkpoint", "rl_model_vecnormalize_180_steps.pkl", [182]),
+        (60, "rl_model_vecnormalize_60_steps.pkl", [62]),
+    ],
+)
+def test_a_model_is_played_on_the_statistics_of_its_moment(normalised, which, name, n_seen):
+    path, logs = normalised.path / name, normalised.path.parent.parent
+    assert seen(path) in n_seen
+    chosen = choose_model(ModelRequest(algo="a2c", env_id=CART, log_folder=logs, which=which))
+    assert chosen.statistics.path == path
+    again = choose_model(ModelRequest(chosen.path, log_folder=logs))
+    assert again.statistics.path.samefile(path)
+
+
+@pytest.mark.parametrize(
+    ("model", "said", "n_seen", "expected"),
+    [
+        # Two for the new beginning. Where the entry says nothing, the agent's own settings count.
+        ("", {}, 244, {"clip_obs": 3.0}),
+        ("rl_model_60_steps", {}, 104, {"clip_obs": 3.0}),
+        ("", {"normalize": {"clip_obs": 4.0}, "gamma": 0.5}, 244, {"clip_obs": 4.0, "gamma": 0.5}),
+        ("", {"normalize": False}, None, None),
+    ],
+)
+def test_statistics_go_on_unless_the_new_entry_says_otherwise(
+    normalised, tmp_path, model, said, n_seen, expected
+):
+    agent = model_at(normalised.path / model)
+    entry = {**SMALL_A2C, **said}
+    run = train_to(tmp_path, "a2c", entry, 40, trained_agent=agent, eval_freq=-1)
+    chosen = choose_model(ModelRequest(algo="a2c", env_id=CART, log_folder=tmp_path))
+    if expected is None:
+        assert not run.vecnormalize_path.exists()
+        assert chosen.statistics is None
+        return
+    assert seen(run.vecnormalize_path) == n_seen
+    statistics, recorded = read(run.vecnormalize_path), run.recorded_spec()["hyperparams"]
+    for key, value in expected.items():
+        assert getattr(statistics, key) == value
+        assert recorded["normalize"].get(key, recorded.get(key)) == value
+    assert chosen.spec.hyperparams.normalize["clip_obs"] == expected["clip_obs"]
+
+
+# --- replay buffers ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    logs = tmp_path_factory.mktemp("logs")
+    return train_to(logs, "dqn", SMALL_DQN, save_freq=80, save_replay_buffer=True, eval_freq=-1)
+
+
+def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(replayed, tmp_path):
+    of_80, of_160 = (f"rl_model_replay_buffer_{n}_steps.pkl" for n in (80, 160))
+    names = {path.name for path in replayed.path.glob("*.pkl")}
+    assert names == {"replay_buffer.pkl", of_160, of_80}
+    for model, name in (
+        ("CartPole-v1.zip", "replay_buffer.pkl"),
+        ("rl_model_80_steps.zip", of_80),
+        ("best_model.zip", "replay_buffer.pkl"),
+    ):
+        assert replay_buffer_of(replayed.path / model) == replayed.path / name
+    going_on = {"trained_agent": replayed.model_path, "save_replay_buffer": True}
+    run = train_to(tmp_path, "dqn", SMALL_DQN, 50, **going_on)
+    before, after = (read(one.path / "replay_buffer.pkl") for one in (replayed, run))
+    # An update follows every fourth step, and training ends with one.
+    assert (before.pos, after.pos) == (200, 252)
+    np.testing.assert_array_equal(after.observations[:200], before.observations[:200])
+    logs = tmp_path / "above" / "logs"
+    with pytest.raises(UserError, match=r"filled by 1 environments at once.* n_envs:1"):
+        train_to(logs, "dqn", {**SMALL_DQN, "n_envs": 2}, 50, **going_on)
+    assert not logs.exists()
+    # Playing needs none.
+    chosen = choose_model(ModelRequest(replayed.model_path, log_folder=replayed.path))
+    env = playing_env(chosen, None)
+    assert load_to_play("dqn", chosen.path, env).replay_buffer.buffer_size == 1
+    env.close()
+
+
+def test_the_kind_of_buffer_follows_the_new_entry_and_none_is_kept_unasked(tmp_path):
+    """Returns of several steps take another kind, which the library writes into the zip."""
+    first = train_to(tmp_path, "dqn", {**SMALL_DQN, "n_steps": 3}, 40, eval_freq=-1)
+    assert not list(first.path.glob("*.pkl"))
+    fields = {"trained_agent": first.model_path, "eval_freq": -1, "save_replay_buffer": True}
+    for n_steps, kind in ((1, "ReplayBuffer"), (2, "NStepReplayBuffer")):
+        run = train_to(tmp_path, "dqn", {**SMALL_DQN, "n_steps": n_steps}, 20, **fields)
+        buffer = read(run.path / "replay_buffer.pkl")
+        assert (type(buffer).__name__, getattr(buffer, "n_steps", 1)) == (kind, n_steps)
+    fields["trained_agent"] = run.model_path
+    said = "holds a NStepReplayBuffer with n_steps 2; these hyperparameters need a ReplayBuffer"
+    with pytest.raises(UserError, match=said):
+        train_to(tmp_path, "dqn", {**SMALL_DQN, "n_steps": 1}, 20, **fields)
+
+
+# --- what was checked is what is loaded, though files are exchanged as soon as they are open -----
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs each of an agent with statistics, and of one with a replay buffer."""
+    folder = tmp_path_factory.mktemp("logs")
+    return {
+        algo: [
+            trained(algo, env_id, entry, n_timesteps=40, seed=seed, log_folder=folder, **fields).run
+            for seed in (0, 1)
+        ]
+        for algo, env_id, entry, fields in (
+            ("a2c", CART, {**SMALL_A2C, "normalize": True}, {**BRIEFLY, "eval_freq": -1}),
+            ("dqn", CART, SMALL_DQN, {"save_replay_buffer": True, "eval_freq": -1}),
+        )
+    }
+
+
+@pytest.fixture
+def swapped(runs, tmp_path, monkeypatch):
+    """A copy of an agent's first run, whose files become the second's once they are opened."""
+
+    def copy(algo):
+        genuine, other = runs[algo]
+        run = replace(genuine, path=tmp_path / genuine.path.name)
+        shutil.copytree(genuine.path, run.path)
+        opens = []
+
+        def open_and_swap(path, *args, **kwargs):
+            number = opened(path, *args, **kwargs)
+            there = pathlib.Path(f"/proc/self/fd/{number}").readlink()
+            if there.is_relative_to(run.path) and there.suffix in (".zip", ".pkl"):
+                opens.append(there.name)
+                shutil.copyfile(other.path / there.relative_to(run.path), tmp_path / "other")
+                (tmp_path / "other").replace(there)
+            return number
+
+        opened = os.open
+        monkeypatch.setattr(os, "open", open_and_swap)
+        return run, opens
+
+    return copy
+
+
+def weights(model):
+    state = model.policy.state_dict().values()
+    return np.concatenate([value.detach().numpy().ravel() for value in state])
+
+
+def check_is_of(genuine, other, algo, model):
+    first, second = (weights(load_model(algo, run.model_path)) for run in (genuine, other))
+    np.testing.assert_array_equal(weights(model), first)
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("by", ["its folder", "its run, for a film"])
+def test_playing(runs, swapped, by):
+    run, opens = swapped("a2c")
+    if by == "its folder":
+        chosen = choose_model(ModelRequest(run.path, log_folder=run.path.parent, device="cpu"))
+    else:
+        spec = spec_of("a2c", CART, {**SMALL_A2C, "normalize": True})
+        chosen = model_of_run(run.model_path, spec, run)
+    env = playing_env(chosen, None)
+    model = load_to_play("a2c", chosen.file, env, "cpu")
+    assert sorted(opens) == ["CartPole-v1.zip", "vecnormalize.pkl"]
+    check_is_of(*runs["a2c"], "a2c", model)
+    own, others = (read(one.vecnormalize_path).obs_rms.mean.tolist() for one in runs["a2c"])
+    assert env.obs_rms.mean.tolist() == own != others
+
+
+def test_going_on(runs, swapped, tmp_path):
+    run, opens = swapped("dqn")
+    fields = {"log_folder": tmp_path / "logs", "eval_freq": -1, "n_timesteps": 16}
+    spec = spec_of("dqn", CART, SMALL_DQN, trained_agent=run.model_path, **fields)
+    training = prepare(spec, Console(quiet=True), {}, "train.py")
+    assert opens == ["CartPole-v1.zip", "replay_buffer.pkl"]
+    genuine = runs["dqn"][0].model_path.read_bytes()
+    recorded = training.run.read_info()["trained_agent_digest"]
+    assert recorded == hashlib.sha256(genuine).hexdigest()
+    check_is_of(*runs["dqn"], "dqn", training.model)
+    training.model.env.close()
+    training.eval_env.close()
+
+
+def test_a_swap_before_the_training_begins_is_found(swapped, tmp_path):
+    """The first look is for refusals without delay; what counts is what is loaded."""
+    run, _ = swapped("dqn")
+    path = agent_to_continue(run.path)
+    spec = spec_of("dqn", CART, SMALL_DQN, log_folder=tmp_path / "logs", trained_agent=path)
+    with pytest.raises(UserError, match=r"CartPole-v1\.zip is not as the run left it"):
+        prepare(spec, Console(quiet=True), {}, "train.py")
+    assert not (tmp_path / "logs").exists()
+
+
+# --- agents of others: rl_zoo3's layout and a model hub's, made with the library alone -----------
+CONFIG = OrderedDict(
+    frame_stack=2,
+    learning_rate="lin_0.1",
+    n_envs=2,
+    n_timesteps=1e5,
+    normalize="dict(norm_obs=True, norm_reward=False)",
+    policy="MlpPolicy",
+    policy_kwargs="dict(net_arch=[4], activation_fn=nn.ReLU)",
+)
+
+
+def cart_poles(n_envs, statistics=None):
+    env = make_vec_env("CartPole-v1", n_envs, seed=0)
+    if statistics is None:
+        return VecFrameStack(VecNormalize(env, norm_reward=False, clip_obs=2.0), 2)
+    normalization = VecNormalize.load(statistics, env)
+    normalization.training = normalization.norm_reward = False
+    return VecFrameStack(normalization, 2)
+
+
+def write_settings(folder, config, **args):
+    folder.mkdir(parents=True)
+    (folder / "config.yml").write_text(yaml.dump(config))
+    args = OrderedDict([("algo", "a2c"), ("env_kwargs", None), *args.items()])
+    (folder / "args.yml").write_text(yaml.dump(args))
+
+
+@pytest.fixture(scope="module")
+def zoo(tmp_path_factory):
+    """A log folder as rl_zoo3 leaves it: a normalised CartPole and a lake without ice."""
+    zoo = tmp_path_factory.mktemp("zoo")
+    run = zoo / "a2c" / "CartPole-v1_1"
+    write_settings(run / "CartPole-v1", CONFIG, env="CartPole-v1")
+    env = cart_poles(2)
+    model = A2C("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [4]}).learn(300)
+    model.save(run / "CartPole-v1")
+    env.save(run / "CartPole-v1" / "vecnormalize.pkl")
+    dry = {"is_slippery": False}
+    run = zoo / "a2c" / "FrozenLake-v1_1"
+    config = OrderedDict(policy="MlpPolicy", env_kwargs={"map_name": "8x8"})
+    write_settings(run / "FrozenLake-v1", config, env="FrozenLake-v1", env_kwargs=dry)
+    A2C("MlpPolicy", gym.make("FrozenLake-v1", **dry), seed=0).save(run / "FrozenLake-v1")
+    return zoo
+
+
+def returns_of(request, n_episodes, n_envs=1):
+    chosen = choose_model(request)
+    env = playing_env(chosen, None, n_envs)
+    model = load_to_play(chosen.spec.algo, chosen.path, env, "cpu")
+    env.seed(0)
+    played = list(play_episodes(model, env, n_episodes))
+    env.close()
+    return played
+
+
+def hub(zoo, folder, *settings):
+    """The same model as hubs have it, with some of the settings beside it."""
+    run = zoo / "a2c" / "CartPole-v1_1"
+    (folder / "a2c-CartPole-v1.zip").write_bytes((run / "CartPole-v1.zip").read_bytes())
+    (folder / "train_eval_metrics.zip").touch()
+    for name in settings:
+        saved = name.replace("vec_normalize", "vecnormalize")
+        (folder / name).write_bytes((run / "CartPole-v1" / saved).read_bytes())
+    return folder
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_it_plays_as_the_library_evaluates_it(zoo, tmp_path, n_envs):
+    run = zoo / "a2c" / "CartPole-v1_1"
+    env = cart_poles(n_envs, run / "CartPole-v1" / "vecnormalize.pkl")
+    env.seed(0)
+    model = A2C.load(run / "CartPole-v1.zip")
+    expected = evaluate_policy(model, env, 7, return_episode_rewards=True)
+    expected = list(zip(*expected, strict=True))
+    assert len(set(expected)) > 1
+    whole = hub(zoo, tmp_path, "args.yml", "config.yml", "vec_normalize.pkl")
+    for request in (
+        ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=zoo),
+        ModelRequest(run, log_folder=zoo),
+        ModelRequest(run / "CartPole-v1", log_folder=zoo),
+        ModelRequest(run / "CartPole-v1.zip", log_folder=zoo),
+        ModelRequest(whole, log_folder=tmp_path),
+        ModelRequest(whole / "a2c-CartPole-v1"),
+    ):
+        assert returns_of(request, 7, n_envs) == expected
+
+
+def test_returns_of_rewards_as_training_normalised_them(zoo):
+    chosen = choose_model(ModelRequest(algo="a2c", env_id=CART, log_folder=zoo))
+    env = with_normalised_rewards(playing_env(chosen, None))
+    ((total, length),) = play_episodes(load_to_play("a2c", chosen.path, env, "cpu"), env, 1)
+    # Every reward of CartPole is 1, and the statistics stay as training left them.
+    one = float(unwrap_vec_normalize(env).normalize_reward(np.ones(1))[0])
+    assert total == pytest.approx(length * one, rel=1e-5) != length
+    env.close()
+
+
+def test_arguments_of_the_command_replace_those_of_the_settings(zoo):
+    request = ModelRequest(algo="a2c", env_id=LAKE, log_folder=zoo)
+    chosen = choose_model(request)
+    assert chosen.spec.hyperparams.env_kwargs == {"is_slippery": False}
+    assert exact_evaluator(chosen.spec).yardstick.optimum == 1.0
+    # And those given now come on top.
+    slippery = choose_model(replace(request, env_kwargs={"is_slippery": True}))
+    assert exact_evaluator(slippery.spec).yardstick.optimum < 0.8
+
+
+def test_named_statistics_are_used(zoo, tmp_path):
+    """Also where the folder says no more than that two frames are stacked."""
+    bare = hub(zoo, tmp_path)
+    (bare / "config.yml").write_text("frame_stack: 2")
+    saved = zoo / "a2c" / "CartPole-v1_1" / "CartPole-v1" / "vecnormalize.pkl"
+    named = ModelRequest(bare, "a2c", "CartPole-v1", statistics=saved)
+    whole = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=zoo)
+    assert returns_of(named, 5) == returns_of(whole, 5)
+    assert choose_model(named).spec.hyperparams.normalize["clip_obs"] == 2.0
+
+
+def test_a_run_without_a_number(zoo, tmp_path):
+    folder = tmp_path / "a2c"
+    write_settings(folder / "CartPole-v1", {"frame_stack": 2}, env="CartPole-v1")
+    run = zoo / "a2c" / "CartPole-v1_1"
+    (folder / "CartPole-v1.zip").write_bytes((run / "CartPole-v1.zip").read_bytes())
+    for number in (0, -1):
+        request = ModelRequest(
+            algo="a2c", env_id="CartPole-v1", log_folder=tmp_path, run_number=number
+        )
+        assert choose_model(request).run == Run(folder, "CartPole-v1")
+    (folder / "CartPole-v1_3").mkdir()
+    with pytest.raises(UserError, match=r"CartPole-v1_3 holds no CartPole-v1\.zip"):
+        choose_model(ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=tmp_path))
+
+
+SAID = ("args.yml", "config.yml")
+
+
+REFUSED = [
+    ((), {}, "is in no run folder: say what it is with --algo"),
+    (
+        (),
+        {"algo": "a2c", "env_id": CART},
+        r"trained on observations of shape \(8,\), and the environment .* gives shape \(4,\)",
+    ),
+    (SAID, {}, "name their file with --vec-normalize"),
+    (SAID, {"statistics": Path("no.pkl")}, r"no such file of statistics: no\.pkl"),
+    ((*SAID, "vec_normalize.pkl"), {"algo": "dqn"}, "cannot be loaded as a dqn agent"),
+    (SAID, {"which": "best"}, "is one model: give its folder for --load-best"),
+]
+
+
+@pytest.mark.parametrize(("settings", "given", "complaint"), REFUSED)
+def test_what_does_not_go_together(zoo, tmp_path, settings, given, complaint):
+    folder = hub(zoo, tmp_path, *settings)
+    path = folder / "a2c-CartPole-v1.zip" if "which" in given else folder
+    with pytest.raises(UserError, match=complaint) as refused:
+        returns_of(ModelRequest(path, **given), 1)
+    assert "\n" not in str(refused.value)
+
+
+def test_several_models_in_a_folder(zoo, tmp_path):
+    hub(zoo, tmp_path)
+    (tmp_path / "other.zip").touch()
+    with pytest.raises(UserError, match=r"holds a2c-CartPole-v1\.zip, other\.zip: name the zip"):
+        choose_model(ModelRequest(tmp_path))
+    for name in ("CartPole-v1", "Taxi-v4"):
+        write_settings(tmp_path / name, {}, env=name)
+    with pytest.raises(UserError, match="models of CartPole-v1, Taxi-v4: name the zip"):
+        choose_model(ModelRequest(tmp_path))
+    assert run_around(tmp_path / "Taxi-v4.zip") == Run(tmp_path.resolve(), "Taxi-v4")
+    assert run_around(tmp_path / "unknown.zip") is None
+
+
+def read_config(tmp_path, text):
+    path = tmp_path / "config.yml"
+    path.write_text(text)
+    return read_saved_settings(path)
+
+
+def test_an_ordered_dict_is_read_as_data(tmp_path):
+    settings = read_config(tmp_path, yaml.dump(CONFIG))
+    assert settings == dict(CONFIG)
+    assert type(settings) is dict
+    nested = OrderedDict(env_kwargs=OrderedDict(a=1), empty=OrderedDict())
+    assert read_config(tmp_path, yaml.dump(nested)) == {"env_kwargs": {"a": 1}, "empty": {}}
+
+
+APPLY = "!!python/object/apply:"
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (f"{APPLY}os.system [touch x]", "os.system is not allowed here"),
+        (f"{APPLY}collections.OrderedDict [[[a, {APPLY}os.getcwd []]]]", "is not allowed here"),
+        ("!!python/object/new:collections.OrderedDict [[[a, 1]]]", "is not allowed here"),
+        ("a: !!python/tuple [1, 2]", "is not allowed here"),
+        (f"{APPLY}collections.OrderedDict [[[a, 1], [a, 2]]]", "no OrderedDict of different keys"),
+        (f"{APPLY}collections.OrderedDict [[[a]]]", "no OrderedDict of different keys"),
+        (f"{APPLY}collections.OrderedDict [[[[1], 2]]]", "no OrderedDict of different keys"),
+        (f"{APPLY}collections.OrderedDict {{a: 1}}", "no OrderedDict of different keys"),
+        (f"{APPLY}collections.OrderedDict x", "no OrderedDict of different keys"),
+        (f"&a {APPLY}collections.OrderedDict [[[a, *a]]]", "nested too deeply"),
+        ("[1, 2]", "must map names to values"),
+        ("1: 2", "must map names to values"),
+    ],
+)
+def test_nothing_else_is_admitted(tmp_path, text, complaint):
+    with pytest.raises(UserError, match=complaint):
+        read_config(tmp_path, text)
+
+
+def test_each_environment_plays_its_share():
+    """Else those would be counted that end first, which are the short ones."""
+
+    class Uneven(gym.Env):
+        observation_space = gym.spaces.Box(-1, 1, (1,))
+        action_space = gym.spaces.Discrete(2)
+        made = 0
+
+        def __init__(self):
+            Uneven.made += 1
+            self.length = 10 ** (Uneven.made - 1)
+
+        def reset(self, *, seed=None, options=None):
+            self.left = self.length
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            self.left -= 1
+            return np.zeros(1, np.float32), 1.0, self.left == 0, False, {}
+
+    class Memory:
+        starts: list = []  # noqa: RUF012
+
+        def predict(self, obs, state, episode_start, deterministic):
+            self.starts.append(episode_start.tolist())
+            return np.zeros(len(obs), int), state
+
+    env = make_vec_env(Uneven, 2)
+    assert [length for _, length in play_episodes(Memory(), env, 5)] == [1, 1, 10, 10, 10]
+    # An agent with a memory is told which of the episodes begin.
+    assert Memory.starts[:2] == [[True, True], [True, False]]
+    assert [start for _, start in Memory.starts].count(True) == 3
+    assert len(list(play_episodes(Memory(), env, None, 6))) == 3
+
+
+@pytest.mark.parametrize(
+    "settings", ["{eval_env_kwargs: 5}", "{normalize: [1]}", "{frame_stack: x}"]
+)
+def test_settings_that_make_no_sense(zoo, tmp_path, settings):
+    folder = hub(zoo, tmp_path, "args.yml")
+    (folder / "config.yml").write_text(settings)
+    with pytest.raises(UserError, match=settings.strip("{").partition(":")[0]):
+        choose_model(ModelRequest(folder, env_kwargs={"sutton_barto_reward": True}))
+    (folder / "run.json").write_text('{"env_name": "X", "spec": {"algo": 1, "hyperparams": 7}}')
+    with pytest.raises(UserError, match="say what it is with --algo"):
+        choose_model(ModelRequest(folder / "a2c-CartPole-v1.zip"))
+
+
+@pytest.mark.parametrize("name", ["../elsewhere", "/etc", "..", "", None])
+def test_a_record_cannot_lead_out_of_its_folder_and_a_damaged_one_is_not_none(tmp_path, name):
+    """The zip beside it would be played as if nobody had said what it was."""
+    assert run_of(tmp_path / "any.zip") is None
+    record = "{" if name is None else json.dumps({"env_name": name})
+    (tmp_path / "run.json").write_text(record)
+    said = r"run\.json is damaged" + (": env_name is " if name is not None else "")
+    with pytest.raises(UserError, match=said):
+        run_of(tmp_path / "any.zip")

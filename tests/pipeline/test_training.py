@@ -1,0 +1,475 @@
+"""A training: its callbacks, what settings do to it, what it leaves, and bandits."""
+
+import csv
+import io
+import re
+import signal
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from rich.console import Console
+from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents.common.callbacks import EpisodeBudget
+from commands.train import describe_pulls, print_outcome
+from envs.bandits import log_uniformly
+from pipeline import callbacks as callbacks_module
+from pipeline.callbacks import (
+    EpisodeCheckpoint,
+    EvaluationCallback,
+    ExponentialExploration,
+    PullSummary,
+    StepCheckpoint,
+    summarise_pulls,
+)
+from pipeline.evaluation.sampled import Evaluation, evaluate
+from pipeline.models.find import checkpoint_file
+from pipeline.runs import PULLS_FILE, Run
+from pipeline.stopping import stops_noticed
+from pipeline.training import carry_out, prepare, train
+from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
+
+TINY_DQN = {"buffer_size": 200, "batch_size": 4, "learning_starts": 20}
+TINY_DQN |= {"policy_kwargs": {"net_arch": [4]}}
+
+
+def evaluation_of(*returns, lengths=None, successes=None):
+    return Evaluation(
+        np.array(returns, dtype=np.float64),
+        np.array(lengths or [1] * len(returns)),
+        None if successes is None else np.array(successes),
+    )
+
+
+@pytest.fixture
+def run(tmp_path):
+    return Run.claim(tmp_path / "logs", "qlearning", "Warehouse-v0")
+
+
+# --- evaluation in training ----------------------------------------------------------------------
+
+# Five moves to the goal: a return of 96 at best.
+# Five moves to the goal: a return of 96 at best.
+SMALL_WAREHOUSE = ("envs:Warehouse-v0", {"desc": ["S...", ".##.", "...G"], "max_episode_steps": 20})
+CLIFF = ("CliffWalking-v1", {"max_episode_steps": 50})
+
+
+def train_with(callback, folder, env_id, env_kwargs, n_envs=1, steps=1000):
+    env = make_vec_env(env_id, n_envs, seed=0, env_kwargs=env_kwargs)
+    model = agent_of("qlearning", env, learning_rate=0.5, exploration_initial_eps=0.3)
+    model.set_logger(configure(str(folder), ["csv"]))
+    model.learn(steps, callback=callback, log_interval=None)
+    model.logger.close()
+    with (folder / "progress.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    # What the two callbacks themselves log, and when.
+    names = [name for name in rows[0] if name.startswith("eval/")] + ["time/total_timesteps"]
+    return model, [{name: row[name] for name in names} for row in rows]
+
+
+def both_callbacks(run, folder, env_id, env_kwargs, after=lambda: None, **options):
+    """Ours and the library's, which see the same episodes: nothing is random there."""
+    env, other = (make_vec_env(env_id, 1, env_kwargs=env_kwargs) for _ in range(2))
+    play = partial(evaluate, env=env, n_episodes=3, seed=99)
+    common = {"callback_after_eval": after(), **options}
+    paths = {"log_path": str(folder), "best_model_save_path": str(folder)}
+    library = EvalCallback(
+        other, n_eval_episodes=3, verbose=0, **paths, **options, callback_after_eval=after()
+    )
+    return EvaluationCallback(run, env, play, **common), library
+
+
+@pytest.mark.parametrize(
+    ("world", "n_envs", "steps", "says_success"),
+    [(SMALL_WAREHOUSE, 3, 500, True), (CLIFF, 1, 6000, False)],
+    ids=["Warehouse", "CliffWalking"],
+)
+def test_evaluations_are_written_as_the_library_writes_them(
+    run, tmp_path, n_envs, world, steps, says_success
+):
+    freq = steps // n_envs // 15
+    own, library = both_callbacks(run, tmp_path / "library", *world, eval_freq=freq)
+    _, expected_log = train_with(library, tmp_path / "library", *world, n_envs, steps)
+    model, log = train_with(own, tmp_path / "own", *world, n_envs, steps)
+    expected = np.load(tmp_path / "library" / "evaluations.npz")
+    written = np.load(run.evaluations_path)
+    assert written.files == expected.files
+    assert ("successes" in written.files) == says_success
+    for name in expected.files:
+        assert written[name].dtype == expected[name].dtype
+        np.testing.assert_array_equal(written[name], expected[name])
+    # There was something to tell apart.
+    assert len(np.unique(expected["results"])) > 1
+    assert own.best_mean_reward == library.best_mean_reward
+    assert own.last_mean_reward == library.last_mean_reward
+    assert log == expected_log
+    best = type(model).load(run.best_model_path)
+    expected_best = type(model).load(tmp_path / "library" / "best_model.zip")
+    assert th.equal(best.policy.q_tables, expected_best.policy.q_tables)
+    assert best.num_timesteps == expected_best.num_timesteps == own.best_timesteps
+    means = expected["results"].mean(axis=1)
+    assert own.best_timesteps == expected["timesteps"][means.argmax()]
+
+
+def scripted(run, evaluations, eval_freq=10, **kwargs):
+    """An evaluation callback that is told what comes out."""
+    outcomes = iter(evaluations)
+    env = make_vec_env("FrozenLake-v1", 1)
+    return EvaluationCallback(run, env, lambda model: next(outcomes), eval_freq, **kwargs)
+
+
+def test_the_best_model_is_the_first_of_the_best_and_evaluations_can_be_asked_for(run):
+    returns = [0.1, 0.5, 0.5, 0.2, 0.4]
+    callback = scripted(run, [evaluation_of(r, r) for r in returns])
+    model = agent_of("qlearning", LAKE).learn(50, callback=callback)
+    assert (callback.best_timesteps, callback.best_mean_reward) == (20, 0.5)
+    assert callback.last_evaluation.mean_return == callback.last_mean_reward == 0.4
+    assert type(model).load(run.best_model_path).num_timesteps == 20
+    assert np.load(run.evaluations_path)["timesteps"].tolist() == [10, 20, 30, 40, 50]
+    callback = scripted(run, [evaluation_of(2.0)], eval_freq=0)
+    agent_of("qlearning", LAKE).learn(50, callback=callback)
+    assert callback.last_evaluation is None
+    assert callback.evaluate_now() is True
+    assert callback.last_evaluation.mean_return == 2.0
+    assert np.load(run.evaluations_path)["timesteps"].tolist() == [50]
+
+
+@pytest.mark.parametrize(("pause", "left"), [(0.0, [1, 2]), (1e9, [1, 1])])
+def test_files_are_there_soon_after_each_evaluation(run, monkeypatch, pause, left):
+    """A run that is killed leaves what it has found until then, or until a second before."""
+    monkeypatch.setattr(callbacks_module, "SECONDS_BETWEEN_WRITES", pause)
+    seen = []
+
+    class Look(BaseCallback):
+        def _on_step(self):
+            path = run.evaluations_path
+            seen.append(len(np.load(path)["timesteps"]) if path.exists() else 0)
+            return True
+
+    evaluations = [
+        evaluation_of(1, 3, lengths=[4, 5], successes=[True, False]),
+        evaluation_of(0, 1, lengths=[6, 7], successes=[True, True]),
+    ]
+    callbacks = CallbackList([scripted(run, evaluations), Look()])
+    agent_of("qlearning", LAKE).learn(20, callback=callbacks)
+    assert seen == [0] * 9 + [left[0]] * 10 + [left[1]]
+    written = np.load(run.evaluations_path)
+    assert written["results"].tolist() == [[1, 3], [0, 1]]
+    assert written["ep_lengths"].tolist() == [[4, 5], [6, 7]]
+    assert written["successes"].tolist() == [[True, False], [True, True]]
+    left = {"Warehouse-v0", "best_model.zip", "evaluations.npz", "run.json"}
+    assert {path.name for path in run.path.iterdir()} == left
+
+
+def test_evaluation_sees_the_normalisation_of_training(run):
+    env = VecNormalize(make_vec_env(CART, 1, seed=0), norm_reward=False)
+    eval_env = VecNormalize(make_vec_env(CART, 1), training=False, norm_reward=False)
+    seen = []
+
+    def evaluator(model):
+        seen.append(eval_env.obs_rms.mean.copy())
+        return evaluation_of(len(seen))
+
+    callback = EvaluationCallback(run, eval_env, evaluator, 25)
+    agent_of("random", env).learn(50, callback=callback)
+    assert not np.array_equal(*seen)
+    np.testing.assert_array_equal(seen[1], env.obs_rms.mean)
+    # The statistics belong to the best model, and lie where they are looked for.
+    path = checkpoint_file(run.best_model_path, "vecnormalize")
+    loaded = VecNormalize.load(str(path), make_vec_env(CART, 1))
+    np.testing.assert_array_equal(loaded.obs_rms.mean, seen[1])
+
+
+# --- budgets, checkpoints, exploration -----------------------------------------------------------
+
+
+class Record(BaseCallback):
+    """Notes at each step the progress, and how many episodes had ended before it."""
+
+    def __init__(self):
+        super().__init__()
+        self.progress = []
+        self.ended = [0]
+
+    def _on_step(self):
+        self.progress.append(self.model._current_progress_remaining)
+        self.ended.append(self.ended[-1] + int(np.sum(self.locals["dones"])))
+        return True
+
+
+@pytest.mark.parametrize(("name", "n_envs"), [("qlearning", 1), ("sarsa", 3), ("dqn", 3)])
+def test_an_episode_budget_ends_training_and_drives_the_schedules(name, n_envs):
+    n_episodes = 20
+    kwargs = TINY_DQN if name == "dqn" else {}
+    model = agent_of(name, make_vec_env(LAKE, n_envs, seed=0), **kwargs)
+    record = Record()
+    model.learn(10**12, callback=CallbackList([record, EpisodeBudget(n_episodes)]))
+    # It ends with the step in which the last episode does, whatever else ends in the same step.
+    assert record.ended[-2] < n_episodes <= record.ended[-1]
+    assert model.num_timesteps == n_envs * len(record.progress)
+    for step, progress in enumerate(record.progress):
+        assert progress == pytest.approx(1 - record.ended[step] / n_episodes, abs=1e-9)
+
+
+def checkpoint_steps(folder):
+    names = [path.name for path in folder.glob("*")]
+    assert all(name.startswith("rl_model_") and name.endswith("_steps.zip") for name in names)
+    return sorted(int(name.split("_")[2]) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "every", "steps"),
+    [
+        (1, 50, [50, 100, 150, 200]),
+        (1, 70, [70, 140]),
+        # The first step at or after each multiple.
+        (3, 50, [51, 102, 150, 201]),
+        (3, 2, list(range(3, 202, 3))),
+        (1, 500, []),
+    ],
+)
+def test_checkpoints_by_steps(tmp_path, n_envs, every, steps):
+    model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
+    model.learn(200, callback=StepCheckpoint(every, tmp_path))
+    assert checkpoint_steps(tmp_path) == steps
+    for n in steps[:2]:
+        loaded = type(model).load(tmp_path / f"rl_model_{n}_steps.zip")
+        assert loaded.num_timesteps == n
+    for kind, unit in ((StepCheckpoint, "steps"), (EpisodeCheckpoint, "episodes")):
+        with pytest.raises(ValueError, match=f"every_n_{unit} must be at least 1, not 0"):
+            kind(0, tmp_path)
+
+
+@pytest.mark.parametrize(("n_envs", "every"), [(1, 1), (3, 4)])
+def test_checkpoints_by_episodes(tmp_path, n_envs, every):
+    model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
+    record = Record()
+    model.learn(300, callback=CallbackList([record, EpisodeCheckpoint(every, tmp_path)]))
+    counts = np.array(record.ended) // every
+    expected = n_envs * np.flatnonzero(np.diff(counts)) + n_envs
+    assert checkpoint_steps(tmp_path) == expected.tolist()
+    assert len(expected) > 3
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_checkpoints_and_budgets_need_no_asking_after_each_step(tmp_path, n_envs):
+    """A callback that has to be asked at each step changes nothing but the speed."""
+    found = []
+    for name, others in {"asked": [Record()], "unasked": []}.items():
+        (tmp_path / name).mkdir()
+        checkpoints = StepCheckpoint(70, tmp_path / name), EpisodeCheckpoint(4, tmp_path / name)
+        env = make_vec_env(LAKE, n_envs, seed=0)
+        model = agent_of("qlearning", env, learning_rate=LinearSchedule(0.5, 0.1, 1.0))
+        callbacks = CallbackList([*others, *checkpoints, EpisodeBudget(60)])
+        model.learn(10**12, callback=callbacks)
+        steps = checkpoint_steps(tmp_path / name)
+        saved = [type(model).load(tmp_path / name / f"rl_model_{n}_steps.zip") for n in steps]
+        tables = [each.policy.q_tables.numpy().tobytes() for each in (*saved, model)]
+        found.append((steps, tables, model.num_timesteps, model._current_progress_remaining))
+    assert len(found[0][0]) > 5
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize(("train_freq", "gradient_steps"), [(1, 1), (4, 2)])
+def test_epsilon_falls_with_each_update(train_freq, gradient_steps):
+    seen = []
+
+    class Look(BaseCallback):
+        def _on_step(self):
+            seen.append((self.model._n_updates, self.model.exploration_rate))
+            return True
+
+    exploration = ExponentialExploration(initial_eps=0.9, final_eps=0.2, decay=0.97)
+    rhythm = {"train_freq": train_freq, "gradient_steps": gradient_steps, "seed": 0}
+    model = DQN("MlpPolicy", Monitor(gym.make(LAKE)), **rhythm, **TINY_DQN)
+    model.learn(150, callback=CallbackList([exploration, Look()]))
+    assert len(seen) == model.num_timesteps
+    # Nothing is learnt in the first 20 steps, and it takes 50 updates to come down to the floor.
+    assert seen[19] == (0, 0.9)
+    assert seen[-1][0] >= 50
+    for n_updates, epsilon in seen:
+        assert epsilon == max(0.2, 0.9 * 0.97**n_updates)
+    assert {epsilon for _, epsilon in seen} >= {0.9, 0.2}
+    for name in ("initial_eps", "final_eps", "decay"):
+        for value in (-0.1, 1.1, float("nan")):
+            with pytest.raises(ValueError, match=f"{name} must lie between 0 and 1, not {value}"):
+                ExponentialExploration(**{name: value})
+
+
+# --- how it ends ---------------------------------------------------------------------------------
+
+
+class Trouble(BaseCallback):
+    """Raises at the three hundredth step."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def _on_step(self):
+        if self.num_timesteps == 300:
+            raise self.error
+        return True
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("thin ice")])
+def test_a_bar_lets_go_of_the_terminal_whatever_happens(tmp_path, monkeypatch, error):
+    monkeypatch.setattr("pipeline.settings.components.callbacks", lambda *args: [Trouble(error)])
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, color_system=None)
+    spec = spec_of("qlearning", n_timesteps=600, log_folder=tmp_path, eval_freq=-1, verbose=1)
+    try:
+        state = train(spec, console, {}, "").state
+    except RuntimeError:
+        state = "failed"
+    assert state == ("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+    # The cursor that was hidden, by the bar and by what came after it, is shown again.
+    codes = re.findall(r"\x1b\[\?25[hl]", file.getvalue())
+    assert codes == ["\x1b[?25l", "\x1b[?25h"] * (2 if state == "interrupted" else 1)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_results_are_told_before_anything_is_drawn(tmp_path, stopped):
+    """A stop while pictures are drawn costs the pictures, and nothing that was found out."""
+    told, file = [], io.StringIO()
+    fields = {"n_timesteps": 600, "log_folder": tmp_path, "pictures": True, "eval_freq": 300}
+
+    def tell(outcome):
+        run = outcome.run
+        told.append((outcome.state, run.read_info()["state"], run.curve_path.exists()))
+        if stopped:
+            signal.raise_signal(signal.SIGINT)
+
+    with stops_noticed():
+        spec = spec_of("qlearning", verbose=1, **fields)
+        training = prepare(spec, Console(file=file, width=200), {}, "train.py")
+        outcome = carry_out(training, tell)
+    assert told == [("finished", "running", False)]
+    info = outcome.run.read_info()
+    assert outcome.state == info["state"] == ("interrupted" if stopped else "finished")
+    assert outcome.run.curve_path.exists() is not stopped
+    assert info["final"]["mean_return"] == outcome.final.mean_return
+    assert ("stopped while drawing: the run counts as interrupted" in file.getvalue()) is stopped
+
+
+# --- what settings do to it ----------------------------------------------------------------------
+
+TINY = {"policy_kwargs": {"net_arch": [4]}, "buffer_size": 1000}
+
+
+def prepared(folder, algo, env_id, **entry):
+    spec = spec_of(algo, env_id, {**TINY, **entry}, log_folder=folder, eval_freq=-1)
+    return prepare(spec, Console(quiet=True), {}, "train.py")
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_noise_is_added_to_what_the_policy_does(tmp_path, n_envs):
+    """A policy that learns nothing, and its actions as they stand in the buffer."""
+    noise = {"noise_type": "normal", "noise_std": 0.1}
+    still = {"learning_rate": 0.0, "learning_starts": 0, "n_timesteps": 500 * n_envs}
+    training = prepared(tmp_path, "td3", "Pendulum-v1", n_envs=n_envs, **noise, **still)
+    carry_out(training)
+    model = training.model
+    assert isinstance(model.action_noise, VectorizedActionNoise) == (n_envs > 1)
+    buffer = model.replay_buffer
+    observations = buffer.observations[:400].reshape(-1, 3)
+    without = model.policy.scale_action(model.predict(observations, deterministic=True)[0])
+    added = buffer.actions[:400].reshape(-1, 1) - without
+    # Where the sum would leave [-1, 1] it is cut off: a policy near 0, so hardly anywhere.
+    assert np.abs(without).max() < 0.6
+    assert added.std() == pytest.approx(0.1, rel=0.1)
+    assert added.mean() == pytest.approx(0, abs=0.02)
+
+
+# --- bandits: judged by regret, drawn by pull, kept when interrupted -----------------------------
+
+
+def train_on(folder, algo, env_id, eval_freq=None, **settings):
+    """The outcome, its pulls, the names of its files and what is printed of it."""
+    fields = {"log_folder": folder, "eval_freq": eval_freq, "pictures": True, "verbose": 1}
+    spec = spec_of(algo, env_id, settings, n_timesteps=300, **fields)
+    console = Console(width=160, file=io.StringIO())
+    outcome = train(spec, console, {}, "train.py")
+    print_outcome(console, spec, outcome)
+    path = outcome.run.path
+    pulls = dict(np.load(path / PULLS_FILE)) if (path / PULLS_FILE).exists() else None
+    return outcome, pulls, {file.name for file in path.iterdir()}, console.file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id"), [("linucb", "LinearBandit-v0"), ("ucb", "GaussianBandit-v0")]
+)
+def test_regret_is_the_judgement_where_arms_are_drawn_anew(algo, env_id, tmp_path):
+    outcome, pulls, names, text = train_on(tmp_path, algo, env_id)
+    regret = float(pulls["regrets"].sum())
+    info = outcome.run.read_info()
+    assert outcome.pulls.regret == info["regret"] == regret > 0
+    assert (outcome.final, outcome.best_return, info["pulls"]["n_pulls"]) == (None, None, 300)
+    assert {"pulls.npz", "pulls.png", "run.json"} <= names
+    assert not names & {"evaluations.npz", "learning_curve.png", "best_model.zip"}
+    assert f"regret   {regret:,.2f} over 300 pulls; a best arm in" in text
+
+
+def test_a_compiled_loop_keeps_no_pulls(tmp_path):
+    """A tabular agent is asked after each pull, unless it was told to compile."""
+    arms = "BernoulliBandit-v0"
+    outcome, pulls, _, _ = train_on(tmp_path / "a", "qlearning", arms)
+    assert outcome.engine == "interpreted: PullRecorder must be asked after each step"
+    assert pulls is not None
+    outcome, pulls, _, text = train_on(tmp_path / "b", "qlearning", arms, engine="compiled")
+    assert (outcome.engine, outcome.pulls, pulls) == ("compiled", None, None)
+    assert "engine: compiled keeps no pulls, so that regret is not known" in text
+    assert "regret" not in outcome.run.read_info()
+
+
+def test_ctrl_c_leaves_the_pulls_so_far(tmp_path, monkeypatch):
+    stop = Trouble(KeyboardInterrupt())
+    monkeypatch.setattr("pipeline.settings.components.callbacks", lambda *args: [stop])
+    outcome, pulls, names, _ = train_on(tmp_path, "ucb", "GaussianBandit-v0")
+    assert outcome.state == "interrupted"
+    # The callback stands before the one that notes the pull.
+    assert {array.shape for array in pulls.values()} == {(1, 299)}
+    assert outcome.run.read_info()["regret"] == pytest.approx(pulls["regrets"].sum())
+    assert "pulls.png" in names
+
+
+def test_a_log_knows_no_regret(tmp_path):
+    log_uniformly(gym.make("SegmentBandit-v0"), 300, 0, tmp_path / "log.csv")
+    kwargs = {"log": str(tmp_path / "log.csv")}
+    outcome, pulls, names, text = train_on(tmp_path, "ucb", "ReplayBandit-v0", env_kwargs=kwargs)
+    matched = int(pulls["matched"].sum())
+    assert 60 < matched < 140
+    assert (outcome.pulls.regret, outcome.pulls.optimal, outcome.final) == (None, None, None)
+    assert outcome.pulls.reward == pytest.approx(pulls["rewards"].sum() / matched)
+    assert f"over the {matched} of 300 that are in the log" in text
+    assert "pulls.png" in names
+
+
+def test_pulls_summed_up_by_hand():
+    pulls = {
+        "rewards": np.array([[1.0, 0.0, 1.0, 0.0]], dtype=np.float32),
+        "regrets": np.array([[0.0, 0.5, 0.25, 0.0]]),
+        "matched": np.ones((1, 4), dtype=bool),
+        "optimal": np.array([[True, False, False, True]]),
+    }
+    found = summarise_pulls(pulls)
+    assert found == PullSummary(n_pulls=4, n_matched=4, reward=0.5, regret=0.75, optimal=0.5)
+    assert describe_pulls(found) == "0.75 over 4 pulls; a best arm in 50% of the last 4"
+    unknown = pulls | {"regrets": np.full((1, 4), np.nan), "matched": np.zeros((1, 4), dtype=bool)}
+    found = summarise_pulls(unknown)
+    assert (found.reward, found.regret, found.optimal) == (None, None, None)
+    assert describe_pulls(found) == "not known: none of 4 pulls is in the log"
