@@ -1,12 +1,13 @@
-"""Names in files become objects only of admitted kinds, which write into the run folder alone."""
+"""Names become objects of admitted kinds alone: those in files, and modules that the user typed."""
 
-import ast
+import dataclasses
 import importlib
+import importlib.metadata
 import inspect
 import math
-import pickle
+import os
 import pkgutil
-import subprocess
+import shutil
 import sys
 import warnings
 from pathlib import Path
@@ -15,9 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3 as sb3
-import yaml
-from gymnasium.spaces import Box
-from gymnasium.wrappers import ClipReward, OrderEnforcing, TimeLimit
+from gymnasium.wrappers import ClipReward, TimeLimit
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CheckpointCallback,
@@ -25,30 +24,34 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack
 from torch import nn, optim
 
 from agents import load_algorithm
 from agents.common.schedules import ExponentialSchedule
 from envs import wrappers
+from pipeline.environments import check_env_id, make_env, make_training_env
 from pipeline.errors import UserError
 from pipeline.settings.components import (
-    action_noise,
     build_algorithm_kwargs,
-    build_value,
     callbacks,
-    check_action_noise,
     confined,
     find_class,
     names_a_place,
     vec_wrapper_factory,
     wrapper_factory,
 )
-from pipeline.settings.hyperparams import component_specs, read_hyperparams, split
-from pipeline.settings.values import DottedName, ScheduleSpec, constructor_parameters
-from tests.peers.peer_environment import peer_folder, peer_python
+from pipeline.settings.hyperparams import split
+from pipeline.settings.values import constructor_parameters
+from pipeline.user_modules import (
+    UserModule,
+    as_flag,
+    check_recorded,
+    import_again,
+    import_typed,
+    keep_copies,
+)
+from tests.pipeline.short_runs import spec_of
 
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 CLIP = "gymnasium.wrappers.ClipReward"
@@ -67,13 +70,6 @@ def wrapped(spec):
     return wrapper_factory(spec)(cartpole())
 
 
-@pytest.mark.parametrize("spec", [None, [], ()])
-def test_nothing_to_wrap(spec):
-    assert wrapper_factory(spec) is None
-    assert vec_wrapper_factory(spec) is None
-    assert callbacks(spec) == []
-
-
 def test_a_list_wraps_from_the_inside_out():
     env = wrapped([{TIME_LIMIT: {"max_episode_steps": "1e2"}}, {CLIP: {"max_reward": 0}}, MONITOR])
     layers = [env, env.env, env.env.env]
@@ -82,69 +78,12 @@ def test_a_list_wraps_from_the_inside_out():
     assert layers[2]._max_episode_steps == 100
 
 
-def test_the_order_is_that_of_rl_zoo3():
-    # In a process of the Python that has it: importing rl_zoo3 patches Gymnasium.
-    code = f"""
-import gymnasium as gym
-from rl_zoo3.utils import get_wrapper_class
-spec = [{{{CLIP!r}: {{"max_reward": 1.0}}}}, {{"gymnasium.wrappers.OrderEnforcing": {{}}}}]
-env = get_wrapper_class({{"env_wrapper": spec}})(gym.make("CartPole-v1").unwrapped)
-print(type(env).__name__, type(env.env).__name__)
-"""
-    done = subprocess.run(
-        [peer_python(), "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
-    )
-    ours = wrapped([{CLIP: {"max_reward": 1.0}}, "gymnasium.wrappers.OrderEnforcing"])
-    assert isinstance(ours, OrderEnforcing)
-    assert done.stdout.split() == [type(ours).__name__, type(ours.env).__name__]
-    assert "rl_zoo3" not in sys.modules
-
-
-def test_arguments_may_be_left_empty_specs_read_before_and_factories_pickled():
-    assert isinstance(wrapped({MONITOR: None}), Monitor)
-    assert isinstance(wrapped(component_specs(MONITOR, "here")), Monitor)
-    wrap = pickle.loads(pickle.dumps(wrapper_factory({TIME_LIMIT: {"max_episode_steps": 7}})))
-    assert isinstance(wrap(cartpole()), TimeLimit)
-
-
 def test_a_wrapper_of_a_vectorised_environment():
     env = vec_wrapper_factory({FRAME_STACK: {"n_stack": 3}})(DummyVecEnv([cartpole]))
     assert isinstance(env, VecFrameStack)
     assert env.observation_space.shape == (12,)
     with pytest.raises(UserError, match=r"vec_env_wrapper: .* is no VecEnvWrapper"):
         vec_wrapper_factory(MONITOR)
-
-
-def test_what_a_wrapper_itself_refuses_is_told():
-    with pytest.raises(UserError, match=f"^env_wrapper: {CLIP}: .*[a-z]"):
-        wrapped({CLIP: {"min_reward": 2.0, "max_reward": 1.0}})
-
-
-def test_a_package_is_admitted_by_the_user(tmp_path, monkeypatch):
-    source = "import gymnasium\nclass Mine(gymnasium.Wrapper):\n    pass\n"
-    (tmp_path / "my_envs.py").write_text(source)
-    (tmp_path / "my_broken.py").write_text("from gymnasium import does_not_exist\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(UserError, match="none of the packages"):
-        wrapper_factory("my_envs.Mine")
-    env = wrapper_factory("my_envs.Mine", ["my_envs"])(cartpole())
-    assert type(env).__name__ == "Mine"
-    with pytest.raises(UserError, match=r"my_broken\.Mine: cannot be imported: .*does_not_exist"):
-        wrapper_factory("my_broken.Mine", ["my_broken"])
-
-
-def test_an_entry_whose_wrapper_is_not_installed_is_readable():
-    path = peer_folder("rl_zoo3") / "hyperparams" / "ppo.yml"
-    found = [
-        env_id
-        for env_id, entry in yaml.safe_load(path.read_text()).items()
-        if "minigrid" in str(entry.get("env_wrapper"))
-    ]
-    hyperparams = split(read_hyperparams("ppo", found[0], path))
-    with pytest.raises(UserError, match="--gym-packages"):
-        wrapper_factory(hyperparams.env_wrapper)
-    with pytest.raises(UserError, match="no module minigrid, or it is not installed"):
-        wrapper_factory(hyperparams.env_wrapper, ["minigrid"])
 
 
 def test_callbacks_and_where_they_save(tmp_path):
@@ -165,18 +104,6 @@ def test_callbacks_and_where_they_save(tmp_path):
 
 
 # --- values --------------------------------------------------------------------------------------
-
-
-def test_schedules_become_objects_and_plain_values_stay():
-    linear = build_value(ScheduleSpec("linear", 1.0, 0.5))
-    assert isinstance(linear, LinearSchedule)
-    assert [linear(1.0), linear(0.5), linear(0.0)] == [1.0, 0.75, 0.5]
-    exponential = build_value(ScheduleSpec("exponential", 1.0, 0.01))
-    assert isinstance(exponential, ExponentialSchedule)
-    assert [exponential(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([1.0, 0.1, 0.01])
-    plain = {"a": [1, 2.5, (None, True)], "b": "nn.Tanh"}
-    assert build_value(plain) == plain
-    assert build_value({"a": [(DottedName("nn.Tanh"), 1)]}) == {"a": [(nn.Tanh, 1)]}
 
 
 def test_arguments_make_an_agent():
@@ -207,38 +134,12 @@ def test_arguments_make_an_agent():
 
 
 @pytest.mark.parametrize(
-    ("kind", "noise"),
-    [("normal", NormalActionNoise), ("ornstein-uhlenbeck", OrnsteinUhlenbeckActionNoise)],
-)
-def test_action_noise_has_the_shape_of_an_action(kind, noise):
-    hyperparams = split({"noise_type": kind, "noise_std": "0.5"})
-    assert hyperparams.algorithm == {}
-    built = action_noise(hyperparams, Box(-2, 2, (3,)))["action_noise"]
-    assert repr(built) == repr(noise(np.zeros(3), np.full(3, 0.5)))
-    assert built().shape == (3,)
-    check_action_noise(hyperparams, sb3.TD3, "td3")
-    check_action_noise(split({}), sb3.PPO, "ppo")
-    with pytest.raises(UserError, match=r"^ppo: noise_type is for agents that add noise to"):
-        check_action_noise(hyperparams, sb3.PPO, "ppo")
-
-
-@pytest.mark.parametrize(
     "name", ["FlattenToDiscrete", "OneHotObservation", "ScaleReward", "TerminationReward"]
 )
 def test_files_that_name_a_class_where_it_was_before_are_read(name):
     before = "rewards" if name.endswith("Reward") else "encodings"
     found = find_class(f"envs.wrappers.{before}.{name}", (gym.Wrapper,), "here")
     assert found is getattr(wrappers, name)
-
-
-def test_reading_needs_no_heavy_library():
-    code = (
-        "import sys\n"
-        "from pipeline.settings import components, hyperparams, values\n"
-        "print({'torch', 'stable_baselines3', 'numba', 'rl_zoo3', 'gymnasium'} & {*sys.modules})"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
 
 
 # --- where components write ----------------------------------------------------------------------
@@ -297,18 +198,6 @@ def test_every_text_of_every_component_is_known():
     ]
 
 
-def test_every_text_of_the_components_of_rl_zoo3_is_known():
-    folder = peer_folder("rl_zoo3")
-    found = set()
-    for file in ("wrappers.py", "callbacks.py"):
-        for node in ast.walk(ast.parse((folder / file).read_text())):
-            if isinstance(node, ast.FunctionDef) and node.name == "__init__":
-                arguments = node.args.args[1:] + node.args.kwonlyargs
-                found |= {a.arg for a in arguments if "str" in ast.unparse(a.annotation or a)}
-    assert found == {"best_model_save_path", "log_path", "name_prefix", "save_path"}
-    assert all(map(names_a_place, found))
-
-
 OUTSIDE = ["/etc/x", "..", "../x", "a/../../x", "C:x", "C:/x", "\\x", "..\\x", "//server/x", "a\0b"]
 
 
@@ -331,20 +220,13 @@ def test_a_place_outside_is_refused_in_one_line(tmp_path, place):
         with pytest.raises(UserError, match=r"inside the run folder|holds no path") as caught:
             make()
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("prefix", ["../../escaped", "..", "a/b", "/a", "C:a", "a\\b"])
-def test_a_prefix_holds_no_path(tmp_path, prefix):
-    with pytest.raises(UserError, match=r"name_prefix begins the names of files"):
-        confined({"name_prefix": prefix}, tmp_path, "")
-
-
-def test_a_link_does_not_lead_out(tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / "link").symlink_to(tmp_path)
+    for prefix in ("../../escaped", "..", "a/b", "/a", "C:a", "a\\b"):
+        with pytest.raises(UserError, match=r"name_prefix begins the names of files"):
+            confined({"name_prefix": prefix}, tmp_path, "")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "link").symlink_to(tmp_path)
     with pytest.raises(UserError, match=r"^here: save_path must lie inside the run folder"):
-        confined({"save_path": "link/x"}, folder, "here")
+        confined({"save_path": "link/x"}, tmp_path / "run", "here")
 
 
 def test_places_inside_are_resolved_there_and_nothing_else_is_touched(tmp_path):
@@ -374,3 +256,212 @@ def test_a_monitor_writes_into_the_run_folder_or_into_none(tmp_path, monkeypatch
     assert Path(env.results_writer.file_handler.name).exists()
     env.close()
     assert [path.name for path in tmp_path.rglob("*.csv")] == ["mine.monitor.csv"]
+
+
+# --- modules of the user's ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def write(own_folder):
+    """Write files into the user's folder."""
+
+    def put(**files):
+        for name, text in files.items():
+            path = own_folder / f"{name.replace('__in__', '/')}.py"
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
+        return own_folder
+
+    return put
+
+
+def complaint_of(call, *args):
+    with pytest.raises(UserError) as caught:
+        call(*args)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_module_is_found_by_its_name_and_by_its_path(write, own_folder, monkeypatch, tmp_path):
+    write(my_first="x = 1", my_package__in____init__="from my_package.part import x")
+    write(my_package__in__part="x = 2", my_space__in__part="x = 3", my_other="import my_first")
+    words = ["my_first", "./my_other.py", "my_package/", "my_package/part.py", "my_space.part"]
+    names = ["my_first", "my_other", "my_package", "my_package.part", "my_space.part"]
+    modules = import_typed(words)
+    assert [(module.typed, module.name) for module in modules] == [*zip(words, names, strict=True)]
+    assert {module.search_folder for module in modules} == {str(own_folder)}
+    assert sys.modules["my_package"].x == 2
+    assert str(own_folder) not in sys.path
+    # From elsewhere, by its path from the home folder; and by another process.
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    typed = f"~/{own_folder.name}/my_first.py"
+    (module,) = import_typed([typed])
+    assert module == UserModule(typed, "my_first", f"{own_folder}/my_first.py")
+    del sys.modules["my_first"]
+    sys.meta_path.pop()
+    import_again(modules)
+    assert sys.modules["my_first"].__file__ == str(own_folder / "my_first.py")
+
+
+def test_what_is_installed_has_no_path_and_our_own_need_not_be_kept(own_folder):
+    installed = UserModule("gymnasium.wrappers", "gymnasium.wrappers")
+    assert import_typed(["gymnasium.wrappers"]) == (installed,)
+    assert import_typed(["envs"], ["envs:Warehouse-v0", "CartPole-v1"]) == ()
+    (own_folder / "envs" / "python3").mkdir(parents=True)  # as of virtual environments
+    assert import_typed(["envs"]) == ()
+
+
+# --- names that are taken, modules that fail -----------------------------------------------------
+OURS = ["envs", "agents", "mdp", "verdicts", "pipeline", "experiments", "tuning"]
+OURS += ["report", "commands", "train", "enjoy", "compare", "tune"]
+
+
+@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("form", ["{}", "./{}.py"])
+def test_a_module_with_the_name_of_ours_is_refused(write, name, form):
+    folder = write(**{name: "raise SystemExit('it was imported')"})
+    complaint = complaint_of(import_typed, [form.format(name)])
+    assert f"{name} is the name of one of Yardstick's own modules: rename" in complaint
+    assert f"{folder / name}.py, or put it into a package of another name" in complaint
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["agents"], "agents is the name of one of Yardstick's own modules: rename"),
+        (["agents/mine.py"], "agents is the name of one of Yardstick's own modules: rename"),
+        (["json"], "json is the name of one of Python's own modules: rename"),
+        (["numpy"], "Python finds another numpy first, at "),
+        (["my_first", "agents/../below/my_first.py"], "Python finds another my_first first, at "),
+        (["no_such"], "cannot import no_such: it is neither in "),
+        (["./no_such.py"], "there is no such file or folder"),
+        (["./below"], "the folder is no package: it holds no __init__.py"),
+        (["~no_such_user/x.py"], "ould not determine home directory"),
+        (["./notes.txt"], "it is no Python file"),
+        (["./my-agents.py"], "'my-agents' is no name of a module: rename it"),
+        (["my-agents"], "it is neither the name of a module nor the path of one"),
+        (["__main__"], "it is neither the name of a module nor the path of one"),
+        (["a b; c"], "--gym-packages 'a b; c': "),
+    ],
+)
+def test_what_cannot_be_imported(write, own_folder, words, complaint):
+    poison = "raise SystemExit('it was imported')"
+    write(agents__in____init__=poison, agents__in__mine=poison, json=poison, numpy=poison)
+    write(my_first="x = 1", below__in__my_first=poison)
+    (own_folder / "notes.txt").touch()
+    (own_folder / "my-agents.py").touch()
+    assert complaint in complaint_of(import_typed, words)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("x = 1\ndef f(:", "my_first.py:2: SyntaxError: "),
+        ("x = 1\n\nimport no_such_library", "my_first.py:3: ModuleNotFoundError: No module named"),
+        ("raise RuntimeError('two\\nlines')", "my_first.py:1: RuntimeError: two lines"),
+        ("import sys\nsys.exit(3)", "my_first.py:2: SystemExit: 3"),
+        ("import agents\nagents.register('ppo', 'a:B')", "my_first.py:2: ValueError: there is an"),
+        ("import my_second", "my_second.py:2: KeyError: 'x'"),
+    ],
+)
+def test_a_module_that_fails_is_told_with_its_line(write, text, complaint):
+    folder = write(my_first=text, my_second="\n{}['x']")
+    told = complaint_of(import_typed, ["my_first"])
+    assert told.startswith(f"--gym-packages my_first: {folder}{os.sep}{complaint}")
+
+
+# --- only what was typed -------------------------------------------------------------------------
+
+
+def test_what_lies_beside_is_found_for_the_users_own_code_alone(write, own_folder, monkeypatch):
+    """A library that looks for another one, or for plugins, does not find a stranger's."""
+    write(my_first="def later():\n    import my_second\n", my_second="x = 1", not_mine="x = 2")
+    (own_folder / "not_mine-1.dist-info").mkdir()
+    (own_folder / "not_mine-1.dist-info" / "METADATA").write_text("Name: not_mine\nVersion: 1\n")
+    plugin = "[torch.backends]\nnot_mine = not_mine:x\n"
+    (own_folder / "not_mine-1.dist-info" / "entry_points.txt").write_text(plugin)
+    write(installed__in__library="def later(): import not_mine")  # as in a virtual environment
+    monkeypatch.syspath_prepend(str(own_folder / "installed"))
+    import_typed(["my_first"])
+    with pytest.raises(ModuleNotFoundError, match="not_mine"):
+        importlib.import_module("library").later()
+    assert "not_mine" not in importlib.metadata.entry_points(group="torch.backends").names
+    sys.modules["my_first"].later()
+    assert sys.modules["my_second"].x == 1
+
+
+REGISTERED = "gymnasium.register('my/Lake-v0', 'gymnasium.envs.toy_text:FrozenLakeEnv')"
+
+
+def test_an_id_imports_what_was_typed_alone(write):
+    write(
+        my_first="raise SystemExit('it was imported')", my_second=f"import gymnasium\n{REGISTERED}"
+    )
+    told = "'my_first:FrozenLake-v1': its module is not imported because a file asks: "
+    said = complaint_of(check_env_id, "my_first:FrozenLake-v1")
+    assert said == f"{told}add --gym-packages my_first"
+    make_env("my_first:FrozenLake-v1", {}).close()
+    assert "my_first" not in sys.modules
+    (module,) = import_typed([], ["my_second:my/Lake-v0"])
+    check_env_id("my_second:my/Lake-v0")
+    assert as_flag([module], "my_second:my/Lake-v0") == ""
+    assert as_flag([module], "my/Lake-v0") == " --gym-packages my_second"
+    assert as_flag([UserModule("./my file.py", "my", None)]) == " --gym-packages './my file.py'"
+    assert gym.spec("my/Lake-v0").namespace == "my"
+
+
+def test_a_run_names_what_to_type(write, tmp_path):
+    folder = write(
+        my_first="import my_beside", my_package__in____init__="", my_beside="import json"
+    )
+    write(json="x = 1", my_other="x = 1", my_package__in__part="'my_named:Class'", my_named="")
+    modules = import_typed(["my_first", "my_package"])
+    run = tmp_path / "run"
+    run.mkdir()
+    keep_copies(modules, run)
+    copies = [path.relative_to(run / "modules").as_posix() for path in run.rglob("*.py")]
+    package = ["my_package/__init__.py", "my_package/part.py"]
+    assert sorted(copies) == ["my_beside.py", "my_first.py", "my_named.py", *package]
+    recorded = {
+        "gym_packages": [module.name for module in modules],
+        "user_modules": [vars(module) for module in modules],
+    }
+    check_recorded(recorded, run)
+    for name in ("my_first", "my_package"):
+        del sys.modules[name]
+    told = complaint_of(check_recorded, recorded, run)
+    assert told.endswith("add --gym-packages ./my_first.py ./my_package")
+    shutil.rmtree(folder / "my_package")
+    (folder / "my_first.py").unlink()
+    told = complaint_of(check_recorded, recorded, run)
+    assert told.endswith(f"add --gym-packages {run}/modules/my_first.py {run}/modules/my_package")
+    packed = tmp_path / "study" / "runs" / "q" / "run.zip"
+    told = complaint_of(check_recorded, recorded, run, packed)
+    words = "modules/my_first.py modules/my_package"
+    assert told.endswith(
+        f"unzip it, read them, and if you trust them add, there, --gym-packages {words}"
+    )
+    shutil.copytree(run / "modules", tmp_path / "study" / "modules")
+    told = complaint_of(check_recorded, recorded, run, packed)
+    assert "read them, and if you trust them add --gym-packages" in told
+    assert told.endswith(
+        f"{tmp_path}/study/modules/my_first.py {tmp_path}/study/modules/my_package"
+    )
+
+
+def test_a_run_that_lies_is_quoted(tmp_path):
+    recorded = {"gym_packages": ["../x", "a\x1b[2Jb", 3], "user_modules": ["x", {"name": "../x"}]}
+    told = complaint_of(check_recorded, recorded, tmp_path)
+    assert told.endswith(r"add --gym-packages ../x 'a\x1b[2Jb'")
+
+
+def test_worker_processes_of_a_training_know_the_modules(write):
+    """Each environment lives in a process of its own, which begins without the user's modules."""
+    write(my_first=f"import gymnasium\n{REGISTERED}\nclass Plain(gymnasium.Wrapper):\n    pass")
+    modules = {"user_modules": import_typed(["my_first"]), "gym_packages": ("my_first",)}
+    spec = spec_of("ppo", "my/Lake-v0", {"env_wrapper": "my_first.Plain"}, vec_env="subproc")
+    env = make_training_env(dataclasses.replace(spec, **modules), None)
+    assert np.array_equal(env.reset(), [0])
+    assert env.env_is_wrapped(sys.modules["my_first"].Plain) == [True]
+    env.close()

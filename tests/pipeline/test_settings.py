@@ -1,20 +1,17 @@
 """Every text of settings that is read, and every mistake in one line: the table is settings.txt."""
 
 import contextlib
-import inspect
 import math
 import os
 from pathlib import Path
-from typing import Any, Literal
 
 import pytest
 import stable_baselines3 as sb3
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.type_aliases import Schedule
 
 from agents import ALGORITHMS, load_algorithm
-from pipeline.errors import UserError, did_you_mean, one_line, unknown
+from pipeline.errors import UserError, did_you_mean
 from pipeline.settings.components import (
     build_algorithm_kwargs,
     build_value,
@@ -29,11 +26,8 @@ from pipeline.settings.hyperparams import (
     split,
 )
 from pipeline.settings.values import (
-    RANGES,
     DottedName,
-    ScheduleSpec,
     algorithm_parameters,
-    coerce,
     constructor_parameters,
     contains_name,
     parse_assignments,
@@ -157,12 +151,6 @@ def test_what_is_no_readable_file(tmp_path):
             read_hyperparams("ppo", "A", path)
 
 
-def test_anchors_and_merge_keys(tmp_path):
-    text = "A: &a {gamma: 0.5, n_envs: 2}\nB: &b {<<: *a, gamma: 0.6}\nC: {<<: *b}\n"
-    read = parse_yaml(text, "file")
-    assert read["B"] == read["C"] == {"gamma": 0.6, "n_envs": 2}
-
-
 @pytest.mark.parametrize(
     ("first", "form", "place"),
     [("[x, x, x, x]", "[{}]", "5"), ("{x: 1}", "{{<<: [{}]}}", "5")],
@@ -180,6 +168,9 @@ def test_what_is_shared_adds_to_the_depth_too():
     with pytest.raises(UserError, match=r"^deep:49:\d+: is nested too deeply"):
         parse_yaml("\n".join(lines), "deep")
     assert parse_yaml("\n".join(lines[:40]), "deep")["a1"] == [["x"]]
+    text = "A: &a {gamma: 0.5, n_envs: 2}\nB: &b {<<: *a, gamma: 0.6}\nC: {<<: *b}\n"
+    read = parse_yaml(text, "file")
+    assert read["B"] == read["C"] == {"gamma": 0.6, "n_envs": 2}
 
 
 # --- literals and assignments --------------------------------------------------------------------
@@ -246,15 +237,12 @@ def test_nothing_is_ever_run(text, tmp_path):
     ],
 )
 def test_an_assignment_in_another_spelling_gets_ours(words, meant):
+    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
+        parse_assignments(["gamma:0.9", "gamma:0.8"])
     with pytest.raises(UserError) as raised:
         parse_assignments(words.split())
     hint = str(raised.value).partition("key:value")[2]
     assert hint == (f": did you mean {meant}?" if meant else "")
-
-
-def test_a_key_given_twice_is_refused():
-    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
-        parse_assignments(["gamma:0.9", "gamma:0.8"])
 
 
 def test_numbers_beyond_all_bounds():
@@ -264,24 +252,6 @@ def test_numbers_beyond_all_bounds():
 
 
 # --- entries and an agent's arguments ------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("value", "normalize"),
-    [
-        (True, {}),
-        (False, None),
-        (None, None),
-        ({"norm_obs": False}, {"norm_obs": False}),
-        ("{'norm_obs': False, 'gamma': 0.5}", {"norm_obs": False, "gamma": 0.5}),
-    ],
-)
-def test_normalisation_takes_the_agents_discount(value, normalize):
-    entry = {"normalize": value, "gamma": 0.9}
-    assert split({"normalize": value}).normalize == normalize
-    wanted = None if normalize is None else {"gamma": 0.9} | normalize
-    assert split(entry).normalize == wanted
-    assert entry == {"normalize": value, "gamma": 0.9}
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -294,50 +264,6 @@ def test_an_algorithms_own_defaults_pass(name):
         if name not in elsewhere and not name.startswith("_")
     }
     assert check_algorithm_kwargs(defaults, parameters, "here") == defaults
-
-
-def test_every_range_is_that_of_some_known_name():
-    known = set(Hyperparams.__dataclass_fields__)
-    for algorithm in map(load_algorithm, ALGORITHMS):
-        known |= constructor_parameters(algorithm).keys()
-    assert RANGES.keys() <= known
-
-
-@pytest.mark.parametrize(
-    ("value", "annotation", "read"),
-    [
-        (1, float | int, 1),
-        ("5", float | str, 5.0),
-        ("five", float | str, "five"),
-        ("true", str, "true"),
-        (1, Literal[1, 2], 1),
-        ([1, 2], list[float], [1.0, 2.0]),
-        ((1, 2), list[int], [1, 2]),
-        ([1, 2.0], tuple[int, ...], (1, 2)),
-        ({"pi": [64.0]}, list[int] | dict[str, list[int]] | None, {"pi": [64]}),
-        ("lin_0.5", Schedule, ScheduleSpec("linear", 0.5, 0.0)),
-        ({"a": 1}, dict, {"a": 1}),
-        ("as it is", "float | NotImported", "as it is"),
-        ({1: [2]}, inspect.Parameter.empty, {1: [2]}),
-        (5, Any, 5),
-        ("1e-4", float | Path | None, 1e-4),
-        ("far", float | Path | None, "far"),
-        (True, Literal[1, 2], UserError),
-        (1, Literal[True], UserError),
-        ("ab", list[str], UserError),
-        ([1, 2], tuple[int, int, int], UserError),
-        ("inf", int, UserError),
-        (2, bool, UserError),
-        (0, str | None, UserError),
-        ([1], tuple[int | str, Path], UserError),
-    ],
-)
-def test_values_are_read_as_annotations_ask(value, annotation, read):
-    if read is UserError:
-        with pytest.raises(UserError, match=r"^here must be "):
-            coerce(value, annotation, "here")
-    else:
-        assert repr(coerce(value, annotation, "here")) == repr(read)
 
 
 # --- anything at all -----------------------------------------------------------------------------
@@ -431,12 +357,3 @@ def test_hints_name_the_nearest_else_a_short_list_else_nothing():
     assert did_you_mean("xyz", ["a2c", "ppo"]) == "known are a2c, ppo"
     assert did_you_mean("xyz", map(str, range(50))) == ""
     assert did_you_mean("xyz", []) == ""
-
-
-def test_an_error_is_one_line():
-    assert str(UserError("one\n  two")) == "one two"
-    said = "unknown agent 'ppoo': did you mean 'ppo'?"
-    assert str(unknown("unknown agent", "ppoo", ["ppo"])) == said
-    assert str(unknown("unknown agent", "x", [])) == "unknown agent 'x'"
-    assert one_line(ValueError("one\n two")) == "one two"
-    assert one_line(AssertionError()) == "AssertionError"
