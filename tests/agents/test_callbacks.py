@@ -31,7 +31,7 @@ from agents.common.callbacks import (
     calls_until_multiple,
     members,
 )
-from agents.compiled.records import event_bytes, window_means
+from agents.compiled.records import event_bytes
 from pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.runs import Run
@@ -348,14 +348,6 @@ def test_each_output_has_the_same_records(case, tmp_path):
     np.testing.assert_equal(compiled, interpreted)
     assert len(compiled[1]) >= 2
     assert len(compiled[0]["rollout/ep_rew_mean"]) >= 2
-
-
-def test_means_are_those_of_windows_added_up_one_by_one():
-    values = np.random.default_rng(0).normal(size=700) * 10.0 ** np.arange(700).clip(0, 12)
-    for size in (1, 3, 100, 130, 300):
-        ends = np.array([1, 2, 99, 100, 101, 350, 700])
-        expected = [float(np.mean(values[max(end - size, 0) : end].tolist())) for end in ends]
-        assert window_means(values, ends, size) == expected
 
 
 def test_events_are_those_that_tensorboard_writes():

@@ -9,6 +9,7 @@ from functools import cache
 import gymnasium as gym
 import numpy as np
 import pytest
+import stable_baselines3
 import torch as th
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -161,6 +162,7 @@ def test_zips_and_pickles_bring_everything_back_and_it_goes_on(name, tmp_path):
     model.save(tmp_path / "agent")
     with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
         data = archive.read("data").decode()
+        assert archive.read("_stable_baselines3_version").decode() == stable_baselines3.__version__
         with archive.open("policy.pth") as file:
             th.load(file, weights_only=True)
     assert ":serialized:" not in data

@@ -28,6 +28,7 @@ from envs.grid import Tile
 from envs.known_models import transition_model
 from envs.wrappers import DiscretizeObservation, TerminationReward
 from machine_code.compiling import inlined
+from tests.envs.corridors import Corridor, Deaf, outcomes, with_p
 
 
 class Foreign(gym.Wrapper):
@@ -68,45 +69,6 @@ class OwnWay(Wind):
 
     def draw(self, row):
         return int(self.np_random.random() < row[1][0])
-
-
-class Calm(Wind):
-    """Steps otherwise than it says."""
-
-    def draw(self, row):
-        return 0
-
-
-class Hidden(Wind):
-    """Its place has another name than ``s``."""
-
-    def step(self, action):
-        self.s = self.place
-        obs, *rest = super().step(action)
-        return self._hide(obs), *rest
-
-    def reset(self, *, seed=None, options=None):
-        obs, info = super().reset(seed=seed)
-        return self._hide(obs), info
-
-    def _hide(self, place):
-        self.place = place
-        del self.s
-        return place
-
-
-class Blank(Wind):
-    """Without a model."""
-
-    def __init__(self):
-        super().__init__()
-        self.rows, self.P = self.P, None
-
-    def step(self, action):
-        self.P = self.rows
-        done = super().step(action)
-        self.P = None
-        return done
 
 
 class Curious(BaseCallback):
@@ -161,13 +123,14 @@ def changed_house():
 
 
 STATISTICS = gym.wrappers.RecordEpisodeStatistics
+CALM = in_time(partial(Corridor, outcomes(wind=0.0)))
 INTERPRETED = {  # reason: environment, settings, callback
     "SubprocVecEnv is not DummyVecEnv": (
         partial(lake, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"}),
     ),
     "VecNormalize is not DummyVecEnv": (lambda: VecNormalize(lake(), norm_obs=False),),
     "the environment's transition model is not known": (partial(lake, wrapper_class=Foreign),),
-    "transition model is not known": (in_time(Blank),),
+    "transition model is not known": (in_time(partial(with_p, None)),),
     "rewards are drawn, and the environment's model holds": (
         partial(gym.make, "MaximizationBias-v0"),
     ),
@@ -194,8 +157,8 @@ INTERPRETED = {  # reason: environment, settings, callback
     "the environment is shown on the screen": (partial(lake, env_kwargs={"render_mode": "human"}),),
     "under DiscretizeObservation and Monitor alone": (partial(pole, gym.wrappers.Autoreset),),
     "with its default reward alone": (partial(pole, sutton_barto_reward=True),),
-    "does not go on from where its attribute s is set": (in_time(Hidden),),
-    "the environment's P is not what step does: state ": (in_time(Calm),),
+    "does not go on from where its attribute s is set": (in_time(Deaf),),
+    "the environment's P is not what step does: state ": (CALM,),
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
     "a schedule is a Python function": (
         lake,
@@ -307,7 +270,7 @@ def test_one_that_draws_in_its_own_way_is_equal_in_distribution():
 
 def test_one_that_steps_otherwise_is_not_planned_for():
     with pytest.raises(ValueError, match="whose transition model is known: the environment's P is"):
-        load_algorithm("value_iteration")(env=in_time(Calm)()).learn(10)
+        load_algorithm("value_iteration")(env=CALM()).learn(10)
 
 
 class Liar(gym.Env):

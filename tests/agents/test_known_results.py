@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
@@ -26,7 +25,6 @@ from mdp import (
 )
 
 N_SEEDS = 10
-CONSTANT = {"exploration_decay": "constant", "exploration_initial_eps": 0.1}
 
 
 def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
@@ -125,28 +123,6 @@ def test_plans_need_a_model_and_the_optimum_a_time_limit():
 
 
 # --- learning ------------------------------------------------------------------------------------
-
-
-FALLING = {"exploration_initial_eps": 0.3, "exploration_final_eps": 0.01, "learning_rate": 0.1}
-
-
-@pytest.mark.parametrize(
-    ("name", "settings"),
-    [
-        ("n_step_sarsa", FALLING),
-        ("n_step_tree_backup", CONSTANT),
-        ("sarsa_lambda", {**CONSTANT, "trace_type": "dutch"}),
-        ("q_lambda", {**CONSTANT, "trace_type": "accumulating"}),
-        ("monte_carlo", CONSTANT),
-        ("off_policy_monte_carlo", CONSTANT),
-    ],
-)
-def test_a_short_way_through_the_books_maze(name, settings):
-    model = made(name, "DynaMaze-v0", n_envs=2, gamma=0.95, **settings).learn(50_000)
-    maze = Monitor(gym.make("DynaMaze-v0"))
-    (length,) = evaluate_policy(model, maze, 1, return_episode_rewards=True)[1]
-    # The shortest takes 14 steps, the next 16; moving at random takes hundreds.
-    assert length <= 16
 
 
 def returns_of(name, env_id, seed, n_episodes, env_kwargs=None, **settings):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-from gymnasium.envs.toy_text.utils import categorical_sample
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,6 +24,7 @@ from envs.known_models import (
     transition_model,
 )
 from envs.warehouse import WarehouseEnv
+from tests.envs.corridors import Backwards, Corridor, Deaf, Unsettable, altered, outcomes, with_p
 
 # Where nothing is a question of frequencies, or these are far off.
 FEW = 5_000
@@ -36,73 +36,7 @@ def few_steps(monkeypatch):
     monkeypatch.setattr(checking, "N_STEPS", FEW)
 
 
-def outcomes(wind=0.3, goal_reward=9.0):
-    """A corridor of five states: 0 left, 1 right; wind blows back by two; the goal is 4."""
-    table = {}
-    for state in range(5):
-        table[state] = {}
-        for action in (0, 1):
-            target = min(max(state + 2 * action - 1, 0), 4)
-            moved = (target, goal_reward if target == 4 else -1.0, target == 4)
-            table[state][action] = [(1 - wind, *moved), (wind, max(state - 2, 0), -1.0, False)]
-    return table
-
-
-def altered(row=(3, 1), **changes):
-    """P with the first outcome of one row changed."""
-    table = outcomes()
-    held = dict(zip(("prob", "state", "reward", "ends"), table[row[0]][row[1]][0], strict=True))
-    table[row[0]][row[1]][0] = tuple({**held, **changes}.values())
-    return table
-
-
-class Corridor(gym.Env):
-    """Steps by ``true``, and tells ``P``; draws as toy_text does."""
-
-    metadata = {"render_modes": ["human"]}  # noqa: RUF012
-    action_space = spaces.Discrete(2)
-
-    def __init__(self, told=None, true=None, start=(1, 0, 0, 0, 0), render_mode=None):
-        self.true = true or outcomes()
-        self.P = told or self.true
-        self.initial_state_distrib = np.array(start, float)
-        self.observation_space = spaces.Discrete(len(self.P))
-        self.render_mode = render_mode
-        self.s = 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.s = self.first()
-        self.steps = 0
-        return self.observe(), {}
-
-    def step(self, action):
-        if self.render_mode == "human":
-            self.render()
-        row = self.true[int(self.s)][action]
-        _, self.s, reward, terminated = row[self.draw(row)]
-        self.steps += 1
-        return self.observe(), reward, terminated, False, {}
-
-    def first(self):
-        return int(categorical_sample([1.0, 0.0, 0.0, 0.0, 0.0], self.np_random))
-
-    def draw(self, row):
-        return categorical_sample([outcome[0] for outcome in row], self.np_random)
-
-    def observe(self):
-        return self.s
-
-    def render(self):
-        raise AssertionError("a check draws nothing")
-
-
 # --- right models ---------------------------------------------------------------------------------
-
-
-class Backwards(Corridor):
-    def draw(self, row):
-        return int(self.np_random.random() < row[1][0])
 
 
 class Careless(Corridor):
@@ -118,44 +52,6 @@ class LateStart(Corridor):
 
     def first(self):
         return int(self.np_random.random() < 0.5)
-
-
-class Unsettable(Corridor):
-    """Its place is not ``s``."""
-
-    @property
-    def s(self):
-        return self.place
-
-    @s.setter
-    def s(self, place):
-        if hasattr(self, "place"):
-            raise AttributeError
-        self.place = place
-
-    def step(self, action):
-        row = self.true[self.place][action]
-        _, self.place, reward, terminated = row[self.draw(row)]
-        return self.place, reward, terminated, False, {}
-
-    def reset(self, *, seed=None, options=None):
-        gym.Env.reset(self, seed=seed)
-        self.place = self.first()
-        return self.place, {}
-
-
-class Deaf(Corridor):
-    """Lets ``s`` be set, and goes on from where it was."""
-
-    def reset(self, *, seed=None, options=None):
-        self.place, info = super().reset(seed=seed)
-        return self.place, info
-
-    def step(self, action):
-        self.s = self.place
-        result = super().step(action)
-        self.place = self.s
-        return result
 
 
 class Pictured(Corridor):
@@ -310,12 +206,6 @@ FALSE = {
 
 
 AGAIN = {"reward", "frequency everywhere", "storms"}
-
-
-def with_p(told):
-    env = Corridor()
-    env.P = told
-    return env
 
 
 def with_spaces(n_states, n_actions):
