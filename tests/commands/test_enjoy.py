@@ -5,7 +5,6 @@ import re
 import shlex
 import shutil
 import time
-import zipfile
 from collections import Counter
 from types import SimpleNamespace
 
@@ -15,16 +14,13 @@ from PIL import Image
 
 import train
 from commands import enjoy
-from commands.enjoy import LiveShow, build_parser, check_playing, figures_table, play
+from commands.enjoy import LiveShow, build_parser, figures_table, play
 from commands.terminal import TextConsole
-from experiments.plan import plan
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.evaluation.policies import ActionFigures
 from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.models.load import load_to_play
 from pipeline.playing import FRAMES_PER_SECOND, check_film_path, write_film
-from pipeline.runs import Run
 
 LAKE = ["--algo", "random", "--env", "FrozenLake-v1"]
 QUICK = ["train.py", "--seed", "0", "-n", "100", "--eval-freq", "-1", "--verbose", "1"]
@@ -93,18 +89,20 @@ def test_several_at_once_are_all_printed_and_logged(type_command, tmp_path):
 
 
 RUN = "logs/random/FrozenLake-v1_1"
-PLAYED = [
-    *(([*LAKE, *which], 100) for which in ([], ["--exp-id", "1"])),
-    ([*LAKE, "--load-checkpoint", "40"], 40),
-    ([*LAKE, "--load-last-checkpoint"], 80),
-    ([*LAKE, "--load-best"], 40),  # a checkpoint in its place
-    ([RUN], 100),
-    ([f"{RUN}/FrozenLake-v1"], 100),
-    ([f"{RUN}/rl_model_40_steps.zip"], 40),
-]
 
 
-@pytest.mark.parametrize(("choice", "n_steps"), PLAYED)
+@pytest.mark.parametrize(
+    ("choice", "n_steps"),
+    [
+        ([*LAKE, "--exp-id", "1"], 100),
+        ([*LAKE, "--load-checkpoint", "40"], 40),
+        ([*LAKE, "--load-last-checkpoint"], 80),
+        ([*LAKE, "--load-best"], 40),  # a checkpoint in its place
+        ([RUN], 100),
+        ([f"{RUN}/FrozenLake-v1"], 100),
+        ([f"{RUN}/rl_model_40_steps.zip"], 40),
+    ],
+)
 def test_what_is_chosen_is_played_and_trained_further(type_command, lake, choice, n_steps):
     if "--load-best" in choice:
         shutil.copy(lake / "rl_model_40_steps.zip", lake / "best_model.zip")
@@ -117,33 +115,35 @@ def test_what_is_chosen_is_played_and_trained_further(type_command, lake, choice
         assert f"trained  {n_steps + 100} steps" in out
 
 
+CHECKPOINTS = "holds no rl_model_50_steps.zip: there are checkpoints after 40, 80 steps"
 REFUSED = [
     ("--n-envs 2 --render ansi", "--render ansi shows one environment"),
     ("--n-envs 2 --record film.gif", "--record shows one environment"),
+    ("--fps 3", "--fps is the pace of --render ansi: give that too"),
+    ("--fps 3 --render none", "--fps is the pace of --render ansi: give that too"),
+    ("--fps 0 --render ansi", "--fps: must be"),
+    ("--fps 61 --render ansi", "--fps: must be"),
     ("--exp-id -1", "holds no FrozenLake-v1.zip"),
     ("--exp-id 9", "9"),
     ("--vec-normalize x.pkl", "no such file of statistics: x.pkl"),
     ("--norm-reward", "--norm-reward: no statistics of VecNormalize belong to this model"),
     ("--load-best", "holds no best_model.zip: its training may not have ended"),
-    (
-        "--load-checkpoint 50",
-        "holds no rl_model_50_steps.zip: there are checkpoints after 40, 80 steps",
-    ),
+    ("--load-checkpoint 50", CHECKPOINTS),
     ("truncated.zip", "no whole zip of an agent"),
-    ("text.zip", "no whole zip of an agent"),
-    ("other.zip", "no whole zip of an agent"),
     ("missing.zip", "no such model file"),
     (f"{RUN}/FrozenLake-v1.zip --algo sarsa", "cannot be loaded as a sarsa agent"),
+    # After the checkpoints are gone.
+    ("--load-checkpoint 7", "holds no rl_model_7_steps.zip: its training may not have"),
+    ("--load-last-checkpoint", "holds no checkpoint: train with --save-freq"),
 ]
 
 
 @pytest.mark.parametrize(("words", "complaint"), REFUSED)
 def test_one_line_for_what_is_not_there_or_not_done(type_command, lake, tmp_path, words, complaint):
-    whole = (lake / "FrozenLake-v1.zip").read_bytes()
-    (tmp_path / "truncated.zip").write_bytes(whole[:-200])
-    (tmp_path / "text.zip").write_text("not a zip")
-    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
-        archive.writestr("readme.txt", "hello")
+    (tmp_path / "truncated.zip").write_bytes((lake / "FrozenLake-v1.zip").read_bytes()[:-200])
+    if words in ("--load-checkpoint 7", "--load-last-checkpoint"):
+        for path in lake.glob("rl_model_*"):
+            path.unlink()
     choice = [] if "sarsa" in words else LAKE
     code, _, err = type_command("enjoy.py", *choice, *words.split())
     assert (code, err.count("\n")) == (2, 1)
@@ -156,18 +156,6 @@ def test_one_line_for_what_is_not_there_or_not_done(type_command, lake, tmp_path
         assert not (tmp_path / "logs" / "sarsa" / "FrozenLake-v1_1").exists()
 
 
-def test_a_run_without_checkpoints_says_so(type_command, lake):
-    for path in lake.glob("rl_model_*"):
-        path.unlink()
-    for choice, complaint in [
-        (["--load-checkpoint", "7"], "holds no rl_model_7_steps.zip: its training may not have"),
-        (["--load-last-checkpoint"], "holds no checkpoint: train with --save-freq"),
-    ]:
-        code, out, err = type_command(*PLAY, *choice)
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert complaint in err
-
-
 def test_a_library_zip_from_elsewhere_is_played(type_command, tmp_path):
     from stable_baselines3 import PPO
 
@@ -178,7 +166,7 @@ def test_a_library_zip_from_elsewhere_is_played(type_command, tmp_path):
     assert (code, "over 2 episodes" in out) == (0, True)
 
 
-# --- films ----------------------------------------------------------------------------------------
+# --- films ------------------------------------------------------------------------------------
 
 
 def test_letters_and_films_of_each_step(type_command, tmp_path):
@@ -217,40 +205,31 @@ def test_a_film_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, smal
     assert film.read_bytes() == b"an earlier one"
 
 
-# --- from another place --------------------------------------------------------------------------
+# --- from another place -------------------------------------------------------------------------
 
 MAP = "S..\n.#.\n..G\n"
 MAZE = ["--algo", "qlearning", "--env", "Warehouse-v0"]
 
 
-def of_a_file(folder):
-    """The map in an entry of a file of hyperparameters."""
-    text = "Warehouse-v0: {policy: QTablePolicy, n_timesteps: 9, env_kwargs: {desc: map.txt}}"
-    (folder / "own.yml").write_text(text)
-    return ["--conf-file", "own.yml"]
-
-
-@pytest.mark.parametrize("given", [lambda folder: ["--env-kwargs", "desc:map.txt"], of_a_file])
-def test_a_run_is_played_where_its_map_is_not(type_command, tmp_path, monkeypatch, given):
+def test_a_run_is_played_where_its_map_is_not(type_command, tmp_path, monkeypatch):
     (tmp_path / "map.txt").write_text(MAP)
-    code, out, err = type_command(*QUICK, *MAZE, *given(tmp_path))
-    assert (code, err) == (0, "")
+    text = "Warehouse-v0: {policy: QTablePolicy, n_timesteps: 9, env_kwargs: {desc: map.txt}}"
+    (tmp_path / "own.yml").write_text(text)
+    commands = []
+    for given in (["--env-kwargs", "desc:map.txt"], ["--conf-file", "own.yml"]):
+        code, out, err = type_command(*QUICK, *MAZE, *given)
+        assert (code, err) == (0, "")
+        commands.append(watch_line(out))
     elsewhere = tmp_path / "elsewhere"
     shutil.copytree(tmp_path / "logs", elsewhere / "logs")
     (tmp_path / "map.txt").write_text("S.......G\n")
     monkeypatch.chdir(elsewhere)
-    code, out, err = type_command(*watch_line(out), "--render", "ansi", "-n", "1")
-    assert (code, err) == (0, "")
-    assert re.search(r"#", out)
-    assert "optimum 97.00" in out
-
-
-def test_the_arguments_of_now_win_over_those_of_evaluation(type_command):
-    type_command(*QUICK, *MAZE, "--eval-env-kwargs", "max_episode_steps:20")
-    words = ["enjoy.py", *MAZE, "--no-render", "--n-episodes", "1", "--stochastic"]
-    assert max(episodes(type_command(*words)[1])) <= 20
-    words += ["--env-kwargs", "max_episode_steps:3"]
-    assert episodes(type_command(*words)[1]) == [3]
+    for number, command in enumerate(commands, start=1):
+        words = [*command, "--exp-id", number, "--render", "ansi", "-n", "1"]
+        code, out, err = type_command(*words)
+        assert (code, err) == (0, "")
+        assert "#" in out
+        assert "optimum 97.00" in out
 
 
 @pytest.mark.parametrize("env_id", ["envs:FrozenLake-v1", "FrozenLake-v1"])
@@ -261,36 +240,9 @@ def test_the_printed_command_plays_this_very_run(type_command, env_id):
     assert watch_line(out)[-2:] == ["-f", "my logs"]
 
 
-@pytest.mark.parametrize(
-    ("env_id", "folder"),
-    [("envs:Warehouse-v0", "Warehouse-v0_1"), ("ALE/Pong-v5", "ALE-Pong-v5_1")],
-)
-def test_an_id_names_the_same_folder_everywhere(tmp_path, monkeypatch, env_id, folder):
-    assert Run.claim(tmp_path, "random", env_id).path.name == folder
-    if env_id.startswith("envs"):
-        environment = EnvironmentSpec(env_id, env_id, {"n_timesteps": 9})
-        study = StudySpec("s", "S", (AgentSpec("random", "random"),), (environment,), n_seeds=1)
-        (planned,) = plan(study, tmp_path)
-        assert planned.path.name == folder
-        planned.path.mkdir(parents=True)
-        assert Run.find(tmp_path / "runs", "random", env_id).path == planned.path
-
-
-def test_a_study_remembers_maps_by_their_contents(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "map.txt").write_text(MAP)
-    environment = EnvironmentSpec("Small", "Warehouse-v0", {"env_kwargs": {"desc": "map.txt"}})
-    study = StudySpec("s", "S", (AgentSpec("qlearning", "qlearning"),), (environment,), n_seeds=1)
-    (planned,) = plan(study, tmp_path)
-    assert planned.spec.as_data()["hyperparams"]["env_kwargs"]["desc"] == MAP.split()
-
-
-# --- ``enjoy.py --render ansi`` on a terminal: one picture in its place, with figures beside it----
-
+# --- ``enjoy.py --render ansi`` on a terminal: one picture in its place, with figures beside it --
 
 REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty
-
-
 ICE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 
 
@@ -331,7 +283,13 @@ def played(chosen, *words, width=100):
     return console.file.getvalue()
 
 
-def test_pictures_replace_each_other_at_their_pace(walker, pauses, monkeypatch):
+def without_style(text):
+    from rich.text import Text
+
+    return Text.from_ansi(text).plain
+
+
+def test_pictures_replace_each_other_at_their_pace_with_figures_beside(walker, pauses, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     shown = played(walker, "--n-episodes", 2, "--fps", 5)
     # Six steps to the goal: seven pictures an episode.
@@ -341,87 +299,36 @@ def test_pictures_replace_each_other_at_their_pace(walker, pauses, monkeypatch):
     assert "episode 1: return 1.00, 6 steps" in shown
     assert "return 1.00 ± 0.00 over 2 episodes" in without_style(shown)
     # The last picture is the goal, with no step to come.
-    last = shown.rindex("episode 2, step 6")
-    assert "value" not in shown[last:]
-
-
-def test_what_the_table_holds_stands_beside_the_map(walker, pauses, monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    shown = played(walker, "--n-episodes", 1)
+    assert "value" not in shown[shown.rindex("episode 2, step 6") :]
+    # In the first, what the table holds stands beside the map.
     first = shown[: shown.index("step 1")]
-    for name in ("left", "down", "right", "up"):
-        assert name in first
     model = load_to_play("qlearning", walker.file, None, "cpu", ())
-    for number in model.policy.q_table[0]:
+    for number, name in zip(model.policy.q_table[0], ("left", "down", "right", "up"), strict=True):
+        assert name in first
         assert f"{number:.4g}" in first
     assert any("SFFF" in line and "left" in line for line in without_style(first).splitlines())
     # Where there is no room beside the map, they stand below it.
     narrow = without_style(played(walker, "--n-episodes", 1, width=30))
     assert any(line.strip() == "SFFF" for line in narrow.splitlines())
-
-
-def without_style(text):
-    from rich.text import Text
-
-    return Text.from_ansi(text).plain
-
-
-def test_elsewhere_pictures_stand_one_below_the_other(walker, pauses):
-    console = TextConsole(file=io.StringIO())
-    play(console, walker, letters("--n-episodes", 1))
-    shown = console.file.getvalue()
-    assert without_style(shown).count("SFFF") == 7
-    assert pauses == []
-    assert REPLACED not in shown
-    assert "value" not in shown
-
-
-def test_a_playing_that_is_broken_off_shows_where_it_was(walker, pauses, monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
+    # A playing that is broken off shows where it was.
     assert "episode 1, step 3" in played(walker, "-n", 3)
 
 
-def test_bars_lie_between_the_lowest_and_the_highest():
-    table = figures_table(ActionFigures("value", np.array([-1.0, 0.0, 3.0])), 2, ("a", "b"))
-    console = TextConsole(file=io.StringIO(), width=60)
-    console.print(table)
-    rows = [line.split() for line in console.file.getvalue().splitlines()]
-    assert rows[1:] == [["a", "-1"], ["b", "0", "###"], [">", "2", "3", "#" * 12]]
-
-
-def rows_of(table, width=60):
-    console = TextConsole(file=io.StringIO(), width=width)
-    console.print(table)
-    return console.file.getvalue().splitlines()
-
-
-@pytest.mark.parametrize(("n_shown", "n_rows"), [(20, 20), (5, 5), (0, 1), (-3, 1)])
-def test_of_many_actions_the_chosen_one_is_among_those_there_is_room_for(n_shown, n_rows):
-    figures = ActionFigures("value", np.arange(100.0))
-    rows = rows_of(figures_table(figures, 99, (), n_shown))
-    assert len(rows) == 1 + n_rows
-    assert rows[-1].split() == [">", "99", "99", "#" * 12]
-    rows = rows_of(figures_table(figures, 0, (), n_shown))
-    assert len(rows) == 1 + n_rows
-    assert rows[1].split() == [">", "0", "0"]
-
-
-@pytest.mark.parametrize("numbers", [[np.nan, 1.0], [np.inf, 0.0], [0.0, 0.0]])
-def test_without_a_range_there_are_no_bars(numbers):
-    rows = rows_of(figures_table(ActionFigures("value", np.array(numbers)), 0, ()))
-    assert "#" not in "".join(rows)
-    assert rows[0].split() == ["action", "value"]
-
-
-def test_bars_give_way_where_it_is_narrow_and_nothing_moves_sideways():
-    figures = ActionFigures("probability", np.array([1e-5, 1.0]))
-    one, other = (
-        rows_of(figures_table(figures, chosen, ("left", "right"), width=width), width)
-        for chosen, width in ((0, 26), (1, 26))
-    )
-    assert {len(row) for row in (*one, *other)} == {26}
-    assert one[2].split() == ["right", "1", "#" * 5]
-    assert rows_of(figures_table(figures, 1, (), width=10), 30)[2].split() == [">", "1", "1"]
+def test_what_repeats_itself_is_shown_for_a_while(wall, pauses, monkeypatch):
+    """The start, one step against the wall, and 20 that look like it, of 100; then it is told."""
+    console = TextConsole(file=io.StringIO())
+    play(console, wall, letters("--n-episodes", 2))
+    shown = without_style(console.file.getvalue())
+    assert shown.count("SFFF") == 2 * 22
+    assert "value" not in shown
+    assert pauses == []
+    assert shown.count("... 79 steps left out, which repeat pictures from above") == 2
+    assert shown.count("return 0.00, 100 steps") == 2
+    monkeypatch.setenv("TERM", "xterm")
+    shown = without_style(played(wall, "--n-episodes", 2))
+    assert shown.count("step 22: it repeats itself, and is not shown any more") == 2
+    assert shown.count("return 0.00, 100 steps") == 2
+    assert len(pauses) == 2 * 23  # the last one after the end
 
 
 def test_what_an_environment_draws_moves_no_cursor(pauses, monkeypatch):
@@ -439,27 +346,28 @@ def test_what_an_environment_draws_moves_no_cursor(pauses, monkeypatch):
     assert "[red]S" in shown
 
 
-def test_a_pace_is_for_letters_alone():
-    for words in (["--fps", "3"], ["--fps", "3", "--render", "none"]):
-        with pytest.raises(UserError, match="--fps is the pace of --render ansi: give that too"):
-            check_playing(build_parser().parse_args(words))
-    args = build_parser().parse_args(["--fps", "3", "--render", "ansi"])
-    check_playing(args)
-    for wrong in ("0", "61", "x"):
-        with pytest.raises(SystemExit):
-            build_parser().parse_args(["--fps", wrong])
+def rows_of(table, width=60):
+    console = TextConsole(file=io.StringIO(), width=width)
+    console.print(table)
+    return console.file.getvalue().splitlines()
 
 
-def test_what_repeats_itself_is_shown_for_a_while(wall, pauses, monkeypatch):
-    """The start, one step against the wall, and 20 that look like it, of 100; then it is told."""
-    console = TextConsole(file=io.StringIO())
-    play(console, wall, letters("--n-episodes", 2))
-    shown = without_style(console.file.getvalue())
-    assert shown.count("SFFF") == 2 * 22
-    assert shown.count("... 79 steps left out, which repeat pictures from above") == 2
-    assert shown.count("return 0.00, 100 steps") == 2
-    monkeypatch.setenv("TERM", "xterm")
-    shown = without_style(played(wall, "--n-episodes", 2))
-    assert shown.count("step 22: it repeats itself, and is not shown any more") == 2
-    assert shown.count("return 0.00, 100 steps") == 2
-    assert len(pauses) == 2 * 23  # the last one after the end
+def test_bars_lie_between_the_lowest_and_the_highest():
+    figures = ActionFigures("value", np.array([-1.0, 0.0, 3.0]))
+    rows = [line.split() for line in rows_of(figures_table(figures, 2, ("a", "b")))]
+    assert rows[1:] == [["a", "-1"], ["b", "0", "###"], [">", "2", "3", "#" * 12]]
+    for numbers in ([np.nan, 1.0], [np.inf, 0.0], [0.0, 0.0]):  # without a range
+        rows = rows_of(figures_table(ActionFigures("value", np.array(numbers)), 0, ()))
+        assert "#" not in "".join(rows)
+        assert rows[0].split() == ["action", "value"]
+
+
+@pytest.mark.parametrize(("n_shown", "n_rows"), [(20, 20), (5, 5), (0, 1), (-3, 1)])
+def test_of_many_actions_the_chosen_one_is_among_those_there_is_room_for(n_shown, n_rows):
+    figures = ActionFigures("value", np.arange(100.0))
+    rows = rows_of(figures_table(figures, 99, (), n_shown))
+    assert len(rows) == 1 + n_rows
+    assert rows[-1].split() == [">", "99", "99", "#" * 12]
+    rows = rows_of(figures_table(figures, 0, (), n_shown))
+    assert len(rows) == 1 + n_rows
+    assert rows[1].split() == [">", "0", "0"]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from agents import ALGORITHMS, load_algorithm
-from commands import compare, enjoy, train
+from commands import compare, enjoy, train, tune
 from commands.cli import (
     INSTEAD,
     SET_BY_FLAGS,
@@ -24,18 +24,24 @@ from commands.cli import (
     number_at_least_zero,
     whole_number,
 )
-from commands.compare import study_spec
+from commands.compare import run_context, study_spec
 from commands.enjoy import model_request
+from commands.terminal import TextConsole
 from commands.train import train_spec
+from commands.tune import tuning_spec
+from experiments.child_processes import NO_LIMITS
 from experiments.plan import plan
 from experiments.study import StudySpec
-from pipeline.environments import make_env, training_changes
+from pipeline.environments import training_changes
 from pipeline.errors import OTHER_NAMES, UserError, did_you_mean
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
 from tests.peers.peer_environment import peer_folder
+from tuning.retesting import Candidate, retest_study
+from tuning.suggesting import planned_run
 
 TRAIN, ENJOY, COMPARE = train, enjoy, compare
+LAKE = ["--env", "FrozenLake-v1"]
 
 
 def options(module):
@@ -44,16 +50,22 @@ def options(module):
 
 
 def trained(*words):
-    base = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
-    return train_spec(train.build_parser().parse_args([*base, *words]))
+    return train_spec(train.build_parser().parse_args([*LAKE, *words]))
 
 
 def compared(*words):
-    base = ["--algos", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
-    return study_spec(compare.build_parser().parse_args([*base, *words]))
+    return study_spec(compare.build_parser().parse_args(list(words)))
 
 
-# --- A flag reaches the field that has its name.
+def tuned(*words):
+    return tuning_spec(tune.build_parser().parse_args([*LAKE, *words]))
+
+
+SHORT = ["--algo", "qlearning", "-n", "60"]
+PAIR = [*LAKE, "--algos", "qlearning", "-n", "60"]
+
+
+# --- a flag reaches the field that has its name -----------------------------------------------
 
 
 def test_flags_of_train_reach_the_specification():
@@ -62,76 +74,73 @@ def test_flags_of_train_reach_the_specification():
     words = [
         word for name, value in given.items() for word in (f"--{name}".replace("_", "-"), value)
     ]
-    spec = trained(*map(str, words), "--verbose", "0", "--progress", "--uuid")
+    spec = trained(*SHORT, *map(str, words), "--verbose", "0", "--progress", "--uuid")
     given |= {"verbose": 0, "progress": True, "unique_id": True, "final_episodes": 3}
     assert {name: getattr(spec, name) for name in given} == given
+    kwargs = ["--env-kwargs", "slip:0.1", "--eval-env-kwargs", "slip:0.2", "max_episode_steps:9"]
+    found = trained("--env", "Warehouse-v0", *SHORT, *kwargs).hyperparams
+    assert (found.env_kwargs, found.eval_env_kwargs) == (
+        {"slip": 0.1},
+        {"slip": 0.2, "max_episode_steps": 9},
+    )
 
 
 def test_without_flags_a_run_is_the_default_one():
-    spec = trained()
-    # A study has the same number of episodes in all its runs; a run by itself as few as will do.
-    assert (spec.eval_episodes, spec.final_episodes) == (None, None)
+    spec = trained(*SHORT)
     own = {"algo", "env_id", "hyperparams", "saved_hyperparams", "seed", "origins"}
     others = {f.name: f.default for f in fields(TrainSpec) if f.name not in own}
+    # A study has the same number of episodes in all its runs; a run by itself as few as will do.
     others |= {"eval_episodes": None, "final_episodes": None}
     assert {name: getattr(spec, name) for name in others} == others
 
 
-def test_flags_of_compare_reach_the_study():
+def test_flags_of_compare_reach_the_study(tmp_path):
     usual = {"figures": ("png", "svg"), "is_quick": False, "metric": "final"}
     usual |= {"n_seeds": StudySpec.n_seeds}
-    study = compared()
+    study = compared(*PAIR)
     assert {name: getattr(study, name) for name in usual} == usual
     given = {"n_seeds": 3, "metric": "best", "margin": 0.5, "episodes_table": 5, "render_every": 6}
     given |= {"name": "mine", "learning_pages": True, "figures": ["pdf", "png"]}
     words = "--seeds 3 --metric best --margin 0.5 --episodes-table 5 --render-every 6 --name mine"
-    study = compared(*words.split(), "--watch-learning", "--figures", "pdf", "png")
+    study = compared(*PAIR, *words.split(), "--watch-learning", "--figures", "pdf", "png")
     assert {name: getattr(study, name) for name in given} == given
-    assert (compared("--quick").is_quick, compared("--quick").n_seeds) == (True, 2)
+    quick = compared(*PAIR, "--quick")
+    assert (quick.is_quick, quick.n_seeds) == (True, 2)
+    words = ["--env", "Warehouse-v0", "--algos", "ppo", "qlearning"]
+    for flags, changed in ((), {"ppo"}), (["--as-it-comes"], set()):
+        planned = plan(compared(*words, *flags), tmp_path)
+        assert {one.agent for one in planned if training_changes(one.spec)} == changed
 
 
 def test_the_page_that_plays_a_training(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
+    (tmp_path / "folder.html").mkdir()
     page = ("--watch-learning", "page.html")
-    assert (trained(*page).watch_learning, trained(*page).watch_episodes) == (Path("page.html"), 0)
-    assert trained(*page, "--watch-episodes", "3").watch_episodes == 3
-    for words, complaint in [
-        (("--watch-episodes", "3"), "says how much --watch-learning shows: give that too"),
-        (("--watch-learning", "page.pdf"), "writes a .html file, not 'page.pdf'"),
-        (("--watch-learning", "no/page.html"), "there is no folder no"),
-        (("--watch-learning", "/proc/page.html"), "nothing can be written in /proc: No such file"),
+    for more, n_episodes in (((), 0), (("--watch-episodes", "3"), 3)):
+        spec = trained(*SHORT, *page, *more)
+        assert (spec.watch_learning, spec.watch_episodes) == (Path("page.html"), n_episodes)
+    for name, complaint in [
+        ("page.pdf", r"writes a \.html file, not 'page\.pdf'"),
+        ("no/page.html", "there is no folder no"),
+        ("/proc/page.html", "nothing can be written in /proc: No such file"),
+        ("folder.html", r"folder\.html is a folder"),
     ]:
         with pytest.raises(UserError, match=complaint):
-            trained(*words)
-    (tmp_path / "page.html").mkdir()
-    with pytest.raises(UserError, match=r"page\.html is a folder"):
-        trained(*page)
+            trained(*SHORT, "--watch-learning", name)
+    with pytest.raises(UserError, match="says how much --watch-learning shows: give that too"):
+        trained(*SHORT, "--watch-episodes", "3")
 
 
-def test_everybody_is_trained_on_the_environment_as_it_comes(tmp_path):
-    words = ["--env", "Warehouse-v0", "--algos", "ppo", "qlearning"]
-    for flags, changed in ((), {"ppo"}), (["--as-it-comes"], set()):
-        study = study_spec(compare.build_parser().parse_args([*words, *flags]))
-        planned = plan(study, tmp_path)
-        assert {one.agent for one in planned if training_changes(one.spec)} == changed
+def test_which_model_is_played_and_with_which_seed():
+    base = ["--algo", "random", *LAKE]
+    for words, which in [([], "final"), (["--load-best"], "best"), (["--load-checkpoint", "0"], 0)]:
+        assert model_request(enjoy.build_parser().parse_args([*base, *words])).which == which
+    args = enjoy.build_parser().parse_args([*base, "--seed", "-1"])
+    seeds = {model_request(args).seed for _ in range(5)}
+    assert (len(seeds), min(seeds) >= 0) == (5, True)
 
 
-@pytest.mark.parametrize(
-    ("words", "which"),
-    [
-        ([], "final"),
-        (["--load-best"], "best"),
-        (["--load-checkpoint", "500"], 500),
-        (["--load-checkpoint", "0"], 0),
-        (["--load-last-checkpoint"], "last checkpoint"),
-    ],
-)
-def test_which_model_is_played(words, which):
-    assert model_request(enjoy.build_parser().parse_args(words)).which == which
-
-
-# --- Every flag with every odd value: it has a meaning, or it is refused in one line.
+# --- every flag with every odd value: it has a meaning, or it is refused in one line -----------
 
 ODD = ("0", "-1", "-5", "7", "1e5", "100_000", "9" * 30, "1e999999999", "-1e999999999", "\u0663")
 ODD = (*ODD, "1.5", "nan", "sNaN", "inf", "-inf", "", " ", "text", "a:b", "/", "..")
@@ -222,79 +231,155 @@ def test_any_other_text_is_refused(text):
         assert value == text if read is folder_name else float(text) == value
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--num-threads", "-1", "--eval-freq", "-5", "--log-interval", "1e12", "--seed", "-1"],
-        ["--num-threads", "0", "--eval-freq", "0", "--save-freq", "-3", "--seed", "4294967295"],
-        ["--eval-episodes", "1", "--n-eval-envs", "1e3", "-params", "n_envs:2e0"],
-        ["--log-interval", "-2", "--verbose", "2"],
-    ],
-)
-def test_what_is_taken_trains(words, tmp_path):
-    words = [*BASES[train], "-f", str(tmp_path), "-tb", str(tmp_path / "tb"), *words]
-    spec = train_spec(train.build_parser().parse_args(words))
-    outcome = carry_out(prepare(spec, Console(file=io.StringIO()), {}, ""))
-    assert outcome.n_steps in (5, 6)
-    # TensorBoard calls a run after its agent.
-    assert [path.name for path in (tmp_path / "tb" / "FrozenLake-v1").iterdir()] == ["random_1"]
-
-
-@pytest.mark.parametrize("text", ["1e5", "100000.0"])
-def test_a_budget_in_settings_may_be_written_as_a_float(text, tmp_path):
-    path = tmp_path / "own.yml"
-    path.write_text(f"default:\n  n_timesteps: {text}\n")
-    for where in (["-params", f"n_timesteps:{text}"], ["-conf", str(path)]):
-        words = ["--algo", "random", "--env", "FrozenLake-v1", *where]
+def test_what_is_taken_trains(tmp_path):
+    for name, typed in {
+        "first": "--num-threads -1 --eval-freq -5 --log-interval 1e12 --seed -1 --verbose 2",
+        "second": "--num-threads 0 --eval-freq 0 --save-freq -3 --seed 4294967295",
+        "third": "--eval-episodes 1 --n-eval-envs 1e3 --log-interval -2 -params n_envs:2e0",
+    }.items():
+        folder = tmp_path / name
+        words = [*BASES[train], "-f", str(folder), "-tb", str(folder / "tb"), *typed.split()]
         spec = train_spec(train.build_parser().parse_args(words))
-        assert spec.hyperparams.n_timesteps == 100_000
+        outcome = carry_out(prepare(spec, Console(file=io.StringIO()), {}, ""))
+        assert outcome.n_steps in (5, 6)
+        # TensorBoard calls a run after its agent.
+        assert [path.name for path in (folder / "tb" / "FrozenLake-v1").iterdir()] == ["random_1"]
 
 
-@pytest.mark.parametrize("device", ["nonsense", "", "cuda:99"])
-def test_a_device_that_is_not_there(device):
-    with pytest.raises(UserError, match="--device: PyTorch has no"):
-        check_device(device)
+def test_a_budget_in_settings_may_be_written_as_a_float(tmp_path):
+    path = tmp_path / "own.yml"
+    for text in ("1e5", "100000.0"):
+        path.write_text(f"default:\n  n_timesteps: {text}\n")
+        for where in (["-params", f"n_timesteps:{text}"], ["-conf", str(path)]):
+            assert trained("--algo", "random", *where).hyperparams.n_timesteps == 100_000
 
 
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "complaint"),
-    [
-        ("FrozenLake-v1", {"map_name": "9x9"}, "unknown map_name '9x9': known are 4x4, 8x8"),
-        ("FrozenLake-v1", {"map_name": 0}, "unknown map_name '0': known are 4x4, 8x8"),
-        ("FrozenLake-v1", {"map_name": float("nan")}, "unknown map_name 'nan'"),
-        ("FrozenLake-v1", {"slippery": 1}, "unknown argument 'slippery': did you mean 'is_slip"),
-        ("FrozenLake-v1", {"desc": []}, "(expected 2, got 1) (with desc=[])"),
-        ("Taxi-v4", {"rainy_probability": "x"}, "'float' and 'str' (with rainy_probability='x')"),
-        ("Warehouse-v0", {"slip": 2}, "slip must be a finite number"),
-        ("CartPole-v1", {"x": 1}, "known are sutton_barto_reward, max_episode_steps"),
-        ("CartPole-v1", {"render_mode": 1}, "(with render_mode=1)"),
-    ],
-)
-def test_arguments_of_environments(env_id, kwargs, complaint):
-    with pytest.raises(UserError) as caught:
-        make_env(env_id, kwargs)
-    assert str(caught.value).startswith(f"{env_id}: ")
-    assert complaint in str(caught.value)
-    assert "environment creator" not in str(caught.value)
-
-
-def test_a_random_seed_to_play_with():
-    words = ["--seed", "-1", "--algo", "random", "--env", "FrozenLake-v1"]
-    args = enjoy.build_parser().parse_args(words)
-    seeds = {model_request(args).seed for _ in range(5)}
-    assert len(seeds) == 5
-    assert min(seeds) >= 0
-
-
-def test_a_folder_is_not_left_to_chance(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_device_that_is_not_there_and_a_folder_without_a_name():
+    for device in ("nonsense", "", "cuda:99"):
+        with pytest.raises(UserError, match="--device: PyTorch has no"):
+            check_device(device)
     for module in (train, enjoy, compare):
         with pytest.raises(SystemExit):
             module.build_parser().parse_args(["-f", ""])
-    assert list(Path.cwd().iterdir()) == []
 
 
-# --- A flag that there is not is answered with what was meant.
+# --- where runs are done, which is settled before anything is begun -----------------------------
+
+
+def test_where_runs_are_done(tmp_path, monkeypatch):
+    def place(words):
+        args = compare.build_parser().parse_args(["study", *words.split()])
+        return run_context(args, tmp_path / "study", "c", NO_LIMITS, TextConsole()).words
+
+    monkeypatch.chdir(tmp_path)
+    Path("slurm.yml").write_text("jobqueue: {slurm: {cores: 4, memory: 8GB}}")
+    assert place("-j 3") == "3 at once"
+    assert place("--cluster local:2") == "on the cluster local:2"
+    assert place("--cluster slurm.yml -j 8") == "on the cluster slurm.yml"
+    for words, message in [
+        ("--cluster 192.0.2.1:8786", "without TLS"),
+        ("--cluster tls://192.0.2.1:8786", "ca-file"),
+        ("--cluster missing.json", "cannot be read"),
+        ("--cluster local:0", "local:N"),
+        ("--cluster local:2 -j 2", "a cluster has its workers"),
+        ("--cluster slurm.yml", "--jobs N"),
+        ("--insecure-cluster", "give --cluster too"),
+    ]:
+        with pytest.raises(UserError, match=message) as refused:
+            place(words)
+        assert "\n" not in str(refused.value)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)  # a machine without Dask
+    with pytest.raises(UserError, match=r"rl-yardstick\[cluster\]"):
+        place("--cluster local:2")
+    assert [path.name for path in tmp_path.iterdir()] == ["slurm.yml"]
+
+
+# --- which engine: what --engine makes of trainings, studies and searches ------------------------
+
+
+@pytest.mark.parametrize(
+    ("algo", "words", "engine"),
+    [
+        ("ppo", "", None),
+        ("ppo", "--engine auto", "auto"),
+        ("ppo", "--engine auto -params engine:auto gamma:0.9", "auto"),
+        ("double_dqn", "--engine compiled", "compiled"),
+        ("qlearning", "--engine interpreted", "interpreted"),
+        ("semi_gradient_q", "--engine auto", "auto"),
+        ("optimal", "--engine auto -n 10", None),
+        ("qrdqn", "--engine library -n 10", None),
+    ],
+)
+def test_an_engine_is_a_setting_where_there_is_a_choice(algo, words, engine):
+    spec = trained("--algo", algo, *words.split())
+    assert spec.hyperparams.algorithm.get("engine") == engine
+
+
+REFUSED = [
+    ("ppo", "-params engine:compiled --engine auto",
+     "--engine auto and -params engine:compiled disagree: give one of them"),
+    ("qlearning", "--engine library",
+     "--engine library: qlearning has the engines auto, compiled, interpreted"),
+    ("ppo", "--engine interpreted",
+     "--engine interpreted: ppo has the engines library, compiled, auto"),
+    ("qrdqn", "--engine compiled", "--engine compiled: qrdqn has one engine, which auto means"),
+    ("optimal", "--engine compiled", "--engine compiled: optimal has one engine, which auto means"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("algo", "words", "complaint"), REFUSED)
+def test_what_is_refused_by_every_command(algo, words, complaint):
+    words = ["-n", "10", *words.split()]
+    # Another agent of the study may have what this one has not.
+    algos = ["sarsa", algo] if "auto" in words else [algo]
+    for ask in (
+        lambda: trained("--algo", algo, *words),
+        lambda: compared(*LAKE, "--algos", *algos, *words),
+        lambda: tuned("--algo", algo, *words),
+    ):
+        with pytest.raises(UserError, match=f"^{re.escape(complaint)}$"):
+            ask()
+
+
+def test_compare_reaches_every_agent_and_a_study_file_too(tmp_path):
+    words = ["--algos", "qlearning", "ppo", "optimal", "--engine", "auto", "-n", "9"]
+    planned = plan(compared(*LAKE, *words), tmp_path)
+    engines = {run.agent: run.spec.hyperparams.algorithm.get("engine") for run in planned}
+    assert engines == {"qlearning": "auto", "ppo": "auto", "optimal": None}
+    headline = compared("studies/library-vs-hand-rolled.yml")
+    engines = {agent.label: agent.settings.get("engine") for agent in headline.agents}
+    assert engines["double_dqn"] == "library"
+    assert {engines[name] for name in ("dqn", "ppo", "qlearning")} == {None}
+    faster = compared("studies/library-vs-hand-rolled.yml", "--engine", "auto")
+    assert {agent.settings["engine"] for agent in faster.agents} == {"auto"}
+
+
+@pytest.mark.parametrize(
+    ("words", "search", "retest"),
+    [
+        (["--algo", "ppo"], "auto", None),
+        (["--algo", "ppo", "--engine", "auto"], "auto", "auto"),
+        (["--algo", "ppo", "--engine", "library"], "library", "library"),
+        (["--algo", "ppo", "-params", "engine:compiled"], "compiled", "compiled"),
+        (["--algo", "double_dqn"], None, None),
+        (["--algo", "qlearning"], None, None),
+    ],
+)
+def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(
+    words, search, retest, tmp_path
+):
+    tuning = tuned(*words)
+    entry = {"n_timesteps": 10, **tuning.agent.settings}
+    run = planned_run(tuning, tmp_path, entry, seed=0)
+    assert run.spec.hyperparams.algorithm.get("engine") == search
+    study = retest_study(tuning, tmp_path, [Candidate(1, entry, 0.5)])
+    engines = {r.spec.hyperparams.algorithm.get("engine") for r in plan(study, tmp_path)}
+    assert engines == {retest}
+    # Another engine makes another search; where there is none to choose, an old one goes on.
+    assert tuning.identity(entry, {}).get("search_engine") == (None if retest else search)
+
+
+# --- a flag that there is not is answered with what was meant -----------------------------------
 
 
 def answer(module, words, capsys):
@@ -351,14 +436,10 @@ def test_whatever_is_unknown_is_told_in_one_line(words, capsys):
     assert err.count("\n") == 1
 
 
-def test_a_hyperparameter_of_another_agent_is_not_offered(capsys):
+def test_a_hyperparameter_of_another_agent_is_not_offered_nor_an_abbreviation_taken(capsys):
     assert "-params" not in answer(TRAIN, "--batch-size 4 --algo qlearning", capsys)
-
-
-def test_an_abbreviation_does_not_mean_another_flag():
     assert COMPARE.build_parser().parse_args(["--seeds", "3"]).seeds == 3
-    with pytest.raises(SystemExit):
-        COMPARE.build_parser().parse_args(["--see", "3"])
+    answer(COMPARE, "--see 3", capsys)
 
 
 def hyperparameters():
@@ -375,31 +456,19 @@ def test_all_hyperparameters_are_known_by_name():
     assert missed == set()
 
 
-def test_what_is_answered_is_not_here():
-    assert (options(TRAIN) | options(ENJOY)).isdisjoint(INSTEAD)
-
-
-@pytest.mark.parametrize(
-    ("name", "known", "hint"),
-    [
-        ("lr", ["gamma", "learning_rate"], "did you mean 'learning_rate'?"),
-        ("alpha", ["gamma", "learning_rate"], "did you mean 'learning_rate'?"),
-        ("ALPHA", ["alphas", "learning_rate"], "did you mean 'learning_rate'?"),
-        ("eps", ["exploration_final_eps", "x"], "did you mean 'exploration_final_eps'?"),
-        ("alpha", ["alphas", "x"], "did you mean 'alphas'?"),
-    ],
-)
-def test_other_names_of_the_field(name, known, hint):
-    assert did_you_mean(name, known) == hint
-
-
 def test_other_names_lead_to_names_that_exist():
     meant = {name for names in OTHER_NAMES.values() for name in names}
     assert meant - hyperparameters() == {"n_timesteps", "n_episodes", "n_envs"}
+    for name, known, meant in [
+        ("lr", ["gamma", "learning_rate"], "learning_rate"),
+        ("ALPHA", ["alphas", "learning_rate"], "learning_rate"),
+        ("eps", ["exploration_final_eps", "x"], "exploration_final_eps"),
+        ("alpha", ["alphas", "x"], "alphas"),
+    ]:
+        assert did_you_mean(name, known) == f"did you mean {meant!r}?"
 
 
-# --- What may be typed beside --resume: nothing that the run has already, not even as it has it.
-
+# --- what may be typed beside --resume: nothing that the run has already, not even as it has it --
 
 ALLOWED = {
     "--save-state-every": "30s",
@@ -448,8 +517,7 @@ def test_which_run_is_said_by_its_folder_or_by_its_agent_and_environment(type_in
     assert "no run of ppo on CartPole-v1 in logs was interrupted" in said
 
 
-# --- The page for those who come from rl_zoo3 is complete, and says what is so.
-
+# --- the page for those who come from rl_zoo3 is complete, and says what is so -------------------
 
 PAGE = Path(__file__).parents[2] / "docs" / "from-rl-zoo3.md"
 COMMANDS = {"train": train, "enjoy": enjoy}
@@ -474,17 +542,12 @@ def rows(command):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_each_flag_has_its_row(command):
-    expected = flags_of_rl_zoo3(command)
+def test_the_table_of_flags_has_each_of_theirs_and_what_is_here(command):
+    expected, ours = flags_of_rl_zoo3(command), options(COMMANDS[command])
     assert len(expected) > 20
     found = [tuple(FLAG.findall(first)) for first, _ in rows(command)]
     assert len(found) == len(set(found))
     assert set(found) == expected
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_what_is_said_to_be_here_is_here(command):
-    ours = options(COMMANDS[command])
     for theirs, here in rows(command):
         assert set(FLAG.findall(here)) <= ours, theirs
         assert FLAG.match(here) or here.startswith(("the same", "no", "what")), theirs
@@ -499,3 +562,5 @@ def test_what_is_said_not_to_be_here_is_answered(capsys):
         err = capsys.readouterr().err
         assert err.count("\n") == 1
         assert re.search(rf"unknown argument {flag} 1: .*not", err)
+
+    assert (options(TRAIN) | options(ENJOY)).isdisjoint(INSTEAD)

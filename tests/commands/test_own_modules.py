@@ -1,6 +1,7 @@
 """train.py, enjoy.py and compare.py on agents and environments of a user's own."""
 
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -76,12 +77,15 @@ def in_own_folder(own_folder, type_in_own_folder):
     return type_in_own_folder
 
 
-@pytest.mark.parametrize("typed", ["my_agents", "./my_agents.py", "my_package"])
-def test_an_agent_of_ones_own_is_trained_and_played(in_own_folder, own_folder, typed, tmp_path):
+@pytest.mark.parametrize("typed", ["./my_agents.py", "my_package"])
+def test_an_agent_of_ones_own_is_listed_trained_and_played(in_own_folder, own_folder, typed):
     if typed == "my_package":
         (own_folder / "my_package").mkdir()
         (own_folder / "my_agents.py").rename(own_folder / "my_package" / "__init__.py")
     own = ["--gym-packages", typed]
+    code, out, _ = in_own_folder("train.py", "--list", *own)
+    assert code == 0
+    assert any(line.split()[:3] == ["lazy", "counts", "[rewards]"] for line in out.splitlines())
     code, out, err = in_own_folder("train.py", *LAZY, *own, "-n", "60", "-params", "weight:1e-2")
     assert (code, err) == (0, "")
     words = " ".join(out.split())
@@ -93,6 +97,10 @@ def test_an_agent_of_ones_own_is_trained_and_played(in_own_folder, own_folder, t
     code, out, err = in_own_folder("enjoy.py", *LAZY, *own, *PLAY)
     assert (code, err) == (0, "")
     assert "(exact)" in out
+    for algo, complaint in (("lasy", "did you mean 'lazy'?"), ("lazy", "how long to train? give")):
+        words = ["--env", "my/Lake-v0", "--algo", algo, *(["-n", "9"] if algo == "lasy" else [])]
+        code, _, err = in_own_folder("train.py", *own, *words)
+        assert (code, complaint in err) == (2, True)
 
 
 def test_a_run_does_not_have_modules_imported(in_own_folder, own_folder, monkeypatch, tmp_path):
@@ -115,29 +123,6 @@ def test_a_run_does_not_have_modules_imported(in_own_folder, own_folder, monkeyp
     assert copy == str(run / "modules" / "my_agents.py")
     code, _, err = in_own_folder("enjoy.py", *by_path, *PLAY, "--gym-packages", copy)
     assert (code, err) == (0, "")
-
-
-def test_an_agent_of_ones_own_is_listed_and_guessed(in_own_folder):
-    code, out, _ = in_own_folder("train.py", "--list", "--gym-packages", "my_agents")
-    assert code == 0
-    assert any(line.split()[:3] == ["lazy", "counts", "[rewards]"] for line in out.splitlines())
-    words = ["train.py", "--gym-packages", "my_agents", "--env", "my/Lake-v0"]
-    code, _, err = in_own_folder(*words, "--algo", "lasy", "-n", "9")
-    assert (code, "did you mean 'lazy'?" in err) == (2, True)
-    code, _, err = in_own_folder(*words, "--algo", "lazy")
-    assert (code, "how long to train? give -n STEPS" in err) == (2, True)
-
-
-def test_ids_make_the_same_folders(in_own_folder, own_folder):
-    """With and without the module, alone and in a study."""
-    env = ["--env", "my_agents:my/Lake-v0"]
-    assert in_own_folder("train.py", *env, "--algo", "random", "-n", "30")[0] == 0
-    assert in_own_folder("enjoy.py", *env, "--algo", "random", *PLAY)[0] == 0
-    words = ["compare.py", *env, "--algos", "random", "-n", "30", "--seeds", "1", "--no-report"]
-    code, _, err = in_own_folder(*words)
-    assert (code, err) == (0, "")
-    assert (own_folder / "logs" / "random" / "my-Lake-v0_1").is_dir()
-    assert (own_folder / "logs/studies/my-Lake-v0_random/runs/random/my-Lake-v0_1").is_dir()
 
 
 def test_a_study_file_imports_nothing(in_own_folder, own_folder):
@@ -164,3 +149,86 @@ def test_a_study_in_a_folder_full_of_names(own_folder):
     runs = sorted(own_folder.glob("logs/studies/*/runs/lazy/*/run.json"))
     specs = [json.loads(run.read_text())["spec"] for run in runs]
     assert [spec["hyperparams"] for spec in specs] == [{"n_timesteps": 50, "weight": 0.25}] * 2
+
+
+# --- an environment that does other than its P says ----------------------------------------------
+
+
+WINDY = """
+import gymnasium as gym
+import numpy as np
+
+class Windy(gym.Env):
+    observation_space = gym.spaces.Discrete(6)
+    action_space = gym.spaces.Discrete(2)
+    initial_state_distrib = np.eye(6)[0]
+
+    def __init__(self, wind=0.3):
+        self.wind = wind
+        self.P = {s: {a: [(1.0, *self.move(s, a))] for a in (0, 1)} for s in range(6)}
+
+    def move(self, state, action):
+        state = min(max(state + 2 * action - 1, 0), 5)
+        return state, 9.0 if state == 5 else -1.0, state == 5
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 0
+        return self.s, {}
+
+    def step(self, action):
+        if self.np_random.random() < self.wind:
+            self.s = max(self.s - 2, 0)
+            return self.s, -1.0, False, False, {}
+        self.s, reward, terminated = self.move(self.s, action)
+        return self.s, reward, terminated, False, {}
+
+gym.register("Windy-v0", entry_point=Windy, max_episode_steps=100)
+"""
+REFUSAL = "the environment's P is not what step does: state 1, action "
+
+
+@pytest.fixture
+def type_windy(type_in_own_folder, own_folder):
+    (own_folder / "windy_of_mine.py").write_text(WINDY)
+
+    def run(program, *words):
+        own = ["--env", "Windy-v0", "--gym-packages", "windy_of_mine", "--algo", "qlearning"]
+        code, out, err = type_in_own_folder(program, *own, *words)
+        return code, " ".join(out.split()), err
+
+    return run
+
+
+def test_the_figures_are_those_of_step(type_windy, own_folder):
+    code, out, err = type_windy("train.py", "-n", "4000", "--seed", "0")
+    assert (code, err) == (0, "")
+    assert out.count(REFUSAL) == 2  # once for the figures, once for the engine
+    assert "; figures are sampled" in out
+    assert f"engine interpreted: {REFUSAL}" in out
+    assert "(exact)" not in out
+    assert re.search(r"over \d+ episodes", out)
+    info = json.loads((own_folder / "logs/qlearning/Windy-v0_1/run.json").read_text())
+    assert info["model_refused"].startswith(REFUSAL)
+    assert not info["final"]["exact"]
+    # Without wind the corridor takes five steps, and earns 5; with it 20 steps or so.
+    assert info["final"]["mean_return"] < 2
+    code, out, err = type_windy("enjoy.py", "--n-episodes", "3", "--render", "none")
+    assert (code, err, out.count(REFUSAL)) == (0, "", 1)
+    assert "exact" not in out
+    # A planner refuses in one line.
+    code, _, err = type_windy("train.py", "--algo", "optimal", "-n", "100")
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"needs an environment whose transition model is known: {REFUSAL}" in err
+    assert not (own_folder / "logs" / "optimal").exists()
+
+
+def test_where_it_does_what_it_says_nothing_is_said(type_windy, own_folder):
+    words = ("-n", "2000", "--seed", "0", "--env-kwargs", "wind:0.0")
+    code, out, err = type_windy("train.py", *words)
+    assert (code, err) == (0, "")
+    assert "not what step does" not in out
+    assert "final return 5.00 (exact)" in out
+    assert "engine compiled" in out
+    info = json.loads((own_folder / "logs/qlearning/Windy-v0_1/run.json").read_text())
+    assert "model_refused" not in info

@@ -1,4 +1,4 @@
-"""rl_zoo3's plot commands, and its enjoy, on run folders of train.py and of studies."""
+"""rl_zoo3's plot commands, and its enjoy, on the run folders of studies."""
 
 import json
 import os
@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 import compare
-import train
 from tests.peers.peer_environment import peer_python
 
 ROOT = Path(compare.__file__).parent
@@ -37,8 +36,6 @@ CONTINUOUS = {
     # All candidates' episodes are of 30 steps, so that its two runs are equally long.
     "ars": {"n_delta": 2},
 }
-AGENTS = ["qlearning", *LIBRARY]
-
 # rl_zoo3.enjoy needs `requests` for downloads, which are not made here.
 RUN = """
 import importlib.util, json, runpy, sys, types
@@ -76,14 +73,8 @@ def zoo(*commands, cwd):
     return outputs
 
 
-def call(main, *words):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [str(word) for word in words])
-        assert main() == 0
-
-
 def compared(folder, name, settings, agents, env_id):
-    """Do a study of two seeds."""
+    """Do a study of two seeds; its run folders."""
     study = {
         "seeds": 2,
         "eval_freq": 40,
@@ -96,101 +87,60 @@ def compared(folder, name, settings, agents, env_id):
         "environments": [env_id],
     }
     (folder / name).write_text(yaml.safe_dump(study))
-    call(compare.main, "compare.py", folder / name, "--no-report", "-f", folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            sys, "argv", ["compare.py", str(folder / name), "--no-report", "-f", str(folder)]
+        )
+        assert compare.main() == 0
+    return (folder / name).with_suffix("") / "runs"
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Two seeds of all agents in two studies, and two of some of them by train.py as well."""
-    folder = tmp_path_factory.mktemp("zoo")
+def test_plots_and_enjoy_of_rl_zoo3_take_the_runs_of_studies(tmp_path):
+    """All in one process, since it imports for seconds."""
     shared = {"n_envs": 1, "eval_env_kwargs": {"max_episode_steps": 20}}
-    compared(folder, "zoo.yml", shared, {"qlearning": None, **LIBRARY}, ENV_ID)
+    agents = {"qlearning": None, **LIBRARY}
+    lake = compared(tmp_path, "zoo.yml", shared, agents, ENV_ID)
+    # Those that act in Box spaces: compared here, plotted and played there.
     short = {"env_kwargs": {"max_episode_steps": 30}}
-    compared(folder, "robots.yml", short, CONTINUOUS, "Pendulum-v1")
-    conf = folder / "short.yml"
-    entry = {"policy": "MlpPolicy", "n_timesteps": 120, **LIBRARY["ppo"], **shared}
-    conf.write_text(yaml.safe_dump({ENV_ID: entry}))
-    words = ["train.py", "--env", ENV_ID, "--verbose", 0, "-f", folder / "logs", "--eval-freq", 40]
-    for seed in (0, 1):
-        call(train.main, *words, "--seed", seed, "--algo", "qlearning", "-n", 120)
-        call(train.main, *words, "--seed", seed, "--algo", "ppo", "--conf-file", conf)
-    return folder
-
-
-def agents_in(runs):
-    return sorted(path.name for path in runs.iterdir())
-
-
-def plot_commands(folder, name):
-    """Plots of a folder of runs, by what they are."""
-    runs, data = folder / name, folder / name.partition("/")[0]
-    algos, base = agents_in(runs), ["-e", ENV_ID, "-f", runs]
-    # Each axis takes a column of rows that are the same for all agents.
-    axes = zip(algos, cycle(["steps", "episodes", "time"]), strict=False)
+    swings = compared(tmp_path, "robots.yml", short, CONTINUOUS, "Pendulum-v1")
+    axes = dict(zip(agents, cycle(["steps", "episodes", "time"]), strict=False))
+    base = ["-e", ENV_ID, "-f", lake]
+    all_plots = ["rl_zoo3.plots.all_plots", "-l", "ours", "--no-display", "-print"]
     commands = {
-        ("plot_train", name, algo, axis): [*base, "-a", algo, "-x", axis, "-w", 2]
-        for algo, axis in [*axes, (algos[0], "episodes"), (algos[0], "time")]
+        **{
+            ("train", algo): ["rl_zoo3.plots.plot_train", *base, "-a", algo, "-x", axis, "-w", 2]
+            for algo, axis in axes.items()
+        },
+        "lake": [*all_plots, *base, "-a", *agents, "-o", "data"],
+        "file": ["rl_zoo3.plots.plot_from_file", "-i", "data.pkl", "-o", "picture"],
+        "swings": [*all_plots, "-e", "Pendulum-v1", "-f", swings, "-a", *CONTINUOUS],
     }
-    words = [*base, "-a", *algos, "-l", "ours", "--no-display", "-print", "-o", f"{data}_data"]
-    commands["all_plots", name] = words
-    picture = ["-i", f"{data}_data.pkl", "-o", f"{data}_picture"]
-    commands["plot_from_file", name] = picture
-    return {key: [f"rl_zoo3.plots.{key[0]}", *words] for key, words in commands.items()}
-
-
-def enjoy(algo, env_id, runs, n_steps):
-    words = ["--algo", algo, "--env", env_id, "-f", runs, "--no-render", "-n", n_steps]
-    return ["rl_zoo3.enjoy", *words, "--device", "cpu", "--gym-packages", "envs"]
-
-
-@pytest.fixture(scope="module")
-def printed(folder):
-    """What commands print, by what they are: all in one process, since it imports for seconds."""
-    robots = folder / "robots" / "runs"
-    swings = ["-a", *CONTINUOUS, "-e", "Pendulum-v1", "-f", robots, "-l", "ours"]
-    commands = {
-        **plot_commands(folder, "logs"),
-        **plot_commands(folder, "zoo/runs"),
-        ("all_plots", "robots"): ["rl_zoo3.plots.all_plots", *swings, "--no-display", "-print"],
-        **{("enjoy", algo): enjoy(algo, ENV_ID, folder / "zoo/runs", 150) for algo in LIBRARY},
-        **{("enjoy", algo): enjoy(algo, "Pendulum-v1", robots, 60) for algo in CONTINUOUS},
-    }
-    return dict(zip(commands, zoo(*commands.values(), cwd=folder), strict=True))
-
-
-@pytest.mark.parametrize("name", ["logs", "zoo/runs"])
-def test_plot_train(printed, name):
-    said = {key: out for key, out in printed.items() if key[:2] == ("plot_train", name)}
-    assert {axis for *_, axis in said} == {"steps", "episodes", "time"}
-    assert not any("No data" in out for out in said.values())
-
-
-@pytest.mark.parametrize("name", ["logs", "zoo/runs"])
-def test_all_plots_and_plot_from_file(folder, printed, name):
-    runs, begin = folder / name, name.partition("/")[0]
-    algos = agents_in(runs)
-    for algo in algos:
-        assert f"{ENV_ID}-{algo.upper()}-ours: 2" in printed["all_plots", name]
-    with (folder / f"{begin}_data.pkl").open("rb") as file:
-        data = pickle.load(file)
-    for algo in algos:
-        curve = data[ENV_ID][f"{algo.upper()}-ours"]
-        ours = [np.load(path) for path in sorted(runs.glob(f"{algo}/*/evaluations.npz"))]
-        assert curve["timesteps"].tolist() == ours[0]["timesteps"].tolist()
-        expected = np.mean([run["results"].mean(axis=1) for run in ours], axis=0)
-        assert np.allclose(curve["mean"], expected)
-    assert len(list(folder.glob(f"{begin}_picture*"))) == 1
-
-
-def test_enjoy_plays_the_runs_of_a_study(printed):
+    for runs, env_id, algos, n in (
+        (lake, ENV_ID, LIBRARY, 150),
+        (swings, "Pendulum-v1", CONTINUOUS, 60),
+    ):
+        for algo in algos:
+            words = ["--algo", algo, "--env", env_id, "-f", runs, "--no-render", "-n", n]
+            words += ["--device", "cpu", "--gym-packages", "envs"]
+            commands["enjoy", algo] = ["rl_zoo3.enjoy", *words]
+    outputs = zoo(*commands.values(), cwd=tmp_path)
+    printed = dict(zip(commands, outputs, strict=True))
+    assert not any("No data" in printed["train", algo] for algo in axes)
+    for algo in agents:
+        assert f"{ENV_ID}-{algo.upper()}-ours: 2" in printed["lake"]
+    for algo in CONTINUOUS:
+        assert f"Pendulum-v1-{algo.upper()}-ours: 2" in printed["swings"]
+        assert f"{algo}/Pendulum-v1_2" in printed["enjoy", algo]
+        assert printed["enjoy", algo].count("Episode Length 30") == 2
     for algo in LIBRARY:
         assert f"{algo}/{ENV_ID}_2" in printed["enjoy", algo]
         assert "pisode" in printed["enjoy", algo]
-
-
-def test_agents_of_continuous_actions(printed):
-    """The same for those that act in Box spaces: compared here, plotted and played there."""
-    for algo in CONTINUOUS:
-        assert f"Pendulum-v1-{algo.upper()}-ours: 2" in printed["all_plots", "robots"]
-        assert f"{algo}/Pendulum-v1_2" in printed["enjoy", algo]
-        assert printed["enjoy", algo].count("Episode Length 30") == 2
+    assert len(list(tmp_path.glob("picture*"))) == 1
+    with (tmp_path / "data.pkl").open("rb") as file:
+        data = pickle.load(file)
+    for algo in agents:
+        curve = data[ENV_ID][f"{algo.upper()}-ours"]
+        ours = [np.load(path) for path in sorted(lake.glob(f"{algo}/*/evaluations.npz"))]
+        assert curve["timesteps"].tolist() == ours[0]["timesteps"].tolist()
+        expected = np.mean([run["results"].mean(axis=1) for run in ours], axis=0)
+        assert np.allclose(curve["mean"], expected)

@@ -1,7 +1,10 @@
-"""What is said of a run, and what the lists of agents and environments hold, to the letter."""
+"""What is said of runs, of their engines, and of how far a study is; lists; to the letter."""
 
 import io
+import json
+import re
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,19 +13,32 @@ from uuid import uuid4
 import numpy as np
 import pytest
 from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from agents import ALGORITHMS
-from commands import terminal
-from commands.terminal import TextConsole, describe
+from agents.networks import engine_setting
+from agents.networks.engine_setting import TOO_SHORT, EnginePlan, Work
+from commands import compare, terminal, tune
+from commands.compare import StudyProgress
+from commands.terminal import TextConsole, about, describe, search_line, study_line, training_line
 from commands.train import (
+    build_parser,
     describe_pulls,
     print_header,
     print_lists,
     print_outcome,
+    train_spec,
     watch_command,
 )
+from commands.tune import TuningProgress
+from experiments.launching import RunFailure
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from machine_code import WorkTime
+from pipeline import signs_of_life
 from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.model_card import card
+from pipeline.preparation import EngineOutlook, planned_outlook
 from pipeline.runs import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -92,34 +108,31 @@ def printed(outcome, spec):
     return [line.rstrip() for line in console.file.getvalue().splitlines()]
 
 
-def test_evaluations_in_words():
+# --- one run ----------------------------------------------------------------------------------
+
+
+def test_evaluations_and_pulls_in_words():
     assert describe(SAMPLED) == "return 2.00 ± 1.00 over 2 episodes"
     assert describe(EXACT) == (
         "return 70.00 (exact), success 87.5%, optimum 80.00, "
         "best random or constant policy -20.00, score 0.90"
     )
-
-
-@pytest.mark.parametrize(
-    ("pulls", "words"),
-    [
-        (pulls_of(), "not known: none of 1,500 pulls is in the log"),
+    for changes, words in [
+        ({}, "not known: none of 1,500 pulls is in the log"),
         (
-            pulls_of(reward=0.25, n_matched=1200),
+            {"reward": 0.25, "n_matched": 1200},
             "not known; reward 0.2500 a pull over the 1,200 of 1,500 that are in the log",
         ),
         (
-            pulls_of(regret=1234.5, optimal=0.97),
+            {"regret": 1234.5, "optimal": 0.97},
             "1,234.50 over 1,500 pulls; a best arm in 97% of the last 100",
         ),
         (
-            pulls_of(regret=0.0, optimal=1.0, n_pulls=40),
+            {"regret": 0.0, "optimal": 1.0, "n_pulls": 40},
             "0.00 over 40 pulls; a best arm in 100% of the last 40",
         ),
-    ],
-)
-def test_pulls_in_words(pulls, words):
-    assert describe_pulls(pulls) == words
+    ]:
+        assert describe_pulls(pulls_of(**changes)) == words
 
 
 def test_a_run_with_nothing_to_tell():
@@ -155,92 +168,32 @@ def test_a_run_with_everything():
     ]
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings", "lines"),
-    [
-        ("qlearning", {"gamma": 0.9}, ["gamma=0.9  n_timesteps=9"]),
-        ("qlearning", {"policy": "QTablePolicy"}, ["n_timesteps=9"]),
-        ("dqn", {"policy": "MlpPolicy"}, ["policy=MlpPolicy  n_timesteps=9"]),
-        (
-            "qlearning",
-            {"learning_rate": "exp_0.3_0.05"},
-            [
-                "n_timesteps=9",
-                "learning_rate=exp_0.3_0.05 (falls exponentially from 0.3 to 0.05)",
-            ],
-        ),
-        (
-            "ppo",
-            {"clip_range": "lin_0.2", "ent_coef": "lin_0.01_0.02"},
-            [
-                "n_timesteps=9",
-                "clip_range=lin_0.2 (falls linearly from 0.2 to 0)",
-                "ent_coef=lin_0.01_0.02 (rises linearly from 0.01 to 0.02)",
-            ],
-        ),
-        (
-            "qlearning",
-            {"train_env_kwargs": {"slip": 0.1}},
-            ["n_timesteps=9", "train_env_kwargs={'slip': 0.1} (in training alone)"],
-        ),
-    ],
-)
+HEADERS = [
+    ("qlearning", {"gamma": 0.9}, ["gamma=0.9  n_timesteps=9"]),
+    ("qlearning", {"policy": "QTablePolicy"}, ["n_timesteps=9"]),
+    ("dqn", {"policy": "MlpPolicy"}, ["policy=MlpPolicy  n_timesteps=9"]),
+    ("qlearning", {"learning_rate": "exp_0.3_0.05"},
+     ["n_timesteps=9", "learning_rate=exp_0.3_0.05 (falls exponentially from 0.3 to 0.05)"]),
+    ("ppo", {"clip_range": "lin_0.2", "ent_coef": "lin_0.01_0.02"},
+     ["n_timesteps=9", "clip_range=lin_0.2 (falls linearly from 0.2 to 0)",
+      "ent_coef=lin_0.01_0.02 (rises linearly from 0.01 to 0.02)"]),
+    ("qlearning", {"train_env_kwargs": {"slip": 0.1}},
+     ["n_timesteps=9", "train_env_kwargs={'slip': 0.1} (in training alone)"]),
+    # Long ones are cut short.
+    ("dqn", {"env_wrapper": "S" * 200}, [f"env_wrapper={'S' * 200}  n_timesteps=9"]),
+    ("dqn", {"env_wrapper": "S" * 201}, [f"env_wrapper={'S' * 200}...  n_timesteps=9"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("algo", "settings", "lines"), HEADERS)
 def test_what_is_about_to_be_trained_is_explained(algo, settings, lines):
     for budget, told in (({"n_timesteps": 9}, "9 steps"), ({"n_episodes": 1500}, "1,500 episodes")):
-        console = console_of()
+        console = console_of(1000)
         print_header(console, replace(spec_of(**settings, **budget), algo=algo))
         head, *found = console.file.getvalue().splitlines()
         assert head == f"{algo} on Lake-v1, seed 7, {told}"
         ((name, number),) = budget.items()
         assert found == [line.replace("n_timesteps=9", f"{name}={number}") for line in lines]
-
-
-# --- lists ----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def lists(monkeypatch):
-    """The lines of both lists, on a wide terminal."""
-    return listed(monkeypatch, 600)
-
-
-def listed(monkeypatch, width):
-    file = io.StringIO()
-    monkeypatch.setattr(
-        terminal, "table_console", lambda **more: Console(file=file, width=width, **more)
-    )
-    print_lists()
-    return [line.rstrip() for line in file.getvalue().splitlines()]
-
-
-def test_every_agent_has_a_line(lists):
-    first, *agents = lists[: len(ALGORITHMS) + 1]
-    width = len("agent (--algo)") + 2
-    width = max(width, *(len(name) + 2 for name in ALGORITHMS))
-    assert first == f"{'agent (--algo)':{width}}what it is"
-    assert agents == [f"{name:{width}}{entry.summary}" for name, entry in ALGORITHMS.items()]
-    # An empty line stands between the lists.
-    assert lists[len(ALGORITHMS) + 1] == ""
-    assert lists[len(ALGORITHMS) + 2].startswith("environment (--env)")
-
-
-def test_an_environment_names_the_agents_that_are_tuned_for_it_and_those_that_fit(lists):
-    (place,) = (n for n, line in enumerate(lists) if line.startswith("Warehouse-v0 "))
-    tuned = lists[place].removeprefix("Warehouse-v0")
-    also, fitting = lists[place + 1].split(maxsplit=1)
-    assert also == "also:"
-    assert {"qlearning", "sarsa", "ppo"} <= set(tuned.split())
-    assert not set(tuned.split()) & set(fitting.split())
-    assert set(tuned.split()) | set(fitting.split()) <= set(ALGORITHMS)
-    assert lists[-2] == ""
-    assert lists[-1].startswith("Any other environment registered with Gymnasium works where")
-
-
-def test_the_command_to_watch_with_is_one_line_however_long():
-    folder = "a folder/" * 20
-    (line,) = printed(outcome_of(), spec_of(folder))[-1:]
-    assert line.startswith("watch    python enjoy.py --algo qlearning --env Lake-v1 -f 'a folder/")
-    assert line.endswith("a folder'")
 
 
 @pytest.mark.parametrize(
@@ -262,21 +215,13 @@ def test_the_command_to_watch_with_names_this_run(tmp_path, typed, others, choic
     assert command == f"python '/some where/enjoy.py' {choice.format(logs=tmp_path)}"
 
 
-def test_the_command_to_watch_with_names_modules():
+def test_the_command_to_watch_with_is_one_line_and_names_modules():
+    (line,) = printed(outcome_of(), spec_of("a folder/" * 20))[-1:]
+    assert line.startswith("watch    python enjoy.py --algo qlearning --env Lake-v1 -f 'a folder/")
+    assert line.endswith("a folder'")
     modules = (UserModule("one", "one"), UserModule("./my two.py", "two", "/x/my two.py"))
-    spec = replace(spec_of(), user_modules=modules)
-    command = watch_command(spec, outcome_of().run)
+    command = watch_command(replace(spec_of(), user_modules=modules), outcome_of().run)
     assert command.endswith(" --env Lake-v1 --gym-packages one './my two.py'")
-
-
-@pytest.mark.parametrize(("length", "shown"), [(200, "S" * 200), (201, "S" * 200 + "...")])
-def test_a_long_setting_is_cut_short_in_the_header(length, shown):
-    console = console_of(1000)
-    print_header(console, spec_of(env_wrapper="S" * length, n_timesteps=1))
-    assert f"env_wrapper={shown}" in console.file.getvalue().replace("\n", "  ").split("  ")
-
-
-# --- into a file or a pipe ------------------------------------------------------------------------
 
 
 def test_redirected_no_row_is_broken_and_in_a_terminal_rows_hang():
@@ -306,6 +251,37 @@ def test_redirected_no_sentence_is_broken(is_terminal):
     assert (file.getvalue() == "a line of more than twenty letters\n") is not is_terminal
 
 
+# --- lists ------------------------------------------------------------------------------------
+
+
+def listed(monkeypatch, width):
+    file = io.StringIO()
+    monkeypatch.setattr(
+        terminal, "table_console", lambda **more: Console(file=file, width=width, **more)
+    )
+    print_lists()
+    return [line.rstrip() for line in file.getvalue().splitlines()]
+
+
+def test_every_agent_has_a_line_and_an_environment_those_that_are_tuned_or_fit(monkeypatch):
+    lists = listed(monkeypatch, 600)
+    first, *agents = lists[: len(ALGORITHMS) + 1]
+    width = max(len(name) + 2 for name in ("agent (--algo)", *ALGORITHMS))
+    assert first == f"{'agent (--algo)':{width}}what it is"
+    assert agents == [f"{name:{width}}{entry.summary}" for name, entry in ALGORITHMS.items()]
+    assert lists[len(ALGORITHMS) + 1] == ""
+    assert lists[len(ALGORITHMS) + 2].startswith("environment (--env)")
+    (place,) = (n for n, line in enumerate(lists) if line.startswith("Warehouse-v0 "))
+    tuned = lists[place].removeprefix("Warehouse-v0")
+    also, fitting = lists[place + 1].split(maxsplit=1)
+    assert also == "also:"
+    assert {"qlearning", "sarsa", "ppo"} <= set(tuned.split())
+    assert not set(tuned.split()) & set(fitting.split())
+    assert set(tuned.split()) | set(fitting.split()) <= set(ALGORITHMS)
+    assert lists[-2] == ""
+    assert lists[-1].startswith("Any other environment registered with Gymnasium works where")
+
+
 @pytest.mark.parametrize("width", [80, 100, 200])
 def test_the_lists_fit_the_terminal_and_keep_every_name(width, monkeypatch):
     lines, widest = listed(monkeypatch, width), listed(monkeypatch, 2000)
@@ -314,13 +290,249 @@ def test_the_lists_fit_the_terminal_and_keep_every_name(width, monkeypatch):
     assert sorted(" ".join(lines).split()) == sorted(" ".join(widest).split())
 
 
-@pytest.mark.parametrize(("columns", "width"), [(None, 80), ("132", 132)])
-def test_redirected_tables_have_80_columns(columns, width, monkeypatch, capsys):
-    if columns:
-        monkeypatch.setenv("COLUMNS", columns)
-    else:
-        monkeypatch.delenv("COLUMNS", raising=False)
-    print_lists()
-    lines = capsys.readouterr().out.splitlines()
-    # The last is a sentence, and on one line.
-    assert width - 15 < max(map(len, lines[:-1])) <= width
+# --- engines: how long a training will take, known to a factor of two ---------------------------
+
+
+COMPILED, LIBRARY = EnginePlan(is_compiled=True, world=(1, 2)), EnginePlan(is_compiled=False)
+BRIDGED = EnginePlan(is_compiled=True, in_python="Mine must be asked after each step")
+SHORT = EnginePlan(is_compiled=False, reason=TOO_SHORT)
+# 10,000 updates of 2 ms, as many calls of 0.3 ms, and steps of 0.05 ms; 10 rows each, compiled.
+WORK = Work("q", 10_000, 1, 10_000, 1000, 4, 0, 0)
+
+
+class Mine(BaseCallback):
+    def _on_step(self):
+        return True
+
+
+@pytest.fixture
+def pace(monkeypatch):
+    """A machine of the pace of that on which the constants were measured."""
+    monkeypatch.setattr(engine_setting, "machine_pace", lambda: 1.0)
+    monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: True)
+
+
+def test_times_that_are_roughly_known():
+    words = [about(seconds) for seconds in (0.4, 4.4, 119, 150, 7200)]
+    assert words == ["less than 1 s", "about 4 s", "about 119 s", "about 2 min", "about 2 h"]
+    found = [WORK.library_seconds, WORK.compiled_seconds, WORK.bridged_seconds]
+    assert found == pytest.approx([23.5, 1.515, 2.515])
+
+
+def outlook(chosen, auto=COMPILED, work=WORK):
+    return EngineOutlook(chosen, auto, work)
+
+
+def head(*plans, callbacks=(), **more):
+    return lambda: training_line(outlook(*plans, **more), None, CallbackList([*callbacks]))
+
+
+LOOP = "library (Stable-Baselines3's own loop)"
+AUTO = "--engine auto: the same networks and updates compiled"
+UNKNOWN = EnginePlan(is_compiled=True, in_python="no model")
+SEARCHED, RETESTED = outlook(COMPILED), outlook(LIBRARY)
+LINES = [
+    (head(LIBRARY), f"{LOOP}, about 24 s of processor time; {AUTO}, about 2 s"),
+    (head(COMPILED),
+     "compiled, about 2 s of processor time (Stable-Baselines3's own loop: about 24 s)"),
+    (head(SHORT, SHORT), f"{LOOP}, about 24 s of processor time: {TOO_SHORT}"),
+    (head(LIBRARY, SHORT), f"{LOOP}, about 24 s of processor time"),
+    (head(BRIDGED, BRIDGED, callbacks=[Mine()]),
+     ("compiled but for the environment, about 3 s of processor time: Mine must be asked after "
+      "each step (Stable-Baselines3's own loop: about 24 s); made a BlockCallback, it would be "
+      "asked only when it acts (docs/training.md#from-python), and training take about 2 s")),
+    (head(LIBRARY, UNKNOWN, work=None), f"{LOOP}; {AUTO} but for the environment (no model)"),
+    (lambda: study_line([(name, RETESTED, 10) for name in ("ppo", "dqn")] + [("x", SEARCHED, 4)]),
+     (f"ppo, dqn: {LOOP}, about 8 min of processor time in 20 runs; with --engine auto compiled, "
+      "about 30 s; x: compiled, about 6 s of processor time in 4 runs")),
+    (lambda: study_line([]), ""),
+    (lambda: search_line("ppo", SEARCHED, RETESTED),
+     (f"search: compiled, about 2 s of processor time a run; re-test: {LOOP}, about 24 s a run, "
+      "in which train runs ppo; --engine auto re-tests compiled, for who trains so")),
+    (lambda: search_line("ppo", SEARCHED, SEARCHED),
+     "search and re-test: compiled, about 2 s of processor time a run"),
+    (lambda: search_line("qlearning", None, None), ""),
+]  # fmt: skip
+
+
+def test_the_line_about_engines(pace, monkeypatch):
+    for line, expected in LINES:
+        assert line() == expected
+    # Compiling is told where it is still to be done.
+    monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: False)
+    start = "compiled, about 2 s of processor time and once about 9 s of compiling ("
+    assert head(COMPILED)().startswith(start)
+
+
+@pytest.mark.parametrize(
+    ("words", "chosen"),
+    [
+        ("ppo", "library"),
+        ("ppo --engine auto", "compiled"),
+        ("ppo --engine auto -n 1000", f"library: {TOO_SHORT}"),
+        ("double_dqn", "compiled"),
+        ("double_dqn --n-episodes 5", f"library: {TOO_SHORT}"),
+        ("dqn --engine auto -params mask_actions:true", "library: it masks actions"),
+        ("qlearning", None),
+    ],
+)
+def test_what_a_planned_run_will_train_on(words, chosen):
+    words = ["--env", "Warehouse-v0", "--algo", *words.split()]
+    found = planned_outlook(train_spec(build_parser().parse_args(words)))
+    assert (found and str(found.plan)) == chosen
+
+
+def test_a_run_says_and_records_what_it_trains_on(type_in_own_folder, own_folder):
+    (own_folder / "each_step.py").write_text(
+        "from stable_baselines3.common.callbacks import BaseCallback\n"
+        "class Mine(BaseCallback):\n    def _on_step(self):\n        return True\n"
+    )
+    lake = ["train.py", "--env", "FrozenLake-v1", "--seed", "0", "--eval-freq", "-1"]
+    words = ["--algo", "ppo", "-n", "64", "--engine", "auto", "-params", "n_steps:64", "n_envs:1"]
+    code, out, err = type_in_own_folder(*lake, *words, "batch_size:64")
+    assert (code, err) == (0, "")
+    (line,) = [line for line in out.splitlines() if line.startswith("engine  library (")]
+    assert line.endswith(TOO_SHORT)
+    record = json.loads((own_folder / "logs/ppo/FrozenLake-v1_1/run.json").read_text())
+    assert record["engine"] == f"library: {TOO_SHORT}"
+    assert record["spec"]["hyperparams"]["engine"] == "auto"
+    assert f"engine: library: {TOO_SHORT}" in card(record, [])
+    words = ["--algo", "qlearning", "-n", "100", "--gym-packages", "each_step"]
+    _, out, err = type_in_own_folder(*lake, *words, "-params", "callback:each_step.Mine")
+    assert err == ""
+    assert (
+        "engine  interpreted, about a hundred times slower or more: Mine must be asked after each "
+        "step; made a BlockCallback, it would be asked only when it acts "
+        "(docs/training.md#from-python)"
+    ) in out.splitlines()
+
+
+# --- how far a study is: in a terminal, and where the output goes elsewhere ----------------------
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands until it is told to go on."""
+    fake = SimpleNamespace(now=1000.0)
+    for place in (compare, tune, terminal, signs_of_life):
+        monkeypatch.setattr(place, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    still = SimpleNamespace(start=lambda: None, stop=lambda: None)
+    monkeypatch.setattr(terminal, "Heartbeat", lambda *_: still)  # nothing beats by itself
+    return fake
+
+
+def planned_runs(n_seeds=4, root=Path("nowhere"), places=("lake",)):
+    agents = (AgentSpec("[b]one[/b]", "qlearning"), AgentSpec("two", "sarsa"))
+    found = tuple(EnvironmentSpec(place, "FrozenLake-v1", {"n_timesteps": 10}) for place in places)
+    return plan(StudySpec("s", "S", agents, found, n_seeds=n_seeds), root)
+
+
+def progress_of(runs, done=(), **options):
+    file = io.StringIO()
+    console = TextConsole(file=file, width=100, **{"force_terminal": False, **options})
+    return file, StudyProgress(console, runs, done)
+
+
+def test_where_there_is_no_terminal_a_line_now_and_then(clock):
+    """After more than ten seconds, from the last line on; and at once for the last run."""
+    runs = planned_runs()
+    file, progress = progress_of(runs, runs[:2])
+    counts = zip(runs[2:], (5, 5, 0.5, 9.9, 70, 0), (0, 0, 1, 1, 2, 3), strict=True)
+    with progress:
+        for run, seconds, n_lines in counts:
+            clock.now += seconds
+            progress.note(run, None)
+            assert file.getvalue().count("\n") == n_lines
+    assert file.getvalue().splitlines() == [
+        "3 of 6 runs in 10 s, about 13 s left by the clock",
+        "5 of 6 runs in 1 min 30 s, about 7 s left by the clock",
+        "6 of 6 runs in 1 min 30 s",
+    ]
+
+
+def test_failures_are_told_at_once_and_of_a_cluster_how_many_workers_there_are(clock):
+    runs = planned_runs()
+    file, progress = progress_of(runs)
+    cluster = SimpleNamespace(words="3 workers", n_workers=3)
+
+    def interrupted():
+        with progress:
+            with progress.watching(lambda: nullcontext(cluster))() as launcher:
+                assert launcher is cluster
+                progress.note(runs[2], RunFailure(runs[2], "too [hot]", Path("log.txt")))
+                clock.now += 11
+                progress.look()
+            clock.now += 11
+            progress.look()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    last = "1 of 8 runs in 22 s, about 1 min 6 s left by the clock, 1 failed"
+    assert file.getvalue().splitlines() == [
+        "failed: [b]one[/b] on lake, seed 1: too [hot]",
+        "1 of 8 runs in 11 s, about 11 s left by the clock, 3 workers, 1 failed",
+        last,
+        f"{last}; the same command continues",
+    ]
+
+
+def test_so_does_the_line_of_a_search(clock):
+    console = TextConsole(file=io.StringIO(), width=100, force_terminal=False)
+    with TuningProgress(console, 10, dict, is_cost=False) as progress:
+        assert progress.figures() == "0 of 10 trials, 0 runs in 0 s"
+        cluster = SimpleNamespace(words="3 workers", n_workers=3)
+        with progress.watching(lambda: nullcontext(cluster))():
+            progress.run_ended()
+            progress.trial_ended(4, 0.5, "")
+            clock.now += 2
+            assert progress.figures() == (
+                "1 of 10 trials, 1 run in 2 s, 3 workers; best 0.5 (trial 4); "
+                "about 18 s left by the clock"
+            )
+
+
+def test_in_a_terminal_one_table_moves(clock):
+    def shown():
+        """Without the codes that move the cursor."""
+        return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", file.getvalue())
+
+    runs = planned_runs()
+    more = {"force_terminal": True, "force_interactive": True, "color_system": None}
+    file, progress = progress_of(runs, runs[:2], **more)
+    with progress:
+        assert re.search(r"agent +environment +runs +failed", shown())
+        # The table is there before the first run has ended, and names are taken to the letter.
+        assert re.search(r"\[b\]one\[/b\] +lake +1/4", shown())
+        assert "0 of 6 runs in 0 s" in shown()
+        clock.now += 7
+        progress.look()
+        assert "0 of 6 runs in 7 s" in shown()
+        clock.now += 53
+        progress.note(runs[2], None)
+        progress.note(runs[3], RunFailure(runs[3], "too [hot]", Path("log.txt")))
+    assert "failed: two on lake, seed 1: too [hot]" in shown()
+    last = shown()[shown().rindex("agent ") :]
+    assert re.search(r"\[b\]one\[/b\] +lake +2/4 .*[^1]\n", last)
+    assert re.search(r"two +lake +1/4 .* 1 *\n", last)
+    assert "2 of 6 runs in 1 min 0 s, about 2 min 0 s left by the clock" in last
+    with pytest.raises(ValueError, match="broken"), progress:  # that promises nothing
+        raise ValueError("broken")
+    assert "continues" not in shown()
+
+
+def test_a_study_says_once_for_each_environment_why_its_model_is_not_used(clock, tmp_path):
+    runs = planned_runs(2, tmp_path, ("mine", "yours", "known"))
+    reasons = {"mine": "P lies", "yours": "P is odd", "known": None}
+    for run in runs:
+        run.path.mkdir(parents=True)
+        record = {"model_refused": reasons[run.environment]}
+        run.run.info_path.write_text(json.dumps(record))
+    file, progress = progress_of(runs)
+    with progress:
+        for run in runs:
+            progress.note(run, None)
+    assert file.getvalue().splitlines()[:-1] == [
+        "mine: P lies; figures are sampled",
+        "yours: P is odd; figures are sampled",
+    ]

@@ -1,4 +1,4 @@
-"""``yardstick pack`` and ``yardstick inspect``."""
+"""``yardstick pack`` and ``yardstick inspect``, and ``enjoy.py`` with what they make."""
 
 import base64
 import json
@@ -21,9 +21,6 @@ from agents import load_algorithm
 from commands import compare, main
 from commands.compare import study_spec
 
-# --- ``yardstick pack`` as a user types it, and ``enjoy.py`` with what it makes -------------------
-
-
 pytestmark = pytest.mark.usefixtures("pictures")
 
 
@@ -34,45 +31,50 @@ def lake(type_command):
     return "logs/qlearning/FrozenLake-v1_1"
 
 
-@pytest.mark.parametrize("target", ["there", "there.zip", None])
-def test_a_run_is_packed_and_played(type_command, lake, tmp_path, target):
-    code, out, err = type_command("pack", lake, *filter(None, [target]))
-    named = target or "qlearning-FrozenLake-v1-3"
-    assert (code, err) == (0, "")
-    assert out.splitlines()[0] == f"pack  {named}"
-    assert out.splitlines()[1].endswith(f" {named}")
-    _, out, err = type_command("pack", named, "--check")
-    assert (out, err) == (f"{named}: 8 files, each as it was packed\n", "")
+def test_a_run_is_packed_and_played(type_command, lake, tmp_path):
+    for target in ("there", "there.zip", None):
+        code, out, err = type_command("pack", lake, *filter(None, [target]))
+        named = target or "qlearning-FrozenLake-v1-3"
+        assert (code, err) == (0, "")
+        first, second = out.splitlines()
+        assert first == f"pack  {named}"
+        assert second.endswith(f" {named}")
+        said = f"{named}: 8 files, each as it was packed\n"
+        assert type_command("pack", named, "--check") == (0, said, "")
     (tmp_path / "logs").rename(tmp_path / "elsewhere")
-    code, out, err = type_command("enjoy.py", named, "--render", "none", "--n-episodes", "2")
+    play = ("--render", "none", "--n-episodes", "2")
+    code, out, err = type_command("enjoy.py", "qlearning-FrozenLake-v1-3", *play)
     assert (code, err) == (0, "")
-    assert out.startswith("qlearning on FrozenLake-v1: ")
     assert "(exact)" in out
+    # A zip is found without its suffix, and a folder before it.
+    folder = tmp_path / "there"
+    for place in (folder / "FrozenLake-v1.zip", "there"):
+        found = type_command("enjoy.py", "there", *play)[1]
+        assert found.startswith(f"qlearning on FrozenLake-v1: {place}\n")
+        shutil.rmtree(folder, ignore_errors=True)
 
 
-def test_a_zip_is_found_without_its_suffix_and_a_folder_before_it(type_command, lake, tmp_path):
+def test_mistakes_end_in_one_line(type_command, lake, tmp_path, monkeypatch):
     type_command("pack", lake, "there.zip")
-    play = ("enjoy.py", "there", "--render", "none", "--n-episodes", "1")
-    assert type_command(*play)[1].startswith("qlearning on FrozenLake-v1: there\n")
-    type_command("pack", lake, "there")
-    folder = tmp_path / "there" / "FrozenLake-v1.zip"
-    assert type_command(*play)[1].startswith(f"qlearning on FrozenLake-v1: {folder}\n")
-
-
-def test_mistakes_end_in_one_line(type_command, lake, tmp_path):
+    (tmp_path / "empty.zip").write_bytes(b"PK\x05\x06" + bytes(18))
+    monkeypatch.setitem(sys.modules, "pygame", None)  # a package that drawing needs
     for words, complaint in [
-        (("nothing",), "nothing: there is no such run folder or pack"),
-        ((lake, "no/there"), "there is no folder no to write the pack in"),
-        ((lake, lake), "is there already: name another place for the pack"),
-        ((lake, "there", "--check"), "--check writes nothing: leave out there"),
-        (("logs",), "it is no run of ours"),
+        (("pack", "nothing"), "nothing: there is no such run folder or pack"),
+        (("pack", lake, "no/there"), "there is no folder no to write the pack in"),
+        (("pack", lake, lake), "is there already: name another place for the pack"),
+        (("pack", lake, "there", "--check"), "--check writes nothing: leave out there"),
+        (("pack", "logs"), "it is no run of ours"),
+        (("pack", "empty.zip", "--check"), "empty.zip"),
+        (("pack", "there.zip", "other"), "there.zip is a file: name the folder of a run\n"),
+        (
+            ("enjoy.py", "there.zip", "--record", "film.gif"),
+            "FrozenLake-v1: pygame is not installed",
+        ),
     ]:
-        code, out, err = type_command("pack", *words)
-        assert (code, out, err.count("\n")) == (2, "", 1)
+        code, out, err = type_command(*words)
+        assert (code, err.count("\n")) == (2, 1)
         assert complaint in err
-    (tmp_path / "there.zip").write_bytes(b"PK\x05\x06" + bytes(18))
-    code, _, err = type_command("pack", "there.zip", "--check")
-    assert (code, err.count("\n")) == (2, 1)
+        assert (out == "") == (words[0] == "pack")
 
 
 CORRIDOR = """
@@ -152,17 +154,6 @@ def test_a_study_with_a_module_of_ones_own_is_played_elsewhere(
     assert [agent.settings["n_timesteps"] for agent in study.agents] == [200, 200]
 
 
-def test_a_package_that_drawing_lacks_is_one_line(type_command, lake, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    type_command("pack", lake, "there.zip")
-    film = ("enjoy.py", "there.zip", "--record", "film.gif", "--n-episodes", "1")
-    code, _, err = type_command(*film)
-    assert (code, len(err.splitlines())) == (2, 1)
-    assert err.startswith("enjoy.py: error: FrozenLake-v1: pygame is not installed")
-    code, _, err = type_command("pack", "there.zip", "other")
-    assert (code, err) == (2, "pack: error: there.zip is a file: name the folder of a run\n")
-
-
 # --- yardstick inspect: what a zip holds and what is suspicious, by exit code too -----------------
 
 
@@ -185,7 +176,10 @@ class Payload:
         return os.mkdir, ("mark",)
 
 
-def test_genuine_zips(inspect, tmp_path):
+def test_genuine_zips_and_one_with_a_payload(inspect):
+    load_algorithm("qlearning")(env="FrozenLake-v1").save("table.zip")
+    code, out, _ = inspect("table.zip")
+    assert (code, "policy.q_tables" in out) == (0, True)
     PPO("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [4]}).save("ppo.zip")
     code, out, err = inspect("ppo.zip")
     assert (code, err) == (0, "")
@@ -193,13 +187,6 @@ def test_genuine_zips(inspect, tmp_path):
     assert "(2, 4)" in out
     assert "a pickle of stable_baselines3.common.policies.ActorCriticPolicy" in out
     assert out.endswith("nothing in it is suspicious\n")
-    load_algorithm("qlearning")(env="FrozenLake-v1").save("table.zip")
-    code, out, _ = inspect("table.zip")
-    assert (code, "policy.q_tables" in out) == (0, True)
-
-
-def test_a_zip_with_a_payload(inspect, tmp_path):
-    PPO("MlpPolicy", "CartPole-v1").save("ppo.zip")
     with zipfile.ZipFile("ppo.zip") as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     text = base64.b64encode(pickle.dumps(Payload())).decode()
@@ -216,7 +203,7 @@ def test_a_zip_with_a_payload(inspect, tmp_path):
     assert not Path("mark").exists()
 
 
-def test_what_is_no_model(inspect, tmp_path):
+def test_what_is_no_model(inspect):
     Path("text.zip").write_text("no zip")
     with zipfile.ZipFile("other.zip", "w") as archive:
         archive.writestr("readme.txt", "hello")

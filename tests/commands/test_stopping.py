@@ -1,19 +1,27 @@
-"""Signals at named moments of a training: what is left, and how the process ends."""
+"""What ends a command from outside: signals, kills, environments that exit, folders that go."""
 
+import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
-import train
 from agents import load_algorithm
+from pipeline.failures import ForeignExitError, exits_as_mistakes
 
-ROOT = Path(train.__file__).parent
+ROOT = Path(__file__).parents[2]
+
+
+# --- signals at named moments of a training: what is left, and how the process ends ---------------
+
 WORDS = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "600", "--seed", "0"]
 # At most two seconds on a machine that has nothing else to do.
 SECONDS = 10
@@ -43,7 +51,7 @@ def train_stopped(server, tmp_path):
         server.stdin.write(json.dumps(request) + "\n")
         server.stdin.flush()
         answer = json.loads(server.stdout.readline())
-        assert (tmp_path / "signalled").exists()
+        (tmp_path / "signalled").unlink()
         assert answer["seconds"] < SECONDS
         folder = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
         record = json.loads((folder / "run.json").read_text()) if folder.exists() else None
@@ -59,15 +67,19 @@ def holds(folder):
     return sorted(p.name for p in folder.iterdir() if p.suffix in (".zip", ".png", ".tmp"))
 
 
-BEGUN = ["compiling", "training", "evaluating", "saving", "judging", "drawing"]
 CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}
+MOMENTS = [
+    ("compiling", "SIGINT"),
+    *(("training", name) for name in CODES),
+    ("evaluating", "SIGINT"),
+    ("saving", "SIGINT"),
+    ("saving", "SIGHUP"),
+    ("judging", "SIGTERM"),
+    ("drawing", "SIGINT"),
+]
 
 
-@pytest.mark.parametrize(
-    ("moment", "name"),
-    [(moment, name) for moment in BEGUN for name in (CODES if moment == "training" else ["SIGINT"])]
-    + [("judging", "SIGTERM"), ("saving", "SIGHUP")],
-)
+@pytest.mark.parametrize(("moment", "name"), MOMENTS)
 def test_what_was_learnt_is_saved(train_stopped, moment, name):
     engine = "compiled" if moment == "compiling" else "interpreted"
     if moment == "compiling":  # before, so that it takes less than the patience for a signal
@@ -123,8 +135,237 @@ def test_a_third_ends_it_at_once_and_the_next_command_clears_up(train_stopped):
 def test_what_is_ignored_from_outside_stays_ignored(train_stopped):
     code, record, _ = train_stopped(ignored=["SIGHUP", "SIGINT"], training="SIGHUP SIGINT SIGHUP")
     assert (code, record["state"]) == (0, "finished")
-
-
-def test_sigterm_works_in_the_background(train_stopped):
+    # As in the background.
     code, record, _ = train_stopped(ignored=["SIGINT"], training="SIGINT SIGTERM")
-    assert (code, record["stopped_by"]) == (143, "SIGTERM")
+    assert code == 143
+
+
+# --- a sample of the campaigns of kills: nothing differs, and nothing is left -------------------
+
+has_compiler = sys.platform == "linux" and shutil.which("cc") is not None
+at_calls = pytest.mark.skipif(not has_compiler, reason="needs Linux and a C compiler")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--only", "qlearning on Warehouse-v0"],  # networks take several times as long
+        pytest.param(["--at-calls", "--only", "a pack"], marks=at_calls),
+    ],
+)
+def test_killed_commands_end_as_they_would_have(tmp_path, words):
+    script = ROOT / "benchmarks" / "fault_campaign.py"
+    words = ["--kills", "2", "--jobs", "2", *words]
+    result = subprocess.run(
+        [sys.executable, str(script), *words],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(ROOT), str(script.parent)]),
+            "TMPDIR": str(tmp_path),
+        },
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    *_, total, _ = result.stdout.splitlines()
+    cells = [cell.strip() for cell in total.split("│")[1:-1]]
+    assert cells[0] == "all"
+    assert int(cells[2]) >= 2  # signals that were sent
+    assert int(cells[7]) >= 1  # commands that came to their end
+    assert cells[8:] == ["0"] * 6
+
+
+# --- what an environment raises to end the program is its run's failure ------------------------
+
+LEAVING = """
+import gymnasium as gym
+
+import builtins
+
+
+class Leaving(gym.Env):
+    observation_space = gym.spaces.Discrete(4)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, where="step", kind="SystemExit", words=None, after=1, render_mode=None):
+        self.where, self.after, self.words, self.calls = where, after, words, 0
+        self.kind = getattr(builtins, kind)
+
+    def leave(self, where):
+        self.calls += where == self.where
+        if where == self.where and self.calls > self.after:
+            raise self.kind() if self.words is None else self.kind(self.words)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.leave("reset")
+        return 0, {}
+
+    def step(self, action):
+        self.leave("step")
+        return int(self.np_random.integers(4)), 1.0, bool(self.np_random.random() < 0.2), False, {}
+
+    def close(self):
+        self.leave("close")
+
+
+gym.register("Leaving-v0", Leaving, max_episode_steps=10)
+"""
+
+
+@pytest.fixture
+def train_leaving(type_in_own_folder, own_folder):
+    """Train on an environment that leaves; code, what is said, and the record if there is one."""
+    (own_folder / "leaving.py").write_text(LEAVING)
+
+    def train(*kwargs, algo="qlearning"):
+        code, _, said = type_in_own_folder(
+            *("train.py", "--env", "Leaving-v0", "--algo", algo, "-n", "300", "--verbose", "0"),
+            *("--gym-packages", "leaving.py", "--eval-freq", "100", "--env-kwargs", *kwargs),
+        )
+        record = own_folder / "logs" / algo / "Leaving-v0_1" / "run.json"
+        return code, said, json.loads(record.read_text()) if record.exists() else None
+
+    yield train
+    gym.registry.pop("Leaving-v0", None)
+
+
+AT_RESET, AT_STEP = "where:'reset' after:20", "where:'step' after:0"
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "moment"),
+    [
+        ("SystemExit", "", AT_RESET),
+        ("SystemExit", "0", AT_STEP),
+        ("SystemExit", "'text'", AT_RESET),
+        ("KeyboardInterrupt", "", AT_RESET),
+        ("KeyboardInterrupt", "", AT_STEP),
+    ],
+)
+def test_a_run_has_failed_and_says_where(train_leaving, kind, words, moment):
+    more = [f"words:{words}"] if words else []
+    code, said, record = train_leaving(*moment.split(), f"kind:'{kind}'", *more)
+    text = words.strip("'")
+    assert (code, said.count("\n")) == (2, 1)
+    assert f"leaving.py:18: {kind}{text and f': {text}'}, which ends no command" in said
+    assert record["state"] == "failed"
+    assert f"{kind}{text and f': {text}'}" in record["reason"]
+
+
+@pytest.mark.parametrize(("where", "algo"), [("close", "random"), ("reset", "qlearning")])
+def test_so_has_one_whose_environment_leaves_before_it_begins_or_when_it_is_closed(
+    train_leaving, where, algo
+):
+    code, said, record = train_leaving(f"where:'{where}'", "after:0", "words:0", algo=algo)
+    assert (code, said.count("\n")) == (2, 1)
+    assert record is None or record["state"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("handler", "error", "raised"),
+    [
+        (signal.default_int_handler, KeyboardInterrupt, KeyboardInterrupt),
+        (signal.SIG_IGN, KeyboardInterrupt, ForeignExitError),
+        (signal.default_int_handler, SystemExit, ForeignExitError),
+    ],
+)
+def test_what_may_be_ctrl_c_stays_what_it_is(handler, error, raised):
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        with pytest.raises(raised), exits_as_mistakes():
+            raise error
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# --- somebody removes the folder that a command works on ------------------------------------------
+
+REMOVING = """
+import pathlib
+import shutil
+
+import gymnasium as gym
+
+
+class Removing(gym.Env):
+    observation_space = gym.spaces.Discrete(4)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, folder, by="removing", render_mode=None):
+        self.folder, self.by, self.steps = pathlib.Path(folder), by, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 500 and self.folder.exists():
+            self.folder.rename(f"{self.folder}-elsewhere")
+            if self.by == "removing":
+                shutil.rmtree(f"{self.folder}-elsewhere")
+        return int(self.np_random.integers(4)), 1.0, bool(self.np_random.random() < 0.2), False, {}
+
+
+gym.register("Removing-v0", Removing, max_episode_steps=10)
+"""
+STUDY = """
+environments:
+  one: {{id: Removing-v0, n_timesteps: 100000000, env_kwargs: {{folder: {folder}, by: {by}}}}}
+agents:
+  one: {{algo: ppo}}
+seeds: 3
+"""
+TRAINING = ["train.py", "--algo", "ppo", "-n", "100000000", "-f", "logs"]
+TUNE = ["tune.py", "--algo", "ppo", "-n", "100000000", "--trials", "2", "-j", "2", "-f", "logs"]
+COMPARE = ["compare.py", "study.yml", "--no-report", "-j", "2", "-f", "logs"]
+COMMANDS = {
+    "a run": (TRAINING, "logs/ppo/Removing-v0_1", "removing"),
+    "a search": (TUNE, "logs/Removing-v0_ppo", "removing"),
+    "all studies": (COMPARE, "logs", "renaming"),
+}
+GONE = "this folder is gone: somebody has removed or renamed it"
+
+
+def words_for(own_folder, words, folder, by):
+    """The words of a command, in which an environment removes a folder."""
+    there = own_folder / folder
+    (own_folder / "removing.py").write_text(REMOVING)
+    (own_folder / "study.yml").write_text(STUDY.format(folder=there, by=by))
+    settings = ["--env", "Removing-v0", "--env-kwargs", f"folder:'{there}'", f"by:'{by}'"]
+    return [*words, "--gym-packages", "removing", *([] if "study.yml" in words else settings)]
+
+
+@pytest.mark.parametrize("what", COMMANDS)
+def test_a_folder_that_is_gone_ends_the_command(type_in_own_folder, own_folder, what):
+    words, folder, by = COMMANDS[what]
+    code, out, err = type_in_own_folder(*words_for(own_folder, words, folder, by))
+    assert (code, err.count("\n")) == (2, 1), err
+    assert err.startswith(f"{words[0]}: error: logs/")
+    assert err.endswith(f": {GONE}\n")
+    assert "another" not in out
+    assert not (own_folder / folder).exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_no_process_is_left_of_a_study_whose_folder_is_gone(own_folder):
+    words = words_for(own_folder, COMPARE, "logs/study", "removing")
+    command = [sys.executable, ROOT / words[0], *words[1:]]
+    done = subprocess.run(command, check=False, timeout=120, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, f"compare.py: error: logs/study: {GONE}\n")
+    deadline = time.monotonic() + 20
+    while (left := processes_in(own_folder)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not left
+    assert not (own_folder / "logs" / "study").exists()
+
+
+def processes_in(folder):
+    """The other processes whose working folder it is."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            found += [int(process.name)] if (process / "cwd").samefile(folder) else []
+    return set(found) - {os.getpid()}

@@ -1,24 +1,30 @@
-"""What a machine refuses to a command: readers, room for its output, memory."""
+"""What terminals, pipes and machines do not take of a command: signs, orders, output, memory."""
 
 import errno
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
+import zipfile
 from pathlib import Path
 
 import pytest
+from rich.table import Table
+from rich.text import Text
 
-import enjoy
-import train
-from commands.cli import Output, go_on_unread, run_command, standard_streams
-from commands.terminal import TextConsole
-from pipeline.errors import UserError
+from commands import compare, enjoy, terminal, train
+from commands.cli import go_on_unread, run_command
+from commands.terminal import TextConsole, print_rows, table_console
+from pipeline.errors import UserError, visible
 from pipeline.signs_of_life import Heartbeat
 
-ROOT = Path(train.__file__).parent
+ROOT = Path(__file__).parents[2]
+
+
+# --- readers that leave, and devices that are full --------------------------------------------
 
 
 class Refusing(io.StringIO):
@@ -71,29 +77,24 @@ def run(monkeypatch):
 
 FULL = os.strerror(errno.ENOSPC)
 LOST = f"train.py: what it prints is lost: {FULL}\n"
-ENDS = [  # lines printed, whether work goes on unread, the error; exit code, what is said
-    (2, False, errno.EPIPE, 1, ""),  # all of it is read
-    (9, False, errno.EPIPE, 0, ""),  # the output is the work, which ends with its reader
-    (9, True, errno.EPIPE, 1, ""),  # the exit code is that of the work
-    (9, False, errno.ENOSPC, 2, f"train.py: error: {FULL}\n"),
-    (9, True, errno.ENOSPC, 1, LOST),
+ENDS = [  # lines printed, whether work goes on unread, its code, the error; exit code, what is said
+    (2, False, 1, errno.EPIPE, 1, ""),  # all of it is read
+    (9, False, 1, errno.EPIPE, 0, ""),  # the output is the work, which ends with its reader
+    (9, True, 1, errno.EPIPE, 1, ""),  # the exit code is that of the work
+    (9, True, 0, errno.EPIPE, 0, ""),
+    (9, False, 1, errno.ENOSPC, 2, f"train.py: error: {FULL}\n"),
+    (9, True, 1, errno.ENOSPC, 1, LOST),
+    (9, True, 0, errno.ENOSPC, 2, LOST),
 ]
 
 
-@pytest.mark.parametrize(("n_lines", "goes_on", "number", "code", "said"), ENDS)
-def test_how_a_command_ends_whose_output_is_not_taken(run, n_lines, goes_on, number, code, said):
-    main, work = printing(n_lines, ends=1, goes_on=goes_on)
+@pytest.mark.parametrize(("n_lines", "goes_on", "ends", "number", "code", "said"), ENDS)
+def test_how_a_command_ends_whose_output_is_not_taken(
+    run, n_lines, goes_on, ends, number, code, said
+):
+    main, work = printing(n_lines, ends=ends, goes_on=goes_on)
     assert run(main, number) == (code, "0\n1\n", said)
     assert work == ["done"] * (goes_on or n_lines == 2)
-
-
-@pytest.mark.parametrize(
-    ("number", "code", "said"), [(errno.EPIPE, 0, ""), (errno.ENOSPC, 2, LOST)]
-)
-def test_work_that_succeeds_unread_is_lost_only_where_it_cannot_be_written(run, number, code, said):
-    main, work = printing(9, goes_on=True)
-    assert run(main, number) == (code, "0\n1\n", said)
-    assert work == ["done"]
 
 
 def test_a_thread_that_says_how_far_it_is_ends_without_a_word(run):
@@ -128,30 +129,59 @@ def test_a_mistake_is_told_where_nobody_hears_it(monkeypatch):
     assert stop.value.code == 2
 
 
-def test_without_a_command_nothing_is_told_to_go_on():
-    before = sys.stdout
-    go_on_unread()
-    assert sys.stdout is before
-    assert not isinstance(before, Output)
+LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 
 
-def test_a_stream_in_place_of_another_is_that_stream_otherwise():
-    stream = io.StringIO("text")
-    output = Output(stream, goes_on=True)
-    assert output.read() == "text"
-    assert output.write("more") == 4
-    assert output.isatty() is False
+def test_where_the_work_is_what_counts_it_goes_on_unread(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def left(main, *words):
+        return run(main, errno.EPIPE, 1, ["x.py", *map(str, words)])
+
+    line = "qlearning on FrozenLake-v1, seed 0, 500 steps\n"
+    assert left(train.main, *LAKE, "--seed", "0", "-n", "500") == (0, line, "")
+    folder = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    assert json.loads((folder / "run.json").read_text())["state"] == "finished"
+    words = ["--algos", "qlearning", *LAKE[2:], "--seeds", 1, "-n", 500, "--name", "s"]
+    assert left(compare.main, *words, "--no-report")[::2] == (0, "")
+    assert (tmp_path / "logs" / "studies" / "s" / "summary.csv").read_text().count("\n") == 2
+    # To play is for who watches, unless a film is wanted.
+    for_ever = ["--n-episodes", 10**9, "--render", "none"]
+    assert left(enjoy.main, folder, *for_ever)[::2] == (0, "")
+    film = ["--n-episodes", "1", "--record", "film.gif", "--reward-log", "returns"]
+    assert left(enjoy.main, folder, *film)[::2] == (0, "")
+    assert (tmp_path / "film.gif").stat().st_size > 0
 
 
-def test_streams_that_were_closed_are_opened_on_nothing(monkeypatch):
-    monkeypatch.setattr(sys, "stdout", None)
-    with standard_streams() as output:
-        assert output.name == os.devnull
-        print("to nobody")  # noqa: T201  # as a library might
-        output.close()
+@pytest.mark.parametrize("words", ["--help", "--list"])
+@pytest.mark.parametrize("is_full", [False, True])
+def test_what_only_prints_says_so_on_a_full_device_and_not_to_a_reader_who_left(words, is_full):
+    command = [sys.executable, str(ROOT / "train.py"), words]
+    if is_full:
+        with open("/dev/full", "w") as full:  # noqa: PTH123  # it is no path
+            done = subprocess.run(
+                command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            )
+        assert done.stderr == "train.py: error: No space left on device\n"
+        assert done.returncode == 2
+        return
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes) as process:
+        process.stdout.close()
+        assert (process.stderr.read(), process.wait(60)) == (b"", 0)
 
 
-# --- a machine that has no more memory, threads or processes -----------------------------------
+@pytest.mark.parametrize("closed", ["<&- >&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_command_does_without_the_streams_that_are_closed(tmp_path, closed):
+    command = f'exec "{sys.executable}" "{ROOT / "train.py"}" --help {closed}'
+    result = subprocess.run(
+        ["/bin/sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    assert ("--algo" in result.stdout) is (">&- " not in f"{closed} ".replace("2>&-", ""))
+
+
+# --- a machine that has no more memory, threads or processes ----------------------------------
 
 
 @pytest.mark.parametrize(
@@ -189,50 +219,166 @@ def test_what_runs_out_is_named_and_a_bug_is_not_hidden(error, line, capsys):
     assert said.count("\n") == 1
 
 
-# --- real processes ------------------------------------------------------------------------------
+# --- terminals whose encoding has few signs ----------------------------------------------------
 
 
-def test_a_training_goes_on_after_its_reader_has_gone_and_playing_ends(
-    tmp_path, left_by_its_reader, monkeypatch, run
-):
-    words = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
-    line = "qlearning on FrozenLake-v1, seed 0, 500 steps\n"
-    assert left_by_its_reader(tmp_path, "train.py", *words) == (line, "", 0)
-    folder = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
-    assert json.loads((folder / "run.json").read_text())["state"] == "finished"
-    model = folder / "FrozenLake-v1.zip"
-    for_ever = ["--n-episodes", 10**9, "--render", "none"]
-    line, err, code = left_by_its_reader(tmp_path, "enjoy.py", model, *for_ever)
-    assert line.startswith("qlearning on FrozenLake-v1")
-    assert (err, code) == ("", 0)
-    # Where a film is wanted, that is what the work is for.
+ANGLE = ["--algo", "angle", "--env", "CartPole-v1"]
+STUDY = (
+    "title: Größer als ∞?\nseeds: 2\nn_episodes: 30\n"
+    "agents: {Ärger 日本: {algo: qlearning}, sarsa: {sweep: {gamma: [0.5]}}}\n"
+    "environments: {'Eis, glatt': {id: FrozenLake-v1}}\n"
+)
+
+
+def test_what_is_printed_where_signs_are_lacking(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    film = ["--n-episodes", "1", "--record", "film.gif", "--reward-log", "returns"]
-    argv = ["enjoy.py", str(model), *film]
-    assert run(enjoy.main, errno.EPIPE, n_texts=1, argv=argv)[::2] == (0, "")
-    assert (tmp_path / "film.gif").stat().st_size > 0
+    Path("länge.yml").write_text(STUDY, encoding="utf-8")
+
+    def printed(module, *words):
+        stream = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+        monkeypatch.setattr(sys, "stdout", stream)
+        monkeypatch.setattr(sys, "argv", [module.__name__, *words])
+        with pytest.raises(SystemExit) as stop:
+            run_command(module.main)
+        assert stop.value.code == 0
+        stream.flush()
+        return stream.buffer.getvalue().decode("cp1252")
+
+    assert re.search(r"over \d+ episodes", printed(train, *ANGLE, "--seed", "0", "-n", "300"))
+    assert " ± " in printed(enjoy, *ANGLE, "--render", "none", "--n-episodes", "2")
+    out = printed(compare, "länge.yml", "--no-report", "-f", "studies")
+    assert "Größer als inf?" in out
+    assert "gamma = 0.5" in out
+    assert Path("studies", "länge", "runs", "Ärger_日本", "Eis,_glatt_2").is_dir()
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device to write to")
-@pytest.mark.parametrize("words", ["--help", "--list"])
-def test_what_only_prints_says_so_on_a_full_device(words):
-    with open("/dev/full", "w") as full:  # noqa: PTH123  # it is no path
-        result = subprocess.run(
-            [sys.executable, str(ROOT / "train.py"), words],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
-    assert result.stderr == "train.py: error: No space left on device\n"
-    assert result.returncode == 2
-
-
-@pytest.mark.parametrize("closed", ["<&- >&-", "2>&-", "<&- >&- 2>&-"])
-def test_a_command_does_without_the_streams_that_are_closed(tmp_path, closed):
-    command = f'exec "{sys.executable}" "{ROOT / "train.py"}" --help {closed}'
-    result = subprocess.run(
-        ["/bin/sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False
+def test_a_machine_that_knows_ascii_alone(tmp_path):
+    """Files too are then opened as ASCII where nothing else is said; with figures and page."""
+    labels = STUDY.replace("Ärger 日本", "anger")  # folders
+    (tmp_path / "s.yml").write_text(labels, encoding="utf-8")
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "compare.py"), "s.yml", "-f", "studies"],
+        cwd=tmp_path,
+        env={**os.environ, **plain, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        check=False,
     )
-    assert (result.returncode, result.stderr) == (0, "")
-    assert ("--algo" in result.stdout) is (">&- " not in f"{closed} ".replace("2>&-", ""))
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"Gr??er als inf?" in done.stdout
+    page = (tmp_path / "studies" / "s" / "report.html").read_text(encoding="utf-8")
+    assert "Größer als ∞?" in page
+
+
+# --- what a terminal would obey is shown, wherever a text of a file or a name is printed ---------
+
+
+TITLE, CLEAR = "\x1b]0;x\x07", "\x1b[2J"
+HOSTILE = TITLE + CLEAR
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\u061cb\udce9", r"\u061cb\udce9"),
+        (HOSTILE, r"\x1b]0;x\x07\x1b[2J"),
+        ("\x9b2J", r"\x9b2J"),
+        ("a\u202eb\u2066", r"a\u202eb\u2066"),
+        ("ä 漢字 😀\ttab\nline", "ä 漢字 😀\ttab\nline"),
+    ],
+)
+def test_control_characters_are_spelt_out(text, shown):
+    assert visible(text) == shown
+    assert str(UserError(text)) == " ".join(shown.splitlines())
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_the_console_obeys_its_own_colours_alone(is_terminal):
+    file = io.StringIO()
+    console = TextConsole(file=file, width=200, force_terminal=is_terminal, _environ={})
+    table = Table(HOSTILE, title=HOSTILE)
+    table.add_row(HOSTILE)
+    console.print(HOSTILE, style="red")
+    console.print(CLEAR)
+    console.print(table)
+    console.print(Text(HOSTILE))
+    printed = file.getvalue()
+    assert CLEAR not in printed
+    assert "\x1b]0;" not in printed
+    assert "\x07" not in printed
+    assert re.sub("\x1b.*?m", "", printed).count(r"\x1b[2J") == 6
+    assert ("\x1b[31m" in printed) is is_terminal
+
+
+@pytest.mark.parametrize("text", ["[/]", "[link=https://a.b]c[/link]", "[red]d[/red]", ":bomb:"])
+def test_no_text_is_markup(text, capsys):
+    for console in (TextConsole(force_terminal=True, width=80, _environ={}), table_console()):
+        table = Table(text, title=text, caption=text)
+        table.add_row(text)
+        console.print(text)
+        console.print(table)
+        print_rows(console, table)
+        out = capsys.readouterr().out
+        assert re.sub("\x1b[^a-z]*m", "", out).count(text) == 9
+        assert "\x1b]8" not in out
+
+
+def test_no_command_prints_by_another_console():
+    for path in Path(terminal.__file__).parent.glob("*.py"):
+        assert not re.search(r"(?<!Text)\bConsole\(", path.read_text().replace("(Console)", ""))
+
+
+TEXT = json.dumps(HOSTILE)  # which YAML reads as JSON does
+LAST = "environments: [FrozenLake-v1]\n"
+STUDIES = [
+    f"agents: {{{TEXT}: }}\n{LAST}",
+    f"agents: {{{TEXT}: {{algo: sarsa}}}}\n{LAST}",
+    f"agents: [sarsa]\nenvironments: {{{TEXT}: {{id: FrozenLake-v1}}}}\n",
+    f"title: {TEXT}\nagents: [sarsa]\n{LAST}",
+    f"description: {TEXT}\nagents: [sarsa]\n{LAST}",
+    f"agents: [qlearning]\nenvironments: [{TEXT}]\n",
+    f"{TEXT}: 1\n",
+    f"metric: {TEXT}\n",
+    f"agents: {{qlearning: {{callback: {TEXT}}}}}\n{LAST}",
+]
+NAMED = [
+    (enjoy, f"{HOSTILE}.zip"),
+    (enjoy, f"{HOSTILE}.yml"),
+    (compare, f"{HOSTILE}.zip"),
+    (compare, f"{HOSTILE}.yml"),
+    (compare, "--logged", "log.csv", "--policy", "uniform"),
+    (train, *LAKE, "--conf-file", HOSTILE),
+    (train, *LAKE, "--gym-packages", HOSTILE),
+    (train, *LAKE, "-params", f"{HOSTILE}:1"),
+    (train, *LAKE, HOSTILE),
+    (train, "--env", f"{HOSTILE}:X-v0", "--algo", "qlearning"),
+]
+
+
+def test_what_a_strangers_texts_are_refused_with(monkeypatch, capsys, tmp_path):
+    def complaint(module, *words):
+        monkeypatch.setattr("sys.argv", ["program", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            run_command(module.main)
+        out, err = capsys.readouterr()
+        assert stop.value.code == 2
+        assert not {"\x1b", "\x07"} & set(out + err)
+        assert len(err.splitlines()) == 1
+        return err
+
+    monkeypatch.chdir(tmp_path)
+    for lines in STUDIES:
+        for escape, told in (("\\u001b", r"\x1b"), ("\\ud83d", r"\ud83d")):
+            Path("s.yml").write_text(lines.replace("\\u001b", escape))
+            assert told in complaint(compare, "s.yml")
+    for name in (f"{HOSTILE}.zip", f"{HOSTILE}.yml"):
+        Path(name).write_text("junk")
+    Path("log.csv").write_text(f"arm,{HOSTILE}\n0,1\n")
+    for case in NAMED:
+        assert r"\x1b" in complaint(*case)
+    with zipfile.ZipFile("x.zip", "w") as archive:
+        archive.writestr("data", "{}")
+    for key in ("algo", "env_id"):
+        spec = {"algo": "qlearning", "env_id": "FrozenLake-v1", key: HOSTILE, "hyperparams": {}}
+        Path("run.json").write_text(json.dumps({"state": "finished", "spec": spec}))
+        complaint(enjoy, "x.zip")
