@@ -141,20 +141,20 @@ def test_a_run_that_fails_leaves_the_page_of_what_it_came_to(type_command, tmp_p
 
 
 def test_a_training_that_is_stopped_is_shown_as_far_as_it_came(type_command, tmp_path, monkeypatch):
-    begun, at = TableRecorder._on_rollout_start, []
+    begun = TableRecorder._on_rollout_start
 
     def stop_later(recorder):
         begun(recorder)
-        if recorder.model.num_timesteps >= 64 and not at:
-            at.append(recorder.model.num_timesteps)
+        if recorder.model.num_timesteps == 64:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(TableRecorder, "_on_rollout_start", stop_later)
-    code, out, _ = type_command(*WATCHED)
+    # Compiled code would not ask after each step.
+    code, out, _ = type_command(*WATCHED, "-params", "engine:interpreted")
     assert (code, out.splitlines()[-1]) == (130, "learning page.html")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     (number,) = re.findall(r"seed 0 · (\d+) steps", text)
-    assert int(number) - at[0] in (0, 1)
+    assert int(number) in {64, 65}
 
 
 def test_a_page_that_finds_no_room_afterwards_ends_in_one_line(type_command, tmp_path, monkeypatch):
