@@ -1,18 +1,19 @@
-import os
-import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+import compare
 import enjoy
 import train
-from commands import share
+from commands import main, share
 from commands.cli import run_command
 from pipeline.signs_of_life import Silence
 
-ROOT = Path(train.__file__).parent
-COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main, "pack": share.pack}
+MAINS = {"train.py": train.main, "enjoy.py": enjoy.main, "compare.py": compare.main}
+COMMANDS = {name: partial(run_command, main) for name, main in MAINS.items()}
+COMMANDS |= {"pack": partial(run_command, share.pack), "yardstick": main}
 
 
 @pytest.fixture(autouse=True)
@@ -41,29 +42,8 @@ def type_command(monkeypatch, capsys, tmp_path):
     def run(*words):
         monkeypatch.setattr(sys, "argv", [str(word) for word in words])
         with pytest.raises(SystemExit) as stop:
-            run_command(COMMANDS[words[0]])
+            COMMANDS[Path(words[0]).name]()
         captured = capsys.readouterr()
         return stop.value.code, captured.out, captured.err
 
     return run
-
-
-@pytest.fixture
-def left_by_its_reader():
-    """Start a command and read its first line alone; the line, all errors and the exit code."""
-
-    def start(folder, program, *words):
-        process = subprocess.Popen(
-            [sys.executable, str(ROOT / program), *map(str, words)],
-            cwd=folder,
-            text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        with process, process.stdout as out, process.stderr as err:
-            line = out.readline()
-            out.close()
-            return line, err.read(), process.wait(timeout=120)
-
-    return start

@@ -2,7 +2,7 @@
 
 import json
 import re
-import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,7 +12,6 @@ import pytest
 import compare
 import envs  # noqa: F401
 from agents import load_algorithm
-from commands.cli import run_command
 from envs.bandits import log_uniformly, read_log
 from experiments.off_policy.estimators import difference_in_value
 from experiments.off_policy.logged_policies import compare_policies, read_policy
@@ -54,24 +53,14 @@ def train(folder, algo, run, **kwargs):
 
 
 @pytest.fixture
-def type_command(folder, monkeypatch, capsys):
+def judge(folder, type_command, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("COLUMNS", "120")  # room for the paths of runs
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["compare.py", *words])
-        with pytest.raises(SystemExit) as stop:
-            run_command(compare.main)
-        captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
-
-    return run
+    return partial(type_command, "compare.py")
 
 
-def test_a_table_with_alternatives_and_a_verdict(type_command):
-    code, out, err = type_command(
-        "--logged", "second.csv", "--policy", RUN, f"{RUN}/ReplayBandit-v0.zip"
-    )
+def test_a_table_with_alternatives_and_a_verdict(judge):
+    code, out, err = judge("--logged", "second.csv", "--policy", RUN, f"{RUN}/ReplayBandit-v0.zip")
     assert (code, err) == (0, "")
     assert "second.csv: 1,500 pulls, 3 arms" in out
     rows = [line.split("│")[1:-1] for line in out.splitlines() if line.startswith("│")]
@@ -83,9 +72,9 @@ def test_a_table_with_alternatives_and_a_verdict(type_command):
     assert f"{RUN} and {RUN}/ReplayBandit-v0.zip do the same on this log" in out
 
 
-def test_agents_of_the_library_and_blind_ones_are_judged_too(type_command):
+def test_agents_of_the_library_and_blind_ones_are_judged_too(judge):
     runs = ["logs/ppo/ReplayBandit-v0_1", "logs/thompson/ReplayBandit-v0_1"]
-    code, out, err = type_command("--logged", "first.csv", "--policy", *runs)
+    code, out, err = judge("--logged", "first.csv", "--policy", *runs)
     assert (code, err) == (0, "")
     for run in runs:
         assert f"{run} was trained on this log: its figures flatter it" in out
@@ -105,9 +94,9 @@ def test_agents_of_the_library_and_blind_ones_are_judged_too(type_command):
         (f"--logged zero.csv --policy {RUN}", "line 2: propensity is '0', it must be a prob"),
     ],
 )
-def test_mistakes_are_one_line(type_command, words, message):
+def test_mistakes_are_one_line(judge, words, message):
     words = words.split()
-    code, out, err = type_command(*words)
+    code, out, err = judge(*words)
     # What the files hold is looked at after the first line.
     about = f"{len(words) - 3} {'policy' if len(words) == 4 else 'policies'} on {words[1]}\n"
     is_known_beforehand = "together" in message or "not both" in message
@@ -116,16 +105,14 @@ def test_mistakes_are_one_line(type_command, words, message):
     assert message in err
 
 
-def test_a_library_zip_from_elsewhere_is_judged(type_command, folder, tmp_path):
+def test_a_library_zip_from_elsewhere_is_judged(judge, folder, tmp_path):
     run = tmp_path / "elsewhere"
     run.mkdir()
     for name in ("run.json", "ReplayBandit-v0.zip"):
         (run / name).write_bytes((folder / "logs/ppo/ReplayBandit-v0_1" / name).read_bytes())
-    assert type_command("--logged", "second.csv", "--policy", str(run))[0] == 0
+    assert judge("--logged", "second.csv", "--policy", str(run))[0] == 0
     (run / "run.json").unlink()
-    code, _, err = type_command(
-        "--logged", "second.csv", "--policy", str(run / "ReplayBandit-v0.zip")
-    )
+    code, _, err = judge("--logged", "second.csv", "--policy", str(run / "ReplayBandit-v0.zip"))
     assert code == 2
     assert "is in no run folder: its agent is not known" in err
 

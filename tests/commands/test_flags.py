@@ -36,6 +36,7 @@ from pipeline.environments import training_changes
 from pipeline.errors import OTHER_NAMES, UserError, did_you_mean
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
+from pipeline.unfinished_runs import SaveInterval
 from tests.peers.peer_environment import peer_folder
 from tuning.retesting import Candidate, retest_study
 from tuning.suggesting import planned_run
@@ -181,7 +182,10 @@ def test_an_odd_value_has_a_meaning_or_is_refused_in_one_line(module, flag, caps
         assert refusal.count("\n") == bool(refusal)
 
 
+SAVED = {"30s": {"seconds": 30.0}, "5m": {"seconds": 300.0}, "5e3": {"steps": 5000}}
+SAVED = {text: SaveInterval(**fields) for text, fields in SAVED.items()}
 MEANINGS = [
+    (TRAIN, "--save-state-every", SAVED, "0s -1m 0 1.5 soon s"),
     (TRAIN, "-n", {"1e5": 100_000, "100_000": 100_000, "-1": -1}, "0 -5 1.5 nan inf text 1e13"),
     (TRAIN, "--n-episodes", {"1e3": 1000, "-1": -1}, "0 -2"),
     (TRAIN, "--seed", {"-1": -1, "0": 0, "4294967295": 2**32 - 1}, "-7 4294967296 1.5"),

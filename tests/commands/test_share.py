@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -18,7 +19,7 @@ from stable_baselines3 import PPO
 
 import train
 from agents import load_algorithm
-from commands import compare, main
+from commands import compare
 from commands.compare import study_spec
 
 pytestmark = pytest.mark.usefixtures("pictures")
@@ -157,26 +158,13 @@ def test_a_study_with_a_module_of_ones_own_is_played_elsewhere(
 # --- yardstick inspect: what a zip holds and what is suspicious, by exit code too -----------------
 
 
-@pytest.fixture
-def inspect(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["yardstick", "inspect", *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
-
-    return run
-
-
 class Payload:
     def __reduce__(self):
         return os.mkdir, ("mark",)
 
 
-def test_genuine_zips_and_one_with_a_payload(inspect):
+def test_genuine_zips_and_one_with_a_payload(type_command):
+    inspect = partial(type_command, "yardstick", "inspect")
     load_algorithm("qlearning")(env="FrozenLake-v1").save("table.zip")
     code, out, _ = inspect("table.zip")
     assert (code, "policy.q_tables" in out) == (0, True)
@@ -203,13 +191,13 @@ def test_genuine_zips_and_one_with_a_payload(inspect):
     assert not Path("mark").exists()
 
 
-def test_what_is_no_model(inspect):
+def test_what_is_no_model(type_command):
     Path("text.zip").write_text("no zip")
     with zipfile.ZipFile("other.zip", "w") as archive:
         archive.writestr("readme.txt", "hello")
     os.mkfifo("pipe")
     for name in ("text.zip", "other.zip", "pipe", "nowhere.zip", "."):
-        code, out, err = inspect(name)
+        code, out, err = type_command("yardstick", "inspect", name)
         assert (code, out, err.count("\n")) == (2, "", 1)
 
 

@@ -302,13 +302,13 @@ def test_paths_of_a_worker_apart_stay_within_its_folder(root, inside):
 
 
 def test_the_four_forms(tmp_path):
+    file, jobs = tmp_path / "scheduler.json", tmp_path / "slurm.yml"
+    file.write_text(json.dumps({"address": "tls://10.0.0.1:8786"}))
+    jobs.write_text("jobqueue:\n  slurm: {cores: 4, memory: 8GB, walltime: '01:00:00'}\n")
     assert read_cluster("local:8") == LocalWorkers(8)
     assert read_cluster("tls://node:8786") == SchedulerAddress("tls://node:8786")
     assert read_cluster("127.0.0.1:8786").read() == "tcp://127.0.0.1:8786"
-    file, jobs = tmp_path / "scheduler.json", tmp_path / "slurm.yml"
-    file.write_text(json.dumps({"address": "tls://10.0.0.1:8786"}))
     assert read_cluster(str(file)).read() == "tls://10.0.0.1:8786"
-    jobs.write_text("jobqueue:\n  slurm: {cores: 4, memory: 8GB, walltime: '01:00:00'}\n")
     queue = read_cluster(str(jobs))
     assert (type(queue), queue.system, queue.n_cores) == (JobQueue, "slurm", 4)
 

@@ -131,6 +131,15 @@ def test_a_run_that_only_says_that_it_has_finished_is_left_out(grid):
     assert "it has lost the digests" in left_out.reason
 
 
+@pytest.mark.parametrize("record", ['{"state": "finished", "spec": [1]}', "{", ""])
+def test_a_record_that_says_nothing_is_damage_and_no_other_run(grid, record):
+    study, planned, root = grid
+    planned[0].run.info_path.write_text(record)
+    assert not planned[0].is_to_do
+    (left_out,) = read_results(study, planned, root).left_out
+    assert "run.json is damaged" in left_out.reason
+
+
 def test_a_run_of_an_earlier_version_without_its_agent_is_left_out(grid):
     study, planned, root = grid
     forget_digests(planned[0])
@@ -151,18 +160,6 @@ def test_what_a_comparison_does_not_read_is_not_held_against_it(grid):
     other = replace(study, eval_freq=20)
     assert all(run.is_to_do for run in plan(other, root))
     assert read_results(other, plan(other, root), root).left_out == ()
-
-
-RECORDS = ["null", "[]", "{}", '{"spec": null}', '{"state": "finished", "spec": [1]}', "{", ""]
-
-
-@pytest.mark.parametrize("record", RECORDS)
-def test_a_record_that_says_nothing_is_damage_and_no_other_run(grid, record):
-    study, planned, root = grid
-    planned[0].run.info_path.write_text(record)
-    assert not planned[0].is_to_do
-    (left_out,) = read_results(study, planned, root).left_out
-    assert "run.json is damaged" in left_out.reason
 
 
 @pytest.mark.parametrize(
@@ -192,27 +189,27 @@ def test_a_record_of_wrong_types(grid, fields):
         read_run(study, planned[0])
 
 
+PULLS, STATISTICS, MAPS = (
+    ("pulls", PULLS_FILE),
+    ("batch", STATISTICS_FILE),
+    ("grid", "value_maps.npz"),
+)
 WRONG_ARRAYS = {
-    "no arms": ("pulls", PULLS_FILE, "arms", None),
-    "arms that there are not": ("pulls", PULLS_FILE, "arms", lambda arms: arms + 10),
-    "arms below 0": ("pulls", PULLS_FILE, "arms", lambda arms: -arms - 1),
-    "arms of floats": ("pulls", PULLS_FILE, "arms", lambda arms: arms * 1.0),
-    "few rewards": ("pulls", PULLS_FILE, "rewards", lambda rewards: rewards[:, 1:]),
-    "no regret": ("batch", STATISTICS_FILE, "regret", None),
-    "little regret": ("batch", STATISTICS_FILE, "regret", lambda regret: regret[1:]),
-    "flat shares": ("batch", STATISTICS_FILE, "shares", np.ravel),
-    "few runs": ("batch", STATISTICS_FILE, "total_reward", lambda total: total[1:]),
-    "no actions": ("grid", "value_maps.npz", "actions", None),
-    "actions that there are not": (
-        "grid",
-        "value_maps.npz",
-        "actions",
-        lambda a: a * 0 + 4,
-    ),  # of 0 to 3
-    "actions below 0": ("grid", "value_maps.npz", "actions", lambda a: -a - 1),
-    "actions of floats": ("grid", "value_maps.npz", "actions", lambda a: a * 1.0),
-    "no values": ("grid", "value_maps.npz", "values", lambda values: values * np.nan),
-    "few values": ("grid", "value_maps.npz", "values", lambda values: values[:, 1:]),
+    "no arms": (*PULLS, "arms", None),
+    "arms that there are not": (*PULLS, "arms", lambda arms: arms + 10),
+    "arms below 0": (*PULLS, "arms", lambda arms: -arms - 1),
+    "arms of floats": (*PULLS, "arms", lambda arms: arms * 1.0),
+    "few rewards": (*PULLS, "rewards", lambda rewards: rewards[:, 1:]),
+    "no regret": (*STATISTICS, "regret", None),
+    "little regret": (*STATISTICS, "regret", lambda regret: regret[1:]),
+    "flat shares": (*STATISTICS, "shares", np.ravel),
+    "few runs": (*STATISTICS, "total_reward", lambda total: total[1:]),
+    "no actions": (*MAPS, "actions", None),
+    "actions that there are not": (*MAPS, "actions", lambda a: a * 0 + 4),  # of 0 to 3
+    "actions below 0": (*MAPS, "actions", lambda a: -a - 1),
+    "actions of floats": (*MAPS, "actions", lambda a: a * 1.0),
+    "no values": (*MAPS, "values", lambda values: values * np.nan),
+    "few values": (*MAPS, "values", lambda values: values[:, 1:]),
 }
 
 
@@ -314,27 +311,23 @@ def test_a_sample_of_the_campaign(tmp_path):
 # --- The files of a run's figures, where they have not the form that a run gives them.
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "#{}",
-        "#{}\n",
-        "r,l,t\n1,2,3\n",
-        "#{}\nr,l\n1,2\n",
-        "#{}\nr,l,t\n1,2\n",
-        "#{}\nr,l,t\nnan,2,3\n",
-        "#{}\nr,l,t\n1,0,3\n",
-        "#{}\nr,l,t\n1,two,3\n",
-        "#{}\nr,l,t\n1e999,2,3\n",
-        "#{}\nr,l,t\n1,2,3\n1,2\n",
-        "#{}\nr,l,t\n1,2,\n",
-        "#{}\nr,l,t\n1_0,2,3\n",
-        "#{}\nr,l,t\nNA,2,3\n",
-        '#{}\nr,l,t\n1,2,3\n"1,2,3\n',
-        "#{}\n\0\0\xff\n",
-    ],
-)
+# After the first line and that of the names; what comes before them is another matter.
+ROWS = [
+    "1,2",
+    "nan,2,3",
+    "1,0,3",
+    "1,two,3",
+    "1e999,2,3",
+    "1,2,3\n1,2",
+    "1,2,",
+    "1_0,2,3",
+    "NA,2,3",
+]
+ROWS += ['1,2,3\n"1,2,3']
+MONITORS = ["", "#{}", "#{}\n", "r,l,t\n1,2,3\n", "#{}\nr,l\n1,2\n", "#{}\n\0\0\xff\n"]
+
+
+@pytest.mark.parametrize("text", [*MONITORS, *(f"#{{}}\nr,l,t\n{row}\n" for row in ROWS)])
 def test_a_monitor_file_of_no_form(tmp_path, text):
     (tmp_path / "0.monitor.csv").write_bytes(text.encode("latin-1"))
     with pytest.raises(DamagedFileError, match=r"0\.monitor\.csv is damaged: ") as error:

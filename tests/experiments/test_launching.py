@@ -74,11 +74,14 @@ def runs_of(root, **fields):
 
 
 def test_a_run_says_what_it_is(tmp_path):
-    _, planned = runs_of(tmp_path)
-    draft = draft_path(tmp_path, planned)
+    _, planned = runs_of(tmp_path, tensorboard=True)
+    draft, old = draft_path(tmp_path, planned), planned.spec.tensorboard_log / "of an earlier try"
+    old.mkdir(parents=True)
     do_run(planned, draft, "compare.py s.yml")
     assert planned.is_finished
     assert not draft.exists()
+    assert not old.exists()
+    assert list(old.parent.rglob("events.out.tfevents.*"))
     args = yaml.safe_load((planned.run.params_path / "args.yml").read_text())
     given = {key: value for key, value in args.items() if value is not None}
     assert given == {"algo": "qlearning", "env": "FrozenLake-v1", "seed": 1}
@@ -89,15 +92,6 @@ def test_a_run_says_what_it_is(tmp_path):
     (planned.path / "mark").touch()
     do_run(planned, draft, "again")
     assert (planned.path / "mark").exists()
-
-
-def test_tensorboard_logs_of_an_earlier_try_are_removed(tmp_path):
-    planned, _ = runs_of(tmp_path, tensorboard=True)
-    old = planned.spec.tensorboard_log / "old"
-    old.mkdir(parents=True)
-    do_run(planned, draft_path(tmp_path, planned), "c")
-    assert not old.exists()
-    assert list(planned.spec.tensorboard_log.rglob("events.out.tfevents.*"))
 
 
 @pytest.mark.parametrize(
@@ -209,17 +203,10 @@ def faulty(tmp_path, faulty_lake):
     return runs
 
 
-@pytest.mark.parametrize(
-    ("fault", "is_kept"),
-    [
-        ("disk", True),
-        ("memory", True),
-        ("allocator", True),
-        ("user", False),
-        ("library", False),
-        ("file", False),
-    ],
-)
+KEPT = {"disk": True, "memory": True, "allocator": True, "user": False, "library": False}
+
+
+@pytest.mark.parametrize(("fault", "is_kept"), [*KEPT.items(), ("file", False)])
 def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(faulty, fault, is_kept):
     root, (planned,) = faulty(fault)
     draft = draft_path(root, planned)
@@ -475,17 +462,6 @@ def test_a_draft_that_cannot_be_renamed(tmp_path, owners, monkeypatch, error):
     assert not draft.exists()
 
 
-def test_removing_a_draft_leaves_the_others_and_the_study(tmp_path):
-    remove_dead_drafts(tmp_path / "never")
-    first, second = draft_of(tmp_path, "1"), draft_of(tmp_path, "2")
-    (tmp_path / "study.yml").touch()
-    remove_draft(first)
-    assert sorted(tmp_path.rglob("*@*")) == [second]
-    for _ in range(2):
-        remove_draft(second)
-        assert [path.name for path in tmp_path.iterdir()] == ["study.yml"]
-
-
 def test_a_draft_says_whose_it_is_however_long_the_labels_are(tmp_path):
     paths = [draft_path(tmp_path, run) for run in runs_of(tmp_path)]
     names = [f"{OWN}@{HERE}@mine@dry_lake_{number}" for number in (1, 2)]
@@ -494,8 +470,15 @@ def test_a_draft_says_whose_it_is_however_long_the_labels_are(tmp_path):
     study = replace(study, agents=(AgentSpec("ö" * 90, "qlearning"),))
     paths = [draft_path(tmp_path, run) for run in plan(study, tmp_path)]
     assert len({path.name for path in paths}) == 2
-    for path in paths:
-        claim_draft(path.with_name(f"{path.name}.dead"))
+    drafts = [path.with_name(f"{path.name}.dead") for path in paths]
+    for draft in drafts:
+        claim_draft(draft)
+    (tmp_path / "study.yml").touch()
+    # To remove one leaves the others, and the study.
+    for draft, n_left in ((drafts[0], 1), (drafts[1], 0), (drafts[1], 0)):
+        remove_draft(draft)
+        assert len([*tmp_path.rglob("*.dead")]) == n_left
+    assert [path.name for path in tmp_path.iterdir()] == ["study.yml"]
 
 
 def test_a_draft_is_a_new_folder_whatever_lies_there(tmp_path):
@@ -536,20 +519,6 @@ def test_a_folder_is_made_while_another_run_removes_the_one_above(
     assert (tmp_path / "a" / "b").is_dir() == is_made
 
 
-def test_a_folder_is_made_that_another_run_removes_as_soon_as_it_is_found(tmp_path, monkeypatch):
-    folder, is_dir = tmp_path / "a", Path.is_dir
-    folder.mkdir()
-
-    def vanishing(path):
-        folder.rmdir()
-        monkeypatch.setattr(Path, "is_dir", is_dir)
-        return False
-
-    monkeypatch.setattr(Path, "is_dir", vanishing)
-    claim_draft(folder / "b")
-    assert (folder / "b").is_dir()
-
-
 # --- Finished runs of other settings: named, kept, and moved aside when that is asked for.
 
 
@@ -581,22 +550,17 @@ def test_other_settings_are_refused_by_name(done):
         check_settings_kept(plan(replace(study, eval_freq=7, eval_episodes=3), done), done)
 
 
-@pytest.mark.parametrize("n_seeds", [1, 2, 5])
-def test_more_or_fewer_seeds_go_without_a_word(done, n_seeds):
-    planned = runs_of(done, n_seeds=n_seeds)
-    check_settings_kept(planned, done)
-    assert move_replaced_aside(planned, done) == ([], None)
-    assert [run.is_finished for run in planned] == [True, True, False, False, False][:n_seeds]
-
-
 def test_what_is_moved_aside_is_whole_and_each_time_elsewhere(done, do_study):
+    for n_seeds in (1, 2, 5):  # more or fewer seeds go without a word
+        planned = runs_of(done, n_seeds=n_seeds)
+        check_settings_kept(planned, done)
+        assert move_replaced_aside(planned, done) == ([], None)
+        assert [run.is_finished for run in planned] == [True, True, False, False, False][:n_seeds]
     before = contents(done / "runs")
     for number, gamma in enumerate((0.5, 0.6), start=1):
         planned = runs_of(done, gamma=gamma)
-        moved, place = move_replaced_aside(planned, done)
-        assert (moved, place) == (planned, done / "replaced" / str(number))
-        assert contents(place) == before
-        check_settings_kept(planned, done)
+        assert move_replaced_aside(planned, done) == (planned, done / "replaced" / str(number))
+        assert contents(done / "replaced" / str(number)) == before
         do_study(study_of(gamma=gamma), done)
         before = contents(done / "runs")
 
@@ -689,29 +653,6 @@ def test_after_a_tenth_of_the_runs_it_is_right_within_a_factor_of_two(n_workers,
         assert all(0.5 < ratio < 2 for ratio in found.values()), found
 
 
-def test_a_run_may_take_the_whole_time_that_is_left():
-    slow, *fast = [run for run in runs_to_time(3) if run.environment == "Taxi-v4"][:4]
-    expected = {run.labels: 1.0 for run in fast}
-    left = TimeLeft([slow, *fast], {**expected, slow.labels: 100.0})
-    left.start(0.0, 8)
-    for run in fast:
-        left.end(run, 1.0)
-    assert left.seconds(10.0, 8) == pytest.approx(90)
-    # Nobody knows how long, once it has taken longer.
-    assert 0 < left.seconds(1000.0, 8) <= 250
-
-
-def test_runs_may_end_in_another_order():
-    first, *_, last = runs_to_time(3)
-    left = TimeLeft([first, last], {})
-    left.start(0.0, 1)
-    left.end(last, 5.0)
-    left.start(5.0, 1)
-    left.end(last, 6.0)  # told twice
-    left.end(first, 7.0)
-    assert left.seconds(7.0, 1) == 0
-
-
 def test_expectations_go_by_agent_and_budget():
     table, network = runs_to_time(1)[0].spec, runs_to_time(1)[2].spec
     assert (table.algo, network.algo) == ("qlearning", "dqn")
@@ -764,24 +705,17 @@ def with_rules(tmp_path):
 
 
 def test_each_rule_of_the_users_is_compiled_once_on_each_environment(with_rules, monkeypatch):
+    places = [("mean", "FrozenLake-v1"), ("mean", "Warehouse-v0")]
     wanted = json.loads(warm_ups(with_rules))
-    assert [(item["algo"], item["env_id"]) for item in wanted] == [
-        ("mean", "FrozenLake-v1"),
-        ("mean", "Warehouse-v0"),
-    ]
+    assert [(item["algo"], item["env_id"]) for item in wanted] == places
     trained = []
     monkeypatch.setattr(run_in_child, "train_aside", trained.append)  # it would compile for seconds
     take_steps(json.dumps([{"algo": "no_such", "modules": []}, {}, *wanted]))
-    assert [(spec.algo, spec.env_id) for spec in trained] == [
-        ("mean", "FrozenLake-v1"),
-        ("mean", "Warehouse-v0"),
-    ]
+    assert [(spec.algo, spec.env_id) for spec in trained] == places
     budgets = {(spec.hyperparams.n_timesteps, spec.hyperparams.n_episodes) for spec in trained}
     assert budgets == {(run_in_child.N_STEPS, None)}
     assert {spec.user_modules for spec in trained} == {MODULES}
-
-
-def test_without_modules_of_the_users_there_is_nothing_to_do(with_rules, monkeypatch):
+    # Without modules of the user's there is nothing to do, nor where they are too many to say.
     bare = [replace(run, spec=replace(run.spec, user_modules=())) for run in with_rules]
     assert json.loads(warm_ups(bare)) == []
     monkeypatch.setattr(run_in_child, "MAX_CHARACTERS", 10)

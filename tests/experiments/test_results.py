@@ -32,8 +32,6 @@ from report.documents import write_tables
 from report.figures import write_figures
 from report.series import episodes_table, study_series
 from report.terminal import print_analysis, print_episodes_table
-from report.words import enumeration, interval
-from verdicts import Estimate
 
 HOUSE = EnvironmentSpec("Warehouse-v0", "Warehouse-v0", {"n_timesteps": 100})
 POLE = EnvironmentSpec("CartPole-v1", "CartPole-v1", {"n_timesteps": 100})
@@ -544,17 +542,6 @@ def test_the_table_per_block_of_episodes(tmp_path):
         "minimum": [1.0, 3.0],
         "maximum": [6.0, 7.0],
     }
-
-
-def test_enumerations_and_intervals():
-    assert [enumeration(list(names)) for names in ("a", "ab", "abc")] == [
-        "a",
-        "a and b",
-        "a, b and c",
-    ]
-    assert interval(Estimate(1.0, 0.5, 1.5, 3)) == "1 [0.5, 1.5]"
-    assert interval(Estimate(1.0, 1.0, 1.0, 3)) == "1"
-    assert interval(Estimate(1.0, math.nan, math.nan, 1)) == "1"
 
 
 def test_versions_that_differ_are_named():
