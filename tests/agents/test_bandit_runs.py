@@ -73,15 +73,6 @@ def test_feedback_of_each_environment_waits_for_its_own():
     assert model.learn(4, reset_num_timesteps=False)._n_updates == 6
 
 
-def test_exp3_remembers_how_likely_a_late_reward_was():
-    """Both pulls of a batch were made with the same probabilities, 1/2."""
-    env = Script(told("feedback_due", [0, 1]))
-    model = load_algorithm("exp3")(env=Monitor(env), seed=0).learn(2)
-    wins = model.policy.sums[0, 1].item()
-    assert wins > 0
-    assert model.policy.scores[0, 1].item() == pytest.approx(wins * 0.1 / 2 / 0.5, rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("name", "line"),
     [

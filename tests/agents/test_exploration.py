@@ -24,8 +24,6 @@ from agents.common.exploration import (
     noisy_greedy_action,
 )
 from agents.common.schedules import (
-    EXPONENTIAL,
-    LINEAR,
     ExponentialSchedule,
     schedule_row,
     schedule_value,
@@ -189,21 +187,12 @@ schedules = st.one_of(
 @given(schedules, st.lists(progress, min_size=20, max_size=20))
 def test_a_row_gives_what_the_schedule_gives_bit_for_bit(schedule, points):
     row = schedule_row(schedule)
+    for foreign in (lambda point: point, FloatSchedule(lambda point: point), "lin_0.1"):
+        assert schedule_row(foreign) is None
     # Of one type, so that compiled code takes them all.
     assert [type(number) for number in row] == [float] * 4
     for point in [*points, 0.0, 0.5, 1.0]:
         assert schedule_value(row, point) == schedule(point)
-
-
-def test_rows():
-    half = LinearSchedule(1, 0, 0.5)
-    assert schedule_row(ExponentialSchedule(0.5, 0.25, 0.75)) == (EXPONENTIAL, 0.5, 0.25, 0.75)
-    assert schedule_row(half) == schedule_row(FloatSchedule(FloatSchedule(half)))
-    assert schedule_row(half) == (LINEAR, 1, 0, 0.5)
-    assert schedule_row(ConstantSchedule(3)) == (LINEAR, 3, 3, 1)
-    assert schedule_row(0.1) == (LINEAR, 0.1, 0.1, 1)
-    for foreign in (lambda point: point, FloatSchedule(lambda point: point), "lin_0.1"):
-        assert schedule_row(foreign) is None
 
 
 def test_exponential_decay_worked_by_hand():
