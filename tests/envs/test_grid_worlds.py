@@ -338,7 +338,9 @@ def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(
     assert np.array_equal(again.unwrapped.desc, env.unwrapped.desc)
     assert str(env).count("TimeLimit") == 1
     assert str(again) == str(env)
-    assert "TimeLimit" not in str(gym.make("envs:RandomWarehouse-v0", max_episode_steps=-1))
+    endless = gym.make("envs:RandomWarehouse-v0", max_episode_steps=-1)
+    assert "TimeLimit" not in str(endless)
+    assert endless.unwrapped.shortest_path_length > 0
 
 
 def test_steps_and_resets_among_a_million_cells_take_little_memory():
