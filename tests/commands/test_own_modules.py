@@ -125,16 +125,6 @@ def test_a_run_does_not_have_modules_imported(in_own_folder, own_folder, monkeyp
     assert (code, err) == (0, "")
 
 
-def test_a_study_file_imports_nothing(in_own_folder, own_folder):
-    study = own_folder / "study.yml"
-    study.write_text("agents: [random]\nenvironments: ['my_agents:my/Lake-v0']\nn_timesteps: 9\n")
-    code, _, err = in_own_folder("compare.py", study)
-    assert code == 2
-    assert err.endswith("study.yml:2: 'my_agents:my/Lake-v0': its module is not imported because a "
-                        "file asks: add --gym-packages my_agents\n")  # fmt: skip
-    assert "my_agents" not in sys.modules
-
-
 def test_a_study_in_a_folder_full_of_names(own_folder):
     """A new process, typed in a folder with modules that have the names of ours and Python's."""
     (own_folder / "my_agents.py").write_text(AGENTS)

@@ -296,11 +296,6 @@ def test_what_weights_are_made_of(name, values, refusal):
             importance_weights(policy, arms, propensities)
 
 
-def test_no_pulls_have_no_weights():
-    nothing = np.zeros(0)
-    assert importance_weights(np.zeros((0, 2)), nothing.astype(np.int64), nothing).shape == (0,)
-
-
 TOO_LITTLE = "the log holds too little of what the policy does: its weights are "
 TOO_SMALL = "the propensities are too small: the weights are "
 
@@ -462,14 +457,6 @@ def test_agents_that_observe_more_than_a_log_holds(log, tmp_path, key, value):
     folder = run_folder(tmp_path / "run", log(NUMBERS), hyperparams={key: value})
     with pytest.raises(UserError, match=f"was trained with {key}: it observes more than a log"):
         read_policy(folder)
-
-
-def test_folders_that_hold_no_agent(tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"empty is no run folder: it holds no whole run\.json"):
-        read_policy(tmp_path / "empty")
-    with pytest.raises(UserError, match=r"run holds no Lake\.zip: its training may not have ended"):
-        read_policy(run_folder(tmp_path / "run"))
 
 
 class SomeSoldOut(ReplayBandit):
