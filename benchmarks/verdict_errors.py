@@ -1,20 +1,32 @@
-"""How often verdicts are wrong, and how often they are found, over kinds of scores.
+"""How often a study says something false, how often intervals miss, and what is found.
 
-    nice python benchmarks/verdict_errors.py [--studies 2000]
+    nice python benchmarks/verdict_errors.py [TABLE ...] [--studies 1000] [--publish]
 
-Wrong claims: each row is a kind of sentence and of scores, each column a number of seeds; "grown"
-looks at 5, 10, 20 and 40 seeds until there is a verdict. The promise is 5 % of studies. Columns of
-one look spend all of it at once.
+Errors: the share of studies with any false sentence, on means, typical runs and failures together,
+by law of scores, number of agents and seeds; the last column looks at 5, 10, 20 and 40 seeds until
+all is decided. A sentence with a condition is false where the condition holds and the claim does
+not. The promise is 5 %, and a look by itself spends all of it here.
 
-Power: the same beside Welch's t test, and beside AdaStop (Mathieu and others, 2023): a permutation
-test of the difference of means, sequential over groups of five seeds.
+Environments: the same for studies of 3 and 10 of them. Paired: runs that share their randomness.
+
+Power: how often the agent that is ahead is found, beside Welch's test, Mann and Whitney's, and
+AdaStop (Mathieu and others, 2023), each with 5 %. Growth: runs that are saved.
+
+Laws after Waudby-Smith and Ramdas (2024) and Learned-Miller and Thomas (2019): equal means, and
+rare failures or successes that few runs show.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, redirect_stdout
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import combinations
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -24,259 +36,480 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from verdicts import (
-    compare_speed,
+    Ends,
+    Judgement,
+    compare_means,
     count_failures,
     fail_more_often,
     failure_threshold,
+    grow,
     judge_pairs,
-    level_of_look,
+    level_of_claim,
+    level_of_environment,
+    look_sizes,
+    mean_interval,
 )
 
 Scores = NDArray[np.float64]
-Draw = Callable[[Generator, tuple[int, ...]], Scores]
+Draw = Callable[[Generator, int], Scores]
 
-SEEDS = (3, 5, 10, 20, 50)
-LOOKS = (5, 10, 20, 40)
-MARGIN = 0.5
+MEASURED = Path(__file__).resolve().parent.parent / "docs" / "measured"
 ALPHA = 0.05
-SPACING = 100.0
+MARGIN = 0.02
+ENDS = Ends(0.0, 1.0)
+SIZES = (3, 5, 8, 10, 20, 50)
+LOOKS = (5, 10, 20, 40)
+LARGE = 200_000
+# What the large sample below leaves open about a share or a mean.
+SLACK = 0.004
 
 
-def failing(share: float) -> Draw:
-    """Scores about 0.95, but 0 in so large a share of runs."""
+@dataclass(frozen=True)
+class Law:
+    """A law of scores between 0 and 1."""
 
-    def draw(rng: Generator, shape: tuple[int, ...]) -> Scores:
-        scores = 0.95 + 0.01 * rng.normal(size=shape)
-        return np.where(rng.random(shape) < share, 0.0, scores)
+    draw: Draw
 
-    return draw
+    @cached_property
+    def known(self) -> Scores:
+        """A large sample in order, from which its mean and shares are known."""
+        return np.sort(self.draw(np.random.default_rng(99), LARGE))
+
+    @cached_property
+    def mean(self) -> float:
+        """What a run scores on average."""
+        return float(self.known.mean())
+
+    def share_below(self, score: float) -> float:
+        """The share of runs that score less."""
+        return float(np.searchsorted(self.known, score - 1e-12)) / LARGE
+
+    def share_above(self, score: float) -> float:
+        """The share of runs that score more."""
+        return 1 - float(np.searchsorted(self.known, score + 1e-12, side="right")) / LARGE
 
 
-def two_peaks(rng: Generator, shape: tuple[int, ...]) -> Scores:
-    """A run either finds the way or does not, as likely."""
-    return (rng.random(shape) < 0.5) + 0.02 * rng.normal(size=shape)
+@cache
+def share_won(law: Law, other: Law, lead: float = 0.0) -> float:
+    """How often a run, with so much more, beats one of the other law; ties count half."""
+    own = np.random.default_rng(1).choice(law.known, 20_000) + lead
+    below = np.searchsorted(other.known, own - 1e-12, side="left")
+    up_to = np.searchsorted(other.known, own + 1e-12, side="right")
+    return float((below + up_to).mean()) / 2 / LARGE
 
 
-def tied(rng: Generator, shape: tuple[int, ...]) -> Scores:
+def normal(mean: float, deviation: float) -> Law:
+    """Normal scores, cut to 0 and 1."""
+    return Law(lambda rng, n: np.clip(rng.normal(mean, deviation, n), 0, 1))
+
+
+def skewed(mean: float, deviation: float, sign: int = 1) -> Law:
+    """Exponential scores, upwards or downwards, cut to 0 and 1."""
+    return Law(
+        lambda rng, n: np.clip(mean + sign * deviation * (rng.exponential(size=n) - 1), 0, 1)
+    )
+
+
+def heavy(mean: float) -> Law:
+    """Scores with heavy tails, cut to 0 and 1: Student's t with 1.5 degrees of freedom."""
+    return Law(lambda rng, n: np.clip(mean + 0.03 * rng.standard_t(1.5, n), 0, 1))
+
+
+def coin(share: float) -> Law:
+    """1 in such a share of runs, else 0."""
+    return Law(lambda rng, n: (rng.random(n) < share).astype(np.float64))
+
+
+def failing(share: float, score: float = 0.95, deviation: float = 0.01) -> Law:
+    """About one score, but 0 in such a share of runs."""
+    width = deviation * 12**0.5
+
+    def draw(rng: Generator, n: int) -> Scores:
+        scores = score + width * (rng.random(n) - 0.5)
+        return np.where(rng.random(n) < share, 0.0, scores)
+
+    return Law(draw)
+
+
+def steady(score: float) -> Law:
+    """Always the same."""
+    return Law(lambda rng, n: np.full(n, score))
+
+
+def tied(rng: Generator, n: int) -> Scores:
     """Four different scores, one of them in most runs."""
-    return rng.choice([0.0, 0.5, 0.9, 1.0], size=shape, p=[0.1, 0.1, 0.2, 0.6])
+    return rng.choice([0.0, 0.5, 0.9, 1.0], n, p=[0.1, 0.1, 0.2, 0.6])
 
 
-DISTRIBUTIONS: dict[str, Draw] = {
-    "normal": lambda rng, shape: rng.normal(size=shape),
-    "exponential": lambda rng, shape: rng.exponential(size=shape),
-    "log-normal": lambda rng, shape: rng.lognormal(size=shape),
-    "two peaks": two_peaks,
-    "heavily tied": tied,
-    "fails in 5 %": failing(0.05),
-    "fails in 30 %": failing(0.3),
+# Two laws of one mean, or that lie just beyond the margin; further agents repeat them.
+FAMILIES: dict[str, tuple[Law, Law]] = {
+    "normal": (normal(0.6, 0.06),) * 2,
+    "normal, spreads 1 to 5": (normal(0.6, 0.02), normal(0.6, 0.1)),
+    "normal, spreads 1 to 10": (normal(0.5, 0.01), normal(0.5, 0.1)),
+    "exponential": (skewed(0.4, 0.08),) * 2,
+    "exponential and mirrored": (skewed(0.5, 0.08), skewed(0.5, 0.08, -1)),
+    "heavy tails": (heavy(0.5),) * 2,
+    "heavily tied": (Law(tied),) * 2,
+    "0 or 1, even": (coin(0.5),) * 2,
+    "0 or 1, 9 in 10": (coin(0.9),) * 2,
+    "always 0.5, and 0 or 1": (steady(0.5), coin(0.5)),
+    "always 0.1, and 1 in 1 of 10": (steady(0.1), coin(0.1)),
+    "all runs alike": (steady(0.86),) * 2,
+    **{f"both fail in {p:.0%}": (failing(p),) * 2 for p in (0.02, 0.05, 0.1, 0.3)},
+    **{
+        f"steady, and fails in {p:.0%}": (failing(0.0, 0.97 * (1 - p)), failing(p, 0.97))
+        for p in (0.02, 0.05, 0.1, 0.3)
+    },
+    "beyond the margin, normal": (normal(0.6, 0.02), normal(0.6205, 0.02)),
+    "beyond the margin, one fails in 3 %": (failing(0.03), failing(0.0)),
+    "beyond the margin, both fail in 5 %": (failing(0.05, 0.95), failing(0.05, 0.9285)),
 }
 
 
-def paired_scores(draw: Draw, rng: Generator, n: int) -> tuple[Scores, Scores]:
-    """Two agents that share half of what makes up a score, as with common random numbers."""
-    shared, own = draw(rng, (n,)), draw(rng, (2, n))
-    return shared + own[0], shared + own[1]
+# What is false of a study.
 
 
-def verdict(first: Scores, second: Scores, level: float, margin: float = 0.0) -> str:
-    """What is said of the first of two agents."""
-    return judge_pairs({"x": first, "y": second}, margin, level)["x", "y"].verdict
+def false_of_pair(
+    judged: Judgement, laws: tuple[Law, Law], runs: tuple[Scores, Scores], level: float
+) -> str:
+    """Which sentence on a pair of agents is false, at the level of one pair; empty for none."""
+    said, apart = judged.mean, laws[0].mean - laws[1].mean
+    if said.verdict == "worse":
+        other = Judgement(said.swapped(), "undecided")
+        turned = false_of_pair(other, (laws[1], laws[0]), (runs[1], runs[0]), level)
+        return turned or _false_typical(judged, laws)
+    if said.verdict == "better" and apart <= 1e-4:
+        outside = laws[0].share_below(runs[0].min()), laws[1].share_above(runs[1].max())
+        if not said.is_conditional:
+            return "ahead"
+        if max(outside) < compare_means(*runs, level).most_outside:
+            return "ahead, if"
+    if said.verdict == "equivalent" and abs(apart) > MARGIN + 1e-4:
+        pairs = list(zip(laws, runs, strict=True))
+        seen = [law.share_below(x.min()) + law.share_above(x.max()) for law, x in pairs]
+        # What further runs do that lie within those that were seen.
+        if not said.is_conditional or max(seen) == 0:
+            return "equivalent, if" if said.is_conditional else "equivalent"
+    return _false_typical(judged, laws)
 
 
-def first_verdict(first: Scores, second: Scores, margin: float = 0.0) -> str:
-    """What is said when a study is grown until it says something."""
-    for look, n in enumerate(LOOKS, start=1):
-        found = verdict(first[:n], second[:n], level_of_look(ALPHA, look), margin)
-        if found != "undecided":
-            return found
-    return "undecided"
+def _false_typical(judged: Judgement, laws: tuple[Law, Law]) -> str:
+    wins = share_won(*laws)
+    if judged.typical == "equivalent":
+        beyond = min(share_won(*laws, MARGIN), share_won(*laws[::-1], MARGIN))
+        return "typical runs equal" if beyond < 0.5 - SLACK else ""
+    is_false = {"better": wins <= 0.5 + SLACK, "worse": wins >= 0.5 - SLACK}
+    return "typical run" if is_false.get(judged.typical, False) else ""
 
 
-def rate(wrong: Callable[[int | None], bool], studies: int) -> list[float]:
-    """The share of studies that are wrong, by number of seeds, the last grown."""
-    return [float(np.mean([wrong(n) for _ in range(studies)])) for n in (*SEEDS, None)]
+def false_of_failures(laws: Sequence[Law], runs: Sequence[Scores], level: float) -> str:
+    """Which sentence on failures is false; empty where none is."""
+    threshold = failure_threshold(0.0, max(float(np.median(each)) for each in runs))
+    if np.isnan(threshold):
+        return ""
+    share = level_of_claim(level, "failures") / len(runs)
+    counts = {str(k): count_failures(each, threshold, share) for k, each in enumerate(runs)}
+    fail = [law.share_below(threshold) for law in laws]
+    if any(fail[int(k)] > count.most + SLACK for k, count in counts.items()):
+        return "limit on failures"
+    more = fail_more_often(counts, level_of_claim(level, "fails more"))
+    return "fails more often" if any(fail[int(a)] <= fail[int(b)] for a, b in more) else ""
 
 
-def said_of(first: Scores, second: Scores, n: int | None, margin: float = 0.0) -> str:
-    """The verdict after n seeds, or of a grown study."""
-    if n is None:
-        return first_verdict(first, second, margin)
-    return verdict(first, second, ALPHA, margin)
+def false_of_study(laws: Sequence[Law], runs: Sequence[Scores], level: float) -> set[str]:
+    """The kinds of sentences that are false of a study with one look."""
+    scores = {str(k): each for k, each in enumerate(runs)}
+    judged = judge_pairs(scores, MARGIN, level, ends=ENDS)
+    share = level_of_claim(level, "means") / len(judged) / (2 if len(laws) > 2 else 1)
+    found = {false_of_failures(laws, runs, level)}
+    for (a, b), judgement in judged.items():
+        i, j = int(a), int(b)
+        found.add(false_of_pair(judgement, (laws[i], laws[j]), (runs[i], runs[j]), share))
+    return found - {""}
 
 
-def wrong_same(draw: Draw, rng: Generator) -> Callable[[int | None], bool]:
-    """An agent is called better or worse than itself."""
-
-    def wrong(n: int | None) -> bool:
-        x, y = draw(rng, (2, n or LOOKS[-1]))
-        return said_of(x, y, n) != "undecided"
-
-    return wrong
-
-
-def wrong_paired(draw: Draw, rng: Generator) -> Callable[[int | None], bool]:
-    """The same, with seeds that make both agents' runs alike."""
-
-    def wrong(n: int | None) -> bool:
-        return said_of(*paired_scores(draw, rng, n or LOOKS[-1]), n) != "undecided"
-
-    return wrong
+def false_of_grown(laws: Sequence[Law], runs: Sequence[Scores], level: float) -> set[str]:
+    """The same of a study that looks until all is decided."""
+    scores = {str(k): each for k, each in enumerate(runs)}
+    growth = grow(scores, LOOKS, MARGIN, level, ends=ENDS)
+    found: set[str] = set()
+    for (a, b), judgement in growth.judged.items():
+        n, i, j = LOOKS[growth.looks[a, b] - 1], int(a), int(b)
+        both = runs[i][:n], runs[j][:n]
+        share = level_of_claim(growth.level, "means") / len(growth.judged)
+        found.add(false_of_pair(judgement, (laws[i], laws[j]), both, share))
+    shown = [runs[k][: growth.seeds[str(k)]] for k in range(len(runs))]
+    return (found | {false_of_failures(laws, shown, growth.level)}) - {""}
 
 
-def wrong_middle(draw: Draw, rng: Generator) -> Callable[[int | None], bool]:
-    """A steady agent at the median of another is called better than it."""
-    middle = float(np.median(draw(np.random.default_rng(0), (100_001,))))
-
-    def wrong(n: int | None) -> bool:
-        scores = draw(rng, (n or LOOKS[-1],))
-        return said_of(np.full(len(scores), middle), scores, n) == "better"
-
-    return wrong
+# The tables.
 
 
-def wrong_equivalent(draw: Draw, rng: Generator) -> Callable[[int | None], bool]:
-    """Agents that lie the margin apart are called equivalent."""
-    margin = MARGIN * float(stats.iqr(draw(np.random.default_rng(0), (100_001,))) or 0.1)
-
-    def wrong(n: int | None) -> bool:
-        x, y = draw(rng, (2, n or LOOKS[-1]))
-        return said_of(x, y + margin * (1 + 1e-9), n, margin) == "equivalent"
-
-    return wrong
+def row(cells: Iterable[object]) -> None:
+    """Print a row of a table in Markdown."""
+    print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 
-def wrong_steady_equivalent(draw: Draw, rng: Generator) -> Callable[[int | None], bool]:
-    """A steady agent that lies the margin above another's median is called equivalent to it."""
-    known = draw(np.random.default_rng(0), (100_001,))
-    margin, middle = MARGIN * float(stats.iqr(known)), float(np.median(known))
-
-    def wrong(n: int | None) -> bool:
-        scores = draw(rng, (n or LOOKS[-1],))
-        steady = np.full(len(scores), middle + margin * (1 + 1e-9))
-        return said_of(steady, scores, n, margin) == "equivalent"
-
-    return wrong
-
-
-def wrong_sooner(never: float, rng: Generator) -> Callable[[int | None], bool]:
-    """An agent is said to arrive sooner than itself."""
-
-    def wrong(n: int | None) -> bool:
-        steps = SPACING * np.ceil(rng.lognormal(2, 0.7, size=(2, n or LOOKS[-1])))
-        steps[rng.random(steps.shape) < never] = np.inf
-        looks = (
-            [(n, ALPHA)] if n else [(m, level_of_look(ALPHA, k + 1)) for k, m in enumerate(LOOKS)]
-        )
-        return any(
-            pair.sooner is not None
-            for m, level in looks
-            for pair in compare_speed({"x": steps[0, :m], "y": steps[1, :m]}, SPACING, level)
-        )
-
-    return wrong
-
-
-def wrong_bound(share: float, rng: Generator) -> Callable[[int | None], bool]:
-    """More runs fail than the bound says."""
-
-    def wrong(n: int | None) -> bool:
-        scores = (rng.random(n or LOOKS[-1]) >= share).astype(np.float64)
-        looks = (
-            [(n, ALPHA)] if n else [(m, level_of_look(ALPHA, k + 1)) for k, m in enumerate(LOOKS)]
-        )
-        return any(count_failures(scores[:m], 0.5, level).most < share for m, level in looks)
-
-    return wrong
-
-
-def wrong_unreliable(share: float, rng: Generator) -> Callable[[int | None], bool]:
-    """An agent is said to fail more often than itself; what failure is depends on the runs."""
-
-    def wrong(n: int | None) -> bool:
-        scores = failing(share)(rng, (2, n or LOOKS[-1]))
-        looks = (
-            [(n, ALPHA)] if n else [(m, level_of_look(ALPHA, k + 1)) for k, m in enumerate(LOOKS)]
-        )
-        return any(unreliable(scores[:, :m], level) for m, level in looks)
-
-    return wrong
-
-
-def unreliable(scores: Scores, level: float) -> bool:
-    """Whether one of two agents is said to fail more often."""
-    threshold = failure_threshold(0.0, float(np.median(scores, axis=1).max()))
-    counts = {str(k): count_failures(row, threshold) for k, row in enumerate(scores)}
-    return bool(fail_more_often(counts, level))
-
-
-def wrong_of_many(draw: Draw, rng: Generator, n: int, studies: int) -> float:
-    """Ten times the same agent: the share of studies that tell any two of them apart."""
-    found = 0
-    for _ in range(studies):
-        scores = {str(k): row for k, row in enumerate(draw(rng, (10, n)))}
-        judged = judge_pairs(scores, 0.0, ALPHA).values()
-        found += any(one.verdict != "undecided" for one in judged)
-    return found / studies
+def heading(cells: Sequence[object]) -> None:
+    """Print the heading of a table."""
+    row(cells)
+    print("|" + "---|" * len(cells))
 
 
 def print_errors(studies: int) -> None:
-    """Wrong claims, a row for each kind of sentence and of scores."""
-    rng = np.random.default_rng(0)
-    names = [*(f"{n} seeds" for n in SEEDS), "grown"]
-    print(f"Wrong claims, per cent of {studies:,} studies\n")
-    print(f"| claim | scores | {' | '.join(names)} |")
-    print("|---|---|" + "---|" * len(names))
-    rows: list[tuple[str, str, Callable[[int | None], bool]]] = []
-    claims = {
-        "better or worse: the same agent": wrong_same,
-        "the same, paired seeds": wrong_paired,
-        "better: steady, at the other's median": wrong_middle,
-        "equivalent: the margin apart": wrong_equivalent,
-        "equivalent: the margin above a median": wrong_steady_equivalent,
-    }
-    for claim, make in claims.items():
-        for kind, draw in DISTRIBUTIONS.items():
-            # No steady agent wins half of its pairs where more than half of the scores are one.
-            if make in {wrong_middle, wrong_steady_equivalent} and kind == "heavily tied":
-                continue
-            rows.append((claim, kind, make(draw, rng)))
-    rows += [
-        ("sooner: the same agent", f"{never:.0%} never arrive", wrong_sooner(never, rng))
-        for never in (0.0, 0.2, 0.6)
-    ]
-    rows += [
-        ("at most so many fail", f"{share:.0%} do", wrong_bound(share, rng))
-        for share in (0.05, 0.1, 0.2, 0.5)
-    ]
-    rows += [
-        ("fails more often: the same agent", f"fails in {share:.0%}", wrong_unreliable(share, rng))
-        for share in (0.05, 0.3, 0.5)
-    ]
-    for claim, kind, wrong in rows:
-        figures = [f"{100 * found:.1f}" for found in rate(wrong, studies)]
-        print(f"| {claim} | {kind} | {' | '.join(figures)} |", flush=True)
-
-
-def print_errors_of_many(studies: int) -> None:
-    """Wrong claims among ten agents."""
-    rng = np.random.default_rng(1)
+    """Studies that say anything false."""
     print(
-        f"\nAny of 45 pairs told apart, ten times the same agent, per cent of {studies:,} studies\n"
+        f"\nStudies with a false sentence, per cent of {studies:,}; of which kind, where over 1\n"
     )
-    print("| scores | 5 seeds | 10 seeds | 20 seeds |\n|---|---|---|---|")
-    for kind, draw in DISTRIBUTIONS.items():
-        found = [f"{100 * wrong_of_many(draw, rng, n, studies):.1f}" for n in (5, 10, 20)]
-        print(f"| {kind} | {' | '.join(found)} |", flush=True)
+    heading(["scores", "agents", *(f"{n} seeds" for n in SIZES), "grown"])
+    for name, both in FAMILIES.items():
+        for n_agents in (2, 4, 10):
+            rng = np.random.default_rng(n_agents)
+            n_studies = studies if n_agents < 10 else max(studies // 10, 1)
+            laws = [both[k % 2] for k in range(n_agents)]
+            cells = []
+            for n in (*SIZES, None):
+                judge = false_of_study if n else false_of_grown
+                found: Counter[str] = Counter()
+                n_false = 0
+                for _ in range(n_studies):
+                    false = judge(laws, [law.draw(rng, n or LOOKS[-1]) for law in laws], ALPHA)
+                    n_false += bool(false)
+                    found.update(false)
+                many = [kind for kind, times in found.items() if times > n_studies / 100]
+                cells.append(" ".join([f"{100 * n_false / n_studies:.1f}", *sorted(many)]))
+            row([name, n_agents, *cells])
+
+
+def print_environments(studies: int) -> None:
+    """Studies of several environments, and of all of them together, that say anything false."""
+    n_agents, n = 4, 10
+    print(
+        f"\nStudies of {n_agents} agents and {n} seeds with a false sentence on any environment or "
+        f"on all together, per cent of {studies:,}\n"
+    )
+    heading(["scores", "1 environment", "3 environments", "10 environments"])
+    for name, both in FAMILIES.items():
+        laws, cells = [both[k % 2] for k in range(n_agents)], []
+        for n_environments in (1, 3, 10):
+            rng, n_false = np.random.default_rng(n_environments), 0
+            level = level_of_environment(ALPHA, n_environments)
+            for _ in range(studies):
+                runs = [[law.draw(rng, n) for law in laws] for _ in range(n_environments)]
+                found = set().union(*(false_of_study(laws, each, level) for each in runs))
+                if n_environments > 1:
+                    means = np.mean(runs, axis=0)  # by agent and seed
+                    together = {str(k): each for k, each in enumerate(means)}
+                    found |= _false_together(laws, together, level)
+                n_false += bool(found)
+            cells.append(f"{100 * n_false / studies:.1f}")
+        row([name, *cells])
+
+
+def _false_together(laws: Sequence[Law], means: dict[str, Scores], level: float) -> set[str]:
+    """The same of the agents' means over environments, without those that have a condition."""
+    judged = judge_pairs(means, MARGIN, level, ends=ENDS)
+    found = set()
+    for (a, b), judgement in judged.items():
+        apart, said = laws[int(a)].mean - laws[int(b)].mean, judgement.mean
+        is_false = {
+            "better": apart <= 1e-4,
+            "worse": apart >= -1e-4,
+            "equivalent": abs(apart) > MARGIN + 1e-4,
+        }
+        if not said.is_conditional and is_false.get(said.verdict, False):
+            found.add("all environments")
+    return found
+
+
+def print_paired(studies: int) -> None:
+    """Runs of one seed that share their randomness: false sentences, and the agent found ahead."""
+    print(f"\nShared randomness: false, and found ahead paired and not, per cent of {studies:,}\n")
+    heading(["correlation", *(f"{n} seeds" for n in (5, 10, 20))])
+    for correlation in (0.0, 0.4, 0.8):
+        cells = []
+        for n in (5, 10, 20):
+            rng, found = np.random.default_rng(n), np.zeros(3)
+            for _ in range(studies):
+                shared, first, second = rng.normal(0.0, 0.06, (3, n))
+                own = correlation**0.5 * shared
+                x, y = (own + (1 - correlation) ** 0.5 * each + 0.6 for each in (first, second))
+                for k, lead, paired in ((0, 0.0, True), (1, 0.06, True), (2, 0.06, False)):
+                    runs = {"x": np.clip(x + lead, 0, 1), "y": np.clip(y, 0, 1)}
+                    judged = judge_pairs(runs, MARGIN, ALPHA, ends=ENDS, paired=paired)
+                    said = judged["x", "y"].mean.verdict
+                    found[k] += said == "better" or (said == "worse" and not lead)
+            cells.append(", ".join(f"{100 * share:.1f}" for share in found / studies))
+        row([correlation, *cells])
+
+
+def print_coverage(studies: int) -> None:
+    """Intervals that hold the truth: of a mean, and of a difference of means."""
+    print(f"\n95 % intervals that hold the truth, lowest of all laws, per cent of {studies:,}\n")
+    heading(["interval", *(f"{n} seeds" for n in SIZES)])
+    means: dict[int, tuple[float, str]] = {}
+    gaps: dict[int, tuple[float, str]] = {}
+    for name, (first, second) in FAMILIES.items():
+        for n in SIZES:
+            rng, held = np.random.default_rng(n), np.zeros(2)
+            for _ in range(studies):
+                x, y = first.draw(rng, n), second.draw(rng, n)
+                low, high = mean_interval(y, ALPHA)
+                gap = compare_means(x, y, ALPHA)
+                apart = first.mean - second.mean
+                held += (
+                    low - 1e-4 <= second.mean <= high + 1e-4,
+                    gap.low - 1e-4 <= apart <= gap.high + 1e-4,
+                )
+            for worst, share in zip((means, gaps), 100 * held / studies, strict=True):
+                worst[n] = min(worst.get(n, (101.0, "")), (float(share), name))
+    for kind, worst in (("mean", means), ("difference of means", gaps)):
+        row([kind, *(f"{share:.1f} ({name})" for share, name in worst.values())])
+
+
+POWER: dict[str, tuple[Law, Law]] = {
+    "normal, 1 standard deviation apart": (normal(0.66, 0.06), normal(0.6, 0.06)),
+    "normal, 2 standard deviations apart": (normal(0.72, 0.06), normal(0.6, 0.06)),
+    "exponential, 1 standard deviation apart": (skewed(0.6, 0.08), skewed(0.52, 0.08)),
+    "never fails, fails in 10 %": (failing(0.0), failing(0.1)),
+    "never fails, fails in 30 %": (failing(0.0), failing(0.3)),
+    "never fails, fails in 60 %": (failing(0.0), failing(0.6)),
+    "always 0.95, and 0.985 but fails in 10 %": (failing(0.0), failing(0.1, 0.9856)),
+    "0.99 and 0.3": (failing(0.0, 0.99), failing(0.0, 0.3)),
+}
+
+
+def print_power(studies: int) -> None:
+    """How often the agent with the higher mean is found ahead."""
+    tests = "verdict without a condition, verdict, Welch, Mann and Whitney, AdaStop"
+    print(f"\nThe agent ahead is found, per cent of {studies:,} studies: {tests}\n")
+    sizes = (5, 10, 20, 50)
+    heading(["scores", *(f"{n} seeds" for n in sizes)])
+    for name, (first, second) in POWER.items():
+        cells = []
+        for n in sizes:
+            rng, found = np.random.default_rng(n), np.zeros(5)
+            for _ in range(studies):
+                x, y = first.draw(rng, n), second.draw(rng, n)
+                mean = judge_pairs({"x": x, "y": y}, 0.0, ALPHA, ends=ENDS)["x", "y"].mean
+                is_ahead = mean.verdict == "better"
+                found += (
+                    is_ahead and not mean.is_conditional,
+                    is_ahead,
+                    stats.ttest_ind(x, y, equal_var=False).pvalue <= ALPHA and x.mean() > y.mean(),
+                    stats.mannwhitneyu(x, y).pvalue <= ALPHA and x.mean() > y.mean(),
+                    adastop(x, y, 5, rng) and x.mean() > y.mean(),
+                )
+            cells.append(", ".join(f"{100 * share:.0f}" for share in found / studies))
+        row([name, *cells])
+    print(f"\nThe best of four is found, and another is called best, per cent of {studies:,}\n")
+    heading(["scores", *(f"{n} seeds" for n in sizes)])
+    for lead in (0.0, 1.0, 2.0):
+        laws = [normal(0.6 + lead * 0.06, 0.06), *[normal(0.6, 0.06)] * 3]
+        cells = []
+        for n in sizes:
+            rng, hits = np.random.default_rng(n), Counter[str]()
+            for _ in range(studies):
+                scores = {str(k): law.draw(rng, n) for k, law in enumerate(laws)}
+                judged = judge_pairs(scores, 0.0, ALPHA, ends=ENDS)
+                wins = Counter(
+                    a if each.mean.verdict == "better" else b
+                    for (a, b), each in judged.items()
+                    if each.mean.verdict in ("better", "worse")
+                )
+                hits.update(name for name, n_won in wins.items() if n_won == len(laws) - 1)
+            n_wrong = sum(times for name, times in hits.items() if name != "0" or not lead)
+            cells.append(f"{100 * hits['0'] / studies:.0f}, {100 * n_wrong / studies:.1f}")
+        row([f"{lead:g} standard deviations ahead of three", *cells])
+
+
+def adastop(first: Scores, second: Scores, group: int, rng: Generator, n_draws: int = 500) -> bool:
+    """Whether AdaStop tells two agents apart: groups of ``group`` seeds, ALPHA over all of them."""
+    n_groups = len(first) // group
+    grouped = np.stack([first, second]).reshape(2, n_groups, group)
+    pooled = grouped.transpose(1, 0, 2).reshape(n_groups, 2 * group)
+    order = rng.random((n_draws, n_groups, 2 * group)).argsort(axis=-1)
+    drawn = np.take_along_axis(np.broadcast_to(pooled, order.shape), order, axis=-1)
+    moved = drawn[..., :group].sum(-1) - drawn[..., group:].sum(-1)
+    observed = pooled[:, :group].sum(-1) - pooled[:, group:].sum(-1)
+    permuted, found = np.abs(moved.cumsum(1)), np.abs(observed.cumsum())
+    alive = np.ones(n_draws, dtype=bool)
+    for k in range(n_groups):
+        # As many of the draws may cross here as the error rate spent so far has left.
+        room = int(ALPHA * (k + 1) / n_groups * n_draws) - int((~alive).sum())
+        bound = np.sort(permuted[alive, k])[::-1][min(room, alive.sum() - 1)]
+        if found[k] > bound + 1e-12:
+            return True
+        alive &= permuted[:, k] <= bound + 1e-12
+    return False
+
+
+GROWN: dict[str, list[Law]] = {
+    "as the headline": [
+        *(steady(1.0), normal(0.984, 0.002)),
+        *(failing(0.0, 0.98), failing(0.05, 0.98), failing(0.1, 0.9)),
+    ],
+    "two agents, 1 standard deviation apart": [normal(0.66, 0.06), normal(0.6, 0.06)],
+    "two agents, the same": [normal(0.6, 0.01)] * 2,
+    "five agents, 0 to 4 standard deviations": [
+        normal(0.5 + 0.06 * apart, 0.06) for apart in (0, 0, 1, 2, 4)
+    ],
+}
+
+
+def print_growth(studies: int) -> None:
+    """Runs and decided pairs of fixed studies and of those that grow."""
+    print(f"\nMean number of runs, per cent of pairs decided, {studies:,} studies\n")
+    fixed, most = (10, 30, 50), (30, 50)
+    heading(["scores", *(f"{n} seeds" for n in fixed), *(f"grown to {n}" for n in most)])
+    for name, laws in GROWN.items():
+        rng, found = np.random.default_rng(6), Counter[str]()
+        for _ in range(studies):
+            scores = {str(k): law.draw(rng, fixed[-1]) for k, law in enumerate(laws)}
+            for n in fixed:
+                first = {key: values[:n] for key, values in scores.items()}
+                judged = judge_pairs(first, MARGIN, ALPHA, decided={}, ends=ENDS).values()
+                found[f"fixed {n}"] += sum(each.is_decided for each in judged)
+                found[f"fixed {n} runs"] += n * len(laws)
+            for n in most:
+                first = {key: values[:n] for key, values in scores.items()}
+                sizes = look_sizes(fixed[0], n, len(laws), ALPHA)
+                growth = grow(first, sizes, MARGIN, ALPHA, ends=ENDS)
+                found[f"grown {n}"] += sum(each.is_decided for each in growth.judged.values())
+                found[f"grown {n} runs"] += sum(growth.seeds.values())
+        n_pairs = len(list(combinations(laws, 2)))
+        keys = [*(f"fixed {n}" for n in fixed), *(f"grown {n}" for n in most)]
+        cells = [
+            f"{found[f'{key} runs'] / studies:.0f}, {100 * found[key] / studies / n_pairs:.0f}"
+            for key in keys
+        ]
+        row([name, *cells])
+
+
+TABLES: dict[str, Callable[[int], None]] = {
+    "errors": print_errors,
+    "environments": print_environments,
+    "paired": print_paired,
+    "coverage": print_coverage,
+    "power": print_power,
+    "growth": print_growth,
+}
 
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--studies", type=int, default=2000, help="simulated for each figure")
-    studies = parser.parse_args().studies
-    print_errors(studies)
-    print_errors_of_many(max(studies // 10, 1))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("tables", nargs="*", metavar="TABLE", help=", ".join(TABLES))
+    parser.add_argument("--studies", type=int, default=1000, help="simulated for each figure")
+    parser.add_argument("--publish", action="store_true", help=f"write into {MEASURED}")
+    args = parser.parse_args()
+    for name in args.tables or TABLES:
+        with ExitStack() as stack:
+            if args.publish:
+                path = MEASURED / f"verdict-{name}.md"
+                file = stack.enter_context(path.open("w", encoding="utf-8"))
+                stack.enter_context(redirect_stdout(file))
+            TABLES[name](args.studies)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from agents.networks.engine_setting import EnginePlan
     from experiments.launching import Launcher, Launchers
-    from pipeline.evaluation.sampled import Evaluation
+    from pipeline.evaluation.sampled import Evaluation, Yardstick
     from pipeline.preparation import EngineOutlook
 
 UNBOUNDED = 10_000  # columns
@@ -200,11 +201,13 @@ def describe_measured(evaluation: Evaluation) -> str:
     yardstick, value = evaluation.yardstick, evaluation.mean_return
     if yardstick is None:
         return ""
-    optimum, score = f"optimum {yardstick.optimum:.2f}", f"score {yardstick.score(value):.2f}"
+    optimum, score = f"optimum {yardstick.optimum:.2f}", f"score {_score(yardstick, value)}"
     if yardstick.at_least is not None:
         optimum = f"optimum between {yardstick.at_least:.2f} and {yardstick.optimum:.2f}"
-        most = f"{yardstick.lower_end.score(value):.2f}"
+        most = _score(yardstick.lower_end, value)
         score += f" to {most} (bracketed)" if not score.endswith(most) else " (bracketed)"
+    if not yardstick.has_scale:
+        score = f"{yardstick.gap(value):.3g} below the optimum"
     text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"
     if evaluation.beats_optimum:
         text += (
@@ -212,6 +215,11 @@ def describe_measured(evaluation: Evaluation) -> str:
             "bracket is of, or the bracket is wrong"
         )
     return text
+
+
+def _score(yardstick: Yardstick, value: float) -> str:
+    """Rounded down: 1 is the optimum and nothing less."""
+    return f"{math.floor(100 * yardstick.score(value) + 1e-6) / 100:.2f}"
 
 
 def episodes(n: int) -> str:

@@ -6,8 +6,7 @@ instead.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -25,13 +24,16 @@ from mdp.transition_model import Floats
 from pipeline.environments import training_changes, trains_on_variant
 from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL
+from pipeline.evaluation.sampled import Yardstick
 from pipeline.signs_of_life import Tell, tell_nobody
 from pipeline.train_spec import TrainSpec
 from verdicts import (
     FEWEST_SEEDS,
     Band,
+    Ends,
     Estimate,
     FailureCount,
+    MeanVerdict,
     PairComparison,
     SpeedComparison,
     Summary,
@@ -45,6 +47,9 @@ from verdicts import (
     fewest_seeds,
     grow,
     judge_pairs,
+    level_of_claim,
+    level_of_environment,
+    mean_interval,
     performance_profile,
     probability_of_improvement,
     summarise,
@@ -91,7 +96,7 @@ def failures(
     if np.isnan(threshold):
         return {}
     return {
-        name: count_failures(values, threshold, level / len(by_chance))
+        name: count_failures(values, threshold, level_of_claim(level, "failures") / len(by_chance))
         for name, values in by_chance.items()
     }
 
@@ -115,6 +120,7 @@ def speeds(
 
 # --- What the verdicts on an environment rest on.
 
+UNIT = Ends(0.0, 1.0)  # of scores
 MARGIN = 0.02  # of the way from the best random or constant policy to the optimum
 
 
@@ -133,6 +139,16 @@ class Evidence:
     threshold: float | None  #: the return that counts as solved, or None
     margin: float  #: the difference within which agents count as equivalent
     certain: frozenset[str]  #: the agents that do not depend on chance
+    #: Between which means are judged: the best random or constant policy and the optimum, where the
+    #: verdicts are about that and it is known; else beyond all runs there are.
+    ends: Ends
+    is_score: bool  #: whether these are the ends of the score
+    paired: bool  #: whether runs of one seed share their randomness
+    n_environments: int  #: of the study, which share its error rate
+
+    def share(self, level: float) -> float:
+        """What of the error rate of a look is for this environment."""
+        return level_of_environment(level, self.n_environments)
 
     @property
     def given(self) -> dict[str, Floats]:
@@ -140,10 +156,9 @@ class Evidence:
         return {name: values[: self.seeds[name]] for name, values in self.scores.items()}
 
     def fewest(self, level: float) -> int:
-        """With how few seeds any two agents can be told apart at this level."""
-        there = {name for name, values in self.scores.items() if np.isfinite(values).any()}
-        n_tested = math.comb(len(there), 2) - math.comb(len(there & self.certain), 2)
-        return max(fewest_seeds(level / max(n_tested, 1)), FEWEST_SEEDS)
+        """With how few seeds anything can be said of any two agents at a look of this level."""
+        there = sum(bool(np.isfinite(values).any()) for values in self.scores.values())
+        return fewest_seeds(self.share(level), 2 if there > 2 else 1)
 
 
 def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
@@ -158,9 +173,14 @@ def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
     at_least = _first(table, "optimum_at_least")
     reachable = optimum if at_least is None else at_least
     span = 0.0 if reachable is None or baseline is None else reachable - baseline
+    scores = {name: sign * each for name, each in values.items()}
+    ends, is_score = Ends.beyond(scores), False
+    if study.metric in ON_THE_SCALE and optimum is not None and baseline is not None:
+        is_score = Yardstick(optimum, baseline).has_scale
+        ends = Ends(baseline, optimum) if is_score else ends
     return Evidence(
         environment=environment,
-        scores={name: sign * each for name, each in values.items()},
+        scores=scores,
         seeds=_seeds(results, environment),
         optimum=optimum,
         optimum_at_least=at_least,
@@ -168,6 +188,10 @@ def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
         threshold=_first(table, "threshold"),
         margin=MARGIN * span if study.margin is None else study.margin,
         certain=agents_without_chance(results, table),
+        ends=ends,
+        is_score=is_score,
+        paired=study.shared_randomness,
+        n_environments=len(study.environments),
     )
 
 
@@ -184,6 +208,25 @@ def _first(table: pd.DataFrame, column: str) -> float | None:
     return None if known.empty else float(known.iloc[0])
 
 
+def bounded_mean(values: Floats, ends: Ends, *, exact: bool = False) -> Estimate:
+    """The mean of scores or returns, with the interval that holds for every law between two ends.
+
+    Where a run lies beyond an end, a few others may lie anywhere: then there is no interval.
+    """
+    known = values[np.isfinite(values)]
+    n_missing = len(values) - len(known)
+    if not len(known):
+        return Estimate(np.nan, np.nan, np.nan, 0, n_missing)
+    mean = float(known.mean())
+    slack = 1e-9 * (ends.high - ends.low)
+    is_within = ends.low - slack <= known.min() and known.max() <= ends.high + slack
+    if not is_within or (len(known) == 1 and not exact):
+        return Estimate(mean, np.nan, np.nan, len(known), n_missing)
+    low, high = mean_interval(ends.shares(known), 0.05, exact=exact)
+    low, high = (ends.low + share * (ends.high - ends.low) for share in (low, high))
+    return Estimate(mean, min(low, mean), max(high, mean), len(known), n_missing)
+
+
 # --- All environments together.
 
 
@@ -194,12 +237,17 @@ class OverallAnalysis:
     scores: Mapping[str, Summary]  #: estimates by agent, the best first
     #: By two agents' labels, the probability that the first scores higher.
     improvement: Mapping[tuple[str, str], Estimate]
+    #: Every two agents, the better ranked first, by the means of their scores over environments.
+    pairs: tuple[PairComparison, ...]
     thresholds: Floats  #: scores at which the profiles are given, shape (n,)
     profiles: Mapping[str, Band]  #: by agent, the share of runs that score higher than each of them
 
 
-def analyse_overall(results: StudyResults) -> OverallAnalysis | None:
-    """Judge the agents over all environments; None for a single one, or without scores."""
+def analyse_overall(results: StudyResults, look: Standing | None = None) -> OverallAnalysis | None:
+    """Judge the agents over all environments; None for a single one, or without scores.
+
+    A seed counts by its mean score over all environments, so that each of them weighs the same.
+    """
     study = results.study
     labels = [environment.label for environment in study.environments]
     if len(labels) < 2:
@@ -211,11 +259,34 @@ def analyse_overall(results: StudyResults) -> OverallAnalysis | None:
     }
     if any(np.isnan(matrix).all(axis=0).any() for matrix in scores.values()):
         return None
-    summaries = {agent: summarise(matrix, seed=RESAMPLING_SEED) for agent, matrix in scores.items()}
-    order = sorted(summaries, key=lambda agent: summaries[agent].iqm.point, reverse=True)
+    look = look or Standing()
+    means = {agent: np.clip(matrix, 0, 1).mean(axis=1) for agent, matrix in scores.items()}
+    order = sorted(means, key=lambda agent: float(np.nanmean(means[agent])), reverse=True)
+    means = {agent: means[agent] for agent in order}
+    levels = [level_of_environment(each, len(labels)) for each in (look.level, look.next_level)]
+    ends, paired = UNIT, study.shared_randomness
+    judged = judge_pairs(means, MARGIN, levels[0], ends=ends, paired=paired)
+    n_seeds = {pair: (each, study.n_seeds) for pair, each in judged.items()}
+    pairs = describe_pairs(
+        n_seeds,
+        means,
+        MARGIN,
+        (levels[0], levels[1]),
+        ends,
+        seed=RESAMPLING_SEED,
+        paired=paired,
+        ranks=len(means) > 2,
+    )
+    summaries = {
+        agent: replace(
+            summarise(scores[agent], seed=RESAMPLING_SEED), mean=bounded_mean(means[agent], ends)
+        )
+        for agent in order
+    }
     thresholds = np.linspace(0, 1, 101)
     return OverallAnalysis(
-        scores={agent: summaries[agent] for agent in order},
+        scores=summaries,
+        pairs=tuple(pairs),
         improvement=_improvement({agent: scores[agent] for agent in order}),
         thresholds=thresholds,
         profiles={
@@ -237,6 +308,27 @@ def _improvement(scores: Mapping[str, Floats]) -> dict[tuple[str, str], Estimate
     return found
 
 
+def not_behind(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[str]:
+    """The agents that none is shown to be better than, without a condition.
+
+    Each of the others is behind one of them.
+    """
+    behind = {
+        p.second if p.verdict == "better" else p.first
+        for p in pairs
+        if p.verdict in ("better", "worse") and not p.is_conditional
+    }
+    return [name for name in names if name not in behind]
+
+
+def shown_best(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[str]:
+    """The agent that is shown to be ahead of all others, or several such that are equal."""
+    ahead = not_behind(names, pairs)
+    among = [pair for pair in pairs if {pair.first, pair.second} <= set(ahead)]
+    are_equal = all(pair.said == MeanVerdict("equivalent") for pair in among)
+    return ahead if are_equal and len(names) > 1 else []
+
+
 # --- Each environment.
 
 # Of agents that were trained on a changed environment.
@@ -249,6 +341,7 @@ class AgentAnalysis:
 
     agent: str  #: its label
     algo: str  #: its name in the table of agents
+    judged: Estimate  #: its mean score between the ends on which means are judged
     n_runs: int  #: runs that finished
     n_missing: int  #: runs that did not
     metric: Summary  #: estimates of what the verdicts are about, over seeds
@@ -310,6 +403,16 @@ class EnvironmentAnalysis:
     #: By agent, where agents play environments whose optima differ; else empty.
     optima: Mapping[str, float] = field(default_factory=dict)
     advice: tuple[str, ...] = ()  #: sentences on runs that failed, see `experiments.analysis`
+    ends: Ends = UNIT  #: between which means are judged
+    is_score: bool = True  #: whether these are the ends of the score
+    is_same: bool = False  #: whether all runs of all agents have the same figure
+    #: The agents whose final returns are, by six standard errors, above what no policy exceeds.
+    impossible: tuple[str, ...] = ()
+
+    @property
+    def best(self) -> list[str]:
+        """The agents shown to be best on average, without a condition: one, or several equal."""
+        return shown_best([agent.agent for agent in self.agents], self.pairs)
 
 
 @dataclass(frozen=True)
@@ -345,7 +448,13 @@ def analyse(
             look = (looks or {}).get(environment.label, Standing())
             environments.append(_analyse_environment(results, evidence, look))
     tell("all environments")
-    return StudyAnalysis(results, tuple(environments), analyse_overall(results))
+    overall = analyse_overall(results, _latest((looks or {}).values()))
+    return StudyAnalysis(results, tuple(environments), overall)
+
+
+def _latest(looks: Iterable[Standing]) -> Standing | None:
+    """The look with the lowest error rate."""
+    return min(looks, key=lambda look: look.level, default=None)
 
 
 def _analyse_environment(
@@ -353,16 +462,15 @@ def _analyse_environment(
 ) -> EnvironmentAnalysis:
     study, table, environment = results.study, results.summary, evidence.environment
     table = table[table["environment"] == environment]
-    sign = -1.0 if study.metric in COSTS else 1.0
-    agents = [_analyse_agent(results, environment, *each) for each in evidence.seeds.items()]
+    level = evidence.share(look.level)
+    agents = [_analyse_agent(results, evidence, *each) for each in evidence.seeds.items()]
     missing = {agent.agent: agent.n_missing for agent in agents}
     agents = [agent for agent in agents if agent.n_runs]
-    points = {agent.agent: sign * agent.metric.mean.point for agent in agents}
     last = -np.inf  # those without a figure
-    agents.sort(key=lambda a: last if np.isnan(points[a.agent]) else points[a.agent], reverse=True)
+    agents.sort(key=lambda a: last if np.isnan(a.judged.point) else a.judged.point, reverse=True)
     names = [agent.agent for agent in agents]
     scores = {name: evidence.scores[name] for name in names}
-    failed = failures(study.metric, scores, evidence.baseline, look.level, evidence.certain)
+    failed = failures(study.metric, scores, evidence.baseline, level, evidence.certain)
     fewest = evidence.fewest(look.level)
     # Of agents with fewer runs nothing is claimed.
     enough = {name: count for name, count in failed.items() if count.n >= fewest}
@@ -379,13 +487,39 @@ def _analyse_environment(
         missing=missing,
         fewest=fewest,
         failures=failed,
-        unreliable=tuple(fail_more_often(enough, look.level)),
-        speeds=speeds(results, environment, names, look.level),
+        unreliable=tuple(fail_more_often(enough, level_of_claim(level, "fails more"))),
+        speeds=speeds(results, environment, names, level_of_claim(level, "sooner")),
         seeds=evidence.seeds,
         look=look,
         optimum_at_least=evidence.optimum_at_least,
         optima=_differing_optima(table),
+        ends=evidence.ends,
+        is_score=evidence.is_score,
+        is_same=_are_alike(scores),
+        impossible=_impossible(evidence, table),
     )
+
+
+def _impossible(evidence: Evidence, table: pd.DataFrame) -> tuple[str, ...]:
+    most = evidence.optimum
+    if most is None or evidence.optimum_at_least is None:
+        return ()
+    found = []
+    for agent, rows in table.groupby("agent", sort=False):
+        finals = rows["final"].dropna().to_numpy(np.float64)
+        error = float(finals.std(ddof=1)) / len(finals) ** 0.5 if len(finals) > 1 else np.inf
+        if float(finals.mean()) - 6 * error > most + abs(most) * 1e-6:
+            found.append(str(agent))
+    return tuple(found)
+
+
+def _are_alike(scores: Mapping[str, Floats]) -> bool:
+    """Whether there are runs of two agents or more, and all have the same figure."""
+    values = [each[np.isfinite(each)] for each in scores.values()]
+    if len(values) < 2 or min(map(len, values)) == 0:
+        return False
+    together = np.concatenate(values)
+    return bool(np.ptp(together) <= 1e-9 * abs(together[0]))
 
 
 def _differing_optima(table: pd.DataFrame) -> dict[str, float]:
@@ -400,26 +534,40 @@ def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[Pai
     """Every two agents, as judged at this look, or at that of a design which decided them."""
     scores = {name: evidence.scores[name] for name in names}
     margin, certain = evidence.margin, evidence.certain
+    ends, paired = evidence.ends, evidence.paired
     if look.design is None:
+        level = evidence.share(look.level)
         judged = {
             pair: (judgement, len(scores[pair[0]]))
-            for pair, judgement in judge_pairs(scores, margin, look.level, certain).items()
+            for pair, judgement in judge_pairs(
+                scores, margin, level, certain, ends=ends, paired=paired
+            ).items()
         }
     else:
         given = {name: evidence.given[name] for name in names}
-        growth = grow(given, look.design.sizes, margin, look.design.level, certain)
+        level = evidence.share(look.design.level)
+        growth = grow(given, look.design.sizes, margin, level, certain, ends=ends, paired=paired)
         judged = {
             pair: (judgement, look.design.sizes[growth.looks[pair] - 1])
             for pair, judgement in growth.judged.items()
         }
-    levels = (look.level, look.next_level)
-    return describe_pairs(judged, scores, margin, levels, seed=RESAMPLING_SEED)
+    levels = (evidence.share(look.level), evidence.share(look.next_level))
+    return describe_pairs(
+        judged,
+        scores,
+        margin,
+        levels,
+        ends,
+        seed=RESAMPLING_SEED,
+        paired=paired,
+        ranks=look.design is None and len(scores) > 2,
+    )
 
 
 def _analyse_agent(
-    results: StudyResults, environment: str, agent: str, n_seeds: int
+    results: StudyResults, evidence: Evidence, agent: str, n_seeds: int
 ) -> AgentAnalysis:
-    study, table = results.study, results.summary
+    study, table, environment = results.study, results.summary, evidence.environment
     table = table[(table["environment"] == environment) & (table["agent"] == agent)]
 
     def values(column: str) -> Floats:
@@ -430,17 +578,27 @@ def _analyse_agent(
         return estimate(values(column), "mean", seed=RESAMPLING_SEED)
 
     has_threshold = bool(table["threshold"].notna().any())
+    exact, sign = agent in evidence.certain, -1.0 if study.metric in COSTS else 1.0
     metric = summarise(values(study.metric), seed=RESAMPLING_SEED)
+    mean_of_scores = bounded_mean(evidence.scores[agent], evidence.ends, exact=exact)
+    ends = [sign * mean_of_scores.low, sign * mean_of_scores.high]
+    metric = replace(metric, mean=replace(metric.mean, low=min(ends), high=max(ends)))
+    score = None
+    optimum, baseline = evidence.optimum, evidence.baseline
+    if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
+        clipped = bounded_mean(np.clip(values("score"), 0, 1), UNIT, exact=exact)
+        score = replace(summarise(values("score"), seed=RESAMPLING_SEED), mean=clipped)
     return AgentAnalysis(
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
+        judged=bounded_mean(
+            evidence.ends.shares(evidence.scores[agent]), Ends(0.0, 1.0), exact=exact
+        ),
         n_runs=len(table),
         n_missing=n_seeds - len(table),
         metric=metric,
-        score=summarise(values("score"), seed=RESAMPLING_SEED)
-        if table["score"].notna().any()
-        else None,
-        final=mean("final"),
+        score=score,
+        final=metric.mean if study.metric == "final" else mean("final"),
         area=mean("area"),
         last_episodes=mean("last_episodes"),
         regret=metric.mean if study.metric == "regret" else mean("regret"),

@@ -26,7 +26,7 @@ from experiments.results import StudyResults
 from experiments.study import StudySpec
 from mdp.transition_model import Floats
 from pipeline.errors import UserError
-from verdicts import Growth, grow, look_sizes
+from verdicts import Growth, grow, level_of_environment, look_sizes
 
 
 def take_looks(results: StudyResults) -> dict[str, Standing]:
@@ -113,7 +113,7 @@ class Step:
     @property
     def undecided(self) -> list[tuple[str, str]]:
         """The pairs that are."""
-        return [pair for pair, each in self.growth.judged.items() if each.verdict == "undecided"]
+        return [pair for pair, each in self.growth.judged.items() if not each.is_decided]
 
 
 def settled_looks(study: StudySpec, root: Path, most: int | None) -> LookLog:
@@ -183,7 +183,8 @@ def _settled(study: StudySpec, looks: Looks, most: int | None) -> Design:
         after, most = looks.design.after, most or looks.design.sizes[-1]
     design = Design(question_of(study), (), {}, after)
     most = max(most or MOST_SEEDS, study.n_seeds)
-    sizes = look_sizes(study.n_seeds, most, len(study.agents), design.level)
+    level = level_of_environment(design.level, len(study.environments))
+    sizes = look_sizes(study.n_seeds, most, len(study.agents), level)
     return replace(design, sizes=sizes, seeds={agent.label: sizes[0] for agent in study.agents})
 
 
@@ -223,7 +224,15 @@ def _check_runs(root: Path, looks: Looks, evidence: Evidence) -> None:
 
 
 def _looked(looks: Looks, design: Design, evidence: Evidence) -> tuple[Looks, Step]:
-    growth = grow(evidence.given, design.sizes, evidence.margin, design.level, evidence.certain)
+    growth = grow(
+        evidence.given,
+        design.sizes,
+        evidence.margin,
+        evidence.share(design.level),
+        evidence.certain,
+        ends=evidence.ends,
+        paired=evidence.paired,
+    )
     seeds = {name: max(n, design.seeds.get(name, 0)) for name, n in growth.seeds.items()}
     more = tuple(
         look_at(

@@ -1,7 +1,7 @@
 """How often a study has been looked at, and what each look may spend of the error rate.
 
-The promise is given for each environment: at most ``ALPHA`` of the studies say anything wrong
-there. So looks are counted for each environment by itself.
+At most ``ALPHA`` of the studies say anything wrong: each environment, and all of them together, may
+spend its share. Looks are counted for each environment by itself.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pipeline.files import write_json
 from safe_files.files import UnsafeFileError, read_file
 from verdicts import level_of_look
 
-ALPHA = 0.05  # of the studies, at most, say anything wrong on an environment
+ALPHA = 0.05  # of the studies, at most, say anything wrong
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Question:
     margin: float | None
     threshold: float | None  # return that counts as solved; None for the usual
     first_seed: int  # the first seed
+    shared_randomness: bool  # whether agents are compared seed by seed
 
 
 @dataclass(frozen=True)
@@ -130,13 +131,15 @@ class Standing:
 
 def question_of(study: StudySpec) -> Question:
     """What a study asks of its runs."""
-    return Question(study.metric, study.margin, study.threshold, study.first_seed)
+    return Question(
+        study.metric, study.margin, study.threshold, study.first_seed, study.shared_randomness
+    )
 
 
 # --- The file in the folder of a study that remembers the looks at it.
 
 LOOKS_FILE = "looks.json"
-_FORMAT = 1
+_FORMAT = 2
 _LARGEST = 50_000_000  # bytes; a thousand agents looked at a hundred times take less
 _LARGEST_NUMBER = 1e300
 

@@ -144,6 +144,9 @@ class StudySpec:
     #: Difference of the metric within which two agents count as equivalent; None for 2 % of the way
     #: from the best random or constant policy to the optimum, where that is known.
     margin: float | None = None
+    #: Whether an agent's run and another's with the same seed share their randomness, as those of
+    #: bandits whose arms and rewards are drawn by the seed: they are then compared seed by seed.
+    shared_randomness: bool = False
     #: Return that counts as solved; None for 95 % of that way, or else what the environment has
     #: registered.
     threshold: float | None = None
@@ -200,6 +203,7 @@ _STUDY_VALUES: dict[str, Any] = {
     "eval_episodes": int,
     "metric": Metric,
     "margin": float,
+    "shared_randomness": bool,
     "threshold": float,
     "episodes_table": int,
 }

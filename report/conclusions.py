@@ -7,14 +7,25 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from experiments.analysis import (
+    MARGIN,
     MARK,
     ON_THE_SCALE,
     AgentAnalysis,
     EnvironmentAnalysis,
     StudyAnalysis,
+    not_behind,
+    shown_best,
 )
 from experiments.study import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
-from report.words import enumeration, interval, number, optimum_words, ordinal, seeds
+from report.words import (
+    enumeration,
+    interval,
+    number,
+    optimum_words,
+    ordinal,
+    score_with_interval,
+    seeds,
+)
 from verdicts import PairComparison
 
 # Sentences on pairs of agents: verdicts, and who fails more often.
@@ -32,21 +43,41 @@ def oriented_pairs(environment: EnvironmentAnalysis) -> list[PairComparison]:
 
 
 def pair_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
-    """The verdicts, those with the same first agent and the same verdict in one sentence."""
+    """The verdicts on means, those with the same first agent and verdict in one sentence.
+
+    Then those on typical runs, where they say something else.
+    """
     too_few = study.n_seeds < environment.fewest
-    texts = [f"{_on_equivalent(environment, g)}." for g in _equivalent_groups(environment)]
+    equal = [
+        group for group in _equivalent_groups(environment) if group != _equal_best(environment)
+    ]
+    texts = [f"{_on_equivalent(environment, group)}." for group in equal]
     oriented = oriented_pairs(environment)
     for name in (agent.agent for agent in environment.agents):
         pairs = [pair for pair in oriented if pair.first == name]
-        better = [_by_how_much(environment, pair) for pair in pairs if pair.verdict == "better"]
+        ahead = [pair for pair in pairs if pair.verdict == "better"]
+        better = [_lead_of(environment, p) for p in ahead if not p.is_conditional]
+        seen = [_lead_of(environment, p) for p in ahead if p.is_conditional]
         open_ = [_how_open(environment, pair) for pair in pairs if pair.verdict == "undecided"]
         if better:
-            texts.append(f"{name} is better than {enumeration(better)}.")
-        if open_ and not too_few:
-            texts.append(f"{name} is undecided against {enumeration(open_)}.")
+            texts.append(f"{name} is better on average than {enumeration(better)}.")
+        if seen:
+            conditional = [p for p in ahead if p.is_conditional]
+            condition = _condition(environment, conditional)
+            texts.append(f"{name} is ahead on average of {enumeration(seen)}, {condition}.")
+        if open_ and not too_few and not environment.is_same:
+            texts.append(f"{name} is undecided on average against {enumeration(open_)}.")
     if too_few and texts and any(pair.verdict == "undecided" for pair in oriented):
         texts.append(f"All other pairs are undecided: {too_few_seeds(study, environment)}.")
-    return texts
+    return [*texts, *_on_typical_runs(environment)]
+
+
+def _equal_best(environment: EnvironmentAnalysis) -> list[str]:
+    """The agents, two or more, that none is better than and that are equal: the first line's."""
+    ahead = not_behind([agent.agent for agent in environment.agents], environment.pairs)
+    pairs = [p for p in environment.pairs if {p.first, p.second} <= set(ahead)]
+    are_equal = all(pair.verdict == "equivalent" for pair in pairs)
+    return ahead if pairs and are_equal else []
 
 
 def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
@@ -64,58 +95,111 @@ def too_few_seeds(study: StudySpec, environment: EnvironmentAnalysis) -> str:
 
 def _on_equivalent(environment: EnvironmentAnalysis, group: Sequence[str]) -> str:
     """Who is equivalent, in what, and what so few runs leave open."""
-    within = f" within {number(environment.margin)}" if environment.margin > 0 else ""
+    within = _within(environment)
     pairs = [p for p in environment.pairs if p.first in group and p.second in group]
     if all(pair.certain for pair in pairs):
         return f"{enumeration(group)} are equivalent{within}"
-    text = f"{enumeration(group)} are equivalent in the typical run{within}"
-    text += _shown_with(environment, pairs)
-    counts = {name: environment.failures[name] for name in group if name in environment.failures}
-    if not counts:
-        n = min(pair.difference.n for pair in pairs)
-        rare = 1 - 0.05 ** (1 / n)
-        return f"{text}; what fewer than {rare:.0%} of runs do, {seeds(n)} may not show"
-    if len({(count.n_failed, count.n) for count in counts.values()}) == 1:
-        count = next(iter(counts.values()))
-        each = " each" if len(counts) > 1 else f" of {next(iter(counts))}"
-        return (
-            f"{text}; {count.n_failed} of {count.n} runs{each} failed, up to {count.most:.0%} could"
-        )
-    told = [
-        f"{count.n_failed} of {count.n} runs of {name} failed (up to {count.most:.0%} could)"
-        for name, count in counts.items()
-    ]
-    return f"{text}; {enumeration(told)}"
+    shown_with = _shown_with(environment, pairs)
+    if not any(pair.is_conditional for pair in pairs):
+        return f"{enumeration(group)} are equivalent on average{within}{shown_with}"
+    runs = f"the runs of {enumeration(group)} that were seen are equal on average{within}"
+    text = f"{runs[0].upper()}{runs[1:]}{shown_with}; {_unseen(environment, pairs)}"
+    failed = failed_runs(environment, group)
+    return f"{text}; {failed}" if failed else text
+
+
+def _within(environment: EnvironmentAnalysis) -> str:
+    """The margin, in scores or else in the unit of the figures."""
+    margin, ends = environment.margin, environment.ends
+    if environment.is_score:
+        margin /= ends.high - ends.low
+    return f" within {number(margin)}" if margin > 0 else ""
+
+
+def _unseen(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
+    """How many further runs may be unlike those that were seen: right in 95 of 100 studies."""
+    n = min(agent.n_runs for agent in environment.agents if _is_in(agent.agent, pairs))
+    n = min([n, *(pair.n_seeds for pair in pairs)])
+    return f"after {n:,} runs, up to {1 - 0.05 ** (1 / n):.0%} of further ones may be different"
+
+
+def _is_in(name: str, pairs: Sequence[PairComparison]) -> bool:
+    return any(name in (pair.first, pair.second) for pair in pairs)
 
 
 def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
-    """Agents of which every two are equivalent, in groups that hold all such pairs."""
+    """Agents of which every two are equivalent, in groups that hold all such pairs.
+
+    Those that are so with a condition stand apart from those that are without.
+    """
     names = [agent.agent for agent in environment.agents]
     pairs = pairs_both_ways(environment)
-    equal = [both for both, pair in pairs.items() if pair.verdict == "equivalent"]
     groups: list[list[str]] = []
-    for pair in equal:
-        if not any(set(pair) <= set(group) for group in groups):
-            group = list(pair)
-            for name in names:
-                if all((name, member) in equal for member in group):
-                    group.append(name)
-            groups.append(sorted(group, key=names.index))
+    for is_conditional in (False, True):
+        equal = [
+            both
+            for both, pair in pairs.items()
+            if pair.verdict == "equivalent" and pair.is_conditional == is_conditional
+        ]
+        found: list[list[str]] = []
+        for pair in equal:
+            if not any(set(pair) <= set(group) for group in found):
+                group = list(pair)
+                for name in names:
+                    if all((name, member) in equal for member in group):
+                        group.append(name)
+                found.append(sorted(group, key=names.index))
+        groups += found
     return groups
 
 
-def _by_how_much(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
-    """The worse agent, the difference, and who failed, but of an agent most of whose runs did."""
+def amounts(environment: EnvironmentAnalysis, *shares: float) -> list[float]:
+    """Differences in scores, or else in the unit of the figures."""
+    span = 1.0 if environment.is_score else environment.ends.high - environment.ends.low
+    return [share * span for share in shares]
+
+
+def _lead_of(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
+    """The agent behind, by how much, and who failed, but of an agent most of whose runs did."""
     counts = {name: environment.failures.get(name) for name in (pair.first, pair.second)}
     few = [name for name, count in counts.items() if count and 2 * count.n_failed <= count.n]
     failed = failed_runs(environment, few)
-    text = f"by {interval(pair.difference)}{_shown_with(environment, [pair])}"
-    return f"{pair.second} ({text}{f'; {failed}' if failed else ''})"
+    mean = pair.mean
+    ends = (mean.seen_low, mean.seen_high) if pair.is_conditional else (mean.low, mean.high)
+    low, high = amounts(environment, *ends)
+    unit = " of the score" if environment.is_score else ""
+    by = f"by {number(low)} to {number(high)}{unit}{_shown_with(environment, [pair])}"
+    return f"{pair.second} ({by}{f'; {failed}' if failed else ''})"
+
+
+def _condition(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
+    """As long as what the leads hold."""
+    most = min(pair.mean.most_outside for pair in pairs)
+    return (
+        f"as long as fewer than {100 * most:.2g} % of further runs lie outside of those that were "
+        f"seen; {_unseen(environment, pairs)}"
+    )
+
+
+def _on_typical_runs(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """Where the typical runs say something else than the means."""
+    medians = {agent.agent: agent.metric.median.point for agent in environment.agents}
+    for pair in environment.pairs:
+        if pair.typical in ("undecided", pair.verdict) or pair.certain:
+            continue
+        seen = pair.swapped() if pair.typical == "worse" else pair
+        figures = f"{number(medians[seen.first])} and {number(medians[seen.second])}"
+        said = {"better": f"{seen.first} is better than {seen.second}"}.get(
+            seen.typical, f"{seen.first} and {seen.second} are equal"
+        )
+        failed = failed_runs(environment, [seen.first, seen.second])
+        yield f"In the typical run, {said} (medians {figures}{f'; {failed}' if failed else ''})."
 
 
 def _how_open(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
     """The other agent, the difference so far, and how many seeds it would take to decide."""
-    text = f"difference {interval(pair.difference)}{_shown_with(environment, [pair])}"
+    low, high = amounts(environment, pair.mean.seen_low, pair.mean.seen_high)
+    text = f"difference so far {number(low)} to {number(high)}{_shown_with(environment, [pair])}"
     if pair.seeds_needed is not None:
         text += f"; about {seeds(pair.seeds_needed)} are needed to decide"
     return f"{pair.second} ({text})"
@@ -142,7 +226,11 @@ def failed_runs(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
 
 def on_unreliable(environment: EnvironmentAnalysis) -> Iterable[str]:
     """Who fails more often, but for agents that are worse anyhow."""
-    worse = {(p.second, p.first) for p in oriented_pairs(environment) if p.verdict == "better"}
+    worse = {
+        (p.second, p.first)
+        for p in oriented_pairs(environment)
+        if p.verdict == "better" and not p.is_conditional
+    }
     for names in environment.unreliable:
         if names not in worse:
             more, less = (environment.failures[name] for name in names)
@@ -229,12 +317,10 @@ class Conclusion:
 def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion:
     """What a study has shown on one environment."""
     failed = failed_runs(environment, [agent.agent for agent in environment.agents])
-    has_equal = any(pair.verdict == "equivalent" for pair in environment.pairs)
-    equal = ": what is equivalent is so in the typical run" if has_equal else ""
     return Conclusion(
         lead=" ".join(_lead(study, environment)),
         pairs=tuple(pair_sentences(study, environment)),
-        failed=f"{failed}{equal}." if failed else "",
+        failed=f"{failed}." if failed else "",
         notes=(
             *_on_other_tasks(environment),
             *on_unreliable(environment),
@@ -247,6 +333,41 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
             *_on_looks(environment),
         ),
     )
+
+
+def overall_sentences(analysis: StudyAnalysis) -> list[str]:
+    """Who is best over all environments, as far as the verdicts say; nothing for a single one."""
+    overall = analysis.overall
+    if overall is None or len(overall.scores) < 2:
+        return []
+    names = list(overall.scores)
+    n = len(analysis.environments)
+    where = "Over both environments" if n == 2 else f"Over all {n} environments"
+    told = {
+        name: f"{name} (score {score_with_interval(overall.scores[name].mean)})" for name in names
+    }
+    best = shown_best(names, overall.pairs)
+    if len(best) == 1:
+        return [f"{where}, {told[best[0]]} is best on average."]
+    if best:
+        equal = enumeration([told[name] for name in best])
+        return [f"{where}, {equal} are best on average, and equal within {number(MARGIN)}."]
+    pairs = [pair.swapped() if pair.verdict == "worse" else pair for pair in overall.pairs]
+    ahead = not_behind(names, overall.pairs)
+    last = [told[name] for name in ahead[:MOST_FIGURES]]
+    more = f" or one of {len(ahead) - MOST_FIGURES} more" if len(ahead) > MOST_FIGURES else ""
+    text = f"{where}, it is undecided who is best on average: {enumeration(last)}{more}."
+    led = [p for p in pairs if p.first == names[0] and p.verdict == "better" and p.second in ahead]
+    if led and len(led) == len(ahead) - 1:
+        by = [
+            f"{p.second} (by {number(p.mean.seen_low)} to {number(p.mean.seen_high)})" for p in led
+        ]
+        share = 100 * min(p.mean.most_outside for p in led)
+        text += (
+            f" {names[0]} is ahead of {enumeration(by)}, as long as fewer than {share:.2g} % of "
+            "further seeds have a mean outside of those that were seen."
+        )
+    return [text]
 
 
 def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
@@ -272,46 +393,94 @@ def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
 
 
 def _standing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Who is best, as far as the verdicts say."""
-    names = [agent.agent for agent in environment.agents]
-    decided = [pair for pair in oriented_pairs(environment) if pair.verdict != "undecided"]
-    better = {(pair.first, pair.second) for pair in decided if pair.verdict == "better"}
-    same = {frozenset((pair.first, pair.second)) for pair in decided} - set(map(frozenset, better))
-    ahead = [name for name in names if not any((other, name) in better for other in names)]
-    first = [agent for agent in environment.agents if agent.agent in ahead]
+    """Who is best on average, as far as the verdicts say."""
+    agents = environment.agents
+    names = [agent.agent for agent in agents]
+    ahead = not_behind(names, environment.pairs)
+    first = [agent for agent in agents if agent.agent in ahead]
     but = _but_failed(environment, ahead)
     if len(names) == 1:
-        yield f"{names[0]}: {_figure(study, environment, first[0])}{but}."
-    elif not decided:
-        yield _nothing_decided(study, environment)
-    elif not ahead:
-        yield "No agent is best: for each of them there is another that is better."
-    elif len(ahead) == 1:
-        others = [name for name in names if name not in ahead and (ahead[0], name) not in better]
-        doubt = f"; against {enumeration(others)} it is undecided" if others else ""
-        yield f"{ahead[0]} is best: {_figure(study, environment, first[0])}{doubt}{but}."
-    elif all(frozenset((a, b)) in same for a in ahead for b in ahead if a != b):
-        where = " in the typical run" if but else ""
-        figure = _figure(study, environment, first[0])
-        yield f"{enumeration(ahead)} are best, and equivalent{where}: {figure}{but}."
+        yield f"{names[0]}: {_figure(study, environment, agents[0])}{but}."
+    elif environment.is_same:
+        yield _all_alike(study, environment)
+    elif study.n_seeds < environment.fewest and not any(pair.certain for pair in environment.pairs):
+        yield _so_far(study, environment)
+    elif len(environment.best) == 1:
+        yield f"{ahead[0]} is best on average: {_figure(study, environment, first[0])}{but}."
+    elif _equal_best(environment):
+        figures = _figures(study, environment, first)
+        seen = "" if environment.best else "As far as was seen, "
+        unseen = "" if environment.best else f"; {_unseen(environment, environment.pairs)}"
+        text = f"{seen}{enumeration(ahead)} are best on average, and equal{_within(environment)}"
+        yield f"{text}: {figures}{_optimum(study, environment)}{unseen}{but}."
     else:
         if len(ahead) > MOST_FIGURES:
-            whoever = f"one of {enumeration(ahead)}"
+            text = (
+                f"the {_extreme(study)} mean so far has {_figures(study, environment, first[:1])}"
+            )
+            whoever = f"one of {enumeration(ahead)}; {text}"
         else:
-            *others, last = [f"{agent.agent} ({interval(agent.metric.mean)})" for agent in first]
-            whoever = f"{', '.join(others)} or {last}"
-        yield f"Best is {whoever}: that is undecided{_optimum(study, environment)}{but}."
+            whoever = f"{_figures(study, environment, first, ' or ')}"
+        optimum = _optimum(study, environment)
+        yield f"Undecided on average: best is {whoever}{optimum}{but}."
+        if len(names) > 2:  # of two the sentence on the pair says it
+            yield from _leads_so_far(environment, ahead)
 
 
-def _nothing_decided(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    top = environment.agents[0]
-    why = f"{seeds_of(study, environment)} decide nothing"
-    if study.n_seeds < environment.fewest:
-        why = too_few_seeds(study, environment)
-    names = _equal_to(top, environment)
-    verb = "has" if len(names) == 1 else "have"
-    so_far = f"{verb} the {_extreme(study)} mean so far: {_figure(study, environment, top)}"
-    return f"Undecided: {why}. {enumeration(names)} {so_far}{_but_failed(environment, names)}."
+def _leads_so_far(environment: EnvironmentAnalysis, ahead: Sequence[str]) -> Iterable[str]:
+    """Whom the first agent leads as far as was seen, of those that are not shown to be behind."""
+    pairs = [p for p in oriented_pairs(environment) if {p.first, p.second} <= set(ahead)]
+    for name in ahead:
+        led = [p for p in pairs if p.first == name and p.verdict == "better"]
+        if len(led) == len(ahead) - 1 and led:
+            told = enumeration([_lead_of(environment, pair) for pair in led])
+            yield f"{name} is ahead of {told}, {_condition(environment, led)}."
+
+
+def _all_alike(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    """That all runs of all agents have the same figure: a fact, and no verdict."""
+    names = [agent.agent for agent in environment.agents]
+    n = min(agent.n_runs for agent in environment.agents)
+    who = "Both agents" if len(names) == 2 else f"All {len(names)} agents"
+    figure = number(environment.agents[0].metric.mean.point)
+    optimum = environment.optimum if study.metric in ON_THE_SCALE else None
+    if optimum is not None and math.isclose(
+        environment.agents[0].metric.mean.point, optimum, rel_tol=1e-6, abs_tol=1e-6
+    ):
+        text = f"{who} reach the optimum, {figure}, in all {n:,} runs"
+    else:
+        text = f"{who} have the same {METRIC_WORDS[study.metric]}, {figure}, in all {n:,} runs"
+        text += _optimum(study, environment)
+    return f"{text}; {_unseen(environment, environment.pairs)}."
+
+
+def _so_far(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    """The means of runs that are too few to claim anything."""
+    figures = _figures(study, environment, environment.agents[:MOST_FIGURES])
+    needed = [p.seeds_needed for p in environment.pairs if p.seeds_needed is not None]
+    n = seeds_of(study, environment)
+    decide = f"{n} decide{'s' if n == seeds(1) else ''}"
+    text = f"So far: {figures}{_optimum(study, environment)}; {decide}"
+    if not needed:
+        return f"{text} nothing, {environment.fewest} or more can."
+    return f"{text} nothing, about {max(min(needed), environment.fewest)} like these would."
+
+
+def _figures(
+    study: StudySpec,
+    environment: EnvironmentAnalysis,
+    agents: Sequence[AgentAnalysis],
+    last: str = " and ",
+) -> str:
+    """Of each agent its own mean."""
+    told = [f"{agent.agent} ({_mean(study, environment, agent)})" for agent in agents]
+    return last.join([", ".join(told[:-1]), told[-1]] if len(told) > 1 else told)
+
+
+def _mean(study: StudySpec, environment: EnvironmentAnalysis, agent: AgentAnalysis) -> str:
+    if environment.is_score:
+        return f"score {score_with_interval(agent.judged)}"
+    return interval(agent.metric.mean)
 
 
 def _but_failed(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
@@ -321,13 +490,15 @@ def _but_failed(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
 
 def _figure(study: StudySpec, environment: EnvironmentAnalysis, agent: AgentAnalysis) -> str:
     value = agent.metric.mean
-    text = f"{METRIC_WORDS[study.metric]} {interval(value)}"
+    text = f"{METRIC_WORDS[study.metric]} {number(value.point)}"
     if study.metric not in ON_THE_SCALE or environment.optimum is None:
-        return text
+        return f"{METRIC_WORDS[study.metric]} {interval(value)}"
     if math.isclose(value.point, environment.optimum, rel_tol=1e-6, abs_tol=1e-6):
         return f"{text}, the optimum"
-    if study.metric == "final" and agent.score is not None:
-        text += f", score {number(agent.score.mean.point)}"
+    if environment.is_score:
+        text += f", {_mean(study, environment, agent)}"
+    else:
+        text += f", {number(environment.optimum - value.point)} below the optimum"
     return f"{text}{_optimum(study, environment)}"
 
 
@@ -354,8 +525,11 @@ def _where_the_median_differs(study: StudySpec, environment: EnvironmentAnalysis
     by_mean = environment.agents[0]
     by_median = max(medians, key=medians.__getitem__)
     one, two = by_mean.metric, by_median.metric
-    if medians[by_median] > medians[by_mean] and not math.isclose(
-        one.median.point, two.median.point
+    is_first = sign * one.mean.point > sign * two.mean.point
+    if (
+        is_first
+        and medians[by_median] > medians[by_mean]
+        and not math.isclose(one.median.point, two.median.point)
     ):
         yield (
             f"By the mean {by_mean.agent} comes first ({number(one.mean.point)} against "
@@ -386,12 +560,7 @@ def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
 
 def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:
     """Agents whose returns are above what no policy exceeds."""
-    most = environment.optimum
-    if environment.optimum_at_least is None or most is None:
-        return
-    # Surely: by six standard errors, three times what the interval of the mean says.
-    least = {a.agent: a.final.point - 3 * (a.final.point - a.final.low) for a in environment.agents}
-    names = [name for name, value in least.items() if value > most + abs(most) * 1e-6]
+    names, most = environment.impossible, environment.optimum
     if names:
         verb = "has" if len(names) == 1 else "have"
         yield (

@@ -12,14 +12,22 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from experiments.analysis import EnvironmentAnalysis, StudyAnalysis, not_behind
 from experiments.plan import tuning_seeds
 from experiments.results import StudyResults
-from experiments.study import COSTS, METRIC_WORDS, StudySpec
+from experiments.study import METRIC_WORDS, StudySpec
 from pipeline.errors import visible
 from pipeline.files import replacing, write_text
-from report.conclusions import conclusion, none_has_learnt, on_changes, pairs_both_ways
-from report.words import enumeration, interval, number, seed_sentence, seeds
+from report.conclusions import conclusion, none_has_learnt, on_changes
+from report.words import (
+    enumeration,
+    interval,
+    number,
+    score_number,
+    score_with_interval,
+    seed_sentence,
+    seeds,
+)
 
 # The languages by the suffix of their files, which their templates have too.
 Markup = Literal["md", "tex"]
@@ -193,17 +201,20 @@ def headline(analysis: StudyAnalysis) -> Table:
 
 def _legend(analysis: StudyAnalysis) -> str:
     study, environments = analysis.study, analysis.environments
-    if all(_median_score(study, agent) for one in environments for agent in one.agents):
-        what = "Score of the median run: 1 is the optimum, 0 the best random or constant policy."
+    if all(one.is_score for one in environments):
+        what = (
+            "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts "
+            "as 0."
+        )
         names = [one.environment for one in environments if one.optimum_at_least is not None]
         if names:
             what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
     else:
-        what = f"{METRIC_WORDS[study.metric].capitalize()}: the median run."
-    extreme = "lowest" if study.metric in COSTS else "highest"
+        what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
     text = (
-        f"{what} Bold: the {extreme}, and what is shown to be equivalent to it in the typical run. "
-        f"?: not told apart from it by {seeds(study.n_seeds)}. Plain: shown to be worse."
+        f"{what} Bold: shown to be best on average, several where they are shown to be equal, or "
+        f"the same in all runs of all agents. ?: {seeds(study.n_seeds)} do not show that another "
+        "agent is better on average."
     )
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
@@ -216,7 +227,9 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
     costs = processor_seconds(analysis.results)
     cells = {}
     for agent in environment.agents:
-        figure = _median_score(analysis.study, agent) or number(agent.metric.median.point)
+        figure = number(agent.metric.mean.point)
+        if environment.is_score:
+            figure = score_number(agent.judged.point)
         place = places.get(agent.agent)
         cost = costs.get((agent.agent, environment.environment))
         count = environment.failures.get(agent.agent)
@@ -228,28 +241,19 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
     return cells
 
 
-def _median_score(study: StudySpec, agent: AgentAnalysis) -> str:
-    """The score of the median run, where scores are what the study is about; else empty."""
-    score = None if agent.score is None else agent.score.median.point
-    return "" if study.metric != "final" or score is None or math.isnan(score) else f"{score:.3f}"
-
-
 def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, str]:
-    """Each agent against the one whose median run is the best: ``best``, ``open`` or ``behind``.
+    """Each agent's place by its mean: ``best``, ``open`` or ``behind``.
 
     Empty where no agent has learnt anything, or there is no figure.
     """
-    sign = -1.0 if study.metric in COSTS else 1.0
-    known = [a for a in environment.agents if not math.isnan(a.metric.median.point)]
-    if not known or none_has_learnt(study, environment):
+    known = [a.agent for a in environment.agents if not math.isnan(a.judged.point)]
+    if none_has_learnt(study, environment):
         return {}
-    leader = max(known, key=lambda agent: sign * agent.metric.median.point).agent
-    words = {"undecided": "open", "better": "behind"}
-    return {leader: "best"} | {
-        second: words.get(pair.verdict, "best")
-        for (first, second), pair in pairs_both_ways(environment).items()
-        if first == leader
-    }
+    if environment.is_same:
+        return dict.fromkeys(known, "best")
+    ahead = not_behind(known, environment.pairs)
+    places = {name: "open" if name in ahead else "behind" for name in known}
+    return places | dict.fromkeys(environment.best, "best")
 
 
 def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
@@ -260,15 +264,15 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
         count, stays = environment.failures.get(agent.agent), agent.steps_to_stay
         cost = costs.get((agent.agent, environment.environment))
         figures = [
-            interval(agent.metric.median),
             interval(agent.metric.mean),
-            NOTHING if agent.score is None else number(agent.score.median.point),
+            number(agent.metric.median.point),
+            NOTHING if agent.score is None else score_with_interval(agent.score.mean),
             NOTHING if count is None else f"{count.n_failed} of {count.n}",
             NOTHING if stays is None else number(stays.median.point),
             NOTHING if cost is None else duration(cost),
         ]
         rows.append(Row(agent.agent, bool(agent.changes), list(map(Cell, figures))))
-    headings = ["median", "mean", "score", "failed", "stays from", "processor time"]
+    headings = ["mean", "median", "score", "failed", "stays from", "processor time"]
     # A column in which no agent has a figure is left out.
     kept = [k for k in range(len(headings)) if any(row.cells[k].figure != NOTHING for row in rows)]
     metric = METRIC_WORDS[results.study.metric]

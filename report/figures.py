@@ -46,10 +46,10 @@ from report.series import (
     PullSeries,
     StudySeries,
     Sweep,
-    best_of,
     linear_up_to,
     mean_regret,
     regret_of_runs,
+    with_best_mean,
 )
 from report.words import enumeration, number
 
@@ -516,7 +516,9 @@ def draw_sweeps(
         axes.plot(x, y, marker="o", label=label, markersize=4, **line_style(mark))
         if place < MOST_BANDS:
             fill_band(axes, sweep.means, mark)
-    best = best_of(environment, [label for sweep in sweeps.values() for label in sweep.labels])
+    best = with_best_mean(
+        environment, [label for sweep in sweeps.values() for label in sweep.labels]
+    )
     rings = [
         (x, y)
         for sweep in sweeps.values()
@@ -525,7 +527,7 @@ def draw_sweeps(
     ]
     if rings:
         x, y = np.transpose(rings)
-        label = f"best: {enumeration(best)}" if len(best) <= FEW else "best"
+        label = f"best mean: {enumeration(best)}" if len(best) <= FEW else "best mean"
         axes.scatter(x, y, 90, "none", edgecolor="black", label=label, zorder=3)
     if len(values) <= MOST_TICKS:
         axes.xaxis.set_major_locator(FixedLocator(values.tolist()))
@@ -556,7 +558,7 @@ def draw_grid(
     colours = mpl.colormaps["Blues"](0.05 + 0.75 * shares)
     across, down = (np.arange(-0.5, n) for n in grid.means.shape[::-1])  # edges of the cells
     axes.pcolormesh(across, down, colours, edgecolor="white", linewidth=1)
-    best = best_of(environment, [label for row in grid.labels for label in row])
+    best = with_best_mean(environment, [label for row in grid.labels for label in row])
     for (row, column), mean in np.ndenumerate(grid.means):
         if not np.isnan(mean):
             ink = "white" if shares[row, column] > 0.6 else "black"
@@ -573,7 +575,7 @@ def draw_grid(
     axes.tick_params(length=0)
     y, x = grid.parameters
     frames = "a frame" if len(best) == 1 else "frames"
-    title += f": {METRIC_WORDS[metric]}, means over seeds; the best in {frames}"
+    title += f": {METRIC_WORDS[metric]}, means over seeds; the best mean in {frames}"
     lettering(axes, title=title, x=x, y=y, beside=1.8)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
 from experiments.bandits import QUANTILES, PullStatistics
 from experiments.study import COSTS, StudySpec
-from report.words import interval, interval_alone, number
+from report.words import interval, interval_alone, number, score_number, score_with_interval
 from verdicts import Estimate, ThresholdSummary
 
 
@@ -107,7 +107,10 @@ def _score(row: Row) -> Cell | None:
     if row.agent.score is None:
         return None
     mean = row.agent.score.mean
-    return replace(estimate_cell(mean), bar=None if math.isnan(mean.point) else bar(mean))
+    cell = replace(
+        estimate_cell(mean), text=score_number(mean.point), in_line=score_with_interval(mean)
+    )
+    return replace(cell, bar=None if math.isnan(mean.point) else bar(mean))
 
 
 def _gap(row: Row) -> Cell | None:

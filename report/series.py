@@ -455,7 +455,7 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
     return found
 
 
-def best_of(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
+def with_best_mean(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
     """Those of these agents that have the best mean."""
     means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in labels}
     best = next(iter(means.values()), math.nan)

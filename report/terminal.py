@@ -15,21 +15,35 @@ from experiments.off_policy.estimators import difference_in_value, mean_reward
 from experiments.off_policy.logged_policies import Comparison, Judged
 from experiments.plan import tuning_seeds
 from experiments.study import METRIC_WORDS, StudySpec
-from report.conclusions import conclusion, pairs_both_ways, seeds_of
+from report.conclusions import conclusion, overall_sentences, pairs_both_ways, seeds_of
 from report.ranking import BANDIT_COLUMNS, COLUMNS, Cell, Column, Row, filled
 from report.words import enumeration, number, optimum_words, seed_sentence
-from verdicts import Estimate, Verdict
+from verdicts import Estimate, PairComparison, Verdict
 
 # All verdicts on an environment at a glance: a row and a column for each agent.
 
 SIGNS: dict[Verdict, str] = {"better": ">", "worse": "<", "equivalent": "=", "undecided": "?"}
 PHRASES: dict[Verdict, str] = {
-    "better": "is better than",
-    "worse": "is worse than",
+    "better": "is better on average than",
+    "worse": "is worse on average than",
     "equivalent": "is equivalent to",
     "undecided": "is undecided against",
 }
-LEGEND = "> better than the agent of the column, < worse, = equivalent, ? undecided"
+LEGEND = (
+    "> better on average than the agent of the column, < worse, = equivalent, ? undecided; "
+    "in brackets: as long as further runs are like those that were seen"
+)
+
+
+def sign(pair: PairComparison) -> str:
+    """The verdict on a pair in a sign, in brackets where it has a condition."""
+    return f"({SIGNS[pair.verdict]})" if pair.is_conditional else SIGNS[pair.verdict]
+
+
+def phrase(pair: PairComparison) -> str:
+    """The verdict on a pair in words, without the agents."""
+    seen = ", as far as was seen" if pair.is_conditional else ""
+    return f"{PHRASES[pair.verdict]}{seen}"
 
 
 def says_more(environment: EnvironmentAnalysis) -> bool:
@@ -51,6 +65,9 @@ FIRST_LEFT_OUT = (
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
     """Print a table for each environment and what it says in words, then what seeds these are."""
+    for sentence in overall_sentences(analysis):
+        console.print()
+        console.print(sentence, highlight=False)
     for environment in analysis.environments:
         console.print()
         _print_ranking(console, analysis, environment)
@@ -82,7 +99,7 @@ def _matrix(environment: EnvironmentAnalysis) -> Table:
         table.add_column(place, justify="right", no_wrap=True)
     pairs = pairs_both_ways(environment)
     for place, name in zip(numbers, names, strict=True):
-        signs = [SIGNS[pairs[name, n].verdict] if (name, n) in pairs else "·" for n in names]
+        signs = [sign(pairs[name, n]) if (name, n) in pairs else "·" for n in names]
         table.add_row(place, name, *signs)
     return table
 
@@ -152,7 +169,8 @@ def _caption(
     }
     means = ", ".join(name for name in ("mean", "IQM") if name not in left_out)
     metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals"
-    told = [f"{means}: {metric} over {seeds_of(study, environment)}"]
+    of_means = "those of means allow for runs that were not seen"
+    told = [f"{means}: {metric} over {seeds_of(study, environment)}; {of_means}"]
     for column, _ in filled(COLUMNS, rows):
         if column.terminal and column.caption and column.terminal not in left_out:
             told.append(f"{column.terminal}: {column.caption.format(**words)}")

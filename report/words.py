@@ -35,6 +35,22 @@ def interval(estimate: Estimate) -> str:
     return f"{number(estimate.point)} [{number(estimate.low)}, {number(estimate.high)}]"
 
 
+def score_number(value: float | None) -> str:
+    """A score, rounded down: 1 is the optimum and nothing less."""
+    if value is None or math.isnan(value):
+        return "-"
+    digits = 10.0**SIGNIFICANT
+    return number(math.floor(value * digits + 1e-6) / digits)
+
+
+def score_with_interval(estimate: Estimate) -> str:
+    """A score with its interval in brackets, where it has one."""
+    if math.isnan(estimate.low) or estimate.low == estimate.high:
+        return score_number(estimate.point)
+    ends = f"[{score_number(estimate.low)}, {score_number(estimate.high)}]"
+    return f"{score_number(estimate.point)} {ends}"
+
+
 def interval_alone(estimate: Estimate) -> str:
     """The interval of a figure, empty where it has none."""
     if math.isnan(estimate.low) or estimate.low == estimate.high:

@@ -30,7 +30,7 @@ from tuning.tuning_spec import SHIPPED, TuningSpec, judged
 from verdicts import Estimate
 
 FOLDER, WINNER, RECORD = "retest", "winner.yml", "tuning.json"
-ROUNDING = 1e-9  # two that are the same but for this are the same
+
 LONGEST_LINE = 100
 LIBRARY_LOOP = "Stable-Baselines3's own loop, in which the agent trains unless told otherwise"
 
@@ -190,27 +190,27 @@ def _verdict(environment: EnvironmentAnalysis | None, label: str) -> str:
     for pair in () if environment is None else environment.pairs:
         for seen in (pair, pair.swapped()):
             if (seen.first, seen.second) == (label, SHIPPED):
-                return seen.verdict
+                return f"{seen.verdict}{', as seen' if seen.is_conditional else ''}"
     return "undecided"
 
 
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
-    """The best on other seeds, unless it is no better there than what the search began with.
+    """The best of those that the verdict calls better than what the search began with.
 
-    Where runs of it failed it is out: those that are left are the luckier ones.
+    That is on seeds that the search has not seen. Where runs of it failed it is out: those that are
+    left are the luckier ones.
     """
     shipped, *others = retested
     there = [each for each in others if each.n_runs >= tuning.retest_seeds]
     if not there:
         return None, "none has run on all other seeds"
     sign = -1 if tuning.is_cost else 1
-    best = max(there, key=lambda each: sign * (each.held_out or 0.0))
     if shipped.held_out is None:
         return None, "the shipped settings did not run"
-    apart = sign * ((best.held_out or 0.0) - shipped.held_out)
-    if best.verdict == "worse" or apart <= ROUNDING * abs(shipped.held_out):
-        return None, "none is better than the shipped settings on other seeds"
-    return best, ""
+    better = [each for each in there if each.verdict.startswith("better")]
+    if not better:
+        return None, "none is shown to be better than the shipped settings on other seeds"
+    return max(better, key=lambda each: sign * (each.held_out or 0.0)), ""
 
 
 # Entries of hyperparameters, which say what they were tuned on.

@@ -28,19 +28,30 @@ if TYPE_CHECKING:
         steps_to_threshold,
         summarise_steps,
     )
-    from verdicts.error_levels import level_of_look
+    from verdicts.error_levels import level_of_claim, level_of_environment, level_of_look
     from verdicts.failures import FailureCount, count_failures, fail_more_often, failure_threshold
     from verdicts.growth import Growth, grow, look_sizes
-    from verdicts.pairs import (
+    from verdicts.means import (
         FEWEST_SEEDS,
-        PairComparison,
+        MeanDifference,
+        MeanVerdict,
         Verdict,
+        ahead_on_average,
+        compare_means,
+        judge_means,
+        mean_interval,
+        rank_by_mean,
+        seeds_needed,
+    )
+    from verdicts.pairs import (
+        Ends,
+        Judgement,
+        PairComparison,
         compare_pairs,
         describe_pairs,
         fewest_seeds,
         judge_pairs,
         probability_of_improvement,
-        seeds_needed,
     )
     from verdicts.rank_tests import (
         ahead_p_value,
@@ -62,18 +73,24 @@ if TYPE_CHECKING:
 __all__ = [
     "FEWEST_SEEDS",
     "Band",
+    "Ends",
     "Estimate",
     "FailureCount",
     "Growth",
+    "Judgement",
+    "MeanDifference",
+    "MeanVerdict",
     "PairComparison",
     "SpeedComparison",
     "Statistic",
     "Summary",
     "ThresholdSummary",
     "Verdict",
+    "ahead_on_average",
     "ahead_p_value",
     "apart_p_value",
     "area_under_curve",
+    "compare_means",
     "compare_pairs",
     "compare_speed",
     "count_failures",
@@ -86,14 +103,19 @@ __all__ = [
     "fewest_seeds",
     "grow",
     "holm",
+    "judge_means",
     "judge_pairs",
+    "level_of_claim",
+    "level_of_environment",
     "level_of_look",
     "look_sizes",
+    "mean_interval",
     "on_grid",
     "optimum_score",
     "paired_difference",
     "performance_profile",
     "probability_of_improvement",
+    "rank_by_mean",
     "seeds_needed",
     "shared_grid",
     "steps_to_stay",
@@ -104,7 +126,10 @@ __all__ = [
 ]
 
 # Those that load least come first: some of them a command needs before it may take long.
-_MODULES = ("error_levels", "resampling", "rank_tests", "pairs", "failures", "curves", "growth")
+_MODULES = (
+    *("error_levels", "resampling", "rank_tests", "means"),
+    *("pairs", "failures", "curves", "growth"),
+)
 
 
 def __getattr__(name: str) -> object:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from verdicts.pairs import FEWEST_SEEDS
+from verdicts.means import FEWEST_SEEDS
 from verdicts.rank_tests import apart_p_value, holm, interval_places
 from verdicts.resampling import (
     N_RESAMPLES,

@@ -1,4 +1,4 @@
-"""How much of the promised error rate each look may spend: apart, so that SciPy is not loaded."""
+"""How the promised error rate is shared, over looks, environments and questions; without SciPy."""
 
 from __future__ import annotations
 
@@ -29,3 +29,18 @@ def level_of_look(alpha: float, look: int, n_looks: int | None = None) -> float:
     if look == 1:
         return FIRST_SHARE * alpha
     return (1 - FIRST_SHARE) * alpha / (look * (look - 1))
+
+
+# What each kind of claim may spend of the error rate of a look at an environment. Proven by
+# Bonferroni's inequality: a study says nothing wrong as long as none of them does.
+SHARES = {"means": 0.75, "typical": 0.1, "failures": 0.07, "fails more": 0.03, "sooner": 0.05}
+
+
+def level_of_claim(level: float, kind: str) -> float:
+    """What one kind of claim, a key of ``SHARES``, may spend of a look's error rate."""
+    return SHARES[kind] * level
+
+
+def level_of_environment(level: float, n_environments: int) -> float:
+    """What one environment of a study may spend; all of them together count as one more."""
+    return level / (n_environments + 1 if n_environments > 1 else 1)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from verdicts.error_levels import level_of_look
-from verdicts.pairs import FEWEST_SEEDS, Judgement, fewest_seeds, judge_pairs
+from verdicts.means import FEWEST_SEEDS
+from verdicts.pairs import Ends, Judgement, fewest_seeds, judge_pairs
 from verdicts.resampling import Floats
 
 # How many times the seeds of a look the next one has, about.
@@ -47,7 +48,7 @@ def look_sizes(first: int, most: int, n_agents: int, level: float) -> tuple[int,
     n_pairs = max(math.comb(n_agents, 2), 1)
     for start in range(first, most):
         steps = max(round(math.log(most / start) / math.log(STEP)), 1)
-        if start >= fewest_seeds(level / (steps + 1) / n_pairs):
+        if start >= fewest_seeds(level / (steps + 1), n_pairs):
             ratio = (most / start) ** (1 / steps)
             return (*(round(start * ratio**step) for step in range(steps)), most)
     return (most,)
@@ -59,6 +60,9 @@ def grow(
     margin: float,
     level: float,
     certain: Collection[str] = (),
+    *,
+    ends: Ends | None = None,
+    paired: bool = False,
 ) -> Growth:
     """Look at a study as often as was settled and its seeds allow, and say who needs more.
 
@@ -73,6 +77,8 @@ def grow(
         margin: the largest difference that does not matter.
         level: the error rate of all looks together. Each has an equal share.
         certain: the agents that do not depend on chance; see ``judge_pairs``.
+        ends: of the scores; see ``judge_pairs``.
+        paired: whether the agents' runs of one seed share their randomness.
 
     Source: Holm's procedure with p-values over looks, each multiplied by the number of looks; see
     Maurer and Bretz (2013), "Multiple testing in group sequential trials using graphical
@@ -87,9 +93,9 @@ def grow(
         seeds |= dict.fromkeys(growing, size)
         if not growing or any(len(scores[name]) < size for name in growing):
             break
-        decided = {pair: each for pair, each in judged.items() if each.verdict != "undecided"}
+        decided = {pair: each for pair, each in judged.items() if each.is_decided}
         shown = {name: np.asarray(values)[: seeds[name]] for name, values in scores.items()}
-        judged = judge_pairs(shown, margin, share, certain, decided)
+        judged = judge_pairs(shown, margin, share, certain, decided, ends=ends, paired=paired)
         looks |= {pair: look for pair in judged if pair not in decided}
     is_done = all(len(values) >= seeds[name] for name, values in scores.items())
     return Growth(judged, looks, seeds, max(looks.values(), default=0), share, is_done)
@@ -105,6 +111,6 @@ def _undecided_agents(
     return {
         name
         for pair, judgement in judged.items()
-        if judgement.verdict == "undecided" and min(there[each] for each in pair) >= FEWEST_SEEDS
+        if not judgement.is_decided and min(there[each] for each in pair) >= FEWEST_SEEDS
         for name in pair
     }

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from verdicts.error_levels import level_of_look
+from verdicts.error_levels import level_of_claim, level_of_look
+from verdicts.means import (
+    FEWEST_SEEDS,
+    MeanDifference,
+    MeanVerdict,
+    Verdict,
+    compare_means,
+    fewest_for,
+    judge_means,
+    rank_by_mean,
+    seeds_needed,
+)
 from verdicts.rank_tests import (
     ahead_p_value,
     apart_p_value,
@@ -35,55 +44,51 @@ from verdicts.resampling import (
     resample_counts,
 )
 
-# Nobody runs more; a difference that needs them is as good as none.
-MOST_SEEDS = 10_000
+
+def fewest_seeds(level: float, n_pairs: int = 1) -> int:
+    """With how few seeds anything can be claimed of means, where so many pairs share a level."""
+    return fewest_for(level_of_claim(level, "means") / n_pairs)
 
 
-def seeds_needed(share: float, level: float = 0.05, power: float = 0.8) -> int | None:
-    """About how many seeds the rank-sum test takes to find one agent ahead.
-
-    Args:
-        share: the share of pairs of runs that the agent which is ahead wins, ties counting half.
-        level: of the one-sided test.
-        power: the probability of finding it.
-
-    Returns:
-        The number, at least ``fewest_seeds``; None beyond ``MOST_SEEDS``, or where the share is a
-        half or less.
-
-    Source: Noether (1987), "Sample size determination for some common nonparametric tests",
-    Journal of the American Statistical Association 82(398).
-    """
-    if not share > 0.5:
-        return None
-    reach = stats.norm.isf(level) + stats.norm.ppf(power)
-    needed = math.ceil(reach**2 / (6 * (share - 0.5) ** 2))
-    return max(needed, fewest_seeds(level)) if needed <= MOST_SEEDS else None
-
-
-def fewest_seeds(level: float) -> int:
-    """With how few seeds a claim at this level can be made at all: see ``share_p_value``."""
-    return math.ceil(-math.log2(level) - 1e-9)
-
-
-# Verdicts on pairs of agents: the tests, corrected for how many there are.
-
-Verdict = Literal["better", "worse", "equivalent", "undecided"]
-
-# Below, nothing is said whatever the scores.
-FEWEST_SEEDS = 3
+# Verdicts on pairs of agents: on what they earn on average, and on their typical runs.
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict and what it stands on."""
+    """Verdicts on a pair of agents, on the first of the two."""
 
-    verdict: Verdict  #: on the first of the two
-    p_value: float  #: of "one of the two is ahead"
-    adjusted_p_value: float  #: the same after Holm's correction over all pairs
-    equivalence_p_value: float  #: of "neither is ahead by more than the margin", likewise corrected
+    mean: MeanVerdict  #: on what they earn on average
+    #: On their typical runs: ``better`` or ``worse`` if a run of one scores higher than one of the
+    #: other more often than not; ``equivalent`` if neither does by more than the margin.
+    typical: Verdict
     #: Whether neither agent depends on chance, so that nothing was to be tested.
     certain: bool = False
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether anything is said about the means, with a condition or without."""
+        return self.mean.verdict != "undecided"
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The ends of the scale on which means are judged; what lies beyond counts as the end."""
+
+    low: float  #: what the worst run scores
+    high: float  #: what the best does
+
+    @staticmethod
+    def beyond(scores: Mapping[str, Floats]) -> Ends:
+        """For scores without known ends: as far beyond the runs that there are as they reach."""
+        values = np.concatenate([*scores.values(), []])
+        values = values[np.isfinite(values)]
+        low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+        reach = high - low if high > low else 1.0
+        return Ends(low - reach, high + reach)
+
+    def shares(self, values: Floats) -> Floats:
+        """Scores as shares of the way from one end to the other."""
+        return np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
 
 
 def judge_pairs(
@@ -92,69 +97,130 @@ def judge_pairs(
     level: float,
     certain: Collection[str] = (),
     decided: Mapping[tuple[str, str], Judgement] | None = None,
+    *,
+    ends: Ends | None = None,
+    paired: bool = False,
 ) -> dict[tuple[str, str], Judgement]:
     """Judge every two agents, in the order of the mapping.
+
+    The verdicts on means are those of simultaneous intervals, one for each pair; those on typical
+    runs are corrected by Holm's procedure.
 
     Args:
         scores: by agent, shape (n_seeds,); what is not finite is a run that is missing.
         margin: the largest difference that does not matter.
-        level: the share of studies in which a ``better`` or ``worse`` may be wrong; likewise an
-            ``equivalent``.
+        level: the share of studies in which anything that is said of the means, of typical runs, of
+            failures or of speed may be wrong; see ``SHARES``.
         certain: the agents that do not depend on chance. Two of these are compared by what they
             score, and no other pair pays for it.
-        decided: the pairs that were at an earlier look, in the same order; see ``grow``. They stay
-            as they are and leave their part of the error rate to the others: a pair that was found
-            apart its part for ``better`` or ``worse``, an equivalent one that for ``equivalent``.
+        decided: the pairs that were decided at an earlier look, in the same order; see ``grow``.
+            They stay as they are. None for a look by itself: half of what is for means is then
+            spent on who is best, see ``rank_by_mean``.
+        ends: of the scores; where they are not known, see ``Ends.beyond``.
+        paired: whether the agents' runs of one seed share their randomness.
     """
     earlier = dict(decided or {})
-    finite = {name: values[np.isfinite(values)] for name, values in scores.items()}
-    pairs = list(combinations(finite, 2))
-    known = {(a, b) for a, b in pairs if a in certain and b in certain}
-    known -= earlier.keys()
-    tested = [
-        pair
-        for pair in pairs
-        if pair not in known
-        and pair not in earlier
-        and min(len(finite[name]) for name in pair) >= FEWEST_SEEDS
-    ]
-    apart = [apart_p_value(finite[a], finite[b]) for a, b in tested]
-    close = [equivalent_p_value(finite[a], finite[b], margin) for a, b in tested]
-    settled = [each.verdict == "equivalent" for each in earlier.values() if not each.certain]
-    corrected = zip(
-        tested,
-        apart,
-        _corrected(apart, settled.count(True)),
-        _corrected(close, settled.count(False)),
-        strict=True,
-    )
-    nothing = Judgement("undecided", np.nan, np.nan, np.nan)
-    judged = {**dict.fromkeys(pairs, nothing), **earlier}
-    for pair, raw, adjusted, equal in corrected:
-        verdict = _verdict(finite[pair[0]], finite[pair[1]], margin, level, adjusted, equal)
-        judged[pair] = Judgement(verdict, float(raw), float(adjusted), float(equal))
+    ends = ends or Ends.beyond(scores)
+    pairs = list(combinations(scores, 2))
+    known = {(a, b) for a, b in pairs if a in certain and b in certain} - earlier.keys()
+    tested = [pair for pair in pairs if pair not in known and pair not in earlier]
+    for_means = level_of_claim(level, "means")
+    ranks = decided is None and len(scores) > 2
+    if ranks:
+        for_means /= 2  # the other half is for who is best
+    share = for_means / max(len(pairs) - len(known), 1)
+    runs = {pair: _runs(scores, pair, paired=paired) for pair in tested}
+    means = {}
+    for pair, (x, y) in runs.items():
+        means[pair] = judge_means(
+            ends.shares(x),
+            ends.shares(y),
+            share,
+            margin=margin / (ends.high - ends.low),
+            paired=paired,
+            exact=(pair[0] in certain, pair[1] in certain),
+        )
+    typical = _typical(runs, margin, level_of_claim(level, "typical"), len(earlier))
+    ahead = _ahead_of_all(scores, for_means, certain, ends, paired=paired) if ranks else ()
+    for pair in {*ahead} | {(b, a) for a, b in ahead}:
+        if pair in means and means[pair] != MeanVerdict("equivalent"):
+            means[pair] = MeanVerdict("better" if pair in ahead else "worse")
+    _close(means)
+    judged = {pair: Judgement(means[pair], typical[pair]) for pair in tested}
     for a, b in known:
-        judged[a, b] = _known(finite[a], finite[b], margin)
-    return judged
+        judged[a, b] = _known(scores[a], scores[b], margin)
+    return {pair: earlier.get(pair) or judged[pair] for pair in pairs}
 
 
-def _corrected(p_values: list[float], n_others: int) -> Floats:
-    """P-values after Holm's correction, for so many besides that are not rejected."""
-    return holm([*p_values, *[1.0] * n_others])[: len(p_values)]
+def _close(means: dict[tuple[str, str], MeanVerdict]) -> None:
+    """Who is better than one that is better than a third is better than that."""
+    better = {pair for pair, said in means.items() if said == MeanVerdict("better")}
+    better |= {(b, a) for (a, b), said in means.items() if said == MeanVerdict("worse")}
+    names = {name for pair in means for name in pair}
+    for middle in names:
+        better |= {(a, c) for a, b in better if b == middle for m, c in better if m == middle}
+    for (a, b), said in means.items():
+        if said != MeanVerdict("equivalent") and {(a, b), (b, a)} & better:
+            means[a, b] = MeanVerdict("better" if (a, b) in better else "worse")
 
 
-def _verdict(
-    first: Floats, second: Floats, margin: float, level: float, apart: float, close: float
-) -> Verdict:
-    """Equivalence goes first: within the margin a difference does not matter, however sure.
+def _ahead_of_all(
+    scores: Mapping[str, Floats],
+    level: float,
+    certain: Collection[str],
+    ends: Ends,
+    *,
+    paired: bool,
+) -> list[tuple[str, str]]:
+    """The pairs of which the first is shown to be ahead of the second and of all that follow it."""
+    shares = {name: ends.shares(values) for name, values in scores.items()}
+    there = {name: np.isfinite(values) for name, values in scores.items()}
+    if paired:
+        in_all = np.asarray(np.all([*there.values()], axis=0))
+        there = dict.fromkeys(there, in_all)
+    finite = {name: values[there[name]] for name, values in shares.items()}
+    order = sorted(finite, key=lambda name: _mean_or_last(finite[name]), reverse=True)
+    exact = [name in certain for name in order]
+    n_ranked = rank_by_mean([finite[name] for name in order], level, paired=paired, exact=exact)
+    return [(order[k], other) for k in range(n_ranked) for other in order[k + 1 :]]
 
-    But not where runs, if only some, are shown to lie further apart than that on one side.
-    """
-    if close <= level and not apart_beyond(first, second, margin, level):
-        return "equivalent"
-    if apart <= level:
-        return "better" if ahead_p_value(first, second) < 0.5 else "worse"
-    return "undecided"
+
+def _mean_or_last(values: Floats) -> float:
+    return float(values.mean()) if len(values) else -np.inf
+
+
+def _runs(
+    scores: Mapping[str, Floats], pair: tuple[str, str], *, paired: bool
+) -> tuple[Floats, Floats]:
+    """The scores of two agents that are there; of the same seeds where they are paired."""
+    x, y = (np.asarray(scores[name], np.float64) for name in pair)
+    there = np.isfinite(x), np.isfinite(y)
+    if paired:
+        there = (there[0] & there[1],) * 2
+    return x[there[0]], y[there[1]]
+
+
+def _typical(
+    runs: Mapping[tuple[str, str], tuple[Floats, Floats]],
+    margin: float,
+    level: float,
+    n_others: int,
+) -> dict[tuple[str, str], Verdict]:
+    """Verdicts on typical runs, corrected for all pairs and so many others."""
+    enough = [pair for pair, both in runs.items() if min(map(len, both)) >= FEWEST_SEEDS]
+    others = [1.0] * n_others
+    apart = holm([*(apart_p_value(*runs[pair]) for pair in enough), *others])
+    close = holm([*(equivalent_p_value(*runs[pair], margin) for pair in enough), *others])
+    found: dict[tuple[str, str], Verdict] = dict.fromkeys(runs, "undecided")
+    for pair, different, same in zip(enough, apart, close, strict=False):
+        first, second = runs[pair]
+        # Within the margin a difference does not matter, however sure it is. But not where runs,
+        # if only some, are shown to lie further apart than that on one side.
+        if same <= level and not apart_beyond(first, second, margin, level):
+            found[pair] = "equivalent"
+        elif different <= level:
+            found[pair] = "better" if ahead_p_value(first, second) < 0.5 else "worse"
+    return found
 
 
 def apart_beyond(first: Floats, second: Floats, margin: float, level: float) -> bool:
@@ -169,12 +235,12 @@ def apart_beyond(first: Floats, second: Floats, margin: float, level: float) -> 
 
 
 def _known(first: Floats, second: Floats, margin: float) -> Judgement:
-    if min(len(first), len(second)) == 0:
-        return Judgement("undecided", np.nan, np.nan, np.nan)
-    apart = float(differences(first[:1], second[:1])[0])
-    if abs(apart) <= margin:
-        return Judgement("equivalent", 1.0, 1.0, 0.0, certain=True)
-    return Judgement("better" if apart > 0 else "worse", 0.0, 0.0, 1.0, certain=True)
+    x, y = (values[np.isfinite(values)] for values in (first, second))
+    if min(len(x), len(y)) == 0:
+        return Judgement(MeanVerdict("undecided"), "undecided")
+    apart = float(differences(x[:1], y[:1])[0])
+    verdict: Verdict = "better" if apart > margin else "worse" if -apart > margin else "equivalent"
+    return Judgement(MeanVerdict(verdict), verdict, certain=True)
 
 
 # How often an agent beats another.
@@ -282,38 +348,49 @@ class PairComparison:
 
     first: str  #: the name of one
     second: str  #: the name of the other
+    said: MeanVerdict  #: of the means
+    #: How far they are apart, in scores between the ends; the intervals for all pairs hold
+    #: together and agree with what is said.
+    mean: MeanDifference
+    typical: Verdict  #: on the typical run of the first; see ``Judgement``
     #: The median difference between a run of the first and one of the second. The intervals of all
-    #: pairs hold together, and agree with the verdicts.
-    difference: Estimate
-    p_value: float  #: of "one of the two is ahead", by the rank-sum test
-    adjusted_p_value: float  #: the same after Holm's correction over all pairs
+    #: pairs hold together, and agree with ``typical``.
+    typical_difference: Estimate
     #: That a run of the first scores higher than one of the second.
     probability_of_improvement: Estimate
-    #: On the first: ``equivalent`` where neither is shown to be ahead by more than the margin in
-    #: half of the pairs of runs; else ``better`` or ``worse`` by the adjusted p-value; else
-    #: ``undecided``.
-    verdict: Verdict
-    #: Where undecided, about the number of seeds that would decide at the next look with 80 %
-    #: power if all is as observed. None where that is more than 10,000, or there are too few seeds
-    #: to say.
+    #: Where the means are undecided, about the number of seeds that would decide at the next look
+    #: with 80 % power if all is as observed. None where that is more than 10,000, or there are too
+    #: few seeds to say.
     seeds_needed: int | None
     #: Whether neither agent depends on chance, so that their scores say all there is.
     certain: bool = False
     #: How many seeds each of the two had then, those of runs that failed among them.
     n_seeds: int = 0
 
+    @property
+    def verdict(self) -> Verdict:
+        """On the first agent's mean."""
+        return self.said.verdict
+
+    @property
+    def is_conditional(self) -> bool:
+        """Whether that holds only as long as further runs are like those that were seen."""
+        return self.said.is_conditional
+
     def swapped(self) -> PairComparison:
         """The same comparison seen from the second agent."""
-        gap, wins = self.difference, self.probability_of_improvement
+        gap, wins = self.typical_difference, self.probability_of_improvement
         return replace(
             self,
             first=self.second,
             second=self.first,
-            difference=replace(gap, point=-gap.point, low=-gap.high, high=-gap.low),
+            said=self.said.swapped(),
+            mean=self.mean.swapped(),
+            typical=_OPPOSITE[self.typical],
+            typical_difference=replace(gap, point=-gap.point, low=-gap.high, high=-gap.low),
             probability_of_improvement=replace(
                 wins, point=1 - wins.point, low=1 - wins.high, high=1 - wins.low
             ),
-            verdict=_OPPOSITE[self.verdict],
         )
 
 
@@ -322,6 +399,8 @@ def compare_pairs(
     margin: float = 0.0,
     *,
     seed: int,
+    ends: tuple[float, float] | None = None,
+    paired: bool = False,
     confidence: float = 0.95,
     n_resamples: int = N_RESAMPLES,
     look: int = 1,
@@ -334,6 +413,9 @@ def compare_pairs(
         scores: by agent, shape (n_seeds,), higher is better. What is not finite is missing.
         margin: the largest difference, in the unit of the scores, that does not matter.
         seed: of the resampling.
+        ends: the lowest and the highest score that a run may have; what lies beyond counts as the
+            end. Where they are not given, see ``Ends.beyond``.
+        paired: whether the agents' runs of one seed share their randomness.
         confidence: of the study: in so many studies no verdict is wrong, over all of its looks.
         n_resamples: how many resamples the intervals of the probabilities come from.
         look: how often the study has been looked at, this time included, each with more seeds.
@@ -342,22 +424,23 @@ def compare_pairs(
 
     Raises:
         ValueError: for arguments out of range, or agents with different numbers of seeds.
-
-    Source: for equivalence, two one-sided tests: Schuirmann (1987), "A comparison of the two
-    one-sided tests procedure and the power approach".
     """
-    _check(scores, margin, confidence)
+    _check(scores, margin, confidence, ends)
     arrays = {name: np.asarray(values, dtype=np.float64) for name, values in scores.items()}
     level = level_of_look(1 - confidence, look, n_looks)
     last = n_looks is not None and look >= n_looks
     later = level if last else level_of_look(1 - confidence, look + 1, n_looks)
-    judged = judge_pairs(arrays, margin, level, certain)
+    scale = Ends(*ends) if ends else Ends.beyond(arrays)
+    judged = judge_pairs(arrays, margin, level, certain, ends=scale, paired=paired)
     return describe_pairs(
         {pair: (judgement, len(arrays[pair[0]])) for pair, judgement in judged.items()},
         arrays,
         margin,
         (level, later),
+        scale,
         seed=seed,
+        paired=paired,
+        ranks=len(arrays) > 2,
         confidence=confidence,
         n_resamples=n_resamples,
     )
@@ -368,8 +451,11 @@ def describe_pairs(
     scores: Mapping[str, Floats],
     margin: float,
     levels: tuple[float, float],
+    ends: Ends,
     *,
     seed: int,
+    paired: bool = False,
+    ranks: bool = False,
     confidence: float = 0.95,
     n_resamples: int = N_RESAMPLES,
 ) -> list[PairComparison]:
@@ -380,41 +466,63 @@ def describe_pairs(
         scores: by agent, shape (n_seeds,).
         margin: the largest difference that does not matter.
         levels: the error rates of the look that judged, and of the next.
+        ends: of the scores.
         seed: of the resampling.
+        paired: whether the agents' runs of one seed share their randomness.
+        ranks: whether half of what is for means was spent on who is best.
         confidence: of the probabilities of improvement.
         n_resamples: how many resamples their intervals come from.
     """
     n_pairs = max(1, sum(not each.certain for each, _ in judged.values()))
-    level, later = (each / n_pairs for each in levels)
+    level = level_of_claim(levels[0], "means") / n_pairs / (2 if ranks else 1)
     comparisons = []
     for (one, two), (judgement, n_seeds) in judged.items():
         both = np.array([scores[one][:n_seeds], scores[two][:n_seeds]])
-        paired = np.where(np.isfinite(both).all(axis=0), both, np.nan)
+        in_both = np.where(np.isfinite(both).all(axis=0), both, np.nan)
         improvement = probability_of_improvement(
-            *paired, seed=seed, confidence=confidence, n_resamples=n_resamples
+            *in_both, seed=seed, confidence=confidence, n_resamples=n_resamples
         )
-        x, y = (values[np.isfinite(values)] for values in both)
-        comparison = PairComparison(
-            first=one,
-            second=two,
-            difference=_difference(x, y, margin, level, judgement),
-            p_value=judgement.p_value,
-            adjusted_p_value=judgement.adjusted_p_value,
-            probability_of_improvement=improvement,
-            verdict=judgement.verdict,
-            seeds_needed=_seeds(x, y, margin, later) if judgement.verdict == "undecided" else None,
-            certain=judgement.certain,
-            n_seeds=n_seeds,
+        x, y = _runs(dict(zip((one, two), both, strict=True)), (one, two), paired=paired)
+        needed = None
+        if not judgement.is_decided and min(len(x), len(y)) > 1:
+            needed = seeds_needed(
+                ends.shares(x),
+                ends.shares(y),
+                level_of_claim(levels[1], "means") / n_pairs,
+                margin / (ends.high - ends.low),
+            )
+            needed = None if needed is None else max(needed, min(len(x), len(y)) + 1, FEWEST_SEEDS)
+        comparisons.append(
+            PairComparison(
+                first=one,
+                second=two,
+                said=judgement.mean,
+                mean=_mean_difference(ends, (x, y), level, margin, judgement, paired=paired),
+                typical=judgement.typical,
+                typical_difference=_difference(
+                    x, y, margin, level_of_claim(levels[0], "typical") / n_pairs, judgement
+                ),
+                probability_of_improvement=improvement,
+                seeds_needed=needed,
+                certain=judgement.certain,
+                n_seeds=n_seeds,
+            )
         )
-        comparisons.append(comparison)
     return comparisons
 
 
-def _check(scores: Mapping[str, ArrayLike], margin: float, confidence: float) -> None:
+def _check(
+    scores: Mapping[str, ArrayLike],
+    margin: float,
+    confidence: float,
+    ends: tuple[float, float] | None,
+) -> None:
     if not 0.5 < confidence < 1:
         raise ValueError(f"confidence is {confidence}, it must lie between 0.5 and 1, as 0.95 does")
     if not margin >= 0:
         raise ValueError(f"margin is {margin}, it must be 0 or a positive difference of scores")
+    if ends is not None and not -np.inf < ends[0] < ends[1] < np.inf:
+        raise ValueError(f"ends are {ends}, they must be two finite scores, the lower one first")
     shapes = {name: np.shape(values) for name, values in scores.items()}
     if len(set(shapes.values())) > 1:
         raise ValueError(
@@ -424,6 +532,35 @@ def _check(scores: Mapping[str, ArrayLike], margin: float, confidence: float) ->
     for shape in set(shapes.values()):
         if len(shape) != 1:
             raise ValueError(f"scores have shape {shape}, they must have (n_seeds,)")
+
+
+def _mean_difference(
+    ends: Ends,
+    runs: tuple[Floats, Floats],
+    level: float,
+    margin: float,
+    judgement: Judgement,
+    *,
+    paired: bool,
+) -> MeanDifference:
+    """The difference of two means, its intervals made to say what the verdict says.
+
+    Who is best is shown by a test of its own, which may decide what an interval leaves open. And
+    who is shown to lie within the margin lies within it: Stefansson, Kim and Hsu (1988), "On
+    confidence sets in multiple comparisons".
+    """
+    x, y = (ends.shares(each) for each in runs)
+    if judgement.certain:
+        apart = float(x[0] - y[0])
+        return MeanDifference(apart, apart, apart, apart, apart)
+    found, said = compare_means(x, y, level, paired=paired), judgement.mean
+    within = margin / (ends.high - ends.low)
+    least = {"better": 0.0, "equivalent": -within}.get(said.verdict, -1.0)
+    most = {"worse": 0.0, "equivalent": within}.get(said.verdict, 1.0)
+    seen = {"seen_low": max(found.seen_low, least), "seen_high": min(found.seen_high, most)}
+    if said.is_conditional:
+        return replace(found, **seen)
+    return replace(found, low=max(found.low, least), high=min(found.high, most), **seen)
 
 
 def _difference(
@@ -439,29 +576,12 @@ def _difference(
     if judgement.certain:
         return replace(found, low=found.point, high=found.point)
     low, high = found.low, found.high
-    if judgement.verdict == "better":
+    if judgement.typical == "better":
         low = max(low, min(found.point, 0.0))
-    elif judgement.verdict == "worse":
+    elif judgement.typical == "worse":
         high = min(high, max(found.point, 0.0))
-    elif judgement.verdict == "equivalent":
+    elif judgement.typical == "equivalent":
         low, high = max(low, -margin), min(high, margin)
     else:
         low, high = min(low, 0.0), max(high, 0.0)
     return found if np.isnan(found.low) else replace(found, low=low, high=high)
-
-
-def _seeds(first: Floats, second: Floats, margin: float, level: float) -> int | None:
-    """Seeds until the verdict that the scores point to."""
-    n = min(len(first), len(second))
-    if n < 2:
-        return None
-    close = min(_share(first + margin, second), _share(second + margin, first))
-    ahead = max(_share(first, second), _share(second, first))
-    within = seeds_needed(close, level) if margin > 0 else None
-    guesses = [guess for guess in (within, seeds_needed(ahead, level / 2)) if guess is not None]
-    return max(n + 1, min(guesses)) if guesses else None
-
-
-def _share(first: Floats, second: Floats) -> float:
-    """The share of pairs of runs that the first wins."""
-    return float(wins_of(first, second).mean()) / len(second)

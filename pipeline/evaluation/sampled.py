@@ -36,6 +36,10 @@ BEYOND_CHANCE = 6.0
 FEWEST_TO_TELL = 10
 
 
+# Where the way from the baseline to the optimum is a smaller share of them, scores say nothing.
+LEAST_WAY = 0.01
+
+
 @dataclass(frozen=True)
 class Yardstick:
     """What returns on an environment are measured against."""
@@ -61,6 +65,12 @@ class Yardstick:
         if self.optimum - self.baseline <= rounding:
             return 1.0 if expected_return >= self.optimum - rounding else 0.0
         return (expected_return - self.baseline) / (self.optimum - self.baseline)
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether the way from the baseline to the optimum is long enough for a score."""
+        least = LEAST_WAY * max(abs(self.optimum), abs(self.baseline))
+        return self.optimum - self.baseline > least
 
     @property
     def lower_end(self) -> Yardstick:

@@ -24,7 +24,7 @@ from pipeline.errors import visible
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.ranking import bar
 from report.series import StudySeries
-from report.words import interval_alone, number, optimum_words
+from report.words import interval_alone, number, optimum_words, score_number
 
 # From data to text that a browser can be handed: templates, JSON, inline scripts.
 
@@ -52,7 +52,7 @@ def templates(folder: str = "") -> Environment:
         number=number,
         optimum=optimum_words,
         interval=interval_alone,
-        p_value=p_value,
+        score=score_number,
         bar=bar,
         breakable=breakable,
     )
@@ -126,13 +126,6 @@ def page_frame(scripts: Sequence[str]) -> dict[str, str]:
         "start": inline_script(start),
         "policy": " ".join(map(script_hash, [early, plotly, own, start])),
     }
-
-
-def p_value(value: float) -> str:
-    """A p-value with as many digits as mean something."""
-    if math.isnan(value):
-        return "-"
-    return "< 0.001" if value < 0.001 else f"{value:.3f}"
 
 
 def breakable(label: str) -> Markup:

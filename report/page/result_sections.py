@@ -14,7 +14,14 @@ from experiments.plan import PlannedRun, tuning_seeds
 from experiments.results import StudyResults, mixed_versions
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from mdp.transition_model import Floats
-from report.conclusions import conclusion, on_changes, pairs_both_ways, places_without_a_run
+from report.conclusions import (
+    amounts,
+    conclusion,
+    on_changes,
+    overall_sentences,
+    pairs_both_ways,
+    places_without_a_run,
+)
 from report.documents import MARKUPS, verdicts_as
 from report.page.frame import Report, Section, setting
 from report.ranking import COLUMNS, Row, filled
@@ -23,11 +30,11 @@ from report.series import (
     Curve,
     EnvironmentSeries,
     Grid,
-    best_of,
     linear_up_to,
     mean_regret,
+    with_best_mean,
 )
-from report.terminal import PHRASES, SIGNS, says_more
+from report.terminal import LEGEND, phrase, says_more, sign
 from report.words import look_sentences, number, seed_sentence
 
 WIDTH, HEIGHT = 200, 100  # of a small figure, in the drawing's own unit
@@ -110,10 +117,11 @@ def verdict(report: Report) -> Section | None:
         for one in environments
     ]
     context = {
-        "general": places_without_a_run(report.analysis),
+        "general": [*overall_sentences(report.analysis), *places_without_a_run(report.analysis)],
         "cards": cards,
-        "signs": SIGNS,
-        "phrases": PHRASES,
+        "sign": sign,
+        "phrase": phrase,
+        "legend": LEGEND,
         "metric": metric,
     }
     files = {name: verdicts_as(name, report.analysis, report.command) for name in MARKUPS}
@@ -123,7 +131,9 @@ def verdict(report: Report) -> Section | None:
 
 def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
     """By agent, what its figure shows: means by parameter, and which are the best of all."""
-    best = best_of(one.environment, [at for sweep in one.sweeps.values() for at in sweep.labels])
+    best = with_best_mean(
+        one.environment, [at for sweep in one.sweeps.values() for at in sweep.labels]
+    )
     return {
         group: {
             **vars(sweep.means),
@@ -136,7 +146,7 @@ def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
 
 def _grid(one: EnvironmentSeries, grid: Grid, metric: str) -> dict[str, Any]:
     """The heat map of an agent: its rows of cells."""
-    best = best_of(one.environment, [label for row in grid.labels for label in row])
+    best = with_best_mean(one.environment, [label for row in grid.labels for label in row])
     shares = grid.shares(is_cost=metric in COSTS)
     rows = [
         [
@@ -217,7 +227,8 @@ def comparison(report: Report) -> Section | None:
     metric = METRIC_WORDS[analysis.study.metric]
     context = {
         "metric": metric,
-        "phrases": PHRASES,
+        "phrase": phrase,
+        "amounts": amounts,
         "most_dots": MOST_DOTS,
         "lower_is_better": analysis.study.metric in COSTS,
         "probabilities": [
@@ -256,7 +267,7 @@ def overall(report: Report) -> Section | None:
     context = {"agents": agents, "scores": scores, "probabilities": overall.improvement}
     data = {
         "agents": agents,
-        "iqm": [{"agent": agent, **vars(overall.scores[agent].iqm)} for agent in agents],
+        "means": [{"agent": agent, **vars(overall.scores[agent].mean)} for agent in agents],
         "thresholds": overall.thresholds,
         "profiles": {
             agent: {"y": band.point, "low": band.low, "high": band.high}

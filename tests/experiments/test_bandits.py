@@ -379,8 +379,8 @@ def test_less_regret_is_better(tmp_path, do_study):
     assert (pair.first, pair.second, pair.verdict) == ("Thompson", "random", "better")
     assert pair.swapped().verdict == "worse"
     said = conclusion(analysis.study, environment)
-    assert said.lead.startswith("Thompson is best: regret of a run ")
-    assert said.pairs[0].startswith("Thompson is better than random (by 1")
+    assert said.lead.startswith("Thompson is best on average: regret of a run ")
+    assert said.pairs[0].startswith("Thompson is better on average than random (by ")
 
 
 # --- The studies as they are shipped, with fewer runs.

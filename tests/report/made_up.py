@@ -10,7 +10,14 @@ from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalys
 from experiments.bandits import PullStatistics
 from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from verdicts import Estimate, PairComparison, Summary, ThresholdSummary
+from verdicts import (
+    Estimate,
+    MeanDifference,
+    MeanVerdict,
+    PairComparison,
+    Summary,
+    ThresholdSummary,
+)
 
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
@@ -27,6 +34,7 @@ def agent(label, mean, **changes):
     figures = AgentAnalysis(
         agent=label,
         algo="qlearning",
+        judged=estimate(mean / 100),
         n_runs=4,
         n_missing=0,
         metric=Summary(estimate(mean), estimate(mean + 1), estimate(mean + 2)),
@@ -44,16 +52,27 @@ def agent(label, mean, **changes):
     return replace(figures, **changes)
 
 
-def pair(first, second, verdict, difference=10.0, **changes):
-    gap = estimate(difference, difference - 5, difference + 5)
-    chance = estimate(0.5, 0.25, 0.75)
-    found = PairComparison(first, second, gap, 0.01, 0.02, chance, verdict, None)
+def pair(first, second, verdict, difference=0.1, *, is_conditional=False, **changes):
+    mean = MeanDifference(
+        difference, difference - 0.05, difference + 0.05, difference - 0.02, difference + 0.02, 0.01
+    )
+    found = PairComparison(
+        first,
+        second,
+        said=MeanVerdict(verdict, is_conditional),
+        mean=mean,
+        typical="undecided",
+        typical_difference=estimate(difference),
+        probability_of_improvement=estimate(0.5, 0.25, 0.75),
+        seeds_needed=None,
+        n_seeds=4,
+    )
     return replace(found, **changes)
 
 
 def environment(agents=(), label="lake", **changes):
     known = EnvironmentAnalysis(label, "Lake-v0", 100.0, 20.0, 96.0, 1.6, True, tuple(agents), ())
-    return replace(known, **changes)
+    return replace(known, **{"fewest": 4, **changes})
 
 
 def study(labels, metric="final", places=("lake",), n_seeds=4):

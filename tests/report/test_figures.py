@@ -101,7 +101,7 @@ def whole_study(root, names, label, linear_up_to=None, on_variant=()):
     belief = Belief(names[1], np.array([2000]), THIRD, densities, [[0.25, 0.75], [None, 0.5]])
     pulls = {name: made_up.pulls(10.0 + 40 * n) for n, name in enumerate(names)}
     profiles = {name: Band(1 - THIRD, (1 - THIRD) / 2, 1 - THIRD / 2) for name in names}
-    overall = OverallAnalysis({}, {}, THIRD, profiles)
+    overall = OverallAnalysis({}, {}, (), THIRD, profiles)
     learnt = curves_of(names, linear_up_to, on_variant)
     places = (
         EnvironmentSeries(lake, learnt, runs_of(names), None, swept, {"swept": grid}),
@@ -251,9 +251,9 @@ second, γ: orange --o (0.9 1) (0.95 2) (1 3)
 band blue 0.2 (0.01 29 32) (0.1 89 92) (0.9 2 5)
 band orange 0.2 (0.9 0 3) (0.95 1 4) (1 2 5)
 rings (0.1 90)
-names first, α, second, γ, best: first, 95 % interval
+names first, α, second, γ, best mean: first, 95 % interval
 # lake_swept_grid
-lake: return of the final policy, means over seeds; the best in a frame | kind | γ
+lake: return of the final policy, means over seeds; the best mean in a frame | kind | γ
 x axis: first, second
 y axis: 1, 2
 frame orange (0 0)
@@ -452,7 +452,7 @@ def test_an_axis_of_values_says_what_scale_it_has(values, scale, words):
     sweep = Sweep("n", curve(values, [1, 2, 3]), ("a", "b", "c"))
     draw_sweeps(axes, {"alone": sweep}, made_up.environment([made_up.agent("c", 3.0)]), "final")
     assert (axes.get_xscale(), axes.get_xlabel()) == (scale, words)
-    assert described(axes.figure)[-1] == "names alone, best: c, 95 % interval"
+    assert described(axes.figure)[-1] == "names alone, best mean: c, 95 % interval"
 
 
 def test_too_many_agents_make_no_lines(drawn, tmp_path):

@@ -163,7 +163,7 @@ def test_settings_command_versions_and_failures(page, report_study):
 def test_settings_have_the_looks_mixed_versions_and_of_old_runs_no_machine(
     report_study, written, monkeypatch
 ):
-    question = Question("final", None, None, 5)
+    question = Question("final", None, None, 5, False)
     look = Look("2026-11-22 10:00:00", question, {"a": 4, "b": 4}, {}, {}, 0.045, planned=False)
     looks = {"Warehouse-v0": Looks((look,))}
     monkeypatch.setattr(result_sections, "read_looks", lambda _: looks)
@@ -435,8 +435,12 @@ def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
     found = first["swept"]
     assert (found["parameter"], found["x"], found["y"]) == ("a", [1, 2, 3], [90, 80, 70])
     assert found["best"] == [True, False, False]
-    assert [text for a, text in page.all("td") if "best" in a.get("class", "")] == ["90 best"]
+    assert [text for a, text in page.all("td") if "best" in a.get("class", "")] == ["90 best mean"]
     shaded = {text: a["style"] for a, text in page.all("td") if "--strength" in a.get("style", "")}
-    assert shaded == {"90 best": "--strength: 90%", "80": "--strength: 45%", "70": "--strength: 0%"}
+    assert shaded == {
+        "90 best mean": "--strength: 90%",
+        "80": "--strength: 45%",
+        "70": "--strength: 0%",
+    }
     captions = " ".join(text for _, text in page.all("figcaption"))
     assert "by a (down) and e (across)" in captions

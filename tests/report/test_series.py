@@ -18,7 +18,6 @@ from report.series import (
     arm_series,
     auer_bound,
     best_expected_reward,
-    best_of,
     best_of_normals,
     grids,
     lai_robbins_slope,
@@ -29,6 +28,7 @@ from report.series import (
     run_series,
     study_series,
     sweeps,
+    with_best_mean,
 )
 from tests.report import made_up
 
@@ -163,7 +163,7 @@ def test_two_parameters_make_a_grid():
     assert grid.labels == [["0.1 a", "0.1 b"], ["0.5 a", ""]]
     np.testing.assert_equal(grid.shares(is_cost=False), [[0, 1], [1, np.nan]])
     np.testing.assert_equal(grid.shares(is_cost=True), [[1, 0], [0, np.nan]])
-    assert best_of(environment, [spec.label for spec in specs]) == ["0.1 b", "0.5 a"]
+    assert with_best_mean(environment, [spec.label for spec in specs]) == ["0.1 b", "0.5 a"]
     assert grids(specs[:2], environment) == {}  # a single row is none
 
 

@@ -36,7 +36,7 @@ CPU += [("low", "lake", 1.0), ("low", "lake", None)]  # which was not measured
 
 
 def lake(**changes):
-    """One that leads by its median, one equivalent to it, one undecided, one worse."""
+    """One with the highest mean, one equivalent to it, one undecided, one worse."""
     agents = [made_up.agent(name, mean) for name, mean in zip(NAMES, (30, 89, 80, 90), strict=True)]
     pairs = (
         made_up.pair("first", "same", "equivalent"),
@@ -56,10 +56,10 @@ def of_lake(cpu=(), metric="final", **changes):
 # --- Markdown and LaTeX ---------------------------------------------------------------------------
 
 LEGEND = (
-    "Score of the median run: 1 is the optimum, 0 the best random or constant policy. Bold: "
-    "the highest, and what is shown to be equivalent to it in the typical run. "
-    "?: not told apart from it by 4 seeds. Plain: shown to be worse. In brackets: processor "
-    "time of the median run."
+    "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts as 0. "
+    "Bold: shown to be best on average, several where they are shown to be equal, or the same in "
+    "all runs of all agents. ?: 4 seeds do not show that another agent is better on average. In "
+    "brackets: processor time of the median run."
 )
 
 
@@ -68,10 +68,10 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
     assert table.splitlines() == [
         "|  | lake |",
         "| --- | --- |",
-        "| `low` | 0.600 |",
-        "| `same` | **1.780** (0.12 s) |",
-        "| `open` | 1.600 ?, 1 of 4 failed |",
-        "| `first` | **1.800** (40 s) |",
+        "| `low` | 0.3 |",
+        "| `same` | 0.89 ? (0.12 s) |",
+        "| `open` | 0.8 ?, 1 of 4 failed |",
+        "| `first` | 0.9 ? (40 s) |",
     ]
     assert legend == LEGEND
     assert processor_seconds(of_lake(cpu=CPU).results) == {
@@ -81,28 +81,29 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
 
 
 def test_other_headlines():
-    costs = table_as("md", headline(of_lake(metric="regret")))
-    assert "| `low` | **31** |" in costs
-    assert "| `open` | 81, 1 of 4 failed |" in costs
-    assert "Regret of a run: the median run. Bold: the lowest" in costs
+    costs = table_as("md", headline(of_lake(metric="regret", is_score=False)))
+    assert "| `low` | 30 |" in costs
+    assert "| `open` | 80 ?, 1 of 4 failed |" in costs
+    assert "Regret of a run: the mean; scores where they are known. Bold" in costs
     assert "processor" not in costs
     some = made_up.agent("first", 90.0, n_missing=2)
     absent = table_as("md", headline(of_lake(agents=(some,), pairs=())))
     assert "| `low` | - |" in absent
-    assert "| `first` | **1.800**, 2 missing |" in absent
+    assert "| `first` | 0.9 ?, 2 missing |" in absent
     bracketed = replace(lake(), environment="hill", optimum_at_least=90.0)
     caption = headline(made_up.analysis([lake(), bracketed], NAMES)).caption
-    assert "policy. On hill the optimum is bracketed: 1 is the upper end. Bold" in caption
+    assert "as 0. On hill the optimum is bracketed: 1 is the upper end. Bold" in caption
 
 
 def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():
     study = made_up.study(NAMES)
-    assert standings(study, lake()) == {
-        "first": "best",
-        "same": "best",
-        "open": "open",
-        "low": "behind",
-    }
+    seen = {"first": "open", "same": "open", "open": "open", "low": "behind"}
+    assert standings(study, lake()) == seen
+    two = lake(
+        agents=lake().agents[0:1] + lake().agents[2:], pairs=lake().pairs[:1] + lake().pairs[2:]
+    )
+    assert standings(study, two) == {"first": "best", "same": "best", "low": "behind"}
+    assert set(standings(study, lake(is_same=True)).values()) == {"best"}
     assert standings(study, lake(baseline=95.0)) == {}
     assert standings(study, made_up.environment([made_up.agent("first", math.nan)])) == {}
 
@@ -134,22 +135,22 @@ Seeds 0 to 3: nothing was tuned on these.
 
 |  | lake |
 | --- | --- |
-| `low` | 0.600 |
-| `first` | **1.800** (40 s) |
+| `low` | 0.3 |
+| `first` | **0.9** (40 s) |
 
 LEGEND
 
 ## lake
 
-|  | median | mean | score | failed | stays from | processor time |
+|  | mean | median | score | failed | stays from | processor time |
 | --- | --- | --- | --- | --- | --- | --- |
-| `first` | 91 [90.9, 91.2] | 90 [89.9, 90.2] | 1.8 | 0 of 4 | 100 | 40 s |
-| `low` | 31 [30.9, 31.2] | 30 [29.9, 30.2] | 0.6 | - | 40 | - |
+| `first` | 90 [89.9, 90.2] | 91 | 0.9 [0.8, 1.1] | 0 of 4 | 100 | 40 s |
+| `low` | 30 [29.9, 30.2] | 31 | 0.3 [0.2, 0.5] | - | 40 | - |
 
 lake: return of the final policy, with 95 % intervals over seeds.
 
-- first is best: return of the final policy 90 [89.9, 90.2], score 0.9; the optimum is 100.
-- first is better than low (by -10 [-15, -5]).
+- first is best on average: return of the final policy 90, score 0.9 [0.8, 1.1]; the optimum is 100.
+- first is better on average than low (by -0.15 to -0.05 of the score).
 - low reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the median one from step 40 \
 on; first in 3 of 4 runs, the median one from step 100 on.
 """
@@ -171,8 +172,8 @@ def test_a_study_as_files(tmp_path):
         r"\toprule",
         r" & lake \\",
         r"\midrule",
-        r"\texttt{low} & 0.600 \\",
-        r"\texttt{first} & \textbf{1.800} (40 s) \\",
+        r"\texttt{low} & 0.3 \\",
+        r"\texttt{first} & \textbf{0.9} (40 s) \\",
         r"\bottomrule",
         r"\end{tabular}}",
     ]
@@ -272,17 +273,18 @@ lake: optimum 100, best random or constant policy 20
 └────────┴─────────────────┴─────────────────┴────────────────┴─────────────────┴────────────┴────────┴──────────┘
 """  # noqa: E501  # as wide as it is printed
 CAPTION = (
-    "mean, IQM: return of the final policy, with 95 % intervals over 4 seeds; training: return of "
-    "the last 100 training episodes; stays from: step from which on the median run stays at a "
-    "return of 96 "
+    "mean, IQM: return of the final policy, with 95 % intervals over 4 seeds; those of means allow "
+    "for runs that were not seen; training: return of the last 100 training episodes; stays from: "
+    "step from which on the median run stays at a return of 96 "
 )
 NARROW_CAPTION = (
-    "mean: return of the final policy, with 95 % intervals over 4 seeds; stays from: step from "
+    "mean: return of the final policy, with 95 % intervals over 4 seeds; those of means allow for "
+    "runs that were not seen; stays from: step from "
     "which on the median run stays at a return of 96; a wider terminal shows training and IQM too "
 )
 SENTENCES = (
-    "first is best: return of the final policy 90 [89.9, 90.2], score 0.9; the optimum is 100. "
-    "first is better than second (by 50 [45, 55]). "
+    "first is best on average: return of the final policy 90, score 0.9 [0.8, 1.1]; the optimum is "
+    "100. first is better on average than second (by 0.05 to 0.15 of the score). "
     "second reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the median one from "
     "step 50 on; first in 3 of 4 runs, the median one from step 100 on. "
     "1 of 4 runs of second is missing. No run of third has finished. "
@@ -294,7 +296,7 @@ SENTENCES = (
 @pytest.mark.parametrize("options", [{}, {"force_terminal": True}], ids=["pipe", "terminal"])
 def test_a_title_a_table_a_caption_and_sentences(width, options):
     agents = (made_up.agent("first", 90.0), made_up.agent("second", 40.0))
-    pairs = (made_up.pair("first", "second", "better", 50.0),)
+    pairs = (made_up.pair("first", "second", "better"),)
     missing = {"first": 0, "second": 1, "third": 4}
     place = made_up.environment(agents, pairs=pairs, missing=missing)
     found = made_up.analysis([place], ["first", "second", "third"])
@@ -346,11 +348,11 @@ def test_three_agents_have_their_verdicts_in_a_matrix():
         ["2", "[b]", ">", "·", "="],
         ["3", "c", "?", "=", "·"],
     ]
-    assert lines[at + 4 : at + 6] == [
-        "> better than the agent of the column, < worse, = equivalent, ? undecided",
-        "1 of 4 runs of c failed: what is equivalent is so in the typical run.",
-    ]
-    assert not any("is undecided against" in line for line in lines)
+    assert " ".join(lines[at + 4 : at + 7]) == (
+        "> better on average than the agent of the column, < worse, = equivalent, ? undecided; in "
+        "brackets: as long as further runs are like those that were seen 1 of 4 runs of c failed."
+    )
+    assert not any("is undecided" in line for line in lines)
 
 
 def test_marks_of_trainings_that_were_changed_and_dashes():
@@ -385,7 +387,7 @@ REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
 def test_bandits_have_a_table_of_their_own(width):
     pulls = pull_statistics(ARMS, REWARDS, np.where(ARMS == 0, 0.3, 0.0), None, 2)
     agents = (made_up.agent("first", 1.0), made_up.agent("no pulls", 3.0))
-    place = made_up.environment(agents, "coins", optimum=None)
+    place = made_up.environment(agents, "coins", optimum=None, is_score=False)
     names, found = ["first", "no pulls"], {("first", "coins"): pulls}
     lines = lines_of(
         print_analysis,
@@ -402,8 +404,8 @@ def test_bandits_have_a_table_of_their_own(width):
     more = "" if wide else "; a wider terminal shows simple regret too"
     assert below(lines).startswith(
         "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; "
-        f"{simple}reward, best arm: at the last pulls{more} Undecided: 4 seeds decide nothing. "
-        "first has the lowest mean so far: regret of a run 1 [0.9, 1.2]."
+        f"{simple}reward, best arm: at the last pulls{more} Undecided on average: best is first "
+        "(1 [0.9, 1.2]) or no pulls (3 [2.9, 3.2])."
     )
 
 

@@ -54,14 +54,15 @@ def test_optimism_is_how_much_better_it_looked_than_it_is(
     ("others", "figure", "winner"),
     [
         ([(1, 0.8, "undecided"), (2, 0.9, "better")], "score", 2),
-        ([(1, 0.8, "undecided"), (2, 0.6, "undecided")], "score", 1),
+        ([(1, 0.8, "better, as seen"), (2, 0.75, "better")], "score", 1),
+        ([(1, 0.8, "undecided"), (2, 0.9, "undecided")], "score", None),
         ([(1, 0.7, "undecided"), (2, 0.6, "worse")], "score", None),  # no better than before
         ([(1, 0.7 + 1e-15, "equivalent")], "score", None),
         ([(1, 0.9, "worse")], "score", None),
         ([(1, None, "undecided")], "score", None),
-        ([(1, 0.9, "better", 0.9, 19), (2, 0.8, "undecided")], "score", 2),  # a run of it failed
+        ([(1, 0.9, "better", 0.9, 19), (2, 0.8, "better")], "score", 2),  # a run of it failed
         ([(1, 0.9, "better", 0.9, 19)], "score", None),
-        ([(1, 0.8, "undecided"), (2, 0.6, "undecided")], "steps", 2),
+        ([(1, 0.65, "better"), (2, 0.6, "better")], "steps", 2),
     ],
 )
 def test_what_wins_is_better_on_other_seeds_than_what_there_was(toy, others, figure, winner):

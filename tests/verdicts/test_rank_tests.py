@@ -12,10 +12,8 @@ from verdicts import (
     ahead_p_value,
     apart_p_value,
     equivalent_p_value,
-    fewest_seeds,
     judge_pairs,
     level_of_look,
-    seeds_needed,
     typical_difference,
 )
 from verdicts.rank_tests import rank_sum_p_value, share_p_value, wins_of
@@ -71,7 +69,7 @@ def test_the_larger_of_two_p_values_counts():
     first, second = rng.normal([[0.8], [0]], 1, size=(2, 12))
     both = rank_sum_p_value(first, second), share_p_value(first, second)
     assert ahead_p_value(first, second) == max(both)
-    assert apart_p_value(first, second) == apart_p_value(second, first) == max(2 * both[0], both[1])
+    assert apart_p_value(first, second) == apart_p_value(second, first) == 2 * max(both)
     sides = ahead_p_value(first + 2, second), ahead_p_value(second + 2, first)
     assert equivalent_p_value(first, second, 2.0) == max(sides)
     assert np.isnan(ahead_p_value(first, second[:0]))
@@ -101,23 +99,10 @@ def test_looks_spend_no_more_than_there_is():
     assert sum(level_of_look(0.05, look, 5) for look in range(1, 6)) == pytest.approx(0.05)
 
 
-def test_seeds_needed_give_about_the_power():
-    share = float(stats.norm.cdf(1 / 2**0.5))  # of agents a standard deviation apart
-    n = seeds_needed(share, 0.025)
-    rng = np.random.default_rng(0)
-    found = [
-        rank_sum_p_value(*rng.normal([[1], [0]], 1, size=(2, n))) <= 0.025 for _ in range(1000)
-    ]
-    # Noether's formula is an approximation; standard error 1.3 %.
-    assert 0.74 < np.mean(found) < 0.88
-    assert seeds_needed(0.5) is seeds_needed(0.4) is seeds_needed(0.501) is None
-    assert seeds_needed(1.0, 0.0001) == fewest_seeds(0.0001) == 14
-    assert fewest_seeds(0.5**5) == 5
-
-
 # --- error rates ---------------------------------------------------------------------------------
 
 STUDIES = 500
+LEVEL = 0.5  # of which a tenth is for typical runs
 # A right test at 5 % exceeds this in one of 10,000 such checks.
 MOST_WRONG = stats.binom.isf(1e-4, STUDIES, 0.05) / STUDIES
 
@@ -137,7 +122,7 @@ def share_said(verdict, draw, n, margin=0.0):
     found = 0
     for _ in range(STUDIES):
         x, y = draw(n)
-        found += judge_pairs({"x": x, "y": y}, margin, 0.05)["x", "y"].verdict in verdict
+        found += judge_pairs({"x": x, "y": y}, margin, LEVEL)["x", "y"].typical in verdict
     return found / STUDIES
 
 
@@ -165,16 +150,3 @@ def test_agents_the_margin_apart_are_rarely_equivalent(kind, margin):
         return x, y + margin
 
     assert share_said({"equivalent"}, draw, 15, margin * (1 - 1e-9)) <= MOST_WRONG
-
-
-def test_a_study_that_grows_is_rarely_wrong():
-    rng, wrong = np.random.default_rng(3), 0
-    for _ in range(STUDIES):
-        scores = dict(zip("xy", rng.exponential(size=(2, 40)), strict=True))
-        for look, n in enumerate((5, 10, 20, 40), start=1):
-            grown = {name: values[:n] for name, values in scores.items()}
-            judged = judge_pairs(grown, 0.0, level_of_look(0.05, look))
-            if judged["x", "y"].verdict != "undecided":
-                wrong += 1
-                break
-    assert wrong / STUDIES <= MOST_WRONG

@@ -52,8 +52,8 @@ def test_runs_that_never_arrive_are_later_than_all_others():
 
 
 def test_few_seeds_say_nothing_of_speed():
-    assert compare_speed({"x": [100, 100, np.nan], "y": [900, 900, 900]}, 10) == []
-    (pair,) = compare_speed({"x": [100] * 4, "y": [900] * 4}, 10)
+    assert compare_speed({"x": [100] * 4 + [np.nan], "y": [900] * 5}, 10) == []
+    (pair,) = compare_speed({"x": [100] * 5, "y": [900] * 5}, 10, 0.001)
     assert pair.sooner is None
     assert not pair.ratio.has_interval
 

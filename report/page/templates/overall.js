@@ -1,10 +1,10 @@
 report.section("overall", (root, data) => {
   report.figure(root.querySelector("#aggregate"), () => {
     // A score far below the best random or constant policy would leave no room for the others.
-    const { traces, yaxis, height } = report.intervals(data.iqm, { least: -0.5 });
+    const { traces, yaxis, height } = report.intervals(data.means, { least: -0.5 });
     return {
       traces,
-      layout: { height: Math.max(height, 320), hovermode: "closest", xaxis: { title: { text: "interquartile mean score" } }, yaxis },
+      layout: { height: Math.max(height, 320), hovermode: "closest", xaxis: { title: { text: "mean score" } }, yaxis },
     };
   });
   report.figure(root.querySelector("#profiles"), () => ({

@@ -1,0 +1,415 @@
+"""Claims about expected scores: what agents earn on average, runs that fail included.
+
+No test on the runs that were seen keeps its error rate for the mean: what fails in one run of
+twenty has mostly not failed in ten. Scores, however, have ends, 0 and 1. So a claim without a
+condition passes two tests that compare the runs that were seen, and two guards that allow for runs
+that were not. Where the guards do not pass, the claim has a condition: that few further runs lie
+outside of what was seen. docs/statistics.md says how often each of them is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import combinations, count
+from math import comb
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import optimize, stats
+
+from verdicts.resampling import Floats
+
+Verdict = Literal["better", "worse", "equivalent", "undecided"]
+Exact = tuple[bool, bool]  # of two agents, whether each does not depend on chance
+
+# With fewer runs of an agent nothing is claimed about its mean.
+FEWEST_SEEDS = 5
+N_SPLITS = 4000  # of a permutation test; all of them where there are fewer
+# From so many scores of both agents on, permutations say what Welch's test does.
+MOST_PERMUTED = 400
+N_SPACINGS = 4000
+SAME = 1e-12  # means closer than this are equal
+
+
+@dataclass(frozen=True)
+class MeanVerdict:
+    """What is said of the means of two agents."""
+
+    verdict: Verdict  #: on the first of the two
+    #: Whether it holds only as long as few further runs lie outside of those that were seen.
+    is_conditional: bool = False
+
+    def swapped(self) -> MeanVerdict:
+        """The same, seen from the second agent."""
+        turned: dict[Verdict, Verdict] = {"better": "worse", "worse": "better"}
+        return replace(self, verdict=turned.get(self.verdict, self.verdict))
+
+
+@dataclass(frozen=True)
+class MeanDifference:
+    """How far one agent is ahead of another on average, in scores between 0 and 1."""
+
+    point: float  #: the difference of the means of the runs
+    low: float  #: what every law of scores between 0 and 1 allows; agrees with the verdict
+    high: float  #: likewise
+    seen_low: float  #: what is possible if further runs lie within those that were seen
+    seen_high: float  #: likewise
+    #: The share of further runs, of the agent ahead below and of the other above all that were
+    #: seen, from which on the lead of those that were seen may be gone; 0 where there is none.
+    most_outside: float = 0.0
+
+    def swapped(self) -> MeanDifference:
+        """The same, seen from the second agent."""
+        return replace(
+            self,
+            point=-self.point,
+            low=-self.high,
+            high=-self.low,
+            seen_low=-self.seen_high,
+            seen_high=-self.seen_low,
+        )
+
+
+# Tests on the runs that were seen.
+
+
+def welch_p_value(first: Floats, second: Floats, *, cautious: bool = False) -> float:
+    """Of "the first mean is higher", where spreads may differ.
+
+    Cautious, it has no more degrees of freedom than the smaller sample.
+
+    Source: Welch (1947), "The generalization of 'Student's' problem when several different
+    population variances are involved", Biometrika 34.
+    """
+    ahead = float(first.mean() - second.mean())
+    if ahead <= SAME:
+        return 1.0
+    parts = first.var(ddof=1) / len(first), second.var(ddof=1) / len(second)
+    spread = float(np.sqrt(sum(parts)))
+    if spread <= SAME:
+        return 0.0
+    shares = parts[0] / spread**2, parts[1] / spread**2
+    freedom = 1 / (shares[0] ** 2 / (len(first) - 1) + shares[1] ** 2 / (len(second) - 1))
+    if cautious:
+        freedom = min(len(first), len(second)) - 1
+    return float(stats.t.sf(ahead / spread, freedom))
+
+
+def permutation_p_value(first: Floats, second: Floats) -> float:
+    """Of the same, by all ways or many to deal out the scores, ranked by Welch's statistic.
+
+    Source: Janssen (1997), "Studentized permutation tests for non-i.i.d. hypotheses", Statistics
+    and Probability Letters 36; Chung and Romano (2013), "Exact and asymptotically robust
+    permutation tests", Annals of Statistics 41.
+    """
+    n, m = len(first), len(second)
+    if first.mean() - second.mean() <= SAME:
+        return 1.0
+    pooled = np.concatenate([first, second])
+    pooled = pooled - pooled.mean()
+    taken = _splits(n, m)
+    sums, squares = taken @ pooled, taken @ pooled**2
+    total = float((pooled**2).sum())
+    ahead = sums / n + sums / m
+    variances = [
+        np.maximum(each / size - (sums / size) ** 2, 0) / (size - 1)
+        for each, size in ((squares, n), (total - squares, m))
+    ]
+    statistic = ahead / np.sqrt(variances[0] + variances[1] + 1e-12 * total / (n + m))
+    found = float((statistic >= statistic[0] * (1 - 1e-9)).mean())
+    if len(taken) < N_SPLITS:
+        return found
+    # Drawn splits cannot show less than their own share.
+    return min(found, welch_p_value(first, second, cautious=True))
+
+
+def paired_p_value(first: Floats, second: Floats) -> float:
+    """Of the same for runs that share their randomness, seed by seed: paired t and sign flips.
+
+    Source: Student (1908); Fisher (1935), "The design of experiments", section 21.
+    """
+    apart = first - second
+    mean = float(apart.mean())
+    if mean <= SAME:
+        return 1.0
+    spread = float(apart.std(ddof=1)) / len(apart) ** 0.5
+    by_t = 0.0 if spread <= SAME else float(stats.t.sf(mean / spread, len(apart) - 1))
+    sums = _signs(len(apart)) @ apart
+    by_signs = float((sums >= sums[0] * (1 - 1e-9)).mean())
+    if len(sums) == N_SPLITS:
+        by_signs = min(by_signs, by_t)
+    return max(by_t, by_signs)
+
+
+@lru_cache(maxsize=32)
+def _splits(n: int, m: int) -> Floats:
+    """Which scores go to the first agent, shape (splits, n + m); the first is the real split."""
+    if comb(n + m, n) < N_SPLITS:
+        chosen = np.array(list(combinations(range(n + m), n)))
+    else:
+        rng = np.random.default_rng(0)
+        drawn = [rng.permutation(n + m)[:n] for _ in range(N_SPLITS - 1)]
+        chosen = np.array([np.arange(n), *drawn])
+    taken = np.zeros((len(chosen), n + m))
+    taken[np.arange(len(chosen))[:, None], chosen] = 1
+    return taken
+
+
+@lru_cache(maxsize=32)
+def _signs(n: int) -> Floats:
+    """Ways to flip the signs of n differences, shape (flips, n); the first flips none."""
+    if 2**n < N_SPLITS:
+        return np.where((np.arange(2**n)[:, None] >> np.arange(n)) & 1, -1.0, 1.0)
+    flips = np.random.default_rng(0).choice([-1.0, 1.0], (N_SPLITS, n))
+    flips[0] = 1
+    return flips
+
+
+# Guards that allow for runs that were not seen.
+
+
+def lowest_means(scores: Floats, *, exact: bool = False) -> Floats:
+    """Means that scores between 0 and 1 may have, those that were not seen being 0; ascending.
+
+    The share of these below a value is the level at which the expected score is above it. Where
+    scores are ``exact``, all runs being alike, they have one mean.
+
+    Source: Learned-Miller and Thomas (2019), "A new confidence interval for the mean of a bounded
+    random variable", arXiv:1905.06208.
+    """
+    return scores[:1] if exact else np.sort(np.sort(scores) @ _spacings(len(scores)))
+
+
+@lru_cache(maxsize=32)
+def _spacings(n: int) -> Floats:
+    """Gaps above each of n sorted uniform numbers, shape (n, draws)."""
+    uniform = np.sort(np.random.default_rng(0).random((N_SPACINGS, n)), axis=1)
+    return np.diff(np.hstack([uniform, np.ones((N_SPACINGS, 1))]), axis=1).T.copy()
+
+
+def mean_interval(scores: ArrayLike, level: float, *, exact: bool = False) -> tuple[float, float]:
+    """The interval of the expected score of one agent, for every law between 0 and 1.
+
+    Args:
+        scores: of its runs, between 0 and 1, shape (n,), at least 1.
+        level: one minus the confidence.
+        exact: whether it does not depend on chance.
+    """
+    values = np.asarray(scores, np.float64)
+    low = float(np.quantile(lowest_means(values, exact=exact), level / 2))
+    return low, 1 - float(np.quantile(lowest_means(1 - values, exact=exact), level / 2))
+
+
+# What the two together say.
+
+
+def seen_p_value(
+    first: Floats, second: Floats, *, paired: bool = False, enough: float = 1.0
+) -> float:
+    """Of "the first mean is higher", by the runs that were seen.
+
+    A p-value above ``enough`` may be too low, but not below that.
+    """
+    if paired:
+        return paired_p_value(first, second)
+    by_t = welch_p_value(first, second)
+    if by_t > enough or by_t == 1 or len(first) + len(second) >= MOST_PERMUTED:
+        return by_t
+    return max(by_t, permutation_p_value(first, second))
+
+
+def ahead_on_average(
+    first: Floats,
+    second: Floats,
+    *,
+    paired: bool = False,
+    exact: Exact = (False, False),
+    enough: float = 1.0,
+) -> float:
+    """The p-value of "the first expected score is higher", for every law between 0 and 1.
+
+    A p-value above ``enough`` may be too low, but not below that.
+    """
+    seen = seen_p_value(first, second, paired=paired, enough=enough)
+    if seen > enough:
+        return seen
+    guards = (
+        float((lowest_means(first, exact=exact[0]) <= second.mean()).mean()),
+        float((1 - lowest_means(1 - second, exact=exact[1]) >= first.mean()).mean()),
+    )
+    return max(seen, *guards)
+
+
+def judge_means(
+    first: ArrayLike,
+    second: ArrayLike,
+    level: float,
+    *,
+    margin: float = 0.0,
+    paired: bool = False,
+    exact: Exact = (False, False),
+) -> MeanVerdict:
+    """Say which of two agents scores more on average.
+
+    Within the margin a difference does not matter, however sure it is: equivalence goes first.
+
+    Args:
+        first: scores of its runs, between 0 and 1, shape (n,), finite.
+        second: likewise, shape (m,); of the same seeds in the same order where ``paired``.
+        level: the error rate of the verdict, on both sides together.
+        margin: the largest difference that does not matter.
+        paired: whether runs of one seed share their randomness.
+        exact: of each agent, whether it does not depend on chance.
+    """
+    x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    if min(len(x), len(y)) < FEWEST_SEEDS:
+        return MeanVerdict("undecided")
+    means = float(x.mean()), float(y.mean())
+
+    def seen(lead: float) -> bool:
+        """Whether the first is ahead of the second by more than this."""
+        return seen_p_value(x - lead, y, paired=paired, enough=level / 2) <= level / 2
+
+    def seen_behind(lead: float) -> bool:
+        return seen_p_value(y - lead, x, paired=paired, enough=level / 2) <= level / 2
+
+    said: Verdict = "undecided"
+    if margin > 0 and seen(-margin) and seen_behind(-margin):
+        said = "equivalent"
+    elif seen(0.0):
+        said = "better"
+    elif seen_behind(0.0):
+        said = "worse"
+    if said == "undecided":
+        return MeanVerdict(said)
+    low, high = _guarded(x, y, level, exact)
+    is_sure = {
+        "equivalent": -margin < low and high < margin,
+        "better": low > 0,
+        "worse": high < 0,
+    }[said]
+    if said == "equivalent" and not is_sure and (low > 0 or high < 0):
+        # So far apart, if not by much, that no further runs could turn it round.
+        return MeanVerdict("better" if means[0] > means[1] else "worse")
+    return MeanVerdict(said, is_conditional=not is_sure)
+
+
+def compare_means(
+    first: ArrayLike,
+    second: ArrayLike,
+    level: float,
+    *,
+    paired: bool = False,
+    exact: Exact = (False, False),
+) -> MeanDifference:
+    """How far one agent is ahead of another on average: the intervals of `judge_means`.
+
+    They hold what the tests at this level do not refuse. Arguments as there.
+    """
+    x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    apart = float(x.mean() - y.mean()) if min(len(x), len(y)) else np.nan
+    if min(len(x), len(y)) < FEWEST_SEEDS:
+        return MeanDifference(apart, -1.0, 1.0, -1.0, 1.0)
+    seen_low, seen_high = _seen_low(x, y, level / 2, paired), -_seen_low(y, x, level / 2, paired)
+    guarded = _guarded(x, y, level, exact)
+    # So many runs at the far ends would take away the lead that was seen.
+    outside = max(seen_low, -seen_high, 0.0) / (1 + abs(apart))
+    low, high = min(seen_low, guarded[0]), max(seen_high, guarded[1])
+    return MeanDifference(apart, low, high, seen_low, seen_high, outside)
+
+
+def _guarded(first: Floats, second: Floats, level: float, exact: Exact) -> tuple[float, float]:
+    """Between which values the difference lies by the guards."""
+    x_low, x_high = mean_interval(first, level, exact=exact[0])
+    y_low, y_high = mean_interval(second, level, exact=exact[1])
+    x, y = float(first.mean()), float(second.mean())
+    return min(x_low - y, x - y_high), max(x_high - y, x - y_low)
+
+
+def _seen_low(first: Floats, second: Floats, level: float, paired: bool) -> float:
+    """The largest lead that the runs that were seen show; -1, the least there is, for none."""
+    ahead = float(first.mean() - second.mean())
+
+    def excess(lead: float) -> float:
+        return seen_p_value(first - lead, second, paired=paired) - level
+
+    # Far from the truth every split but the real one is lost: with too few splits nothing shows.
+    if excess(-2.0) > 0:
+        return -1.0
+    if excess(ahead - 2 * SAME) <= 0:
+        return ahead
+    return max(float(optimize.bisect(excess, -2.0, ahead, xtol=1e-5)), -1.0)
+
+
+# Who is best.
+
+
+def rank_by_mean(
+    scores: Sequence[Floats], level: float, *, paired: bool = False, exact: Sequence[bool] = ()
+) -> int:
+    """How many agents, from the first on, are each shown to be ahead of all that follow.
+
+    The agent with the highest mean is held against every other, each time with half of the level:
+    that it was chosen for its mean costs nothing more. Only if it is ahead of all of them is the
+    second held against those behind it, and so on.
+
+    Args:
+        scores: by agent, the highest mean first, between 0 and 1, shape (n_runs,) each.
+        level: the share of studies in which any of these claims may be wrong.
+        paired: whether runs of one seed share their randomness.
+        exact: by agent, whether it does not depend on chance.
+
+    Source: Gutmann and Maymin (1987), "Is the selected population the best?", Annals of Statistics
+    15; Hung and Fithian (2019), "Rank verification for exponential families", Annals of Statistics
+    47.
+    """
+    known = [*exact, *[False] * len(scores)]
+    for place, first in enumerate(scores):
+        for other in range(place + 1, len(scores)):
+            if min(len(first), len(scores[other])) < FEWEST_SEEDS:
+                return place
+            both = known[place], known[other]
+            p_value = ahead_on_average(
+                first, scores[other], paired=paired, exact=both, enough=level / 2
+            )
+            if p_value > level / 2 and not (all(both) and first[0] > scores[other][0]):
+                return place
+    return max(len(scores) - 1, 0)
+
+
+# Nobody runs more; a difference that needs them is as good as none.
+MOST_SEEDS = 10_000
+
+
+def seeds_needed(
+    first: Floats, second: Floats, level: float, margin: float = 0.0, power: float = 0.8
+) -> int | None:
+    """About how many runs of each agent show who is ahead, as long as further runs are like these.
+
+    Args:
+        first: scores, shape (n,), at least 2.
+        second: likewise.
+        level: of the verdict, on both sides together.
+        margin: within which they would be equivalent.
+        power: the probability of a verdict.
+
+    Returns:
+        The number, at least ``FEWEST_SEEDS``; None beyond ``MOST_SEEDS``.
+    """
+    apart = abs(float(first.mean() - second.mean()))
+    reach = max(apart, margin - apart)
+    if reach <= SAME:
+        return None
+    variance = float(first.var(ddof=1) + second.var(ddof=1))
+    steps = float(stats.norm.isf(level / 2) + stats.norm.ppf(power))
+    needed = math.ceil(steps**2 * variance / reach**2) + 1
+    return max(needed, fewest_for(level)) if needed <= MOST_SEEDS else None
+
+
+def fewest_for(level: float) -> int:
+    """With how few runs of each of two agents their splits can show anything at a level."""
+    return next(n for n in count(FEWEST_SEEDS) if comb(2 * n, n) * level >= 2)
