@@ -149,8 +149,7 @@ def test_a_training_that_is_stopped_is_shown_as_far_as_it_came(type_command, tmp
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(TableRecorder, "_on_rollout_start", stop_later)
-    # Compiled code would not ask after each step.
-    code, out, _ = type_command(*WATCHED, "-params", "engine:interpreted")
+    code, out, _ = type_command(*WATCHED)
     assert (code, out.splitlines()[-1]) == (130, "learning page.html")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     (number,) = re.findall(r"seed 0 · (\d+) steps", text)
