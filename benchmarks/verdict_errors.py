@@ -259,7 +259,8 @@ def heading(cells: Sequence[object]) -> None:
 def print_errors(studies: int) -> None:
     """Studies that say anything false."""
     print(
-        f"\nStudies with a false sentence, per cent of {studies:,}; of which kind, where over 1\n"
+        f"\nStudies with a false sentence, per cent of {studies:,}; of which kind, where over 1; "
+        "with ten agents a tenth as many studies\n"
     )
     heading(["scores", "agents", *(f"{n} seeds" for n in SIZES), "grown"])
     for name, both in FAMILIES.items():
@@ -354,13 +355,16 @@ def print_coverage(studies: int) -> None:
             rng, held = np.random.default_rng(n), np.zeros(2)
             for _ in range(studies):
                 x, y = first.draw(rng, n), second.draw(rng, n)
-                low, high = mean_interval(y, ALPHA)
-                gap = compare_means(x, y, ALPHA)
+                (low, high), own = mean_interval(y, ALPHA), mean_interval(x, ALPHA)
                 apart = first.mean - second.mean
-                held += (
-                    low - 1e-4 <= second.mean <= high + 1e-4,
-                    gap.low - 1e-4 <= apart <= gap.high + 1e-4,
-                )
+                # That of a difference holds what its guards hold, which are computed faster.
+                least = min(own[0] - y.mean(), x.mean() - high)
+                most = max(own[1] - y.mean(), x.mean() - low)
+                is_held = least <= apart <= most
+                if not is_held:
+                    gap = compare_means(x, y, ALPHA)
+                    is_held = gap.low - 1e-4 <= apart <= gap.high + 1e-4
+                held += low - 1e-4 <= second.mean <= high + 1e-4, is_held
             for worst, share in zip((means, gaps), 100 * held / studies, strict=True):
                 worst[n] = min(worst.get(n, (101.0, "")), (float(share), name))
     for kind, worst in (("mean", means), ("difference of means", gaps)):
@@ -420,7 +424,7 @@ def print_power(studies: int) -> None:
                 hits.update(name for name, n_won in wins.items() if n_won == len(laws) - 1)
             n_wrong = sum(times for name, times in hits.items() if name != "0" or not lead)
             cells.append(f"{100 * hits['0'] / studies:.0f}, {100 * n_wrong / studies:.1f}")
-        row([f"{lead:g} standard deviations ahead of three", *cells])
+        row([f"{lead:g} standard deviations ahead of three others", *cells])
 
 
 def adastop(first: Scores, second: Scores, group: int, rng: Generator, n_draws: int = 500) -> bool:
