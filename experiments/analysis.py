@@ -218,11 +218,13 @@ def bounded_mean(values: Floats, ends: Ends, *, exact: bool = False) -> Estimate
     if not len(known):
         return Estimate(np.nan, np.nan, np.nan, 0, n_missing)
     mean = float(known.mean())
+    if exact:
+        return Estimate(mean, mean, mean, len(known), n_missing)
     slack = 1e-9 * (ends.high - ends.low)
     is_within = ends.low - slack <= known.min() and known.max() <= ends.high + slack
-    if not is_within or (len(known) == 1 and not exact):
+    if not is_within or len(known) == 1:
         return Estimate(mean, np.nan, np.nan, len(known), n_missing)
-    low, high = mean_interval(ends.shares(known), 0.05, exact=exact)
+    low, high = mean_interval(ends.shares(known), 0.05)
     low, high = (ends.low + share * (ends.high - ends.low) for share in (low, high))
     return Estimate(mean, min(low, mean), max(high, mean), len(known), n_missing)
 
@@ -591,9 +593,7 @@ def _analyse_agent(
     return AgentAnalysis(
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
-        judged=bounded_mean(
-            evidence.ends.shares(evidence.scores[agent]), Ends(0.0, 1.0), exact=exact
-        ),
+        judged=bounded_mean(evidence.ends.shares(evidence.scores[agent]), UNIT, exact=exact),
         n_runs=len(table),
         n_missing=n_seeds - len(table),
         metric=metric,

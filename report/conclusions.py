@@ -118,13 +118,10 @@ def _within(environment: EnvironmentAnalysis) -> str:
 
 def _unseen(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
     """How many further runs may be unlike those that were seen: right in 95 of 100 studies."""
-    n = min(agent.n_runs for agent in environment.agents if _is_in(agent.agent, pairs))
-    n = min([n, *(pair.n_seeds for pair in pairs)])
+    names = {name for pair in pairs for name in (pair.first, pair.second)}
+    n_runs = [agent.n_runs for agent in environment.agents if agent.agent in names]
+    n = min([*n_runs, *(pair.n_seeds for pair in pairs)])
     return f"after {n:,} runs, up to {1 - 0.05 ** (1 / n):.0%} of further ones may be different"
-
-
-def _is_in(name: str, pairs: Sequence[PairComparison]) -> bool:
-    return any(name in (pair.first, pair.second) for pair in pairs)
 
 
 def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:

@@ -59,7 +59,6 @@ if TYPE_CHECKING:
         equivalent_p_value,
         holm,
         paired_difference,
-        typical_difference,
     )
     from verdicts.resampling import (
         Estimate,
@@ -122,7 +121,6 @@ __all__ = [
     "steps_to_threshold",
     "summarise",
     "summarise_steps",
-    "typical_difference",
 ]
 
 # Those that load least come first: some of them a command needs before it may take long.

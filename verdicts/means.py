@@ -35,6 +35,12 @@ N_SPACINGS = 4000
 SAME = 1e-12  # means closer than this are equal
 
 
+def opposite(verdict: Verdict) -> Verdict:
+    """The same, seen from the second agent."""
+    turned: dict[Verdict, Verdict] = {"better": "worse", "worse": "better"}
+    return turned.get(verdict, verdict)
+
+
 @dataclass(frozen=True)
 class MeanVerdict:
     """What is said of the means of two agents."""
@@ -45,8 +51,7 @@ class MeanVerdict:
 
     def swapped(self) -> MeanVerdict:
         """The same, seen from the second agent."""
-        turned: dict[Verdict, Verdict] = {"better": "worse", "worse": "better"}
-        return replace(self, verdict=turned.get(self.verdict, self.verdict))
+        return replace(self, verdict=opposite(self.verdict))
 
 
 @dataclass(frozen=True)

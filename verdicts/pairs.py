@@ -19,6 +19,7 @@ from verdicts.means import (
     compare_means,
     fewest_for,
     judge_means,
+    opposite,
     rank_by_mean,
     seeds_needed,
 )
@@ -29,7 +30,6 @@ from verdicts.rank_tests import (
     equivalent_p_value,
     holm,
     same_shape,
-    typical_difference,
     wins_of,
 )
 from verdicts.resampling import (
@@ -334,13 +334,6 @@ def _resampled(wins: Floats, counts: Counts) -> Floats:
 
 # Which of two agents is better, by how much, and how many seeds it would take to say.
 
-_OPPOSITE: dict[Verdict, Verdict] = {
-    "better": "worse",
-    "worse": "better",
-    "equivalent": "equivalent",
-    "undecided": "undecided",
-}
-
 
 @dataclass(frozen=True)
 class PairComparison:
@@ -353,9 +346,6 @@ class PairComparison:
     #: together and agree with what is said.
     mean: MeanDifference
     typical: Verdict  #: on the typical run of the first; see ``Judgement``
-    #: The median difference between a run of the first and one of the second. The intervals of all
-    #: pairs hold together, and agree with ``typical``.
-    typical_difference: Estimate
     #: That a run of the first scores higher than one of the second.
     probability_of_improvement: Estimate
     #: Where the means are undecided, about the number of seeds that would decide at the next look
@@ -379,15 +369,14 @@ class PairComparison:
 
     def swapped(self) -> PairComparison:
         """The same comparison seen from the second agent."""
-        gap, wins = self.typical_difference, self.probability_of_improvement
+        wins = self.probability_of_improvement
         return replace(
             self,
             first=self.second,
             second=self.first,
             said=self.said.swapped(),
             mean=self.mean.swapped(),
-            typical=_OPPOSITE[self.typical],
-            typical_difference=replace(gap, point=-gap.point, low=-gap.high, high=-gap.low),
+            typical=opposite(self.typical),
             probability_of_improvement=replace(
                 wins, point=1 - wins.point, low=1 - wins.high, high=1 - wins.low
             ),
@@ -499,9 +488,6 @@ def describe_pairs(
                 said=judgement.mean,
                 mean=_mean_difference(ends, (x, y), level, margin, judgement, paired=paired),
                 typical=judgement.typical,
-                typical_difference=_difference(
-                    x, y, margin, level_of_claim(levels[0], "typical") / n_pairs, judgement
-                ),
                 probability_of_improvement=improvement,
                 seeds_needed=needed,
                 certain=judgement.certain,
@@ -561,27 +547,3 @@ def _mean_difference(
     if said.is_conditional:
         return replace(found, **seen)
     return replace(found, low=max(found.low, least), high=min(found.high, most), **seen)
-
-
-def _difference(
-    first: Floats, second: Floats, margin: float, level: float, judgement: Judgement
-) -> Estimate:
-    """The typical difference, its interval made to say what the verdict says.
-
-    Holm's correction may decide what an interval that counts all pairs leaves open; the test for
-    unequal spreads may leave open what it decides. And who is shown to lie within the margin lies
-    within it: Stefansson, Kim and Hsu (1988), "On confidence sets in multiple comparisons".
-    """
-    found = typical_difference(first, second, level)
-    if judgement.certain:
-        return replace(found, low=found.point, high=found.point)
-    low, high = found.low, found.high
-    if judgement.typical == "better":
-        low = max(low, min(found.point, 0.0))
-    elif judgement.typical == "worse":
-        high = min(high, max(found.point, 0.0))
-    elif judgement.typical == "equivalent":
-        low, high = max(low, -margin), min(high, margin)
-    else:
-        low, high = min(low, 0.0), max(high, 0.0)
-    return found if np.isnan(found.low) else replace(found, low=low, high=high)

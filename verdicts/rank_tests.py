@@ -224,42 +224,16 @@ def _normal_tail(ranks: Floats, n: int, m: int, found: int) -> float:
     return float(stats.norm.sf((found - n * (total + 1) - step / 2) / spread))
 
 
-# How far apart the typical runs of two agents are.
+@lru_cache(maxsize=4096)
+def interval_places(n: int, m: int, level: float) -> tuple[int, int] | None:
+    """Where the interval of the median of n m differences ends; None for too few seeds.
 
-
-def typical_difference(first: Floats, second: Floats, level: float) -> Estimate:
-    """The median of all differences between a run of ``first`` and one of ``second``.
-
-    Its interval goes from one of these differences to another, so that it never leaves what is
-    possible. It belongs to the rank-sum test: where scores differ by a shift, it holds those shifts
-    that the test does not refuse.
-
-    Args:
-        first: shape (n,), finite.
-        second: shape (m,), finite.
-        level: one minus the confidence of the interval.
-
-    Returns:
-        The estimate; without interval where the seeds are too few for that level.
+    It belongs to the rank-sum test: where scores differ by a shift, it holds those shifts that the
+    test does not refuse at this level.
 
     Source: Hodges and Lehmann (1963), "Estimates of location based on rank tests"; Lehmann (1975),
     "Nonparametrics", section 2.6.
     """
-    n, m = len(first), len(second)
-    if min(n, m) == 0:
-        return Estimate(np.nan, np.nan, np.nan, 0)
-    apart = differences(first[:, None], second).ravel()
-    middle = float(np.median(apart))
-    places = interval_places(n, m, level)
-    if places is None:
-        return Estimate(middle, np.nan, np.nan, min(n, m))
-    low, high = np.partition(apart, places)[list(places)]
-    return Estimate(middle, float(low), float(high), min(n, m))
-
-
-@lru_cache(maxsize=4096)
-def interval_places(n: int, m: int, level: float) -> tuple[int, int] | None:
-    """Where the interval of the typical one of n m differences ends; None for too few seeds."""
     if 0.5 ** min(n, m) > level:
         return None
     if n + m <= MOST_COUNTED:

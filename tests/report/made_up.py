@@ -62,7 +62,6 @@ def pair(first, second, verdict, difference=0.1, *, is_conditional=False, **chan
         said=MeanVerdict(verdict, is_conditional),
         mean=mean,
         typical="undecided",
-        typical_difference=estimate(difference),
         probability_of_improvement=estimate(0.5, 0.25, 0.75),
         seeds_needed=None,
         n_seeds=4,

@@ -14,9 +14,8 @@ from verdicts import (
     equivalent_p_value,
     judge_pairs,
     level_of_look,
-    typical_difference,
 )
-from verdicts.rank_tests import rank_sum_p_value, share_p_value, wins_of
+from verdicts.rank_tests import interval_places, rank_sum_p_value, share_p_value, wins_of
 
 SCORES = st.lists(st.integers(0, 3), min_size=2, max_size=5)
 
@@ -75,21 +74,20 @@ def test_the_larger_of_two_p_values_counts():
     assert np.isnan(ahead_p_value(first, second[:0]))
 
 
-def test_the_typical_difference_worked_by_hand():
-    # All differences of 1..5 and 11..15: from -14 to -6, -10 five times, symmetric.
-    found = typical_difference(np.arange(1.0, 6), np.arange(11.0, 16), 0.05)
+def test_the_interval_of_a_median_of_differences_worked_by_hand():
     # Two-sided 0.05 leaves out two of the 25 on each side: 2 (1 + 1) / 252, (1 + 1 + 2) is 0.032.
-    assert (found.point, found.low, found.high) == (-10, -13, -7)
-    assert not typical_difference(np.arange(4.0), np.arange(4.0), 0.05).has_interval
+    assert interval_places(5, 5, 0.05) == (2, 22)
+    assert interval_places(4, 4, 0.05) is None
 
 
 @pytest.mark.parametrize("n", [8, 30])
-def test_the_interval_of_the_typical_difference_covers(n):
+def test_the_interval_of_a_median_of_differences_covers(n):
     rng = np.random.default_rng(n)
-    rows = [typical_difference(*rng.exponential(size=(2, n)), 0.05) for _ in range(2000)]
-    missed = np.mean([not one.low <= 0 <= one.high for one in rows])
+    pairs = rng.exponential(size=(2000, 2, n))
+    apart = np.sort([np.subtract.outer(*pair).ravel() for pair in pairs])
+    low, high = apart[:, interval_places(n, n, 0.05)].T
     # Standard error 0.5 %; steps of the exact test make it a little cautious.
-    assert 0.025 < missed < 0.065
+    assert 0.025 < ((low > 0) | (high < 0)).mean() < 0.065
 
 
 def test_looks_spend_no_more_than_there_is():
