@@ -22,7 +22,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.sampled import Yardstick, evaluate
+from pipeline.evaluation.sampled import evaluate
+from pipeline.evaluation.yardstick import Yardstick
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
     from agents.networks.engine_setting import EnginePlan
     from experiments.launching import Launcher, Launchers
-    from pipeline.evaluation.sampled import Evaluation, Yardstick
+    from pipeline.evaluation.sampled import Evaluation
+    from pipeline.evaluation.yardstick import Yardstick
     from pipeline.preparation import EngineOutlook
 
 UNBOUNDED = 10_000  # columns

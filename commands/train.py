@@ -512,7 +512,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
 
 def describe_pulls(pulls: PullSummary) -> str:
     """The pulls of a training in a few words."""
-    from pipeline.callbacks import LAST_PULLS
+    from pipeline.runs import LAST_PULLS
 
     if pulls.regret is not None:
         last = min(LAST_PULLS, pulls.n_pulls)

@@ -23,8 +23,7 @@ from experiments.study import COSTS, StudySpec
 from mdp.transition_model import Floats
 from pipeline.environments import training_changes, trains_on_variant
 from pipeline.errors import UserError
-from pipeline.evaluation import FAILED, NEARLY_ALL
-from pipeline.evaluation.sampled import Yardstick
+from pipeline.evaluation.yardstick import FAILED, NEARLY_ALL, Yardstick
 from pipeline.signs_of_life import Tell, tell_nobody
 from pipeline.train_spec import TrainSpec
 from verdicts import (

@@ -36,7 +36,7 @@ from pipeline.finite_numbers import (
 )
 from pipeline.models.find import checkpoint_file
 from pipeline.models.load import save_model, save_normalization, save_replay_buffer
-from pipeline.runs import PULLS_FILE, Run
+from pipeline.runs import LAST_PULLS, PULLS_FILE, Run
 from pipeline.settings import components
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
@@ -214,8 +214,6 @@ class NumberWatch(BlockCallback):
 
 
 # --- the pulls of a training on a bandit ----------------------------------------------------------
-
-LAST_PULLS = 100
 
 
 @dataclass(frozen=True)

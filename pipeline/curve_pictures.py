@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.transition_model import Floats
-from pipeline.callbacks import LAST_PULLS
 from pipeline.files import replacing
-from pipeline.runs import Run
+from pipeline.runs import LAST_PULLS, Run
 from safe_files.files import NO_LIMIT, read_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pipeline.evaluation.sampled import Yardstick
+    from pipeline.evaluation.yardstick import Yardstick
 
 
 def fix_layout(figure: Figure) -> None:

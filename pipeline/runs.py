@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from pipeline.train_spec import TrainSpec
 
 PULLS_FILE = "pulls.npz"
+LAST_PULLS = 100  # the mean of so many tells how it went at the end
 
 # States in a folder: the newest two, so that one is whole.
 GENERATIONS = 2

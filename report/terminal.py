@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.console import Console
@@ -12,13 +13,15 @@ from rich.table import Table
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.off_policy.estimators import difference_in_value, mean_reward
-from experiments.off_policy.logged_policies import Comparison, Judged
 from experiments.plan import tuning_seeds
 from experiments.study import METRIC_WORDS, StudySpec
 from report.conclusions import conclusion, overall_sentences, pairs_both_ways, seeds_of
 from report.ranking import BANDIT_COLUMNS, COLUMNS, Cell, Column, Row, filled
 from report.words import enumeration, number, optimum_words, seed_sentence
 from verdicts import Estimate, PairComparison, Verdict
+
+if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
+    from experiments.off_policy.logged_policies import Comparison, Judged
 
 # All verdicts on an environment at a glance: a row and a column for each agent.
 

@@ -22,9 +22,9 @@ from mdp.transition_model import Floats
 from pipeline.agent_settings import resolved_spec
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError
-from pipeline.evaluation import FAILED, NEARLY_ALL
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.yardstick import FAILED, NEARLY_ALL
 from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.train_spec import TrainSpec
 

@@ -43,7 +43,8 @@ from mdp import (
 from mdp.transition_model import Bools, Floats
 from pipeline.environments import evaluation_kwargs, make_single_env
 from pipeline.evaluation.policies import OfLastPolicy, best_actions, obstacle, policy_matrix
-from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.yardstick import Yardstick
 from pipeline.train_spec import TrainSpec, is_plain
 
 # Limit for the array with the observations of all states.

@@ -178,6 +178,25 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
+# Loading the library takes longer than many a study.
+WITHOUT_PYTORCH = """
+import sys
+import compare
+sys.argv = "compare.py --algos qlearning sarsa --env FrozenLake-v1 --seeds 2 -n 500".split()
+code = compare.main()
+assert not {"stable_baselines3", "torch"} & sys.modules.keys()
+sys.exit(code)
+"""
+
+
+def test_the_process_that_plans_and_tells_a_study_loads_no_pytorch(folder):
+    done = subprocess.run([sys.executable, "-c", WITHOUT_PYTORCH], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    # For these sentences trained agents were loaded.
+    assert "did not learn the task" in " ".join(done.stdout.split())
+    assert len(list(folder.rglob("report.html"))) == 1
+
+
 def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(
     type_command, folder, monkeypatch
 ):

@@ -36,7 +36,8 @@ from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from machine_code import WorkTime
 from pipeline import signs_of_life
-from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.yardstick import Yardstick
 from pipeline.model_card import card
 from pipeline.preparation import EngineOutlook, planned_outlook
 from pipeline.runs import Run

@@ -17,7 +17,8 @@ from pipeline.evaluation import policies
 from pipeline.evaluation.advice import advice
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.policies import action_figures, policy_matrix
-from pipeline.evaluation.sampled import Yardstick, evaluate
+from pipeline.evaluation.sampled import evaluate
+from pipeline.evaluation.yardstick import Yardstick
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
 

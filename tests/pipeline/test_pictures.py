@@ -15,8 +15,8 @@ from pipeline.curve_pictures import draw_learning_curve, read_monitors
 from pipeline.environments import make_training_env
 from pipeline.evaluation import value_maps
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.sampled import Yardstick
 from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal, value_map
+from pipeline.evaluation.yardstick import Yardstick
 from pipeline.models.load import load_model
 from pipeline.runs import Run
 from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of, spec_of, trained

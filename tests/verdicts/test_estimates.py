@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.evaluation.sampled import Yardstick
+from pipeline.evaluation.yardstick import Yardstick
 from verdicts import (
     estimate,
     optimum_score,
