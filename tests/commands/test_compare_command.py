@@ -182,7 +182,7 @@ def names(folder):
 WITHOUT_PYTORCH = """
 import sys
 import compare
-sys.argv = "compare.py --algos qlearning sarsa --env FrozenLake-v1 --seeds 2 -n 500".split()
+sys.argv = "compare.py --algos qlearning sarsa --env FrozenLake-v1 --seeds 2 -n 1000".split()
 code = compare.main()
 assert not {"stable_baselines3", "torch"} & sys.modules.keys()
 sys.exit(code)
@@ -190,7 +190,9 @@ sys.exit(code)
 
 
 def test_the_process_that_plans_and_tells_a_study_loads_no_pytorch(folder):
-    done = subprocess.run([sys.executable, "-c", WITHOUT_PYTORCH], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_PYTORCH], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stderr) == (0, "")
     # For these sentences trained agents were loaded.
     assert "did not learn the task" in " ".join(done.stdout.split())
