@@ -165,7 +165,15 @@ def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gy
 
 def make_training_env(spec: TrainSpec, monitor_folder: Path | None) -> Any:
     """The environments of the training, each under a Monitor that writes into the folder."""
-    return _make_vec_env(spec, spec.hyperparams.n_envs, spec.seed, True, monitor_folder)
+    return _make_vec_env(spec, spec.hyperparams.n_envs, first_slot_seed(spec), True, monitor_folder)
+
+
+def first_slot_seed(spec: TrainSpec) -> int:
+    """The seed of the first environment of a training; the next has one more, and so on.
+
+    No two runs with different seeds and as many environments share one.
+    """
+    return spec.seed * spec.hyperparams.n_envs
 
 
 def make_evaluation_env(

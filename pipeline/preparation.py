@@ -32,6 +32,7 @@ from pipeline.callbacks import (
 )
 from pipeline.digests import VERSION, VERSION_FIELD
 from pipeline.environments import (
+    first_slot_seed,
     make_evaluation_env,
     make_single_env,
     make_training_env,
@@ -317,7 +318,16 @@ def is_unread(spec: TrainSpec) -> bool:
 def make_model(
     spec: TrainSpec, trained: ModelFile | None, env: VecEnv, kwargs: dict[str, Any]
 ) -> BaseAlgorithm:
-    """The agent of a run: a new one, or the one that it goes on from."""
+    """The agent of a run: a new one, or the one that it goes on from; its environments seeded."""
+    model = _model(spec, trained, env, kwargs)
+    # The library seeds slot i with s + i: most streams of one run would be those of the next.
+    env.seed(first_slot_seed(spec))
+    return model
+
+
+def _model(
+    spec: TrainSpec, trained: ModelFile | None, env: VecEnv, kwargs: dict[str, Any]
+) -> BaseAlgorithm:
     folder = spec.tensorboard_log
     common: dict[str, Any] = {
         "seed": spec.seed,
