@@ -30,6 +30,7 @@ from pipeline.evaluation.sampled import (
     evaluation_seed,
     is_sure,
 )
+from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.settings import hyperparams
 from pipeline.settings.hyperparams import TUNED_ON, read_hyperparams, split
 from pipeline.settings.yaml import read_yaml
@@ -70,7 +71,7 @@ def seeds_of_run(n_envs, seed, n_eval_envs=TrainSpec.n_eval_envs):
     """All seeds of environments, of action spaces and of the agent."""
     starts = [evaluation_seed(seed, purpose) for purpose in PURPOSES]
     evaluations = (range(start, start + n_eval_envs) for start in starts)
-    return set(range(seed, seed + n_envs)).union(*evaluations)
+    return {seed, *range(seed * n_envs, (seed + 1) * n_envs)}.union(*evaluations)
 
 
 @pytest.mark.parametrize(
@@ -84,17 +85,16 @@ def test_a_run_takes_the_seeds_that_are_said(algo, settings, monkeypatch):
         return make(seed)
 
     monkeypatch.setattr(seeding, "np_random", watched)
-    raw = {**read_hyperparams(algo, LAKE), "n_envs": 3, "n_timesteps": 12}
+    raw = {**read_hyperparams(algo, LAKE), "n_envs": 3, "n_timesteps": 12, **settings}
     spec = resolved_spec(raw, algo=algo, env_id=LAKE, seed=7)
-    model = agent_of(algo, make_training_env(spec, None), **settings)
-    model.set_random_seed(7)
+    model = make_model(spec, None, make_training_env(spec, None), algorithm_kwargs(spec))
     taken.clear()
     model.learn(12)
-    assert taken <= {7, 8, 9}
+    assert taken == {21, 22, 23}
     taken.clear()
     evaluate(model, make_evaluation_env(spec, 2), 4, evaluation_seed(7, 1))
     assert taken == {evaluation_seed(7, 1), evaluation_seed(7, 1) + 1}
-    assert {7, 8, 9} | taken <= seeds_of_run(3, 7, 2)
+    assert {7, 21, 22, 23} | taken <= seeds_of_run(3, 7, 2)
 
 
 def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_stream():
@@ -113,9 +113,6 @@ def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_strea
         for seeds in (range(10), range(1000, 1010))
     )
     assert not tuned & judged
-    # Neighbours share seeds of environments: docs/statistics.md says how much that matters.
-    assert len(seeds_of_run(8, 0) & seeds_of_run(8, 1)) == 7
-    assert not seeds_of_run(8, 0) & seeds_of_run(8, 8)
 
 
 # --- what is played ------------------------------------------------------------------------------
