@@ -33,6 +33,7 @@ N_SPLITS = 4000  # of a permutation test; all of them where there are fewer
 MOST_PERMUTED = 400
 N_SPACINGS = 4000
 SAME = 1e-12  # means closer than this are equal
+ROUNDED = 1e-9  # a run that is closer to an end may be there, but for rounding
 
 
 def opposite(verdict: Verdict) -> Verdict:
@@ -239,6 +240,8 @@ def ahead_on_average(
 
     A p-value above ``enough`` may be too low, but not below that.
     """
+    if _is_at_an_end(first, second, exact):
+        return 0.0
     seen = seen_p_value(first, second, paired=paired, enough=enough)
     if seen > enough:
         return seen
@@ -247,6 +250,15 @@ def ahead_on_average(
         float((1 - lowest_means(1 - second, exact=exact[1]) >= first.mean()).mean()),
     )
     return max(seen, *guards)
+
+
+def _is_at_an_end(first: Floats, second: Floats, exact: Exact) -> bool:
+    """Whether one always has the most that there is and the other once had less, or the reverse.
+
+    Then their means cannot be equal, however few runs tell it.
+    """
+    has_most = exact[0] and first[0] >= 1 - SAME and bool((second < 1 - ROUNDED).any())
+    return has_most or (exact[1] and second[0] <= SAME and bool((first > ROUNDED).any()))
 
 
 def judge_means(
@@ -274,6 +286,7 @@ def judge_means(
     if min(len(x), len(y)) < FEWEST_SEEDS:
         return MeanVerdict("undecided")
     means = float(x.mean()), float(y.mean())
+    is_known = _is_at_an_end(x, y, exact), _is_at_an_end(y, x, exact[::-1])
 
     def seen(lead: float) -> bool:
         """Whether the first is ahead of the second by more than this."""
@@ -285,19 +298,19 @@ def judge_means(
     said: Verdict = "undecided"
     if margin > 0 and seen(-margin) and seen_behind(-margin):
         said = "equivalent"
-    elif seen(0.0):
+    elif is_known[0] or seen(0.0):
         said = "better"
-    elif seen_behind(0.0):
+    elif is_known[1] or seen_behind(0.0):
         said = "worse"
     if said == "undecided":
         return MeanVerdict(said)
     low, high = _guarded(x, y, level, exact)
     is_sure = {
         "equivalent": -margin < low and high < margin,
-        "better": low > 0,
-        "worse": high < 0,
+        "better": low > ROUNDED or is_known[0],
+        "worse": high < -ROUNDED or is_known[1],
     }[said]
-    if said == "equivalent" and not is_sure and (low > 0 or high < 0):
+    if said == "equivalent" and not is_sure and (low > ROUNDED or high < -ROUNDED):
         # So far apart, if not by much, that no further runs could turn it round.
         return MeanVerdict("better" if means[0] > means[1] else "worse")
     return MeanVerdict(said, is_conditional=not is_sure)
@@ -354,7 +367,12 @@ def _seen_low(first: Floats, second: Floats, level: float, paired: bool) -> floa
 
 
 def rank_by_mean(
-    scores: Sequence[Floats], level: float, *, paired: bool = False, exact: Sequence[bool] = ()
+    scores: Sequence[Floats],
+    level: float,
+    *,
+    paired: bool = False,
+    exact: Sequence[bool] = (),
+    seen_only: bool = False,
 ) -> int:
     """How many agents, from the first on, are each shown to be ahead of all that follow.
 
@@ -367,6 +385,8 @@ def rank_by_mean(
         level: the share of studies in which any of these claims may be wrong.
         paired: whether runs of one seed share their randomness.
         exact: by agent, whether it does not depend on chance.
+        seen_only: whether the claims have the condition that few further runs lie outside of what
+            was seen.
 
     Source: Gutmann and Maymin (1987), "Is the selected population the best?", Annals of Statistics
     15; Hung and Fithian (2019), "Rank verification for exponential families", Annals of Statistics
@@ -377,11 +397,14 @@ def rank_by_mean(
         for other in range(place + 1, len(scores)):
             if min(len(first), len(scores[other])) < FEWEST_SEEDS:
                 return place
-            both = known[place], known[other]
-            p_value = ahead_on_average(
-                first, scores[other], paired=paired, exact=both, enough=level / 2
-            )
-            if p_value > level / 2 and not (all(both) and first[0] > scores[other][0]):
+            both, second = (known[place], known[other]), scores[other]
+            if seen_only and not _is_at_an_end(first, second, both):
+                p_value = seen_p_value(first, second, paired=paired, enough=level / 2)
+            else:
+                p_value = ahead_on_average(
+                    first, second, paired=paired, exact=both, enough=level / 2
+                )
+            if p_value > level / 2 and not (all(both) and first[0] > second[0]):
                 return place
     return max(len(scores) - 1, 0)
 

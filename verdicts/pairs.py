@@ -141,15 +141,35 @@ def judge_pairs(
             exact=(pair[0] in certain, pair[1] in certain),
         )
     typical = _typical(runs, margin, level_of_claim(level, "typical"), len(earlier))
-    ahead = _ahead_of_all(scores, for_means, certain, ends, paired=paired) if ranks else ()
-    for pair in {*ahead} | {(b, a) for a, b in ahead}:
-        if pair in means and means[pair] != MeanVerdict("equivalent"):
-            means[pair] = MeanVerdict("better" if pair in ahead else "worse")
+    if ranks:
+        seen, sure = (
+            _ahead_of_all(scores, for_means, certain, ends, paired=paired, seen_only=seen_only)
+            for seen_only in (True, False)
+        )
+        for a, b in seen:
+            _say(means, (a, b), MeanVerdict("better", is_conditional=True))
+        for a, b in sure:
+            _say(means, (a, b), MeanVerdict("better"))
     _close(means)
     judged = {pair: Judgement(means[pair], typical[pair]) for pair in tested}
     for a, b in known:
         judged[a, b] = _known(scores[a], scores[b], margin)
     return {pair: earlier.get(pair) or judged[pair] for pair in pairs}
+
+
+def _say(
+    means: dict[tuple[str, str], MeanVerdict],
+    pair: tuple[str, str],
+    said: MeanVerdict,
+) -> None:
+    """Put a verdict in the place of one on the same pair that says less."""
+    if pair not in means:
+        pair, said = pair[::-1], said.swapped()
+    known = means.get(pair, MeanVerdict("equivalent"))
+    if known.verdict == "undecided" or (
+        not said.is_conditional and known != MeanVerdict("equivalent")
+    ):
+        means[pair] = said
 
 
 def _close(means: dict[tuple[str, str], MeanVerdict]) -> None:
@@ -171,6 +191,7 @@ def _ahead_of_all(
     ends: Ends,
     *,
     paired: bool,
+    seen_only: bool,
 ) -> list[tuple[str, str]]:
     """The pairs of which the first is shown to be ahead of the second and of all that follow it."""
     shares = {name: ends.shares(values) for name, values in scores.items()}
@@ -181,7 +202,9 @@ def _ahead_of_all(
     finite = {name: values[there[name]] for name, values in shares.items()}
     order = sorted(finite, key=lambda name: _mean_or_last(finite[name]), reverse=True)
     exact = [name in certain for name in order]
-    n_ranked = rank_by_mean([finite[name] for name in order], level, paired=paired, exact=exact)
+    n_ranked = rank_by_mean(
+        [finite[name] for name in order], level, paired=paired, exact=exact, seen_only=seen_only
+    )
     return [(order[k], other) for k in range(n_ranked) for other in order[k + 1 :]]
 
 
@@ -463,7 +486,8 @@ def describe_pairs(
         n_resamples: how many resamples their intervals come from.
     """
     n_pairs = max(1, sum(not each.certain for each, _ in judged.values()))
-    level = level_of_claim(levels[0], "means") / n_pairs / (2 if ranks else 1)
+    for_best = level_of_claim(levels[0], "means") / 2 if ranks else 0.0
+    level = (for_best or level_of_claim(levels[0], "means")) / n_pairs
     comparisons = []
     for (one, two), (judgement, n_seeds) in judged.items():
         both = np.array([scores[one][:n_seeds], scores[two][:n_seeds]])
@@ -486,7 +510,9 @@ def describe_pairs(
                 first=one,
                 second=two,
                 said=judgement.mean,
-                mean=_mean_difference(ends, (x, y), level, margin, judgement, paired=paired),
+                mean=_mean_difference(
+                    ends, (x, y), (level, for_best), margin, judgement, paired=paired
+                ),
                 typical=judgement.typical,
                 probability_of_improvement=improvement,
                 seeds_needed=needed,
@@ -523,7 +549,7 @@ def _check(
 def _mean_difference(
     ends: Ends,
     runs: tuple[Floats, Floats],
-    level: float,
+    levels: tuple[float, float],
     margin: float,
     judgement: Judgement,
     *,
@@ -531,7 +557,8 @@ def _mean_difference(
 ) -> MeanDifference:
     """The difference of two means, its intervals made to say what the verdict says.
 
-    Who is best is shown by a test of its own, which may decide what an interval leaves open. And
+    Who is best is shown by a test of its own, which may decide what an interval leaves open; the
+    level of that is the second of the two, and that of the intervals of all pairs the first. And
     who is shown to lie within the margin lies within it: Stefansson, Kim and Hsu (1988), "On
     confidence sets in multiple comparisons".
     """
@@ -539,7 +566,10 @@ def _mean_difference(
     if judgement.certain:
         apart = float(x[0] - y[0])
         return MeanDifference(apart, apart, apart, apart, apart)
-    found, said = compare_means(x, y, level, paired=paired), judgement.mean
+    found, said = compare_means(x, y, levels[0], paired=paired), judgement.mean
+    is_ahead = said.verdict in ("better", "worse")
+    if said.is_conditional and is_ahead and found.seen_low <= 0 <= found.seen_high:
+        found = compare_means(x, y, levels[1], paired=paired)
     within = margin / (ends.high - ends.low)
     least = {"better": 0.0, "equivalent": -within}.get(said.verdict, -1.0)
     most = {"worse": 0.0, "equivalent": within}.get(said.verdict, 1.0)

@@ -12,6 +12,7 @@ from scipy import stats
 from verdicts import (
     Ends,
     compare_means,
+    compare_pairs,
     fewest_seeds,
     judge_means,
     judge_pairs,
@@ -19,6 +20,7 @@ from verdicts import (
     rank_by_mean,
 )
 from verdicts.means import (
+    MeanVerdict,
     ahead_on_average,
     paired_p_value,
     permutation_p_value,
@@ -151,6 +153,38 @@ def test_the_best_is_told_from_each_other_without_a_price_for_their_number():
     judged = judge_pairs(dict(zip("abcd", [best, *others], strict=True)), 0.02, 0.05, ends=UNIT)
     assert {judged["a", other].mean.verdict for other in "bcd"} == {"better"}
     assert not any(judged["a", other].mean.is_conditional for other in "bcd")
+
+
+def test_who_is_best_may_have_a_condition_too():
+    # So far ahead that it shows against each, if not against all pairs at once, nor with the guard.
+    best, others = normal_scores(10, 0.66), [normal_scores(10, mean) for mean in (0.58, 0.579)]
+    scores = dict(zip("abc", [best, *others], strict=True))
+    assert rank_by_mean([*scores.values()], 0.02) == 0
+    assert rank_by_mean([*scores.values()], 0.02, seen_only=True) == 1
+    for pair in compare_pairs(scores, ends=(0, 1), seed=0)[:2]:
+        assert judge_means(best, scores[pair.second], 0.05 / 3) == MeanVerdict("better", True)
+        assert pair.said == MeanVerdict("better", True)
+        assert 0 < pair.mean.seen_low < 0.08 < pair.mean.seen_high
+        assert pair.mean.most_outside > 0
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ([1.0] * 9 + [0.9], MeanVerdict("better")),
+        ([1.0] * 9 + [1 - 1e-12], MeanVerdict("equivalent", True)),
+        ([1.0] * 4, MeanVerdict("undecided")),
+    ],
+)
+def test_who_always_has_the_most_there_is_is_ahead_of_whoever_once_had_less(other, said):
+    most = np.ones(len(other))
+    assert judge_means(most, other, 0.05, margin=0.02, exact=(True, False)) == said
+    assert judge_means(other, most, 0.05, margin=0.02, exact=(False, True)) == said.swapped()
+    # The same from below, where an agent always has the least.
+    least, other = 1 - most, 1 - np.array(other)
+    assert judge_means(other, least, 0.05, margin=0.02, exact=(False, True)) == said
+    # Of one that only had the most so far nothing is known.
+    assert judge_means(most, 1 - other, 0.05, margin=0.0).verdict == "undecided"
 
 
 @given(st.lists(SCORES, min_size=3, max_size=5), st.floats(0.01, 0.2))
