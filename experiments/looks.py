@@ -139,7 +139,7 @@ def question_of(study: StudySpec) -> Question:
 # --- The file in the folder of a study that remembers the looks at it.
 
 LOOKS_FILE = "looks.json"
-_FORMAT = 2
+_FORMAT, _ABOUT_TYPICAL_RUNS = 2, 1
 _LARGEST = 50_000_000  # bytes; a thousand agents looked at a hundred times take less
 _LARGEST_NUMBER = 1e300
 
@@ -167,6 +167,11 @@ def read_looks(root: Path) -> LookLog:
         raise _wrong(path, str(error).removeprefix(f"{path} ")) from error
     except (ValueError, RecursionError) as error:
         raise _wrong(path, "it is no JSON") from error
+    if isinstance(data, dict) and data.get("format") == _ABOUT_TYPICAL_RUNS:
+        raise UserError(
+            f"{path} was written by an earlier version, whose verdicts were not about means: give "
+            "the study another name, or remove the file: then the looks at this study are forgotten"
+        )
     try:
         return _log(data)
     except _MisfitError as error:

@@ -206,6 +206,9 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
         path.write_text(text)
         with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
             read_looks(tmp_path)
+    path.write_text('{"format": 1, "environments": {"lake": {}}}')
+    with pytest.raises(UserError, match=r"by an earlier version, .* give the study another name"):
+        read_looks(tmp_path)
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match="it is no JSON"):
         read_looks(tmp_path)
