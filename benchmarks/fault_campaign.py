@@ -7,17 +7,17 @@
 Every agent is trained once in peace. Then the same command is started again and again, and gets a
 signal at a moment drawn uniformly from the time that it takes: SIGKILL, SIGTERM, SIGINT, or SIGINT
 twice. When a process has come to the end, its files are held against those of the undisturbed run,
-bit for bit, but for moments and durations. A study is treated likewise, the signal going to the
-driver, to one of its workers, or to all its processes; so are filming and judging by a log, which
-begin anew.
+bit for bit, but for moments and durations. After twenty signals it is left alone. A study is
+treated likewise, the signal going to the driver, to one of its workers, or to all its processes; so
+are filming and judging by a log, which begin anew.
 
 With ``--at-calls`` short commands, also a search and a pack, get one of the first three signals
 when one of their processes is about to make the k-th system call that changes the folder: write,
 fsync, rename, mkdir, unlink and the like; k is drawn uniformly. Before SIGKILL half of a write is
 done. After three such stops the command is left alone. That needs Linux and a C compiler.
 
-Counted are results that differ, files that
-are damaged, processes that are left, and files that are left. All must be none.
+Counted are results that differ, files that are damaged, processes that are left, and files that are
+left. All must be none.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ from _campaign_commands import Case, Stop, cases, short_cases
 SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGINT twice")
 TARGETS = ("driver", "worker", "all")
 MOST_STARTS = 200  # of one command: it should have come to its end by then
+MOST_SIGNALS = 20  # that one command gets before it is left alone
 LONGEST = 60  # seconds of a start, beside twenty times as long as in peace
 
 
@@ -216,7 +217,7 @@ def main() -> int:
         os.environ["XDG_CONFIG_HOME"] = str(Path(folder) / "config")
         found = (short_cases if args.at_calls else cases)(Path(folder))
         chosen = [case for case in found if case.name in args.only or not args.only]
-        most = 3 if args.at_calls else args.kills
+        most = 3 if args.at_calls else MOST_SIGNALS
         signals, seed = 0, 0
         with ThreadPoolExecutor(args.jobs) as pool:
             list(pool.map(Case.prepare, chosen))

@@ -562,6 +562,7 @@ def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[Pai
         seed=RESAMPLING_SEED,
         paired=paired,
         ranks=look.design is None and len(scores) > 2,
+        certain=certain,
     )
 
 

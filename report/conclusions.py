@@ -400,7 +400,7 @@ def _standing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[st
         yield f"{names[0]}: {_figure(study, environment, agents[0])}{but}."
     elif environment.is_same:
         yield _all_alike(study, environment)
-    elif study.n_seeds < environment.fewest and not any(pair.certain for pair in environment.pairs):
+    elif study.n_seeds < environment.fewest and _is_open(environment):
         yield _so_far(study, environment)
     elif len(environment.best) == 1:
         yield f"{ahead[0]} is best on average: {_figure(study, environment, first[0])}{but}."
@@ -422,6 +422,10 @@ def _standing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[st
         yield f"Undecided on average: best is {whoever}{optimum}{but}."
         if len(names) > 2:  # of two the sentence on the pair says it
             yield from _leads_so_far(environment, ahead)
+
+
+def _is_open(environment: EnvironmentAnalysis) -> bool:
+    return all(pair.verdict == "undecided" for pair in environment.pairs)
 
 
 def _leads_so_far(environment: EnvironmentAnalysis, ahead: Sequence[str]) -> Iterable[str]:

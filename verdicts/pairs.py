@@ -453,6 +453,7 @@ def compare_pairs(
         seed=seed,
         paired=paired,
         ranks=len(arrays) > 2,
+        certain=certain,
         confidence=confidence,
         n_resamples=n_resamples,
     )
@@ -468,6 +469,7 @@ def describe_pairs(
     seed: int,
     paired: bool = False,
     ranks: bool = False,
+    certain: Collection[str] = (),
     confidence: float = 0.95,
     n_resamples: int = N_RESAMPLES,
 ) -> list[PairComparison]:
@@ -482,6 +484,7 @@ def describe_pairs(
         seed: of the resampling.
         paired: whether the agents' runs of one seed share their randomness.
         ranks: whether half of what is for means was spent on who is best.
+        certain: the agents that do not depend on chance.
         confidence: of the probabilities of improvement.
         n_resamples: how many resamples their intervals come from.
     """
@@ -511,7 +514,12 @@ def describe_pairs(
                 second=two,
                 said=judgement.mean,
                 mean=_mean_difference(
-                    ends, (x, y), (level, for_best), margin, judgement, paired=paired
+                    (ends.shares(x), ends.shares(y)),
+                    (one in certain, two in certain),
+                    (level, for_best),
+                    margin / (ends.high - ends.low),
+                    judgement,
+                    paired=paired,
                 ),
                 typical=judgement.typical,
                 probability_of_improvement=improvement,
@@ -547,8 +555,8 @@ def _check(
 
 
 def _mean_difference(
-    ends: Ends,
     runs: tuple[Floats, Floats],
+    exact: tuple[bool, bool],
     levels: tuple[float, float],
     margin: float,
     judgement: Judgement,
@@ -562,17 +570,16 @@ def _mean_difference(
     who is shown to lie within the margin lies within it: Stefansson, Kim and Hsu (1988), "On
     confidence sets in multiple comparisons".
     """
-    x, y = (ends.shares(each) for each in runs)
+    x, y = runs
     if judgement.certain:
         apart = float(x[0] - y[0])
         return MeanDifference(apart, apart, apart, apart, apart)
-    found, said = compare_means(x, y, levels[0], paired=paired), judgement.mean
+    found, said = compare_means(x, y, levels[0], paired=paired, exact=exact), judgement.mean
     is_ahead = said.verdict in ("better", "worse")
     if said.is_conditional and is_ahead and found.seen_low <= 0 <= found.seen_high:
-        found = compare_means(x, y, levels[1], paired=paired)
-    within = margin / (ends.high - ends.low)
-    least = {"better": 0.0, "equivalent": -within}.get(said.verdict, -1.0)
-    most = {"worse": 0.0, "equivalent": within}.get(said.verdict, 1.0)
+        found = compare_means(x, y, levels[1], paired=paired, exact=exact)
+    least = {"better": 0.0, "equivalent": -margin}.get(said.verdict, -1.0)
+    most = {"worse": 0.0, "equivalent": margin}.get(said.verdict, 1.0)
     seen = {"seen_low": max(found.seen_low, least), "seen_high": min(found.seen_high, most)}
     if said.is_conditional:
         return replace(found, **seen)

@@ -24,10 +24,13 @@ def study_of(runs, optimum=1.0, baseline=0.0, metric="final"):
     """The analysis of made-up final figures, by environment and agent, shape (n_seeds,)."""
     places, agents = list(runs), list(next(iter(runs.values())))
     n_seeds = max(len(each) for by_agent in runs.values() for each in by_agent.values())
+    algos = {agent: agent if agent in ("optimal", "random") else "qlearning" for agent in agents}
     study = StudySpec(
         "made-up",
         "A study that nobody has run",
-        tuple(AgentSpec(agent, "qlearning", {"n_timesteps": 100}, tuned=False) for agent in agents),
+        tuple(
+            AgentSpec(agent, algos[agent], {"n_timesteps": 100}, tuned=False) for agent in agents
+        ),
         tuple(EnvironmentSpec(place, "FrozenLake-v1") for place in places),
         n_seeds=n_seeds,
         metric=metric,
@@ -36,7 +39,7 @@ def study_of(runs, optimum=1.0, baseline=0.0, metric="final"):
     rows = [
         dict.fromkeys(RUN_COLUMNS, math.nan)
         | {"agent": agent, "environment": place, "seed": seed, "exact": True}
-        | {"algo": "qlearning", "env_id": "FrozenLake-v1", "cpu_seconds": 1.0, metric: value}
+        | {"algo": algos[agent], "env_id": "FrozenLake-v1", "cpu_seconds": 1.0, metric: value}
         | (
             known | {"score": (value - baseline) / (optimum - baseline)}
             if metric == "final"
@@ -71,6 +74,16 @@ SENTENCES = {
         {name: [86.0] * 5 for name in "ABCD"},
         {"optimum": 86.0, "baseline": -92.0},
         ["All 4 agents reach the optimum, 86, in all 5 runs; after 5 runs, up to 45% of"],
+    ),
+    "a planner, and random moves": (
+        {"optimal": [1.0] * 5, "A": [1, 1, 1, 1, 0.9], "B": [1, 1, 1, 1, 0.9], "random": [0.0] * 5},
+        {},
+        [
+            "optimal is best on average: return of the final policy 1, the optimum.",
+            "optimal is better on average than A (by",
+            "A is better on average than random",
+            "A is undecided on average against B",
+        ],
     ),
     "one fails": (
         {
