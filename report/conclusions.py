@@ -68,7 +68,11 @@ def pair_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[s
         if open_ and not too_few and not environment.is_same:
             texts.append(f"{name} is undecided on average against {enumeration(open_)}.")
     if too_few and texts and any(pair.verdict == "undecided" for pair in oriented):
-        texts.append(f"All other pairs are undecided: {too_few_seeds(study, environment)}.")
+        n = seeds_of(study, environment)
+        texts.append(
+            f"All other pairs are undecided: {n} are too few, whatever they score; it takes "
+            f"{environment.fewest} or more."
+        )
     return [*texts, *_on_typical_runs(environment)]
 
 
@@ -83,14 +87,6 @@ def _equal_best(environment: EnvironmentAnalysis) -> list[str]:
 def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     """How many seeds the agents were to have."""
     return seeds(*(environment.seeds.values() or [study.n_seeds]))
-
-
-def too_few_seeds(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    """That so few seeds cannot decide, and how many could."""
-    return (
-        f"{seeds_of(study, environment)} cannot tell {len(environment.agents)} agents apart, "
-        f"whatever they score; it takes {environment.fewest} or more"
-    )
 
 
 def _on_equivalent(environment: EnvironmentAnalysis, group: Sequence[str]) -> str:
