@@ -343,6 +343,7 @@ class AgentAnalysis:
     agent: str  #: its label
     algo: str  #: its name in the table of agents
     judged: Estimate  #: its mean score between the ends on which means are judged
+    spread: float  #: the standard deviation over runs of these scores, or else of the metric
     n_runs: int  #: runs that finished
     n_missing: int  #: runs that did not
     metric: Summary  #: estimates of what the verdicts are about, over seeds
@@ -583,6 +584,9 @@ def _analyse_agent(
     exact, sign = agent in evidence.certain, -1.0 if study.metric in COSTS else 1.0
     metric = summarise(values(study.metric), seed=RESAMPLING_SEED)
     mean_of_scores = bounded_mean(evidence.scores[agent], evidence.ends, exact=exact)
+    judged = evidence.ends.shares(evidence.scores[agent])
+    of_runs = judged if evidence.is_score else values(study.metric)
+    of_runs = of_runs[np.isfinite(of_runs)]
     ends = [sign * mean_of_scores.low, sign * mean_of_scores.high]
     metric = replace(metric, mean=replace(metric.mean, low=min(ends), high=max(ends)))
     score = None
@@ -593,7 +597,8 @@ def _analyse_agent(
     return AgentAnalysis(
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
-        judged=bounded_mean(evidence.ends.shares(evidence.scores[agent]), UNIT, exact=exact),
+        judged=bounded_mean(judged, UNIT, exact=exact),
+        spread=float(of_runs.std(ddof=1)) if len(of_runs) > 1 else 0.0,
         n_runs=len(table),
         n_missing=n_seeds - len(table),
         metric=metric,

@@ -212,9 +212,9 @@ def _legend(analysis: StudyAnalysis) -> str:
     else:
         what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
     text = (
-        f"{what} Bold: shown to be best on average, several where they are shown to be equal, or "
-        f"the same in all runs of all agents. ?: {seeds(study.n_seeds)} do not show that another "
-        "agent is better on average."
+        f"{what} ±: the standard deviation of runs. Bold: shown to be best on average, several "
+        "where they are shown to be equal, or the same in all runs of all agents. ?: "
+        f"{seeds(study.n_seeds)} do not show that another agent is better on average."
     )
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
@@ -233,7 +233,9 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
         place = places.get(agent.agent)
         cost = costs.get((agent.agent, environment.environment))
         count = environment.failures.get(agent.agent)
-        notes = " ?" if place == "open" else ""
+        spread = number(float(f"{agent.spread:.2g}"))
+        notes = "" if spread == "0" else f" ± {spread}"
+        notes += " ?" if place == "open" else ""
         notes += "" if cost is None else f" ({duration(cost)})"
         notes += f", {count.n_failed} of {count.n} failed" if count and count.n_failed else ""
         notes += f", {agent.n_missing} missing" if agent.n_missing else ""

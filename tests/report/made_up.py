@@ -35,6 +35,7 @@ def agent(label, mean, **changes):
         agent=label,
         algo="qlearning",
         judged=estimate(mean / 100),
+        spread=0.0,
         n_runs=4,
         n_missing=0,
         metric=Summary(estimate(mean), estimate(mean + 1), estimate(mean + 2)),

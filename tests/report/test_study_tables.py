@@ -38,6 +38,7 @@ CPU += [("low", "lake", 1.0), ("low", "lake", None)]  # which was not measured
 def lake(**changes):
     """One with the highest mean, one equivalent to it, one undecided, one worse."""
     agents = [made_up.agent(name, mean) for name, mean in zip(NAMES, (30, 89, 80, 90), strict=True)]
+    agents[2] = replace(agents[2], spread=0.1234)
     pairs = (
         made_up.pair("first", "same", "equivalent"),
         made_up.pair("open", "first", "undecided"),
@@ -57,9 +58,9 @@ def of_lake(cpu=(), metric="final", **changes):
 
 LEGEND = (
     "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts as 0. "
-    "Bold: shown to be best on average, several where they are shown to be equal, or the same in "
-    "all runs of all agents. ?: 4 seeds do not show that another agent is better on average. In "
-    "brackets: processor time of the median run."
+    "±: the standard deviation of runs. Bold: shown to be best on average, several where they are "
+    "shown to be equal, or the same in all runs of all agents. ?: 4 seeds do not show that another "
+    "agent is better on average. In brackets: processor time of the median run."
 )
 
 
@@ -70,7 +71,7 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
         "| --- | --- |",
         "| `low` | 0.3 |",
         "| `same` | 0.89 ? (0.12 s) |",
-        "| `open` | 0.8 ?, 1 of 4 failed |",
+        "| `open` | 0.8 ± 0.12 ?, 1 of 4 failed |",
         "| `first` | 0.9 ? (40 s) |",
     ]
     assert legend == LEGEND
@@ -83,8 +84,8 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
 def test_other_headlines():
     costs = table_as("md", headline(of_lake(metric="regret", is_score=False)))
     assert "| `low` | 30 |" in costs
-    assert "| `open` | 80 ?, 1 of 4 failed |" in costs
-    assert "Regret of a run: the mean; scores where they are known. Bold" in costs
+    assert "| `open` | 80 ± 0.12 ?, 1 of 4 failed |" in costs
+    assert "Regret of a run: the mean; scores where they are known. ±: the" in costs
     assert "processor" not in costs
     some = made_up.agent("first", 90.0, n_missing=2)
     absent = table_as("md", headline(of_lake(agents=(some,), pairs=())))
@@ -92,7 +93,7 @@ def test_other_headlines():
     assert "| `first` | 0.9 ?, 2 missing |" in absent
     bracketed = replace(lake(), environment="hill", optimum_at_least=90.0)
     caption = headline(made_up.analysis([lake(), bracketed], NAMES)).caption
-    assert "as 0. On hill the optimum is bracketed: 1 is the upper end. Bold" in caption
+    assert "as 0. On hill the optimum is bracketed: 1 is the upper end. ±: the" in caption
 
 
 def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():

@@ -146,6 +146,8 @@ def test_what_is_said_is_true_of_the_runs(runs):
         for second in re.findall(r"([A-D]) \(by", told):
             assert sign(pairs[first, second]) == ">"
             assert means[first] > means[second]
+    spreads = {agent.agent: agent.spread for agent in environment.agents}
+    assert spreads == pytest.approx({name: np.std(runs[k], ddof=1) for k, name in enumerate(means)})
     places = standings(analysis.study, environment)
     bold = {row.label for row in headline(analysis).rows if any(c.is_bold for c in row.cells)}
     assert bold == {name for name, place in places.items() if place == "best"}
