@@ -134,7 +134,7 @@ NOTHING = "-"
 
 
 class Cell(NamedTuple):
-    """A figure in a table, and notes behind it, in which nothing can be markup."""
+    """A figure in a table, and notes behind it, in which ± alone is markup, for LaTeX."""
 
     figure: str
     is_bold: bool = False

@@ -92,6 +92,7 @@ def test_other_headlines():
     assert "| `low` | - |" in absent
     assert "| `first` | 0.9 ?, 2 missing |" in absent
     bracketed = replace(lake(), environment="hill", optimum_at_least=90.0)
+    assert r"\texttt{open} & 0.8 $\pm$ 0.12 ?, 1 of 4" in table_as("tex", headline(of_lake()))
     caption = headline(made_up.analysis([lake(), bracketed], NAMES)).caption
     assert "as 0. On hill the optimum is bracketed: 1 is the upper end. ±: the" in caption
 
