@@ -303,7 +303,7 @@ def give_up(training: Training, error: BaseException) -> None:
     with suppress(OSError):  # what the run has failed by says more
         training.evaluation.write()
     if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
-        run.update_info(state=INTERRUPTED)
+        run.end(state=INTERRUPTED)
         return
     run.fail(one_line(error))
     if isinstance(error, OSError) and error.errno in DISK_ERRORS:

@@ -41,6 +41,7 @@ from pipeline.models.find import checkpoint_file
 from pipeline.runs import PULLS_FILE, Run
 from pipeline.stopping import stops_noticed
 from pipeline.training import carry_out, prepare, train
+from pipeline.unfinished_runs import run_of_spec
 from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
 
 TINY_DQN = {"buffer_size": 200, "batch_size": 4, "learning_starts": 20}
@@ -364,6 +365,17 @@ def test_results_are_told_before_anything_is_drawn(tmp_path, stopped):
     assert outcome.run.curve_path.exists() is not stopped
     assert info["final"]["mean_return"] == outcome.final.mean_return
     assert ("stopped while drawing: the run counts as interrupted" in file.getvalue()) is stopped
+
+
+def test_a_run_that_is_stopped_once_more_while_it_ends_can_be_gone_on_with(tmp_path):
+    def stop(outcome):
+        raise KeyboardInterrupt
+
+    training = prepare(spec_of("qlearning", log_folder=tmp_path), Console(quiet=True), {}, "")
+    with pytest.raises(KeyboardInterrupt):
+        carry_out(training, stop)
+    assert training.run.read_info()["state"] == "interrupted"
+    assert run_of_spec(training.spec, any_seed=False).path == training.run.path
 
 
 # --- what settings do to it ----------------------------------------------------------------------
