@@ -13,14 +13,6 @@ PACKAGES := safe_files machine_code mdp verdicts envs agents pipeline experiment
 BIN := .venv/bin
 STAMP := .venv/.installed
 PINS := constraints.txt requirements.txt
-# MushroomRL needs an old NumPy and brings a PyTorch of its own: that comparison is run by itself.
-# What times something, with as few rounds as tell anything.
-BENCHMARKS := 'tabular_speed.py --repeats 2' 'plain_loops.py' 'network_speed.py --repeats 1' \
-  'against_rl_zoo3.py --repeats 1' 'startup.py' \
-  'coursework_sweeps.py' 'bandit_testbed.py --rounds 1' 'bandit_speed.py --rounds 2' \
-  'exact_evaluation.py' 'evaluation_share.py -n 20000 --env CartPole-v1 Acrobot-v1' \
-  'planning_scale.py' 'page_scale.py'
-
 # One thread per process: more of them slow networks this small down, and tests run side by side.
 export OMP_NUM_THREADS ?= 1
 
@@ -65,8 +57,8 @@ format: $(STAMP) ## Format the code and mend what ruff can mend
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
-bench: $(STAMP) ## Time everything, with few rounds
-	@set -e; for run in $(BENCHMARKS); do echo "== $$run"; $(BIN)/python benchmarks/$$run; done
+bench: peers ## Time everything, with one round
+	$(BIN)/python benchmarks/timing.py --rounds 1 tabular networks bandits evaluation planning processes page
 
 mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0
 	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED)

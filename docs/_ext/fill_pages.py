@@ -8,7 +8,8 @@ The kinds: ``code``, with names that the linked file defines; ``environment``, w
 arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, likewise, for
 a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``agents`` and
 ``agents-by-spaces``, with nothing, for tables of agents; ``trainings``, for what commands reach;
-``reference``, with a module and perhaps names in it, for their docstrings below a heading.
+``reference``, with a module and perhaps names in it, for their docstrings below a heading;
+``timings``, for the linked file of what `benchmarks/timing.py` has measured.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from environment_facts import (  # noqa: E402
     optima_block,
     variants_block,
 )
+from measured_tables import timings_block  # noqa: E402
 from recommended_commands import trainings_block, with_outcomes  # noqa: E402
 
 
@@ -50,6 +52,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "facts": facts_block,
     "optima": optima_block,
     "reference": reference_block,
+    "timings": timings_block,
     "trainings": trainings_block,
     "variants": variants_block,
 }
@@ -62,7 +65,7 @@ def filled(text: str, folder: Path) -> str:
     def fill(line: re.Match[str]) -> str:
         target, kind, arguments = line.groups()
         words = (arguments or "").split()
-        if kind == "code":
+        if kind in ("code", "timings"):
             words = [(folder / target).resolve().relative_to(DOCS.parent).as_posix(), *words]
         return KINDS[kind](*words).rstrip("\n")
 

@@ -189,8 +189,8 @@ class Shares(NamedTuple):
     at_first: float  # of the steps of short trainings, until that comes to `STEPS_AT_FIRST`
 
 
-# Chosen so that evaluations take a fifth of the time of training or less, as
-# `benchmarks/evaluation_share.py` measures.
+# Chosen by how long a step of evaluation takes beside one of training, so that all of them take a
+# fifth of its time or less. Figures: docs/benchmarks.md.
 NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
 TABLE = Shares(usual=1 / 100, at_first=1 / 5)
 # A2C learns once from each step, which takes no longer than to play one.

@@ -1,26 +1,17 @@
-"""What the page of a large study costs: seconds to judge, draw and write it, its size, its loading.
-
-    python benchmarks/page_scale.py            # 10 agents, 10 environments, 30 seeds
-    python benchmarks/page_scale.py 5 2 10     # others
+"""What the page of a large study takes: 10 agents, 10 environments, 30 seeds; seconds.
 
 Nothing is trained: learning curves rise to an end that each agent has on each environment, with
-noise, and runs that fail. Seconds are processor time of this process, and in the end of a headless
-Chromium's for the page, where there is one with its driver. Maps and films are not in it: on a page
-they take up to 2 MB more.
+noise, and runs that fail. Seconds are of the processor, of this process and of a headless
+Chromium's for the page. Maps and films are not in it.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
-import sys
-import tempfile
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pandas as pd
@@ -32,6 +23,7 @@ from report.figures import write_figures
 from report.page import write_report
 from report.page.frame import Report
 from report.series import study_series
+from timing import Benchmark, Contender, Rows, seconds
 
 N_STEPS = 100_000
 N_EVALUATIONS = 20
@@ -118,24 +110,13 @@ def _row(agent: str, environment: str, seed: int, evaluations: pd.DataFrame) -> 
     }
 
 
-def timed(name: str, work: Callable[[], Any]) -> Any:
-    """What the work returns; its seconds are printed."""
-    started = time.process_time()
-    result = work()
-    print(f"{name:<28} {time.process_time() - started:7.2f} s")
-    return result
-
-
-def loading(page: Path) -> tuple[float, float] | None:
-    """Seconds of processor time that a page takes: until it stands still, and with all drawn.
-
-    Those of the browser's process for the page; None without Chromium and its driver.
-    """
+def loading(page: Path, script: str = "") -> float:
+    """What the browser's process for a page takes, until it stands still and has run a script."""
     from selenium import webdriver
 
     browser, driver_path = shutil.which("chromium"), shutil.which("chromedriver")
     if browser is None or driver_path is None:
-        return None
+        raise SystemExit("this needs chromium and chromedriver")
     options = webdriver.ChromeOptions()
     options.binary_location = browser
     for flag in ("--headless", "--no-sandbox", "--disable-gpu", "--window-size=1280,900"):
@@ -146,9 +127,8 @@ def loading(page: Path) -> tuple[float, float] | None:
         before = _seconds(driver)
         driver.get(page.as_uri())
         time.sleep(SETTLING)
-        ready = _seconds(driver)
-        driver.execute_script("report.drawAll()")
-        return ready - before, _seconds(driver) - before
+        driver.execute_script(script)
+        return _seconds(driver) - before
     finally:
         driver.quit()
 
@@ -158,23 +138,23 @@ def _seconds(driver: Any) -> float:
     return float(next(one["value"] for one in metrics if one["name"] == "ProcessTime"))
 
 
-def main() -> None:
-    """Print the table."""
-    n_agents, n_environments, n_seeds = map(int, sys.argv[1:4] or ["10", "10", "30"])
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        page = root / "report.html"
-        results = timed("making it up", lambda: made_up(n_agents, n_environments, n_seeds, root))
-        analysis = timed("judging", lambda: analyse(results))
-        series = timed("working out the curves", lambda: study_series(analysis))
-        timed("drawing the figures", lambda: write_figures(series, None))
-        timed("writing the page", lambda: write_report(Report(series, "python compare.py"), page))
-        print(f"{'size of the page':<28} {page.stat().st_size / 1e6:7.2f} MB")
-        seconds = loading(page)
-        if seconds is not None:
-            print(f"{'ready in Chromium':<28} {seconds[0]:7.2f} s")
-            print(f"{'all its figures drawn':<28} {seconds[1]:7.2f} s")
+def rows(folder: Path) -> Rows:
+    """From the results of runs to the page, and the page in a browser."""
+    results, page = made_up(10, 10, 30, folder), folder / "report.html"
+    analysis = analyse(results)
+    series = study_series(analysis)
+    report = Report(series, "python compare.py")
+    write_report(report, page)
+    steps: dict[str, Contender] = {
+        "judging": seconds(partial(analyse, results)),
+        "curves": seconds(partial(study_series, analysis)),
+        "figures": seconds(partial(write_figures, series, None)),
+        "writing the page": seconds(partial(write_report, report, page)),
+        "ready in Chromium": partial(loading, page),
+        "all its figures drawn": partial(loading, page, "report.drawAll()"),
+    }
+    size = f"{page.stat().st_size / 1e6:.1f} MB"
+    return {f"{name} ({size})": {"seconds": step} for name, step in steps.items()}
 
 
-if __name__ == "__main__":
-    main()
+BENCHMARK = Benchmark("seconds", rounds=1, rows=rows, is_speed=False)

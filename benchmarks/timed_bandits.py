@@ -1,0 +1,152 @@
+"""Bandit agents; pulls a second.
+
+Ours go through the environment, Monitor and all; the plain loops and MABWiser are handed rewards
+that NumPy draws, which favours them.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from mabwiser.mab import MAB, LearningPolicy
+from stable_baselines3.common.monitor import Monitor
+
+import envs  # noqa: F401  # registers the bandits
+from agents import load_algorithm
+from agents.bandits.runs import run_batch
+from timing import Benchmark, Rows, speed
+
+PULLS = 1000
+BATCH = 200
+N_ARMS, N_FEATURES = 10, 5
+PROBABILITIES = (0.2, 0.5, 0.75)
+EPSILON, CONFIDENCE = 0.1, 1.0
+# Our agents: arguments, environment, its arguments.
+OURS: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
+    "epsilon_greedy": ({"exploration_initial_eps": EPSILON}, "GaussianBandit-v0", {}),
+    "ucb": ({"c": CONFIDENCE}, "GaussianBandit-v0", {}),
+    "thompson": ({}, "BernoulliBandit-v0", {}),
+    "linucb": ({}, "LinearBandit-v0", {"n_arms": N_ARMS, "n_features": N_FEATURES}),
+}
+MABWISER = {
+    "epsilon_greedy": LearningPolicy.EpsilonGreedy(EPSILON),
+    "ucb": LearningPolicy.UCB1(CONFIDENCE),
+    "thompson": LearningPolicy.ThompsonSampling(),
+    "linucb": LearningPolicy.LinUCB(1.0),
+}
+
+
+class World:
+    """Rewards as a plain loop draws them."""
+
+    def __init__(self, name: str) -> None:
+        self.rng = np.random.default_rng(0)
+        self.coins = name == "thompson"
+        self.n_arms = len(PROBABILITIES) if self.coins else N_ARMS
+        self.means = PROBABILITIES if self.coins else self.rng.standard_normal(N_ARMS)
+        self.weights = self.rng.standard_normal((N_ARMS, N_FEATURES))
+
+    def pull(self, arm: int) -> float:
+        """A reward of ``arm``."""
+        if self.coins:
+            return float(self.rng.random() < self.means[arm])
+        return float(self.rng.normal(self.means[arm]))
+
+    def context(self) -> Any:
+        """Features to choose in."""
+        return self.rng.uniform(-1, 1, N_FEATURES)
+
+    def pull_in(self, arm: int, context: Any) -> float:
+        """A reward of ``arm`` in ``context``."""
+        return float(self.rng.normal(self.weights[arm] @ context))
+
+
+def batch(name: str) -> None:
+    """Our compiled batch."""
+    kwargs, env_id, env_kwargs = OURS[name]
+    run_batch(name, kwargs, env_id, env_kwargs, range(BATCH))
+
+
+def interpreted(name: str) -> None:
+    """Our agent, step by step."""
+    kwargs, env_id, env_kwargs = OURS[name]
+    env = Monitor(gym.make(env_id, **env_kwargs))
+    agent: Any = load_algorithm(name)(env=env, seed=0, **kwargs)
+    agent.learn(PULLS, log_interval=None)
+
+
+def plain(name: str) -> None:
+    """As written by hand, with NumPy."""
+    world = World(name)
+    rng, n_arms = world.rng, world.n_arms
+    values, counts, wins = np.zeros(n_arms), np.zeros(n_arms), np.zeros(n_arms)
+    for t in range(PULLS):
+        if name == "thompson":
+            arm = int(np.argmax(rng.beta(1 + wins, 1 + counts - wins)))
+        elif name == "ucb" and t >= n_arms:
+            arm = int(np.argmax(values + CONFIDENCE * np.sqrt(2 * math.log(t) / counts)))
+        elif name == "ucb":
+            arm = t
+        else:
+            explores = rng.random() < EPSILON
+            arm = int(rng.integers(n_arms)) if explores else int(np.argmax(values))
+        reward = world.pull(arm)
+        counts[arm] += 1
+        wins[arm] += reward
+        values[arm] += (reward - values[arm]) / counts[arm]
+
+
+def plain_linucb() -> None:
+    """With the inverse kept by the formula of Sherman and Morrison."""
+    world = World("linucb")
+    inverses = np.tile(np.eye(N_FEATURES), (N_ARMS, 1, 1))
+    moments = np.zeros((N_ARMS, N_FEATURES))
+    for _ in range(PULLS):
+        x = world.context()
+        half = inverses @ x
+        means = np.einsum("ad,ad->a", half, moments)
+        arm = int(np.argmax(means + np.sqrt(half @ x)))
+        reward = world.pull_in(arm, x)
+        inverses[arm] -= np.outer(half[arm], half[arm]) / (1 + half[arm] @ x)
+        moments[arm] += reward * x
+
+
+def mabwiser(name: str) -> None:
+    """MABWiser, one decision and one reward at a time."""
+    world = World(name)
+    arms = list(range(world.n_arms))
+    mab = MAB(arms, MABWISER[name])
+    if name != "linucb":
+        mab.fit(arms, [world.pull(arm) for arm in arms])
+        for _ in range(PULLS):
+            arm = mab.predict()
+            mab.partial_fit([arm], [world.pull(arm)])
+        return
+    mab.fit([0], [0.0], world.context()[None])
+    for _ in range(PULLS):
+        x = world.context()[None]
+        arm = mab.predict(x)
+        mab.partial_fit([arm], [world.pull_in(arm, x[0])], x)
+
+
+def rows(folder: Path) -> Rows:
+    """A plain loop, MABWiser, and ours one by one and as a batch of 200 runs."""
+    made: Rows = {}
+    for name in OURS:
+        batch(name)  # compiled by now
+        loop = plain_linucb if name == "linucb" else partial(plain, name)
+        made[name] = {
+            "NumPy loop": speed(loop, PULLS),
+            "MABWiser": speed(partial(mabwiser, name), PULLS),
+            "our agent": speed(partial(interpreted, name), PULLS),
+            "our batch": speed(partial(batch, name), BATCH * PULLS),
+        }
+    return made
+
+
+BENCHMARK = Benchmark("pulls a second", rounds=5, rows=rows)

@@ -1,0 +1,136 @@
+"""What evaluations, callbacks and logs add to a training; seconds of the processor.
+
+The trainings are `train.py`'s, without a flag for evaluation and with a shorter budget, and
+`learn()` with what people put beside it. The first contender is the training alone.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents import load_algorithm
+from agents.common.callbacks import BlockCallback
+from commands.train import build_parser, train_spec
+from envs.wrappers import DiscretizeObservation
+from pipeline.training import train
+from timing import Benchmark, Contender, Rows
+
+N_STEPS = 20_000
+TRAININGS = (
+    "--env CartPole-v1 --algo ppo",
+    "--env CartPole-v1 --algo ppo --engine compiled",
+    "--env CartPole-v1 --algo dqn",
+    "--env CartPole-v1 --algo a2c --engine compiled",
+    "--env CartPole-v1 --algo qlearning",
+    "--env Acrobot-v1 --algo semi_gradient_sarsa",
+    "--env Pendulum-v1 --algo ppo",
+)
+# Agent, environment, number of environments and steps.
+BESIDE = (
+    ("qlearning", "FrozenLake-v1", 1, 3_000_000),
+    ("qlearning", "CartPole-v1", 1, 3_000_000),
+    ("ppo", "CartPole-v1", 16, 100_000),
+)
+PPO = {"n_steps": 128, "batch_size": 512, "n_epochs": 10, "learning_rate": 1e-3, "ent_coef": 0.01}
+TABLE = {"learning_rate": 0.1, "exploration_initial_eps": 0.1, "exploration_decay": "constant"}
+IN_BINS = partial(
+    DiscretizeObservation,
+    bins=50,
+    low=[-0.41887903, -0.87266463],
+    high=[0.41887903, 0.87266463],
+    dims=[2, 3],
+)
+
+
+def typed(words: str, *more: str) -> Contender:
+    """A whole training, as it is typed."""
+
+    def measure() -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            flags = [*words.split(), "-n", str(N_STEPS), "--seed", "0", "-f", folder, *more]
+            spec = train_spec(build_parser().parse_args([*flags, "--num-threads", "1"]))
+            started = time.process_time()
+            train(spec, Console(quiet=True), {}, "")
+            return time.process_time() - started
+
+    return measure
+
+
+class EachThousand(BlockCallback):
+    """One that says when it acts."""
+
+    every_n_steps = 1000
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def environments(algo: str, env_id: str, n: int, folder: str | None = None) -> VecEnv:
+    """Those of a training or an evaluation; CartPole in bins for a table."""
+    in_bins: Any = IN_BINS if (algo, env_id) == ("qlearning", "CartPole-v1") else None
+    return make_vec_env(env_id, n, seed=0, wrapper_class=in_bins, monitor_dir=folder)
+
+
+def beside(algo: str, env_id: str, n_envs: int, n_steps: int, name: str) -> float:
+    """What a training takes beside which something is put, once its loop is compiled."""
+    every = n_steps // 10 // n_envs
+    with tempfile.TemporaryDirectory() as folder:
+        evaluated = partial(EvalCallback, n_eval_episodes=20, eval_freq=every, verbose=0)
+        callbacks: dict[str, Callable[[], BaseCallback]] = {
+            "EvalCallback with log and best model": lambda: evaluated(
+                environments(algo, env_id, 1), log_path=folder, best_model_save_path=folder
+            ),
+            "CheckpointCallback, ten zips": lambda: CheckpointCallback(every, folder),
+            "BlockCallback every 1,000 steps": EachThousand,
+        }
+        settings: dict[str, Any] = {"policy": "MlpPolicy", **PPO} if algo == "ppo" else TABLE
+        algorithm: Any = load_algorithm(algo)
+        env = environments(algo, env_id, n_envs, folder)
+        model = algorithm(env=env, seed=0, engine="auto", **settings)
+        interval = None
+        if name == "TensorBoard":
+            model.set_logger(configure(folder, ["tensorboard"]))
+            interval = 1 if algo == "ppo" else 100
+        model.learn(300 * n_envs, log_interval=interval)
+        callback = callbacks[name]() if name in callbacks else None
+        started = time.process_time()
+        model.learn(n_steps, callback=callback, log_interval=interval)
+        return time.process_time() - started
+
+
+def rows(folder: Path) -> Rows:
+    """Trainings with and without their evaluations, and with what stands beside them."""
+    made: Rows = {
+        f"train.py {words}": {
+            "--eval-freq -1 --eval-episodes 1": typed(
+                words, "--eval-freq", "-1", "--eval-episodes", "1"
+            ),
+            "as typed": typed(words),
+        }
+        for words in TRAININGS
+    }
+    names = (
+        "nothing",
+        "EvalCallback with log and best model",
+        "TensorBoard",
+        "CheckpointCallback, ten zips",
+        "BlockCallback every 1,000 steps",
+    )
+    for training in BESIDE:
+        label = f"learn(), {training[0]} compiled, {training[1]}"
+        made[label] = {name: partial(beside, *training, name) for name in names}
+    return made
+
+
+BENCHMARK = Benchmark("seconds", rounds=3, rows=rows, is_speed=False, warms_up=True)
