@@ -127,7 +127,7 @@ def test_runs_that_fail_are_tried_once_and_do_not_hold_a_study_up(type_command, 
 def test_a_damaged_memory_stops_a_study_before_anything_is_run(type_command, tmp_path):
     folder = tmp_path / "s" / "bandits"
     folder.mkdir(parents=True)
-    (folder / "looks.json").write_text('{"format": 1}')
+    (folder / "looks.json").write_text('{"format": 2}')
     for more in ([], ["--until-decided"]):
         code, _, err = type_command("bandits.yml", *more, "-f", "s")
         assert (code, err.count("\n")) == (2, 1)
