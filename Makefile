@@ -8,7 +8,7 @@ N ?= 25
 SEED ?= 0
 
 # What is installed, and has to work on systems other than this one.
-PACKAGES := safe_files machine_code mdp verdicts envs agents pipeline experiments tuning report commands
+PACKAGES := safe_files machine_code mdp verdicts envs agents pipeline diagnosis experiments tuning report commands
 
 BIN := .venv/bin
 STAMP := .venv/.installed

@@ -42,6 +42,7 @@ NAME = "yardstick"
 COMMANDS = {
     "train": "train an agent on an environment",
     "enjoy": "watch a trained agent",
+    "explain": "say where an agent loses what it stays behind the optimum",
     "compare": "compare agents over seeds, and write a page",
     "tune": "search for an agent's settings, and test them on other seeds",
     "pack": "make a finished run, or a study, a zip for others, with a card",

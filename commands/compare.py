@@ -178,28 +178,46 @@ def _compare(args: argparse.Namespace) -> int:
             if args.until_decided:
                 return _grow_study(args, study, context)
             read_looks(root)  # so that it is known how often the study was looked at
-            _prepare(args, study, planned, context)
+            if args.repair:
+                repair(console, study, planned)
+            _prepare(study, planned, context, args.replace)
             return run_study(context, study, planned)
         except KeyboardInterrupt:
             end_server()
             raise
 
 
+def results_of(study: StudySpec, context: RunContext) -> StudyResults:
+    """Do the runs of a study that are missing, as the only one that does, and read them."""
+    from experiments.child_processes import end_server
+    from experiments.launching import EarlyResults
+    from experiments.plan import plan
+    from pipeline.locks import folder_lock, told_if_gone
+    from safe_files.files import take_up
+
+    root = context.root
+    take_up(root)
+    planned, early = plan(study, root), EarlyResults(study)
+    with folder_lock(root, give_way, partial(say, context.console)), told_if_gone(root):
+        try:
+            _prepare(study, planned, context)
+            do_missing(context, planned, early)
+            return read(context, study, planned, early)
+        except KeyboardInterrupt:
+            end_server()
+            raise
+
+
 def _prepare(
-    args: argparse.Namespace,
-    study: StudySpec,
-    planned: Sequence[PlannedRun],
-    context: RunContext,
+    study: StudySpec, planned: Sequence[PlannedRun], context: RunContext, replaces: bool = False
 ) -> None:
     """Make sure that the runs can be done, before any is; and load the libraries for them."""
-    if args.repair:
-        repair(context.console, study, planned)
     with doing(context.console, "looking for runs that are there") as activity, loading_libraries():
         from experiments.child_processes import do_aside
         from experiments.plan import check_settings
         from experiments.run_folders import check_settings_kept
 
-        if not args.replace:
+        if not replaces:
             check_settings_kept(planned, context.root)
         if any(run.is_to_do for run in planned):
             context.get_ready(planned)
@@ -262,7 +280,9 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
     counts = counts_of(study, looks)
     now = grown(study, counts)
     planned = plan(now, context.root, counts)
-    _prepare(args, now, planned, context)
+    if args.repair:
+        repair(context.console, now, planned)
+    _prepare(now, planned, context)
     remember(context.root, read_looks(context.root), looks)  # before the first run is done
     failures: list[RunFailure] = []
     said: set[tuple[str, int]] = set()

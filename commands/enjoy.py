@@ -65,28 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Play a trained agent and print the returns of its episodes.",
         epilog=EPILOG,
     )
-    add = parser.add_argument
-    zipped = "path of a model zip, a run folder or a pack (default: a run is looked for)"
-    add("model", nargs="?", help=zipped)
-    add("--algo", type=filled, help="agent (default: ppo, or what the zip's run folder says)")
-    env = "environment id (default: CartPole-v1, or what the run folder says)"
-    add("--env", type=filled, help=env)
-    add("-f", "--folder", type=filled, default="logs", help="folder of all runs (default: logs)")
-    add(
-        "--exp-id",
-        type=RUN_NUMBER,
-        default=0,
-        metavar="N",
-        help="number of the run (default: 0, the newest; -1 for FOLDER/ALGO/ENV.zip itself)",
-    )
-    add("--load-best", action="store_true", help="the model with the best evaluation in training")
-    checkpoint = "the checkpoint after that many steps"
-    add("--load-checkpoint", type=COUNT_OR_NONE, metavar="STEPS", help=checkpoint)
-    add("--load-last-checkpoint", action="store_true", help="the last checkpoint")
-    statistics = "statistics of VecNormalize (default: those saved with the model)"
-    add("--vec-normalize", metavar="FILE", help=statistics)
-    add_shared(parser, "--device", "--num-threads")
-
+    add_model_flags(parser)
     group = parser.add_argument_group("playing")
     add = group.add_argument
     steps = "stop after this many steps"
@@ -122,6 +101,31 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def add_model_flags(parser: argparse.ArgumentParser) -> None:
+    """The flags that say which agent is meant."""
+    add = parser.add_argument
+    zipped = "path of a model zip, a run folder or a pack (default: a run is looked for)"
+    add("model", nargs="?", help=zipped)
+    add("--algo", type=filled, help="agent (default: ppo, or what the zip's run folder says)")
+    env = "environment id (default: CartPole-v1, or what the run folder says)"
+    add("--env", type=filled, help=env)
+    add("-f", "--folder", type=filled, default="logs", help="folder of all runs (default: logs)")
+    add(
+        "--exp-id",
+        type=RUN_NUMBER,
+        default=0,
+        metavar="N",
+        help="number of the run (default: 0, the newest; -1 for FOLDER/ALGO/ENV.zip itself)",
+    )
+    add("--load-best", action="store_true", help="the model with the best evaluation in training")
+    checkpoint = "the checkpoint after that many steps"
+    add("--load-checkpoint", type=COUNT_OR_NONE, metavar="STEPS", help=checkpoint)
+    add("--load-last-checkpoint", action="store_true", help="the last checkpoint")
+    statistics = "statistics of VecNormalize (default: those saved with the model)"
+    add("--vec-normalize", metavar="FILE", help=statistics)
+    add_shared(parser, "--device", "--num-threads")
+
+
 # --- what is done ---------------------------------------------------------------------------------
 
 
@@ -129,18 +133,18 @@ def main() -> int:
     """Parse the arguments and play; the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
-        from pipeline.packs import unpacked
+        from commands.terminal import TextConsole
         from pipeline.playing import check_film_path
 
         check_playing(args)
         if args.record is not None:
             check_film_path(Path(args.record))
-        wanted = model_request(args)
+        console = TextConsole(highlight=False, quiet=args.verbose < 1)
         with ExitStack() as stack:
-            if wanted.path is not None:
-                path, zipped_in = stack.enter_context(unpacked(wanted.path))
-                wanted = replace(wanted, path=path, zipped_in=zipped_in)
-            _play_found(args, wanted)
+            chosen = found_model(console, model_request(args), stack)
+            if args.record is not None or args.reward_log:
+                go_on_unread()
+            play(console, chosen, args)
     return 0
 
 
@@ -184,29 +188,31 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
     )
 
 
-def _play_found(args: argparse.Namespace, wanted: ModelRequest) -> None:
-    """Find the model, and play it."""
-    from pipeline.models.choose import find_model, with_statistics
-    from pipeline.runs import NoRunError
+def found_model(console: Console, wanted: ModelRequest, stack: ExitStack) -> ChosenModel:
+    """Find the model and say where it is; the libraries that play it are loaded with it.
 
+    A pack stays unpacked until the stack is closed.
+    """
+    from commands.terminal import say
+    from pipeline.models.choose import find_model, with_statistics
+    from pipeline.packs import unpacked
+    from pipeline.runs import NoRunError
+    from pipeline.signs_of_life import doing
+
+    typed = wanted.path
+    if typed is not None:
+        path, zipped_in = stack.enter_context(unpacked(typed))
+        wanted = replace(wanted, path=path, zipped_in=zipped_in)
     try:
         found = find_model(wanted)
     except NoRunError as error:
         flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
         raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error
-    from commands.terminal import TextConsole, say
-    from pipeline.signs_of_life import doing
-
-    console = TextConsole(highlight=False, quiet=args.verbose < 1)
-    place = args.model if wanted.zipped_in is not None else found.path
+    place = typed if wanted.zipped_in is not None else found.path
     say(console, f"{found.spec.algo} on {found.spec.env_id}: {place}")
     with doing(console, "loading the libraries"), loading_libraries():
         # All that plays, so that nothing is loaded in the middle of it.
-
-        chosen = with_statistics(found, wanted.statistics)
-    if args.record is not None or args.reward_log:
-        go_on_unread()
-    play(console, chosen, args)
+        return with_statistics(found, wanted.statistics)
 
 
 # --- playing --------------------------------------------------------------------------------------

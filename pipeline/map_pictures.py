@@ -7,7 +7,7 @@ whole numbers. ``cell`` is the width of a cell in points.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -269,6 +269,46 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     write_png(figure, path)
 
 
+COST_COLOURS = ("#FFFFFF", "#FBD9B5", "#F2994A", "#C8501E")
+
+
+def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> None:
+    """Draw an agent's values into a PNG file, and beside them what its actions cost.
+
+    Args:
+        path: the file.
+        title: of the picture.
+        found: the map of the agent.
+        losses: what is lost in each state, in return per episode, shape (S,).
+    """
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    layers, cell = shown_layers(found), cell_inches(found.layout)
+    best = found.optimal_values[found.matters]
+    scale = Normalize(float(best.min()), max(float(best.max()), float(best.min()) + 1e-9))
+    colours = LinearSegmentedColormap.from_list("values", VALUE_COLOURS)
+    costs = replace(found, values=losses, matters=found.visited)
+    cost_scale = Normalize(0, max(float(losses.max()), 1e-12))
+    cost_colours = LinearSegmentedColormap.from_list("costs", COST_COLOURS)
+    figure, pairs = _panels(found.layout, len(layers), cell)
+    pairs[0][0].set_title(f"agent: return {found.initial @ found.values:,.5g}", fontsize=10)
+    pairs[0][1].set_title(f"what its actions cost: {losses.sum():,.4g} in all", fontsize=10)
+    for pair, layer in zip(pairs, layers, strict=True):
+        if found.layout.prizes:
+            pair[0].set_ylabel(layer_name(found.layout, layer))
+    _explain(figure, found, cost_scale, cost_colours, "return lost there in an episode")
+    figure.suptitle(title, x=0.01, ha="left")
+    fix_layout(figure)
+    decimals = 0 if losses.max() >= 1000 else 2
+    for pair, layer in zip(pairs, layers, strict=True):
+        value, cost = policies_in(found, layer)[0], policies_in(costs, layer)[0]
+        draw_ground(pair[0], value, scale, colours)
+        _draw_policy(pair[0], value, 72 * cell, decimals_for(found), thick=True)
+        draw_ground(pair[1], cost, cost_scale, cost_colours)
+        _draw_policy(pair[1], cost, 72 * cell, decimals, thick=True)
+    write_png(figure, path)
+
+
 def shown_layers(found: ValueMap) -> list[int]:
     """The layers that a policy comes to, up to four, those with the fewest prizes first."""
     come_to = found.matters & (found.visited | found.optimal_visited)
@@ -338,13 +378,19 @@ def _draw_policy(axes: Axes, policy: Policy, cell: float, decimals: int, *, thic
     mark_differing(axes, policy, cell)
 
 
-def _explain(figure: Figure, found: ValueMap, scale: Normalize, colours: Colormap) -> None:
-    """The colour bar and the legend."""
+def _explain(
+    figure: Figure,
+    found: ValueMap,
+    scale: Normalize,
+    colours: Colormap,
+    told: str = "expected return from here on",
+) -> None:
+    """The colour bar, which tells what its numbers are, and the legend."""
     from matplotlib.cm import ScalarMappable
 
     source = ScalarMappable(scale, colours)
     bar = figure.colorbar(source, ax=figure.axes, aspect=30, pad=0.02)
-    bar.set_label("expected return from here on")
+    bar.set_label(told)
     bar.ax.spines[:].set_visible(False)
     figure.legend(
         handles=list(_legend(found, scale)),

@@ -67,17 +67,18 @@ def advice(
     # Where a constant action is optimal, the score of a near-optimal return may be 0.
     near = yardstick.gap(final.mean_return) <= NEAR_OPTIMUM * abs(yardstick.optimum)
     failed = yardstick.score(final.mean_return) < FAILED and not near
-    running = _still_running(evaluator, policy, 1)
+    running = still_running(evaluator, policy, 1)
     if not failed:
         if running.sum() < NEARLY_ALL:
             return None
         best = evaluator.optimum[1].argmax(axis=1)
-        if _still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # nobody can end an episode
+        if still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # nobody can end an episode
             return None
-    return Advice(_instead(evaluator, policy, running), _try_first(spec, agent, evaluator, n_steps))
+    instead = how_episodes_end(evaluator, policy)
+    return Advice(instead, _try_first(spec, agent, evaluator, n_steps))
 
 
-def _still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats:
+def still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats:
     """How often an episode acts in each state in its last steps before the limit, shape (S,)."""
     model, horizon = evaluator.model, evaluator.horizon
     visits = state_visitation(model, policy, horizon)
@@ -86,14 +87,15 @@ def _still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Float
     return np.maximum(visits, 0.0)
 
 
-def _instead(evaluator: ExactEvaluator, policy: Any, running: Floats) -> str:
-    share = float(running.sum())
+def how_episodes_end(evaluator: ExactEvaluator, policy: Any) -> str:
+    """How the episodes of a policy end, and where they are caught if they do not."""
+    share = float(still_running(evaluator, policy, 1).sum())
     if share < 0.5:
         worth = policy_return(evaluator.model, policy, evaluator.horizon, success=evaluator.success)
         end = f"{1 - share:.0%} of its episodes end before the time limit"
         rate = worth.success_rate
         return end if rate is None else f"{end}, {rate:.1%} of all with success"
-    late = _still_running(evaluator, policy, min(LAST_STEPS, max(evaluator.horizon // 2, 1)))
+    late = still_running(evaluator, policy, min(LAST_STEPS, max(evaluator.horizon // 2, 1)))
     order = np.argsort(-late, kind="stable")
     n_states = int(np.searchsorted(np.cumsum(late[order]), NEARLY_ALL * late.sum())) + 1
     places = [f"state {state}" for state in order[:MOST_STATES_NAMED]]

@@ -284,3 +284,31 @@ def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | N
                 values = distribution.distribution.probs[0]
                 return ActionFigures("probability", values.cpu().numpy())
     return None
+
+
+def believed_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
+    """What an agent believes actions or states to be worth: shape (S, A), or (S,); None if nothing.
+
+    ``observations`` has the states along its first axis.
+    """
+    policy: Any = agent.policy
+    if isinstance(agent, TabularAlgorithm):
+        return np.asarray(policy.q_table[observations])
+    if isinstance(agent, TileAlgorithm) and not isinstance(agent, SoftmaxAlgorithm):
+        return np.asarray(policy.sums(observations))
+    if not is_network(agent) or has_memory(agent):
+        return None
+
+    def asked(part: NDArray[Any]) -> NDArray[Any]:
+        with th.no_grad():
+            tensor, _ = policy.obs_to_tensor(part)
+            if (net := getattr(policy, "q_net", None)) is not None:
+                values = net(tensor)
+            elif (net := getattr(policy, "quantile_net", None)) is not None:
+                values = net(tensor).mean(dim=1)
+            else:
+                values = policy.predict_values(tensor)[:, 0]
+        return np.asarray(values.cpu().numpy(), dtype=np.float64)
+
+    has_values = any(hasattr(policy, name) for name in ("q_net", "quantile_net", "predict_values"))
+    return _in_parts(agent, observations, None, asked) if has_values else None

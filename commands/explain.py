@@ -1,0 +1,207 @@
+"""``explain.py``: where an agent loses what it stays behind the optimum."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from commands.cli import OneLineParser, add_shared, command_line, filled
+from commands.enjoy import add_model_flags, found_model, model_request
+from pipeline.errors import UserError
+from pipeline.failures import exits_as_mistakes
+from pipeline.stopping import stops_noticed
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from diagnosis.explanation import Explanation
+    from pipeline.evaluation.exact import ExactEvaluator
+    from pipeline.models.choose import ChosenModel, ModelRequest
+
+EPILOG = """\
+examples:
+  python explain.py --env FrozenLake-v1 --algo qlearning
+  python explain.py logs/dqn/Taxi-v4_1 --json why.json
+  python explain.py logs/sarsa/CliffWalking-v1_1 --against logs/qlearning/CliffWalking-v1_1
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The flags: those of enjoy.py that say which agent, and what to do with it."""
+    parser = OneLineParser(
+        description="Say where an agent loses what it stays behind the optimum, exactly.",
+        epilog=EPILOG,
+    )
+    add_model_flags(parser)
+    group = parser.add_argument_group("explaining")
+    add = group.add_argument
+    test = "train four seeds with this change (KEY:VALUE ...) and four without; several changes "
+    test += "may be tried by giving the flag again; without a change, a small table of them"
+    add("--test", nargs="*", action="append", metavar="KEY:VALUE", help=test)
+    other = "another agent on the same environment: where the two first differ, and what it costs"
+    add("--against", type=filled, metavar="MODEL", help=other)
+    add("--map", type=filled, metavar="FILE", help="draw the cost of each cell, as .png")
+    add("--course", action="store_true", help="the same of each checkpoint of the run")
+    add("--json", type=filled, metavar="FILE", help="write the explanation there too")
+    add_shared(group, "--env-kwargs", "--gym-packages", "--jobs")
+    parser.set_defaults(seed=0)
+    return parser
+
+
+def main() -> int:
+    """Parse the arguments and explain; the exit code."""
+    args = build_parser().parse_args()
+    with stops_noticed(), exits_as_mistakes(), ExitStack() as stack:
+        from commands.terminal import TextConsole, say
+        from report.why import why_lines
+
+        console = TextConsole(highlight=False)
+        wanted = model_request(args)
+        one = _asked(console, wanted, stack)
+        explained = one.explanation()
+        for line in why_lines(explained):
+            say(console, line)
+        if explained.proposal is not None and args.test is None:
+            say(console, f"to see what helps: --test {explained.proposal}, or --test alone")
+        data = explained.as_data()
+        if args.against is not None:
+            other = replace(wanted, path=Path(args.against), algo=None, env_id=None)
+            data["against"] = _compare(console, one, _asked(console, other, stack))
+        if args.course:
+            data["course"] = _course(console, one, stack, explained)
+        if args.map is not None:
+            _draw(console, one, explained, Path(args.map))
+        if args.test is not None:
+            data["tried"] = _test(console, args, one, explained)
+        if args.json is not None:
+            from pipeline.files import write_json
+
+            write_json(Path(args.json), data)
+    return 0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """An agent that can be asked what it does in every state."""
+
+    chosen: ChosenModel
+    evaluator: ExactEvaluator
+    agent: BaseAlgorithm
+
+    def explanation(self) -> Explanation:
+        """Where it loses what it stays behind the optimum."""
+        from diagnosis.explanation import explanation
+
+        return explanation(self.chosen.spec, self.agent, self.evaluator)
+
+
+def _asked(console: Console, wanted: ModelRequest, stack: ExitStack) -> Asked:
+    """Find and load an agent, and work out the optimum of its environment."""
+    from pipeline.signs_of_life import doing
+
+    chosen = found_model(console, wanted, stack)
+    with doing(console, "working out the optimum"):
+        from pipeline.evaluation.exact import exact_evaluator, model_refusal
+
+        spec = chosen.spec
+        evaluator = exact_evaluator(spec)
+        if evaluator is None:
+            reason = model_refusal(spec) or f"the model of {spec.env_id} is not known"
+            raise UserError(f"{reason}, so the gap to the optimum cannot be split")
+    return Asked(chosen, evaluator, _loaded(chosen, stack))
+
+
+def _loaded(chosen: ChosenModel, stack: ExitStack) -> BaseAlgorithm:
+    from pipeline.models.load import load_to_play
+    from pipeline.playing import playing_env
+
+    spec = chosen.spec
+    env = stack.enter_context(closing(playing_env(chosen, None)))
+    return load_to_play(spec.algo, chosen.file, env, spec.device, spec.user_modules)
+
+
+# --- more than one agent --------------------------------------------------------------------------
+
+
+def _compare(console: Console, one: Asked, other: Asked) -> dict[str, Any]:
+    """Say where two agents first do something different; the same as JSON."""
+    from commands.terminal import say
+    from diagnosis.explanation import parting
+    from report.why import parting_lines
+
+    if one.evaluator.model.prob.shape != other.evaluator.model.prob.shape:
+        raise UserError("--against: the two agents do not act on the same environment")
+    found = parting(*((each.chosen.spec, each.agent, each.evaluator) for each in (one, other)))
+    for line in parting_lines(found):
+        say(console, line)
+    return found.as_data()
+
+
+def _course(console: Console, one: Asked, stack: ExitStack, last: Explanation) -> list[Any]:
+    """Print the parts of the gap at each checkpoint; the same as JSON."""
+    from commands.terminal import say
+    from pipeline.models.choose import model_of_run
+    from report.why import course_lines
+
+    run = one.chosen.run
+    saved = [] if run is None else run.checkpoints()
+    if run is None or not saved:
+        raise UserError("--course: the run has no checkpoints; train it with --save-freq N")
+    course = {}
+    for path in saved:
+        then = _loaded(model_of_run(path, one.chosen.spec, run), stack)
+        course[then.num_timesteps] = replace(one, agent=then).explanation()
+    course.setdefault(one.agent.num_timesteps, last)
+    for line in course_lines(course):
+        say(console, line)
+    return [{"timesteps": steps, **each.as_data()} for steps, each in course.items()]
+
+
+# --- trying changes -------------------------------------------------------------------------------
+
+
+def _test(
+    console: Console, args: argparse.Namespace, one: Asked, explained: Explanation
+) -> list[Any]:
+    """Train four seeds as it is and with each change, and say which is best; the same as JSON."""
+    from commands.compare import RunContext, results_of
+    from commands.terminal import say
+    from experiments.interventions import AS_IT_IS, intervention_study, tried, usual_changes
+    from experiments.launching import available_cores
+    from experiments.run_limits import RunLimits
+    from report.why import tried_lines
+
+    spec, run = one.chosen.spec, one.chosen.run
+    changes = [" ".join(change) for change in args.test if change]
+    if not changes:
+        changes = usual_changes(spec, explained.proposal, one.agent.num_timesteps)
+    name = one.chosen.path.stem if run is None else f"{spec.algo}_{run.path.name}"
+    study = intervention_study(spec, changes, name)
+    root = Path(args.folder) / "explain" / study.name
+    workers = max(args.jobs, 0) or available_cores()
+    context = RunContext(root, command_line(), RunLimits(), console, n_workers=workers)
+    found = tried(results_of(study, context))
+    for line in tried_lines(found, AS_IT_IS):
+        say(console, line)
+    return [{"change": each.change, "returns": each.returns.tolist()} for each in found]
+
+
+def _draw(console: Console, one: Asked, explained: Explanation, path: Path) -> None:
+    """Draw what each cell costs."""
+    from commands.terminal import say
+    from pipeline.evaluation.value_maps import map_refusal, value_map
+    from pipeline.map_pictures import draw_cost_map
+
+    if path.suffix != ".png":
+        raise UserError(f"--map writes a .png, not {path}")
+    found = value_map(one.evaluator, one.agent)
+    if found is None:
+        reason = map_refusal(one.evaluator) or "only grid worlds have a map"
+        raise UserError(f"--map: {reason}")
+    title = f"{one.chosen.spec.algo} on {one.chosen.spec.env_id}"
+    draw_cost_map(path, title, found, explained.losses)
+    say(console, f"map: {path}")

@@ -1,0 +1,631 @@
+"""Says where an agent loses what it stays behind the optimum, exactly, where the model is known.
+
+The gap is split in two ways, and both sums are exact. By state: what the agent's actions cost where
+it takes them (`mdp.gaps`). By part: between the optimum and the agent stand policies that have one
+more of its handicaps each, and every part is what one handicap costs. Parts may be negative.
+
+1. Its objective: the best policy for its discount, on the environment that it trains on, which does
+   not know the clock.
+2. Exploring: the same for agents that learn the values of their own exploring policy.
+3. Not observable: the best that can be done by what is observed.
+4. Never tried: planning on the pairs of state and action that it has tried.
+5. Values not settled: one exact look ahead with its own values.
+6. Look-ahead: the agent itself.
+
+A part says where the return is lost, not why. What helps is found by trying it: see
+`experiments.interventions`.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.toy_text.taxi import TaxiEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.planning import PlanningAgent
+from agents.reference import RandomAgent
+from envs.known_models import transition_model
+from envs.layout import action_names
+from mdp import (
+    TransitionModel,
+    finite_horizon_optimum,
+    policy_iteration,
+    policy_return,
+    state_values,
+)
+from mdp.evaluation import canonical_policy, policy_matrix
+from mdp.gaps import GapByState, Repair, first_differences, gap_by_state, greedy_repairs
+from mdp.memoryless import best_memoryless
+from mdp.transition_model import Bools, Floats, Ints
+from pipeline.environments import make_single_env
+from pipeline.errors import UserError
+from pipeline.evaluation.advice import how_episodes_end, still_running
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.evaluation.policies import believed_values
+from pipeline.train_spec import TrainSpec
+
+# Planning for an agent's objective takes about a second where outcomes are so many.
+MOST_OUTCOMES = 500_000
+# Action values closer to the best than this, relative to it, are as good.
+TIE = 1e-9
+# States are named where so few of them make up so much of the gap.
+MOST_STATES, MOST_OF_GAP = 3, 0.5
+# Parts and repairs below this share of the gap are not worth a line.
+WORTH_A_LINE = 0.05
+# Parts from which on a change is proposed, those that more training may heal, and how much more.
+LARGE = 0.25
+SMALL = 0.1  # of the gap, the one in the agent's own objective
+UNFINISHED = ("never tried", "not settled", "look-ahead", "learning")
+MORE_TRAINING = 4
+# A return that is reached but for rounding, relative to it.
+ROUNDING = 1e-9
+# Agents that learn the values of the policy that they explore with.
+ON_POLICY = frozenset(
+    {
+        "sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo",
+        "semi_gradient_sarsa",
+    }
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the handicaps between the optimum and the agent."""
+
+    name: str  #: ``objective``, ``exploring``, ``not observable``, ``never tried``, ...
+    loss: float  #: what it costs, in return per episode
+    meaning: str  #: what that is, in words
+
+
+@dataclass(frozen=True)
+class StateLoss:
+    """A state in which the agent loses return."""
+
+    state: int
+    name: str  #: where that is
+    loss: float  #: in return per episode
+    visits: float  #: how often an episode acts there
+    action: str  #: what the agent does there
+    best: str  #: what is best there
+    #: what the agent believes the two to be worth, what they are truly worth in its own objective,
+    #: and how often each was updated; None where that is not known
+    believed: tuple[float, float] | None = None
+    true: tuple[float, float] | None = None
+    updates: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Where an agent loses what it stays behind the optimum."""
+
+    optimum: float  #: the highest expected return under the time limit
+    value: float  #: the agent's expected return
+    score: float  #: on the scale of the yardstick
+    ending: str  #: how its episodes end
+    parts: tuple[Part, ...]  #: their losses sum to the gap; empty where they are not known
+    states: tuple[StateLoss, ...]  #: the states that lose most, at most 20, the worst first
+    n_states: int  #: states in which it loses anything
+    losses: Floats  #: of each state, shape (S,); they sum to the gap
+    repairs: tuple[tuple[str, float], ...]  #: state, and return once it and those before are right
+    #: the discount that it learns under, and the gap at its start in that objective
+    discount: float | None = None
+    own_gap: float | None = None
+    #: where losses are spread, what its own policy does along the best road; or what looks alike
+    road: str = ""
+    is_caught: bool = False  #: whether most of its episodes run out of time
+    looks_alike: bool = False  #: whether it cannot tell states apart
+    proposal: str | None = None  #: a change that may help, as ``--test`` takes it
+
+    @property
+    def gap(self) -> float:
+        """How far the agent stays behind the optimum."""
+        return self.optimum - self.value
+
+    @property
+    def is_optimal(self) -> bool:
+        """Whether nothing but rounding lies between the agent and the optimum."""
+        return self.gap <= ROUNDING * max(1.0, abs(self.optimum))
+
+    @property
+    def is_concentrated(self) -> bool:
+        """Whether few states make up most of the gap, and are where it is lost.
+
+        An agent that is caught loses most where it stands, not where it should have gone.
+        """
+        if self.is_caught or self.looks_alike:
+            return False
+        few = sum(state.loss for state in self.states[:MOST_STATES])
+        return not self.is_optimal and few >= MOST_OF_GAP * self.gap
+
+    def as_data(self) -> dict[str, Any]:
+        """The explanation as JSON."""
+        return {
+            "optimum": self.optimum,
+            "return": self.value,
+            "gap": self.gap,
+            "score": self.score,
+            "ending": self.ending,
+            "parts": [vars(part) for part in self.parts],
+            "states": [vars(state) for state in self.states],
+            "n_states": self.n_states,
+            "repairs": [{"name": name, "return": value} for name, value in self.repairs],
+            "discount": self.discount,
+            "gap_in_own_objective": self.own_gap,
+            "road": self.road,
+            "proposal": self.proposal,
+        }
+
+
+class _Task(NamedTuple):
+    """What the agent was trained for."""
+
+    model: TransitionModel  # of the environment that it trains on
+    discount: float
+    epsilon: float  # how often it explores, where it learns the values of doing so, else 0
+    lived: TransitionModel  # the model with these random actions
+
+
+def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Explanation:
+    """Where an agent loses what it stays behind the optimum.
+
+    Args:
+        spec: of the run that the agent comes from.
+        agent: the agent, whose greedy policy is explained.
+        evaluator: as `exact_evaluator` gives it for the spec.
+
+    Raises:
+        UserError: where the agent's policy cannot be asked for all states, or the environment is
+            too large.
+    """
+    if reason := evaluator.obstacle(agent):
+        raise UserError(f"{spec.algo} cannot be explained: {reason}")
+    model, horizon = evaluator.model, evaluator.horizon
+    policy = evaluator.policy(agent, deterministic=True)
+    try:
+        split = gap_by_state(model, policy, horizon)
+    except ValueError as error:
+        raise UserError(f"{spec.algo} on {spec.env_id} cannot be explained: {error}") from error
+    with closing(make_single_env(spec)) as env:
+        words = _Words(env, evaluator)
+        explained = Explanation(
+            optimum=split.optimum,
+            value=split.value,
+            score=evaluator.yardstick.score(split.value),
+            ending=how_episodes_end(evaluator, policy),
+            is_caught=still_running(evaluator, policy, 1).sum() > 0.5,
+            parts=(),
+            states=(),
+            n_states=int((split.losses > 0).sum()),
+            losses=split.losses,
+            repairs=(),
+        )
+        if explained.is_optimal:
+            return explained
+        task = _task(spec, agent, evaluator)
+        found = _Found(evaluator, agent, policy, split, task)
+        explained = replace(
+            explained,
+            parts=found.parts(),
+            states=found.states(words),
+            repairs=tuple((words.place(state), value) for state, value in found.repairs()),
+            discount=None if task is None else task.discount,
+            own_gap=found.own_gap(),
+        )
+        if found.groups is not None:
+            alike = found.alike(words)
+            explained = replace(explained, road=alike, repairs=(), looks_alike=True)
+        elif not explained.is_concentrated:
+            explained = replace(explained, road=found.road(words))
+        return replace(explained, proposal=found.proposal(explained.parts))
+
+
+def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:
+    """What the agent was trained for, where that is known and has the same states."""
+    discount = getattr(agent, "gamma", None)
+    if isinstance(agent, PlanningAgent | RandomAgent) or not isinstance(discount, int | float):
+        return None
+    with closing(make_single_env(spec, training=True)) as env:
+        model = transition_model(env)
+    if model is None or model.prob.shape != evaluator.model.prob.shape:
+        return None
+    if model.prob.size > MOST_OUTCOMES:
+        return None
+    epsilon = 0.0
+    if spec.algo in ON_POLICY and getattr(agent, "exploration", "") == "epsilon_greedy":
+        epsilon = float(getattr(agent, "exploration_rate", 0.0))
+    lived = _noisy(model, epsilon) if epsilon > 0 else model
+    return _Task(model, float(discount), epsilon, lived)
+
+
+class _Words:
+    """Names of states and actions."""
+
+    def __init__(self, env: gym.Env[Any, Any], evaluator: ExactEvaluator) -> None:
+        self._base, self._layout = env.unwrapped, evaluator.layout
+        self._actions = action_names(env)
+
+    def place(self, state: int) -> str:
+        """The name of a state."""
+        if (layout := self._layout) is not None:
+            name = layout.place_name(state % layout.n_cells)
+            collected = layout.collected_in(state // layout.n_cells)
+            return f"{name}, {len(collected)} collected" if collected else name
+        if isinstance(self._base, TaxiEnv):
+            row, column, passenger, target = self._base.decode(state)
+            where = "on board" if passenger == 4 else f"at {'RGYB'[passenger]}"
+            place = f"row {row + 1}, column {column + 1}"
+            return f"{place}, passenger {where}, to {'RGYB'[target]}"
+        return f"state {state}"
+
+    def action(self, action: int) -> str:
+        """The name of an action."""
+        return self._actions[action] if action < len(self._actions) else f"action {action}"
+
+
+class _Found:
+    """All that is worked out of one agent's gap."""
+
+    def __init__(
+        self,
+        evaluator: ExactEvaluator,
+        agent: BaseAlgorithm,
+        policy: NDArray[Any],
+        split: GapByState,
+        task: _Task | None,
+    ) -> None:
+        self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
+        self.model, self.horizon = evaluator.model, evaluator.horizon
+        self.agent, self.taken = agent, _first_actions(evaluator.model, policy, evaluator.horizon)
+        self.groups = _groups(evaluator.observations, self.model.reachable)
+        self.beliefs = believed_values(agent, evaluator.observations)
+        self.updates = _updates(agent, evaluator.observations)
+        # the optimal action values of its own objective, shape (S, A)
+        self.own_values: Floats | None = None
+        if task is not None:
+            try:
+                self.own_values = policy_iteration(task.lived, task.discount).action_values
+            except ValueError:  # without a discount, where episodes need not end
+                self.task = None
+
+    # --- parts ------------------------------------------------------------------------------------
+
+    def parts(self) -> tuple[Part, ...]:
+        """The handicaps between the optimum and the agent, in their order."""
+        task = self.task
+        if task is None or self.own_values is None:
+            return ()
+        found: list[Part] = []
+        reached = self.split.optimum
+
+        def down_to(value: float, name: str, meaning: str) -> None:
+            nonlocal reached
+            # A policy that does worse than the agent itself splits nothing off.
+            if value >= self.split.value:
+                found.append(Part(name, reached - value, meaning))
+                reached = value
+
+        values = policy_iteration(task.model, task.discount).action_values
+        best = self._best_of(values)
+        known = f"the best policy for discount {task.discount:g} returns {best:.4g}"
+        down_to(best, "objective", known)
+        if task.epsilon > 0:
+            best = self._best_of(self.own_values)
+            told = f"the best for one that explores with epsilon {task.epsilon:g}"
+            down_to(best, "exploring", f"{told} returns {best:.4g}")
+        if self.groups is not None:
+            seen = best_memoryless(self.model, self.groups, self.horizon)
+            if seen is not None:
+                told = f"the best policy found that goes by what is observed returns {seen:.4g}"
+                down_to(seen, "not observable", told)
+        elif self.beliefs is not None:
+            self._of_values(down_to, task)
+        has_values = self.groups is None and self.beliefs is not None
+        looked = found[-1].name == "not settled"
+        last = "look-ahead" if looked else "not settled" if has_values else "learning"
+        down_to(self.split.value, last, f"the agent itself returns {self.split.value:.4g}")
+        return tuple(found)
+
+    def _of_values(self, down_to: Any, task: _Task) -> None:
+        """The parts of an agent that has values of its own, for each state by itself."""
+        assert self.beliefs is not None
+        if self.updates is not None:
+            planned = self._planned_on_tried(task.lived, task.discount)
+            n_tried = int((self.updates > 0)[self.model.reachable].sum())
+            n_pairs = int(self.model.reachable.sum()) * self.model.n_actions
+            told = f"planning on the {n_tried:,} of {n_pairs:,} pairs that it tried"
+            down_to(planned, "never tried", f"{told} returns {planned:.4g}")
+        values = self.beliefs if self.beliefs.ndim == 1 else self.beliefs.max(axis=1)
+        if task.epsilon > 0 and self.beliefs.ndim == 2:
+            values = (1 - task.epsilon) * values + task.epsilon * self.beliefs.mean(axis=1)
+        ahead = _looked_ahead(task.model, task.discount, values)
+        if self.evaluator.masks is not None:
+            ahead = np.where(self.evaluator.masks, ahead, -np.inf)
+        seen = self._worth(ahead.argmax(axis=1))
+        down_to(seen, "not settled", f"one exact look ahead with its own values returns {seen:.4g}")
+
+    def _best_of(self, values: Floats) -> float:
+        """The return of the best policy whose actions are all greedy in some values (S, A)."""
+        top = values.max(axis=1, keepdims=True)
+        greedy = values >= top - TIE * np.maximum(1.0, np.abs(top))
+        return finite_horizon_optimum(self.model, self.horizon, mask=greedy).start_value
+
+    def _worth(self, policy: Ints) -> float:
+        return policy_return(self.model, policy, self.horizon).expected_return
+
+    def _planned_on_tried(self, model: TransitionModel, discount: float) -> float:
+        """The return of the best policy that takes only what was tried.
+
+        States in which nothing was tried are worth what the agent believes, and it does there what
+        it does.
+        """
+        assert self.updates is not None
+        assert self.beliefs is not None
+        tried: Bools = self.updates > 0
+        if self.evaluator.masks is not None:
+            tried &= self.evaluator.masks
+        unknown: Bools = np.asarray(~tried.any(axis=1))
+        ends = model.terminated | unknown[:, None, None]
+        values = self.beliefs if self.beliefs.ndim == 1 else self.beliefs.max(axis=1)
+        reward = np.where(unknown[:, None, None], values[:, None, None], model.reward)
+        known = replace(model, terminated=ends, reward=reward, reward_variance=None)
+        try:
+            plan = policy_iteration(known, discount, mask=tried | unknown[:, None])
+        except ValueError:  # without a discount, where what it tried need not end
+            return self.split.value
+        taken = np.eye(self.model.n_actions, dtype=np.bool_)[self.taken]
+        allowed = np.where(unknown[:, None], taken, tried)
+        return self._best_of(np.where(allowed, plan.action_values, -np.inf))
+
+    def proposal(self, parts: tuple[Part, ...]) -> str | None:
+        """The change to its settings that the parts suggest, as ``--test`` takes it, or None."""
+        gap, changes, own_gap = self.split.gap, [], self.own_gap()
+        lost = {part.name: part.loss / gap for part in parts}
+        # What costs it little in its own objective it has little reason to learn.
+        is_small = own_gap is not None and own_gap < SMALL * gap
+        if self.task is not None and (is_small or lost.get("objective", 0.0) >= LARGE):
+            nearer = 1 - 0.5 / self.horizon  # what `gamma: auto` stands for
+            values = policy_iteration(self.task.model, nearer).action_values
+            if nearer > self.task.discount and self._best_of(values) > self.split.value:
+                changes.append("gamma:auto")
+        if lost.get("exploring", 0.0) >= LARGE:
+            changes.append("exploration_final_eps:0")
+        if sum(lost.get(name, 0.0) for name in UNFINISHED) >= LARGE:
+            steps = f"{MORE_TRAINING * self.agent.num_timesteps:.2g}"
+            changes.append(f"n_timesteps:{float(steps):.0f}")
+        return " ".join(changes) or None
+
+    # --- in its own objective ---------------------------------------------------------------------
+
+    def own_gap(self) -> float | None:
+        """The gap at the start in the agent's own objective, without the clock; None if unknown."""
+        task = self.task
+        if task is None or self.own_values is None or task.discount >= 1:
+            return None
+        best = float(task.lived.initial @ self.own_values.max(axis=1))
+        own = policy_return(task.lived, self.taken, None, task.discount)
+        return max(best - own.expected_return, 0.0)
+
+    # --- by state ---------------------------------------------------------------------------------
+
+    def states(self, words: _Words, most: int = 20) -> tuple[StateLoss, ...]:
+        """The states that lose most, the worst first."""
+        split = self.split
+        order = [int(state) for state in np.argsort(-split.losses, kind="stable")[:most]]
+        return tuple(self._state(state, words) for state in order if split.losses[state] > 0)
+
+    def _state(self, state: int, words: _Words) -> StateLoss:
+        split, best = self.split, int(self.split.action_values[state].argmax())
+        taken = int(self.taken[state])
+        pair = [taken, best]
+
+        def of(table: NDArray[Any] | None) -> tuple[Any, Any] | None:
+            if table is None or table.ndim != 2:
+                return None
+            first, second = table[state, pair].tolist()
+            return first, second
+
+        is_seen = self.groups is None
+        return StateLoss(
+            state=state,
+            name=words.place(state),
+            loss=float(split.losses[state]),
+            visits=float(split.visits[state]),
+            action=words.action(taken),
+            best=words.action(best),
+            believed=of(self.beliefs) if is_seen else None,
+            true=of(self.own_values) if is_seen else None,
+            updates=of(self.updates) if is_seen else None,
+        )
+
+    def repairs(self) -> list[Repair]:
+        """The greedy repairs that each regain a share of the gap that is worth a line."""
+        found = greedy_repairs(self.model, self.policy, self.horizon, self.split, MOST_STATES)
+        value, kept = self.split.value, []
+        for repair in found:
+            if repair.value - value < WORTH_A_LINE * self.split.gap:
+                break
+            kept.append(repair)
+            value = repair.value
+        return kept
+
+    def alike(self, words: _Words) -> str:
+        """The states that are observed alike, of which it acts most often in one."""
+        assert self.groups is not None
+        visits = np.bincount(self.groups, self.split.visits)
+        counts = np.bincount(self.groups, self.model.reachable)
+        most = int(np.where(counts > 1, visits, -1.0).argmax())
+        states = np.flatnonzero((self.groups == most) & self.model.reachable)
+        names = "; ".join(words.place(int(state)) for state in states[:MOST_STATES])
+        more = f" and {len(states) - MOST_STATES} more" if len(states) > MOST_STATES else ""
+        return f"it cannot tell {len(states)} states apart: {names}{more}"
+
+    def road(self, words: _Words) -> str:
+        """From where on the best road the agent's own policy reaches the end, and its last error.
+
+        The road is where an optimal policy most likely goes from the likeliest start.
+        """
+        model, evaluator = self.model, self.evaluator
+        ends_well = model.terminated if evaluator.success is None else evaluator.success
+        counted = replace(
+            model,
+            reward=(ends_well & model.terminated).astype(np.float64),
+            reward_variance=None,
+        )
+        reached = state_values(counted, self.policy, self.horizon)
+        optimal = evaluator.optimum[1]
+        plan = finite_horizon_optimum(model, self.horizon)
+        road, state = [], int(model.initial.argmax())
+        for step in range(min(self.horizon, model.n_states)):
+            road.append(state)
+            action = int(plan.actions(step)[state])
+            likeliest = int(model.prob[state, action].argmax())
+            if model.terminated[state, action, likeliest]:
+                break
+            state = int(model.next_state[state, action, likeliest])
+            if state in road:
+                break
+        sure = [place for place in road if reached[place] > 0.99]
+        wrong = [place for place in road if not optimal[place, self.taken[place]]]
+        if not wrong:
+            return ""
+        last = wrong[-1]
+        told = f"on the best road of {len(road)} states it reaches the end from {len(sure)}"
+        best = words.action(int(plan.actions(0)[last]))
+        does = words.action(int(self.taken[last]))
+        return (
+            f"{told}; its last wrong turn is at {words.place(last)}: {does}, where {best} is best"
+        )
+
+
+# --- two agents -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Place:
+    """A state in which two agents first do something different."""
+
+    state: int
+    name: str
+    met: float  #: the chance that an episode comes to its first difference there
+    gain: float  #: what the better agent gains by it, in return per episode
+    actions: tuple[str, str]  #: what the better and the worse agent do there
+
+
+@dataclass(frozen=True)
+class Parting:
+    """Where the policies of two agents first part, the one with the higher return first."""
+
+    names: tuple[str, str]
+    difference: float  #: of the returns, at least 0; the gains sum to it
+    met: float  #: the chance that an episode comes to a difference
+    places: tuple[Place, ...]  #: those that matter most, at most 20, the dearest first
+
+    def as_data(self) -> dict[str, Any]:
+        """The same as JSON."""
+        return {**vars(self), "places": [vars(place) for place in self.places]}
+
+
+Side = tuple[TrainSpec, BaseAlgorithm, ExactEvaluator]
+
+
+def parting(one: Side, other: Side) -> Parting:
+    """Where the policies of two agents on one environment first part, and what that costs.
+
+    Raises:
+        UserError: where an agent cannot be asked for all states, or the environment is too large.
+    """
+    evaluator = one[2]
+    model, horizon = evaluator.model, evaluator.horizon
+    policies = []
+    for spec, agent, of in (one, other):
+        if reason := of.obstacle(agent):
+            raise UserError(f"{spec.algo} cannot be compared: {reason}")
+        policies.append(of.policy(agent, deterministic=True))
+    returns = [policy_return(model, policy, horizon).expected_return for policy in policies]
+    names = [spec.algo for spec, _, _ in (one, other)]
+    if names[0] == names[1]:
+        names = [f"{name} {number}" for number, name in enumerate(names, 1)]
+    order = [0, 1] if returns[0] >= returns[1] else [1, 0]
+    better, worse = (policies[i] for i in order)
+    try:
+        found = first_differences(model, better, worse, horizon)
+    except ValueError as error:
+        raise UserError(f"{one[0].env_id}: {error}") from error
+    with closing(make_single_env(one[0])) as env:
+        words = _Words(env, evaluator)
+        taken = [_first_actions(model, policy, horizon) for policy in (better, worse)]
+        places = [
+            Place(
+                state=int(state),
+                name=words.place(int(state)),
+                met=float(found.met[state]),
+                gain=float(found.gains[state]),
+                actions=(words.action(int(taken[0][state])), words.action(int(taken[1][state]))),
+            )
+            for state in np.argsort(-np.abs(found.gains), kind="stable")[:20]
+            if found.met[state] > 0
+        ]
+    return Parting(
+        names=(names[order[0]], names[order[1]]),
+        difference=returns[order[0]] - returns[order[1]],
+        met=float(found.met.sum()),
+        places=tuple(places),
+    )
+
+
+def _first_actions(model: TransitionModel, policy: NDArray[Any], horizon: int) -> Ints:
+    """The likeliest action of a policy at the first step, shape (S,)."""
+    canonical = canonical_policy(model, policy, horizon)
+    likeliest: Ints = policy_matrix(model, canonical).argmax(axis=1)
+    return likeliest
+
+
+def _groups(observations: NDArray[Any], reachable: Bools) -> Ints | None:
+    """The number of what is observed in each state, shape (S,); None where it tells them apart."""
+    rows = observations.reshape(len(observations), -1)
+    _, numbers = np.unique(rows, axis=0, return_inverse=True)
+    numbers = numbers.reshape(-1).astype(np.int64)
+    there = numbers[reachable]
+    return None if len(np.unique(there)) == len(there) else numbers
+
+
+def _updates(agent: BaseAlgorithm, observations: NDArray[Any]) -> Ints | None:
+    """How often each pair of state and action was updated, shape (S, A), of agents with tables."""
+    counts = getattr(agent.policy, "visit_counts", None)
+    if counts is None or observations.ndim != 1:
+        return None
+    summed: Ints = counts.numpy().sum(axis=0)[observations]
+    return summed if summed.any() else None
+
+
+def _looked_ahead(model: TransitionModel, discount: float, values: Floats) -> Floats:
+    """Action values (S, A) by one exact step from values (S,)."""
+    following = np.where(model.terminated, 0.0, values[model.next_state])
+    later: Floats = np.einsum("sak,sak->sa", model.prob, following)
+    return model.expected_reward + discount * later
+
+
+def _noisy(model: TransitionModel, epsilon: float) -> TransitionModel:
+    """The model in which a uniformly random action is taken instead with probability epsilon.
+
+    Its optimal policy is the best epsilon-soft one (Sutton and Barto, section 5.4).
+    """
+    n_states, n_actions, _ = model.prob.shape
+
+    def both(array: NDArray[Any]) -> NDArray[Any]:
+        random = np.repeat(array.reshape(n_states, 1, -1), n_actions, axis=1)
+        return np.concatenate([array, random], axis=2)
+
+    prob = both(model.prob)
+    n_own = model.n_outcomes
+    prob[:, :, :n_own] *= 1 - epsilon
+    prob[:, :, n_own:] *= epsilon / n_actions
+    return TransitionModel(
+        prob, both(model.next_state), both(model.reward), both(model.terminated), model.initial
+    )

@@ -1,0 +1,114 @@
+"""What is said of an explanation: where an agent loses return, in at most twelve lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from diagnosis.explanation import Explanation, Part, Parting, StateLoss
+    from experiments.interventions import Tried
+
+# A part below this share of the gap has no line.
+LEAST_SHARE = 0.02
+MOST_STATES = 3
+
+
+def why_lines(explained: Explanation) -> list[str]:
+    """How episodes end, the gap and its parts, the gap in the agent's own objective, and where."""
+    if explained.is_optimal:
+        return [f"optimal: it returns {explained.value:.6g}, and nobody can have more"]
+    gap, optimum = explained.gap, explained.optimum
+    told = [
+        explained.ending,
+        f"gap {gap:.4g}: it returns {explained.value:.6g}, the optimum is {optimum:.6g}",
+    ]
+    shown = [part for part in explained.parts if _is_shown(part, gap)]
+    width = max((len(part.name) for part in shown), default=0)
+    told += [f"  {part.name:<{width}} {part.loss:>9.4g}  {part.meaning}" for part in shown]
+    if explained.own_gap is not None:
+        own = f"in its own objective, at discount {explained.discount:g}"
+        told.append(f"the gap at the start {own}: {explained.own_gap:.4g}")
+    if explained.is_concentrated:
+        worst = explained.states[:MOST_STATES]
+        told += [_state(state, gap) for state in worst if state.loss >= LEAST_SHARE * gap]
+    elif explained.road:
+        told.append(explained.road)
+    if explained.repairs:
+        told.append(_repairs(explained))
+    return told
+
+
+def _is_shown(part: Part, gap: float) -> bool:
+    return part.name == "not observable" or abs(part.loss) >= LEAST_SHARE * gap
+
+
+def _state(state: StateLoss, gap: float) -> str:
+    """What is lost in one state, and what the agent knows of it."""
+    share = f"{state.loss / gap:.0%} of the gap"
+    text = f"  {state.name}: {share}, {state.visits:.3g} visits an episode; "
+    text += f"it does {state.action}, where {state.best} is best"
+    if state.action == state.best:
+        text = f"  {state.name}: {share}, {state.visits:.3g} visits an episode; {state.action} is "
+        text += "best on average, but not with few steps left"
+    elif state.believed is not None and state.true is not None:
+        told = [f"believes {value:.4g}" for value in state.believed]
+        told = [f"{one}, truly {true:.4g}" for one, true in zip(told, state.true, strict=True)]
+        if state.updates is not None:
+            told = [f"{one}, {n:,} updates" for one, n in zip(told, state.updates, strict=True)]
+        text += f" ({state.action}: {told[0]}; {state.best}: {told[1]})"
+    return text
+
+
+def _repairs(explained: Explanation) -> str:
+    told, value = [], explained.value
+    for place, reached in explained.repairs:
+        share = (reached - explained.value) / explained.gap
+        told.append(f"{place} right: {reached:.5g}, {share:.1%} of the gap regained")
+        value = reached
+    assert value > explained.value
+    return "; ".join(["with " + told[0], *(f"and {one}" for one in told[1:])])
+
+
+def parting_lines(parting: Parting) -> list[str]:
+    """Where two agents first do something different, and what that costs, the dearest first."""
+    better, worse = parting.names
+    difference = f"{better} returns {parting.difference:.4g} more than {worse}"
+    if not parting.places:
+        return [f"{difference}: their policies are the same wherever they come"]
+    told = [f"{difference}; they part in {parting.met:.1%} of the episodes, first at"]
+    return told + [
+        f"  {place.name}: in {place.met:.1%} of the episodes, worth {place.gain:.4g}; "
+        f"{better} does {place.actions[0]}, {worse} {place.actions[1]}"
+        for place in parting.places[:MOST_STATES]
+    ]
+
+
+def course_lines(course: Mapping[int, Explanation]) -> list[str]:
+    """A table of the gap and its parts by the steps of training."""
+    names = list(dict.fromkeys(part.name for one in course.values() for part in one.parts))
+    rows = [["steps", "gap", *names]]
+    for steps, one in course.items():
+        losses = {part.name: part.loss for part in one.parts}
+        parts = [f"{losses[name]:.4g}" if name in losses else "" for name in names]
+        rows.append([f"{steps:,}", f"{one.gap:.4g}", *parts])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.rjust, row, widths)) for row in rows]
+
+
+def tried_lines(tried: Sequence[Tried], as_it_is: str) -> list[str]:
+    """What each change came to over its seeds, the best first; and that this is no verdict."""
+    width = max(len(one.change) for one in tried)
+    told = []
+    for one in tried:
+        returns = " ".join(f"{value:.5g}" for value in one.returns) or "no run finished"
+        mean = f"mean {one.returns.mean():.5g}, " if len(one.returns) else ""
+        told.append(f"  {one.change:<{width}}  {mean}{returns}")
+    best = tried[0]
+    before = next(one for one in tried if one.change == as_it_is)
+    n_runs = len(before.returns)
+    if best is before or not len(best.returns) or best.returns.mean() <= before.returns.mean():
+        return [*told, "no change that was tried is better on average"]
+    n_above = sum(best.returns > before.returns.max()) if n_runs else 0
+    said = f"{best.change} is best on average: {n_above} of its {len(best.returns)} runs are above "
+    return [*told, f"{said}every run as it is; four seeds are a hint, compare.py gives a verdict"]
