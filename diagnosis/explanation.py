@@ -56,6 +56,8 @@ MOST_OUTCOMES = 500_000
 TIE = 1e-9
 # States are named where so few of them make up so much of the gap.
 MOST_STATES, MOST_OF_GAP = 3, 0.5
+# The chance of an end that counts as sure.
+SURELY = 0.99
 # Parts and repairs below this share of the gap are not worth a line.
 WORTH_A_LINE = 0.05
 # Parts from which on a change is proposed, those that more training may heal, and how much more.
@@ -306,7 +308,7 @@ class _Found:
         def down_to(value: float, name: str, meaning: str) -> None:
             nonlocal reached
             # A policy that does worse than the agent itself splits nothing off.
-            if value >= self.split.value:
+            if value >= self.split.value - ROUNDING * max(1.0, abs(value)):
                 found.append(Part(name, reached - value, meaning))
                 reached = value
 
@@ -468,8 +470,11 @@ class _Found:
     def road(self, words: _Words) -> str:
         """From where on the best road the agent's own policy reaches the end, and its last error.
 
-        The road is where an optimal policy most likely goes from the likeliest start.
+        The road is where the best policy that wastes no time most likely goes from the likeliest
+        start.
         """
+        if self.task is None:
+            return ""
         model, evaluator = self.model, self.evaluator
         ends_well = model.terminated if evaluator.success is None else evaluator.success
         counted = replace(
@@ -479,24 +484,26 @@ class _Found:
         )
         reached = state_values(counted, self.policy, self.horizon)
         optimal = evaluator.optimum[1]
-        plan = finite_horizon_optimum(model, self.horizon)
+        planned = policy_iteration(model, 1 - 0.5 / self.horizon).policy
         road, state = [], int(model.initial.argmax())
-        for step in range(min(self.horizon, model.n_states)):
+        for _ in range(min(self.horizon, model.n_states)):
             road.append(state)
-            action = int(plan.actions(step)[state])
+            action = int(planned[state])
             likeliest = int(model.prob[state, action].argmax())
             if model.terminated[state, action, likeliest]:
                 break
             state = int(model.next_state[state, action, likeliest])
             if state in road:
                 break
-        sure = [place for place in road if reached[place] > 0.99]
-        wrong = [place for place in road if not optimal[place, self.taken[place]]]
+        is_lost = (reached <= SURELY) & (self.taken != planned)
+        is_wrong = is_lost | ~optimal[np.arange(model.n_states), self.taken]
+        wrong = [place for place in road if is_wrong[place]]
         if not wrong:
             return ""
+        n_sure = int((reached[road] > SURELY).sum())
         last = wrong[-1]
-        told = f"on the best road of {len(road)} states it reaches the end from {len(sure)}"
-        best = words.action(int(plan.actions(0)[last]))
+        told = f"on the best road of {len(road)} states it reaches the end from {n_sure}"
+        best = words.action(int(planned[last]))
         does = words.action(int(self.taken[last]))
         return (
             f"{told}; its last wrong turn is at {words.place(last)}: {does}, where {best} is best"

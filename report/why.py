@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from pipeline.errors import UserError
+from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from diagnosis.explanation import Explanation, Part, Parting, StateLoss
@@ -37,6 +43,36 @@ def why_lines(explained: Explanation) -> list[str]:
     if explained.repairs:
         told.append(_repairs(explained))
     return told
+
+
+@dataclass(frozen=True)
+class Why:
+    """What is said of one run."""
+
+    lines: list[str]
+    proposal: str | None  # a change that may help, as ``explain.py --test`` takes it
+
+
+def whys_of(runs: Sequence[tuple[TrainSpec, Path]]) -> list[Why | None]:
+    """What is said of each run, of which the zip is named; None where its gap cannot be split.
+
+    For a process of its own: this loads PyTorch.
+    """
+    return [_why_of(spec, path) for spec, path in runs]
+
+
+def _why_of(spec: TrainSpec, path: Path) -> Why | None:
+    from diagnosis.explanation import explanation
+    from pipeline.evaluation.exact import evaluator_of
+    from pipeline.models.load import load_model
+
+    with suppress(UserError, OSError):
+        evaluator = evaluator_of(spec)
+        if evaluator is not None:
+            agent = load_model(spec.algo, path, modules=spec.user_modules, device="cpu")
+            found = explanation(spec, agent, evaluator)
+            return Why(why_lines(found), found.proposal)
+    return None
 
 
 def _is_shown(part: Part, gap: float) -> bool:

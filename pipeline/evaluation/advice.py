@@ -83,7 +83,11 @@ def still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats
     model, horizon = evaluator.model, evaluator.horizon
     visits = state_visitation(model, policy, horizon)
     if n_last < horizon:
-        visits = visits - state_visitation(model, policy, horizon - n_last)
+        has_time = (
+            policy.ndim == 2 and len(policy) == horizon and policy.shape != model.prob.shape[:2]
+        )
+        before = policy[: horizon - n_last] if has_time and len(policy) > 1 else policy
+        visits = visits - state_visitation(model, before, horizon - n_last)
     return np.maximum(visits, 0.0)
 
 

@@ -34,6 +34,7 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     world_sections.bandits,
     result_sections.comparison,
     result_sections.overall,
+    world_sections.why,
     world_sections.policies,
     world_sections.played_episodes,
     result_sections.watching,

@@ -22,6 +22,7 @@ from pipeline.environments import make_single_env
 from report.films import MAX_BYTES, films_of, has_film
 from report.page.frame import Report, Section, data_uri, first_runs, layout_data
 from report.series import SPREAD, Pulls, PullSeries, mean_regret, regret_of_runs
+from report.why import whys_of
 from report.words import number
 from safe_files.files import NO_LIMIT, read_file
 
@@ -93,6 +94,41 @@ def _bandit_data(series: PullSeries) -> dict[str, Any]:
         "arms": series.arms if series.arms and len(series.arms.names) <= MOST_ARMS else None,
         "beliefs": series.beliefs,
     }
+
+
+# Where the median run of each agent loses what it stays behind the optimum.
+
+MOST_EXPLAINED = 8  # agents of an environment, each of which is loaded and asked
+
+
+def why(report: Report) -> Section | None:
+    """What is said of each agent's median run; None where no gap can be split."""
+    analysis = report.analysis
+    chosen = [_median_runs(analysis, one)[:MOST_EXPLAINED] for one in analysis.environments]
+    asked = [(run.spec, run.run.model_path) for runs in chosen for run in runs]
+    answers = iter(do_aside(whys_of, asked) if asked else ())
+    told = [[(run, next(answers)) for run in runs] for runs in chosen]
+    told = [[(run, why) for run, why in of_runs if why is not None] for of_runs in told]
+    if not any(told):
+        return None
+    return Section("why", "Why not optimal", {"told": told}, by_environment=True)
+
+
+def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> list[PlannedRun]:
+    """The exactly evaluated run of each agent whose final return is the median, or below it."""
+    table = analysis.results.summary
+    here = (table["environment"] == environment.environment) & table["exact"].astype(bool)
+    runs: dict[tuple[str, str], dict[int, PlannedRun]] = {}
+    for run in analysis.results.finished:
+        if not run.is_batch:
+            runs.setdefault(run.labels, {})[run.seed] = run
+    found = []
+    for agent in environment.agents:
+        rows = table[here & (table["agent"] == agent.agent)].sort_values("final", kind="stable")
+        of_agent = runs.get((agent.agent, environment.environment), {})
+        if len(rows) and of_agent:
+            found.append(of_agent[int(rows["seed"].iloc[(len(rows) - 1) // 2])])
+    return found
 
 
 # What agents do on each cell of a grid world, over their training, beside the optimum.
