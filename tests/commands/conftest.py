@@ -6,12 +6,18 @@ import pytest
 
 import compare
 import enjoy
+import explain
 import train
 from commands import main, share
 from commands.cli import run_command
 from pipeline.signs_of_life import Silence
 
-MAINS = {"train.py": train.main, "enjoy.py": enjoy.main, "compare.py": compare.main}
+MAINS = {
+    "train.py": train.main,
+    "enjoy.py": enjoy.main,
+    "explain.py": explain.main,
+    "compare.py": compare.main,
+}
 COMMANDS = {name: partial(run_command, main) for name, main in MAINS.items()}
 COMMANDS |= {"pack": partial(run_command, share.pack), "yardstick": main}
 

@@ -1,0 +1,79 @@
+"""``explain.py`` as a user types it: runs, zips, changes that are tried, files, refusals."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+TRAIN = ("train.py", "--algo", "qlearning", "--env", "FrozenLake-v1", "-n", 3000, "--eval-freq", -1)
+
+
+@pytest.fixture
+def run(type_command):
+    """A run of Q-learning that has not settled, with checkpoints."""
+    code, _, _ = type_command(*TRAIN, "--save-freq", 1000, "--verbose", 0)
+    assert code == 0
+    return "logs/qlearning/FrozenLake-v1_1"
+
+
+def test_a_run_is_explained_in_twelve_lines_and_as_json(type_command, run):
+    code, out, _ = type_command("explain.py", run, "--json", "why.json")
+    data = json.loads(Path("why.json").read_text())
+    assert code == 0
+    assert len(out.splitlines()) <= 14  # which run, twelve lines, what to try
+    assert f"gap {data['gap']:.4g}: it returns" in out
+    assert sum(part["loss"] for part in data["parts"]) == pytest.approx(data["gap"])
+    assert {"name", "loss", "visits", "action", "best", "updates"} <= data["states"][0].keys()
+    zipped = type_command("explain.py", f"{run}/FrozenLake-v1.zip")[1]
+    assert zipped.splitlines()[1:] == out.splitlines()[1:]
+    found = type_command("explain.py", "--algo", "qlearning", "--env", "FrozenLake-v1")[1]
+    assert found.splitlines()[1:] == out.splitlines()[1:]
+
+
+def test_a_change_is_tried_on_four_seeds_beside_the_run_as_it_is(type_command, run):
+    words = ("--test", "n_timesteps:60000", "--test", "gamma:0.5", "--json", "why.json")
+    code, out, _ = type_command("explain.py", run, *words, "-j", 1)
+    tried = {
+        one["change"]: one["returns"] for one in json.loads(Path("why.json").read_text())["tried"]
+    }
+    assert code == 0
+    assert [*tried] == ["n_timesteps:60000", *[one for one in tried if "60000" not in one]]
+    assert {len(returns) for returns in tried.values()} == {4}
+    assert "n_timesteps:60000 is best on average" in out
+    assert "12 runs, 12 of them there already" in type_command("explain.py", run, *words)[1]
+
+
+def test_checkpoints_show_the_course_and_two_agents_where_they_part(type_command, run, tmp_path):
+    last = f"{run}/rl_model_1000_steps.zip"
+    words = ("--course", "--against", last, "--map", "costs.png", "--json", "why.json")
+    code, out, _ = type_command("explain.py", run, *words)
+    data = json.loads(Path("why.json").read_text())
+    assert code == 0
+    assert [row["timesteps"] for row in data["course"]] == [1000, 2000, 3000]
+    assert data["course"][-1]["gap"] == data["gap"]
+    assert sum(place["gain"] for place in data["against"]["places"]) == pytest.approx(
+        data["against"]["difference"]
+    )
+    assert "they part in" in out
+    assert (tmp_path / "costs.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--algo", "qlearning", "--env", "Taxi-v4"], "train one with"),
+        (["{run}", "--test", "gama:0.9"], "gama"),
+        (["{run}", "--map", "costs.svg"], "--map writes a .png"),
+        (["{run}", "--against", "nowhere"], "no such model file: nowhere"),
+        (["{cart}"], "the model of CartPole-v1 is not known"),
+        (["{cart}", "--course"], "the model of CartPole-v1 is not known"),
+    ],
+)
+def test_what_cannot_be_explained_is_refused_in_one_line(type_command, run, words, line):
+    cart = "logs/random/CartPole-v1_1"
+    if "{cart}" in words:
+        type_command("train.py", "--algo", "random", "--env", "CartPole-v1", "-n", 100)
+    words = [word.format(run=run, cart=cart) for word in words]
+    code, _, err = type_command("explain.py", *words)
+    assert (code, err.count("\n")) == (2, 1)
+    assert line in err
