@@ -1,0 +1,114 @@
+r"""Is the change that an explanation proposes the one that wins? Counted over twenty runs.
+
+    python benchmarks/explain_hits.py --publish
+
+Ten runs are of agents with the shipped settings that are not optimal, ten of agents that failed by a
+known mistake: too low a discount, too few steps, too little exploration. Each run of seed 4 is
+explained; then the proposal and the usual changes (`experiments.interventions`) are trained with the
+seeds 0 to 3. A proposal hits where no change is better on average by more than 5 % of the gap of the
+runs as they are; where nothing is proposed, that is a hit if no change regains 5 % of that gap.
+The result goes to docs/measured/explain-hits.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "measured" / "explain-hits.md"
+SEED = 4
+MATTERS = 0.05  # of the gap
+
+SHIPPED = [
+    "--algo qlearning --env FrozenLake-v1",
+    "--algo sarsa --env FrozenLake-v1",
+    "--algo ppo --env FrozenLake-v1",
+    "--algo qlearning --env FrozenLake8x8-v1",
+    "--algo sarsa --env FrozenLake8x8-v1",
+    "--algo dqn --env FrozenLake8x8-v1",
+    "--algo ppo --env FrozenLake8x8-v1",
+    "--algo sarsa --env CliffWalking-v1",
+    "--algo ppo --env Taxi-v4",
+    "--algo expected_sarsa --env Taxi-v4",
+]
+SLIPPING = "--env Warehouse-v0 --env-kwargs slip:0.1"
+FAILED = [
+    f"--algo qlearning {SLIPPING} -n 100000 -params gamma:0.99 learning_rate:0.1",
+    f"--algo sarsa {SLIPPING} -n 100000 -params gamma:0.99 learning_rate:0.1",
+    "--algo qlearning --env Warehouse-v0 -n 3000",
+    "--algo sarsa --env Warehouse-v0 -params gamma:0.5",
+    "--algo qlearning --env Taxi-v4 -n 5000",
+    "--algo qlearning --env FrozenLake8x8-v1 -n 20000",
+    "--algo qlearning --env MineMaze-v0 -params gamma:0.5 initial_q:0",
+    "--algo sarsa --env CliffWalking-v1 -n 500",
+    "--algo dqn --env Warehouse-v0 -n 4000",
+    "--algo ppo --env Warehouse-v0 -params gamma:0.8",
+]
+
+
+def judged(words: str, folder: Path) -> list[str]:
+    """A row of the table: the run, its gap, what was proposed, what won, and whether they agree."""
+    told = folder / "why.json"
+    network = any(f"--algo {name} " in words for name in ("dqn", "ppo"))
+    engine = ["--engine", "auto"] if network else []
+    train = [*words.split(), *engine, "--seed", str(SEED), "-f", str(folder), "--verbose", "0"]
+    _run("train.py", *train)
+    run = next(path for path in folder.glob("*/*_1") if path.is_dir())
+    _run("explain.py", str(run), "-f", str(folder), "--test", "--json", str(told))
+    found = json.loads(told.read_text(encoding="utf-8"))
+    means = {one["change"]: sum(one["returns"]) / len(one["returns"]) for one in found["tried"]}
+    as_it_is, optimum = means.pop("as it is"), found["optimum"]
+    gap = optimum - as_it_is
+    best = max(means, key=lambda change: means[change])
+    proposal = found["proposal"]
+    reached = as_it_is if proposal is None else means[proposal]
+    is_hit = max(means[best], as_it_is) - reached <= MATTERS * gap
+    regained = (means[best] - as_it_is) / gap if gap > 0 else 0.0
+    return [
+        f"`{words}`",
+        f"{gap:.4g}",
+        f"`{proposal}`" if proposal else "nothing",
+        f"`{best}`, {regained:.0%} of the gap" if regained > MATTERS else "nothing",
+        "yes" if is_hit else "no",
+    ]
+
+
+def _run(script: str, *words: str) -> None:
+    command = [sys.executable, str(ROOT / script), *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 1):
+        raise SystemExit(f"{script} {' '.join(words)}:\n{done.stderr}")
+
+
+def table(rows: list[list[str]]) -> str:
+    """The table, and how many of its rows are hits."""
+    headings = ["run of seed 4", "mean gap, seeds 0 to 3", "proposed", "won", "hit"]
+    lines = [headings, ["---"] * len(headings), *rows]
+    n_hits = sum(row[-1] == "yes" for row in rows)
+    told = f"{n_hits} of {len(rows)} proposals are what wins."
+    return "\n".join([told, "", *("| " + " | ".join(line) + " |" for line in lines), ""])
+
+
+def main() -> None:
+    """Judge all runs, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--publish", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
+    args = parser.parse_args()
+    rows = []
+    for words in (*SHIPPED, *FAILED):
+        with tempfile.TemporaryDirectory() as folder:
+            rows.append(judged(words, Path(folder)))
+        print(" | ".join(rows[-1]), flush=True)
+    text = table(rows)
+    print(text)
+    if args.publish:
+        PAGE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
