@@ -2,10 +2,10 @@ r"""Is the change that an explanation proposes the one that wins? Counted over t
 
     python benchmarks/explain_hits.py --publish
 
-Ten runs are of agents with the shipped settings that are not optimal, ten of agents that failed by a
+Ten runs are of agents with shipped settings that are not optimal, ten of agents that failed by a
 known mistake: too low a discount, too few steps, too little exploration. Each run of seed 4 is
-explained; then the proposal and the usual changes (`experiments.interventions`) are trained with the
-seeds 0 to 3. A proposal hits where no change is better on average by more than 5 % of the gap of the
+explained; then the proposal and the usual changes (`experiments.interventions`) are trained with
+the seeds 0 to 3. A proposal hits where no change is better on average by over 5 % of the gap of the
 runs as they are; where nothing is proposed, that is a hit if no change regains 5 % of that gap.
 The result goes to docs/measured/explain-hits.md.
 """

@@ -352,10 +352,10 @@ def test_compare_reaches_every_agent_and_a_study_file_too(tmp_path):
     assert engines == {"qlearning": "auto", "ppo": "auto", "optimal": None}
     headline = compared("studies/library-vs-hand-rolled.yml")
     engines = {agent.label: agent.settings.get("engine") for agent in headline.agents}
-    assert engines["double_dqn"] == "library"
-    assert {engines[name] for name in ("dqn", "ppo", "qlearning")} == {None}
-    faster = compared("studies/library-vs-hand-rolled.yml", "--engine", "auto")
-    assert {agent.settings["engine"] for agent in faster.agents} == {"auto"}
+    assert {engines[name] for name in ("dqn", "double_dqn", "ppo")} == {"auto"}
+    assert {engines[name] for name in ("qlearning", "sarsa")} == {None}
+    all_of_them = compared("studies/library-vs-hand-rolled.yml", "--engine", "compiled")
+    assert {agent.settings["engine"] for agent in all_of_them.agents} == {"compiled"}
 
 
 @pytest.mark.parametrize(
