@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -200,7 +201,6 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
             value=split.value,
             score=evaluator.yardstick.score(split.value),
             ending=how_episodes_end(evaluator, policy),
-            is_caught=still_running(evaluator, policy, 1).sum() > 0.5,
             parts=(),
             states=(),
             n_states=int((split.losses > 0).sum()),
@@ -218,6 +218,7 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
             repairs=tuple((words.place(state), value) for state, value in found.repairs()),
             discount=None if task is None else task.discount,
             own_gap=found.own_gap(),
+            is_caught=found.is_caught(),
         )
         if found.groups is not None:
             alike = found.alike(words)
@@ -287,10 +288,12 @@ class _Found:
         self.groups = _groups(evaluator.observations, self.model.reachable)
         self.beliefs = believed_values(agent, evaluator.observations)
         self.updates = _updates(agent, evaluator.observations)
-        # the optimal action values of its own objective, shape (S, A)
+        # optimal action values for its discount, and of its own objective, shape (S, A)
+        self.for_discount: Floats | None = None
         self.own_values: Floats | None = None
         if task is not None:
             try:
+                self.for_discount = policy_iteration(task.model, task.discount).action_values
                 self.own_values = policy_iteration(task.lived, task.discount).action_values
             except ValueError:  # without a discount, where episodes need not end
                 self.task = None
@@ -300,7 +303,7 @@ class _Found:
     def parts(self) -> tuple[Part, ...]:
         """The handicaps between the optimum and the agent, in their order."""
         task = self.task
-        if task is None or self.own_values is None:
+        if task is None or self.for_discount is None or self.own_values is None:
             return ()
         found: list[Part] = []
         reached = self.split.optimum
@@ -312,8 +315,7 @@ class _Found:
                 found.append(Part(name, reached - value, meaning))
                 reached = value
 
-        values = policy_iteration(task.model, task.discount).action_values
-        best = self._best_of(values)
+        best = self._best_of(self.for_discount)
         known = f"the best policy for discount {task.discount:g} returns {best:.4g}"
         down_to(best, "objective", known)
         if task.epsilon > 0:
@@ -328,7 +330,7 @@ class _Found:
         elif self.beliefs is not None:
             self._of_values(down_to, task)
         has_values = self.groups is None and self.beliefs is not None
-        looked = found[-1].name == "not settled"
+        looked = any(part.name == "not settled" for part in found)
         last = "look-ahead" if looked else "not settled" if has_values else "learning"
         down_to(self.split.value, last, f"the agent itself returns {self.split.value:.4g}")
         return tuple(found)
@@ -413,6 +415,19 @@ class _Found:
         own = policy_return(task.lived, self.taken, None, task.discount)
         return max(best - own.expected_return, 0.0)
 
+    # --- on the way -------------------------------------------------------------------------------
+
+    @cached_property
+    def direct(self) -> Ints:
+        """The best policy that wastes no time, shape (S,)."""
+        return policy_iteration(self.model, 1 - 0.5 / self.horizon).policy
+
+    def is_caught(self) -> bool:
+        """Whether most episodes run out of time, although those of the best policy end."""
+        if self.task is None or still_running(self.evaluator, self.policy, 1).sum() <= 0.5:
+            return False
+        return bool(still_running(self.evaluator, self.direct, 1).sum() < 0.5)
+
     # --- by state ---------------------------------------------------------------------------------
 
     def states(self, words: _Words, most: int = 20) -> tuple[StateLoss, ...]:
@@ -484,7 +499,7 @@ class _Found:
         )
         reached = state_values(counted, self.policy, self.horizon)
         optimal = evaluator.optimum[1]
-        planned = policy_iteration(model, 1 - 0.5 / self.horizon).policy
+        planned = self.direct
         road, state = [], int(model.initial.argmax())
         for _ in range(min(self.horizon, model.n_states)):
             road.append(state)
