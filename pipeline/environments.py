@@ -6,7 +6,7 @@ import inspect
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -227,16 +227,20 @@ def _make_vec_env(
         wrapper_class=wrap_elsewhere if spec.vec_env == "subproc" else wrapper,
         vec_env_cls=getattr(vec_env, TRAINING_VEC_ENVS[spec.vec_env if training else "dummy"]),
     )
-    wrappers = spec.hyperparams.vec_env_wrapper
-    wrap = vec_wrapper_factory(wrappers, spec.gym_packages, folder=monitor_folder)
-    env = env if wrap is None else wrap(env)
-    if (normalize := spec.hyperparams.normalize) is not None:
-        # Statistics come from training, and returns of evaluation are reported as they are.
-        fixed = {} if training else {"norm_reward": False, "training": False}
-        env = vec_env.VecNormalize(env, **{**normalize, **fixed})
-    if spec.hyperparams.frame_stack is not None:
-        env = vec_env.VecFrameStack(env, spec.hyperparams.frame_stack)
-    return BaseAlgorithm._wrap_env(env)
+    with ExitStack() as undo:  # what cannot be wrapped as settings say is closed again
+        undo.callback(env.close)
+        wrappers = spec.hyperparams.vec_env_wrapper
+        wrap = vec_wrapper_factory(wrappers, spec.gym_packages, folder=monitor_folder)
+        env = env if wrap is None else wrap(env)
+        if (normalize := spec.hyperparams.normalize) is not None:
+            # Statistics come from training, and returns of evaluation are reported as they are.
+            fixed = {} if training else {"norm_reward": False, "training": False}
+            env = vec_env.VecNormalize(env, **{**normalize, **fixed})
+        if spec.hyperparams.frame_stack is not None:
+            env = vec_env.VecFrameStack(env, spec.hyperparams.frame_stack)
+        env = BaseAlgorithm._wrap_env(env)
+        undo.pop_all()
+    return env
 
 
 # What `gymnasium.make` takes itself.

@@ -1,3 +1,4 @@
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -8,6 +9,7 @@ import compare
 import enjoy
 import explain
 import train
+import tune
 from commands import main, share
 from commands.cli import run_command
 from pipeline.signs_of_life import Silence
@@ -50,6 +52,22 @@ def type_command(monkeypatch, capsys, tmp_path):
         with pytest.raises(SystemExit) as stop:
             COMMANDS[Path(words[0]).name]()
         captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def type_study(own_folder, monkeypatch, capfd):
+    """Run ``compare.py`` or ``tune.py`` in a user's own folder; also what child processes say."""
+    path = os.pathsep.join([str(own_folder), str(Path(compare.__file__).parent)])
+    monkeypatch.setenv("PYTHONPATH", path)
+
+    def run(*words, program="compare.py"):
+        monkeypatch.setattr(sys, "argv", [program, *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            run_command(tune.main if program == "tune.py" else compare.main)
+        captured = capfd.readouterr()
         return stop.value.code, captured.out, captured.err
 
     return run

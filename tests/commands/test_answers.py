@@ -9,11 +9,12 @@ import sys
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from commands import main as yardstick
-from commands.cli import COMMANDS, as_called, called_as, command_line, run_command
+from commands.cli import as_called, called_as, run_command
 
 ROOT = Path(__file__).parents[2]
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
@@ -36,54 +37,41 @@ LAKE_WORDS = "--algo qlearning --env FrozenLake-v1"
 QUICK = f"train.py {LAKE_WORDS} --seed 0 -n 500"
 PAIR = "compare.py --env FrozenLake-v1 --algos qlearning sarsa --n-episodes 60 --no-report"
 TUNE = f"tune.py {LAKE_WORDS}"
+OPTIMAL = "train.py --algo optimal --env CliffWalking-v1 --seed 0"
+GROWS = "compare.py grows.yml --until-decided"
 RUN = "qlearning on FrozenLake-v1, seed 0, 500 steps"
 STUDY = "qlearning, sarsa on FrozenLake-v1"
 SEARCH = "qlearning on FrozenLake-v1: a search for settings"
 PLAIN = "optimal on CliffWalking-v1, seed 0, 10 steps"
 CARTS = "ppo on CartPole-v1, seed 0, 500 steps"
+# Which words refuse what is recorded in ``tests/golden``; here, that it is said before anything.
 MISTAKES = [
-    ("train.py --env Warehose-v0", "unknown environment 'Warehose-v0': did you mean"),
     ("train.py --algo qlerning", "unknown agent 'qlerning': did you mean 'qlearning'?"),
-    (f"{QUICK} -params learning_rate", "learning_rate"),
     (f"{QUICK} -params n_episodes:5", "not both"),
-    (f"{QUICK} --conf-file nowhere.yml", "nowhere.yml"),
     (f"{QUICK} --conf-file broken.yml", "broken.yml:3:9: "),
     (f"{QUICK} --env Warehouse-v0 --env-kwargs desc:map.txt", "letter 'x' at row 2, column 2"),
     (f"{QUICK} -i nowhere.zip", "no such model file: nowhere.zip"),
-    (f"{QUICK} --gym-packages no_such_module", "cannot import no_such_module"),
     ("train.py --algo qlearning --env MountainCarContinuous-v0",
      "fitting agents: ppo, a2c, sac, td3, ddpg, tqc, crossq, trpo, ars, ppo_lstm, random"),
     ("train.py -optimize --n-trials 100", "by the command tune: see tune --help"),
 
     ("enjoy.py --algo dqn --env CartPole-v1",
      "train one with: python train.py --algo dqn --env CartPole-v1"),
-    ("enjoy.py --record film.avi", ".gif or .mp4"),
-    ("enjoy.py -P", "-P: there is no bar; each episode is printed as it ends"),
-    ("enjoy.py --n-envs 0", "--n-envs: must be a whole number of at least 1, not '0'"),
     ("enjoy.py map.txt --trust", "unknown argument --trust: it is not needed"),
 
-    ("compare.py", "what to compare? give --env and --algos, or a study file"),
     ("compare.py bad.yml --env Taxi-v4", "not both"),
-    ("compare.py --env Taxi-v4 --algos dqnn", "did you mean 'dqn'?"),
     ("compare.py --env Taxi-v4 --algos dqn dqn", "--algos names one of them"),
     ("compare.py --env MountainCarContinuous-v0 --algos sarsa", "does not fit"),
-    (f"{PAIR} -n 5", "not both"),
     (f"{PAIR} --metric finl", "did you mean 'final'?"),
     (f"{PAIR} --gym-packages no_such", "cannot import no_such"),
-    (f"{PAIR} --env-kwargs slipery:True", "slipery"),
     (f"{PAIR} --conf-file a.yml",
      "--conf-file a.yml: whose hyperparameters? a file has those of"),
     (f"{PAIR} --conf-file sarsa:a.yml sarsa:a.yml", "--conf-file names two files for sarsa"),
-    (f"{PAIR} --conf-file sarsa:no.yml", "--conf-file: there is no file no.yml"),
     (f"{PAIR} --conf-file dqn:a.yml", "(qlearning, sarsa): qlearning:dqn:a.yml"),
-    ("compare.py grows.yml --until-decided --quick",
-     "--until-decided and --quick do not go together"),
     ("compare.py grows.yml --until-decided --replace",
      "--until-decided and --replace do not go together"),
     ("compare.py grows.yml --max-seeds 9", "--max-seeds belongs to --until-decided"),
 
-    ("tune.py --env FrozenLake-v1 --algo qlerning", "did you mean 'qlearning'?"),
-    (f"{TUNE} --search-space none.yml", "--search-space: there is no file none.yml"),
     (f"{TUNE} --first-seed 998", "seed 1000 is one of the search and of the re-test"),
     (f"{TUNE} --storage redis://u:secret@h", "--storage: 'redis://u:***@h' is no"),
     (f"{TUNE} -n 9 --n-episodes 9", "give -n or --n-episodes, not both"),
@@ -92,32 +80,16 @@ MISTAKES = [
 # What only the libraries can tell comes after the line that is printed before they are loaded.
 LATE = [
     (f"{QUICK} -params learning_rat:0.1", RUN, "did you mean 'learning_rate'?"),
-    (f"{QUICK} -params gamma:high", RUN, "gamma"),
-    (f"{QUICK} -params gamma:1.5", RUN, "gamma"),
-    (f"{QUICK} -params exploration:greedy", RUN, "exploration"),
     (f"{QUICK} -tb /dev/null/logs", RUN, "Not a directory: /dev/null/logs"),
     (f"{QUICK} -params engine:compiled --vec-env subproc", RUN, "is not DummyVecEnv"),
     (f"{QUICK} --algo ppo --env CartPole-v1 -params n_steps:1 n_envs:1", CARTS, "n_steps"),
     (f"{PAIR} -params gama:0.9", STUDY, "did you mean 'gamma'?"),
     (f"{QUICK} -f taken", RUN, "cannot make a run folder in taken/qlearning"),
     (f"{TUNE} --search-space odd.yml", SEARCH, "'maxx_episode_steps': did you mean"),
-    (
-        f"{TUNE} --search-space space.yml --storage .",
-        SEARCH,
-        "--storage journal:FILE: . is no file",
-    ),
+    (f"{TUNE} --search-space space.yml --storage .", SEARCH, "journal:FILE: . is no file"),
     (f"{TUNE} --search-space space.yml --sampler grid --trials 3", SEARCH, "give more trials"),
-    (f"{TUNE} -params gama:0.9", SEARCH, "did you mean 'gamma'?"),
-    (
-        "train.py --algo optimal --env CliffWalking-v1 --seed 0 --conf-file plain.yml",
-        PLAIN,
-        "needs a time limit",
-    ),
-    (
-        "compare.py grows.yml --until-decided --max-seeds 5",
-        "grows",
-        "--max-seeds is 5, the study begins with 10 seeds",
-    ),
+    (f"{OPTIMAL} --conf-file plain.yml", PLAIN, "needs a time limit"),
+    (f"{GROWS} --max-seeds 5", "grows", "--max-seeds is 5, the study begins with 10 seeds"),
     ("compare.py bad.yml", "bad", "bad.yml:1: qlearning: gamma"),
 ]
 CASES = [*((line, "", complaint) for line, complaint in MISTAKES), *LATE]
@@ -166,7 +138,6 @@ def test_what_is_not_installed_is_named_beforehand(
     [
         ("train.py", "python enjoy.py"),
         ("/a place/compare.py", "python '/a place/enjoy.py'"),
-        ("../train.py", "python ../enjoy.py"),
         ("yardstick compare", "yardstick enjoy"),
         ("/somewhere/pytest", "python enjoy.py"),
         ("", "python enjoy.py"),
@@ -176,13 +147,6 @@ def test_commands_are_named_as_the_user_calls_them(monkeypatch, program, named):
     monkeypatch.setattr(sys, "argv", [program])
     assert called_as("enjoy") == named
     assert as_called("  python enjoy.py X\n  python enjoy.py") == f"  {named} X\n  {named}"
-
-
-def test_the_command_line_can_be_typed_again(monkeypatch):
-    for words in (["train.py", "--env", "A B"], ["yardstick train", "--env", "A B"]):
-        monkeypatch.setattr(sys, "argv", words)
-        program = "yardstick train" if " " in words[0] else "python train.py"
-        assert command_line() == f"{program} --env 'A B'"
 
 
 def test_training_and_playing_by_the_installed_name(type_command, tmp_path):
@@ -209,10 +173,7 @@ KNOWN = "train, enjoy, compare, tune, pack, inspect"
     ("words", "said"),
     [
         ("enjoy --algo dqn --env CartPole-v1", f" enjoy: error: {NO_RUN}"),
-        ("train --evn X", " train: error: unknown argument --evn X: did you mean '--env'? "),
         ("compare a.yml", " compare: error: a.yml:1: unknown agent 'sarsaa'"),
-        ("trian", ": error: unknown command 'trian': did you mean 'train'? (see --help)\n"),
-        ("trian --env X", ": error: unknown command 'trian': did you mean 'train'? (see --help)\n"),
         ("x", f": error: unknown command 'x': known are {KNOWN} (see --help)\n"),
         ("", f": error: which command? {KNOWN} (see --help)\n"),
         ("--env train", ": error: unknown argument --env: known are -h, --help, --version (see "),
@@ -223,35 +184,20 @@ def test_mistakes_name_the_installed_command(type_command, tmp_path, words, said
     code, out, err = type_command("yardstick", *words.split())
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"yardstick{said}")
-
-
-def test_help_has_examples_for_the_one_who_asks(type_command):
-    """That of the scripts is recorded in ``tests/golden``."""
-    for command in ("train", "enjoy", "compare"):
-        code, out, _ = type_command("yardstick", command, "--help")
-        assert code == 0
-        assert out.startswith(f"usage: yardstick {command} [-h]")
-        assert f"\n  yardstick {command} --env" in out
-        assert ".py" not in out.replace("STUDY.py", "")
-    code, out, _ = type_command("yardstick", "--help")
-    assert code == 0
-    assert all(f"  yardstick {command}" in out for command in COMMANDS)
     assert type_command("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
 
 
-@pytest.mark.parametrize("program", ["train.py", "enjoy.py", "compare.py", "yardstick compare"])
+@pytest.mark.parametrize("program", ["train.py", "yardstick compare"])
 def test_ctrl_c_while_the_command_itself_is_imported(monkeypatch, capsys, program):
     """Which takes a tenth of a second, in which a traceback would be all that there is to say."""
     wanted = program.removesuffix(".py").split()[-1]
 
-    class Interrupted:
-        @staticmethod
-        def find_spec(name, path=None, target=None):
-            if name == f"commands.{wanted}":
-                raise KeyboardInterrupt
+    def find_spec(name, path=None, target=None):
+        if name == f"commands.{wanted}":
+            raise KeyboardInterrupt
 
     monkeypatch.setattr(sys, "argv", program.split())
-    monkeypatch.setattr(sys, "meta_path", [Interrupted, *sys.meta_path])
+    monkeypatch.setattr(sys, "meta_path", [SimpleNamespace(find_spec=find_spec), *sys.meta_path])
     monkeypatch.delitem(sys.modules, f"commands.{wanted}", raising=False)
     script = partial(runpy.run_path, str(ROOT / program), run_name="__main__")
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
@@ -277,33 +223,18 @@ def test_ctrl_c_while_the_last_word_is_being_said(monkeypatch):
 # Words, the exit code, "libraries" where they are needed, and what is printed until then. Help
 # comes first: what an earlier answer has loaded is there for the later ones.
 MODEL = "logs/qlearning/FrozenLake-v1_1/FrozenLake-v1.zip"
-ABOUT = "qlearning on FrozenLake-v1, seed 0, 500 steps\n"
 PLANNED = "1 runs, 0 of them there already; 2 at once, in logs/studies/s\n"
+COMPARED = "python compare --algos qlearning --env FrozenLake-v1 --seeds 1 -n 500 --name s -j 2"
 ANSWERS = [
     ("yardstick --help", 0, None),
-    *(
-        (f"{name} {command} --help", 0, None)
-        for name in ("yardstick", "python")
-        for command in ("train", "enjoy", "compare")
-    ),
+    *((f"python {command} --help", 0, None) for command in ("train", "enjoy", "compare")),
     ("python train --list", 0, None),
-    *(
-        (f"python {words}", 2, "")
-        for words in (
-            "train --env Warehose-v0",
-            "train --conf-file missing.yml",
-            "enjoy --algo ppo --env CartPole-v1",
-            "compare missing.yml",
-            "compare --env MountainCarContinuous-v0 --algos sarsa",
-        )
-    ),
-    (f"python train {LAKE_WORDS} --seed 0 -n 500", "libraries", ABOUT),
+    ("python train --env Warehose-v0", 2, ""),
+    ("python enjoy --algo ppo --env CartPole-v1", 2, ""),
+    ("python compare --env MountainCarContinuous-v0 --algos sarsa", 2, ""),
+    (f"python train {LAKE_WORDS} --seed 0 -n 500", "libraries", f"{RUN}\n"),
     (f"python train {LAKE_WORDS} --seed 0 -n 500 --verbose 0", "libraries", ""),
-    (
-        "python compare --algos qlearning --env FrozenLake-v1 --seeds 1 -n 500 --name s -j 2",
-        "libraries",
-        f"qlearning on FrozenLake-v1\n{PLANNED}",
-    ),
+    (COMPARED, "libraries", f"qlearning on FrozenLake-v1\n{PLANNED}"),
     (f"python enjoy {MODEL}", "libraries", f"qlearning on FrozenLake-v1: {MODEL}\n"),
 ]
 HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib")
@@ -345,9 +276,8 @@ for line in asked:
 
 def test_answers_before_anything_heavy_is_loaded(type_command, tmp_path):
     assert type_command("train.py", *LAKE, "--seed", "0", "-n", "500")[0] == 0
-    asked = json.dumps([[line for line, *_ in ANSWERS], HEAVY])
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, asked],
+        [sys.executable, "-c", PROGRAM, json.dumps([[line for line, *_ in ANSWERS], HEAVY])],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -356,11 +286,9 @@ def test_answers_before_anything_heavy_is_loaded(type_command, tmp_path):
     )
     lines = [line for line in done.stdout.splitlines() if line.startswith("ANSWER ")]
     found = [json.loads(line.removeprefix("ANSWER ")) for line in lines]
-    expected = [
-        (line, code, out) for (line, code, _), (*_, out, _) in zip(ANSWERS, found, strict=True)
-    ]
-    assert [tuple(each[:3]) for each in found] == expected
-    for (line, _, said), (*_, out, has_gymnasium) in zip(ANSWERS, found, strict=True):
+    for (line, code, said), answer in zip(ANSWERS, found, strict=True):
+        assert answer[:2] == [line, code]
+        *_, out, has_gymnasium = answer
         assert out.startswith(said or ""), line
         assert bool(out) == (said != ""), line
         assert not (has_gymnasium and "--help" in line)

@@ -3,39 +3,34 @@
 import argparse
 import ast
 import inspect
-import io
 import re
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
 from agents import ALGORITHMS, load_algorithm
 from commands import compare, enjoy, train, tune
 from commands.cli import (
     INSTEAD,
     SET_BY_FLAGS,
-    check_device,
     folder_name,
     hint,
     number_at_least_zero,
     whole_number,
 )
-from commands.compare import run_context, study_spec
+from commands.compare import study_spec
 from commands.enjoy import model_request
-from commands.terminal import TextConsole
 from commands.train import train_spec
 from commands.tune import tuning_spec
-from experiments.child_processes import NO_LIMITS
 from experiments.plan import plan
 from experiments.study import StudySpec
 from pipeline.environments import training_changes
 from pipeline.errors import OTHER_NAMES, UserError, did_you_mean
 from pipeline.train_spec import TrainSpec
-from pipeline.training import carry_out, prepare
 from pipeline.unfinished_runs import SaveInterval
 from tests.peers.peer_environment import peer_folder
 from tuning.retesting import Candidate, retest_study
@@ -80,18 +75,13 @@ def test_flags_of_train_reach_the_specification():
     assert {name: getattr(spec, name) for name in given} == given
     kwargs = ["--env-kwargs", "slip:0.1", "--eval-env-kwargs", "slip:0.2", "max_episode_steps:9"]
     found = trained("--env", "Warehouse-v0", *SHORT, *kwargs).hyperparams
-    assert (found.env_kwargs, found.eval_env_kwargs) == (
-        {"slip": 0.1},
-        {"slip": 0.2, "max_episode_steps": 9},
-    )
-
-
-def test_without_flags_a_run_is_the_default_one():
-    spec = trained(*SHORT)
+    told = found.env_kwargs, found.eval_env_kwargs
+    assert told == ({"slip": 0.1}, {"slip": 0.2, "max_episode_steps": 9})
+    # Without flags a run is the default one, with as few episodes of evaluation as will do.
     own = {"algo", "env_id", "hyperparams", "saved_hyperparams", "seed", "origins"}
     others = {f.name: f.default for f in fields(TrainSpec) if f.name not in own}
-    # A study has the same number of episodes in all its runs; a run by itself as few as will do.
     others |= {"eval_episodes": None, "final_episodes": None}
+    spec = trained(*SHORT)
     assert {name: getattr(spec, name) for name in others} == others
 
 
@@ -113,32 +103,23 @@ def test_flags_of_compare_reach_the_study(tmp_path):
         assert {one.agent for one in planned if training_changes(one.spec)} == changed
 
 
+NO_PAGES = {
+    "page.pdf": r"writes a \.html file, not 'page\.pdf'",
+    "no/page.html": "there is no folder no",
+    "/proc/page.html": "nothing can be written in /proc: No such file",
+    "folder.html": r"folder\.html is a folder",
+}
+
+
 def test_the_page_that_plays_a_training(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.html").mkdir()
-    page = ("--watch-learning", "page.html")
     for more, n_episodes in (((), 0), (("--watch-episodes", "3"), 3)):
-        spec = trained(*SHORT, *page, *more)
+        spec = trained(*SHORT, "--watch-learning", "page.html", *more)
         assert (spec.watch_learning, spec.watch_episodes) == (Path("page.html"), n_episodes)
-    for name, complaint in [
-        ("page.pdf", r"writes a \.html file, not 'page\.pdf'"),
-        ("no/page.html", "there is no folder no"),
-        ("/proc/page.html", "nothing can be written in /proc: No such file"),
-        ("folder.html", r"folder\.html is a folder"),
-    ]:
+    for name, complaint in NO_PAGES.items():
         with pytest.raises(UserError, match=complaint):
             trained(*SHORT, "--watch-learning", name)
-    with pytest.raises(UserError, match="says how much --watch-learning shows: give that too"):
-        trained(*SHORT, "--watch-episodes", "3")
-
-
-def test_which_model_is_played_and_with_which_seed():
-    base = ["--algo", "random", *LAKE]
-    for words, which in [([], "final"), (["--load-best"], "best"), (["--load-checkpoint", "0"], 0)]:
-        assert model_request(enjoy.build_parser().parse_args([*base, *words])).which == which
-    args = enjoy.build_parser().parse_args([*base, "--seed", "-1"])
-    seeds = {model_request(args).seed for _ in range(5)}
-    assert (len(seeds), min(seeds) >= 0) == (5, True)
 
 
 # --- every flag with every odd value: it has a meaning, or it is refused in one line -----------
@@ -193,17 +174,13 @@ MEANINGS = [
     (TRAIN, "--eval-freq", {"-1": -1, "0": 0, "-3": -3, "1e4": 10_000}, "1.5 nan"),
     (TRAIN, "--eval-episodes", {"1": 1}, "0 -1"),
     (TRAIN, "--n-eval-envs", {"1": 1}, "0 -1"),
-    (TRAIN, "--save-freq", {"-3": -3, "0": 0, "1e4": 10_000}, "1.5"),
     (TRAIN, "--log-interval", {"-1": -1, "-2": -2, "4": 4}, "0 -3"),
     (TRAIN, "--verbose", {"0": 0, "2": 2}, "-1 3 7"),
     (ENJOY, "--seed", {"-1": -1, "3": 3}, "-7"),
-    (ENJOY, "--num-threads", {"-1": -1, "0": 0}, "-2"),
     (COMPARE, "-n", {"1e5": 100_000}, "0 -1"),
-    (COMPARE, "--n-episodes", {"1e2": 100}, "0 -1"),
     (COMPARE, "--seeds", {"1e1": 10}, "0 -1 1000001"),
     (COMPARE, "--jobs", {"-1": -1, "0": 0, "3": 3}, "-2 4097"),
     (COMPARE, "--margin", {"0": 0.0, "0.5": 0.5}, "-1 nan inf"),
-    (COMPARE, "--episodes-table", {"10": 10}, "0"),
     (COMPARE, "--render-every", {"0": 0, "10": 10}, "-1"),
     (COMPARE, "--name", {"my study": "my study"}, ".. a/b / CON a:b nul.txt"),
 ]
@@ -226,97 +203,28 @@ def test_what_a_value_means(module, flag, taken, refused, capsys):
 @given(st.text() | st.floats().map(str) | st.integers().map(str))
 def test_any_other_text_is_refused(text):
     for read in (whole_number(1, 100, {-1: "none"}), number_at_least_zero, folder_name):
-        try:
+        with suppress(argparse.ArgumentTypeError):
             value = read(text)
-        except argparse.ArgumentTypeError:
-            continue
-        if isinstance(value, int):
-            assert value == -1 or 1 <= value <= 100
-        assert value == text if read is folder_name else float(text) == value
-
-
-def test_what_is_taken_trains(tmp_path):
-    for name, typed in {
-        "first": "--num-threads -1 --eval-freq -5 --log-interval 1e12 --seed -1 --verbose 2",
-        "second": "--num-threads 0 --eval-freq 0 --save-freq -3 --seed 4294967295",
-        "third": "--eval-episodes 1 --n-eval-envs 1e3 --log-interval -2 -params n_envs:2e0",
-    }.items():
-        folder = tmp_path / name
-        words = [*BASES[train], "-f", str(folder), "-tb", str(folder / "tb"), *typed.split()]
-        spec = train_spec(train.build_parser().parse_args(words))
-        outcome = carry_out(prepare(spec, Console(file=io.StringIO()), {}, ""))
-        assert outcome.n_steps in (5, 6)
-        # TensorBoard calls a run after its agent.
-        assert [path.name for path in (folder / "tb" / "FrozenLake-v1").iterdir()] == ["random_1"]
-
-
-def test_a_budget_in_settings_may_be_written_as_a_float(tmp_path):
-    path = tmp_path / "own.yml"
-    for text in ("1e5", "100000.0"):
-        path.write_text(f"default:\n  n_timesteps: {text}\n")
-        for where in (["-params", f"n_timesteps:{text}"], ["-conf", str(path)]):
-            assert trained("--algo", "random", *where).hyperparams.n_timesteps == 100_000
-
-
-def test_a_device_that_is_not_there_and_a_folder_without_a_name():
-    for device in ("nonsense", "", "cuda:99"):
-        with pytest.raises(UserError, match="--device: PyTorch has no"):
-            check_device(device)
-    for module in (train, enjoy, compare):
-        with pytest.raises(SystemExit):
-            module.build_parser().parse_args(["-f", ""])
-
-
-# --- where runs are done, which is settled before anything is begun -----------------------------
-
-
-def test_where_runs_are_done(tmp_path, monkeypatch):
-    def place(words):
-        args = compare.build_parser().parse_args(["study", *words.split()])
-        return run_context(args, tmp_path / "study", "c", NO_LIMITS, TextConsole()).words
-
-    monkeypatch.chdir(tmp_path)
-    Path("slurm.yml").write_text("jobqueue: {slurm: {cores: 4, memory: 8GB}}")
-    assert place("-j 3") == "3 at once"
-    assert place("--cluster local:2") == "on the cluster local:2"
-    assert place("--cluster slurm.yml -j 8") == "on the cluster slurm.yml"
-    for words, message in [
-        ("--cluster 192.0.2.1:8786", "without TLS"),
-        ("--cluster tls://192.0.2.1:8786", "ca-file"),
-        ("--cluster missing.json", "cannot be read"),
-        ("--cluster local:0", "local:N"),
-        ("--cluster local:2 -j 2", "a cluster has its workers"),
-        ("--cluster slurm.yml", "--jobs N"),
-        ("--insecure-cluster", "give --cluster too"),
-    ]:
-        with pytest.raises(UserError, match=message) as refused:
-            place(words)
-        assert "\n" not in str(refused.value)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)  # a machine without Dask
-    with pytest.raises(UserError, match=r"rl-yardstick\[cluster\]"):
-        place("--cluster local:2")
-    assert [path.name for path in tmp_path.iterdir()] == ["slurm.yml"]
+            assert value == text if read is folder_name else float(text) == value
+            assert not isinstance(value, int) or value == -1 or 1 <= value <= 100
 
 
 # --- which engine: what --engine makes of trainings, studies and searches ------------------------
 
 
 @pytest.mark.parametrize(
-    ("algo", "words", "engine"),
+    ("words", "engine"),
     [
-        ("ppo", "", None),
-        ("ppo", "--engine auto", "auto"),
-        ("ppo", "--engine auto -params engine:auto gamma:0.9", "auto"),
-        ("double_dqn", "--engine compiled", "compiled"),
-        ("qlearning", "--engine interpreted", "interpreted"),
-        ("semi_gradient_q", "--engine auto", "auto"),
-        ("optimal", "--engine auto -n 10", None),
-        ("qrdqn", "--engine library -n 10", None),
+        ("ppo", None),
+        ("ppo --engine auto -params engine:auto gamma:0.9", "auto"),
+        ("double_dqn --engine compiled", "compiled"),
+        ("qlearning --engine interpreted", "interpreted"),
+        ("optimal --engine auto -n 10", None),
+        ("qrdqn --engine library -n 10", None),
     ],
 )
-def test_an_engine_is_a_setting_where_there_is_a_choice(algo, words, engine):
-    spec = trained("--algo", algo, *words.split())
-    assert spec.hyperparams.algorithm.get("engine") == engine
+def test_an_engine_is_a_setting_where_there_is_a_choice(words, engine):
+    assert trained("--algo", *words.split()).hyperparams.algorithm.get("engine") == engine
 
 
 REFUSED = [
@@ -324,10 +232,7 @@ REFUSED = [
      "--engine auto and -params engine:compiled disagree: give one of them"),
     ("qlearning", "--engine library",
      "--engine library: qlearning has the engines auto, compiled, interpreted"),
-    ("ppo", "--engine interpreted",
-     "--engine interpreted: ppo has the engines library, compiled, auto"),
     ("qrdqn", "--engine compiled", "--engine compiled: qrdqn has one engine, which auto means"),
-    ("optimal", "--engine compiled", "--engine compiled: optimal has one engine, which auto means"),
 ]  # fmt: skip
 
 
@@ -350,29 +255,26 @@ def test_compare_reaches_every_agent_and_a_study_file_too(tmp_path):
     planned = plan(compared(*LAKE, *words), tmp_path)
     engines = {run.agent: run.spec.hyperparams.algorithm.get("engine") for run in planned}
     assert engines == {"qlearning": "auto", "ppo": "auto", "optimal": None}
-    headline = compared("studies/library-vs-hand-rolled.yml")
-    engines = {agent.label: agent.settings.get("engine") for agent in headline.agents}
-    assert {engines[name] for name in ("dqn", "double_dqn", "ppo")} == {"auto"}
-    assert {engines[name] for name in ("qlearning", "sarsa")} == {None}
-    all_of_them = compared("studies/library-vs-hand-rolled.yml", "--engine", "compiled")
-    assert {agent.settings["engine"] for agent in all_of_them.agents} == {"compiled"}
+    headline = "studies/library-vs-hand-rolled.yml"
+    for words, expected in (((), {"auto", None}), (("--engine", "compiled"), {"compiled"})):
+        agents = compared(headline, *words).agents
+        assert {agent.settings.get("engine") for agent in agents} == expected
 
 
 @pytest.mark.parametrize(
     ("words", "search", "retest"),
     [
-        (["--algo", "ppo"], "auto", None),
-        (["--algo", "ppo", "--engine", "auto"], "auto", "auto"),
-        (["--algo", "ppo", "--engine", "library"], "library", "library"),
-        (["--algo", "ppo", "-params", "engine:compiled"], "compiled", "compiled"),
-        (["--algo", "double_dqn"], None, None),
-        (["--algo", "qlearning"], None, None),
+        ("ppo", "auto", None),
+        ("ppo --engine library", "library", "library"),
+        ("ppo -params engine:compiled", "compiled", "compiled"),
+        ("double_dqn", None, None),
+        ("qlearning", None, None),
     ],
 )
 def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(
     words, search, retest, tmp_path
 ):
-    tuning = tuned(*words)
+    tuning = tuned("--algo", *words.split())
     entry = {"n_timesteps": 10, **tuning.agent.settings}
     run = planned_run(tuning, tmp_path, entry, seed=0)
     assert run.spec.hyperparams.algorithm.get("engine") == search
@@ -388,7 +290,7 @@ def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(
 
 def answer(module, words, capsys):
     with pytest.raises(SystemExit) as end:
-        module.build_parser().parse_args(words.split())
+        module.build_parser().parse_args(words.split(" "))
     err = capsys.readouterr().err
     assert (end.value.code, err.count("\n")) == (2, 1)
     return err
@@ -399,51 +301,33 @@ def answer(module, words, capsys):
     [
         (TRAIN, "--lr 0.1", "behind -params: -params learning_rate:0.1 "),
         (TRAIN, "--learning-rate 0.1 --algo qlearning", "-params learning_rate:0.1 "),
-        (TRAIN, "--gamma", "-params gamma:VALUE "),
         (TRAIN, "--gamma --seed 3", "-params gamma:VALUE "),
         (TRAIN, "--alpha 0.1 --algo qlearning", "-params learning_rate:0.1 "),
         (TRAIN, "--alpha 0.1 --algo linucb", "-params alpha:0.1 "),
         (TRAIN, "--epsilon 0.1 --algo dqn", "-params exploration_final_eps:0.1 "),
-        (TRAIN, "--epsilon 0.1 --algo epsilon_greedy", "-params exploration_"),
-        (TRAIN, "--tie-breaking first --algo qlearning", "-params tie_breaking:first "),
         (TRAIN, "--n-steps 128", "-params n_steps:128 "),
         (TRAIN, "--n-steps 128 --algo qlearning", "did you mean '--n-timesteps'?"),
         (TRAIN, "--net-arch [64]", '-params policy_kwargs:"dict(net_arch=[64, 64])" '),
         (TRAIN, "--timesteps 5", "did you mean '--n-timesteps'?"),
-        (TRAIN, "--episodes 5", "did you mean '--n-episodes'?"),
-        (TRAIN, "--algorithm dqn", "did you mean '--algo'?"),
         (TRAIN, "--num_threads 2", "did you mean '--num-threads'?"),
-        (TRAIN, "--folder x", "did you mean '--log-folder'?"),
         (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
-        (TRAIN, "--n-jobs 2", "not searched for here"),
         (TRAIN, "--wandb-entity=me", "-tb DIR writes TensorBoard logs"),
-        (ENJOY, "--render-mode human", "did you mean '--render'?"),
+        (TRAIN, "a\nb", "unknown argument "),
         (ENJOY, "--log-folder x", "did you mean '--folder'?"),
         (ENJOY, "--video x.gif", "did you mean '--record'?"),
         (ENJOY, "--gamma 0.9", "a matter of training: train with -params gamma:VALUE "),
         (COMPARE, "--seed 3", "did you mean '--seeds'?"),
-        (COMPARE, "--n-jobs 2", "did you mean '--jobs'?"),
         (COMPARE, "--gamma 0.9 --algos dqn --env x", "-params gamma:VALUE "),
         (COMPARE, "x.yml --gamma 0.9", "-params gamma:0.9 "),
+        (COMPARE, "--see 3", "unknown argument --see"),  # no abbreviation is taken
     ],
 )
 def test_what_was_meant(module, words, meant, capsys):
     assert meant in answer(module, words, capsys)
 
 
-@pytest.mark.parametrize("words", [[""], ["a\nb"], ["--"], ["--lr", "a\nb"], ["-x=\n"], [" "]])
-def test_whatever_is_unknown_is_told_in_one_line(words, capsys):
-    with pytest.raises(SystemExit):
-        TRAIN.build_parser().parse_args([*words, "--nonsense"])
-    err = capsys.readouterr().err
-    assert ": error: unknown argument " in err
-    assert err.count("\n") == 1
-
-
-def test_a_hyperparameter_of_another_agent_is_not_offered_nor_an_abbreviation_taken(capsys):
+def test_a_hyperparameter_of_another_agent_is_not_offered(capsys):
     assert "-params" not in answer(TRAIN, "--batch-size 4 --algo qlearning", capsys)
-    assert COMPARE.build_parser().parse_args(["--seeds", "3"]).seeds == 3
-    answer(COMPARE, "--see 3", capsys)
 
 
 def hyperparameters():
@@ -463,13 +347,8 @@ def test_all_hyperparameters_are_known_by_name():
 def test_other_names_lead_to_names_that_exist():
     meant = {name for names in OTHER_NAMES.values() for name in names}
     assert meant - hyperparameters() == {"n_timesteps", "n_episodes", "n_envs"}
-    for name, known, meant in [
-        ("lr", ["gamma", "learning_rate"], "learning_rate"),
-        ("ALPHA", ["alphas", "learning_rate"], "learning_rate"),
-        ("eps", ["exploration_final_eps", "x"], "exploration_final_eps"),
-        ("alpha", ["alphas", "x"], "alphas"),
-    ]:
-        assert did_you_mean(name, known) == f"did you mean {meant!r}?"
+    assert did_you_mean("ALPHA", ["alphas", "learning_rate"]) == "did you mean 'learning_rate'?"
+    assert did_you_mean("alpha", ["alphas", "x"]) == "did you mean 'alphas'?"
 
 
 # --- what may be typed beside --resume: nothing that the run has already, not even as it has it --
@@ -504,14 +383,14 @@ def flags():
             yield flag, None if action.nargs == 0 else value
 
 
-@pytest.mark.parametrize(("flag", "value"), list(flags()))
-def test_every_flag_beside_resume(type_in_own_folder, own_folder, flag, value):
+def test_every_flag_beside_resume(type_in_own_folder, own_folder):
     (own_folder / "run").mkdir()
-    words = [flag] if value is None else [flag, value]
-    code, _, said = type_in_own_folder("train.py", "--resume", "run", *words)
-    assert (code, said.count("\n")) == (2, 1)
-    refusal = f"{flag} cannot be given with --resume: the run has its own"
-    assert (refusal in said) == (flag not in ALLOWED), said
+    for flag, value in flags():
+        words = [flag] if value is None else [flag, value]
+        code, _, said = type_in_own_folder("train.py", "--resume", "run", *words)
+        assert (code, said.count("\n")) == (2, 1)
+        refusal = f"{flag} cannot be given with --resume: the run has its own"
+        assert (refusal in said) == (flag not in ALLOWED), said
     assert not list((own_folder / "run").iterdir())
 
 
@@ -561,10 +440,5 @@ def test_what_is_said_not_to_be_here_is_answered(capsys):
     refused = [FLAG.findall(theirs) for theirs, here in rows("train") if here.startswith("no")]
     assert len(refused) > 15
     for flag in (flag for flags in refused for flag in flags):
-        with pytest.raises(SystemExit):
-            train.build_parser().parse_args([flag, "1"])
-        err = capsys.readouterr().err
-        assert err.count("\n") == 1
-        assert re.search(rf"unknown argument {flag} 1: .*not", err)
-
+        assert re.search(rf"unknown argument {flag} 1: .*not", answer(train, f"{flag} 1", capsys))
     assert (options(TRAIN) | options(ENJOY)).isdisjoint(INSTEAD)

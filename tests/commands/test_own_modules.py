@@ -1,7 +1,6 @@
 """train.py, enjoy.py and compare.py on agents and environments of a user's own."""
 
 import json
-import re
 import shlex
 import subprocess
 import sys
@@ -197,28 +196,15 @@ def test_the_figures_are_those_of_step(type_windy, own_folder):
     assert "; figures are sampled" in out
     assert f"engine interpreted: {REFUSAL}" in out
     assert "(exact)" not in out
-    assert re.search(r"over \d+ episodes", out)
     info = json.loads((own_folder / "logs/qlearning/Windy-v0_1/run.json").read_text())
     assert info["model_refused"].startswith(REFUSAL)
     assert not info["final"]["exact"]
     # Without wind the corridor takes five steps, and earns 5; with it 20 steps or so.
     assert info["final"]["mean_return"] < 2
     code, out, err = type_windy("enjoy.py", "--n-episodes", "3", "--render", "none")
-    assert (code, err, out.count(REFUSAL)) == (0, "", 1)
-    assert "exact" not in out
+    assert (code, err, out.count(REFUSAL), "exact" in out) == (0, "", 1, False)
     # A planner refuses in one line.
     code, _, err = type_windy("train.py", "--algo", "optimal", "-n", "100")
     assert (code, err.count("\n")) == (2, 1)
     assert f"needs an environment whose transition model is known: {REFUSAL}" in err
     assert not (own_folder / "logs" / "optimal").exists()
-
-
-def test_where_it_does_what_it_says_nothing_is_said(type_windy, own_folder):
-    words = ("-n", "2000", "--seed", "0", "--env-kwargs", "wind:0.0")
-    code, out, err = type_windy("train.py", *words)
-    assert (code, err) == (0, "")
-    assert "not what step does" not in out
-    assert "final return 5.00 (exact)" in out
-    assert "engine compiled" in out
-    info = json.loads((own_folder / "logs/qlearning/Windy-v0_1/run.json").read_text())
-    assert "model_refused" not in info

@@ -75,22 +75,19 @@ def zoo(*commands, cwd):
 
 def compared(folder, name, settings, agents, env_id):
     """Do a study of two seeds; its run folders."""
+    own = {name: {"tuned": False, "policy": "MlpPolicy", **agents[name]} for name in agents}
     study = {
         "seeds": 2,
         "eval_freq": 40,
         "eval_episodes": 3,
-        "settings": {"n_timesteps": 120, **settings},
-        "agents": {
-            name: {"tuned": False, "policy": "MlpPolicy", **own} if own is not None else {}
-            for name, own in agents.items()
-        },
         "environments": [env_id],
+        "settings": {"n_timesteps": 120, **settings},
+        "agents": {**own, **({"qlearning": {}} if "qlearning" in agents else {})},
     }
     (folder / name).write_text(yaml.safe_dump(study))
+    words = ["compare.py", str(folder / name), "--no-report", "-f", str(folder)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            sys, "argv", ["compare.py", str(folder / name), "--no-report", "-f", str(folder)]
-        )
+        patch.setattr(sys, "argv", words)
         assert compare.main() == 0
     return (folder / name).with_suffix("") / "runs"
 
@@ -98,7 +95,7 @@ def compared(folder, name, settings, agents, env_id):
 def test_plots_and_enjoy_of_rl_zoo3_take_the_runs_of_studies(tmp_path):
     """All in one process, since it imports for seconds."""
     shared = {"n_envs": 1, "eval_env_kwargs": {"max_episode_steps": 20}}
-    agents = {"qlearning": None, **LIBRARY}
+    agents = {"qlearning": {}, **LIBRARY}
     lake = compared(tmp_path, "zoo.yml", shared, agents, ENV_ID)
     # Those that act in Box spaces: compared here, plotted and played there.
     short = {"env_kwargs": {"max_episode_steps": 30}}
@@ -122,7 +119,8 @@ def test_plots_and_enjoy_of_rl_zoo3_take_the_runs_of_studies(tmp_path):
         for algo in algos:
             words = ["--algo", algo, "--env", env_id, "-f", runs, "--no-render", "-n", n]
             words += ["--device", "cpu", "--gym-packages", "envs"]
-            commands["enjoy", algo] = ["rl_zoo3.enjoy", *words]
+            best = ["--load-best"] if algo == "crossq" else []  # with its own statistics
+            commands["enjoy", algo] = ["rl_zoo3.enjoy", *words, *best]
     outputs = zoo(*commands.values(), cwd=tmp_path)
     printed = dict(zip(commands, outputs, strict=True))
     assert not any("No data" in printed["train", algo] for algo in axes)

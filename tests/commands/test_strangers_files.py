@@ -7,7 +7,6 @@ import base64
 import json
 import os
 import pickle
-import shutil
 import sys
 import zipfile
 
@@ -17,12 +16,6 @@ import pytest
 import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
 from envs.bandits import log_uniformly
-from pipeline.errors import UserError
-from pipeline.models.choose import model_of_run
-from pipeline.runs import Run
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
-from report.films import episode_in_training
 
 ENV = "SegmentBandit-v0"
 PLAY = ("--render", "none", "--n-episodes", "1")
@@ -114,18 +107,6 @@ def test_a_zip_is_played_trained_further_or_judged(type_in_own_folder, evil_zip,
     check_refused(answer, mark, "ep_info_buffer", "posix.mkdir")
 
 
-def test_a_film_is_made_of_a_copied_study(evil_zip, mark):
-    raw = {"n_timesteps": 8}
-    spec = TrainSpec("ppo", "CartPole-v1", split(raw), raw, 0)
-    shutil.copy(evil_zip, evil_zip.with_name("CartPole-v1.zip"))
-    run = Run(evil_zip.parent, "CartPole-v1")
-    chosen = model_of_run(run.model_path, spec, run)
-    with pytest.raises(UserError) as refused:
-        episode_in_training(chosen, 0, 5)
-    assert not mark.exists()
-    assert "ep_info_buffer" in str(refused.value)
-
-
 # --- statistics and replay buffers ---------------------------------------------------------------
 
 
@@ -148,20 +129,6 @@ def test_a_replay_buffer_beside_the_agent(type_in_own_folder, own_folder, payloa
     (own_folder / "replay_buffer.pkl").write_bytes(payload)
     words = ["--algo", "dqn", "--env", ENV, "-n", "8", "-i", "dqn.zip"]
     check_refused(type_in_own_folder("train.py", *words), mark, "replay_buffer.pkl")
-
-
-def test_a_hand_written_zip_with_a_pickle_in_it(type_in_own_folder, own_folder, payload, mark):
-    run = hand_written_run(own_folder / "gift")
-    text = {":type:": "x", ":serialized:": base64.b64encode(payload).decode()}
-    for changes in ({"verbose": text}, {"predict": 1}, {"invented": 1}):
-        with zipfile.ZipFile(run / f"{ENV}.zip") as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
-        members["data"] = json.dumps({**json.loads(members["data"]), **changes})
-        with zipfile.ZipFile(own_folder / "evil.zip", "w") as archive:
-            for name, content in members.items():
-                archive.writestr(name, content)
-        answer = type_in_own_folder("enjoy.py", "evil.zip", "--env", ENV, *PLAY)
-        check_refused(answer, mark, "cannot be loaded as a random agent")
 
 
 # --- modules that a file asks for ----------------------------------------------------------------

@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import threading
 import zipfile
 from pathlib import Path
 
@@ -15,11 +14,10 @@ import pytest
 from rich.table import Table
 from rich.text import Text
 
-from commands import compare, enjoy, terminal, train
+from commands import compare, enjoy, train
 from commands.cli import go_on_unread, run_command
 from commands.terminal import TextConsole, print_rows, table_console
 from pipeline.errors import UserError, visible
-from pipeline.signs_of_life import Heartbeat
 
 ROOT = Path(__file__).parents[2]
 
@@ -97,28 +95,6 @@ def test_how_a_command_ends_whose_output_is_not_taken(
     assert work == ["done"] * (goes_on or n_lines == 2)
 
 
-def test_a_thread_that_says_how_far_it_is_ends_without_a_word(run):
-    """Where libraries took five seconds to load, `enjoy.py | head -1` played on for nobody."""
-    said, consoles, work = threading.Event(), [], []
-
-    def say():
-        said.set()
-        consoles[0].print("loading")
-
-    def main():
-        consoles.append(TextConsole())
-        heart = Heartbeat(say, 0.01)
-        heart.start()
-        assert said.wait(10)
-        heart.stop()
-        consoles[0].print("loaded")
-        work.append("played")
-        return 1
-
-    assert run(main, errno.EPIPE, 0) == (0, "", "")
-    assert work == []
-
-
 def test_a_mistake_is_told_where_nobody_hears_it(monkeypatch):
     def main():
         raise UserError("wrong")
@@ -153,35 +129,29 @@ def test_where_the_work_is_what_counts_it_goes_on_unread(run, tmp_path, monkeypa
     assert (tmp_path / "film.gif").stat().st_size > 0
 
 
-@pytest.mark.parametrize("words", ["--help", "--list"])
-@pytest.mark.parametrize("is_full", [False, True])
-def test_what_only_prints_says_so_on_a_full_device_and_not_to_a_reader_who_left(words, is_full):
-    command = [sys.executable, str(ROOT / "train.py"), words]
-    if is_full:
-        with open("/dev/full", "w") as full:  # noqa: PTH123  # it is no path
-            done = subprocess.run(
-                command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
-            )
-        assert done.stderr == "train.py: error: No space left on device\n"
-        assert done.returncode == 2
-        return
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, **pipes) as process:
+def test_what_only_prints_says_so_on_a_full_device_and_not_to_a_reader_who_left():
+    command, pipes = [sys.executable, str(ROOT / "train.py"), "--list"], {"stderr": -1}
+    with open("/dev/full", "w") as full:  # noqa: PTH123  # it is no path
+        done = subprocess.run(command, stdout=full, text=True, check=False, **pipes)
+    said = "train.py: error: No space left on device\n"
+    assert (done.returncode, done.stderr) == (2, said)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, **pipes) as process:
         process.stdout.close()
         assert (process.stderr.read(), process.wait(60)) == (b"", 0)
 
 
-@pytest.mark.parametrize("closed", ["<&- >&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
 def test_a_command_does_without_the_streams_that_are_closed(tmp_path, closed):
     command = f'exec "{sys.executable}" "{ROOT / "train.py"}" --help {closed}'
-    result = subprocess.run(
-        ["/bin/sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert (result.returncode, result.stderr) == (0, "")
-    assert ("--algo" in result.stdout) is (">&- " not in f"{closed} ".replace("2>&-", ""))
+    done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert ("--algo" in done.stdout) is (closed == "2>&-")
 
 
 # --- a machine that has no more memory, threads or processes ----------------------------------
+
+
+NO_ROOM = "DefaultCPUAllocator: can't allocate memory:\nyou tried 9 bytes"
 
 
 @pytest.mark.parametrize(
@@ -189,14 +159,7 @@ def test_a_command_does_without_the_streams_that_are_closed(tmp_path, closed):
     [
         (MemoryError(), "this machine gives no more memory"),
         (MemoryError("Unable to allocate 4 GiB"), "no more memory: Unable to allocate 4 GiB"),
-        (
-            RuntimeError("[enforce fail at alloc_cpu.cpp:1]\nDefaultCPUAllocator: can't allocate "),
-            None,
-        ),
-        (
-            RuntimeError("DefaultCPUAllocator: can't allocate memory:\nyou tried 9 bytes"),
-            "no more memory: DefaultCPUAllocator: can't allocate memory: you tried 9 bytes",
-        ),
+        (RuntimeError(NO_ROOM), "no more memory: DefaultCPUAllocator: can't allocate memory: you"),
         (ImportError("libtorch.so: failed to map segment from shared object"), "no more memory: "),
         (RuntimeError("can't start new thread"), "no more threads or processes: "),
         (RuntimeError("a bug"), None),
@@ -207,49 +170,22 @@ def test_what_runs_out_is_named_and_a_bug_is_not_hidden(error, line, capsys):
     def main():
         raise error
 
-    if line is None:
-        with pytest.raises(type(error)):
-            run_command(main)
-        return
-    with pytest.raises(SystemExit) as stop:
+    with pytest.raises(type(error) if line is None else SystemExit) as stop:
         run_command(main)
-    said = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert line in said
-    assert said.count("\n") == 1
+    if line is not None:
+        said = capsys.readouterr().err
+        assert (stop.value.code, said.count("\n")) == (2, 1)
+        assert line in said
 
 
 # --- terminals whose encoding has few signs ----------------------------------------------------
 
 
-ANGLE = ["--algo", "angle", "--env", "CartPole-v1"]
 STUDY = (
     "title: Größer als ∞?\nseeds: 2\nn_episodes: 30\n"
     "agents: {Ärger 日本: {algo: qlearning}, sarsa: {sweep: {gamma: [0.5]}}}\n"
     "environments: {'Eis, glatt': {id: FrozenLake-v1}}\n"
 )
-
-
-def test_what_is_printed_where_signs_are_lacking(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    Path("länge.yml").write_text(STUDY, encoding="utf-8")
-
-    def printed(module, *words):
-        stream = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
-        monkeypatch.setattr(sys, "stdout", stream)
-        monkeypatch.setattr(sys, "argv", [module.__name__, *words])
-        with pytest.raises(SystemExit) as stop:
-            run_command(module.main)
-        assert stop.value.code == 0
-        stream.flush()
-        return stream.buffer.getvalue().decode("cp1252")
-
-    assert re.search(r"over \d+ episodes", printed(train, *ANGLE, "--seed", "0", "-n", "300"))
-    assert " ± " in printed(enjoy, *ANGLE, "--render", "none", "--n-episodes", "2")
-    out = printed(compare, "länge.yml", "--no-report", "-f", "studies")
-    assert "Größer als inf?" in out
-    assert "gamma = 0.5" in out
-    assert Path("studies", "länge", "runs", "Ärger_日本", "Eis,_glatt_2").is_dir()
 
 
 def test_a_machine_that_knows_ascii_alone(tmp_path):
@@ -310,7 +246,7 @@ def test_the_console_obeys_its_own_colours_alone(is_terminal):
     assert ("\x1b[31m" in printed) is is_terminal
 
 
-@pytest.mark.parametrize("text", ["[/]", "[link=https://a.b]c[/link]", "[red]d[/red]", ":bomb:"])
+@pytest.mark.parametrize("text", ["[/]", "[link=https://a.b]c[/link]", ":bomb:"])
 def test_no_text_is_markup(text, capsys):
     for console in (TextConsole(force_terminal=True, width=80, _environ={}), table_console()):
         table = Table(text, title=text, caption=text)
@@ -323,28 +259,18 @@ def test_no_text_is_markup(text, capsys):
         assert "\x1b]8" not in out
 
 
-def test_no_command_prints_by_another_console():
-    for path in Path(terminal.__file__).parent.glob("*.py"):
-        assert not re.search(r"(?<!Text)\bConsole\(", path.read_text().replace("(Console)", ""))
-
-
 TEXT = json.dumps(HOSTILE)  # which YAML reads as JSON does
 LAST = "environments: [FrozenLake-v1]\n"
 STUDIES = [
     f"agents: {{{TEXT}: }}\n{LAST}",
-    f"agents: {{{TEXT}: {{algo: sarsa}}}}\n{LAST}",
     f"agents: [sarsa]\nenvironments: {{{TEXT}: {{id: FrozenLake-v1}}}}\n",
     f"title: {TEXT}\nagents: [sarsa]\n{LAST}",
-    f"description: {TEXT}\nagents: [sarsa]\n{LAST}",
     f"agents: [qlearning]\nenvironments: [{TEXT}]\n",
     f"{TEXT}: 1\n",
-    f"metric: {TEXT}\n",
     f"agents: {{qlearning: {{callback: {TEXT}}}}}\n{LAST}",
 ]
 NAMED = [
     (enjoy, f"{HOSTILE}.zip"),
-    (enjoy, f"{HOSTILE}.yml"),
-    (compare, f"{HOSTILE}.zip"),
     (compare, f"{HOSTILE}.yml"),
     (compare, "--logged", "log.csv", "--policy", "uniform"),
     (train, *LAKE, "--conf-file", HOSTILE),

@@ -12,7 +12,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from rich.console import Console
-from stable_baselines3 import A2C, DQN
+from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import set_random_seed
@@ -21,25 +21,23 @@ import agents
 import enjoy
 from agents import ALGORITHMS, load_algorithm
 from agents.common.model_files import JsonAlgorithm
-from envs.wrappers import ActionMasks, has_masks
+from envs.wrappers import ActionMasks
 from pipeline import training
 from pipeline.agent_settings import check_fit
 from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.policies import has_memory, player, policy_matrix
+from pipeline.evaluation.policies import policy_matrix
 from pipeline.evaluation.sampled import evaluate
 from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.models.load import (
     load_model,
     load_replay_buffer,
     load_to_play,
-    own_classes,
 )
 from pipeline.playing import play_episodes, playing_env
-from pipeline.settings.components import build_algorithm_kwargs, default_policy
+from pipeline.settings.components import build_algorithm_kwargs
 from pipeline.settings.hyperparams import split
-from pipeline.user_modules import import_typed
 from tests.pipeline.short_runs import LAKE, SWING, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
 
@@ -97,21 +95,17 @@ def test_all_of_them_are_tried():
 
 @pytest.mark.parametrize(
     ("name", "more"),
-    [
-        *((name, {}) for name in CASES),
-        ("double_dqn", {"mask_actions": True}),
-    ],
+    [*((name, {}) for name in CASES), ("double_dqn", {"mask_actions": True})],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
 )
 def test_a_zip_is_loaded_as_by_the_library(name, more, tmp_path):
     model = made(name, **more).learn(60)
     model.save(tmp_path / "model.zip")
     obs = np.stack([model.observation_space.sample() for _ in range(20)])
-    has_buffer = getattr(model, "replay_buffer", None) is not None
-    if has_buffer:
-        model.save_replay_buffer(tmp_path / "buffer.pkl")
     theirs = type(model).load(tmp_path / "model.zip", made(name, **more).env, device="cpu")
     ours = load_model(name, tmp_path / "model.zip", made(name, **more).env, device="cpu")
-    if has_buffer:
+    if getattr(model, "replay_buffer", None) is not None:
+        model.save_replay_buffer(tmp_path / "buffer.pkl")
         theirs.load_replay_buffer(tmp_path / "buffer.pkl")
         load_replay_buffer(ours, tmp_path / "buffer.pkl")
     ends = [goes_on(loaded, obs) for loaded in (theirs, ours)]
@@ -130,58 +124,23 @@ def changed(path, **changes):
             archive.writestr(name, content)
 
 
-def test_a_function_as_schedule_is_refused_with_the_way_out(tmp_path):
-    path = tmp_path / "model.zip"
-    model = made("ppo")
-    model.learning_rate = lambda progress: 1e-3 * progress
-    model.save(path)
-    with pytest.raises(UserError) as refused:
-        load_model("ppo", path)
-    said = str(refused.value)
-    assert "learning_rate holds a function with its code" in said
-    assert said.endswith("-params learning_rate:3e-4")
-    assert load_model("ppo", path, learning_rate=3e-4).lr_schedule(0.5) == 3e-4
-    # To play, nobody asks for it.
-    assert load_to_play("ppo", path, model.env, "cpu").lr_schedule(0.5) == 0.0
-
-
 HUGE = {"type": "Discrete", "n": 10**9, "start": 0, "rng": None}
-DAMAGE = {
-    "whole numbers": (lambda table: table.to(th.int8), "not of the kind"),
-    "complex": (lambda table: table.to(th.complex128), "not of the kind"),
-    "not a number": (lambda table: table * th.nan, "not finite"),
-    "infinite": (lambda table: table + th.inf, "not finite"),
-    "too small": (lambda table: table[:, :-1], "size mismatch"),
+
+
+# Other attributes in its zip.
+ATTRIBUTES = {
+    "a method": ({"predict": 1}, "sets 'predict', which is no attribute of such an agent"),
+    "its class": ({"__class__": 1}, "sets '__class__', which is no attribute of such an agent"),
+    "no space": ({"observation_space": 3}, "does not say its observation_space"),
+    "a huge space": ({"observation_space": HUGE}, "more than 10,000,000"),
+    "no environment": ({"n_envs": 0}, "is of an agent on .* environments, not on 1 to 100000"),
+    "too many": ({"n_envs": 10**12}, "is of an agent on .* environments, not on 1 to 100000"),
+    "a text": ({"n_envs": "2"}, "is of an agent on .* environments, not on 1 to 100000"),
 }
 
 
-@pytest.mark.parametrize("case", DAMAGE)
-def test_tables_are_finite_numbers_of_the_right_kind_and_shape(case, tmp_path):
-    damage, complaint = DAMAGE[case]
-    model = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0)
-    with th.no_grad():
-        model.policy.q_tables = damage(model.policy.q_tables)
-    model.save(tmp_path / "model.zip")
-    with pytest.raises(UserError, match=complaint):
-        load_model("qlearning", tmp_path / "model.zip")
-
-
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        *(
-            ({key: 1}, f"sets '{key}', which is no attribute of such an agent")
-            for key in ("predict", "no_such_thing", "__class__")
-        ),
-        ({"observation_space": 3}, "does not say its observation_space"),
-        ({"observation_space": HUGE}, "more than 10,000,000"),
-        *(
-            ({"n_envs": n}, r"is of an agent on .* environments, not on 1 to 100000")
-            for n in (0, 10**12, "2")
-        ),
-    ],
-)
-def test_attributes_are_those_of_an_agent_and_of_bearable_size(changes, complaint, tmp_path):
+@pytest.mark.parametrize(("changes", "complaint"), ATTRIBUTES.values(), ids=ATTRIBUTES)
+def test_what_is_damaged_is_refused(changes, complaint, tmp_path):
     path = tmp_path / "model.zip"
     load_algorithm("qlearning")(env="FrozenLake-v1", seed=0).save(path)
     changed(path, **changes)
@@ -189,140 +148,57 @@ def test_attributes_are_those_of_an_agent_and_of_bearable_size(changes, complain
         load_model("qlearning", path)
 
 
-MINE = """
-import agents
-from stable_baselines3 import PPO
-from stable_baselines3.common.torch_layers import FlattenExtractor
-
-agents.register("mine_ppo", f"{__name__}:Mine", actions="Discrete")
-
-
-class Net(FlattenExtractor):
-    pass
-
-
-class Job:
-    pass
-
-
-class Mine(PPO):
-    bonus = 0.5
-
-    def __init__(self, *args, bonus=0.5, **kwargs):
-        self.bonus = bonus
-        super().__init__(*args, **kwargs)
-"""
-
-
-def test_classes_of_the_users_are_admitted_where_the_module_was_typed(own_folder):
-    (own_folder / "mine.py").write_text(MINE)
-    modules = import_typed(["mine"])
-    net = sys.modules["mine"].Net
-    settings = {"policy": "MlpPolicy", "env": "CartPole-v1", "device": "cpu"}
-    settings["policy_kwargs"] = {**TINY, "features_extractor_class": net}
-    for name, more in (("ppo", {}), ("mine_ppo", {"bonus": 0.25})):
-        model = load_algorithm(name)(**settings, **more)
-        model.save(own_folder / "model.zip")
-        loaded = load_model(name, own_folder / "model.zip", modules=modules)
-        assert type(loaded) is type(model)
-        assert type(loaded.policy.features_extractor) is net
-        assert weights(loaded) == weights(model)
-        assert vars(loaded).get("bonus") == more.get("bonus")
-    load_algorithm("ppo")(**settings).save(own_folder / "model.zip")
-    with pytest.raises(UserError, match=r"refers to mine\.Net, .* --gym-packages MODULE"):
-        load_model("ppo", own_folder / "model.zip")
-    # What is no part of a network may not be named, wherever it comes from.
-    assert set(own_classes(load_algorithm("ppo"), modules)) >= {"mine.Net"}
-    assert "mine.Job" not in own_classes(load_algorithm("mine_ppo"), modules)
+def test_tables_are_finite_numbers(tmp_path):
+    model = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0)
+    for factor in (th.nan, th.inf):
+        model.policy.q_tables += factor
+        model.save(tmp_path / "model.zip")
+        with pytest.raises(UserError, match="not finite"):
+            load_model("qlearning", tmp_path / "model.zip")
+        model.policy.q_tables.zero_()
 
 
 # --- algorithms that know nothing of this project ------------------------------------------------
 
 
-class Plain:
-    """As a stranger writes it, without annotations."""
-
-    policy_aliases = {"FirstPolicy": object}  # noqa: RUF012
-
-    def __init__(self, policy, env, weight=0.5, kind="mean", count=3):
-        pass
-
-
-class Rising(DQN):
-    def __init__(self, *args, first=0.5, **kwargs):
-        super().__init__(*args, **kwargs)
-
-
-class OneByOne(A2C):
-    """Takes one observation at a time."""
+def odd_agent(name, answer):
+    """An agent of a stranger's with a way of its own to answer."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        return np.array([int(np.asarray(observation).item()) % 4]), None
+        return answer(observation, state)
+
+    return type(name, (A2C,), {"predict": predict})
 
 
-class Forgetful(A2C):
-    """Remembers how often it was asked."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        return np.zeros(len(observation), int), (state or (0,))
+def one_by_one(observation, _):
+    return np.array([int(np.asarray(observation).item()) % 4]), None
 
 
-class Dice(A2C):
-    """Cannot be told to be deterministic."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        return np.random.default_rng().integers(4, size=len(observation)), None
+def forgetful(observation, state):
+    return np.zeros(len(observation), int), (state or (0,))
 
 
-@pytest.fixture
-def registered():
-    before = dict(agents.ALGORITHMS)
-    for cls in (OneByOne, Forgetful, Dice):
-        agents.register(cls.__name__.lower(), f"{__name__}:{cls.__name__}")
-    yield
-    agents.ALGORITHMS.clear()
-    agents.ALGORITHMS.update(before)
+def dice(observation, _):
+    return np.random.default_rng().integers(4, size=len(observation)), None
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "kwargs", "complaint"),
-    [
-        (Plain, {"wieght": 1}, "unknown hyperparameter 'wieght': did you mean 'weight'?"),
-        (Plain, {"policy": "Frst"}, "unknown policy 'Frst'"),
-        (Rising, {"policy": "MlpPolicy", "gamma": "high"}, "gamma must be a number, not 'high'"),
-        (Rising, {"policy": "MlpPolicy", "seed": 1}, "seed is set by --seed, not here"),
-    ],
-)
-def test_a_wrong_argument_is_told_and_what_has_no_annotation_is_read_as_its_default(
-    algorithm, kwargs, complaint
-):
-    for given, read in (("1e-4", 1e-4), (2, 2.0), ("auto", "auto"), (None, None)):
-        arguments = {"policy": "FirstPolicy", "weight": given}
-        assert build_algorithm_kwargs(Plain, arguments, "plain")["weight"] == read
-    policies = [default_policy(cls, is_dict=is_dict) for cls in (DQN, Plain) for is_dict in (0, 1)]
-    assert policies == ["MlpPolicy", "MultiInputPolicy", "FirstPolicy", "FirstPolicy"]
-    with pytest.raises(UserError) as caught:
-        build_algorithm_kwargs(algorithm, {"policy": "FirstPolicy", **kwargs}, "mine")
-    assert complaint in str(caught.value)
+ODD = {
+    "onebyone": (one_by_one, "predict takes no batch of observations (ValueError)"),
+    "forgetful": (forgetful, "predict remembers what it saw before"),
+    "dice": (dice, "predict draws its actions at random"),
+}
 
 
-@pytest.mark.usefixtures("registered")
-@pytest.mark.parametrize(
-    ("algo", "reason"),
-    [
-        ("onebyone", "predict takes no batch of observations (ValueError)"),
-        ("forgetful", "predict remembers what it saw before"),
-        ("dice", "predict draws its actions at random"),
-    ],
-)
-def test_what_cannot_be_asked_for_all_states_is_sampled(algo, reason, tmp_path):
-    console = Console(record=True, width=200, file=io.StringIO())
+@pytest.mark.parametrize("algo", ODD)
+def test_what_cannot_be_asked_for_all_states_is_sampled(algo, tmp_path, monkeypatch, request):
+    answer, reason = ODD[algo]
+    monkeypatch.setitem(globals(), f"{algo}_agent", odd_agent(algo, answer))
+    agents.register(algo, f"{__name__}:{algo}_agent")
+    request.addfinalizer(lambda: ALGORITHMS.pop(algo))
     fields = {"n_timesteps": 60, "log_folder": tmp_path, "eval_freq": 20, "eval_episodes": 4}
-    spec = spec_for(algo, LAKE, {"policy_kwargs": TINY}, verbose=1, **fields)
-    outcome = training.train(spec, console, {}, "")
-    assert f"evaluations are sampled, not exact: {reason}" in console.export_text()
-    assert not outcome.final.is_exact
-    assert len(outcome.final.returns) == 100
+    outcome, printed = train_to(spec_for(algo, LAKE, {"policy_kwargs": TINY}, verbose=1, **fields))
+    assert f"evaluations are sampled, not exact: {reason}" in printed
+    assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 100)
     with np.load(outcome.run.evaluations_path) as evaluations:
         assert evaluations["results"].shape == (3, 4)
 
@@ -420,50 +296,12 @@ def test_nothing_invalid_is_done_in_training_evaluation_and_play(tmp_path):
     assert [length for _, length in played] == [-total for total, _ in played]
     with pytest.raises(UserError, match="MaskablePPO has to be told which actions are valid, and"):
         next(play_episodes(maskable, make_vec_env(LAKE, 1), 1))
-    deaf = agent_of("random", Corridor())
-    assert player(deaf, corridors(1)) is deaf
     for env_id in ("Told-v0", "Taxi-v4", WAREHOUSE):
-        assert has_masks(gym.make(env_id))
         for name in ("dqn", "ppo_mask"):
             spec = spec_of(name, env_id, mask_actions=True)
             check_fit(spec)
             assert "<ActionMasks" in str(make_single_env(spec))
     assert "ActionMasks" not in str(make_single_env(spec_of("dqn", mask_actions=False)))
-
-
-def test_an_environment_without_masks_is_refused():
-    with pytest.raises(UserError) as caught:
-        check_fit(spec_of("ppo_mask", "CartPole-v1"))
-    (line,) = str(caught.value).splitlines()
-    assert line.startswith(
-        "ppo_mask does not fit CartPole-v1: it needs to be told which actions are valid, by a "
-        "method action_masks() or by info['action_mask']; fitting agents: semi_gradient_sarsa, "
-        "semi_gradient_q, actor_critic, reinforce, dqn, "
-    )
-    assert "ppo_mask" not in line.partition("fitting agents")[2]
-    for env_id in ("CartPole-v1", "FrozenLake-v1"):
-        with pytest.raises(UserError, match=f"^mask_actions: {env_id} has no action masks: neith"):
-            make_single_env(spec_of("dqn", env_id, mask_actions=True), training=True)
-
-
-def test_a_masked_policy_is_the_plain_one_on_what_is_valid():
-    """Leaving actions out of a softmax divides the others by what they add up to."""
-    evaluator = exact_evaluator(spec_of("ppo_mask", "FrozenLake-v1"))
-    env = gym.make("FrozenLake-v1")
-    agent = load_algorithm("ppo_mask")("MlpPolicy", env, seed=0, device="cpu", **SMALL)
-    masks = np.random.default_rng(0).random((16, 4)) < 0.5
-    masks[:, 2] |= ~masks.any(axis=1)
-    obs = evaluator.observations
-    with th.no_grad():
-        tensor, _ = agent.policy.obs_to_tensor(obs)
-        plain = agent.policy.get_distribution(tensor).distribution.probs.numpy()
-    expected = plain * masks / (plain * masks).sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(policy_matrix(agent, obs, False, masks), expected, atol=1e-6)
-    best = policy_matrix(agent, obs, True, masks)
-    assert (best.argmax(axis=1) == expected.argmax(axis=1)).all()
-    with pytest.raises(TypeError, match="MaskablePPO: which actions are valid in each state is"):
-        policy_matrix(agent, obs, deterministic=True)
-    assert evaluator.obstacle(agent) != ""
 
 
 @pytest.mark.parametrize("name", ["qlearning", "dqn", "double_dqn"])
@@ -510,48 +348,6 @@ def test_an_agent_goes_on_with_its_masks_and_is_played_with_them(tmp_path):
 # --- agents with a memory ------------------------------------------------------------------------
 
 
-class Counting(gym.Env):
-    """Rewards the action that is the number of steps done so far; shows nothing."""
-
-    observation_space = spaces.Discrete(1)
-    action_space = spaces.Discrete(20)
-
-    def __init__(self, length):
-        self.length = length
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return 0, {}
-
-    def step(self, action):
-        reward = float(action == self.steps)
-        self.steps += 1
-        return 0, reward, self.steps == self.length, False, {}
-
-
-class Counter:
-    """Acts by how often it was asked since its episode began, which only its state says."""
-
-    num_timesteps = 0
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        state = np.zeros(len(observation), int) if state is None else state
-        actions = np.where(episode_start, 0, state)
-        return actions, actions + 1
-
-
-@pytest.mark.parametrize("ends", [[4], [4, 7, 5]])
-def test_evaluation_and_play_hand_the_state_on(ends):
-    lengths = iter(ends)
-    env = make_vec_env(lambda: Counting(next(lengths)), len(ends))
-    evaluation = evaluate(Counter(), env, 9, 0)
-    assert (evaluation.returns == evaluation.lengths).all()
-    assert sorted(set(evaluation.lengths)) == sorted(ends)
-    if len(ends) == 1:
-        assert list(play_episodes(Counter(), env, 3)) == [(4, 4)] * 3
-
-
 def test_an_agent_with_a_memory_is_judged_by_episodes_and_says_so(tmp_path, monkeypatch, capsys):
     outcome, printed = train_to(spec_of("ppo_lstm", LAKE, tmp_path))
     assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 100)
@@ -564,9 +360,5 @@ def test_an_agent_with_a_memory_is_judged_by_episodes_and_says_so(tmp_path, monk
     assert "(exact)" not in printed
     # Asked for every state at once, it would take them for one after another.
     agent = agent_of("ppo_lstm", LAKE, device="cpu", **AGENTS["ppo_lstm"])
-    assert has_memory(agent)
     with pytest.raises(TypeError, match="RecurrentPPO: it acts by what it remembers"):
         policy_matrix(agent, np.arange(16))
-    outcome, printed = train_to(spec_of("ppo", LAKE, tmp_path))
-    assert outcome.final.is_exact
-    assert "evaluations are" not in printed

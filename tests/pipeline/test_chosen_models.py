@@ -9,6 +9,7 @@ import shutil
 from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -21,15 +22,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
 from pipeline.models.choose import ModelRequest, agent_to_continue, choose_model, model_of_run
-from pipeline.models.find import model_at, replay_buffer_of, run_around, run_of
+from pipeline.models.find import model_at, replay_buffer_of, run_of
 from pipeline.models.load import load_model, load_to_play, with_normalised_rewards
 from pipeline.playing import play_episodes, playing_env
-from pipeline.runs import Run
 from pipeline.settings.yaml import read_saved_settings
 from pipeline.training import prepare
-from tests.pipeline.short_runs import CART, LAKE, spec_of, trained
+from tests.pipeline.short_runs import CART, spec_of, trained
 
 SMALL_A2C = {"policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}
 SMALL_DQN = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 10, "buffer_size": 500}
@@ -144,21 +143,6 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(re
     env = playing_env(chosen, None)
     assert load_to_play("dqn", chosen.path, env).replay_buffer.buffer_size == 1
     env.close()
-
-
-def test_the_kind_of_buffer_follows_the_new_entry_and_none_is_kept_unasked(tmp_path):
-    """Returns of several steps take another kind, which the library writes into the zip."""
-    first = train_to(tmp_path, "dqn", {**SMALL_DQN, "n_steps": 3}, 40, eval_freq=-1)
-    assert not list(first.path.glob("*.pkl"))
-    fields = {"trained_agent": first.model_path, "eval_freq": -1, "save_replay_buffer": True}
-    for n_steps, kind in ((1, "ReplayBuffer"), (2, "NStepReplayBuffer")):
-        run = train_to(tmp_path, "dqn", {**SMALL_DQN, "n_steps": n_steps}, 20, **fields)
-        buffer = read(run.path / "replay_buffer.pkl")
-        assert (type(buffer).__name__, getattr(buffer, "n_steps", 1)) == (kind, n_steps)
-    fields["trained_agent"] = run.model_path
-    said = "holds a NStepReplayBuffer with n_steps 2; these hyperparameters need a ReplayBuffer"
-    with pytest.raises(UserError, match=said):
-        train_to(tmp_path, "dqn", {**SMALL_DQN, "n_steps": 1}, 20, **fields)
 
 
 # --- what was checked is what is loaded, though files are exchanged as soon as they are open -----
@@ -355,16 +339,6 @@ def test_returns_of_rewards_as_training_normalised_them(zoo):
     env.close()
 
 
-def test_arguments_of_the_command_replace_those_of_the_settings(zoo):
-    request = ModelRequest(algo="a2c", env_id=LAKE, log_folder=zoo)
-    chosen = choose_model(request)
-    assert chosen.spec.hyperparams.env_kwargs == {"is_slippery": False}
-    assert exact_evaluator(chosen.spec).yardstick.optimum == 1.0
-    # And those given now come on top.
-    slippery = choose_model(replace(request, env_kwargs={"is_slippery": True}))
-    assert exact_evaluator(slippery.spec).yardstick.optimum < 0.8
-
-
 def test_named_statistics_are_used(zoo, tmp_path):
     """Also where the folder says no more than that two frames are stacked."""
     bare = hub(zoo, tmp_path)
@@ -374,21 +348,6 @@ def test_named_statistics_are_used(zoo, tmp_path):
     whole = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=zoo)
     assert returns_of(named, 5) == returns_of(whole, 5)
     assert choose_model(named).spec.hyperparams.normalize["clip_obs"] == 2.0
-
-
-def test_a_run_without_a_number(zoo, tmp_path):
-    folder = tmp_path / "a2c"
-    write_settings(folder / "CartPole-v1", {"frame_stack": 2}, env="CartPole-v1")
-    run = zoo / "a2c" / "CartPole-v1_1"
-    (folder / "CartPole-v1.zip").write_bytes((run / "CartPole-v1.zip").read_bytes())
-    for number in (0, -1):
-        request = ModelRequest(
-            algo="a2c", env_id="CartPole-v1", log_folder=tmp_path, run_number=number
-        )
-        assert choose_model(request).run == Run(folder, "CartPole-v1")
-    (folder / "CartPole-v1_3").mkdir()
-    with pytest.raises(UserError, match=r"CartPole-v1_3 holds no CartPole-v1\.zip"):
-        choose_model(ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=tmp_path))
 
 
 SAID = ("args.yml", "config.yml")
@@ -417,19 +376,6 @@ def test_what_does_not_go_together(zoo, tmp_path, settings, given, complaint):
     assert "\n" not in str(refused.value)
 
 
-def test_several_models_in_a_folder(zoo, tmp_path):
-    hub(zoo, tmp_path)
-    (tmp_path / "other.zip").touch()
-    with pytest.raises(UserError, match=r"holds a2c-CartPole-v1\.zip, other\.zip: name the zip"):
-        choose_model(ModelRequest(tmp_path))
-    for name in ("CartPole-v1", "Taxi-v4"):
-        write_settings(tmp_path / name, {}, env=name)
-    with pytest.raises(UserError, match="models of CartPole-v1, Taxi-v4: name the zip"):
-        choose_model(ModelRequest(tmp_path))
-    assert run_around(tmp_path / "Taxi-v4.zip") == Run(tmp_path.resolve(), "Taxi-v4")
-    assert run_around(tmp_path / "unknown.zip") is None
-
-
 def read_config(tmp_path, text):
     path = tmp_path / "config.yml"
     path.write_text(text)
@@ -453,11 +399,8 @@ APPLY = "!!python/object/apply:"
         (f"{APPLY}os.system [touch x]", "os.system is not allowed here"),
         (f"{APPLY}collections.OrderedDict [[[a, {APPLY}os.getcwd []]]]", "is not allowed here"),
         ("!!python/object/new:collections.OrderedDict [[[a, 1]]]", "is not allowed here"),
-        ("a: !!python/tuple [1, 2]", "is not allowed here"),
         (f"{APPLY}collections.OrderedDict [[[a, 1], [a, 2]]]", "no OrderedDict of different keys"),
-        (f"{APPLY}collections.OrderedDict [[[a]]]", "no OrderedDict of different keys"),
         (f"{APPLY}collections.OrderedDict [[[[1], 2]]]", "no OrderedDict of different keys"),
-        (f"{APPLY}collections.OrderedDict {{a: 1}}", "no OrderedDict of different keys"),
         (f"{APPLY}collections.OrderedDict x", "no OrderedDict of different keys"),
         (f"&a {APPLY}collections.OrderedDict [[[a, *a]]]", "nested too deeply"),
         ("[1, 2]", "must map names to values"),
@@ -469,52 +412,41 @@ def test_nothing_else_is_admitted(tmp_path, text, complaint):
         read_config(tmp_path, text)
 
 
-def test_each_environment_plays_its_share():
+class Uneven(gym.Env):
+    """The first of them has episodes of one step, the next one's take ten."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+    made = 0
+
+    def __init__(self):
+        self.length = 10**Uneven.made
+        Uneven.made += 1
+
+    def reset(self, *, seed=None, options=None):
+        self.left = self.length
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.left -= 1
+        return np.zeros(1, np.float32), 1.0, self.left == 0, False, {}
+
+
+def test_each_environment_plays_its_share(monkeypatch):
     """Else those would be counted that end first, which are the short ones."""
+    monkeypatch.setattr(Uneven, "made", 0)
+    starts = []
 
-    class Uneven(gym.Env):
-        observation_space = gym.spaces.Box(-1, 1, (1,))
-        action_space = gym.spaces.Discrete(2)
-        made = 0
+    def predict(obs, state, episode_start, deterministic):
+        starts.append(episode_start.tolist())
+        return np.zeros(len(obs), int), state
 
-        def __init__(self):
-            Uneven.made += 1
-            self.length = 10 ** (Uneven.made - 1)
-
-        def reset(self, *, seed=None, options=None):
-            self.left = self.length
-            return np.zeros(1, np.float32), {}
-
-        def step(self, action):
-            self.left -= 1
-            return np.zeros(1, np.float32), 1.0, self.left == 0, False, {}
-
-    class Memory:
-        starts: list = []  # noqa: RUF012
-
-        def predict(self, obs, state, episode_start, deterministic):
-            self.starts.append(episode_start.tolist())
-            return np.zeros(len(obs), int), state
-
-    env = make_vec_env(Uneven, 2)
-    assert [length for _, length in play_episodes(Memory(), env, 5)] == [1, 1, 10, 10, 10]
+    memory, env = SimpleNamespace(predict=predict), make_vec_env(Uneven, 2)
+    assert [length for _, length in play_episodes(memory, env, 5)] == [1, 1, 10, 10, 10]
     # An agent with a memory is told which of the episodes begin.
-    assert Memory.starts[:2] == [[True, True], [True, False]]
-    assert [start for _, start in Memory.starts].count(True) == 3
-    assert len(list(play_episodes(Memory(), env, None, 6))) == 3
-
-
-@pytest.mark.parametrize(
-    "settings", ["{eval_env_kwargs: 5}", "{normalize: [1]}", "{frame_stack: x}"]
-)
-def test_settings_that_make_no_sense(zoo, tmp_path, settings):
-    folder = hub(zoo, tmp_path, "args.yml")
-    (folder / "config.yml").write_text(settings)
-    with pytest.raises(UserError, match=settings.strip("{").partition(":")[0]):
-        choose_model(ModelRequest(folder, env_kwargs={"sutton_barto_reward": True}))
-    (folder / "run.json").write_text('{"env_name": "X", "spec": {"algo": 1, "hyperparams": 7}}')
-    with pytest.raises(UserError, match="say what it is with --algo"):
-        choose_model(ModelRequest(folder / "a2c-CartPole-v1.zip"))
+    assert starts[:2] == [[True, True], [True, False]]
+    assert [start for _, start in starts].count(True) == 3
+    assert len(list(play_episodes(memory, env, None, 6))) == 3
 
 
 @pytest.mark.parametrize("name", ["../elsewhere", "/etc", "..", "", None])

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from rich.console import Console
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -14,21 +13,18 @@ from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
-    training_changes,
     training_kwargs,
     trains_on_variant,
     with_logs_located,
     with_maps_read,
 )
 from pipeline.errors import UserError
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
-from pipeline.training import train
+from tests.pipeline.short_runs import CART, trained
+from tests.pipeline.short_runs import spec_of as spec_for
 
 
-def spec_of(env_id, entry=None, **kwargs):
-    entry = {"n_timesteps": 100, **(entry or {})}
-    return TrainSpec("random", env_id, split(entry), entry, seed=0, **kwargs)
+def spec_of(env_id, entry=None):
+    return spec_for("random", env_id, entry)
 
 
 def layers(env):
@@ -111,21 +107,6 @@ def test_what_makes_training_returns_those_of_a_variant(entry, is_variant):
     assert trains_on_variant(spec_of("Warehouse-v0", entry)) is is_variant
 
 
-CLIPPED = {"gymnasium.wrappers.ClipReward": {"min_reward": -10, "max_reward": 0}}
-
-
-def test_what_settings_change_for_training_in_words():
-    random = {"random_start": True, "max_episode_steps": 100, "slip": 0.0, **SHAPED}
-    clipped = {"gymnasium.wrappers.ClipReward": {"min_reward": -10, "max_reward": 0}}
-    entry = {"env_kwargs": {"goal_reward": 50}, "normalize": True, "train_env_kwargs": random}
-    assert training_changes(spec_of("Warehouse-v0", entry)) == (
-        *("random starts", "episodes of 100 steps", "shelf_reward -10"),
-    )
-    entry = {"train_env_wrapper": [clipped, SCALED, "envs.wrappers.ActionMasks"]}
-    words = ("rewards clipped at -10 and 0", "rewards x 0.01", "ActionMasks")
-    assert training_changes(spec_of("Warehouse-v0", entry)) == words
-
-
 # --- time limits ---------------------------------------------------------------------------------
 
 
@@ -145,10 +126,10 @@ def test_what_settings_change_for_training_in_words():
 )
 def test_evaluation_always_has_a_time_limit(env_id, entry, training, evaluation):
     spec = spec_of(env_id, entry)
-    assert time_limit(make_single_env(spec, training=True)) == training
-    assert time_limit(make_single_env(spec)) == evaluation
-    assert time_limit(make_training_env(spec, None).envs[0]) == training
-    assert time_limit(make_evaluation_env(spec, 1).envs[0]) == evaluation
+    made = make_single_env(spec, training=True), make_training_env(spec, None).envs[0]
+    assert [time_limit(env) for env in made] == [training] * 2
+    made = make_single_env(spec), make_evaluation_env(spec, 1).envs[0]
+    assert [time_limit(env) for env in made] == [evaluation] * 2
 
 
 # --- wrappers ------------------------------------------------------------------------------------
@@ -209,9 +190,6 @@ def test_normalisation_learns_in_training_alone_and_rewards_are_evaluated_as_the
     assert type(plain) is DummyVecEnv
 
 
-# --- names ---------------------------------------------------------------------------------------
-
-
 # --- files that arguments name -------------------------------------------------------------------
 
 ROWS = ["S..", ".#.", "..G"]
@@ -225,12 +203,12 @@ def map_file(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("map_file")
 @pytest.mark.parametrize("env_id", ["Warehouse-v0", "MineMaze-v0", "envs:Warehouse-v0"])
-@pytest.mark.parametrize("key", ["env_kwargs", "train_env_kwargs", "eval_env_kwargs"])
-def test_a_maps_rows_take_the_place_of_its_path(env_id, key):
-    settings = {"gamma": 0.9, key: {"desc": "map.txt", "slip": 0.1}}
-    read = {"gamma": 0.9, key: {"desc": ROWS, "slip": 0.1}}
-    assert with_maps_read(env_id, settings) == with_maps_read(env_id, read) == read
-    assert settings[key]["desc"] == "map.txt"
+def test_a_maps_rows_take_the_place_of_its_path(env_id):
+    for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
+        settings = {"gamma": 0.9, key: {"desc": "map.txt", "slip": 0.1}}
+        read = {"gamma": 0.9, key: {"desc": ROWS, "slip": 0.1}}
+        assert with_maps_read(env_id, settings) == with_maps_read(env_id, read) == read
+        assert settings[key]["desc"] == "map.txt"
     assert with_maps_read("FrozenLake-v1", settings) == settings
     with pytest.raises(UserError, match=r"Warehouse-v0: desc: cannot read the map file no\.txt"):
         with_maps_read("Warehouse-v0", {"env_kwargs": {"desc": "no.txt"}, "eval_env_kwargs": None})
@@ -248,42 +226,34 @@ def test_a_log_is_found_from_other_folders(tmp_path):
 # --- memory --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("key", "wrapper", "argument"),
-    [
-        ("env_wrapper", "gymnasium.wrappers.FrameStackObservation", "stack_size"),
-        ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecFrameStack", "n_stack"),
-    ],
-)
-def test_stacks_of_wrappers_are_bounded(key, wrapper, argument):
-    spec = spec_of("CartPole-v1", {key: {wrapper: {argument: 10**9}}})
-    with pytest.raises(UserError, match=f"{argument} must be at most 10,000"):
-        make_evaluation_env(spec, 1)
+def greedy():
+    """An environment that asks for more than there is."""
+    return np.empty(2**50)
 
 
-class Greedy(gym.Env):
-    def __init__(self):
-        np.empty(2**50)
+STACK = {"env_wrapper": {"gymnasium.wrappers.FrameStackObservation": {"stack_size": 10**9}}}
+VEC_STACK = {
+    "vec_env_wrapper": {"stable_baselines3.common.vec_env.VecFrameStack": {"n_stack": 10**9}}
+}
 
 
 @pytest.mark.parametrize(
-    ("algo", "entry", "said"),
+    ("env_id", "entry", "said"),
     [
-        ("ppo", {"n_envs": 10**9}, "n_envs 1,000,000,000 would take 18,626 GB of memory at least"),
-        ("ppo", {"n_steps": 10**12}, "Unable to allocate"),
-        ("ppo", {"policy_kwargs": "dict(net_arch=[1000000, 1000000])"}, "allocate memory"),
-        ("ppo", {"env_id": "Greedy-v0"}, r"Greedy-v0: .*allocate"),
+        (CART, STACK, "stack_size must be at most 10,000"),
+        (CART, VEC_STACK, "n_stack must be at most 10,000"),
+        (CART, {"n_envs": 10**9}, "n_envs 1,000,000,000 would take 18,626 GB of memory at least"),
+        (CART, {"n_steps": 10**12}, "Unable to allocate"),
+        (CART, {"policy_kwargs": "dict(net_arch=[1000000, 1000000])"}, "allocate memory"),
+        ("Greedy-v0", {}, r"Greedy-v0: .*allocate"),
     ],
 )
 def test_numbers_beyond_all_memory_end_in_one_line_and_leave_nothing(
-    tmp_path, monkeypatch, algo, entry, said
+    tmp_path, monkeypatch, env_id, entry, said
 ):
-    greedy = gym.envs.registration.EnvSpec("Greedy-v0", Greedy, max_episode_steps=9)
-    monkeypatch.setitem(gym.registry, "Greedy-v0", greedy)
-    raw = {"n_timesteps": 10, **entry}
-    env_id = raw.pop("env_id", "CartPole-v1")
-    spec = TrainSpec(algo, env_id, split(raw), raw, seed=0, log_folder=tmp_path / "logs")
+    spec = gym.envs.registration.EnvSpec("Greedy-v0", greedy, max_episode_steps=9)
+    monkeypatch.setitem(gym.registry, "Greedy-v0", spec)
     with pytest.raises(UserError, match=said) as caught:
-        train(spec, Console(quiet=True), {}, "")
+        trained("ppo", env_id, entry, n_timesteps=10, log_folder=tmp_path / "logs")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "logs").exists()

@@ -4,12 +4,12 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 
@@ -42,6 +42,11 @@ def leave_lock(root, owner, seconds=0.0):
     return path
 
 
+def assert_taken(root, told, say=never):
+    with pytest.raises(locks.FolderInUseError, match=told), lock(root, say=say):
+        never()
+
+
 def files_in(folder):
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
@@ -64,48 +69,22 @@ def test_inside_nobody_else_is_let_in_and_afterwards_nothing_is_left(tmp_path, m
     who = re.escape(f"{root}: process {os.getpid()} on {locks.mark()['host']} is at work")
     for _ in range(2):
         with lock(root):
-            with (
-                pytest.raises(locks.FolderInUseError, match=f"^{who} on it since 20..-"),
-                lock(root),
-            ):
-                never()
+            assert_taken(root, f"^{who} on it since 20..-")
             assert files_in(root) == [LOCK]
         assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_cannot_speak_to_the_terminal(tmp_path):
+    # It cannot speak to the terminal.
     leave_lock(tmp_path, {**locks.mark(), "token": "\x1b[2J", "since": "\x1b]0;taken\x07"})
-    with pytest.raises(locks.FolderInUseError, match=r"since \\x1b\]0;taken\\x07$"), lock(tmp_path):
-        never()
+    assert_taken(tmp_path, r"since \\x1b\]0;taken\\x07$")
 
 
-def test_what_came_into_the_folder_stays_and_it_is_let_go_when_the_work_fails(tmp_path):
-    def fail(root):
-        with lock(root):
-            (root / "summary.csv").touch()
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fail(tmp_path / "study")
-    with lock(tmp_path / "study"):
-        pass
-    assert files_in(tmp_path) == ["study/summary.csv"]
-
-
-OWNERS = {
-    "dead": "dead",
-    "silent": FOREIGN,
-    "empty": "",
-    "half": "{",
-    "list": "[]",
-    "odd": '{"pid": "x"}',
-}
+OWNERS = {"dead": None, "silent": FOREIGN, "empty": "", "half": "{", "list": "[]"}
+OWNERS |= {"odd": '{"pid": "x"}'}
 
 
 @pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
 def test_the_dead_and_the_silent_hold_nothing(tmp_path, owner, dead):
     """A process of this machine is looked for; of what is elsewhere the signs of life count."""
-    if owner == "dead":
+    if owner is None:
         leave_lock(tmp_path, {**dead, "token": "t"})
     else:
         leave_lock(tmp_path, owner, seconds=61)
@@ -115,16 +94,10 @@ def test_the_dead_and_the_silent_hold_nothing(tmp_path, owner, dead):
 
 
 def test_one_elsewhere_that_shows_itself_is_at_work(tmp_path, monkeypatch):
-    path = leave_lock(tmp_path, FOREIGN, seconds=50)
-    monkeypatch.setattr(time, "sleep", lambda seconds: os.utime(path))
-    said = []
-    with (
-        pytest.raises(locks.FolderInUseError, match="on elsewhere is at work"),
-        lock(tmp_path, say=said.append),
-    ):
-        never()
-    (line,) = said
-    assert line.startswith("waiting for a sign of life: ")
+    path, said = leave_lock(tmp_path, FOREIGN, seconds=50), []
+    monkeypatch.setattr(time, "sleep", lambda seconds: os.utime(path))  # its sign of life
+    assert_taken(tmp_path, "on elsewhere is at work", said.append)
+    assert [line.partition(":")[0] for line in said] == ["waiting for a sign of life"]
     assert files_in(tmp_path) == [LOCK]
     monkeypatch.undo()
     monkeypatch.setattr(locks, "SECONDS_OF_SILENCE", 0.05)  # it says no more
@@ -136,49 +109,19 @@ def test_one_elsewhere_that_shows_itself_is_at_work(tmp_path, monkeypatch):
 def test_of_many_at_once_one_gets_the_lock_of_the_dead(tmp_path):
     """Whoever removes the dead one's lock must not remove the next one's."""
     leave_lock(tmp_path, FOREIGN, seconds=61)
-    inside, refused, begin = [], [], threading.Barrier(8)
-    most = []
+    inside, most, begin = [], [], threading.Barrier(8)
 
-    def drive():
+    def drive(_):
         begin.wait()
-        try:
-            with lock(tmp_path):
-                inside.append(1)
-                most.append(len(inside))
-                time.sleep(0.05)
-                inside.pop()
-        except locks.FolderInUseError:
-            refused.append(1)
+        with suppress(locks.FolderInUseError), lock(tmp_path):
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.05)
+            inside.pop()
 
-    threads = [threading.Thread(target=drive) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(drive, range(8)))
     assert set(most) == {1}
-    assert len(most) + len(refused) == 8
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_who_was_killed_while_removing_a_lock_is_in_nobodys_way(tmp_path, monkeypatch):
-    path = leave_lock(tmp_path, FOREIGN, seconds=61)
-
-    def be_killed(found, **options):
-        if found == path or found.name.endswith(".dead.tmp"):
-            raise SystemExit
-        os.unlink(found)  # noqa: PTH108
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "unlink", be_killed)
-        patch.setattr(Path, "rmdir", be_killed)
-        with pytest.raises(SystemExit), lock(tmp_path):
-            never()
-    (grave,) = tmp_path.glob("*.dead.tmp")
-    assert path.exists()
-    then = grave.stat().st_mtime - 9
-    os.utime(grave, (then, then))
-    with lock(tmp_path):
-        pass
     assert list(tmp_path.iterdir()) == []
 
 
@@ -304,57 +247,50 @@ def test_a_run_whose_process_is_gone_was_interrupted(tmp_path, dead):
     for state in ("finished", "failed"):
         assert run_of(tmp_path, dead, state=state).state == state
     assert Run(tmp_path, "Taxi-v4").state is None
+    with pytest.raises(UserError, match="its training was cut off before it was written"):
+        model_of(run_of(tmp_path, dead))
 
 
 DRAFT = f".run.json.{'0' * 16}.tmp"
 
 
+SET_UP = ("0.monitor.csv", "Taxi-v4/config.yml", "Taxi-v4/command.txt", DRAFT, "modules/mine.py")
+KEPT = {
+    "a folder of the user's": lambda path: (path / "notes.txt").mkdir(),
+    "a model": lambda path: (path / "best_model.zip").mkdir(),
+    "settings of the user's": lambda path: (path / "Taxi-v4" / "mine.yml").mkdir(),
+    "a folder among modules": lambda path: (path / "modules" / "sub").mkdir(parents=True),
+    "a link": lambda path: (path / "0.monitor.csv").symlink_to(path.parent),
+    "a damaged record": lambda path: (path / "run.json").write_text("{"),
+}
+
+
+def held_in(run):
+    return sorted(run.path.rglob("*"))
+
+
 def test_a_set_up_that_was_killed_is_cleared_away(tmp_path, dead):
     """But not one that is at work, may be, or holds anything else."""
-    elsewhere = {**dead, "boot": "x", "host": "elsewhere"}
     gone = run_of(tmp_path, dead)
-    (gone.path / "modules").mkdir()
-    names = "0.monitor.csv", "Taxi-v4/config.yml", "Taxi-v4/command.txt", DRAFT, "modules/mine.py"
-    for name in names:
+    for name in SET_UP:
+        (gone.path / name).parent.mkdir(exist_ok=True)
         (gone.path / name).touch()
     claimed = Run(tmp_path / "sarsa" / f".Taxi-v4.{'a' * 16}.tmp", "Taxi-v4")
     claimed.params_path.mkdir(parents=True)
     claimed.info_path.write_text(json.dumps({"state": RUNNING, "process": dead}))
+    elsewhere = {**dead, "boot": "x", "host": "elsewhere"}
     kept = [run_of(tmp_path, process) for process in (locks.mark(), elsewhere, None)]
     kept += [run_of(tmp_path, dead, spec={"algo": "sarsa"})]
-    for name in ("notes.txt", "best_model.zip", "Taxi-v4/mine.yml", "modules/sub"):
+    for put in KEPT.values():
         kept.append(run_of(tmp_path, dead))
-        (kept[-1].path / "modules").mkdir()
-        (kept[-1].path / name).mkdir()
-    kept.append(run_of(tmp_path, dead))
-    (kept[-1].path / "0.monitor.csv").symlink_to(tmp_path)
-    damaged = run_of(tmp_path, dead)
-    damaged.info_path.write_text("{")
-    kept.append(damaged)
-    before = {path for run in kept for path in run.path.rglob("*")}
+        put(kept[-1].path)
+    before = {run.path: held_in(run) for run in kept}
     # Half-written files go where nobody can be writing them.
     ended, busy = (run_of(tmp_path, process, spec={"a": 1}) for process in (dead, locks.mark()))
     for run in (ended, busy):
         for name in (DRAFT, f"Taxi-v4/{DRAFT}", ".mine.tmp", "mine.tmp"):
             (run.path / name).touch()
     remove_leftovers(tmp_path, "sarsa", "Taxi-v4")
-    remove_leftovers(tmp_path / "nowhere", "sarsa", "Taxi-v4")
     assert [len(list(run.path.rglob("*.tmp"))) for run in (ended, busy)] == [2, 4]
-    for run in (ended, busy):
-        shutil.rmtree(run.path)
-    assert sorted((tmp_path / "sarsa").iterdir()) == sorted(run.path for run in kept)
-    assert {path for run in kept for path in run.path.rglob("*")} == before
-
-
-def test_a_training_that_was_killed_is_known_as_interrupted(tmp_path):
-    """By its process: nothing else says so."""
-    code = (
-        "import os, signal, sys; from pathlib import Path; from pipeline.runs import Run\n"
-        "Run.claim(Path(sys.argv[1]), 'sarsa', 'Taxi-v4').update_info(spec={'algo': 'sarsa'})\n"
-        "os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
-    assert done.returncode == -signal.SIGKILL
-    assert Run.find(tmp_path, "sarsa", "Taxi-v4").state == INTERRUPTED
-    with pytest.raises(UserError, match="its training was cut off before it was written"):
-        model_of(Run.find(tmp_path, "sarsa", "Taxi-v4"))
+    assert {*(tmp_path / "sarsa").iterdir()} == {*before, ended.path, busy.path}
+    assert {run.path: held_in(run) for run in kept} == before

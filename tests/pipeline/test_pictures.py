@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from PIL import Image
 
-from mdp import policy_return
 from pipeline import curve_pictures
 from pipeline import map_pictures as drawing
 from pipeline.curve_pictures import draw_learning_curve, read_monitors
@@ -68,23 +66,6 @@ def test_an_action_among_several_best_ones_does_not_differ():
         assert not found.differs.any()
         assert found.values[6] == found.optimal_values[6] == 97
     assert found.optimal_actions[6].tolist() == [True, False, False, True]
-    evaluator, planner = made("MineMaze-v0", "optimal", {"max_episode_steps": 60})
-    planner.plan()
-    assert not value_map(evaluator, planner).differs.any()
-
-
-@pytest.mark.parametrize(
-    ("name", "env_id", "env_kwargs"),
-    [("dqn", LAKE, {}), ("qlearning", LAKE, {}), ("ppo", WAREHOUSE, {"observation": "position"})],
-)
-def test_values_mean_the_same_for_tables_and_networks(name, env_id, env_kwargs):
-    arguments = {"buffer_size": 10} if name == "dqn" else {}
-    evaluator, agent = made(env_id, name, env_kwargs, **arguments)
-    found = value_map(evaluator, agent)
-    actions, _ = agent.predict(evaluator.observations, deterministic=True)
-    assert found.actions.tolist() == actions.tolist()
-    earned = policy_return(evaluator.model, actions, evaluator.horizon).expected_return
-    assert found.values @ evaluator.model.initial == pytest.approx(earned, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -144,20 +125,15 @@ def recorded(recorder):
 
 
 def test_of_very_many_maps_every_second_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(value_maps, "MAX_MAPS", 4)
+    monkeypatch.setattr(value_maps, "MAX_MAPS", 4)  # of which there are soon very many
     evaluator, agent = made(LAKE)
-    for step, expected in [
-        (40, [10, 20, 30, 40]),
-        (50, [20, 40, 50]),
-        (80, [20, 40, 60, 80]),
-        (90, [40, 80, 90]),
-        (170, [80, 160, 170]),
-    ]:
+    for step, expected in ((50, [20, 40, 50]), (80, [20, 40, 60, 80]), (170, [80, 160, 170])):
         recorder = ValueMapRecorder(tmp_path / "maps.npz", evaluator)
         for earlier in range(10, step + 1, 10):
             recorder.record(agent, earlier)
         recorder.finish(agent, step)
-        assert recorded(recorder) == expected
+        with np.load(recorder.path) as file:
+            assert file["timesteps"].tolist() == expected
 
 
 # --- the picture of a map ------------------------------------------------------------------------
@@ -197,54 +173,6 @@ def test_what_stands_in_the_cells_is_what_the_map_says():
     assert sorted(arrows) == right + left
 
 
-SHORT = """79 0 79, -1000 0 -1000, 0.744 2 0.74, -0.004 2 0.00, -0.006 2 -0.01, 57.64 1 57.6,
--718.7 1 -719, 99.46 1 99.5, 99.6 2 100, 9999.4 2 9999, 9999.6 0 10k, -27427 0 -27k, 999499 0 999k,
--999500 0 -1.0M, 0 0 0"""
-
-
-def test_numbers_are_short():
-    for row in SHORT.replace("\n", " ").split(", "):
-        value, decimals, text = row.split()
-        assert drawing.short_number(float(value), int(decimals)) == text.replace("-", MINUS)
-    decimals = [drawing.decimals_for(map_of(*env)) for env in [(WAREHOUSE,), (LAKE,)]]
-    assert [*decimals, drawing.decimals_for(map_of(WAREHOUSE, slip=0.1))] == [0, 2, 1]
-    # Nor is rounding below a scale.
-    values = np.array([0.3, 0.1 + 0.2 - 1e-15, 0.2999, 0.8])
-    assert drawing.is_below(values, Normalize(0.3, 0.7)).tolist() == [False, False, True, False]
-
-
-@pytest.mark.parametrize("desc", [["S..", ".#G"], ["S" + "." * 11, "." * 11 + "G"]])
-def test_rows_and_columns_count_from_one_as_pages_and_advice_do(desc, monkeypatch, tmp_path):
-    figures = []
-    monkeypatch.setattr(drawing, "write_png", lambda figure, path: figures.append(figure))
-    found = map_of(WAREHOUSE, desc=desc)
-    drawing.draw_value_map(tmp_path / "map.png", "title", found)
-    panel, column = figures[0].axes[0], len(desc[0]) - 1
-    labels = panel.get_yticklabels()[-1].get_text(), panel.get_xticklabels()[-1].get_text()
-    assert panel.xaxis.get_ticklocs()[-1] == column
-    expected = f"row {labels[0]}, column {labels[1]}"
-    assert found.layout.place_name(2 * column + 1) == expected == f"row 2, column {column + 1}"
-
-
-@pytest.mark.parametrize(
-    ("env_id", "env_kwargs", "is_wide"),
-    [
-        (WAREHOUSE, {}, True),
-        (WAREHOUSE, {"desc": ["SG"]}, False),
-        ("RandomWarehouse-v0", {"size": 50}, True),
-        ("MineMaze-v0", {}, False),
-    ],
-)
-def test_every_kind_of_map_can_be_drawn(env_id, env_kwargs, is_wide, tmp_path):
-    drawing.draw_value_map(tmp_path / "map.png", "a title", map_of(env_id, **env_kwargs))
-    with Image.open(tmp_path / "map.png") as image:
-        image.load()
-        width, height = image.size
-    assert (width > height) == is_wide
-    assert max(width, height) < 2000
-    assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
-
-
 # --- the learning curve --------------------------------------------------------------------------
 
 
@@ -279,32 +207,14 @@ def write_evaluations(run, results):
     np.savez(run.evaluations_path, timesteps=steps, results=results, ep_lengths=results)
 
 
-@pytest.mark.parametrize("rows", [None, [], [(1.0, 3, 0.1)], [(r, 10, r) for r in range(300)]])
-@pytest.mark.parametrize("is_judged", [True, False])
-def test_the_picture_of_a_run_with_little_or_much_to_show(run, rows, is_judged):
-    if rows is not None:
-        write_monitor(run.path, 0, rows)
-    if is_judged:
-        write_evaluations(run, [[1.0, 2.0]])
-    draw_learning_curve(run, "title")
-    with Image.open(run.curve_path) as image:
-        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
-        assert image.size == (960, 540)
-    for colour, is_there in ((curve_pictures.ORANGE, len(rows or ()) > 1), ("#0072B2", is_judged)):
-        wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-        assert (pixels == wanted).all(axis=1).any() == is_there
-    assert not list(run.path.glob(".*"))
-
-
 @pytest.fixture
 def figure_of(run, monkeypatch):
     """The figure of a run with returns above its optimum."""
     drawn = []
     monkeypatch.setattr(curve_pictures, "write_png", lambda figure, _: drawn.append(figure))
 
-    def figure(judged=True, n_episodes=50, returns=None, **options):
-        returns = [89.0] * n_episodes if returns is None else returns
-        write_monitor(run.path, 0, [(one, 10, i) for i, one in enumerate(returns)])
+    def figure(judged=True, n_episodes=50, **options):
+        write_monitor(run.path, 0, [(89.0, 10, i) for i in range(n_episodes)])
         run.evaluations_path.unlink(missing_ok=True)
         if judged:
             write_evaluations(run, [[70.0], [79.0]])
@@ -323,11 +233,10 @@ JUDGED = ["evaluation, mean return", "optimum", "best random or constant policy"
 EACH, MEAN = "training, each episode", "training, mean of {} episodes"
 
 
-def test_training_on_a_variant_is_drawn_apart_and_else_with_the_evaluations(figure_of, monkeypatch):
+def test_training_on_a_variant_is_drawn_apart_and_else_with_the_evaluations(figure_of):
     upper, lower = figure_of(on_variant=True).axes
     assert (names_in(upper), names_in(lower)) == (JUDGED, [EACH, MEAN.format(50)])
     assert lower.get_title(loc="left") == "training, on a variant of the environment"
-    assert upper.get_title(loc="left") == "title"
     # Steps go together, returns do not.
     assert upper.get_xlim() == lower.get_xlim()
     assert upper.get_ylim()[1] < 89 < lower.get_ylim()[1]
@@ -339,15 +248,3 @@ def test_training_on_a_variant_is_drawn_apart_and_else_with_the_evaluations(figu
         assert names_in(figure_of(**options).axes[0]) == expected
     (axes,) = figure_of(judged=False, on_variant=True).axes
     assert [name.partition(",")[0] for name in names_in(axes)] == ["training on a variant"] * 2
-    monkeypatch.setattr(curve_pictures, "MAX_POINTS", 100)
-    assert "training, 1 episode in 2" in names_in(figure_of(n_episodes=200).axes[0])
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "scale"),
-    [(-790.0, 79.0, "linear"), (-791.0, 79.0, "symlog"), (10, 0, "linear"), (11, 0, "symlog")],
-)
-def test_early_returns_that_dwarf_the_last_are_compressed(figure_of, first, last, scale):
-    (axes,) = figure_of(judged=False, returns=[first, *[last] * 3]).axes
-    assert axes.get_yscale() == scale
-    assert ("log beyond" in axes.get_ylabel()) == (scale == "symlog")

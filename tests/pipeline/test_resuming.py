@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shutil
 import sys
 import zipfile
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch as th
 from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents import ALGORITHMS
 from pipeline import state_files, state_saver
@@ -59,7 +61,6 @@ TRAININGS = [
     ("Warehouse-v0", "q_lambda", 600, {"engine": "interpreted", "n_envs": 3}),
     ("Warehouse-v0", "monte_carlo", 600, {"engine": "interpreted"}),
     (GRID, "off_policy_monte_carlo", 600, {"engine": "compiled", "n_envs": 3}),
-    (LEFT_RIGHT, "qlearning", 600, {"engine": "compiled"}),
     (GRID, "qlearning_ucb", 600, {"value_bound": 1.0}),
     (GRID, "dyna_q", 600, {"outcomes_kept": 3, "n_envs": 2}),
     (GRID, "dyna_q_plus", 600, {"engine": "interpreted"}),
@@ -71,8 +72,8 @@ TRAININGS = [
     # Cut off in the middle of episodes.
     (LEFT_RIGHT, "reinforce", 600, {"engine": "compiled"}),
     (GRID, "reinforce", 600, {"engine": "interpreted", "n_envs": 2}),
-    *((GRID, name, 300, {}) for name in ("value_iteration", "policy_iteration")),
-    *((GRID, name, 300, {}) for name in ("optimal", "random")),
+    *((GRID, name, 300, {}) for name in ("value_iteration", "policy_iteration", "optimal")),
+    (GRID, "random", 300, {}),
     (LEFT_RIGHT, "angle", 300, {}),
     (LEFT_RIGHT, "dqn", 300, {**EAGER, "n_steps": 3, "exploration_fraction": 0.5}),
     (LEFT_RIGHT, "dqn", 300, {**EAGER, **SPARING}),
@@ -80,9 +81,7 @@ TRAININGS = [
     ("Warehouse-v0", "deep_qlearning", 200, {}),
     # Long enough for `auto` to compile it, as a whole and for what is left.
     (GRID, "double_dqn", 5000, EAGER),
-    (LEFT_RIGHT, "ppo", 600, {**SMALL, "learning_rate": "lin_0.001", "clip_range": "lin_0.2"}),
     (SWING, "ppo", 600, {**SMALL, "use_sde": True, "normalize": True, "frame_stack": 2}),
-    (LEFT_RIGHT, "a2c", 600, {}),
     # Cut off in the middle of rollouts, and after some moves of the target network.
     (LEFT_RIGHT, "ppo", 600, {**SMALL, "engine": "compiled", "learning_rate": "lin_0.001"}),
     (LEFT_RIGHT, "ppo", 600, {**SMALL, "engine": "compiled", "normalize": True}),
@@ -233,11 +232,7 @@ def test_every_agent_is_tried():
 
 @pytest.mark.parametrize(
     ("env_id", "algo", "settings"),
-    [
-        (GRID, "qlearning", {"engine": "compiled"}),
-        (GRID, "sarsa", {"engine": "interpreted", "n_envs": 3}),
-        (LINEAR, "linucb", {}),
-    ],
+    [(GRID, "sarsa", {"engine": "interpreted", "n_envs": 3}), (LINEAR, "linucb", {})],
 )
 def test_so_it_is_where_a_trained_agent_goes_on(tmp_path, monkeypatch, env_id, algo, settings):
     begun = carried_out(spec_of(tmp_path / "first", env_id, algo, 200, settings))
@@ -278,10 +273,8 @@ def test_budgets_in_episodes_callbacks_and_checkpoints(tmp_path, monkeypatch, al
         settings |= EAGER
     raw = {**override(read_hyperparams(algo, GRID, None), settings), "n_episodes": 30}
     raw.pop("n_timesteps", None)
-    common = {"verbose": 0, "pictures": False, "save_freq": 50}
-    spec = resolved_spec(
-        raw, algo=algo, env_id=GRID, seed=3, log_folder=tmp_path / "whole", **common
-    )
+    common = {"verbose": 0, "pictures": False, "save_freq": 50, "log_folder": tmp_path / "whole"}
+    spec = resolved_spec(raw, algo=algo, env_id=GRID, seed=3, **common)
     whole = carried_out(spec)
     run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch, every=20)
     again = gone_on(run)
@@ -291,8 +284,6 @@ def test_budgets_in_episodes_callbacks_and_checkpoints(tmp_path, monkeypatch, al
 
 def events(folder):
     """What TensorBoard reads of a folder, but for speeds and durations."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     reader = EventAccumulator(str(folder))
     reader.Reload()
     names = [name for name in reader.Tags()["scalars"] if not name.startswith("time/")]
@@ -301,7 +292,7 @@ def events(folder):
 
 @pytest.mark.parametrize(
     ("algo", "interval", "settings"),
-    [("ppo", -1, SMALL), ("ppo", 3, SMALL), ("a2c", -1, {"n_envs": 1}), ("dqn", -1, EAGER)],
+    [("ppo", 3, SMALL), ("a2c", -1, {"n_envs": 1}), ("dqn", -1, EAGER)],
 )
 def test_logs_go_on_in_their_folder(tmp_path, monkeypatch, algo, interval, settings):
     spec = spec_of(tmp_path / "whole", LEFT_RIGHT, algo, 1500, settings, log_interval=interval)
@@ -342,8 +333,7 @@ def test_the_older_state_serves_where_the_newest_is_damaged(parts):
 
 def test_without_a_state_the_run_begins_anew(parts):
     whole, run = parts
-    for path in run.state_path.iterdir():
-        path.unlink()
+    shutil.rmtree(run.state_path)
     with at_work_on(run, pytest.fail):
         keeping = go_on(run, StateKeeping(), pytest.fail)
         assert (run.path / LOCK).exists()
@@ -419,7 +409,6 @@ def test_the_newest_unfinished_run(tabular, tmp_path):
         ({}, "does not say what it was asked for"),
         ({"env_id": GRID, "hyperparams": [1]}, "run.json is damaged"),
         ({"env_id": "Other-v0", "hyperparams": {}}, "run.json is damaged"),
-        ({"env_id": 3, "hyperparams": {}}, "run.json is damaged"),
     ],
 )
 def test_a_record_that_was_edited_is_refused(tmp_path, spec, said):

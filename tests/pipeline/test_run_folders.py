@@ -1,13 +1,10 @@
 """Run folders: each run has its own and is found again; what it says of its files; whole files."""
 
-import errno
 import hashlib
 import io
 import json
 import math
 import os
-import platform
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -16,9 +13,8 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as np_st
 
 from pipeline import files, runs
 from pipeline.digests import DamagedFileError, read_arrays, read_record, sealed
@@ -48,22 +44,18 @@ def test_runs_are_numbered_from_one_and_gaps_are_not_filled(tmp_path):
     run = Run.claim(tmp_path, "sarsa", "Taxi-v3")
     assert run.path == tmp_path / "sarsa" / "Taxi-v3_1"
     assert names(run.path) == ["Taxi-v3", "run.json"]
-    (tmp_path / "sarsa" / "Taxi-v3_10").mkdir()
-    (tmp_path / "sarsa" / "Taxi-v3_9").mkdir()
+    for number in (10, 9):
+        (tmp_path / "sarsa" / f"Taxi-v3_{number}").mkdir()
     assert claim_names(tmp_path, "Taxi-v3", 2) == ["Taxi-v3_11", "Taxi-v3_12"]
     assert Run.find(tmp_path, "sarsa", "Taxi-v3").path == run.path.with_name("Taxi-v3_12")
     assert Run.find(tmp_path, "sarsa", "Taxi-v3", 1) == run
-    shutil.rmtree(tmp_path / "sarsa" / "Taxi-v3_9")
-    with pytest.raises(UserError, match=r"no run 2 of sarsa on .*: there is 1, 10, 11, 12$"):
+    with pytest.raises(UserError, match=r"no run 2 of sarsa on .*: there is 1, 9, 10, 11, 12$"):
         Run.find(tmp_path, "sarsa", "Taxi-v3", 2)
-    second = Run.find(tmp_path, "sarsa", TAXI)
-    for _ in range(2):
-        second.discard()
+    Run.find(tmp_path, "sarsa", TAXI).discard()
     assert Run.find(tmp_path, "sarsa", TAXI).path.name == "Taxi-v4_1"
 
 
-OTHERS = "Taxi-v4 Taxi-v4_ Taxi-v4_0 Taxi-v4_x Taxi-v4_7_old Taxi-v4_7.zip Taxi-v4_-7 MyTaxi-v4_7 "
-OTHERS += "taxi-v4_7 Taxi-v40_7 Taxi-v4_2_7"
+OTHERS = "Taxi-v4 Taxi-v4_0 Taxi-v4_x Taxi-v4_7_old Taxi-v4_7.zip Taxi-v4_-7 MyTaxi-v4_7 Taxi-v40_7"
 
 
 def test_folders_of_other_names_do_not_count(tmp_path):
@@ -74,8 +66,7 @@ def test_folders_of_other_names_do_not_count(tmp_path):
     assert claim_names(tmp_path, TAXI, 1) == ["Taxi-v4_1"]
 
 
-def test_processes_never_share_a_folder(tmp_path):
-    program = """
+CLAIMS = """
 import sys
 from pathlib import Path
 from pipeline.runs import Run
@@ -84,16 +75,11 @@ sys.stdin.readline()
 for _ in range(25):
     print(Run.claim(Path(sys.argv[1]), "sarsa", "Taxi-v4").path.name)
 """
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", program, str(tmp_path)],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(2)
-    ]
+
+
+def test_processes_never_share_a_folder(tmp_path):
+    words, pipes = [sys.executable, "-c", CLAIMS, str(tmp_path)], {"stdin": -1, "stdout": -1}
+    processes = [subprocess.Popen(words, cwd=ROOT, text=True, **pipes) for _ in range(2)]
     for process in processes:
         assert process.stdout.readline() == "ready\n"
     for process in processes:
@@ -103,28 +89,17 @@ for _ in range(25):
     assert sorted(names) == sorted(f"Taxi-v4_{n}" for n in range(1, 51))
 
 
-def test_what_no_folder_can_be_made_of(tmp_path):
-    (tmp_path / "sarsa").write_text("not a folder")
-    with pytest.raises(UserError, match=f"cannot make a run folder in {tmp_path}/sarsa: "):
-        Run.claim(tmp_path, "sarsa", "Taxi-v4")
-    with pytest.raises(UserError, match=r"cannot make a run folder in .*: File name too long"):
-        Run.claim(tmp_path, "dqn", "Taxi-v4", suffix="x" * 300)
-
-
 def test_runs_with_a_unique_suffix_count_and_are_found(tmp_path):
-    suffixes = [f"_{uuid4()}" for _ in range(2)]
-    for suffix in suffixes:
-        Run.claim(tmp_path, "sarsa", TAXI, suffix)
+    suffix = f"_{uuid4()}"
+    Run.claim(tmp_path, "sarsa", TAXI, suffix)
     newest = Run.find(tmp_path, "sarsa", TAXI)
-    assert (newest.path.name, newest.model_path.name) == (f"Taxi-v4_2{suffixes[1]}", "Taxi-v4.zip")
-    assert Run.find(tmp_path, "sarsa", TAXI, 1).path.name == f"Taxi-v4_1{suffixes[0]}"
-    assert claim_names(tmp_path, TAXI, 1) == ["Taxi-v4_3"]
+    assert (newest.path.name, newest.model_path.name) == (f"Taxi-v4_1{suffix}", "Taxi-v4.zip")
+    assert claim_names(tmp_path, TAXI, 1) == ["Taxi-v4_2"]
 
 
 @pytest.mark.parametrize(
     ("env_id", "name"),
     [
-        ("ALE/Pong-v5", "ALE-Pong-v5"),
         ("envs:Warehouse-v0", "Warehouse-v0"),
         ("ale_py:ALE/Pong-v5", "ALE-Pong-v5"),
         ("Odd.(+)[x]{1}$-v0", "Odd.(+)[x]{1}$-v0"),
@@ -137,8 +112,7 @@ def test_names_of_environments_in_file_names(tmp_path, env_id, name):
     (tmp_path / "sarsa" / "Oddx(+)[x]{1}$-v0_9").mkdir(parents=True)
     assert claim_names(tmp_path, env_id, 2) == [f"{name}_1", f"{name}_2"]
     run = Run.find(tmp_path, "sarsa", env_id)
-    assert run.path.name == f"{name}_2"
-    assert run.path.parent == tmp_path / "sarsa"
+    assert run.path == tmp_path / "sarsa" / f"{name}_2"
     assert run.model_path == run.path / f"{name}.zip"
     assert run.vecnormalize_path == run.path / name / "vecnormalize.pkl"
 
@@ -160,13 +134,6 @@ def test_info_names_the_process_while_it_is_at_work(tmp_path):
     run.update_info(state="finished", final={"mean_return": 7.5})
     expected = {"state": "finished", "seed": 3, "final": {"mean_return": 7.5}}
     assert run.read_info() == json.loads(run.info_path.read_text()) == expected
-
-
-def test_a_machine_is_recorded_without_its_name():
-    machine = runs.recorded_machine()
-    assert machine["system"].startswith(platform.system())
-    assert int(machine["cores"]) >= 1
-    assert platform.node() not in str(machine)
 
 
 # --- the record and the digests ------------------------------------------------------------------
@@ -206,13 +173,12 @@ def test_the_digests_are_those_of_sha256sum_and_the_record_has_its_own(run):
     assert sealed({"state": "running"}) == {"state": "running"}
 
 
-# The last two lose the digests, for which one letter of a name is enough.
+# The last ones lose the digests, for which one letter of a name is enough.
 CHANGES = {
     '"finished"': '"finishee"',
     "0.1": "0.3",
     "Lake-v1/config.yml": "Lake-v1/confic.yml",
     '"run.json"': '"run.jsom"',
-    '"steps"': '"stepz"',
     '"files"': '"file?"',
     '"record_version"': '"record_versio?"',
 }
@@ -225,34 +191,6 @@ def test_a_changed_record_is_refused(run, old):
     run.info_path.write_text(text.replace(old, CHANGES[old]))
     with pytest.raises(DamagedFileError, match=r"run\.json is damaged: it "):
         run.read_info()
-
-
-@pytest.mark.parametrize("field", ["files", "record_version"])
-def test_a_record_that_lost_its_digests_is_no_record_of_an_earlier_version(run, field):
-    record = json.loads(run.info_path.read_text())
-    del record[field]
-    run.info_path.write_text(json.dumps(record))
-    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: it "):
-        run.read_info()
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner),
-    max_leaves=8,
-)
-
-
-@given(content=st.binary(max_size=40) | JSON.map(lambda data: json.dumps(data).encode()))
-def test_any_record_is_read_or_refused_in_one_line(tmp_path_factory, content):
-    path = tmp_path_factory.mktemp("record") / "run.json"
-    path.write_bytes(content)
-    try:
-        found = read_record(path)
-    except DamagedFileError as error:
-        found = error
-    is_one_line = str(found).startswith(f"{path} is damaged: ") and "\n" not in str(found)
-    assert isinstance(found, dict) or is_one_line
 
 
 @pytest.mark.parametrize(
@@ -311,16 +249,6 @@ def test_files_of_the_user_are_nobodys_business(run):
     assert [path.name for path in run.files.matching("*.monitor.csv")] == ["0.monitor.csv"]
 
 
-def test_a_run_of_an_earlier_version_is_taken_as_it_is(tmp_path):
-    run = Run(tmp_path, "Lake-v1")
-    run.update_info(state="finished")
-    (tmp_path / "0.monitor.csv").write_bytes(b"anything")
-    assert run.files.digests is None
-    assert run.files.read(tmp_path / "0.monitor.csv") == b"anything"
-    run.files.check(tmp_path / "0.monitor.csv")
-    assert [path.name for path in run.files.matching("*.csv")] == ["0.monitor.csv"]
-
-
 # --- arrays --------------------------------------------------------------------------------------
 PATH = Path("run/evaluations.npz")
 
@@ -339,30 +267,15 @@ def zipped(members, **options):
     return stream.getvalue()
 
 
+def header(shape):
+    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
 def npy(array):
     stream = io.BytesIO()
     np.save(stream, array)
     return stream.getvalue()
-
-
-@given(
-    array=np_st.arrays(
-        st.sampled_from(["?", "i1", "<u4", ">i8", "<f2", ">f8"]), np_st.array_shapes(min_dims=0)
-    ),
-    is_fortran=st.booleans(),
-    save=st.sampled_from([np.savez, np.savez_compressed]),
-)
-def test_what_numpy_writes_is_read_as_numpy_does(array, is_fortran, save):
-    array = np.asfortranarray(array) if is_fortran and array.ndim else array
-    (found,) = read_arrays(PATH, archive(save, a=array)).values()
-    assert found.dtype == array.dtype
-    assert found.flags.writeable
-    assert np.array_equal(found, array, equal_nan=array.dtype.kind == "f")
-
-
-def header(shape):
-    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
 
 
 GOOD = npy(np.arange(3.0))
@@ -372,18 +285,14 @@ GOOD = npy(np.arange(3.0))
     ("content", "reason"),
     [
         (b"", "not a zip file"),
-        (b"PK\x03\x04", "not a zip file"),
         (archive(a=np.arange(9))[:-30], "not a zip file"),
         (archive(a=np.array([{}], object)), "Object arrays cannot be loaded"),
         (archive(a=np.array(["text"])), "where numbers belong"),
         (archive(a=np.array([1j])), "complex128 where numbers belong"),
-        (archive(a=np.zeros(1, "M8[s]")), "where numbers belong"),
         (archive(a=np.zeros(1, [("x", "f8")])), "where numbers belong"),
         (zipped([("a.txt", b"")]), "what is no array"),
-        (zipped([("a.npy", b"")]), "what is no array"),
         (zipped([("a.npy", b"\x93NUMPY\x03\x00")]), "EOF"),
         (zipped([("a.npy", header("(1000000000000,)"))]), "Unable to allocate|EOF"),
-        (zipped([("a.npy", header("(9000,)") + bytes(8))]), "EOF"),
         (zipped([("a.npy", header("(-1,)") + bytes(8))]), "negative"),
         (zipped([("a.npy", header("(1L,)") + bytes(8))]), "Python 2"),
         (zipped([("a.npy", header("(1") + bytes(8))]), "parse|EOF"),
@@ -395,16 +304,6 @@ def test_anything_else_is_refused_in_one_line(content, reason):
     with pytest.raises(DamagedFileError, match=reason) as caught:
         read_arrays(PATH, content)
     assert str(caught.value).startswith("run/evaluations.npz is damaged: ")
-
-
-def test_a_bomb_is_not_unpacked():
-    small = archive(np.savez_compressed, a=np.zeros(1_000_000))
-    assert read_arrays(PATH, small)["a"].size == 1_000_000
-    bomb = archive(np.savez_compressed, a=np.zeros(10_000_000))
-    with pytest.raises(DamagedFileError, match="would take more memory than 4 times its"):
-        read_arrays(PATH, bomb)
-    # One that is stored as it is may be of any size.
-    assert read_arrays(PATH, archive(a=np.zeros(10_000_000)))["a"].size == 10_000_000
 
 
 # --- files that are there whole, or as before ----------------------------------------------------
@@ -440,45 +339,6 @@ def test_a_writer_that_fails_changes_nothing(tmp_path, error, old):
     assert old is None or path.read_text() == old
 
 
-@pytest.mark.parametrize(
-    ("n_refused", "platform_", "tries"),
-    [(0, "linux", 1), (99, "linux", 1), (0, "win32", 1), (3, "win32", 4), (99, "win32", 6)],
-)
-def test_what_a_scanner_of_windows_holds_is_renamed_soon_or_an_error(
-    tmp_path, monkeypatch, n_refused, platform_, tries
-):
-    tried, replace = [], os.replace
-
-    def refusing(path, target, **folders):
-        tried.append(target)
-        if len(tried) <= n_refused:
-            raise PermissionError(errno.EACCES, "is being used by another process")
-        return replace(path, target, **folders)
-
-    monkeypatch.setattr(os, "replace", refusing)
-    monkeypatch.setattr(files.time, "sleep", lambda seconds: None)
-    monkeypatch.setattr(sys, "platform", platform_)
-    (tmp_path / "draft").write_text("new")
-    if n_refused == 99:
-        with pytest.raises(PermissionError):
-            files.put_in_place(tmp_path / "draft", tmp_path / "file")
-    else:
-        files.put_in_place(tmp_path / "draft", tmp_path / "file")
-        assert (tmp_path / "file").read_text() == "new"
-    assert len(tried) == tries
-
-
-def test_a_folder_that_is_gone_is_not_made_anew(tmp_path):
-    """Some libraries would do that in `write`, and leave a run in two places."""
-    path = tmp_path / "gone" / "a.zip"
-    with (
-        pytest.raises(FileNotFoundError, match="its folder is gone"),
-        files.replacing(path) as draft,
-    ):
-        draft.parent.mkdir()
-    assert not path.parent.exists()
-
-
 # --- names and JSON ------------------------------------------------------------------------------
 DEVICES = {"CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$"}
 DEVICES |= {f"{port}{digit}" for port in ("COM", "LPT") for digit in "0123456789¹²³"}
@@ -498,35 +358,23 @@ def is_acceptable(name):
     )
 
 
-@given(NAMES | st.text(min_size=100, max_size=400))
-@example("COM¹.x")
-def test_a_name_is_one_that_every_system_takes(name):
+@given(NAMES | st.text(min_size=100, max_size=400), NAMES)
+@example("COM¹.x", "com¹.x")
+@example("CON", "con")
+@example("a:", "a?")
+@example("x" * 150, "x" * 151)
+def test_a_name_is_one_that_every_system_takes_and_two_stay_two(name, other):
     portable = files.portable_name(name)
     assert is_acceptable(portable)
     assert files.portable_name(portable) == portable
     assert len(portable.encode()) <= 100
     if is_acceptable(name) and len(name.encode()) <= 100:
         assert portable == name
-
-
-@given(NAMES, NAMES)
-@example("CON", "con")
-@example("a:", "a?")
-@example("a.", "a")
-@example("x" * 150, "x" * 151)
-def test_two_names_stay_two(first, second):
-    assume(first != second)
-    a, b = files.portable_name(first), files.portable_name(second)
+    there = files.portable_name(other)
+    assert (portable == there) == (name == other)
     # Names that a system takes as they are may differ in upper and lower case alone.
-    assert a != b
-    if (a, b) != (first, second):
-        assert a.casefold() != b.casefold()
-
-
-leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
-values = st.recursive(
-    leaves, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=10
-)
+    if name != other and (portable, there) != (name, other):
+        assert portable.casefold() != there.casefold()
 
 
 def strictly(text):
@@ -536,11 +384,6 @@ def strictly(text):
         raise AssertionError(f"{name} is no JSON")
 
     return json.loads(text, parse_constant=refuse)
-
-
-@given(values)
-def test_what_is_written_is_read_again_as_it_was(value):
-    assert strictly(files.json_text(value)) == value
 
 
 def test_what_is_no_json_is_written_as_the_nearest_that_is():

@@ -19,7 +19,6 @@ from pipeline.settings.components import (
     wrapper_factory,
 )
 from pipeline.settings.hyperparams import (
-    Hyperparams,
     check_algorithm_kwargs,
     entry_names,
     read_hyperparams,
@@ -117,14 +116,11 @@ def test_each_text_is_read_or_refused(section, text, mark, expected, tmp_path):
         (b"", ": must map environment ids to hyperparameters"),
         (b"A: " + b"[" * 3000, ":1:53: is nested too deeply, or too large"),
         (b"A: {b: " + b"9" * 5000 + b"}", "is too long for a number"),
-        (b"A: {b: 0x" + b"f" * 5000 + b"}", "is too long for a number"),
         (b"A: {b: " + b":".join([b"1"] * 5000) + b"}", "is too long for a number"),
-        (b"\x00\x01\x02", ": is not a text file"),
-        (b"PK\x03\x04\xff\xfe", ": is not a text file"),
         (b"A: \xff", ": is not a text file"),
         (b"# " + b"x" * 600_000, "is larger than 262,144 bytes"),
     ],
-    ids=["empty", "deep", "9", "0xf", "1:1", "nul", "zip", "latin", "large"],
+    ids=["empty", "deep", "9", "1:1", "latin", "large"],
 )
 def test_a_broken_file_is_told_with_its_place(tmp_path, content, complaint):
     path = tmp_path / "ppo.yml"
@@ -181,10 +177,8 @@ def test_what_is_shared_adds_to_the_depth_too():
     [
         ("(" * 500, "column"),
         ("-" * 9_000 + "1", "cannot be read"),
-        ("a" + ".a" * 4_900, "cannot be read"),
         ("1" * 20_000, "longer than 10000 characters"),
         ("9" * 6_000, "column 1"),
-        ("", "invalid syntax"),
     ],
     ids=lambda text: f"{text[:3]} x {len(text)}",
 )
@@ -198,15 +192,10 @@ def test_long_texts_are_refused_in_one_short_line(text, complaint):
     "text",
     [
         "__import__('os').system('touch {}')",
-        "(lambda: open('{}', 'w'))()",
         "[open('{}', 'w')]",
         "[].__class__.__base__.__subclasses__()",
-        "dict(a=dict.__base__)",
         "[x for x in [open('{}', 'w')]]",
-        "dict(a=open('{}', 'w'))",
         "f\"{{open('{}', 'w')}}\"",
-        "'a'.upper()",
-        "(y := open('{}', 'w'))",
         "a[open('{}', 'w')]",
     ],
 )
@@ -228,27 +217,22 @@ def test_nothing_is_ever_run(text, tmp_path):
         ("learning_rate = 0.1", "learning_rate:0.1"),
         ("learning_rate =0.1", "learning_rate:0.1"),
         ("learning_rate: 0.1 gamma:0.9", "learning_rate:0.1"),
-        ("ent_coef=-1", "ent_coef:-1"),
         ("a=b=c", "a:b=c"),
         ("p=dict(a=[64,8])", "'p:dict(a=[64,8])'"),
         ("learning_rate gamma:0.9", ""),
-        ("gamma", ""),
         ("a-b=1", ""),
     ],
 )
 def test_an_assignment_in_another_spelling_gets_ours(words, meant):
-    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
-        parse_assignments(["gamma:0.9", "gamma:0.8"])
     with pytest.raises(UserError) as raised:
         parse_assignments(words.split())
     hint = str(raised.value).partition("key:value")[2]
     assert hint == (f": did you mean {meant}?" if meant else "")
 
 
-def test_numbers_beyond_all_bounds():
-    assert parse_literal("-1e999") == -math.inf
-    with pytest.raises(UserError, match=r"^here: gamma must be a number, not 1000"):
-        check_algorithm_kwargs({"gamma": 10**400}, PARAMETERS["PPO"], "here")
+def test_one_name_is_given_once():
+    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
+        parse_assignments(["gamma:0.9", "gamma:0.8"])
 
 
 # --- entries and an agent's arguments ------------------------------------------------------------
@@ -284,11 +268,6 @@ LITERALS = st.recursive(
     ),
     max_leaves=15,
 )
-JUNK = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
-    max_leaves=5,
-)
 # What is close to being a literal finds more than plain noise does.
 PIECES = [
     *"()[]{},:='\"1*.#\\\n\x00\ud800",
@@ -317,6 +296,8 @@ def test_a_literal_is_read_back_from_its_repr(value):
 
 @given(st.text() | FRAGMENTS | SCHEDULES, st.binary())
 def test_junk_is_read_or_refused_in_one_line(text, content):
+    with contextlib.suppress(UserError):
+        assert not contains_name(parse_assignments([f"key:{text}"]))
     read_or_refused(parse_literal, text, "here")
     for junk in (text, content):
         read_or_refused(parse_yaml, junk, "here")
@@ -326,34 +307,17 @@ def test_junk_is_read_or_refused_in_one_line(text, content):
         assert math.isfinite(schedule.end)
 
 
-@given(st.lists(st.text() | FRAGMENTS.map("key:{}".format), max_size=3))
-def test_junk_assignments_are_read_or_refused(assignments):
-    with contextlib.suppress(UserError):
-        result = parse_assignments(assignments)
-        assert len(result) == len(assignments)
-        assert not contains_name(result)
-
-
-@given(
-    st.sampled_from(sorted(PARAMETERS["DQN"])),
-    st.sampled_from(sorted(Hyperparams.__dataclass_fields__)),
-    JUNK,
-)
-def test_any_value_is_read_or_refused(argument, key, value):
-    read_or_refused(check_algorithm_kwargs, {argument: value}, PARAMETERS["DQN"], "here")
-    read_or_refused(split, {key: value})
-
-
 # --- hints and errors ----------------------------------------------------------------------------
 
 
-def test_hints_name_the_nearest_else_a_short_list_else_nothing():
-    assert did_you_mean("pppo", ["a2c", "ppo"]) == "did you mean 'ppo'?"
-    assert did_you_mean("PPO", ["a2c", "ppo"]) == "did you mean 'ppo'?"
-    assert did_you_mean("gamme", ["gamma", "gammb"], n=2) in {
-        "did you mean 'gamma' or 'gammb'?",
-        "did you mean 'gammb' or 'gamma'?",
-    }
-    assert did_you_mean("xyz", ["a2c", "ppo"]) == "known are a2c, ppo"
-    assert did_you_mean("xyz", map(str, range(50))) == ""
-    assert did_you_mean("xyz", []) == ""
+@pytest.mark.parametrize(
+    ("name", "known", "hint"),
+    [
+        ("PPPO", ["a2c", "ppo"], "did you mean 'ppo'?"),
+        ("xyz", ["a2c", "ppo"], "known are a2c, ppo"),
+        ("xyz", list(map(str, range(50))), ""),
+        ("xyz", [], ""),
+    ],
+)
+def test_hints_name_the_nearest_else_a_short_list_else_nothing(name, known, hint):
+    assert did_you_mean(name, known) == hint

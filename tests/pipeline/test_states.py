@@ -14,7 +14,6 @@ import random
 import re
 import subprocess
 import sys
-import tempfile
 import threading
 import types
 import weakref
@@ -26,9 +25,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from stable_baselines3 import DQN, HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.utils import set_random_seed
@@ -44,9 +40,6 @@ class Holder:
 
     def __init__(self, **held):
         vars(self).update(held)
-
-    def one(self):
-        return 1
 
     def two(self):
         return 2
@@ -271,12 +264,11 @@ def test_everything_goes_on_as_it_would_have_and_saving_changes_nothing(tmp_path
 
 VALUES = [
     *(Path("/a/b"), re.compile("a+", re.IGNORECASE), np.dtype("int16"), th.float64, th.strided),
-    *(th.device("cpu"), th.Size([2, 3]), slice(1, None, 2), datetime.date(2026, 11, 22), ...),
-    datetime.datetime(2026, 11, 22, 7, 30, 0, 1),
-    datetime.datetime(2026, 11, 22, tzinfo=datetime.UTC),
-    *(datetime.timedelta(3, 4, 5), decimal.Decimal("1.50"), logging.getLogger("a name")),
-    *(np.mean, np.add, th.tanh, types.MappingProxyType({"a": 1}), collections.Counter("aab")),
-    *(collections.OrderedDict(b=1, a=2), Side.LEFT | Side.RIGHT, Side(0), range(1, 9, 2)),
+    *(th.device("cpu"), th.Size([2, 3]), slice(1, None, 2), ..., decimal.Decimal("1.50")),
+    datetime.datetime(2026, 11, 22, 7, 30, 0, 1, tzinfo=datetime.UTC),
+    *(datetime.timedelta(3, 4, 5), logging.getLogger("a name"), np.mean, np.add, th.tanh),
+    *(types.MappingProxyType({"a": 1}), collections.Counter("aab"), range(1, 9, 2)),
+    *(collections.OrderedDict(b=1, a=2), Side.LEFT | Side.RIGHT, Side(0)),
 ]
 
 
@@ -288,24 +280,6 @@ def test_values(tmp_path, value):
     assert found == value
 
 
-@given(
-    st.recursive(
-        st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(),
-        lambda inner: st.lists(inner) | st.tuples(inner) | st.dictionaries(st.text(), inner),
-        max_leaves=20,
-    )
-)
-def test_any_data(tmp_path_factory, data):
-    assert repr(again(data, tmp_path_factory.mktemp("a"))) == repr(data)
-
-
-@given(hnp.arrays(hnp.scalar_dtypes(), hnp.array_shapes(min_dims=0, min_side=0)))
-def test_any_array(tmp_path_factory, values):
-    found = again(values, tmp_path_factory.mktemp("a"))
-    assert (found.dtype, found.shape) == (values.dtype, values.shape)
-    assert found.tobytes() == values.tobytes()
-
-
 def test_zeros_at_the_end_take_no_room(tmp_path):
     buffer = np.zeros((1000, 100))
     buffer[2, 3] = 1.0
@@ -313,56 +287,36 @@ def test_zeros_at_the_end_take_no_room(tmp_path):
     assert (tmp_path / "state").stat().st_size < 4000
 
 
-def test_the_generators_that_libraries_share_stay_theirs(tmp_path):
-    shared = [random.random, np.random.mtrand._rand, th.default_generator]
-    draw, numpy, torch = again(shared, tmp_path)
-    assert draw.__self__ is random.random.__self__
-    assert numpy is shared[1]
-    assert torch is shared[2]
-
-
 SEEN = "now"
 
 
-def test_functions_see_the_names_of_their_module(tmp_path, monkeypatch):
-    found = again(lambda: SEEN, tmp_path)
+def test_functions_see_their_module_and_shared_generators_stay_shared(tmp_path, monkeypatch):
+    shared = [random.random, np.random.mtrand._rand, th.default_generator]
+    see, draw, numpy, torch = again([lambda: SEEN, *shared], tmp_path)
     monkeypatch.setitem(globals(), "SEEN", "later")
-    assert found() == "later"
+    assert see() == "later"
+    assert draw.__self__ is random.random.__self__
+    assert (numpy is shared[1], torch is shared[2]) == (True, True)
 
 
-def test_what_was_added_since_goes_and_what_no_state_keeps_stays_as_it_was_built(tmp_path):
+def test_an_environment_is_filled_in_and_not_made_anew(tmp_path):
+    """What was added since goes; what no state keeps stays as it was built; methods go along."""
+
     class Working(World):
         excluded_from_states = ("room",)
 
-    found = gone_through(Working(a=1, room="old"), Working(a=0, room="new", more=2), tmp_path)
-    assert vars(found) == {"a": 1, "room": "new"}
-
-
-def test_environments_that_functions_hold_are_the_same_objects(tmp_path):
     inner, other = World(position=3), World(position=0)
-    found = gone_through(World(envs=[inner]), World(envs=[other]), tmp_path)
+    original = Working(a=1, room="old", envs=[inner])
+    original.now = Holder.two.__get__(original)
+    built = Working(a=0, room="new", more=2, envs=[other])
+    found = gone_through(original, built, tmp_path)
+    assert found is built
+    assert (found.a, found.room, hasattr(found, "more")) == (1, "new", False)
     assert found.envs[0] is other
     assert other.position == 3
+    assert (found.now(), found.now.__self__ is found) == (2, True)
     added = gone_through(World(envs=[inner]), World(envs=[]), tmp_path)
     assert added.envs[0].position == 3
-
-
-def test_a_method_that_was_put_in_place_of_another(tmp_path):
-    original = World()
-    original.now = Holder.two.__get__(original)
-    found = gone_through(original, other := World(), tmp_path)
-    assert found.now() == 2
-    assert found.now.__self__ is other
-
-
-def test_caches_that_are_lost_are_named():
-    @functools.lru_cache
-    def double(x):
-        return 2 * x
-
-    assert pickled({"it": Holder(cache=double)}).lost == []
-    double(1)
-    assert pickled({"it": Holder(cache=double)}).lost == ["the cache of it.cache"]
 
 
 def test_texts_and_paths_follow_a_folder_that_was_moved(tmp_path):
@@ -397,7 +351,6 @@ def test_what_the_new_training_has_not_is_missed_by_its_place(tmp_path):
     "make",
     [
         lambda: csv.reader(["a", "b"]),
-        tempfile.TemporaryDirectory,
         lambda: subprocess.Popen([sys.executable, "-c", ""]),
         random.SystemRandom,
         lambda: (i for i in range(3)),
@@ -405,30 +358,15 @@ def test_what_the_new_training_has_not_is_missed_by_its_place(tmp_path):
         lambda: th.zeros(2).to_sparse(),
         lambda: Path(__file__).open(),  # noqa: SIM115
     ],
-    ids=["rows", "folder", "process", "entropy", "generator", "memory", "sparse", "file"],
+    ids=["rows", "process", "entropy", "generator", "memory", "sparse", "file"],
 )
 def test_what_cannot_be_kept_is_refused_by_its_place(make):
     value = make()
     with pytest.raises(NotKeepableError, match=r"^it\.held\[0\]: "):
         pickled({"it": Holder(held=[value])})
-    for end in ("wait", "cleanup", "close"):
+    for end in ("wait", "close"):
         if not isinstance(value, types.GeneratorType):
             getattr(value, end, lambda: None)()
-
-
-def test_errors_of_objects_are_told_by_their_place_and_long_chains_are_refused():
-    class Odd:
-        @property
-        def __dict__(self):
-            raise ZeroDivisionError("odd")
-
-    with pytest.raises(NotKeepableError, match=r"^it\.held: ZeroDivisionError: odd$"):
-        pickled({"it": Holder(held=Odd())})
-    chain = None
-    for _ in range(50_000):
-        chain = [chain]
-    with pytest.raises(NotKeepableError, match="too deep"):
-        pickled({"it": chain})
 
 
 @pytest.mark.parametrize("n_steps", [30, 150], ids=["partly full", "round once"])
