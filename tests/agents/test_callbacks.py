@@ -46,12 +46,16 @@ def lake(engine="compiled", n_envs=1, name="qlearning", **kwargs):
 
 def snapshot(model):
     """What a callback can see of the agent."""
-    tables = model.policy.q_tables.numpy().tobytes(), model.policy.visit_counts.numpy().tobytes()
-    counts = model.num_timesteps, model._episode_num, model._n_updates, model.mean_td_error
-    rates = model._current_progress_remaining, model.exploration_rate
-    pending = model._last_obs.tolist(), model._next_actions.tolist()
-    returns = [(info["r"], info["l"]) for info in model.ep_info_buffer]
-    return tables, counts, rates, pending, returns, model.rng.bit_generator.state
+    return {
+        "tables": model.policy.q_tables.numpy().tobytes(),
+        "visits": model.policy.visit_counts.numpy().tobytes(),
+        "generator": model.rng.bit_generator.state,
+        "rates": (model._current_progress_remaining, model.exploration_rate),
+        "counts": (model.num_timesteps, model._episode_num, model._n_updates),
+        "error": model.mean_td_error,
+        "pending": (model._last_obs.tolist(), model._next_actions.tolist()),
+        "returns": [(info["r"], info["l"]) for info in model.ep_info_buffer],
+    }
 
 
 class Recorder(BaseCallback):

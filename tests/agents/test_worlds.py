@@ -4,10 +4,14 @@ import numba
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
+from hypothesis import given
+from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import envs  # noqa: F401  # registers the environments
 from agents.compiled.generators import handles_of, next_uniform, skip_uniform
+from agents.compiled.greedy_play import COMPENSATED_SUM
+from agents.compiled.loop import add_to_return, begin_episode
 from agents.compiled.worlds import (
     CAR_STATE,
     CART_POLE_ENV,
@@ -136,6 +140,41 @@ def test_bins_equal_the_wrappers(kwargs, dims):
     assert indices.tolist() == [env.observation(state) for state in seen]
     np.testing.assert_array_equal(indices, env.map_observations(seen))
     assert len(np.unique(indices)) > 0.8 * env.observation_space.n
+
+
+# --- Monitor's sums -------------------------------------------------------------------------------
+
+
+@numba.njit
+def running_sums(record, rewards, compensated, sums):
+    begin_episode(record)
+    for i in range(len(rewards)):
+        add_to_return(record, rewards[i], compensated)
+        sums[i] = record.episode_return + record.compensation
+
+
+def compensated_sum(values):
+    """Neumaier's sum, which Python's `sum` of floats is from 3.12 on."""
+    total, lost = 0.0, 0.0
+    for value in values:
+        new_total = total + value
+        larger, smaller = (total, value) if abs(total) >= abs(value) else (value, total)
+        lost += (larger - new_total) + smaller
+        total = new_total
+    return total + lost if lost else total
+
+
+def plain_sum(values):
+    return float(np.add.accumulate([0.0, *values])[-1])
+
+
+@given(values=st.lists(st.floats(-1e12, 1e12), max_size=40))
+def test_sums_by_either_rule_and_as_this_python_does(values):
+    rules = ((True, compensated_sum), (False, plain_sum), (COMPENSATED_SUM, sum))
+    for compensated, add_up in rules:
+        sums = np.empty(len(values))
+        running_sums(np.zeros(1, dtype=CART_POLE_ENV)[0], np.array(values), compensated, sums)
+        assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
 
 
 # --- generators ----------------------------------------------------------------------------------
