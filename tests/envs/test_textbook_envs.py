@@ -44,6 +44,20 @@ def test_values_of_short_walks_are_those_of_the_book():
     assert optimum_of("RandomWalk-v0") == pytest.approx(0.5)
 
 
+def test_the_walk_of_a_thousand_states_is_example_9_1():
+    kwargs = {"n_states": 1000, "max_jump": 100, "left_reward": -1}
+    model = model_of("RandomWalk-v0", **kwargs)
+    # From state 1, one jump to the left in two leads beyond the end.
+    assert model.prob[1, 0][model.next_state[1, 0] == 0].sum() == pytest.approx(0.5)
+    assert model.prob[31, 0][model.next_state[31, 0] == 0].sum() == pytest.approx(70 / 200)
+    assert sorted(set(model.next_state[500, 0].tolist())) == [*range(400, 500), *range(501, 601)]
+    values = optimal_values("RandomWalk-v0", **kwargs)[1:1001]
+    # The linear system by itself: each value is the mean of what 200 jumps lead to.
+    padded = np.concatenate([[-1.0] * 100, values, [1.0] * 100])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 201).sum(axis=1)
+    np.testing.assert_allclose(values, (windows - values) / 200, atol=1e-9)
+
+
 @pytest.mark.parametrize("p", [0.05, 0.3, 0.59, 0.95])
 def test_returns_of_the_corridor_are_those_of_the_closed_form(p):
     # Example 13.1: v1 = 1 + p v2 + (1-p) v1, v2 = 1 + p v1 + (1-p) v3, v3 = 1 + (1-p) v2.
