@@ -30,9 +30,9 @@ def feed(agent, obs, action, reward, next_obs, end=""):
 class Told:
     """An agent on some spaces, which learns from what it is told to have done."""
 
-    def __init__(self, name, observations, n_actions=2, **settings):
-        env = Spaces(observations, n_actions)
-        self.agent = load_algorithm(name)(env=env, **{"seed": 0, **settings})
+    def __init__(self, algorithm, observations, n_actions=2, **settings):
+        kind = load_algorithm(algorithm) if isinstance(algorithm, str) else algorithm
+        self.agent = kind(env=Spaces(observations, n_actions), **{"seed": 0, **settings})
         self.agent._begin_episodes()
 
     def step(self, obs, action, reward, next_obs, end=""):

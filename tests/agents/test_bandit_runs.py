@@ -89,12 +89,6 @@ def test_rewards_that_do_not_fit(name, line):
         load_algorithm(name)(env=NORMAL, seed=0).learn(1)
 
 
-def test_mabwisers_coins_are_coins():
-    with pytest.raises(ValueError, match="MABWiserThompson as it is set learns from rewards that"):
-        load_algorithm("mabwiser_thompson")(env=NORMAL, seed=0).learn(10)
-    assert load_algorithm("thompson")(env=NORMAL, likelihood="gaussian").learn(20)._n_updates == 20
-
-
 # --- the compiled batch --------------------------------------------------------------------------
 
 CLICKS = [(COINS, {}), (SEGMENTS, {}), (SEGMENTS, {"batch_size": 7, "pulls": 240})]
@@ -107,18 +101,18 @@ FALLING = {
     "exploration_initial_eps": 0.9,
     "tie_breaking": "first",
 }
+EVERYWHERE, LINEAR = [*NUMBERED, ("LinearBandit-v0", {})], [*CLICKS, ("LinearBandit-v0", {})]
 COVERED = [
-    ("epsilon_greedy", {}, CLICKS),
     ("epsilon_greedy", FALLING, NUMBERED),
-    ("boltzmann", {"temperature": 0.2}, NUMBERED),
-    ("ucb", {}, NUMBERED[2:]),
+    ("boltzmann", {"temperature": 0.2}, NUMBERED[2:]),
     ("ucb", {"variant": "sutton_barto", "tie_breaking": "first"}, NUMBERED),
-    ("gradient_bandit", {}, NUMBERED),
+    ("ucb", {}, NUMBERED[2:]),
+    ("gradient_bandit", {}, NUMBERED[2:]),
     ("gradient_bandit", {"baseline": False, "ignore_context": True}, CLICKS),
     ("thompson", {"likelihood": "gaussian", "ignore_context": True}, NUMBERED),
-    ("linucb", {}, [*NUMBERED, ("LinearBandit-v0", {})]),
-    ("lin_thompson", {"alpha": 0.3, "tie_breaking": "first"}, [*CLICKS, ("LinearBandit-v0", {})]),
-    ("lin_epsilon_greedy", {"exploration_decay": "linear"}, [*CLICKS, ("LinearBandit-v0", {})]),
+    ("linucb", {}, EVERYWHERE),
+    ("lin_thompson", {"alpha": 0.3, "tie_breaking": "first"}, LINEAR),
+    ("lin_epsilon_greedy", {"exploration_decay": "linear"}, LINEAR),
 ]
 COVERED += [
     (name, {}, CLICKS)  # coins alone for some, and what comes later
@@ -141,16 +135,6 @@ def test_a_batch_is_its_runs_one_by_one(name, kwargs, env_id, env_kwargs):
             assert np.array_equal(ours, theirs, equal_nan=ours.dtype.kind == "f"), array
     assert batch.arms.shape == (2, 240)
     assert len(set(batch.arms[0].tolist())) > 1
-
-
-def test_a_run_that_ends_inside_a_batch_of_feedback():
-    """The last pulls have had no feedback then."""
-    for pulls, learnt in ((20, 14), (21, 21), (1000, 1000)):
-        args = ("ucb", {}, SEGMENTS, {"batch_size": 7}, [3])
-        batch, single = run_batch(*args, pulls), run_one_by_one(*args, pulls)
-        assert np.array_equal(batch.estimates, single.estimates, equal_nan=True)
-        agent = load_algorithm("ucb")(env=gym.make(SEGMENTS, batch_size=7), seed=3)
-        assert agent.learn(pulls).policy.counts.sum() == learnt
 
 
 def test_posteriors_at_some_moments():
@@ -234,29 +218,15 @@ def test_ours_and_theirs_pull_the_same_arms(ours, theirs, env_id, kwargs):
     assert len(set(first.arms[0].tolist())) > 2
 
 
-def test_what_mabwiser_has_learnt_is_known():
-    linear = load_algorithm("mabwiser_linucb")(env=make_vec_env(SEGMENTS, seed=0), seed=0)
-    # Core users click on the second treatment, casual ones on the first.
-    assert linear.learn(2000).predict(np.array([0, 1]), deterministic=True)[0].tolist() == [1, 0]
-    coins = load_algorithm("mabwiser_thompson")(env=make_vec_env(COINS, seed=0), seed=0).learn(500)
-    assert coins.predict(0, deterministic=True)[0] == 2
-    won, lost = coins.policy.parts.T
-    assert coins.policy.judged(np.ones((1, 1)))[0] == pytest.approx(won / (won + lost))
-    result = run_one_by_one("mabwiser_ucb1", {}, NORMAL, {}, [3], pulls=12)
-    assert result.arms[0, :10].tolist() == list(range(10))
-
-
 # --- known results -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "kwargs", "mean_loc", "reward", "optimal"),
     [
-        ("epsilon_greedy", {"exploration_initial_eps": 0.01}, 0, 1.321, 60.1),
         ("epsilon_greedy", {"exploration_initial_eps": 0.1}, 0, 1.361, 79.7),
         ("ucb", {"variant": "sutton_barto", "c": 2.0}, 0, 1.491, 85.6),
         ("gradient_bandit", {}, 4, 5.507, 85.3),
-        ("gradient_bandit", {"baseline": False}, 4, 5.215, 49.4),
     ],
 )
 def test_testbed_at_the_last_pull(name, kwargs, mean_loc, reward, optimal):
@@ -266,20 +236,8 @@ def test_testbed_at_the_last_pull(name, kwargs, mean_loc, reward, optimal):
     assert 100 * result.optimal[:, -1].mean() == pytest.approx(optimal, abs=4)
 
 
-@pytest.mark.parametrize(
-    ("name", "kwargs", "env_id", "regret", "tolerance"),
-    [
-        ("thompson", {}, COINS, 14.8, 3.0),
-        ("ucb", {}, COINS, 82.0, 6.0),  # well below Auer's bound of 432.1
-        ("epsilon_greedy", {"exploration_initial_eps": 0.1}, COINS, 275.5, 8.0),
-        ("epsilon_greedy", {"exploration_initial_eps": 1.0}, COINS, 2666.7, 20.0),
-        # What a pooled test loses, and what agents win that look at the segment.
-        ("thompson", {"ignore_context": True}, SEGMENTS, 443, 5),
-        ("thompson", {}, SEGMENTS, 37, 4.5),
-        ("linucb", {"alpha": 1.0}, SEGMENTS, 31, 4.5),
-        ("epsilon_greedy", {"exploration_initial_eps": 1.0}, SEGMENTS, 653, 6),
-    ],
-)
-def test_regrets_of_10_000_pulls(name, kwargs, env_id, regret, tolerance):
-    result = run_batch(name, kwargs, env_id, {"pulls": 10_000}, range(100))
-    assert result.regrets.sum(axis=1).mean() == pytest.approx(regret, abs=tolerance)
+def test_what_a_pooled_test_loses():
+    """Agents that look at the segment win what others lose; a mean of 100 runs of 10,000 pulls."""
+    for kwargs, regret in (({"ignore_context": True}, 443), ({}, 37)):
+        result = run_batch("thompson", kwargs, SEGMENTS, {"pulls": 10_000}, range(100))
+        assert result.regrets.sum(axis=1).mean() == pytest.approx(regret, abs=5)

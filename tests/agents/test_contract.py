@@ -13,15 +13,8 @@ import stable_baselines3
 import torch as th
 from stable_baselines3.common.callbacks import (
     BaseCallback,
-    CallbackList,
-    CheckpointCallback,
-    EvalCallback,
-    LogEveryNTimesteps,
-    StopTrainingOnMaxEpisodes,
-    StopTrainingOnNoModelImprovement,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import envs  # noqa: F401  # registers the environments
@@ -74,7 +67,6 @@ AGENTS = {  # where each is tried, and with which settings other than its own
 }
 PLANNING = {"value_iteration", "policy_iteration", "optimal"}
 ALL = pytest.mark.parametrize("name", AGENTS)
-SOME = pytest.mark.parametrize("name", ["qlearning", "reinforce", "optimal", "angle", "thompson"])
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Training and eval env are not of the same type:UserWarning"
@@ -227,30 +219,6 @@ def test_signatures_name_every_argument(name):
 # --- the library's services ----------------------------------------------------------------------
 
 
-@SOME
-def test_library_callbacks(name, tmp_path):
-    evaluation = EvalCallback(
-        environment(name),
-        eval_freq=50,
-        n_eval_episodes=1,
-        best_model_save_path=str(tmp_path),
-        log_path=str(tmp_path),
-        callback_after_eval=StopTrainingOnNoModelImprovement(2, min_evals=1),
-        verbose=0,
-    )
-    others = [CheckpointCallback(100, str(tmp_path)), LogEveryNTimesteps(100)]
-    model = make(name)
-    model.set_logger(configure(str(tmp_path / "log"), ["csv"]))
-    model.learn(300, callback=CallbackList([evaluation, *others]))
-    model.logger.close()
-    assert {"best_model.zip", "rl_model_100_steps.zip"} < {path.name for path in tmp_path.iterdir()}
-    assert len(np.load(tmp_path / "evaluations.npz")["timesteps"]) >= 2
-    header = (tmp_path / "log" / "progress.csv").read_text().splitlines()[0]
-    assert {"eval/mean_reward", "time/total_timesteps"} < set(header.split(","))
-    model = make(name).learn(10_000, callback=StopTrainingOnMaxEpisodes(max_episodes=3))
-    assert model._episode_num == 3
-
-
 @pytest.mark.parametrize("name", ["sarsa", "actor_critic", "ucb"])
 def test_training_under_other_vec_envs(name):
     forks = {"start_method": "fork"}  # they would import for seconds
@@ -269,6 +237,16 @@ def test_another_environment_is_begun_anew():
     model.set_env(env)
     assert model._last_obs is None
     assert model.learn(100, reset_num_timesteps=False).get_env() is env
+
+
+@pytest.mark.parametrize("name", ["sarsa", "monte_carlo", "actor_critic", "reinforce"])
+def test_a_loaded_agent_can_go_on_in_the_middle_of_episodes(name, tmp_path):
+    env = make_vec_env(LAKE, 2, seed=3)
+    model = load_algorithm(name)(env=env, seed=1, engine="interpreted").learn(50)
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model", env, force_reset=False)
+    assert loaded._last_obs.tolist() == model._last_obs.tolist()
+    assert loaded.learn(50, reset_num_timesteps=False).num_timesteps == 100
 
 
 # --- what files keep -----------------------------------------------------------------------------

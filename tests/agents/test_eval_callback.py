@@ -1,7 +1,5 @@
 """The library's `EvalCallback` beside a compiled training finds what it finds beside any other."""
 
-import copy
-import warnings
 from functools import partial
 
 import gymnasium as gym
@@ -12,9 +10,6 @@ from gymnasium.wrappers import TransformReward
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     EvalCallback,
-    EveryNTimesteps,
-    StopTrainingOnNoModelImprovement,
-    StopTrainingOnRewardThreshold,
 )
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -71,48 +66,34 @@ def python_steps(monkeypatch):
 def found(algo, env_id, engine, folder, kind=EvalCallback, wrapper=None, n_envs=2, **settings):
     """All that an evaluation leaves behind, beside a training that goes on after it."""
     deterministic = settings.pop("deterministic", True)
-    eval_env = make_vec_env(
-        env_id, n_envs, seed=7, wrapper_class=wrapper, monitor_dir=str(folder / "eval")
-    )
+    monitored = {"wrapper_class": wrapper, "monitor_dir": str(folder / "eval")}
+    eval_env = make_vec_env(env_id, n_envs, seed=7, **monitored)
     train_env = make_vec_env(env_id, 2, seed=1, wrapper_class=wrapper)
     model = load_algorithm(algo)(env=train_env, seed=0, engine=engine, **settings)
     model.set_logger(configure(str(folder / "log"), ["csv"]))
-    best, after = Noted(), Noted()
-    callback = kind(
-        eval_env,
-        best,
-        after,
-        n_eval_episodes=5,
-        eval_freq=STEPS // 8,
-        log_path=str(folder),
-        best_model_save_path=str(folder),
-        deterministic=deterministic,
-    )
+    best, after, place = Noted(), Noted(), str(folder)
+    often = {"n_eval_episodes": 5, "eval_freq": STEPS // 8, "deterministic": deterministic}
+    callback = kind(eval_env, best, after, log_path=place, best_model_save_path=place, **often)
     model.learn(STEPS, callback=callback, log_interval=None)
     model.logger.close()
-    monitors = [_monitor(env) for env in eval_env.envs]
-    for monitor in monitors:
-        monitor.results_writer.file_handler.close()
+    eval_env.close()
     with np.load(folder / "evaluations.npz") as file:
         arrays = {name: file[name].tolist() for name in file.files}
     unwrapped = [env.unwrapped for env in eval_env.envs]
     logged = np.genfromtxt(folder / "log" / "progress.csv", delimiter=",", names=True)
     texts = [(folder / "eval" / f"{i}.monitor.csv").read_text() for i in range(n_envs)]
+    names = ("total_steps", "rewards")
+    lists = ("results", "length", "successes", "timesteps")
     return {
-        "attributes": [
-            callback.evaluations_results,
-            callback.evaluations_length,
-            callback.evaluations_successes,
-            callback.evaluations_timesteps,
-            callback._is_success_buffer,
-            (callback.best_mean_reward, callback.last_mean_reward),
-        ],
+        "lists": [getattr(callback, f"evaluations_{name}") for name in lists],
+        "means": (callback.best_mean_reward, callback.last_mean_reward),
+        "successes": callback._is_success_buffer,
         "file": arrays,
         "best model": (folder / "best_model.zip").is_file(),
         "told": (best.seen, after.seen),
         "logged": (logged.dtype.names, logged.tolist()),
         "rows": [[row.split(",")[:2] for row in text.splitlines()[1:]] for text in texts],
-        "monitors": [(monitor.total_steps, monitor.rewards) for monitor in monitors],
+        "monitors": [[env.get_wrapper_attr(name) for name in names] for env in eval_env.envs],
         "states": [np.array(getattr(env, "s", getattr(env, "state", 0))) for env in unwrapped],
         "generators": [env.np_random.bit_generator.state for env in unwrapped],
         "predicting": getattr(model, "predict_rng", model.rng).bit_generator.state,
@@ -120,38 +101,30 @@ def found(algo, env_id, engine, folder, kind=EvalCallback, wrapper=None, n_envs=
     }
 
 
-def _monitor(env):
-    while not hasattr(env, "results_writer"):
-        env = env.env
-    return env
+RANDOMLY = {"deterministic": False}
+TABLES = [
+    ("qlearning", LAKE, None, {}, 1),
+    ("qlearning", LAKE, None, RANDOMLY, 3),
+    ("double_qlearning", WAREHOUSE, None, {**RANDOMLY, "tie_breaking": "first"}, 2),
+    ("sarsa", CART, IN_BINS, {}, 3),
+    ("dyna_q", LAKE, None, {**RANDOMLY, "exploration": "gaussian_noise"}, 1),
+    ("semi_gradient_sarsa", "MountainCar-v0", None, {}, 2),
+]
 
 
-@pytest.mark.parametrize(
-    ("algo", "env_id", "wrapper", "settings", "n_envs"),
-    [
-        ("qlearning", LAKE, None, {}, 1),
-        ("qlearning", LAKE, None, {"deterministic": False}, 3),
-        ("double_qlearning", WAREHOUSE, None, {"deterministic": False, "tie_breaking": "first"}, 2),
-        ("sarsa", CART, IN_BINS, {}, 3),
-        ("dyna_q", LAKE, None, {"deterministic": False, "exploration": "gaussian_noise"}, 1),
-        ("semi_gradient_sarsa", "MountainCar-v0", None, {}, 2),
-    ],
-)
+@pytest.mark.parametrize(("algo", "env_id", "wrapper", "settings", "n_envs"), TABLES)
 def test_tables_find_what_is_found_in_python(
     algo, env_id, wrapper, settings, n_envs, tmp_path, python_steps, capsys
 ):
-    said, results = [], []
+    said, results, kwargs = [], [], {"wrapper": wrapper, "n_envs": n_envs, **settings}
     for engine in ("interpreted", "compiled"):
         python_steps.clear()
-        result = found(
-            algo, env_id, engine, tmp_path / engine, wrapper=wrapper, n_envs=n_envs, **settings
-        )
-        results.append(result)
+        results.append(found(algo, env_id, engine, tmp_path / engine, **kwargs))
         said.append(capsys.readouterr().out)
     np.testing.assert_equal(results[1], results[0])
     assert said[1] == said[0]
     assert "New best mean reward!" in said[0]
-    assert len(results[0]["attributes"][0]) == 4
+    assert len(results[0]["lists"][0]) == 4
     assert not python_steps, "all was played in compiled code"
 
 
@@ -205,9 +178,8 @@ def test_environments_without_monitor_are_counted_as_the_library_counts(tmp_path
         env = gym.make(LAKE)
         env.reset(seed=5)
         callback = EvalCallback(env, eval_freq=100, log_path=str(tmp_path / engine))
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            model.env.seed(0)
+        model.env.seed(0)
+        with pytest.warns(UserWarning, match="Monitor") as caught:
             model.learn(400, callback=callback)
         told.append([(str(w.message), w.category) for w in caught if "Monitor" in str(w.message)])
         results.append((callback.evaluations_results, callback.evaluations_length))
@@ -239,34 +211,3 @@ def test_what_is_not_covered_is_the_librarys(algo, env_id, wrapper, settings, py
     model.learn(250, callback=callback)
     assert python_steps
     assert set(map(id, python_steps)) == {id(eval_env)}
-
-
-STOPS = {
-    "a threshold": {
-        "eval_freq": 50,
-        "callback_on_new_best": StopTrainingOnRewardThreshold(0.2, verbose=0),
-    },
-    "no improvement": {
-        "eval_freq": 50,
-        "callback_after_eval": StopTrainingOnNoModelImprovement(3, 2, verbose=0),
-    },
-    "within another": {
-        "eval_freq": 2,
-        "callback_after_eval": StopTrainingOnNoModelImprovement(2, verbose=0),
-    },
-}
-
-
-@pytest.mark.parametrize("by", STOPS)
-def test_callbacks_within_and_beside_stop_the_training(by, python_steps):
-    stopped = []
-    for engine in ("interpreted", "compiled"):
-        python_steps.clear()
-        env = make_vec_env(LAKE, 1, seed=0)
-        model = load_algorithm("qlearning")(env=env, seed=0, engine=engine, initial_q=1.0)
-        own = copy.deepcopy(STOPS[by])
-        callback = EvalCallback(make_vec_env(LAKE, 1, seed=2), verbose=0, **own)
-        callback = EveryNTimesteps(70, callback) if by == "within another" else callback
-        stopped.append(model.learn(5000, callback=callback).num_timesteps)
-    assert stopped[0] == stopped[1] < 5000
-    assert not python_steps

@@ -63,20 +63,6 @@ def test_a_handler_of_ones_own_is_called_at_once_and_what_it_raises_waits(number
         assert signal.getsignal(number) is handle
 
 
-def test_a_handler_that_raises_nothing_stops_nothing():
-    """What it raises on a second signal does not wait, even if that is its first exception."""
-    handled, seen = [], []
-
-    def handle(number, frame):
-        handled.append(number)
-        if len(handled) > 1:
-            raise KeyboardInterrupt
-
-    with handling(signal.SIGTERM, handle), pytest.raises(KeyboardInterrupt):
-        work_interrupted(signal.SIGTERM, 2, seen)
-    assert seen == [False, False]
-
-
 class Interrupter(BlockCallback):
     """Lets an interrupt come so many seconds of the process's own work after that call."""
 

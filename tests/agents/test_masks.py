@@ -14,16 +14,13 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import envs  # noqa: F401  # registers the environments
 from agents import ALGORITHMS, load_algorithm
 from agents.bandits.algorithm import Pull
-from agents.bandits.runs import run_batch, run_one_by_one
 from agents.bandits.upper_bounds import kl_ucb_index
-from agents.compiled.worlds import NotCompilable
 from agents.library import DQN, DoubleDQN
-from envs.bandits import SegmentBandit
 from envs.known_models import action_masks_of_states
 from envs.wrappers import ActionMasks
 from tests.agents.hand_fed import feed
@@ -118,27 +115,28 @@ def few(n):
 
 # --- what is masked is not done ------------------------------------------------------------------
 
-EXPLORATION = {
-    "epsilon": {"exploration_initial_eps": 0.5, "exploration_decay": "constant"},
-    "boltzmann": {"exploration": "boltzmann", "temperature": 0.5},
-    "gaussian": {"exploration": "gaussian_noise", "noise_std": 20.0},
-}
+GREEDILY = {"exploration_initial_eps": 0.5, "exploration_decay": "constant"}
 # That all of them keep to masks, in either engine, is seen in test_engines.py.
-TRIED = [("double_qlearning", "epsilon"), *(("sarsa", kind) for kind in EXPLORATION)]
+TRIED = {
+    "double_qlearning": GREEDILY,
+    "sarsa, epsilon": GREEDILY,
+    "sarsa, boltzmann": {"exploration": "boltzmann", "temperature": 0.5},
+    "sarsa, gaussian": {"exploration": "gaussian_noise", "noise_std": 20.0},
+}
 
 
-@pytest.mark.parametrize(("name", "exploration"), TRIED)
+@pytest.mark.parametrize("row", TRIED)
 @few(8)
 @given(allowed=masks_of(C), ties=st.sampled_from(["random", "first"]))
-def test_a_masked_action_is_never_chosen(name, exploration, allowed, ties):
+def test_a_masked_action_is_never_chosen(row, allowed, ties):
     # Tables full of noise: what is best is mostly masked. The environment itself refuses.
-    noisy = {"tie_breaking": ties, "initial_q_std": 5.0, **EXPLORATION[exploration]}
-    agent = on_ring(name, allowed, 2, **noisy).learn(60)
+    noisy = {"tie_breaking": ties, "initial_q_std": 5.0, **TRIED[row]}
+    agent = on_ring(row.partition(",")[0], allowed, 2, **noisy).learn(60)
     obs = np.arange(C).repeat(20)
     for deterministic in (True, False):
         told = agent.predict(obs, deterministic=deterministic, action_masks=allowed[obs])[0]
         assert allowed[obs, told].all()
-    if exploration != "gaussian":
+    if "gaussian" not in row:
         met = agent.policy.masks.any(axis=1)
         probabilities = agent.action_probabilities()
         assert not probabilities[met][~allowed[met]].any()
@@ -159,27 +157,13 @@ def test_a_masked_arm_is_never_pulled(name, masks, ties, batch):
             assert allowed[np.arange(len(arms)), arms].all()
 
 
-@pytest.mark.parametrize("name", ["sarsa", *BANDITS])
-def test_where_everything_is_allowed_masks_change_no_bit(name):
-    ends = []
-    for mask_actions in (False, True):
-        place, more = (on_ring, ()) if name == "sarsa" else (in_shop, (2, 5))
-        model = place(name, EVERYTHING, *more, mask_actions=mask_actions).learn(400)
-        tables = {key: value.numpy().tobytes() for key, value in model.policy.state_dict().items()}
-        tables.pop("allowed_actions", None)
-        ends.append((tables, model.rng.bit_generator.state, model._last_obs.tolist()))
-    assert ends[0] == ends[1]
-
-
 ALLOWED, ARM_TABLES = [1, 3], {"counts", "sums", "scores", "coefficients"}
 
 
 class Fewer(gym.Wrapper):
     """The two of the actions that are allowed, as an environment of its own."""
 
-    def __init__(self, env):
-        super().__init__(env)
-        self.action_space = spaces.Discrete(len(ALLOWED))
+    action_space = spaces.Discrete(len(ALLOWED))
 
     def step(self, action):
         return self.env.step(ALLOWED[action])
@@ -238,44 +222,41 @@ def test_a_zip_brings_the_masks_back_and_one_can_begin_or_cease_to_go_by_them(na
 VALUES, OTHERS = [10.0, 4.0, 2.0, 50.0], [0.0, -7.0, 8.0, 90.0]
 NEXT_MASKS = np.array([[1, 1, 1, 1], [0, 1, 1, 0], [1, 1, 1, 1]], bool)
 SOFTMAX = 1 / (1 + np.exp(-1.0))  # of action 1 at temperature 2
-TARGETS = [
-    ("qlearning", {}, {3 + 0.5 * 4}),
+TARGETS = {  # agent: settings, targets
+    "qlearning": ({}, {3 + 0.5 * 4}),
     # Half of the time a random one of two, of mean 3, else the better, 4.
-    ("expected_sarsa", {**UNIFORM, "exploration_initial_eps": 0.5}, {3 + 0.5 * 3.5}),
-    ("expected_sarsa", {"exploration": "boltzmann", "temperature": 2.0},
-     {3 + 0.5 * (4 * SOFTMAX + 2 * (1 - SOFTMAX))}),
-    ("sarsa", UNIFORM, {3 + 0.5 * 4, 3 + 0.5 * 2}),
+    "expected_sarsa": ({**UNIFORM, "exploration_initial_eps": 0.5}, {3 + 0.5 * 3.5}),
+    "expected_sarsa, boltzmann": (
+        {"exploration": "boltzmann", "temperature": 2.0},
+        {3 + 0.5 * (4 * SOFTMAX + 2 * (1 - SOFTMAX))},
+    ),
+    "sarsa": (UNIFORM, {3 + 0.5 * 4, 3 + 0.5 * 2}),
     # Of the allowed, the first table prefers action 1 and the second action 2.
-    ("double_qlearning", {}, {3 + 0.5 * -7, 3 + 0.5 * 2}),
-]  # fmt: skip
+    "double_qlearning": ({}, {3 + 0.5 * -7, 3 + 0.5 * 2}),
+}
 
 
-@pytest.mark.parametrize(("name", "own", "targets"), TARGETS)
-def test_targets_are_those_of_the_allowed_actions(name, own, targets):
-    found = set()
+@pytest.mark.parametrize("row", TARGETS)
+def test_targets_are_those_of_the_allowed_actions(row):
+    name, (own, targets), found = row.partition(",")[0], TARGETS[row], set()
     for seed in range(9):
-        table = np.zeros((C, A))
         agent = on_ring(name, NEXT_MASKS, learning_rate=1.0, gamma=0.5, **{**own, "seed": seed})
         agent.learn(0)
         q_tables = agent.policy.q_tables.numpy()
         for q_table, values in zip(q_tables, (VALUES, OTHERS), strict=False):
-            q_table[:], q_table[1] = table, values
+            q_table[:], q_table[1] = 0, values
         agent.policy.note_masks(np.arange(C), NEXT_MASKS)
         agent.masks_are_known = True
         feed(agent, 0, 1, 3, 1)
         (value,) = q_tables[:, 0, 1][q_tables[:, 0, 1] != 0]
         found.add(round(value, 12))
-        if name == "sarsa":
-            assert value == 3 + 0.5 * VALUES[agent._next_actions[0]]
+        assert name != "sarsa" or value == 3 + 0.5 * VALUES[agent._next_actions[0]]
     assert found == {round(target, 12) for target in targets}
-
-
-def test_where_nothing_is_known_everything_counts():
-    agent = on_ring("qlearning", NEXT_MASKS)
-    agent.policy.q_tables[0, 1] = th.tensor(VALUES)
-    assert agent.predict(1, deterministic=True)[0] == 3
-    assert agent.predict(1, deterministic=True, action_masks=NEXT_MASKS[1])[0] == 1
-    assert not agent.policy.masks[1].any(), "what is told to predict is not kept"
+    if name == "qlearning":  # where nothing is known everything counts, and nothing told is kept
+        agent.policy.masks[1] = False
+        assert agent.predict(1, deterministic=True)[0] == 3
+        assert agent.predict(1, deterministic=True, action_masks=NEXT_MASKS[1])[0] == 1
+        assert not agent.policy.masks[1].any()
 
 
 def test_the_last_state_of_an_episode_that_is_cut_off_is_told_by_info():
@@ -367,19 +348,6 @@ def test_late_feedback_remembers_what_was_allowed_and_how_likely_the_pull_was():
     assert [pull.probability for pull in learnt] == pytest.approx([1 / 2, 1 / 4], rel=1e-15)
 
 
-def test_a_batch_of_masked_runs_goes_one_by_one(monkeypatch):
-    masks = np.array([[True, False, True], [True, True, False]])
-    args = {"mask_actions": True}, "SegmentBandit-v0", {}
-    # As a user's own kind of the environment has it.
-    told = lambda self: masks[self.context]  # noqa: E731
-    monkeypatch.setattr(SegmentBandit, "action_masks", told, raising=False)
-    with pytest.raises(NotCompilable, match=r"^the environment is asked for its action masks"):
-        run_batch("ucb", *args, [0])
-    for name in ("ucb", "linucb"):
-        result = run_one_by_one(name, *args, [0, 5], 150)
-        assert masks[result.contexts, result.arms].all()
-
-
 # --- deep Q-learning -----------------------------------------------------------------------------
 
 BOTH = pytest.mark.parametrize("algorithm", [DQN, DoubleDQN])
@@ -418,10 +386,9 @@ def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(algorithm, tmp_pa
 
 @BOTH
 def test_deep_agents_predict_among_the_allowed(algorithm):
-    agent = algorithm(env=warehouse(), **MASKED)
+    agent, obs = algorithm(env=warehouse(), **MASKED), np.arange(100)
     masks = np.random.default_rng(0).random((100, 4)) < 0.4
     masks[:, 2] |= ~masks.any(axis=1)
-    obs = np.arange(100)
     with th.no_grad():
         values = agent.q_net(agent.policy.obs_to_tensor(obs)[0]).numpy()
     best = np.where(masks, values, -np.inf).argmax(axis=1)
@@ -467,29 +434,6 @@ def test_deep_targets_by_hand(algorithm, expected):
     assert 0 < in_state_1.sum() < 64
     assert set(values.amax(dim=1)[in_state_1].tolist()) == {expected}
     assert set(values.amax(dim=1)[~in_state_1].tolist()) == {0.0}
-
-
-def test_updates_with_masks_are_dqns_own_where_all_is_allowed():
-    class Free(gym.Wrapper):
-        def action_masks(self):
-            return np.ones(2, bool)
-
-    def free():
-        return ActionMasks(Free(gym.make("CartPole-v1")))
-
-    own = {**MASKED, "learning_starts": 1000}
-    masked = DQN(env=make_vec_env(free, seed=0), **own).learn(60)
-    plain = DQN(env="CartPole-v1", **{**own, "mask_actions": False}).learn(60)
-    # The same transitions: what is drawn to explore differs.
-    masked.set_parameters(plain.get_parameters())
-    for name in ("observations", "next_observations", "rewards", "dones", "timeouts"):
-        getattr(masked.replay_buffer, name)[:] = getattr(plain.replay_buffer, name)
-    masked.replay_buffer.actions[..., :1] = plain.replay_buffer.actions
-    for agent in (masked, plain):
-        np.random.seed(0)  # noqa: NPY002  # what the library's buffers draw from
-        agent.train(5, 16)
-    for ours, theirs in zip(masked.policy.parameters(), plain.policy.parameters(), strict=True):
-        assert th.equal(ours, theirs)
 
 
 def test_without_masks_it_is_the_librarys_agent_and_file(tmp_path):
@@ -573,9 +517,3 @@ def test_refused_in_one_line(case):
     with pytest.raises(ValueError, match=f"^{line}") as refusal:
         call()
     assert "\n" not in str(refusal.value)
-
-
-def test_masks_behind_a_vector_wrapper():
-    env = VecNormalize(DummyVecEnv([lambda: Shop(vectors=True)]))
-    model = load_algorithm("linucb")(env=env, seed=0, mask_actions=True).learn(100)
-    assert model.predict(VECTOR, deterministic=True, action_masks=[0, 0, 1, 0])[0] == 2

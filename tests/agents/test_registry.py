@@ -17,6 +17,7 @@ import envs  # noqa: F401  # registers the bandits
 from agents import ALGORITHMS, fitting_algorithms, load_algorithm
 from agents.bandits.runs import run_batch, run_one_by_one
 from pipeline.settings.values import algorithm_parameters
+from tests.agents.hand_fed import Told
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "policy_iteration", "optimal"]
@@ -89,31 +90,24 @@ def test_which_agents_fit(env_id, names):
 
 
 ANY = "Box or Discrete or MultiDiscrete or MultiBinary"
+MISFITS = [  # agent, observations, actions, and why it does not fit
+    ("qlearning", DISCRETE, DISCRETE, ""),
+    ("ppo", spaces.Dict({"a": BOX}), DISCRETE, ""),
+    ("angle", BOX, spaces.Discrete(2), ""),
+    ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
+    ("qlearning", BOX, DISCRETE, f"it observes Discrete spaces, not {BOX}"),
+    ("sarsa", spaces.Discrete(4, start=1), DISCRETE,
+     "it needs Discrete spaces that start at 0, not Discrete(4, start=1)"),
+    ("a2c", BOX, spaces.Discrete(2, start=-1),
+     "it needs Discrete spaces that start at 0, not Discrete(2, start=-1)"),
+    ("random", spaces.Tuple([DISCRETE]), DISCRETE,
+     f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
+    ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
+     "it needs observations of shape (4,), not (2,)"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "observations", "actions", "misfit"),
-    [
-        ("qlearning", DISCRETE, DISCRETE, ""),
-        ("ppo", BOX, BOX, ""),
-        ("sac", BOX, BOX, ""),
-        ("ppo", spaces.Dict({"a": BOX}), DISCRETE, ""),
-        ("angle", BOX, spaces.Discrete(2), ""),
-        ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
-        ("qlearning", BOX, DISCRETE, f"it observes Discrete spaces, not {BOX}"),
-        ("qlearning", DISCRETE, BOX, f"it acts in Discrete spaces, not {BOX}"),
-        ("dqn", BOX, BOX, f"it acts in Discrete spaces, not {BOX}"),
-        ("sarsa", spaces.Discrete(4, start=1), DISCRETE,
-         "it needs Discrete spaces that start at 0, not Discrete(4, start=1)"),
-        ("a2c", BOX, spaces.Discrete(2, start=-1),
-         "it needs Discrete spaces that start at 0, not Discrete(2, start=-1)"),
-        ("ucb", BOX, DISCRETE, f"it observes Discrete spaces, not {BOX}"),
-        ("random", spaces.Tuple([DISCRETE]), DISCRETE,
-         f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
-        ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
-         "it needs observations of shape (4,), not (2,)"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "observations", "actions", "misfit"), MISFITS)
 def test_why_an_agent_does_not_fit(name, observations, actions, misfit):
     assert ALGORITHMS[name].misfit(observations, actions) == misfit
 
@@ -244,17 +238,15 @@ def test_what_cannot_be_registered(name, entry_point, fields, complaint):
     assert before == ALGORITHMS
 
 
-@pytest.mark.parametrize(
-    ("entry_point", "complaint"),
-    [
+def test_a_class_that_is_none():
+    for entry_point, complaint in (
         ("gymnasium:Typo", "mine is registered as gymnasium:Typo, which does not exist"),
         ("gymnasium:Env", "which is no subclass of BaseAlgorithm"),
-    ],
-)
-def test_a_class_that_is_none(entry_point, complaint):
-    agents.register("mine", entry_point)
-    with pytest.raises(ValueError, match=complaint):
-        load_algorithm("mine")
+    ):
+        agents.register("mine", entry_point)
+        with pytest.raises(ValueError, match=complaint):
+            load_algorithm("mine")
+        del ALGORITHMS["mine"]
 
 
 # --- the agents that CONTRIBUTING.md writes, as they stand there ----------------------------------
@@ -282,8 +274,13 @@ def example(tmp_path):
 
 
 def test_a_tabular_rule(example):
+    """Next values 4, 8, 6, 6: half the mean and half the best 8 make 7, and 2 + 0.5 * 7 is 5.5."""
     cautious, lines = example("CautiousQLearning")
     assert lines + OTHER_LINES <= 45
+    told = Told(cautious, 2, 4, caution=0.5, gamma=0.5, learning_rate=1.0)
+    told.agent.policy.q_tables.numpy()[0, 1] = [4, 8, 6, 6]
+    told.step(0, 3, 2.0, 1)
+    assert told.agent.policy.q_table[0, 3] == 2 + 0.5 * (0.5 * 6 + 0.5 * 8)
     tables = []
     for engine in ("compiled", "interpreted"):
         env = make_vec_env("FrozenLake-v1", 2, seed=3)
@@ -294,21 +291,6 @@ def test_a_tabular_rule(example):
     assert tables[0].any()
     with pytest.raises(ValueError, match="caution must lie between 0 and 1, not 2"):
         cautious(env="FrozenLake-v1", caution=2)
-
-
-def test_a_rule_worked_by_hand(example):
-    """Next values 4, 8, 6: half the mean 6 and half the best 8 make 7, and 2 + 0.5 * 7 is 5.5."""
-    cautious, _ = example("CautiousQLearning")
-    env = make_vec_env("Taxi-v4", 1, seed=0)
-    model = cautious(env=env, caution=0.5, gamma=0.5, learning_rate=1.0, seed=0)
-    values = model.policy.q_tables.numpy()
-    values[0, 1] = [4, 8, 6, 6, 6, 6]
-    model._last_obs, model._next_actions = np.array([0]), np.array([-1])
-    from agents.common.algorithm import Transitions
-
-    step = np.array([0]), np.array([3]), np.array([2.0]), np.array([False]), np.array([False])
-    model._learn_from(Transitions(*step, np.array([1])))
-    assert values[0, 0, 3] == 2 + 0.5 * (0.5 * 6 + 0.5 * 8)
 
 
 def test_a_bandit_index(example):

@@ -9,17 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from agents.common.exploration import EPSILON_GREEDY, action_probabilities
-from agents.tabular.traces import SMALLEST_TRACE
-from tests.agents.hand_fed import (
-    ENDS,
-    N_ACTIONS,
-    N_STATES,
-    SHARES,
-    Fed,
-    episodes,
-    greedy,
-    tables,
-)
+from tests.agents.hand_fed import ENDS, N_ACTIONS, N_STATES, SHARES, Fed, episodes, greedy, tables
 
 GAMMA, ALPHA = 0.75, 0.25
 USUAL = {"gamma": GAMMA, "learning_rate": ALPHA}
@@ -96,29 +86,6 @@ def test_tree_backup(table, steps, end, n, epsilon, target_policy):
         expected = textbook_table(fed.table, steps, end, n, mean, tree)
         fed.episode(steps, end)
         assert_close(fed.table, expected)
-
-
-HALF = {"learning_rate": 0.5, "gamma": 0.5}
-
-
-def test_two_steps_by_hand():
-    # 1 + .5 * 2 + .25 * Q(2, 0) = 2 + .25 * 8 = 4, half-way from 10 on: 7.
-    table = [[10, 0], [0, 0], [8, 0]]
-    fed = Fed("n_step_sarsa", table, n_steps=2, **HALF)
-    assert fed.step(0, 0, 1, 1).tolist() == table
-    assert fed.agent.mean_td_error == 0
-    assert fed.step(1, 0, 2, 2)[0, 0] == 7
-    assert fed.agent.mean_td_error == 6
-    # The end: 2 + .5 * 4 = 4 from state 1 on, half-way from 0 on; 4 from state 2 on.
-    assert fed.step(2, 0, 4, 0, "terminated").tolist() == [[7, 0], [2, 0], [6, 0]]
-    # Another episode's first step is not learnt from: the last errors, 4 and 4, go on standing.
-    fed.step(0, 0, 1, 1)
-    assert fed.agent.mean_td_error == 4
-    # A greedy tree: in state 1 action 1 is best with 6, so that action 0 tells nothing beyond.
-    table = [[10, 0], [0, 6], [8, 0]]
-    fed = Fed("n_step_tree_backup", table, n_steps=2, target_policy="greedy", **HALF)
-    fed.step(0, 0, 1, 1)
-    assert fed.step(1, 0, 2, 2)[0, 0] == 10 + 0.5 * (1 + 0.5 * 6 - 10)
 
 
 # --- traces --------------------------------------------------------------------------------------
@@ -212,41 +179,6 @@ def test_dutch_traces_are_the_online_lambda_return(name, learning_rate, table, s
         assert_close(fed.table, by_online_lambda_returns(name, before, taken, end, decay, sizes))
 
 
-@pytest.mark.parametrize(
-    ("trace_type", "value"), [("replacing", 4.0), ("accumulating", 3.5), ("dutch", 3.875)]
-)
-def test_sarsa_lambda_by_hand(trace_type, value):
-    """Twice the same state and action; step size and discount are a half, lambda is 1."""
-    fed = Fed("sarsa_lambda", [[4, 0]], trace_type=trace_type, trace_decay=1.0, **HALF)
-    # 4 + .5 * 4 - 4 = 2, half of it; then 3 - 5 = -2, times half of the trace.
-    assert fed.step(0, 0, 4, 0).tolist() == [[5, 0]]
-    assert fed.agent.mean_td_error == 2
-    assert fed.step(0, 0, 3, 0, "terminated").tolist() == [[value, 0]]
-
-
-def test_watkins_cut_by_hand():
-    # Greedy in state 0, and then in state 1 not: only that entry learns of what follows.
-    fed = Fed("q_lambda", [[4, 0], [0, 8]], trace_decay=1.0, **HALF)
-    # 2 + .5 * 8 - 4 = 2, half of it.
-    assert fed.step(0, 0, 2, 1).tolist() == [[5, 0], [0, 8]]
-    assert fed.step(1, 0, 6, 0, "terminated").tolist() == [[5, 0], [3, 8]]
-    # And where it is greedy: 6 - 8 = -2, half of it, and half of that for state 0.
-    fed = Fed("q_lambda", [[4, 0], [0, 8]], trace_decay=1.0, **HALF)
-    fed.step(0, 0, 2, 1)
-    assert fed.step(1, 1, 6, 0, "terminated").tolist() == [[4.5, 0], [0, 7]]
-
-
-def test_a_trace_that_has_faded_is_forgotten():
-    """A trace of 0.02 ** 8 is: what comes eight steps later says nothing of the first step."""
-    assert 0.02**8 < SMALLEST_TRACE < 0.02**7
-    settings_ = {"learning_rate": 1.0, "gamma": 1.0, "trace_decay": 0.02}
-    for later, is_told in ((7, True), (8, False)):
-        fed = Fed("sarsa_lambda", np.zeros((11, 1)), **settings_)
-        for k in range(later):
-            fed.step(k, 0, 0, k + 1)
-        assert bool(fed.step(later, 0, 1e15, 0, "terminated")[0, 0]) == is_told
-
-
 # --- Monte Carlo ---------------------------------------------------------------------------------
 
 
@@ -270,28 +202,6 @@ def test_returns_after_visits(table, steps, end, every_visit, learning_rate):
         fed.episode(steps, end)
         assert_close(fed.table, expected)
     assert np.array_equal(fed.agent.policy.visit_counts.numpy()[0], visits)
-
-
-@pytest.mark.parametrize(("every_visit", "twice_visited"), [(False, 6.5), (True, 5.0)])
-def test_monte_carlo_by_hand(every_visit, twice_visited):
-    """Returns from the end: 4, 2 + .5 * 4 = 4, 1 + .5 * 4 = 3; the step size is a half."""
-    fed = Fed("monte_carlo", [[10, 0], [0, 0]], every_visit=every_visit, **HALF)
-    tables = fed.episode([(0, 0, 1), (1, 1, 2), (0, 0, 4)], "terminated")
-    assert tables[1].tolist() == [[10, 0], [0, 0]]
-    # 10 + .5 * (3 - 10), or first 10 + .5 * (4 - 10) = 7 and then 7 + .5 * (3 - 7).
-    assert tables[2].tolist() == [[twice_visited, 0], [0, 2]]
-    assert fed.agent.mean_td_error == pytest.approx((6 + 4 + 4) / 3 if every_visit else (4 + 7) / 2)
-
-
-def test_an_episode_that_fills_the_record_is_learnt_from():
-    settings_ = {"gamma": 0.5, "longest_episode": 2, "learning_rate": "sample_average"}
-    fed = Fed("monte_carlo", [[0, 0], [0, 0], [8, 0]], **settings_)
-    fed.step(0, 0, 1, 1)
-    # 1 + .5 * (2 + .5 * 8), and what is left counts as another episode.
-    assert fed.step(1, 1, 2, 2).tolist() == [[4, 0], [0, 6], [8, 0]]
-    # Its rest began with what the last target counted on.
-    assert fed.committed == 0
-    assert fed.step(2, 0, 6, 0, "terminated").tolist() == [[4, 0], [0, 6], [6, 0]]
 
 
 class Weighed(Fed):
@@ -373,12 +283,6 @@ def test_weights_that_would_overflow_end_the_learning():
     assert np.isfinite(fed.table).all()
     # 3 to the power of 314 is below 1e150.
     assert int(fed.agent.policy.visit_counts.sum()) == 315
-
-
-def test_what_was_not_chosen_by_the_agent_is_not_weighed():
-    fed = Weighed(np.zeros((4, 3)), 0.5)
-    table = fed.episode([(1, 0, 1), (2, 0, 1), (3, 0, 2)], "terminated")[-1]
-    assert table.tolist() == [[0] * 3] * 3 + [[2, 0, 0]]
 
 
 # --- what they come down to ----------------------------------------------------------------------

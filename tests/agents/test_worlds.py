@@ -12,7 +12,6 @@ import envs  # noqa: F401  # registers the environments
 from agents.compiled.generators import handles_of, next_uniform, skip_uniform
 from agents.compiled.greedy_play import COMPENSATED_SUM
 from agents.compiled.loop import add_to_return, begin_episode
-from agents.compiled.records import whole_rows
 from agents.compiled.worlds import (
     CAR_STATE,
     CART_POLE_ENV,
@@ -118,15 +117,15 @@ def test_steps_equal_gymnasiums(case):
     assert 0.005 < terminated.mean() < 0.98
 
 
-@pytest.mark.parametrize("dims", [[2, 3], [3, 2], [0, 1]])
-@pytest.mark.parametrize(
-    "kwargs",
-    [
-        {"bins": 50, "low": [-0.41887903, -0.87266463], "high": [0.41887903, 0.87266463]},
-        {"bins": [10, 3], "low": -0.1, "high": [0.3, 0.7]},
-        {"bins": 1, "low": -1, "high": 1},
-    ],
-)
+BINNED = [
+    {"bins": 50, "low": [-0.41887903, -0.87266463], "high": [0.41887903, 0.87266463]},
+    {"bins": [10, 3], "low": -0.1, "high": [0.3, 0.7]},
+    {"bins": 1, "low": -1, "high": 1},
+]
+
+
+@pytest.mark.parametrize("dims", [[2, 3], [3, 0]])
+@pytest.mark.parametrize("kwargs", BINNED)
 def test_bins_equal_the_wrappers(kwargs, dims):
     env = pole(**kwargs, dims=dims)
     uniform = np.random.default_rng(0).uniform(-1, 1, (20_000, 4))
@@ -143,7 +142,7 @@ def test_bins_equal_the_wrappers(kwargs, dims):
     assert len(np.unique(indices)) > 0.8 * env.observation_space.n
 
 
-# --- Monitor's sums and rows ---------------------------------------------------------------------
+# --- Monitor's sums -------------------------------------------------------------------------------
 
 
 @numba.njit
@@ -176,21 +175,6 @@ def test_sums_by_either_rule_and_as_this_python_does(values):
         sums = np.empty(len(values))
         running_sums(np.zeros(1, dtype=CART_POLE_ENV)[0], np.array(values), compensated, sums)
         assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
-
-
-def test_rows_are_pythons_to_the_last_letter():
-    rng, end = np.random.default_rng(0), "1.5e-05\r\n"
-    powers = 10.0 ** np.arange(15)
-    whole = rng.integers(-(10**15) + 1, 10**15, 500) * 1.0
-    returns = np.concatenate([[0.0], powers, powers - 1, -powers, whole])
-    lengths = rng.integers(1, 10**12, len(returns))
-    lengths[:3] = 1, 9, 10
-    pairs = zip(returns.tolist(), lengths.tolist(), strict=True)
-    expected = "".join(f"{round(total, 6)},{length},{end}" for total, length in pairs)
-    assert whole_rows(returns, lengths, end) == expected
-    assert whole_rows(np.empty(0), np.empty(0, dtype=np.int64), end) == ""
-    for odd in (0.5, -1e-9, 1e15, -1e15, 1e300, np.inf, -np.inf, np.nan):  # left to Python
-        assert whole_rows(np.array([1.0, odd]), np.array([1, 1]), end) is None
 
 
 # --- generators ----------------------------------------------------------------------------------

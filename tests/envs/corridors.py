@@ -73,7 +73,9 @@ class Backwards(Corridor):
 
 
 class Unsettable(Corridor):
-    """Its place is not ``s``."""
+    """Its place is not ``s``, which cannot be set."""
+
+    place = None
 
     @property
     def s(self):
@@ -81,9 +83,8 @@ class Unsettable(Corridor):
 
     @s.setter
     def s(self, place):
-        if hasattr(self, "place"):
+        if self.place is not None:
             raise AttributeError
-        self.place = place
 
     def step(self, action):
         row = self.true[self.place][action]

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
-from hypothesis import given
-from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env
 
 import envs  # noqa: F401 (registers the environments)
@@ -83,16 +81,6 @@ def test_the_last_dimension_counts_fastest_and_only_the_chosen_ones_count():
     assert env.reset()[0] == 1 * 4 + 3
 
 
-ROW = st.lists(st.floats(-60, 60, width=32), min_size=4, max_size=4)
-
-
-@given(st.lists(ROW, min_size=1, max_size=20), st.integers(1, 60))
-def test_a_batch_is_discretised_as_its_members(rows, bins):
-    env = cart_pole(bins=bins)
-    batch = np.array(rows, np.float32)
-    assert env.map_observations(batch).tolist() == [env.observation(row) for row in batch]
-
-
 @pytest.mark.parametrize(
     ("space", "shown", "n", "index"),
     [
@@ -125,18 +113,12 @@ def test_one_hot_worked_by_hand():
 # --- rewards --------------------------------------------------------------------------------------
 
 
-def test_rewards_are_scaled():
-    env = ScaleReward(Showing(spaces.Discrete(2), 0), scale=0.25)
-    env.reset()
-    assert ([env.step(0)[1], env.step(0)[1]], env.scale) == ([0.25, 0.5], 0.25)
-
-
 @pytest.mark.parametrize(
     ("limit", "on_truncation", "rewards"),
-    [(9, False, [1, -10]), (9, True, [1, -10]), (1, False, [1]), (1, True, [-10])],
+    [(9, False, [0.25, -10]), (9, True, [0.25, -10]), (1, False, [0.25]), (1, True, [-10])],
 )
-def test_the_last_reward_is_replaced(limit, on_truncation, rewards):
-    inner = TimeLimit(Showing(spaces.Discrete(2), 0), limit)
+def test_rewards_are_scaled_and_the_last_one_is_replaced(limit, on_truncation, rewards):
+    inner = ScaleReward(TimeLimit(Showing(spaces.Discrete(2), 0), limit), scale=0.25)
     env = TerminationReward(inner, reward=-10, on_truncation=on_truncation)
     env.reset()
     assert [env.step(0)[1] for _ in rewards] == rewards
@@ -216,18 +198,19 @@ def test_wrapped_environments_are_checked_remade_from_their_spec_and_pickled(nam
 
 # --- action masks ---------------------------------------------------------------------------------
 
+STILL = {"is_slippery": False}
 MASKED = {
     "Warehouse": lambda: gym.make("Warehouse-v0"),
     "slippery Warehouse": lambda: gym.make("Warehouse-v0", slip=0.5),
     "MineMaze": lambda: ScaleReward(FlattenToDiscrete(gym.make("MineMaze-v0")), 0.1),
     "Taxi": lambda: gym.make("Taxi-v4"),
     "told Taxi": lambda: ActionMasks(gym.make("Taxi-v4")),
-    "idle lake": lambda: IdleActionMasks(gym.make("FrozenLake-v1", is_slippery=False)),
+    "idle lake": lambda: IdleActionMasks(gym.make("FrozenLake-v1", **STILL)),
     "idle cliff": lambda: ActionMasks(IdleActionMasks(gym.make("CliffWalking-v1"))),
 }
 
 
-def test_moves_into_shelves_and_out_of_the_map_are_masked():
+def test_moves_that_bump_and_actions_that_are_idle_are_masked():
     env = gym.make("Warehouse-v0", desc=["S#", ".G"])
     # Of the start: up leaves the map, down is free, left leaves it, right is a shelf.
     expected = [[0, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
@@ -236,23 +219,11 @@ def test_moves_into_shelves_and_out_of_the_map_are_masked():
     walled_in.s = 7
     assert walled_in.action_masks().all()
     assert walled_in.dynamics.action_masks()[7].all()
-
-
-@pytest.mark.parametrize("slip", [0, 0.3])
-def test_a_masked_move_is_one_that_is_meant_to_bump(slip):
-    env = MineMazeEnv(slip=slip)
-    model, masks = env.transition_model(), action_masks_of_states(env)
-    ends = model.terminated.all(axis=(1, 2))
-    # The first outcome is the one that is meant.
-    stays = model.next_state[:, :, 0] == np.arange(model.n_states)[:, None]
-    np.testing.assert_array_equal(masks, ~stays | ends[:, None])
-
-
-def test_idle_actions_change_nothing():
-    env = IdleActionMasks(gym.make("FrozenLake-v1", is_slippery=False))
-    model = transition_model(env)
-    goes = model.next_state[:, :, 0] != np.arange(16)[:, None]
-    np.testing.assert_array_equal(action_masks_of_states(env), goes | model.terminated[:, :, 0])
+    for env in (MineMazeEnv(slip=0.3), IdleActionMasks(gym.make("FrozenLake-v1", **STILL))):
+        model, masks = transition_model(env), action_masks_of_states(env)
+        # The first outcome is the one that is meant.
+        goes = model.next_state[:, :, 0] != np.arange(model.n_states)[:, None]
+        np.testing.assert_array_equal(masks, goes | model.terminated[:, :, 0])
     # On ice any move may lead somewhere.
     assert IdleActionMasks(gym.make("FrozenLake-v1")).masks.all()
 
@@ -275,26 +246,6 @@ def test_masks_of_all_states_are_those_told_on_the_way(name):
             _, info = env.reset()
 
 
-class ToldByInfo(gym.Wrapper):
-    """Says it in info alone."""
-
-    def reset(self, **kwargs):
-        obs, info = self.env.reset(**kwargs)
-        return obs, {**info, "action_mask": np.array([0, 1], np.int8)}
-
-    def step(self, action):
-        *rest, info = self.env.step(action)
-        return *rest, {**info, "action_mask": np.array([1, 0], np.int8)}
-
-
-def test_info_alone_is_enough_for_the_wrapper():
-    env = ActionMasks(ToldByInfo(gym.make("CartPole-v1")))
-    env.reset(seed=0)
-    assert env.action_masks().tolist() == [False, True]
-    env.step(1)
-    assert env.action_masks().tolist() == [True, False]
-
-
 class OwnMasks(MineMazeEnv):
     """Never up."""
 
@@ -308,5 +259,16 @@ def test_masks_that_are_not_there_are_not_guessed():
         assert action_masks(env) is action_masks_of_states(env) is None
     assert action_masks_of_states(OwnMasks()) is None
     assert action_masks(OwnMasks()).tolist() == [False, True, True, True]
-    # A wrapper that nobody here knows may mask as well.
+    # A wrapper that nobody here knows may mask as well, and say so in info alone.
     assert action_masks_of_states(gym.Wrapper(MineMazeEnv())) is None
+    env = ActionMasks(ToldByInfo(gym.make("CartPole-v1")))
+    env.reset(seed=0)
+    assert env.action_masks().tolist() == [False, True]
+
+
+class ToldByInfo(gym.Wrapper):
+    """Says it in info alone."""
+
+    def reset(self, **kwargs):
+        obs, info = self.env.reset(**kwargs)
+        return obs, {**info, "action_mask": np.array([0, 1], np.int8)}

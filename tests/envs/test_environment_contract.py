@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -146,21 +147,14 @@ def test_every_render_mode_renders_and_closes_twice(env_id, kwargs):
 
 
 @every_id
-@pytest.mark.parametrize("place", ["below", "above"])
-def test_an_action_that_does_not_exist_is_refused(env_id, kwargs, place):
+def test_an_action_that_does_not_exist_is_refused(env_id, kwargs):
     env = gym.make(env_id, **kwargs).unwrapped
     env.reset(seed=0)
-    action = -1 if place == "below" else env.action_space.n
-    with pytest.raises(ValueError, match=rf"(action|arm) {action} does not exist: (0 up|they are)"):
-        env.step(action)
-
-
-@named(IDS[:1])
-def test_actions_may_be_arrays_without_axes(env_id, kwargs):
-    env = gym.make(env_id, **kwargs)
-    env.reset(seed=0)
-    observation = env.step(np.array(3))[0]
-    assert (observation, type(observation)) == (91, int)
+    for action in (-1, env.action_space.n):
+        told = rf"(action|arm) {action} does not exist: (0 up|they are)"
+        with pytest.raises(ValueError, match=told):
+            env.step(action)
+    assert isinstance(env.step(np.array(0))[0], int | np.ndarray)  # arrays without axes may be
 
 
 # Two are too large to be written as dictionaries in no time.
@@ -184,20 +178,28 @@ class Fixed:
         return self.uniform
 
 
-@named([(name, kwargs) for name, kwargs in GRID_WORLDS if kwargs])
+# In floating point 0.7 + 0.2 + 0.1 stays below 1.
+THREE = {"segment_probabilities": [0.7, 0.2, 0.1], "click_rates": [[0.1, 0.3], [0, 1], [0.7, 0.2]]}
+ON_EDGES = [row for row in GRID_WORLDS if row[1]] + [("SegmentBandit-v0", THREE)]
+
+
+@named(ON_EDGES)
 def test_uniform_numbers_on_the_edge_choose_as_toy_text_does(env_id, kwargs):
     env = gym.make(env_id, **kwargs).unwrapped
-    listed = [prob for prob, *_ in env.P[0][0]]
-    edges = np.concatenate([[0.0], np.cumsum(env.initial_state_distrib), np.cumsum(listed)])
+    model = env.transition_model()
+    edges = [np.cumsum(model.initial), *np.cumsum(model.prob, axis=2)[:3, 0]]
+    edges = np.concatenate([[0.0], *edges])
     uniforms = np.concatenate([edges, np.nextafter(edges, 0), np.nextafter(edges, 1)])
     for uniform in np.unique(uniforms[uniforms < 1]).tolist():
         env.np_random = Fixed(uniform)
         env.reset()
-        assert env.s == categorical_sample(env.initial_state_distrib, env.np_random)
-        outcomes = env.P[int(env.s)][0]
-        chosen = categorical_sample([outcome[0] for outcome in outcomes], env.np_random)
-        env.step(0)
-        assert env.s == outcomes[chosen][1]
+        assert env.s == categorical_sample(model.initial, env.np_random)
+        for state in {int(env.s), *range(3)}:
+            env.s = state
+            chosen = categorical_sample(model.prob[state, 0], env.np_random)
+            _, reward, *_ = env.step(0)
+            assert env.s == model.next_state[state, 0, chosen]
+            assert reward == model.reward[state, 0, chosen]
 
 
 @named(GRID_WORLDS)
@@ -218,3 +220,80 @@ def test_information_of_a_grid_world_is_complete_and_fresh(env_id, kwargs):
     # One uniform number for the start and one for the step, also where nothing is random.
     rng.random(2)
     assert env.np_random.random() == rng.random()
+
+
+# --- arguments ------------------------------------------------------------------------------------
+
+INF, NAN = float("inf"), float("nan")
+MANY = {"segment_probabilities": [1 / 1024] * 1024, "click_rates": [[0.5, 0.5]] * 1024}
+ONE = {"segment_probabilities": [1], "click_rates": [[0.5]]}
+CHANGING = {"maze": "blocking", "changed": True}
+REFUSED = [
+    ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),
+    ("Warehouse", {"slip": NAN}, "slip must be a finite number from 0 to 1, not nan"),
+    ("Warehouse", {"slip": "0.1"}, "slip must be a finite number from 0 to 1, not '0.1'"),
+    ("Warehouse", {"slip": True}, "slip must be a finite number from 0 to 1, not True"),
+    ("Warehouse", {"shelf_reward": "a"}, "shelf_reward must be a finite number, not 'a'"),
+    ("Warehouse", {"observation": "positon"}, "'positon': did you mean 'position'? It must be one"),
+    ("Warehouse", {"observation": "xyz"}, "'xyz': it must be one of discrete, position, one_hot"),
+    ("MineMaze", {"step_reward": INF}, "step_reward must be a finite number, not inf"),
+    ("MineMaze", {"goal_reward": None}, "goal_reward must be a finite number, not None"),
+    ("MineMaze", {"random_start": 1}, "random_start must be true or false, not 1"),
+    ("RandomWarehouse", {"size": 1}, "size must be a whole number from 2 to 4096, not 1"),
+    ("RandomWarehouse", {"size": 2.5}, "size must be a whole number from 2 to 4096, not 2.5"),
+    ("RandomWarehouse", {"shelf_density": 1.1}, "shelf_density must be a finite number from 0 to"),
+    ("RandomWarehouse", {"map_seed": -1}, "map_seed must be a whole number from 0 to 9223372036"),
+    ("DynaMaze", {"maze": "block"}, "unknown maze 'block': did you mean 'blocking'"),
+    ("DynaMaze", {"changed": True}, "changed: the maze 'dyna' never changes"),
+    ("DynaMaze", {"maze": "blocking", "change_after_steps": 5}, "change_after_steps needs changed"),
+    ("DynaMaze", {**CHANGING, "change_after_steps": 0}, "change_after_steps must be a whole num"),
+    ("RandomWalk", {"n_states": 0}, "n_states must be a whole number from 1 to 10000"),
+    ("RandomWalk", {"n_states": 9999, "max_jump": 9999}, "is too much: twice their product"),
+    ("WindyGridworld", {"moves": "queen"}, "unknown moves 'queen'"),
+    ("WindyGridworld", {"stochastic": 1}, "stochastic must be true or false"),
+    ("GamblersProblem", {"heads_probability": 2}, "heads_probability must be a finite"),
+    ("GamblersProblem", {"start_capital": 100}, "start_capital must be a whole number"),
+    ("MaximizationBias", {"n_actions": 1}, "n_actions must be a whole number from 2"),
+    ("MaximizationBias", {"reward_std": -1}, "reward_std must be a finite number"),
+    ("RiverSwim", {"n_states": 1}, "n_states must be a whole number from 2"),
+    ("DeepSea", {"size": 1}, "size must be a whole number from 2"),
+    ("DeepSea", {"map_seed": -1}, "map_seed must be a whole number"),
+    ("Racetrack", {"track": "middle"}, "unknown track 'middle'"),
+    ("JacksCarRental", {"variant": "exam"}, "unknown variant 'exam': did you mean 'exam"),
+    ("JacksCarRental", {"first_cars": 21}, "first_cars must be a whole number from 0 to 20"),
+    ("BernoulliBandit", {"probabilities": [0.5]}, "must hold 2 numbers or more, not 1"),
+    ("BernoulliBandit", {"probabilities": 0.5}, "must be a list of numbers, not 0.5"),
+    ("BernoulliBandit", {"probabilities": "ab"}, "must be a list of numbers, not 'ab'"),
+    ("BernoulliBandit", {"probabilities": [0.5, 1.5]}, "[1] must be a finite number from"),
+    ("BernoulliBandit", {"pulls": 0}, "pulls must be a whole number from 1 to 1000000000, not 0"),
+    ("GaussianBandit", {"n_arms": 1}, "n_arms must be a whole number from 2 to 10000, not 1"),
+    ("GaussianBandit", {"means": [1, 2], "n_arms": 3}, "n_arms is 3, but 2 are given: leave it"),
+    ("GaussianBandit", {"means": [1, 2], "mean_loc": 4}, "mean_loc is for means that are drawn"),
+    ("GaussianBandit", {"means": [1, None]}, "means[1] must be a finite number, not None"),
+    ("GaussianBandit", {"reward_std": -1}, "reward_std must be a finite number"),
+    ("GaussianBandit", {"drift_std": NAN}, "drift_std must be a finite number"),
+    ("LinearBandit", {"arm_parameters": []}, "arm_parameters must be a list of rows of numbers"),
+    ("LinearBandit", {"arm_parameters": [[1, 2]]}, "arm_parameters must have two rows or more"),
+    ("LinearBandit", {"arm_parameters": [[1, 2], [1]]}, "[1] has length 1, arm_parameters[0] has"),
+    ("LinearBandit", {"arm_parameters": [[1, 2], [3, 4]], "n_features": 3}, "is 3, but 2 are"),
+    ("LinearBandit", {"n_features": 0}, "n_features must be a whole number from 1 to 10000, not 0"),
+    ("SegmentBandit", {"segment_probabilities": [0.3, 0.6]}, "must sum to 1, not to 0.9"),
+    ("SegmentBandit", {"segment_probabilities": [0.3, 0.3, 0.4]}, "a row for each segment: 3"),
+    ("SegmentBandit", ONE, "click_rates must have a column for each treatment, two or more"),
+    ("SegmentBandit", {"click_rates": [[0.1, 0.2], [0.3, -0.1]]}, "[1][1] must be a finite"),
+    ("SegmentBandit", {"batch_size": 0}, "batch_size must be a whole number from 1 to"),
+    ("SegmentBandit", MANY, "1024 contexts and 2 arms are too many: twice"),
+]
+
+
+NAMED = [f"{name} {line}" for name, _, line in REFUSED]
+
+
+@pytest.mark.parametrize(("name", "wrong", "line"), REFUSED, ids=NAMED)
+def test_arguments_out_of_range_are_refused(name, wrong, line):
+    with pytest.raises(ValueError, match=re.escape(line)) as refused:
+        gym.make(f"{name}-v0", **wrong)
+    assert "\n" not in str(refused.value)
+    kind = type(gym.make(f"{name}-v0").unwrapped)
+    with pytest.raises(ValueError, match="render_mode 'ansy': did you mean 'ansi'"):
+        kind(render_mode="ansy")

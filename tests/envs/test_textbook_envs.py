@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import poisson
 
 import envs  # noqa: F401 (registers the environments)
-from envs.finite_env import first_above, summing_to_one
 from envs.known_models import action_masks_of_states, success_outcomes, time_limit, transition_model
 from envs.textbook.racetrack import LEFT_TRACK, TRACKS, crossed_cells
 from mdp import finite_horizon_optimum, policy_iteration, policy_return, value_iteration
@@ -83,14 +82,6 @@ def test_the_second_state_of_the_corridor_alone_is_reversed():
 @pytest.mark.parametrize(("moves", "steps"), [("rook", 15), ("king", 7), ("king_and_stay", 7)])
 def test_the_shortest_ways_through_the_wind(moves, steps):
     assert optimum_of("WindyGridworld-v0", moves=moves) == -steps
-
-
-def test_the_way_that_example_6_5_shows():
-    env = gym.make("WindyGridworld-v0").unwrapped
-    env.reset(seed=0)
-    states, rewards, terminated = walk(env, [3] * 9 + [1] * 4 + [2] * 2)
-    assert states == [31, 32, 33, 24, 15, 6, 7, 8, 9, 19, 29, 39, 49, 48, 37]
-    assert (rewards, terminated) == ([-1.0] * 15, True)
 
 
 def next_by_hand(state, down, right, gust):
@@ -189,26 +180,6 @@ def test_the_treasure_is_worth_99_hundredths(size, map_seed):
     best = goes_well[-1] - 0.01 / size * goes_well.sum()
     slippery = optimum_of("DeepSea-v0", deterministic=False, **kwargs)
     assert slippery == pytest.approx(best, abs=1e-12)
-
-
-def test_one_dive_in_all_finds_the_treasure():
-    model, totals = model_of("DeepSea-v0", size=4), []
-    for actions in np.ndindex(2, 2, 2, 2):
-        state, total = 0, 0.0
-        for action in actions:
-            total += model.reward[state, action, 0]
-            state = model.next_state[state, action, 0]
-        assert state == 16
-        totals.append(total)
-    assert sorted(totals)[-2] <= 0
-    assert max(totals) == pytest.approx(0.99)
-    # Without shuffled actions.
-    env = gym.make("DeepSea-v0", size=3, map_seed=None).unwrapped
-    env.reset(seed=0)
-    assert walk(env, [1, 0, 1]) == ([4, 6, 9], pytest.approx([-0.01 / 3, 0, -0.01 / 3]), True)
-    noise = model_of("DeepSea-v0", size=5, deterministic=False).reward_variance
-    assert np.flatnonzero(noise.max(axis=(1, 2))).tolist() == [20, 24]
-    assert model_of("DeepSea-v0", size=5).reward_variance is None
 
 
 # --- Racetrack ------------------------------------------------------------------------------------
@@ -409,35 +380,3 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     counts, chances = np.bincount(states.astype(int), minlength=len(model.prob)), 0 * model.initial
     np.add.at(chances, model.next_state[state, action], prob)
     assert (np.abs(counts - n * chances) <= 5 * np.sqrt(n * chances) + 3).all()
-
-
-@pytest.mark.parametrize(
-    ("env_id", "wrong", "message"),
-    [
-        ("RandomWalk-v0", {"n_states": 0}, "n_states must be a whole number from 1 to 10000"),
-        ("RandomWalk-v0", {"n_states": 9999, "max_jump": 9999}, "is too much: twice their product"),
-        ("WindyGridworld-v0", {"moves": "queen"}, "unknown moves 'queen'"),
-        ("WindyGridworld-v0", {"stochastic": 1}, "stochastic must be true or false"),
-        ("GamblersProblem-v0", {"heads_probability": 2}, "heads_probability must be a finite"),
-        ("GamblersProblem-v0", {"start_capital": 100}, "start_capital must be a whole number"),
-        ("MaximizationBias-v0", {"n_actions": 1}, "n_actions must be a whole number from 2"),
-        ("MaximizationBias-v0", {"reward_std": -1}, "reward_std must be a finite number"),
-        ("RiverSwim-v0", {"n_states": 1}, "n_states must be a whole number from 2"),
-        ("DeepSea-v0", {"size": 1}, "size must be a whole number from 2"),
-        ("DeepSea-v0", {"map_seed": -1}, "map_seed must be a whole number"),
-        ("Racetrack-v0", {"track": "middle"}, "unknown track 'middle'"),
-        ("JacksCarRental-v0", {"variant": "exam"}, "unknown variant 'exam': did you mean 'exam"),
-        ("JacksCarRental-v0", {"first_cars": 21}, "first_cars must be a whole number from 0 to 20"),
-    ],
-)
-def test_arguments_out_of_range_are_refused(env_id, wrong, message):
-    with pytest.raises(ValueError, match=message):
-        gym.make(env_id, **wrong)
-
-
-def test_probabilities_sum_to_one_exactly_and_the_last_sum_counts_where_they_do_not():
-    given = np.array([[0.1] * 10, [0.3, 0.7] + [0.0] * 8])
-    found = summing_to_one(given)
-    assert (found.cumsum(axis=1)[:, -1] == 1).all()
-    np.testing.assert_allclose(found, given, atol=1e-15)
-    assert first_above([0.5, 0.75], 0.9) == 0

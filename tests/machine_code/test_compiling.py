@@ -36,11 +36,10 @@ def scaled_total(numbers, times):
 class Compiled(event.Listener):
     """Names of what is compiled."""
 
-    def __init__(self):
-        self.names = []
+    names = ()
 
     def on_start(self, event):
-        self.names.append(event.data["dispatcher"].py_func.__name__)
+        self.names += (event.data["dispatcher"].py_func.__name__,)
 
     def on_end(self, event):
         pass
@@ -58,10 +57,7 @@ def test_parts_are_compiled_once_and_only_python_is_refused():
     assert numbers.tolist() == [6.0, 15.0]
     with pytest.raises(TypeError, match="only compiled functions can call scale"):
         scale(numbers, 2)
-    # What Python may call as well is machine code once it does.
-    assert not total.overloads
     assert total(numbers, 2) == 42
-    assert len(total.overloads) == 1
 
 
 def test_without_the_compiler_python_plans_and_evaluates():
@@ -82,12 +78,6 @@ for name in ("envs:Warehouse-v0", "FrozenLake-v1"):
     assert warehouse == ["79.0", "79.0"]
     planned, earned = map(float, frozen_lake)
     assert earned == pytest.approx(planned, abs=1e-12)
-
-
-def test_durations_add_up():
-    assert WorkTime(3.0, 2.0) + WorkTime(1.0, 0.5) == WorkTime(4.0, 2.5)
-    assert WorkTime(3.0, 2.0) - WorkTime(1.0, 0.5) == WorkTime(2.0, 1.5)
-    assert WorkTime(1.23456, 0.00049).as_data() == {"seconds": 1.235, "cpu_seconds": 0.0}
 
 
 def test_compiling_is_timed_as_a_whole():

@@ -1,12 +1,11 @@
 """Exact evaluation against closed forms and known figures."""
 
-import itertools
 from dataclasses import replace
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import (
@@ -21,14 +20,10 @@ from mdp import (
     state_visitation,
     value_iteration,
 )
-from mdp.evaluation import LimitedEpisodes
-from mdp.large_maps import chance_of_losing, drift
 
 
 def model_of(env_id, **kwargs):
-    model = transition_model(gym.make(f"envs:{env_id}", **kwargs))
-    assert model is not None
-    return model
+    return transition_model(gym.make(f"envs:{env_id}", **kwargs))
 
 
 def coin(end, reward=1.0):
@@ -45,13 +40,25 @@ def coin(end, reward=1.0):
     )
 
 
-def test_the_geometric_distribution():
+def test_the_geometric_distribution_to_its_end_cut_off_and_without_end():
     found = policy_return(coin(0.2, reward=3), np.array([0]), None)
-    assert found.expected_length == pytest.approx(5)
-    assert found.length_variance == pytest.approx(0.8 / 0.04)
-    assert found.expected_return == pytest.approx(15)
+    figures = (found.expected_length, found.length_variance, found.expected_return)
+    assert figures == pytest.approx((5, 0.8 / 0.04, 15))
     assert found.return_variance == pytest.approx(9 * 0.8 / 0.04)
     assert found.success_rate is None
+    model = coin(0.5)
+    found = policy_return(model, np.array([0]), 3, success=model.terminated)
+    assert found.expected_length == 0.5 * 1 + 0.25 * 2 + 0.25 * 3
+    assert found.success_rate == 0.875
+    assert state_visitation(model, np.array([0]), 3).tolist() == [1.75]
+    success = np.ones((1, 2, 2), bool)
+    found = policy_return(model, np.array([1]), None, 0.9, success)
+    assert found.expected_return == pytest.approx(10)
+    assert found.return_variance == pytest.approx(0)
+    assert (found.expected_length, found.success_rate) == (np.inf, 0)
+    assert np.isnan(found.length_variance)
+    # Marks of success that do not end the episode are ignored.
+    assert policy_return(model, np.array([1]), 9, success=success).success_rate == 0
 
 
 @pytest.mark.parametrize("horizon", [None, 400])
@@ -67,83 +74,45 @@ def test_drawn_rewards_add_their_own_variance(horizon):
         assert replace(found, return_variance=0.0) == replace(known, return_variance=0.0)
 
 
-def test_the_geometric_distribution_cut_off():
-    model = coin(0.5)
-    found = policy_return(model, np.array([0]), 3, success=model.terminated)
-    assert found.expected_length == 0.5 * 1 + 0.25 * 2 + 0.25 * 3
-    assert found.success_rate == 0.875
-    assert state_visitation(model, np.array([0]), 3).tolist() == [1.75]
+def test_random_moves_in_the_warehouse():
+    for shelf_reward, expected in ((-100, -27_427), (-1, -776)):
+        model = model_of("Warehouse-v0", shelf_reward=shelf_reward)
+        uniform, *constant = baseline_policies(model)
+        found = policy_return(model, uniform, 1000).expected_return
+        assert found == pytest.approx(expected, abs=0.5)
+        returns = [policy_return(model, policy, 1000).expected_return for policy in constant]
+        assert returns[1:] == [-1000, -1000, -1000]
+        assert baseline_return(model, 1000) == pytest.approx(max(-1000, expected), abs=0.5)
 
 
-def test_a_discounted_return_without_end():
-    found = policy_return(coin(0.5), np.array([1]), None, discount=0.9)
-    assert found.expected_return == pytest.approx(10)
-    assert found.return_variance == pytest.approx(0)
-    assert found.expected_length == np.inf
-    assert np.isnan(found.length_variance)
-    success = np.ones((1, 2, 2), bool)
-    assert policy_return(coin(0.5), np.array([1]), None, 0.9, success).success_rate == 0
-
-
-def test_different_starts_add_to_the_variance():
-    # From each of two states one step to the end, for 1 and for 5.
-    model = TransitionModel(
-        prob=np.ones((2, 1, 1)),
-        next_state=np.zeros((2, 1, 1), int),
-        reward=np.array([[[1.0]], [[5.0]]]),
-        terminated=np.ones((2, 1, 1), bool),
-        initial=np.array([0.5, 0.5]),
-    )
-    for horizon in (1, None):
-        found = policy_return(model, np.zeros(2, int), horizon)
-        assert (found.expected_return, found.return_variance) == (3.0, 4.0)
-
-
-@pytest.mark.parametrize(
-    ("shelf_reward", "expected"), [(-100, -27_427), (-1, -776)], ids=["shelf-100", "shelf-1"]
-)
-def test_random_moves_in_the_warehouse(shelf_reward, expected):
-    model = model_of("Warehouse-v0", shelf_reward=shelf_reward)
-    uniform, *constant = baseline_policies(model)
-    assert policy_return(model, uniform, 1000).expected_return == pytest.approx(expected, abs=0.5)
-    returns = [policy_return(model, policy, 1000).expected_return for policy in constant]
-    assert returns[1:] == [-1000, -1000, -1000]
-    assert baseline_return(model, 1000) == pytest.approx(max(-1000, expected), abs=0.5)
-
-
-def test_the_baseline_policies_are_distributions_over_actions_alone():
-    model = coin(0.5)
-    assert [policy.tolist() for policy in baseline_policies(model)] == [
-        [[0.5, 0.5]],
-        [[1.0, 0.0]],
-        [[0.0, 1.0]],
-    ]
-
-
-def test_the_best_route_of_the_warehouse():
+def test_the_best_routes_of_the_warehouse():
     env = gym.make("envs:Warehouse-v0")
     model, success = transition_model(env), success_outcomes(env)
-    assert model is not None
-    found = policy_return(model, value_iteration(model, 1.0).policy, 1000, success=success)
-    assert vars(found) == {
-        "expected_return": 79.0,
-        "return_variance": 0.0,
-        "expected_length": 22.0,
-        "length_variance": 0.0,
-        "success_rate": 1.0,
-    }
-    visits = state_visitation(model, value_iteration(model, 1.0).policy, 1000)
+    best = value_iteration(model, 1.0)
+    found = policy_return(model, best.policy, 1000, success=success)
+    assert [*vars(found).values()] == [79.0, 0.0, 22.0, 0.0, 1.0]
+    visits = state_visitation(model, best.policy, 1000)
     assert sorted(visits)[-22:] == [1.0] * 22
     assert visits.sum() == 22
+    values, optimal = optimal_choices(model, 1000)
+    np.testing.assert_array_equal(values[model.reachable], best.values[model.reachable])
+    assert optimal[np.arange(100), best.policy].all()
+
+    def routes(state):
+        following = [
+            (model.next_state[state, a, 0], model.terminated[state, a, 0])
+            for a in np.flatnonzero(optimal[state])
+        ]
+        return sum(1 if ended else routes(reached) for reached, ended in following)
+
+    assert routes(90) == 2
 
 
 def test_the_frozen_lake_without_time_limit():
     env = gym.make("FrozenLake-v1")
     model, success = transition_model(env), success_outcomes(env)
-    assert model is not None
     found = policy_return(model, value_iteration(model, 1.0).policy, None, success=success)
-    assert found.success_rate == pytest.approx(14 / 17)
-    assert found.expected_return == pytest.approx(14 / 17)
+    assert found.success_rate == found.expected_return == pytest.approx(14 / 17)
     assert found.return_variance == pytest.approx(14 / 17 * 3 / 17)
 
 
@@ -164,24 +133,14 @@ def test_forms_of_one_policy_agree():
     actions = value_iteration(model, 0.99).policy
     matrix = np.eye(4)[actions]
     expected = policy_return(model, actions, 100)
-    assert policy_return(model, matrix, 100) == expected
-    assert policy_return(model, matrix.astype(np.float32), 100) == expected
-    assert policy_return(model, np.tile(actions.astype(np.uint8), (100, 1)), 100) == expected
-
-
-def test_networks_round_their_probabilities():
-    model = coin(0.5)
-    rounded = np.array([[1 / 3, 2 / 3]], np.float32) * np.float32(1 + 1e-6)
-    found = policy_return(model, rounded, 50).expected_return
-    assert found == pytest.approx(
-        policy_return(model, np.array([[1 / 3, 2 / 3]]), 50).expected_return
-    )
+    for form in (matrix, matrix.astype(np.float32), np.tile(actions.astype(np.uint8), (100, 1))):
+        assert policy_return(model, form, 100) == expected
+    # Networks round their probabilities.
+    model, third = coin(0.5), np.array([[1 / 3, 2 / 3]])
+    rounded = third.astype(np.float32) * np.float32(1 + 1e-6)
+    found, exact = (policy_return(model, form, 50) for form in (rounded, third))
+    assert found.expected_return == pytest.approx(exact.expected_return)
     assert state_visitation(model, rounded, 1).tolist() == [1.0]
-
-
-def test_marks_of_success_that_do_not_end_the_episode_are_ignored():
-    found = policy_return(coin(0.5), np.array([1]), 9, success=np.ones((1, 2, 2), bool))
-    assert found.success_rate == 0
 
 
 def test_what_a_policy_says_of_unreachable_states_is_ignored():
@@ -196,33 +155,38 @@ def test_what_a_policy_says_of_unreachable_states_is_ignored():
 @pytest.mark.parametrize(
     ("policy", "horizon", "message"),
     [
-        (np.array([1]), None, "from state 0 the policy never ends the episode"),
-        (np.array([2]), 5, "the policy takes an action outside 0..1"),
-        (np.array([-1]), 5, "the policy takes an action outside 0..1"),
-        (np.zeros((4, 1), int), 5, r"actions have shape \(4, 1\), they must have \(1,\), or \(5"),
-        (np.zeros((4, 1), int), None, r"actions have shape \(4, 1\)"),
-        (np.ones((1, 3)), 5, r"the policy matrix has shape \(1, 3\), it must have \(1, 2\)"),
-        (np.array([[0.5, 0.6]]), 5, r"in state 0 the policy's probabilities are \[0.5 0.6\]"),
-        (np.array([[np.nan, 1.0]]), 5, "in state 0 the policy's probabilities are"),
-        (np.array([[-0.5, 1.5]]), 5, "in state 0 the policy's probabilities are"),
-        (np.array([0]), 0, "horizon is 0, it must be at least 1, or None"),
+        ([1], None, "from state 0 the policy never ends the episode"),
+        ([2], 5, "the policy takes an action outside 0..1"),
+        ([-1], 5, "the policy takes an action outside 0..1"),
+        ([[0]] * 4, 5, r"actions have shape \(4, 1\), they must have \(1,\), or \(5"),
+        ([[0]] * 4, None, r"actions have shape \(4, 1\)"),
+        ([[1.0] * 3], 5, r"the policy matrix has shape \(1, 3\), it must have \(1, 2\)"),
+        ([[0.5, 0.6]], 5, r"in state 0 the policy's probabilities are \[0.5 0.6\]"),
+        ([[np.nan, 1.0]], 5, "in state 0 the policy's probabilities are"),
+        ([[-0.5, 1.5]], 5, "in state 0 the policy's probabilities are"),
+        ([0], 0, "horizon is 0, it must be at least 1, or None"),
     ],
     ids=str,
 )
-@pytest.mark.parametrize("function", [policy_return, state_visitation])
-def test_wrong_policies_are_refused(function, policy, horizon, message):
-    with pytest.raises(ValueError, match=message):
-        function(coin(0.5), policy, horizon)
+def test_wrong_policies_are_refused(policy, horizon, message):
+    for function in (policy_return, state_visitation):
+        with pytest.raises(ValueError, match=message):
+            function(coin(0.5), np.array(policy), horizon)
 
 
-def test_marks_of_the_wrong_shape_are_refused():
+def test_other_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match=r"success has shape \(1,\), the model has \(1, 2, 2\)"):
         policy_return(coin(0.5), np.array([0]), 5, success=np.ones(1, bool))
+    for horizon in (0, -1):
+        for call in (partial(state_values, policy=np.zeros(5, int)), optimal_choices):
+            with pytest.raises(ValueError, match=f"horizon is {horizon}, it must be at least 1"):
+                call(corridor(), horizon=horizon)
+    with pytest.raises(ValueError, match=r"outside 0..1"):
+        state_values(corridor(), np.full(5, 2), 3)
 
 
 # --- values of states, with the whole time limit ahead -------------------------------------------
 
-Floats = NDArray[np.float64]
 LEFT, RIGHT = 0, 1
 
 
@@ -244,26 +208,23 @@ def corridor():
     )
 
 
-def test_values_of_a_corridor_worked_by_hand():
-    always_right = np.full(5, RIGHT)
-    assert state_values(corridor(), always_right, 100).tolist() == [7, 8, 9, 10, 0]
+HALF = np.full((5, 2), 0.5)
+CORRIDOR = [  # a policy, steps left, and the values of the states
+    ([RIGHT] * 5, 100, [7, 8, 9, 10, 0]),
     # With three steps left the exit is out of reach from state 0.
-    assert state_values(corridor(), always_right, 3).tolist() == [-3, 8, 9, 10, 0]
-    assert state_values(corridor(), np.full(5, LEFT), 100).tolist() == [-100, -100, -100, -100, 0]
-    to_and_fro = np.array([RIGHT, LEFT, RIGHT, RIGHT, RIGHT])
-    assert state_values(corridor(), to_and_fro, 7).tolist() == [-7, -7, 9, 10, 0]
+    ([RIGHT] * 5, 3, [-3, 8, 9, 10, 0]),
+    ([LEFT] * 5, 100, [-100, -100, -100, -100, 0]),
+    ([RIGHT, LEFT, RIGHT, RIGHT, RIGHT], 7, [-7, -7, 9, 10, 0]),
+    (HALF, 1, [-1, -1, -1, 4.5, 0]),
+    (HALF, 2, [-2, -2, 0.75, 4, 0]),
+    # One that changes with the step.
+    ([[LEFT] * 5, [RIGHT] * 5, [RIGHT] * 5], 3, [-3, -3, -3, 8, 0]),
+]
 
 
-def test_values_of_random_steps_worked_by_hand():
-    model = corridor()
-    half = np.full((5, 2), 0.5)
-    assert state_values(model, half, 1).tolist() == [-1, -1, -1, 4.5, 0]
-    assert state_values(model, half, 2).tolist() == [-2, -2, 0.75, 4, 0]
-
-
-def test_values_of_a_policy_that_changes_with_the_step():
-    first_left = np.array([[LEFT] * 5, [RIGHT] * 5, [RIGHT] * 5])
-    assert state_values(corridor(), first_left, 3).tolist() == [-3, -3, -3, 8, 0]
+@pytest.mark.parametrize(("policy", "horizon", "values"), CORRIDOR)
+def test_values_of_a_corridor_worked_by_hand(policy, horizon, values):
+    assert state_values(corridor(), np.array(policy), horizon).tolist() == values
 
 
 def test_what_is_best_in_a_corridor():
@@ -280,42 +241,10 @@ def test_what_is_best_in_a_corridor():
 
 @pytest.mark.parametrize(("advantage", "n_best"), [(0.0, 2), (1e-11, 2), (1e-7, 1)])
 def test_actions_are_equal_within_rounding(advantage, n_best):
-    model = TransitionModel(
-        prob=np.ones((1, 2, 1)),
-        next_state=np.zeros((1, 2, 1), int),
-        reward=np.array([[[5.0], [5.0 + advantage]]]),
-        terminated=np.ones((1, 2, 1), bool),
-        initial=np.ones(1),
-    )
+    model = coin(1.0, reward=5.0)
+    reward = np.array([[[5.0, 5.0], [5.0 + advantage] * 2]])
+    model = replace(model, reward=reward, terminated=np.ones((1, 2, 2), bool))
     assert optimal_choices(model, 3)[1].sum() == n_best
-
-
-def test_the_warehouse_has_two_best_routes():
-    model = model_of("Warehouse-v0")
-    values, optimal = optimal_choices(model, 1000)
-    best = value_iteration(model, 1.0)
-    np.testing.assert_array_equal(values[model.reachable], best.values[model.reachable])
-    assert optimal[np.arange(100), best.policy].all()
-    assert model.initial @ values == 79
-
-    def routes(state):
-        following = [
-            (model.next_state[state, a, 0], model.terminated[state, a, 0])
-            for a in np.flatnonzero(optimal[state])
-        ]
-        return sum(1 if ended else routes(reached) for reached, ended in following)
-
-    assert routes(90) == 2
-
-
-def test_wrong_arguments_are_refused():
-    for horizon in (0, -1):
-        with pytest.raises(ValueError, match=f"horizon is {horizon}, it must be at least 1"):
-            state_values(corridor(), np.zeros(5, int), horizon)
-        with pytest.raises(ValueError, match=f"horizon is {horizon}, it must be at least 1"):
-            optimal_choices(corridor(), horizon)
-    with pytest.raises(ValueError, match=r"outside 0..1"):
-        state_values(corridor(), np.full(5, 2), 3)
 
 
 # --- a time limit ---------------------------------------------------------------------------------
@@ -336,28 +265,6 @@ def test_a_way_that_goes_round_for_a_million_steps():
     assert policy_return(model, policy, 10**6 + 1).expected_length == 10**6 + 1
 
 
-def test_a_hopeless_policy_is_given_up():
-    """Each step costs 1 and the end, which comes with probability 0.1, pays 5."""
-    model = TransitionModel(
-        prob=np.array([[[0.9, 0.1]]]),
-        next_state=np.zeros((1, 1, 2), int),
-        reward=np.array([[[-1.0, 5.0]]]),
-        terminated=np.array([[[False, True]]]),
-        initial=np.ones(1),
-    )
-    worth = policy_return(model, np.array([0]), 100).expected_return
-
-    def told(floor):
-        episodes = LimitedEpisodes(model, np.zeros((1, 1), int), 100)
-        none = np.zeros((1, 1, 2), bool)
-        return episodes.result(1.0, none, with_success=False, floor=floor).expected_return
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mdp.evaluation.MOST_BACKWARDS", 0)
-        assert told(worth - 1e-9) == pytest.approx(worth)
-        assert told(worth + 0.5) == -np.inf
-
-
 # --- a limit far away ----------------------------------------------------------------------------
 
 
@@ -365,8 +272,6 @@ def test_a_hopeless_policy_is_given_up():
 def test_of_a_warehouse_it_is_found(slip):
     env = gym.make("envs:RandomWarehouse-v0", size=15, slip=slip, max_episode_steps=5000)
     model, horizon = transition_model(env), time_limit(env)
-    assert model is not None
-    assert horizon is not None
     found, expected = optimum_far_from_limit(model, horizon), finite_horizon_optimum(model, horizon)
     assert found == pytest.approx(expected.start_value, abs=1e-6)
 
@@ -389,36 +294,11 @@ def far_goal(length, **changes):
 def test_a_limit_that_matters_is_noticed():
     # With an end that costs 50, 30 steps of standing still are better; and 60 are no better than
     # 10 steps to the end, which is too close to call without looking.
-    for limit, end in itertools.product((30, 58, 62), (-50.0,)):
-        assert optimum_far_from_limit(far_goal(10, end=end), limit) is None
+    for limit in (30, 58, 62):
+        assert optimum_far_from_limit(far_goal(10, end=-50.0), limit) is None
     assert optimum_far_from_limit(far_goal(10, end=-50.0), 200) == -59.0
     assert finite_horizon_optimum(far_goal(10, end=-50.0), 30).start_value == -30.0
     # Where steps cost nothing, or nobody arrives, nothing can be said.
     assert optimum_far_from_limit(far_goal(10, step=0.0, end=5.0), 10**6) is None
-    endless = far_goal(10)
-    model = TransitionModel(
-        endless.prob, endless.next_state, endless.reward, np.zeros((10, 2, 1), bool), np.eye(10)[0]
-    )
-    assert optimum_far_from_limit(model, 10**6) is None
-
-
-def test_how_values_change_on_the_way():
-    """From state 0 one slips back to it with probability 1/4, else on to 1, which ends for 4."""
-    model = TransitionModel(
-        prob=np.array([[[0.75, 0.25]], [[1.0, 0.0]]]),
-        next_state=np.array([[[1, 0]], [[0, 0]]]),
-        reward=np.array([[[-1.0, -3.0]], [[4.0, 0.0]]]),
-        terminated=np.array([[[False, False]], [[True, False]]]),
-        initial=np.array([1.0, 0.0]),
-    )
-    values = value_iteration(model, 1.0).values
-    assert values == pytest.approx([2.0, 4.0])  # v = 0.75 (4 - 1) + 0.25 (v - 3)
-    step_cost, fall, variance = drift(
-        model.prob, model.next_state, model.terminated, model.reward, model.reachable, values
-    )
-    # Of the rises 2 and 0 the mean is 1.5, and the variance 0.75 * 0.25 + 0.25 * 2.25.
-    assert (step_cost, fall, variance) == pytest.approx((1.0, 1.5, 0.75))
-    bound = chance_of_losing(10.0, 1.5, 0.75, 100)
-    assert bound == pytest.approx(np.exp(-100 / (150 + 10)))
-    assert chance_of_losing(-1.0, 1.5, 0.75, 100) == 1.0
-    assert chance_of_losing(1.0, 0.0, 0.0, 100) == 0.0
+    endless = replace(far_goal(10), terminated=np.zeros((10, 2, 1), bool))
+    assert optimum_far_from_limit(endless, 10**6) is None

@@ -25,13 +25,12 @@ def test_sizes_and_derived_arrays():
     assert (model.n_states, model.n_actions, model.n_outcomes) == (2, 2, 2)
     assert model.expected_reward.tolist() == [[3.5, -1.0], [0.0, 7.0]]
     assert model.reachable.tolist() == [True, False]
-
-
-def test_outcomes_that_lead_to_one_state_stay_apart():
-    given = arrays()
-    given["next_state"][1, 1] = [0, 0]
-    model = TransitionModel(**given)
-    assert model.prob[1, 1].tolist() == [0.5, 0.5]
+    copy = pickle.loads(pickle.dumps(model))
+    for name in arrays():
+        np.testing.assert_array_equal(getattr(copy, name), getattr(model, name))
+    for given, kept in ((np.int32, np.int32), (np.uint8, np.int64)):
+        states = arrays()["next_state"].astype(given)
+        assert TransitionModel(**{**arrays(), "next_state": states}).next_state.dtype == kept
 
 
 def test_arrays_are_read_only_and_the_callers_stay_writable():
@@ -45,17 +44,11 @@ def test_arrays_are_read_only_and_the_callers_stay_writable():
     assert np.shares_memory(model.prob, given["prob"])
 
 
-@pytest.mark.parametrize(("given", "kept"), [(np.int32, np.int32), (np.uint8, np.int64)])
-def test_index_types(given, kept):
-    model = TransitionModel(**{**arrays(), "next_state": arrays()["next_state"].astype(given)})
-    assert model.next_state.dtype == kept
-
-
-def test_pickling_keeps_everything():
-    model = TransitionModel(**arrays())
-    copy = pickle.loads(pickle.dumps(model))
-    for name in arrays():
-        np.testing.assert_array_equal(getattr(copy, name), getattr(model, name))
+SHAPED = {
+    "prob": r"prob has shape \(2, 4\)",
+    "reward": r"reward has shape \(2, 4\), prob has \(2, 2, 2\)",
+    "initial": r"initial has shape \(1, 2\), it must be \(2,\)",
+}
 
 
 @pytest.mark.parametrize(
@@ -71,25 +64,17 @@ def test_pickling_keeps_everything():
         ("initial", slice(None), [1.5, -0.5], r"initial has a probability outside \[0, 1\] at"),
     ],
 )
-def test_wrong_numbers_are_refused(name, place, value, message):
+def test_wrong_arrays_are_refused(name, place, value, message):
     given = arrays()
+    given["prob"][1, 1] = [0.5, 0.5 + 5e-10]  # rounding is accepted
+    TransitionModel(**given)
+    if name in SHAPED:
+        shape = (1, 2) if name == "initial" else (2, 4)
+        with pytest.raises(ValueError, match=SHAPED[name]):
+            TransitionModel(**{**given, name: given[name].reshape(shape)})
     given[name][place] = value
     with pytest.raises(ValueError, match=message):
         TransitionModel(**given)
-
-
-@pytest.mark.parametrize(
-    ("name", "shape", "message"),
-    [
-        ("prob", (2, 4), r"prob has shape \(2, 4\)"),
-        ("reward", (2, 4), r"reward has shape \(2, 4\), prob has \(2, 2, 2\)"),
-        ("initial", (1, 2), r"initial has shape \(1, 2\), it must be \(2,\)"),
-    ],
-)
-def test_wrong_shapes_are_refused(name, shape, message):
-    given = arrays()
-    with pytest.raises(ValueError, match=message):
-        TransitionModel(**{**given, name: given[name].reshape(shape)})
 
 
 def test_variances_of_rewards_are_checked():
@@ -106,13 +91,7 @@ def test_variances_of_rewards_are_checked():
             TransitionModel(**given, reward_variance=variance)
 
 
-def test_rounding_of_probabilities_is_accepted():
-    given = arrays()
-    given["prob"][1, 1] = [0.5, 0.5 + 5e-10]
-    TransitionModel(**given)
-
-
-def test_from_gymnasium_pads_and_keeps_the_order():
+def test_from_gymnasium_pads_keeps_the_order_and_refuses_gaps():
     outcomes = [(0.25, 1, 1.0, True), (0.5, 0, 2.0, False), (0.25, 1, 1.0, True)]
     P = {  # noqa: N806 (Gymnasium's own name)
         0: {0: outcomes, 1: [(1.0, 1, 3.0, False)]},
@@ -123,19 +102,14 @@ def test_from_gymnasium_pads_and_keeps_the_order():
     assert model.next_state[0, 0].tolist() == [1, 0, 1]
     assert model.reward[:, 1, 0].tolist() == [3.0, 5.0]
     assert model.terminated[0, 0].tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize(
-    ("P", "message"),
-    [
-        ({0: {0: [(1.0, 0, 0.0, True)]}, 2: {}}, "P has no state 1"),
-        ({0: {0: [(1.0, 0, 0.0, True)]}, 1: {}}, "state 1 must have the actions 0 to 0"),
+    row = {0: [(1.0, 0, 0.0, True)]}
+    for broken, message in (
+        ({0: row, 2: {}}, "P has no state 1"),
+        ({0: row, 1: {}}, "state 1 must have the actions 0 to 0"),
         ({0: {0: []}}, "state 0, action 0 has no outcome"),
-    ],
-)
-def test_from_gymnasium_refuses_gaps(P, message):  # noqa: N803 (as above)
-    with pytest.raises(ValueError, match=message):
-        TransitionModel.from_gymnasium(P, np.ones(len(P)) / len(P))
+    ):
+        with pytest.raises(ValueError, match=message):
+            TransitionModel.from_gymnasium(broken, np.ones(len(broken)) / len(broken))
 
 
 @pytest.mark.parametrize(

@@ -67,100 +67,85 @@ def space(kind, **state):
 
 def with_state(maker, key, value):
     """A new object whose state has one attribute."""
-    return START + maker + b")\x81}" + text(key) + value + b"sb."
+    return maker + b")\x81}" + text(key) + value + b"sb"
 
 
-# Each is read by everything that reads pickles, see `loaders`.
-ATTACKS = {
-    "a call of the system": START + name("os", "system") + text("true") + b"\x85R.",
-    "the same in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
-    "getattr": START + name("builtins", "getattr") + b".",
-    "a way through attributes": START + name(UTILS, "FloatSchedule.__init__.__globals__") + b".",
-    "the state of a class, by slots": START
-    + CONSTANT
-    + b"N}"
-    + text("__call__")
-    + DEQUE
-    + b"s\x86b.",
-    "the state of a class": START + CONSTANT + b"}" + text("x") + b"K\x01sb.",
-    "an object that is called": START + CONSTANT + b")R)R.",
+# Instructions of protocol 4, between its beginning and its end.
+INSTRUCTIONS = {
+    "a call of the system": name("os", "system") + text("true") + b"\x85R",
+    "getattr": name("builtins", "getattr"),
+    "a way through attributes": name(UTILS, "FloatSchedule.__init__.__globals__"),
+    "the state of a class, by slots": CONSTANT + b"N}" + text("__call__") + DEQUE + b"s\x86b",
+    "the state of a class": CONSTANT + b"}" + text("x") + b"K\x01sb",
+    "an object that is called": CONSTANT + b")R)R",
     "an attribute that is no setting": with_state(CONSTANT, "__class__", b"K\x01"),
     "a schedule that is a class": with_state(FLOAT_SCHEDULE, "value_schedule", RELU),
-    "a class that is called": START + RELU + b")R.",
-    "lists in lists": START + b"]" * 5000 + b"a" * 4999 + b".",
-    "a huge index of the memo": START + b"Nr\xff\xff\xff\x0f0h\x01.",
-    "an array of gigabytes": START
-    + name("numpy._core.multiarray", "_reconstruct")
-    + name("numpy", "ndarray")
-    + b"J\xff\xff\xff\x7f\x85C\x01b\x87R.",
-    "an array of objects": pickle.dumps(np.array([print], dtype=object)),
-    "a key whose hash takes for ever": START + LAYERS + b"}" + TOP + b"K\x01s.",
-    "a value that is huge once it is written out": START + LAYERS + TOP + b".",
-    "a whole number of thousands of digits": pickle.dumps(10**5000),
-    "a length that is not there": START + b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
-    "an infinite schedule": pickle.dumps(ConstantSchedule(float("inf"))),
-    "a schedule that is no number": pickle.dumps(ConstantSchedule(float("nan"))),
+    "a class that is called": RELU + b")R",
+    "lists in lists": b"]" * 5000 + b"a" * 4999,
+    "a huge index of the memo": b"Nr\xff\xff\xff\x0f0h\x01",
+    "an array of gigabytes": name("numpy._core.multiarray", "_reconstruct")
+    + name("numpy", "ndarray") + b"J\xff\xff\xff\x7f\x85C\x01b\x87R",
+    "a key whose hash takes for ever": LAYERS + b"}" + TOP + b"K\x01s",
+    "a value that is huge once it is written out": LAYERS + TOP,
+    "a length that is not there": b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f",
     "a schedule of a huge number": with_state(CONSTANT, "val", b"\x8a\xff" + b"\x7f" * 255),
     # Calls of what calls return, and states of what is no new object.
-    "a call of a call": START + DEQUE + b")R)R.",
-    "a call of a call that is huge once it is written out": START
-    + SHORT_LAYERS
-    + DEQUE
-    + SHORT_TOP
-    + b"\x85R)R.",
-    "calls of calls, deep": START + DEQUE + b")R" * 2_000 + b".",
-    "tuples in tuples": START + b"N" + b"\x85" * 2_000 + b".",
-    "two states": START + CONSTANT + b")\x81}b}b.",
-    "the state of a list": START + b"]}b.",
-    "the state of a name": START + name("builtins", "int") + b"}b.",
-    "a state that is its own object": START
-    + FLOAT_SCHEDULE
-    + b")\x81\x94}"
-    + text("value_schedule")
-    + b"h\x00sb.",
+    "a call of a call": DEQUE + b")R)R",
+    "a call of a call that is huge once it is written out":
+        SHORT_LAYERS + DEQUE + SHORT_TOP + b"\x85R)R",
+    "calls of calls, deep": DEQUE + b")R" * 2_000,
+    "tuples in tuples": b"N" + b"\x85" * 2_000,
+    "two states": CONSTANT + b")\x81}b}b",
+    "the state of a list": b"]}b",
+    "the state of a name": name("builtins", "int") + b"}b",
+    "a state that is its own object":
+        FLOAT_SCHEDULE + b")\x81\x94}" + text("value_schedule") + b"h\x00sb",
     # Places of the stack and of the memo.
-    "an end before the beginning": START + b"0000.",
-    "an item of a name": START + name("os", "environ") + b"Na.",
-    "a member of an object": START + DEQUE + b")R(K\x01\x90.",
-    "a place of the memo that is empty": START + b"h\x07.",
-    "a list of itself": START + b"]\x94h\x00a.",
-    "an object among its own items": START + DEQUE + b")R\x94h\x00a.",
-    "an object in its own argument": START + b"]\x94" + DEQUE + b"h\x00\x85R\x94a.",
+    "an end before the beginning": b"0000",
+    "an item of a name": name("os", "environ") + b"Na",
+    "a member of an object": DEQUE + b")R(K\x01\x90",
+    "a place of the memo that is empty": b"h\x07",
+    "a list of itself": b"]\x94h\x00a",
+    "an object among its own items": DEQUE + b")R\x94h\x00a",
+    "an object in its own argument": b"]\x94" + DEQUE + b"h\x00\x85R\x94a",
     # Keys and members whose hash is not theirs alone, or takes for ever.
-    "a key that is an object": START + b"}" + DEQUE + b")RNs.",
-    "a key that is a truth": START + b"}\x88Ns.",
-    "members that are tuples": START + SHORT_LAYERS + b"\x8f(" + SHORT_TOP + b"\x90.",
-    "frozen members that are tuples": START + SHORT_LAYERS + b"(" + SHORT_TOP + b"\x91.",
-    "keys of an object that are tuples": START
-    + SHORT_LAYERS
-    + name("collections", "OrderedDict")
-    + b")R"
-    + SHORT_TOP
-    + b"Ns.",
-    # Instructions of no model, and of older protocols.
+    "a key that is an object": b"}" + DEQUE + b")RNs",
+    "a key that is a truth": b"}\x88Ns",
+    "members that are tuples": SHORT_LAYERS + b"\x8f(" + SHORT_TOP + b"\x90",
+    "frozen members that are tuples": SHORT_LAYERS + b"(" + SHORT_TOP + b"\x91",
+    "keys of an object that are tuples":
+        SHORT_LAYERS + name("collections", "OrderedDict") + b")R" + SHORT_TOP + b"Ns",
+    # Instructions of no model.
+    "an extension code": b"\x82\x01",
+    "arguments by keyword": CONSTANT + b")}\x92",
+    # The last byte makes it as long as it says.
+    "a long number of a megabyte": b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f",
+    "a long number of -1 bytes": b"\x8b\xff\xff\xff\xff",
+    "a frame without an end": b"\x95" + b"\xff" * 8 + b"N",
+    "a frame in a frame": b"\x95" + struct.pack("<Q", 20) + b"\x95" + bytes(20) + b"N",
+    # Sizes that are no numbers, or too large.
+    "an array of no number": array(bytes(8), NAN + b"\x85"),
+    "an array of -1 numbers": array(bytes(8), b"J\xff\xff\xff\xff\x85"),
+    "an array of 33 dimensions": array(bytes(8), b"(" + b"K\x01" * 33 + b"t"),
+    "a space of many values":
+        space("discrete.Discrete", n=b"\x8a\x0c" + b"\x7f" * 12, start=b"K\0"),
+    "a space of no number of values": space("multi_binary.MultiBinary", n=NAN),
+    "a deque of a length below 0": DEQUE + b")J\xfb\xff\xff\xff\x86R",
+}  # fmt: skip
+# Each is read by everything that reads pickles, see `loaders`.
+ATTACKS = {attack: START + instructions + b"." for attack, instructions in INSTRUCTIONS.items()} | {
+    "a call of the system in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
+    "an array of objects": pickle.dumps(np.array([print], dtype=object)),
+    "a whole number of thousands of digits": pickle.dumps(10**5000),
+    "an infinite schedule": pickle.dumps(ConstantSchedule(float("inf"))),
+    "a schedule that is no number": pickle.dumps(ConstantSchedule(float("nan"))),
     "an instance": b"(S'true'\nios\nsystem\n.",
     "a persistent id": START + b"Px\n.",
-    "an extension code": START + b"\x82\x01.",
-    "arguments by keyword": START + CONSTANT + b")}\x92.",
     "a buffer from elsewhere": b"\x80\x05\x97.",
     "a whole number of protocol 0": b"I" + b"9" * 10**6 + b"\n.",
-    # The last byte makes it as long as it says.
-    "a long number of a megabyte": START + b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f.",
-    "a long number of -1 bytes": START + b"\x8b\xff\xff\xff\xff.",
     "protocol 255": b"\x80\xff.",
-    "a frame without an end": START + b"\x95" + b"\xff" * 8 + b"N.",
-    "a frame in a frame": START + b"\x95" + struct.pack("<Q", 20) + b"\x95" + bytes(20) + b"N.",
     "nothing": b"",
     "no end": START + b"N",
-    # Sizes that are no numbers, or too large.
-    "an array of no number": START + array(bytes(8), NAN + b"\x85") + b".",
-    "an array of -1 numbers": START + array(bytes(8), b"J\xff\xff\xff\xff\x85") + b".",
-    "an array of 33 dimensions": START + array(bytes(8), b"(" + b"K\x01" * 33 + b"t") + b".",
-    "a space of many values": START
-    + space("discrete.Discrete", n=b"\x8a\x0c" + b"\x7f" * 12, start=b"K\0")
-    + b".",
-    "a space of no number of values": START + space("multi_binary.MultiBinary", n=NAN) + b".",
-    "a deque of a length below 0": START + DEQUE + b")J\xfb\xff\xff\xff\x86R.",
 }
 
 
@@ -246,26 +231,16 @@ class Attack:
         return os.mkdir, (self.mark,)
 
 
-def test_a_genuine_zip_is_loaded(genuine):
+def test_no_pickle_in_the_settings_is_run(genuine, tmp_path):
+    mark = tmp_path / "mark"
     assert isinstance(load(genuine), PPO)
-
-
-@pytest.mark.parametrize(
-    "key", ["policy_class", "invented", "learning_rate", "clip_range", "algorithm"]
-)
-def test_no_pickle_in_the_settings_is_run(genuine, tmp_path, key):
-    mark = tmp_path / "mark"
-    changed = with_settings(genuine, **{key: pickled(Attack(mark))})
-    with pytest.raises(UnsafeFileError, match=key) as refusal:
-        load(changed)
-    assert refusal.value.key == key
-    assert not mark.exists()
-
-
-@pytest.mark.parametrize("key", ["env", "_logger", "device", "_vec_normalize_env", "lr_schedule"])
-def test_what_the_reader_decides_is_not_even_read(genuine, tmp_path, key):
-    mark = tmp_path / "mark"
-    assert isinstance(load(with_settings(genuine, **{key: pickled(Attack(mark))})), PPO)
+    for key in ("policy_class", "invented", "learning_rate", "clip_range", "algorithm"):
+        with pytest.raises(UnsafeFileError, match=key) as refusal:
+            load(with_settings(genuine, **{key: pickled(Attack(mark))}))
+        assert refusal.value.key == key
+    # What the reader decides is not even read.
+    for key in ("env", "_logger", "device", "_vec_normalize_env", "lr_schedule"):
+        assert isinstance(load(with_settings(genuine, **{key: pickled(Attack(mark))})), PPO)
     assert not mark.exists()
 
 
@@ -339,38 +314,48 @@ def trained():
 
 
 BIAS, ACTOR = "actor.mu.bias", "actor.optimizer.pth"
+
+
+def weight(change):
+    """Something is done to one weight."""
+    return "policy.pth", lambda held: held.update({BIAS: change(held[BIAS])})
+
+
+def average(change, member=ACTOR):
+    """Something is done to what an optimizer remembers of one weight."""
+    return member, lambda held: change(held["state"][0])
+
+
+def group(member=ACTOR, **settings):
+    """An optimizer has other settings."""
+    return member, lambda held: held["param_groups"][0].update(settings)
+
+
+def entropy(change):
+    """Something is done to the entropy coefficient."""
+    key = "log_ent_coef"
+    return "pytorch_variables.pth", lambda held: held.update({key: change(held[key])})
+
+
 WRONG_TENSORS = {
-    "a weight that is no number": ("policy.pth", lambda w: w[BIAS].fill_(th.nan)),
-    "a weight of float64": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].double()})),
-    "a weight of int8": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].to(th.int8)})),
-    "a weight of half": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].half()})),
-    "a complex weight": ("policy.pth", lambda w: w.update({BIAS: w[BIAS] + 1j})),
-    "a weight of another shape": ("policy.pth", lambda w: w.update({BIAS: th.zeros(2)})),
-    "a weight that is a list": ("policy.pth", lambda w: w.update({BIAS: [0.0]})),
-    "an average of another kind": (
-        ACTOR,
-        lambda o: o["state"][0].update(exp_avg=o["state"][0]["exp_avg"].double()),
+    "a weight that is no number": weight(lambda w: w.fill_(th.nan)),
+    "a weight of float64": weight(lambda w: w.double()),
+    "a weight of int8": weight(lambda w: w.to(th.int8)),
+    "a weight of half": weight(lambda w: w.half()),
+    "a complex weight": weight(lambda w: w + 1j),
+    "a weight of another shape": weight(lambda w: th.zeros(2)),
+    "a weight that is a list": weight(lambda w: [0.0]),
+    "an average of another kind": average(lambda s: s.update(exp_avg=s["exp_avg"].double())),
+    "an average of another shape": average(
+        lambda s: s.update(exp_avg=th.zeros(3)), "critic.optimizer.pth"
     ),
-    "an average of another shape": (
-        "critic.optimizer.pth",
-        lambda o: o["state"][0].update(exp_avg=th.zeros(3)),
-    ),
-    "a count of steps that is a text": (ACTOR, lambda o: o["state"][0].update(step="many")),
+    "a count of steps that is a text": average(lambda s: s.update(step="many")),
     "averages of no parameter": (ACTOR, lambda o: o["state"].update({77: {"step": 1}})),
-    "a learning rate that is a text": (ACTOR, lambda o: o["param_groups"][0].update(lr="fast")),
-    "an infinite learning rate": (
-        "ent_coef_optimizer.pth",
-        lambda o: o["param_groups"][0].update(lr=float("inf")),
-    ),
-    "one beta": (ACTOR, lambda o: o["param_groups"][0].update(betas=(0.9,))),
-    "an entropy coefficient of another kind": (
-        "pytorch_variables.pth",
-        lambda v: v.update(log_ent_coef=v["log_ent_coef"].double()),
-    ),
-    "several entropy coefficients": (
-        "pytorch_variables.pth",
-        lambda v: v.update(log_ent_coef=th.zeros(3)),
-    ),
+    "a learning rate that is a text": group(lr="fast"),
+    "an infinite learning rate": group("ent_coef_optimizer.pth", lr=float("inf")),
+    "one beta": group(betas=(0.9,)),
+    "an entropy coefficient of another kind": entropy(lambda v: v.double()),
+    "several entropy coefficients": entropy(lambda v: th.zeros(3)),
 }
 
 
@@ -482,6 +467,7 @@ def odd_zips(genuine):
         for member, held in [*genuine.items(), ("policy.pth", b"another")]:
             archive.writestr(member, held)
     longer = zip_of({**genuine, "policy.pth!x": b"another"})
+    bomb = zip_of({"archive/data.pkl": bytes(100 * MB)}, zipfile.ZIP_DEFLATED)
     link = zipfile.ZipInfo("policy.pth")
     link.create_system, link.external_attr = 3, 0o120777 << 16
     linked = io.BytesIO()
@@ -504,13 +490,7 @@ def odd_zips(genuine):
         "of a later version": directory(raw, policy, 6, struct.pack("<H", 255)),
         "a field beyond the list": directory(raw, policy, 30, struct.pack("<H", 60_000)),
         "another checksum": directory(raw, policy, 16, struct.pack("<L", 1)),
-        "a bomb in a bomb": zip_of(
-            {
-                **genuine,
-                "policy.pth": zip_of({"archive/data.pkl": bytes(100 * MB)}, zipfile.ZIP_DEFLATED),
-            },
-            zipfile.ZIP_DEFLATED,
-        ),
+        "a bomb in a bomb": zip_of({**genuine, "policy.pth": bomb}, zipfile.ZIP_DEFLATED),
     }
 
 
@@ -581,10 +561,8 @@ BOMBS = {
     "many marks": b"(" * 4_000_000 + b".",
     "many places of the memo": b"N" + b"\x94" * 4_000_000 + b".",
     "many calls": DEQUE + b"\x940](" + b"h\x00)R" * 1_000_000 + b"e.",
-    "a wide text": b"X"
-    + (16 * MB + 4).to_bytes(4, "little")
-    + b"a" * 16 * MB
-    + b"\xf0\x9f\x98\x80.",
+    "a wide text":
+        b"X" + (16 * MB + 4).to_bytes(4, "little") + b"a" * 16 * MB + b"\xf0\x9f\x98\x80.",
     "bytes that are not there": b"\x96" + (8 << 30).to_bytes(8, "little") + b".",
     "keys of one hash": b"}(" + LONGS + b"u.",
     # What reading them takes just fits the budget.
@@ -593,14 +571,9 @@ BOMBS = {
     "nothing at many places": b"](" + b"N" * 1_900_000 + b"e.",
     "calls that just fit": DEQUE + b"\x940](" + b"h\x00)R" * 140_000 + b"e.",
     "names that just fit": text("a") + b"\x940](" + b"h\x00h\x00\x93" * 300_000 + b"e.",
-    "a list in lists in lists": b"]("
-    + b"N" * 3000
-    + b"e\x940]("
-    + b"h\x00" * 3000
-    + b"e\x940]("
-    + b"h\x01" * 3000
-    + b"e.",
-}
+    "a list in lists in lists":
+        b"](" + b"N" * 3000 + b"e\x940](" + b"h\x00" * 3000 + b"e\x940](" + b"h\x01" * 3000 + b"e.",
+}  # fmt: skip
 JSON_BOMBS = {
     "lists in JSON": "[" + "[]," * 3_000_000 + "[]]",
     "dictionaries in JSON": "[" + "{}," * 3_000_000 + "{}]",
@@ -622,9 +595,8 @@ def view(n_stored, said, offset, shape, strides):
 
     class Pickler(pickle.Pickler):
         def persistent_id(self, value):
-            return (
-                ("storage", th.FloatStorage, "0", "cpu", said) if type(value) is Storage else None
-            )
+            is_storage = type(value) is Storage
+            return ("storage", th.FloatStorage, "0", "cpu", said) if is_storage else None
 
     Pickler(pickled, 2).dump({"log_std": Tensor()})
     return zip_of({"archive/data.pkl": pickled.getvalue(), "archive/data/0": bytes(4 * n_stored)})
@@ -663,49 +635,43 @@ FEW = storage(FLOAT, PATH, b"K\x04")
 
 
 def same_record_as_many_kinds(n):
-    kinds = [
-        REBUILT
-        + storage(f"ctorch\n{kind}Storage\n".encode(), PATH, b"J" + struct.pack("<i", n // size))
-        + b"K\x00K\x01\x85K\x01\x85\x89}tR"
-        for kind, size in NUMBERS.items()
-    ]
-    return file_of(b"](" + b"".join(kinds) + b"e", bytes(n))
+    kinds = b""
+    for kind, size in NUMBERS.items():
+        named, fitting = f"ctorch\n{kind}Storage\n".encode(), b"J" + struct.pack("<i", n // size)
+        kinds += REBUILT + storage(named, PATH, fitting) + b"K\x00K\x01\x85K\x01\x85\x89}tR"
+    return file_of(b"](" + kinds + b"e", bytes(n))
 
 
+FOUR = bytes(16)  # four numbers of float32
+HUGE = b"h\x20"
+LONG = b"\x8a\x08" + struct.pack("<q", 1 << 62)
 STORAGES = {
-    "a key that is huge once it is written out": file_of(
-        OLD_LAYERS + storage(FLOAT, b"h\x20", b"K\x01"), bytes(4)
-    ),
-    "a size that is huge once it is written out": file_of(
-        OLD_LAYERS + storage(FLOAT, PATH, b"h\x20"), bytes(4)
-    ),
-    "a kind that is huge once it is written out": file_of(
-        OLD_LAYERS + storage(b"h\x20", PATH, b"K\x01"), bytes(4)
-    ),
+    "a key that is huge once it is written out":
+        file_of(OLD_LAYERS + storage(FLOAT, HUGE, b"K\x01"), bytes(4)),
+    "a size that is huge once it is written out":
+        file_of(OLD_LAYERS + storage(FLOAT, PATH, HUGE), bytes(4)),
+    "a kind that is huge once it is written out":
+        file_of(OLD_LAYERS + storage(HUGE, PATH, b"K\x01"), bytes(4)),
     "a size that is a list": file_of(
-        storage(b"ctorch\nComplexDoubleStorage\n", PATH, b"](" + b"N" * 900_000 + b"e"), bytes(16)
-    ),
+        storage(b"ctorch\nComplexDoubleStorage\n", PATH, b"](" + b"N" * 900_000 + b"e"), FOUR),
     "a size that is no number": file_of(storage(FLOAT, PATH, NAN), bytes(4)),
     "a size that is a float": file_of(storage(FLOAT, PATH, b"G?\xf0" + bytes(6)), bytes(4)),
     "a storage that is no tuple": file_of(b"NQ", bytes(4)),
     "a record elsewhere": file_of(storage(FLOAT, pickled_text("../x"), b"K\x01"), bytes(4)),
-    "the state of a storage": file_of(FEW + b"}b", bytes(16)),
-    "a stride that is no number": file_of(
-        REBUILT + FEW + b"K\x00K\x02\x85" + NAN + b"\x85\x89}tR", bytes(16)
-    ),
-    "a size that has no end": file_of(
-        REBUILT + FEW + b"K\x00\x8a\x08" + struct.pack("<q", 1 << 62) + b"\x85K\x01\x85\x89}tR",
-        bytes(16),
-    ),
+    "the state of a storage": file_of(FEW + b"}b", FOUR),
+    "a stride that is no number":
+        file_of(REBUILT + FEW + b"K\x00K\x02\x85" + NAN + b"\x85\x89}tR", FOUR),
+    "a size that has no end":
+        file_of(REBUILT + FEW + b"K\x00" + LONG + b"\x85K\x01\x85\x89}tR", FOUR),
     "40 dimensions": file_of(
-        REBUILT + FEW + b"K\x00(" + b"K\x01" * 40 + b"t(" + b"K\x01" * 40 + b"t\x89}tR", bytes(16)
-    ),
-    "a record under two names": zip_of(
-        {"archive/data.pkl": b"\x80\x02" + FEW + b".", "archive/data/0": bytes(16)}
-        | {"other/data/0": b"\0\0\x80?" * 4}
-    ),
+        REBUILT + FEW + b"K\x00(" + b"K\x01" * 40 + b"t(" + b"K\x01" * 40 + b"t\x89}tR", FOUR),
+    "a record under two names": zip_of({
+        "archive/data.pkl": b"\x80\x02" + FEW + b".",
+        "archive/data/0": FOUR,
+        "other/data/0": b"\0\0\x80?" * 4,
+    }),
     "one record as many kinds of numbers": same_record_as_many_kinds(48 * MB),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("attack", STORAGES)

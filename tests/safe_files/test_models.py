@@ -151,8 +151,15 @@ def go_on(name, folder, load, load_buffer, load_statistics):
     kinds = {attribute: type(value) for attribute, value in vars(model).items()}
     before = weights(model)
     reseed()
-    model.learn(60, reset_num_timesteps=False)
-    return model, kinds, before
+    return model.learn(60, reset_num_timesteps=False), kinds, before
+
+
+LIBRARY = (
+    lambda algorithm, path, env: algorithm.load(path, env),
+    lambda model, path: model.load_replay_buffer(path),
+    VecNormalize.load,
+)
+OURS = load_model, load_replay_buffer, load_vec_normalize
 
 
 # What the library says when it loads such models, by its own function too.
@@ -169,16 +176,8 @@ def test_a_genuine_model_goes_on_as_the_library_would(name, tmp_path):
     if isinstance(model, sb3.common.off_policy_algorithm.OffPolicyAlgorithm):
         model.save_replay_buffer(tmp_path / "buffer.pkl")
 
-    library, its_kinds, its_weights = go_on(
-        name,
-        tmp_path,
-        lambda algorithm, path, env: algorithm.load(path, env),
-        lambda model, path: model.load_replay_buffer(path),
-        VecNormalize.load,
-    )
-    ours, our_kinds, our_weights = go_on(
-        name, tmp_path, load_model, load_replay_buffer, load_vec_normalize
-    )
+    library, its_kinds, its_weights = go_on(name, tmp_path, *LIBRARY)
+    ours, our_kinds, our_weights = go_on(name, tmp_path, *OURS)
     assert our_kinds == its_kinds
     assert th.equal(our_weights, its_weights)
     assert th.equal(our_weights, weights(model))
