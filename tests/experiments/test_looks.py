@@ -1,5 +1,6 @@
 """What counts as a look at a study, what each may spend, and the file that remembers them."""
 
+import copy
 import json
 from dataclasses import replace
 
@@ -69,10 +70,6 @@ def number_of_looks(root, environment="lake"):
     return len(read_looks(root).get(environment, Looks()).taken)
 
 
-def everything_said(analysis):
-    return " ".join(conclusion(analysis.study, analysis.environments[0]).everything)
-
-
 def test_a_look_counts_when_the_runs_or_the_question_are_others(tmp_path):
     dry = replace(LAKE, label="dry")
     for place, fields in [
@@ -121,88 +118,66 @@ def test_a_run_that_is_damaged_since_costs_no_look_and_one_that_is_new_does(tmp_
     assert look(tmp_path) == (2, 2)
 
 
-def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
-    tmp_path, monkeypatch
-):
-    assert look(tmp_path) == (1, 1)
-    before = (tmp_path / LOOKS_FILE).read_bytes()
-
-    def cut_off(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("pipeline.files.put_in_place", cut_off)  # Ctrl-C at the worst moment
-        with pytest.raises(KeyboardInterrupt):
-            look(tmp_path, n_seeds=20)
-    assert [path.name for path in tmp_path.iterdir()] == [LOOKS_FILE]
-    assert (tmp_path / LOOKS_FILE).read_bytes() == before
-    assert look(tmp_path, n_seeds=20) == (2, 2)
-
-
-def test_page_and_terminal_say_which_look_it_is(tmp_path):
-    def said(n_seeds):
-        results = results_of(study_of(n_seeds=n_seeds), tmp_path)
-        return everything_said(analyse(results, looks=take_looks(results)))
-
-    assert "look" not in said(10)
-    assert "This is the second look at this study: claims at 0.25 %." in said(20)
-    text = said(6)
-    assert "; 6 seeds decide nothing, about " in text
-    assert "This would be the third look at this study, with claims at 0.083 %; runs that" in text
-    assert "This is the" not in text
-
-
 # --- The file.
 
-
-def damages(data):
-    """The data of a file, each time with something that was not written so."""
-    lake = data["environments"]["lake"]
-    first, *others = lake["taken"]
-    question = first["question"]
-    design = {"question": question, "sizes": [10, 20], "seeds": {"a": 10}, "after": 0}
-    yield from ({}, [], {**data, "format": 3})
-    changed = [[], *({k: v for k, v in lake.items() if k != key} for key in lake)]
-    changed += [{**lake, "taken": others}, {**lake, "taken": lake["taken"][::-1]}]
-    for key, value in [
-        ("level", 0.05),
-        ("level", None),
-        ("planned", True),
-        ("planned", 0),
-        ("seeds", {"qlearning": -1, "sarsa": 10}),
-        ("seeds", {"qlearning": 10}),
-        ("runs", {"qlearning": True, "sarsa": 10}),
-        ("digests", {"qlearning": 1, "sarsa": "2"}),
-        ("question", {**question, "metric": "luck"}),
-        ("question", {**question, "margin": 10**400}),
-        ("question", {**question, "margin": "1"}),
-        ("question", {}),
-        ("date", 5),
-        ("more", 5),
-    ]:
-        changed.append({**lake, "taken": [{**first, key: value}, *others]})
-    for key, value in [
-        ("sizes", []),
-        ("sizes", [20, 10]),
-        ("sizes", [0, 10]),
-        ("sizes", "10"),
-        ("seeds", {"a": 11}),
-        ("after", 3),
-        ("after", -1),
-        ("after", 0),  # right in itself, but the first look had the level of the first
-    ]:
-        changed.append({**lake, "design": {**design, key: value}})
-    yield from ({**data, "environments": {"lake": each}} for each in changed)
+LAKE_ENTRY = ("environments", "lake")
+FIRST = (*LAKE_ENTRY, "taken", 0)
+DESIGN = {"sizes": [10, 20], "seeds": {"a": 10}, "after": 0}
+# What stands where in a file of two looks in place of what was written.
+DAMAGES = [
+    ((), {}),
+    ((), []),
+    (("format",), 3),
+    (LAKE_ENTRY, []),
+    (LAKE_ENTRY, {}),
+    ((*LAKE_ENTRY, "taken"), lambda taken: taken[1:]),
+    ((*LAKE_ENTRY, "taken"), lambda taken: taken[::-1]),
+    *(((*FIRST, "level"), level) for level in (0.05, None)),
+    *(((*FIRST, "planned"), planned) for planned in (True, 0)),
+    *(((*FIRST, "seeds"), seeds) for seeds in ({"qlearning": -1, "sarsa": 10}, {"qlearning": 10})),
+    ((*FIRST, "runs"), {"qlearning": True, "sarsa": 10}),
+    ((*FIRST, "digests"), {"qlearning": 1, "sarsa": "2"}),
+    ((*FIRST, "question"), {}),
+    ((*FIRST, "question", "metric"), "luck"),
+    *(((*FIRST, "question", "margin"), margin) for margin in (10**400, "1")),
+    ((*FIRST, "date"), 5),
+    ((*FIRST, "more"), 5),
+    *(((*LAKE_ENTRY, "design", "sizes"), sizes) for sizes in ([], [20, 10], [0, 10], "10")),
+    ((*LAKE_ENTRY, "design", "seeds"), {"a": 11}),
+    # 0 is right in itself, but the first look had the level of the first.
+    *(((*LAKE_ENTRY, "design", "after"), after) for after in (3, -1, 0)),
+]
+NO_JSON = ["", "{", "[" * 100_000, "\x00", '{"format": 1e999}', "9" * 10_000]
 
 
-def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
-    look(tmp_path)
-    look(tmp_path, n_seeds=20)
+@pytest.fixture(scope="module")
+def looked_twice(tmp_path_factory):
+    root = tmp_path_factory.mktemp("looks")
+    look(root)
+    look(root, n_seeds=20)
+    return json.loads((root / LOOKS_FILE).read_text())
+
+
+@pytest.mark.parametrize(("place", "value"), DAMAGES)
+def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(
+    tmp_path, looked_twice, place, value
+):
+    data = within = {"file": copy.deepcopy(looked_twice)}
+    if "design" in place:
+        lake = data["file"]["environments"]["lake"]
+        lake["design"] = {**DESIGN, "question": lake["taken"][0]["question"]}
+    *above, last = ("file", *place)
+    for key in above:
+        within = within[key]
+    within[last] = value(within[last]) if callable(value) else value
+    (tmp_path / LOOKS_FILE).write_text(json.dumps(data["file"]))
+    with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
+        read_looks(tmp_path)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
     path = tmp_path / LOOKS_FILE
-    texts = [json.dumps(each) for each in damages(json.loads(path.read_text()))]
-    assert len(texts) > 25
-    texts += ["", "{", "[" * 100_000, "\x00", '{"format": 1e999}', "9" * 10_000]
-    for text in texts:
+    for text in NO_JSON:
         path.write_text(text)
         with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
             read_looks(tmp_path)
@@ -318,9 +293,7 @@ def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp
     counts, steps = grow(study, tmp_path, most=40)
     results = results_of(grown(study, counts), tmp_path, counts=counts)
     analysis = analyse(results, looks={step.environment: step.standing for step in steps[-1]})
-    text = everything_said(analysis)
-    assert text.startswith("qlearning is best on average: ")
-    assert "qlearning is better on average than " in text
+    text = " ".join(conclusion(analysis.study, analysis.environments[0]).everything)
     assert text.count(", with 10 seeds)") == 2
     assert "is undecided on average against " in text
     assert ", with 40 seeds" in text

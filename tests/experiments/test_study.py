@@ -136,37 +136,40 @@ def test_what_one_line_says(read):
 
 def test_agents_and_environments(read):
     study = read(
-        "n_episodes: 50\ntuned: false\n"
+        "n_timesteps: 500\ntuned: false\nsettings: {gamma: 0.9, env_kwargs: {map_name: 4x4}}\n"
         "agents:\n"
         "  slow: {algo: qlearning, learning_rate: 0.01, summary: creeps}\n"
         "  sarsa: {tuned: true}\n"
         "environments:\n"
-        "  slippery: {id: FrozenLake-v1}\n"
-        "  dry: {id: FrozenLake-v1, env_kwargs: {is_slippery: false}}\n"
+        "  small: {id: FrozenLake-v1}\n"
+        "  dry: {id: FrozenLake-v1, n_episodes: 7, gamma: 0.8, env_kwargs: {is_slippery: false}}\n"
     )
     slow, sarsa = study.agents
     assert (slow.label, slow.algo, slow.tuned) == ("slow", "qlearning", False)
     assert (slow.summary, slow.settings) == ("creeps", {"learning_rate": 0.01})
     assert (sarsa.algo, sarsa.tuned) == ("sarsa", True)
-    assert slow.where.endswith("lakes.yml:4")
-    slippery, dry = study.environments
-    assert (slippery.env_id, slippery.settings) == ("FrozenLake-v1", {"n_episodes": 50})
-    assert dry.settings == {"n_episodes": 50, "env_kwargs": {"is_slippery": False}}
-
-
-def test_settings_of_an_environment_go_over_those_of_the_file(read):
-    study = read(
-        "agents: [qlearning]\nn_timesteps: 500\n"
-        "settings: {gamma: 0.9, env_kwargs: {is_slippery: false, map_name: 4x4}}\n"
-        "environments:\n"
-        "  small: {id: FrozenLake-v1}\n"
-        "  large: {id: FrozenLake-v1, n_episodes: 7, gamma: 0.8, env_kwargs: {map_name: 8x8}}\n"
-    )
-    small, large = (environment.settings for environment in study.environments)
-    shared = {"is_slippery": False}
-    assert small == {"n_timesteps": 500, "gamma": 0.9, "env_kwargs": {**shared, "map_name": "4x4"}}
+    assert slow.where.endswith("lakes.yml:5")
+    small, dry = study.environments
+    usual = {"n_timesteps": 500, "gamma": 0.9, "env_kwargs": {"map_name": "4x4"}}
+    assert (small.env_id, small.settings) == ("FrozenLake-v1", usual)
     # One budget replaces the other, and arguments of the environment are put over one by one.
-    assert large == {"n_episodes": 7, "gamma": 0.8, "env_kwargs": {**shared, "map_name": "8x8"}}
+    arguments = {"map_name": "4x4", "is_slippery": False}
+    assert dry.settings == {"n_episodes": 7, "gamma": 0.8, "env_kwargs": arguments}
+    quick = study.quickened()
+    assert (quick.name, quick.is_quick) == ("lakes-quick", True)
+    assert quick.n_seeds < study.n_seeds
+
+
+def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
+    (tmp_path / "mine.yml").write_text("FrozenLake-v1: {n_timesteps: 7, gamma: 0.5}\n")
+    study = read(
+        "seeds: 1\nenvironments: [FrozenLake-v1]\ntuned: false\nagents:\n  sarsa: {n_timesteps: 9}"
+        "\n  mine: {algo: sarsa, conf_file: mine.yml, learning_rate: 0.25}\n"
+    )
+    assert [run.spec.saved_hyperparams for run in plan(study, tmp_path)] == [
+        {"n_timesteps": 9},
+        {"n_timesteps": 7, "gamma": 0.5, "learning_rate": 0.25},
+    ]
 
 
 def test_an_environment_as_it_comes_is_trained_on_as_it_is_judged_on(read, tmp_path):
@@ -190,20 +193,19 @@ def test_an_environment_as_it_comes_is_trained_on_as_it_is_judged_on(read, tmp_p
 # --- Sweeps.
 
 
-def test_sweeps_multiply(read):
+def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
     study = read(
         TAXI + "sweep: {gamma: [0.9, 0.99], learning_rate: [0.1, 0.5]}\n"
         "agents:\n  qlearning:\n  sarsa:\n    sweep: {gamma: [0.5]}\n"
     )
     assert [agent.label for agent in study.agents] == [
-        "qlearning with γ = 0.9 with α = 0.1",
-        "qlearning with γ = 0.9 with α = 0.5",
-        "qlearning with γ = 0.99 with α = 0.1",
-        "qlearning with γ = 0.99 with α = 0.5",
-        "sarsa with γ = 0.5 with α = 0.1",
-        "sarsa with γ = 0.5 with α = 0.5",
+        *(f"qlearning with γ = {g} with α = {a}" for g in (0.9, 0.99) for a in (0.1, 0.5)),
+        *(f"sarsa with γ = 0.5 with α = {a}" for a in (0.1, 0.5)),
     ]
     assert study.agents[2].settings == {"gamma": 0.99, "learning_rate": 0.1}
+    sweep = ", ".join(f"{name}: {list(range(100))}" for name in "abcdef")
+    with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents up to here; .* 10,000 at"):
+        read(f"{TAXI}agents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
 
 
 @pytest.mark.parametrize(
@@ -226,37 +228,7 @@ def test_alone_an_agent_is_labelled_by_what_is_swept(read, sweep, labels, folder
     assert folder in (None, file_name(labels[0]))
 
 
-NAMES = st.text("abcdef_", min_size=1, max_size=6)
-VALUES = st.integers() | st.floats(allow_nan=False) | st.booleans()
-
-
-def test_a_sweep_is_counted_before_it_is_made(read):
-    values = f"[{', '.join(map(str, range(100)))}]"
-    sweep = ", ".join(f"{name}: {values}" for name in "abcdef")
-    with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents up to here; .* 10,000 at"):
-        read(f"{TAXI}agents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
-
-
-BUDGETS = {"n_timesteps", "n_episodes"}
-SETTINGS = st.dictionaries(st.sampled_from(["gamma", *sorted(BUDGETS)]), VALUES)
-
-
-@given(SETTINGS, SETTINGS, st.dictionaries(NAMES, VALUES), st.dictionaries(NAMES, VALUES))
-def test_later_settings_win(settings, changes, kwargs, changed_kwargs):
-    result = layered({**settings, "env_kwargs": kwargs}, {**changes, "env_kwargs": changed_kwargs})
-    assert {key: result[key] for key in changes} == changes
-    assert result["env_kwargs"] == {**kwargs, **changed_kwargs}
-    if BUDGETS & set(changes):
-        assert BUDGETS & set(result) <= set(changes)
-
-
 # --- Names and files.
-
-
-def test_quick_has_fewer_seeds_and_a_folder_of_its_own(read):
-    quick = read(BASE + "seeds: 30\nquick: {seeds: 4}\n").quickened()
-    assert (quick.name, quick.n_seeds, quick.is_quick) == ("lakes-quick", 4, True)
-    assert read(BASE + "seeds: 1\n").quickened().n_seeds == 1
 
 
 @given(st.text() | st.text(min_size=99, max_size=300) | st.sampled_from(["CON", "nul.x", "a."]))
@@ -280,19 +252,6 @@ def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
     assert find_study("other/mine-maze.yml") == Path("other/mine-maze.yml")
     with pytest.raises(UserError, match=r"mine-mase: cannot be read: .* did you mean 'mine-maze'"):
         find_study("mine-mase")
-
-
-def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
-    (tmp_path / "mine.yml").write_text("FrozenLake-v1: {n_timesteps: 7, gamma: 0.5}\n")
-    study = read(
-        "seeds: 1\nenvironments: [FrozenLake-v1]\ntuned: false\nagents:\n  sarsa: {n_timesteps: 9}"
-        "\n  mine: {algo: sarsa, conf_file: mine.yml, learning_rate: 0.25}\n"
-    )
-    assert [agent.conf_file for agent in study.agents] == [None, tmp_path / "mine.yml"]
-    assert [run.spec.saved_hyperparams for run in plan(study, tmp_path)] == [
-        {"n_timesteps": 9},
-        {"n_timesteps": 7, "gamma": 0.5, "learning_rate": 0.25},
-    ]
 
 
 @pytest.mark.parametrize(
