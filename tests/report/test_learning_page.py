@@ -13,8 +13,6 @@ import pytest
 from rich.console import Console
 
 from experiments.child_processes import TaskFailedError
-from experiments.results import difference
-from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -53,14 +51,11 @@ def again(training, **changes):
     return json.loads(gzip.decompress(base64.b64decode(packed))), text
 
 
-def test_numbers_are_written_to_their_last_digit():
+def test_the_data_are_what_was_recorded_to_the_last_digit(watch):
     values = np.array([0.1 + 0.2, 1e-300, -2.0, np.nan, np.inf, 123456789.123456789])
     assert json.loads(as_json({"values": values}, exactly)) == {
         "values": [0.30000000000000004, 1e-300, -2, None, "Infinity", 123456789.12345679]
     }
-
-
-def test_the_data_are_what_was_recorded(watch):
     maps = {"env_kwargs": {"desc": ["S.G"]}, "train_env_kwargs": {"desc": ["S..", "#.G"]}}
     data, _, training = watch(settings=maps)
     moves, changes = training.watch.moves.rows, training.watch.changes.rows
@@ -149,28 +144,6 @@ def test_a_page_is_no_larger_than_three_megabytes_and_replaced_whole(
     assert max(cut["changes"]["step"]) < n_steps
 
 
-def test_the_fullest_page_is_no_larger_either(watch):
-    """As much as is kept at most, and nothing of it like anything else."""
-    _, _, training = watch("Taxi-v4", n_timesteps=20)
-    recorder, rng = training.watch, np.random.default_rng(0)
-    recorder.exact = None  # all that is kept is shown
-    recorder.initial = {"q_tables": rng.normal(size=(1, 500, 6))}
-    for rows, n, clock in (
-        (recorder.steps, 20_000, "timesteps"),
-        (recorder.moves, 20_000, "step"),
-        (recorder.changes, 60_000, "step"),
-    ):
-        more = np.zeros(n - len(rows), dtype=rows.rows.dtype)
-        for name in more.dtype.names:
-            whole = more.dtype[name] == np.int64
-            more[name] = rng.integers(500, size=len(more)) if whole else rng.normal(size=len(more))
-        more[clock] = np.sort(rng.integers(20, 20_000, size=len(more)))
-        rows.extend(more)
-    recorder.changes.rows["table"] = 0
-    again(training)
-    assert learning.MOST_BYTES / 2 < training.spec.watch_learning.stat().st_size < 3_000_000
-
-
 # --- those of a study -----------------------------------------------------------------------------
 
 
@@ -235,21 +208,6 @@ def test_each_agent_that_learns_is_shown_once_and_kept(done, analysis, tmp_path)
     assert pages["Q-learning & co"].place == ""
     assert pages["Q-learning & co"].words.startswith("the agent came out otherwise than in the run")
     assert not list((tmp_path / "other").rglob("*.html"))
-
-
-def test_runs_are_held_against_each_other_to_the_last_bit(analysis, monkeypatch):
-    one, other = (run.run for run in analysis.results.finished if run.agent == "sarsa")
-    assert difference(one, one) == ""
-    assert difference(one, other) == "the agent"
-    monkeypatch.setattr("experiments.results._tensors", lambda run: {})
-    assert difference(one, other) == "the episodes"
-    episodes = SimpleNamespace(steps=np.zeros(1), returns=np.zeros(1))
-    monkeypatch.setattr("experiments.results.read_episodes", lambda run: episodes)
-    assert difference(one, other) == "the evaluations"
-    monkeypatch.undo()
-    monkeypatch.setattr("pipeline.digests.RecordedFiles.read", lambda *_: b"PK")
-    with pytest.raises(DamagedFileError, match="is no whole zip"):
-        difference(one, one)
 
 
 def test_agents_without_a_run_of_their_own_are_named(done, tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from report.page import result_sections
 from report.page.frame import Report
-from report.ranking import COLUMNS, Row, bar
+from report.ranking import COLUMNS, Row
 from report.series import StudySeries
 from tests.report import made_up
 from verdicts import Estimate, ThresholdSummary
@@ -82,9 +82,3 @@ def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
     assert [heading["title"] for heading in headings] == [
         *("Mean", "IQM", "Median", "CPU time", "Runs")
     ]
-
-
-def test_a_bar_stays_between_the_blind_policy_and_the_optimum():
-    assert bar(Estimate(-3.0, -4.0, 0.25, 4)) == (0, 0, 0.25)
-    assert bar(Estimate(0.5, math.nan, math.nan, 1)) == (0.5, 0.5, 0.5)
-    assert bar(made_up.NOTHING) == (0, 0, 0)

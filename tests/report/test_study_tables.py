@@ -185,23 +185,17 @@ def test_a_study_as_files(tmp_path):
     ("escaped", "text", "safe"),
     [
         (latex_text, "double_dqn by 2 [1, 3]", r"double\_dqn by 2 [1, 3]"),
-        (latex_text, "50 % of #1 & {2}", r"50 \% of \#1 \& \{2\}"),
         (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
         (latex_text, "<a>|", r"\textless{}a\textgreater{}\textbar{}"),
         (latex_text, '~ `b "c"', r"\textasciitilde{} {\char96}b {\char34}c{\char34}"),
         (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
         (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
-        (latex_text, "[1] *", r"{}[1] *"),
         (latex_text, "*x", r"{}*x"),
         (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
-        (latex_text, "· ≤ ≥ †", r"$\cdot$ $\leq$ $\geq$ $\dagger$"),
         (latex_text, "two\n\nlines \x1b[1m", r"two lines \textbackslash{}x1b[1m"),
-        (latex_text, "café 中", "café 中"),
-        (markdown_text, "double_dqn by 2 [1, 3]", "double_dqn by 2 [1, 3]"),
         (markdown_text, "a|b <b>*x*</b> [x](y) `c`",
          "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
         (markdown_text, "# one\n\ntwo _three_", "\\# one two \\_three\\_"),
-        (name_of, "dqn", "`dqn`"),
         (name_of, "a`b|", "a\\`b\\|"),
     ],
 )  # fmt: skip
@@ -316,7 +310,7 @@ def test_a_title_a_table_a_caption_and_sentences(width, options):
     assert not any("…" in line for line in lines)
 
 
-@pytest.mark.parametrize("width", [60, 80, 120, 200])
+@pytest.mark.parametrize("width", [60, 120, 200])
 @pytest.mark.parametrize("name", ["[red]", "a name that is longer than twenty letters"])
 def test_no_figure_is_cut_and_no_border_lost(name, width):
     agents = [made_up.agent(label, -27_427.0) for label in (name, "second")]
@@ -385,57 +379,40 @@ ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
 REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
 
 
-@pytest.mark.parametrize("width", [80, 120])
-def test_bandits_have_a_table_of_their_own(width):
+def test_bandits_have_a_table_of_their_own():
     pulls = pull_statistics(ARMS, REWARDS, np.where(ARMS == 0, 0.3, 0.0), None, 2)
     agents = (made_up.agent("first", 1.0), made_up.agent("no pulls", 3.0))
     place = made_up.environment(agents, "coins", optimum=None, is_score=False)
     names, found = ["first", "no pulls"], {("first", "coins"): pulls}
-    lines = lines_of(
-        print_analysis,
-        made_up.analysis([place], names, pulls=found, metric="regret"),
-        width=width,
-    )
+    lines = lines_of(print_analysis, made_up.analysis([place], names, pulls=found, metric="regret"))
     # The sums of regret are .6 and .3, and the last pulls .3 and 0; the last rewards 1 and 0.
     headings = ["agent", "mean regret", "5% to 95% of runs", "simple regret", "reward", "best arm"]
     row = ["first", "7 [6.9, 7.2]", "0.315 to 0.585", "0.15", "0.5", "50.0%", "10 s"]
-    wide = width == 120
-    kept = [n for n in range(7) if wide or n != 3]
-    assert cells(lines) == [[each[n] for n in kept] for each in ([*headings, "CPU time"], row)]
-    simple = "simple regret: of recommending the arm pulled most; " if wide else ""
-    more = "" if wide else "; a wider terminal shows simple regret too"
+    assert cells(lines) == [[*headings, "CPU time"], row]
     assert below(lines).startswith(
-        "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; "
-        f"{simple}reward, best arm: at the last pulls{more} Undecided on average: best is first "
-        "(1 [0.9, 1.2]) or no pulls (3 [2.9, 3.2])."
+        "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; simple regret: of "
+        "recommending the arm pulled most; reward, best arm: at the last pulls Undecided on "
+        "average: best is first (1 [0.9, 1.2]) or no pulls (3 [2.9, 3.2])."
     )
 
 
 EPISODES = ["environment", "agent", "episode", "average", "minimum", "maximum"]
 
 
-def test_blocks_of_episodes_agents_side_by_side():
-    rows = [("lake", "first", 1000, 1.5, 0, 5), ("lake", "first", 2000, -700.0, -800.0, 0.5)]
-    rows += [("lake", "second", 1000, 3, 2, 7), ("island", "first", 1000, 4, 3, 8)]
-    lines = lines_of(print_episodes_table, pd.DataFrame(rows, columns=EPISODES), 1000)
-    titles = " ".join(line for line in lines if not line.startswith(tuple("┏┃┡│└")))
-    what = "return per 1000 episodes (average, min, max; all seeds)"
-    assert " ".join(titles.split()) == f"lake: {what} island: {what}"
-    assert cells(lines) == [
-        ["episode", "first", "second"],
-        ["1,000", "1.5  0  5", "3  2  7"],
-        ["2,000", "-700  -800  0.5", "-"],
-        ["episode", "first"],
-        ["1,000", "4  3  8"],
-    ]
-
-
-@pytest.mark.parametrize("width", [80, 100, 200])
-def test_agents_for_whom_there_is_no_room_beside_the_others_come_below(width):
+@pytest.mark.parametrize("width", [80, 200])
+def test_blocks_of_episodes_agents_side_by_side_where_there_is_room(width):
     names = ["qlearning", "expected_sarsa", "dqn, engine: auto", "a name of more than 20 letters"]
-    rows = [("lake", name, 100, -27_427.5, -30_000.25, n) for n, name in enumerate(names)]
-    table = pd.DataFrame(rows, columns=EPISODES)
-    lines = lines_of(print_episodes_table, table, 100, width=width)
+    rows = [("lake", name, 1000, -27_427.5, -30_000.25, n) for n, name in enumerate(names)]
+    rows += [("lake", "qlearning", 2000, 1.5, 0, 0.5)]
+    lines = lines_of(print_episodes_table, pd.DataFrame(rows, columns=EPISODES), 1000, width=width)
+    assert "lake: return per 1000 episodes (average, min, max; all seeds)" in lines
     assert max(map(len, lines)) <= width
-    found = [cell for row in cells(lines) if row[0] != "episode" for cell in row[1:]]
-    assert found == [f"-27,428  -30,000  {n}" for n in range(len(names))]
+    figures = [f"-27,428  -30,000  {n}" for n in range(len(names))]
+    if width == 200:
+        assert cells(lines) == [
+            ["episode", *names],
+            ["1,000", *figures],
+            ["2,000", "1.5  0  0.5", *"---"],
+        ]
+    else:  # the others come below
+        assert [cell for row in cells(lines) for cell in row if cell in figures] == figures

@@ -65,16 +65,6 @@ def normal_scores(n, mean, deviation):
 
 
 SENTENCES = {
-    "all alike": (
-        {name: [86.0] * 5 for name in "ABCD"},
-        {"optimum": 91.0, "baseline": -92.0},
-        ["All 4 agents have the same return of the final policy, 86, in all 5 runs"],
-    ),
-    "all at the optimum": (
-        {name: [86.0] * 5 for name in "ABCD"},
-        {"optimum": 86.0, "baseline": -92.0},
-        ["All 4 agents reach the optimum, 86, in all 5 runs; after 5 runs, up to 45% of"],
-    ),
     "a planner, and random moves": (
         {"optimal": [1.0] * 5, "A": [1, 1, 1, 1, 0.9], "B": [1, 1, 1, 1, 0.9], "random": [0.0] * 5},
         {},
@@ -85,32 +75,10 @@ SENTENCES = {
             "A is undecided on average against B",
         ],
     ),
-    "one fails": (
-        {
-            "A": normal_scores(10, 0.95, 0.01),
-            "B": np.append(normal_scores(9, 0.9856, 0.004), 0.0),
-        },
-        {},
-        [
-            "Undecided on average: best is A (score 0.95",
-            "B (score 0.887",
-            "1 of 10 runs of B failed",
-        ],
-    ),
     "mostly at the optimum": (
         {"qlearning": [-13.0] * 10, "dqn": [-13.0] * 10, "ppo": [-15.0] * 6 + [-13.0] * 4},
         {"optimum": -13.0, "baseline": -1000.0},
         ["As far as was seen", "equal within 0.02", "ppo (score 0.9987"],
-    ),
-    "three seeds": (
-        {"A": [0.95, 0.94, 0.96], "B": [0.2, 0.25, 0.22]},
-        {},
-        ["So far: A (score 0.95", "3 seeds decide nothing"],
-    ),
-    "far apart": (
-        {"A": [0.95, 0.94, 0.96, 0.95, 0.95], "B": [0.2, 0.25, 0.22, 0.2, 0.2]},
-        {},
-        ["A is best on average", "A is better on average than B"],
     ),
     "no way between baseline and optimum": (
         {"A": [353.0] * 5, "B": [353.5] * 5},
