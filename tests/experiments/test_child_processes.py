@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import compare
-from experiments import child_processes
+from experiments import child_processes, run_limits
 from experiments.child_processes import (
     StoppedError,
     TaskDiedError,
@@ -289,7 +289,7 @@ DRIVER = """
 import multiprocessing, sys
 from functools import partial
 import study_chores
-from experiments import child_processes
+from experiments import child_processes, run_limits
 
 if __name__ == "__main__":
     method, folder = sys.argv[1:]
@@ -482,6 +482,16 @@ def test_the_memory_that_a_process_takes(monkeypatch):
             kept[start] = 1
         assert 45e6 < resident_memory(os.getpid()) - before < 60e6
     assert resident_memory(2**31 - 2) == 0
+
+    def ps(command, **options):
+        assert command == ["ps", "-o", "rss=", "-p", "7"]
+        return subprocess.CompletedProcess(command, 0, b" 1234\n")
+
+    # Where there is no /proc another program tells.
+    exists = Path.exists
+    monkeypatch.setattr(Path, "exists", lambda path: "/proc/self" not in str(path) and exists(path))
+    monkeypatch.setattr(run_limits.subprocess, "run", ps)
+    assert resident_memory(7) == 1234 * 1024
     monkeypatch.setattr(sys, "platform", "win32")  # where it is not measured
     with pytest.raises(UserError, match="not measured on Windows"):
         RunLimits(memory=10**9)

@@ -274,7 +274,14 @@ def test_paper_has_every_environment_in_light_colours_and_loses_nothing(browser,
     browser.wait(lambda: browser.all(".sheet"))
     # Ranking, learning curves, differences, policies, films, settings.
     assert browser.shown("h2 .where") == ["FrozenLake-v1", "Warehouse-v0"] * 6
-    browser.fits(PAPER)
+    for css in (".sheet .plot .main-svg", ".sheet table", ".sheet .board", "#verdict .card"):
+        rights = browser.run(
+            "return [...document.querySelectorAll(arguments[0])]"
+            ".filter((e) => e.getClientRects().length)"
+            ".map((e) => e.getBoundingClientRect().right)",
+            css,
+        )
+        assert 0 < max(rights) <= PAPER, css
     assert browser.all("details:not([open])") == []
     ink = browser.run("return getComputedStyle(document.querySelector('.sheet .xtick text')).fill")
     assert ink == "rgb(27, 31, 35)"

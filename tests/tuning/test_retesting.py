@@ -1,6 +1,5 @@
 """The re-test: what is run again, what wins, and by how much the search was fooled."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -19,8 +18,6 @@ from tuning.retesting import (
     write_winner,
 )
 from verdicts import Estimate
-
-NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
 def retested(number, held_out, verdict="undecided", in_search=0.9, n_runs=20, n_failed=0):

@@ -9,13 +9,10 @@ from contextlib import suppress
 import numpy as np
 import optuna
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
 
 from experiments.results import Curve, RunResults
-from pipeline import locks
 from pipeline.errors import UserError
 from tuning import searching
 from tuning.searching import UnjudgedError, outcome_of
@@ -109,23 +106,6 @@ def test_a_kill_at_any_write_to_the_storage_changes_no_trial(toy, tmp_path, samp
         assert searched(storage) == undisturbed, k
 
 
-def test_the_trial_of_a_driver_that_was_killed_comes_before_those_that_nobody_began(
-    toy, tmp_path, monkeypatch
-):
-    whole = toy.opened(toy.tuning(), tmp_path / "whole")
-    toy.search(whole, toy.Launcher())
-    killed = toy.opened(toy.tuning(), tmp_path / "killed")
-    mark = locks.mark()
-    with monkeypatch.context() as patch:
-        patch.setattr(locks, "mark", lambda: {**mark, "began": 1})  # not this process
-        patch.setattr(killed.queue, "give_back", lambda _: None)
-        toy.search(killed, toy.Launcher(stops_after=11))
-    assert toy.states(killed).count("RUNNING") == 1
-    again = toy.opened(toy.tuning(), tmp_path / "killed")
-    toy.search(again, toy.Launcher())
-    assert toy.params(again) == toy.params(whole)
-
-
 def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path):
     place = toy.opened(toy.tuning(pruner="median", n_trials=20, n_seeds=5), tmp_path)
     launcher = toy.search(place, toy.Launcher())
@@ -173,26 +153,6 @@ def test_only_scores_have_1_to_hope_for_where_all_are_below_0(toy, tmp_path, jud
     assert len(launcher.done) == (4 if hopeless else 5)
 
 
-def test_a_cost_is_made_small(toy, tmp_path):
-    place = toy.opened(toy.tuning(figure="steps"), tmp_path)
-    toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
-    assert place.study.best_value == min(trial.value for trial in place.queue.trials())
-
-
-def test_seeds_go_side_by_side_where_trials_are_few(toy, tmp_path):
-    place = toy.opened(toy.tuning(n_trials=1), tmp_path)
-    waiting = []
-
-    class Slow(toy.Launcher):
-        def submit(self, planned):
-            waiting.append(planned.seed)
-            return super().submit(planned)
-
-    toy.search(place, Slow(n_workers=3))
-    assert sorted(waiting) == [0, 1, 2]
-    assert toy.states(place) == ["COMPLETE"]
-
-
 def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tmp_path):
     place = toy.opened(toy.tuning(), tmp_path)
 
@@ -208,40 +168,33 @@ def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tm
         assert (FAILURE in trial.user_attrs) == fails
 
 
-def test_where_nothing_but_failures_comes_of_it_the_search_ends_and_says_why(
-    toy, tmp_path, monkeypatch
-):
+def test_where_nothing_but_failures_comes_of_it_the_search_ends_and_says_why(toy, tmp_path):
     place = toy.opened(toy.tuning(), tmp_path)
     with pytest.raises(UserError, match=r"all of the first 5 trials failed; seed \d: it broke"):
         toy.search(place, toy.Launcher(failing={0, 1, 2}))
 
 
-def test_after_the_time_no_run_is_begun(toy, tmp_path):
-    place = toy.opened(toy.tuning(), tmp_path)
-    launcher = toy.search(place, toy.Launcher(), deadline=-math.inf)
-    assert not launcher.done
-    assert toy.states(place) == ["WAITING"] * 10
+def test_how_many_runs_there_are(toy, tmp_path):
+    """None after the time is over; seeds side by side; more trials beside those that are there."""
+    late = toy.opened(toy.tuning(n_trials=4), tmp_path)
+    assert not toy.search(late, toy.Launcher(), deadline=-math.inf).done
+    assert toy.states(late) == ["WAITING"] * 4
+    assert len(toy.search(late, toy.Launcher(n_workers=3)).done) == 12
+    more = toy.opened(toy.tuning(n_trials=6), tmp_path)
+    assert len(toy.search(more, toy.Launcher()).done) == 6
+    assert toy.states(more) == ["COMPLETE"] * 6
 
 
 def test_a_grid_goes_through_every_point_once(toy, tmp_path):
-    place = toy.opened(toy.tuning(sampler="grid", n_trials=12), tmp_path)
-    toy.search(place, toy.Launcher())
+    place = toy.opened(toy.tuning(sampler="grid", n_trials=12, figure="steps"), tmp_path / "it")
+    toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
     tried = {(p["learning_rate"], p["gamma"]) for p in toy.params(place)[1:]}
     assert len(toy.params(place)) == 10  # three values of each, and what was shipped
     assert len(tried) == 9
     assert {gamma for _, gamma in tried} == {0.5, 0.75, 1.0}
-
-
-def test_a_grid_that_does_not_fit_is_refused(toy, tmp_path):
+    assert place.study.best_value == 50.0  # a cost is made small
     with pytest.raises(UserError, match="4 settings with two values of each number"):
-        toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path)
-
-
-def test_more_trials_are_added_to_those_that_are_there(toy, tmp_path):
-    toy.search(toy.opened(toy.tuning(n_trials=4), tmp_path), toy.Launcher())
-    more = toy.opened(toy.tuning(n_trials=6), tmp_path)
-    assert len(toy.search(more, toy.Launcher()).done) == 6
-    assert toy.states(more) == ["COMPLETE"] * 6
+        toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path / "too few")
 
 
 def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
@@ -308,14 +261,6 @@ def test_by_hand(objective, is_cost, value):
     assert judged(VALUES, objective, is_cost=is_cost) == pytest.approx(value)
 
 
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30), st.sampled_from(["mean", "iqm"]))
-def test_a_cost_is_a_score_with_its_sign_turned(figures, objective):
-    for each in (objective, "lower"):
-        turned = judged([-figure for figure in figures], each, is_cost=True)
-        assert turned == pytest.approx(-judged(figures, each, is_cost=False), abs=1e-6)
-        assert min(figures) - 1e-6 <= -turned <= max(figures) + 1e-6
-
-
 def outcome(toy, monkeypatch, figure, **row):
     figures = {"step": [10, 20, 30], "seconds": [0.5, 1.0, 1.5], "value": [0.0, 0.6, 0.4]}
     evaluations = Curve({}, {name: np.array(values) for name, values in figures.items()})
@@ -343,12 +288,9 @@ def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value):
     assert (found.figure, found.seconds) == (value, 2.0)
 
 
-@pytest.mark.parametrize("value", [None, np.nan, np.inf])
-def test_a_run_without_the_figure_says_nothing(toy, monkeypatch, value):
+@pytest.mark.parametrize("regret", [None, np.nan, np.inf])
+def test_a_run_without_the_figure_says_nothing(toy, monkeypatch, regret):
     with pytest.raises(UnjudgedError, match="no figure for regret"):
-        outcome(toy, monkeypatch, "regret", regret=value)
-
-
-def test_steps_to_a_threshold_that_nobody_knows_are_refused(toy, monkeypatch):
+        outcome(toy, monkeypatch, "regret", regret=regret)
     with pytest.raises(UserError, match="give --threshold"):
         outcome(toy, monkeypatch, "steps", threshold=None)

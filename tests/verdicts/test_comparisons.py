@@ -30,12 +30,22 @@ def interval(found):
 # --- probability of improvement ------------------------------------------------------------------
 
 
-def test_wins_and_ties_worked_by_hand():
-    # 1 beats nothing and ties with 1; 3 beats 1 and 2; 2 beats 1 and ties with 2; of nine 4 are
-    # won by the first row by row: (0.5 + 0 + 0), (1 + 1 + 0), (1 + 0.5 + 0).
-    found = probability_of_improvement([1, 3, 2], [1, 2, 4], seed=0)
-    assert found.point == pytest.approx(4 / 9)
-    assert (found.n, found.n_missing) == (3, 0)
+@pytest.mark.parametrize(
+    ("first", "second", "point", "n", "n_missing"),
+    [
+        ([2], [1], 1, 1, 0),
+        ([NAN], [1], NAN, 0, 1),
+        ([np.inf, 1], [np.inf, 0], 0.625, 2, 0),
+        ([0.3], [0.1 + 0.2], 0.5, 1, 0),  # in the last bits alone
+        # Environments are averaged.
+        ([[1, 5], [2, 5], [3, NAN]], [[0, 5], [0, 5], [0, 5]], 0.75, 5, 1),
+    ],
+)
+def test_who_wins(first, second, point, n, n_missing):
+    found = probability_of_improvement(first, second, seed=0)
+    assert (found.n, found.n_missing) == (n, n_missing)
+    assert found.point == pytest.approx(point, nan_ok=True)
+    assert found.has_interval == (n > 1)
 
 
 @given(PAIRS)
@@ -53,25 +63,6 @@ def test_the_two_probabilities_add_up_to_one(pair):
     assert one.point + other.point == pytest.approx(1)
     assert interval(one) == pytest.approx([1 - other.high, 1 - other.low])
     assert 0 <= one.low <= one.point <= one.high <= 1
-
-
-def test_resampling_draws_both_agents_seeds_together():
-    rng = np.random.default_rng(0)
-    first, second = rng.normal(0.5, 1, size=(2, 8))
-    drawn = np.random.default_rng(3).integers(8, size=(500, 8))
-    wins = [np.mean(first[rows][:, None] > second[rows]) for rows in drawn]
-    found = probability_of_improvement(first, second, seed=3, n_resamples=500)
-    tail = stats.norm.cdf(-np.sqrt(8 / 7) * stats.t.ppf(0.975, 7))
-    assert interval(found) == pytest.approx(np.quantile(wins, [tail, 1 - tail]))
-
-
-def test_environments_are_averaged():
-    first, second = [[1, 5], [2, 5], [3, NAN]], [[0, 5], [0, 5], [0, 5]]
-    found = probability_of_improvement(first, second, seed=0)
-    assert found.point == 0.75
-    assert (found.n, found.n_missing) == (5, 1)
-    turned = probability_of_improvement(second, first, seed=0)
-    assert (turned.point, turned.n, turned.n_missing) == (0.25, 5, 1)
 
 
 def test_seeds_of_each_environment_are_resampled_by_themselves():
@@ -108,19 +99,7 @@ def test_with_many_seeds_the_normal_interval_agrees_with_resampling(n_envs, monk
     assert interval(normal) == pytest.approx(interval(resampled), abs=0.006 / n_envs**0.5)
 
 
-def test_infinite_scores_are_compared():
-    found = probability_of_improvement([np.inf, 1], [np.inf, 0], seed=0)
-    assert found.point == 0.625
-
-
-def test_without_seeds_there_is_no_probability():
-    assert np.isnan(probability_of_improvement([1, NAN], [NAN, 1], seed=0).point)
-    single = probability_of_improvement([2], [1], seed=0)
-    assert single.point == 1
-    assert not single.has_interval
-
-
-@pytest.mark.parametrize(("truth", "n"), [(0.5, 10), (0.95, 5), (0.7, 30)])
+@pytest.mark.parametrize(("truth", "n"), [(0.95, 5), (0.7, 30)])
 def test_the_interval_of_the_probability_covers(truth, n):
     rng = np.random.default_rng(0)
     ahead = stats.norm.ppf(truth) * np.sqrt(2)
@@ -146,47 +125,22 @@ def test_the_paired_interval_is_scipys():
     assert found.point == pytest.approx(np.mean(first - second))
 
 
-def test_seeds_that_one_agent_lacks_do_not_count():
-    found = paired_difference([1, NAN, 5, np.inf, 9, 7], [0, 3, 2, 1, 4, -np.inf])
-    assert (found.point, found.n, found.n_missing) == (3, 3, 3)
-
-
-def test_differences_without_spread():
-    same = paired_difference([1, 2, 3], [1, 2, 3])
-    assert [same.point, *interval(same)] == [0, 0, 0]
-    constant = paired_difference([0.4, 0.4], [0.1, 0.1])
-    assert constant.point == constant.low == constant.high == pytest.approx(0.3)
-
-
-def test_differences_in_the_last_bits_are_none():
-    exact, other = [0.3, 0.6], [0.1 + 0.2, 0.2 + 0.4]
-    assert exact != other
-    assert paired_difference(exact, other).low == 0
-    assert probability_of_improvement(exact[:1], other[:1], seed=0).point == 0.5
-
-
-def test_a_single_pair_decides_nothing():
-    found = paired_difference([3], [1])
-    assert found.point == 2
-    assert not found.has_interval
-    assert np.isnan(paired_difference([NAN], [1]).point)
-
-
-def draws(kind, rng, shape):
-    if kind == "normal":
-        return rng.normal(size=shape)
-    if kind == "skewed":  # a difference of skewed scores is not itself skewed
-        return rng.exponential(size=shape) - rng.exponential(size=shape)
-    return (rng.random(shape) < 0.7).astype(float) - (rng.random(shape) < 0.7)
-
-
-@pytest.mark.parametrize(("kind", "n"), [("normal", 5), ("skewed", 10), ("two peaks", 5)])
-def test_the_interval_of_a_difference_covers(kind, n):
-    differences = draws(kind, np.random.default_rng(1), (1000, n))
-    found = [paired_difference(row, np.zeros(n)) for row in differences]
-    hits = np.mean([one.low <= 0 <= one.high for one in found])
-    # Standard error 0.007; coarse differences of five seeds are tested cautiously.
-    assert 0.93 <= hits <= (0.995 if kind == "two peaks" else 0.98)
+@pytest.mark.parametrize(
+    ("first", "second", "expected", "n_missing"),
+    [
+        # Seeds that one agent lacks do not count.
+        ([1, NAN, 5, np.inf, 8, 7], [0, 3, 2, 1, 3, -np.inf], (3, -1.968, 7.968), 3),
+        ([1, 2, 3], [1, 2, 3], (0, 0, 0), 0),
+        ([0.4, 0.4], [0.1, 0.1], (0.3, 0.3, 0.3), 0),
+        ([0.3, 0.6], [0.1 + 0.2, 0.2 + 0.4], (0, 0, 0), 0),  # in the last bits alone
+        ([3], [1], (2, NAN, NAN), 0),
+        ([NAN], [1], (NAN, NAN, NAN), 1),
+    ],
+)
+def test_differences_by_hand(first, second, expected, n_missing):
+    found = paired_difference(first, second)
+    assert found.n_missing == n_missing
+    assert [found.point, *interval(found)] == pytest.approx(expected, abs=5e-4, nan_ok=True)
 
 
 # --- Holm ----------------------------------------------------------------------------------------
@@ -197,9 +151,7 @@ def test_holm_worked_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]).tolist() == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.9, 0.6]).tolist() == [1, 1]
     assert holm([]).tolist() == []
-
-
-def test_holm_does_not_count_tests_that_were_not_made():
+    # Tests that were not made do not count.
     assert holm([0.02, NAN, 0.01]).tolist() == pytest.approx([0.02, NAN, 0.02], nan_ok=True)
 
 
@@ -221,12 +173,6 @@ NOISE = np.array([-0.3, 0.2, 0.1, -0.2, 0.3, -0.1])
 def verdicts(scores, margin=0.0, **arguments):
     found = compare_pairs(scores, margin, **QUICK, **arguments)
     return {(one.first, one.second): one.verdict for one in found}
-
-
-def test_pairs_come_in_the_order_of_the_mapping():
-    pairs = compare_pairs({"b": [1, 2], "a": [1, 2], "c": [1, 2]}, **QUICK)
-    assert [(one.first, one.second) for one in pairs] == [("b", "a"), ("b", "c"), ("a", "c")]
-    assert compare_pairs({"alone": [1, 2]}, **QUICK) == []
 
 
 def test_each_verdict():
@@ -273,16 +219,12 @@ def test_the_typical_run_is_another_question_than_the_mean():
     assert one.mean.point > 0
 
 
-def test_many_pairs_ask_for_more():
+def test_many_pairs_and_later_looks_ask_for_more():
     first, second = np.arange(6) + 4.5, np.arange(6.0)
     (alone,) = compare_pairs({"x": first, "y": second}, **QUICK)
-    assert alone.verdict == "better"
     crowd = {name: second + 0.01 * k for k, name in enumerate("abcde")}
     among = compare_pairs({"x": first, "y": second, **crowd}, **QUICK)[0]
     assert among.mean.seen_low < alone.mean.seen_low
-
-
-def test_later_looks_ask_for_more():
     scores = {"x": np.arange(6) + 3.5, "y": np.arange(6.0)}
     pair = ("x", "y")
     assert verdicts(scores)[pair] == "better"

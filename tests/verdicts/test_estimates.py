@@ -13,7 +13,7 @@ from verdicts import (
     performance_profile,
     summarise,
 )
-from verdicts.resampling import check_confidence, enough_resamples, interval_tail
+from verdicts.resampling import enough_resamples, interval_tail
 
 STATISTICS = ("mean", "median", "iqm")
 PLAIN = {"mean": np.mean, "median": np.median, "iqm": lambda x: stats.trim_mean(x, 0.25)}
@@ -41,13 +41,6 @@ def test_statistics_equal_the_plain_ones(scores):
     summary = summarise(scores, seed=0, n_resamples=10)
     plain = [PLAIN[name](scores) for name in STATISTICS]
     assert points(summary) == pytest.approx(plain, abs=1e-9)
-
-
-def test_one_statistic_alone_is_the_same():
-    scores = np.random.default_rng(0).normal(size=(7, 3))
-    summary = summarise(scores, seed=4)
-    for name in STATISTICS:
-        assert estimate(scores, name, seed=4) == getattr(summary, name)
 
 
 def test_environments_weigh_the_same_where_runs_are_missing():
@@ -82,6 +75,7 @@ def test_seeds_are_resampled_within_each_environment():
     for name in STATISTICS:
         resampled = [PLAIN[name](sample) for sample in np.hstack(drawn)]
         found = estimate(scores, name, seed=11, n_resamples=2000)
+        assert found == getattr(summarise(scores, seed=11, n_resamples=2000), name)
         assert found.point == pytest.approx(PLAIN[name](scores.ravel()))
         assert [found.low, found.high] == pytest.approx(np.quantile(resampled, [tail, 1 - tail]))
 
@@ -96,13 +90,6 @@ def test_the_tail_of_several_environments_has_the_degrees_of_freedom_of_welch():
     # Two alike add up their degrees of freedom.
     alike = stats.norm.cdf(-np.sqrt(3 / 2) * stats.t.ppf(0.975, 4))
     assert interval_tail([strata[0], strata[0]], 0.95) == pytest.approx(alike)
-
-
-def test_the_interval_of_a_mean_is_about_the_t_interval():
-    scores = stats.norm.ppf((np.arange(12) + 0.5) / 12)
-    mean = estimate(scores, "mean", seed=0, n_resamples=100_000)
-    half = stats.t.ppf(0.975, 11) * stats.sem(scores)
-    assert [mean.low, mean.high] == pytest.approx([-half, half], rel=0.05)
 
 
 def test_many_seeds_need_fewer_resamples():
@@ -140,84 +127,30 @@ def test_without_a_score_there_is_no_figure(scores):
     assert found.n_missing == np.sum(~np.isfinite(scores))
 
 
-def test_the_same_seed_gives_the_same_interval():
-    scores = np.random.default_rng(0).normal(size=8)
-    assert summarise(scores, seed=1) == summarise(scores, seed=1)
-    assert summarise(scores, seed=1).mean != summarise(scores, seed=2).mean
-    np.random.default_rng(5)
-    assert summarise(scores.tolist(), seed=1) == summarise(scores, seed=1)
-
-
-@given(
-    st.lists(NUMBERS, min_size=2, max_size=10, unique=True),
-    st.floats(0.01, 100),
-    st.floats(-100, 100),
-)
-def test_intervals_move_with_the_scores(scores, scale, shift):
-    moved = summarise(np.multiply(scores, scale) + shift, seed=0, n_resamples=50)
-    for name in STATISTICS:
-        one, other = (
-            getattr(summary, name) for summary in (summarise(scores, seed=0, n_resamples=50), moved)
-        )
-        expected = np.array([one.point, one.low, one.high]) * scale + shift
-        assert [other.point, other.low, other.high] == pytest.approx(expected, abs=1e-6)
-
-
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match=r"shape \(1, 1, 1\), they must have"):
         summarise([[[1.0]]], seed=0)
     with pytest.raises(ValueError, match=r"shape \(0,\)"):
         summarise([], seed=0)
-    with pytest.raises(ValueError, match="confidence is 95"):
-        summarise([1.0, 2.0], seed=0, confidence=95)
-
-
-def test_a_confidence_is_a_share():
-    for confidence in (-0.1, 0, 1, 1.5, 95, float("nan")):
+    for confidence in (-0.1, 0, 1, 95, float("nan")):
         with pytest.raises(ValueError, match="it must lie between 0 and 1, as 0"):
-            check_confidence(confidence)
-    for confidence in (5e-324, 0.5, 0.95, np.nextafter(1, 0)):
-        check_confidence(confidence)
+            summarise([1.0, 2.0], seed=0, confidence=confidence)
 
 
 # --- coverage ------------------------------------------------------------------------------------
 
 
-def coverage(draw, truth, statistic, n_runs=600):
-    """Share of intervals that hold the truth; its standard error is 0.009 at 0.95."""
-    rng = np.random.default_rng(7)
-    found = [
-        estimate(draw(rng), statistic, seed=trial, n_resamples=1000) for trial in range(n_runs)
-    ]
-    return np.mean([one.low <= truth <= one.high for one in found])
-
-
 @pytest.mark.parametrize(("statistic", "n"), [("mean", 5), ("median", 10), ("iqm", 5), ("iqm", 30)])
 def test_intervals_over_normal_scores_cover(statistic, n):
+    """Of 600 intervals; the standard error is 0.009 at 0.95."""
+    rng = np.random.default_rng(7)
+    found = [
+        estimate(rng.normal(3, 2, size=n), statistic, seed=trial, n_resamples=1000)
+        for trial in range(600)
+    ]
     # Percentiles as they are cover 83 % with 5 seeds and 90 % with 10.
     least = 0.89 if n == 5 else 0.92
-    assert least <= coverage(lambda rng: rng.normal(3, 2, size=n), 3, statistic) <= 0.985
-
-
-@pytest.mark.parametrize(("statistic", "least"), [("mean", 0.87), ("median", 0.92), ("iqm", 0.92)])
-def test_intervals_over_skewed_scores_cover(statistic, least):
-    quarters = stats.expon.ppf([0.25, 0.75])
-    truth = {
-        "mean": 1.0,
-        "median": np.log(2),
-        "iqm": stats.expon.expect(lambda x: x, lb=quarters[0], ub=quarters[1]) * 2,
-    }
-    found = coverage(lambda rng: rng.exponential(size=10), truth[statistic], statistic)
-    assert least <= found <= 0.985
-
-
-def test_intervals_over_environments_cover():
-    # One environment varies ten times as much as the others, and so decides alone.
-    def draw(rng):
-        return rng.normal(0, [1, 1, 10], size=(5, 3))
-
-    assert 0.88 <= coverage(draw, 0, "mean") <= 0.98
-    assert 0.92 <= coverage(draw, 0, "iqm") <= 0.995
+    assert least <= np.mean([one.low <= 3 <= one.high for one in found]) <= 0.985
 
 
 # --- scores and profiles -------------------------------------------------------------------------
@@ -257,15 +190,3 @@ def test_a_profile_has_no_band_over_one_seed_and_no_share_over_none():
     assert single.point.tolist() == [0.5]
     assert np.isnan([single.low, single.high]).all()
     assert np.isnan(performance_profile([[0.2, np.nan]], [0.5], seed=0).point).all()
-
-
-def test_the_band_of_a_profile_covers():
-    rng = np.random.default_rng(0)
-    hits = []
-    for trial in range(300):
-        scores = rng.normal([0.0, 0.5], 1, size=(10, 2))
-        band = performance_profile(scores, [0.0], seed=trial, n_resamples=1000)
-        truth = np.mean(stats.norm.sf([0.0, -0.5]))
-        hits.append(band.low[0] <= truth <= band.high[0])
-    # Shares of ten runs are coarse: 0.92 to 0.99, give or take three standard errors.
-    assert 0.90 <= np.mean(hits) <= 0.995

@@ -58,16 +58,6 @@ def test_few_seeds_say_nothing_of_speed():
     assert not pair.ratio.has_interval
 
 
-def test_the_same_agent_is_rarely_sooner_than_itself():
-    rng, wrong = np.random.default_rng(0), 0
-    for _ in range(400):
-        steps = 100 * np.ceil(rng.lognormal(3, 0.5, size=(3, 10)))
-        steps[rng.random(steps.shape) < 0.3] = NEVER
-        found = compare_speed(dict(zip("xyz", steps, strict=True)), 100)
-        wrong += any(pair.sooner for pair in found)
-    assert wrong / 400 <= stats.binom.isf(1e-4, 400, 0.05) / 400
-
-
 def test_staying_is_told_from_a_first_crossing():
     steps = [10, 20, 30, 40, 50]
     assert steps_to_stay(steps, [0, 1, 0, 1, 1], 1) == 40
