@@ -1,4 +1,4 @@
-"""Pulls of bandits: their record, figures worked the plain way, batches, and the shipped studies."""
+"""Pulls of bandits: their record, figures worked the plain way, batches, the shipped studies."""
 
 import dataclasses
 import math
