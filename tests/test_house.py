@@ -151,13 +151,6 @@ def test_no_module_needs_one_that_needs_it() -> None:
     assert "\n".join(cycles(import_graph())) == ""
 
 
-def test_imports_inside_functions_and_for_types_count() -> None:
-    graph = import_graph()
-    assert "commands.terminal" in graph["commands.train"]  # inside a function
-    assert "pipeline.preparation" in graph["commands.train"]  # under TYPE_CHECKING
-    assert "commands.train" in graph["train"]
-
-
 def test_no_module_has_the_name_of_one_of_pythons_own() -> None:
     parts = {part for path in sources() for part in module_name(path).split(".")}
     assert parts & sys.stdlib_module_names == set()
