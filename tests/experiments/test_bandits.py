@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
@@ -15,19 +14,16 @@ from stable_baselines3.common.env_util import make_vec_env
 import compare
 from agents import load_algorithm
 from agents.bandits.runs import run_batch
-from agents.compiled.worlds import NotCompilable
 from experiments.analysis import analyse
 from experiments.bandits import (
     MAX_POINTS,
     QUANTILES,
     STATISTICS_FILE,
     PullStatistics,
-    points_of,
     pull_statistics,
     read_run,
     run_regret,
     stacked_statistics,
-    true_means,
 )
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
@@ -140,17 +136,6 @@ def test_every_figure_at_every_point_the_plain_way():
         assert found.shares[context] == pytest.approx(counts / counts.sum())
 
 
-@pytest.mark.parametrize("n", [1, MAX_POINTS, MAX_POINTS + 1, 10**6])
-def test_points_thin_out_from_the_hundredth_pull_on(n):
-    points = points_of(n)
-    assert points[-1] == n
-    assert len(points) == n if n <= MAX_POINTS else 200 < len(points) <= MAX_POINTS
-    assert points[:101].tolist() == list(range(1, min(n, 101) + 1))
-    assert (np.diff(points) > 0).all()
-    # Later ones lie further apart, but for rounding.
-    assert (np.diff(np.diff(points)) >= -1).all()
-
-
 def test_statistics_are_read_as_they_were_written(tmp_path):
     given = {"moments": (1, 3), "posteriors": np.arange(16.0).reshape(2, 2, 1, 2, 2)}
     given["true_means"] = np.array([[0.1, 0.2]])
@@ -163,20 +148,6 @@ def test_statistics_are_read_as_they_were_written(tmp_path):
     assert read.posteriors.tolist() == given["posteriors"][0].tolist()  # of the first run alone
     assert read.true_means.tolist() == [[0.1, 0.2]]
     assert [path.name for path in tmp_path.iterdir()] == ["statistics.npz"]
-
-
-def test_means_that_all_runs_share():
-    for env_id, kwargs, expected in [
-        ("BernoulliBandit-v0", {}, [list(COINS)]),
-        ("SegmentBandit-v0", {}, SEGMENT_MEANS.tolist()),
-        ("GaussianBandit-v0", {"means": [1.0, 3.0]}, [[1, 3]]),
-        ("GaussianBandit-v0", {}, None),
-        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
-        ("LinearBandit-v0", {}, None),
-    ]:
-        with gym.make(env_id, **kwargs) as env:
-            found = true_means(env)
-        assert (None if found is None else found.tolist()) == expected
 
 
 # --- Batches where they may be, equal to their runs to the last bit.
@@ -267,26 +238,6 @@ def test_a_batch_is_its_runs(batches, label, tmp_path):
         assert ours.estimates == pytest.approx(np.nanmean(result.estimates, axis=0))
         info = planned.run.read_info()
         assert (info["engine"], info["n_runs"], info["n_timesteps"]) == ("compiled batch", 5, 200)
-
-
-def test_of_runs_that_differ_in_length_the_shortest_counts(batches, tmp_path):
-    for n in (4, 3):
-        (tmp_path / str(n)).mkdir()
-        pulls = {"arms": ARMS[:1, :n], "rewards": REWARDS[:1, :n], "regrets": REGRETS[:1, :n]}
-        np.savez(tmp_path / str(n) / PULLS_FILE, **pulls)
-    found = stacked_statistics(batches.planned[0].spec, [tmp_path / "4", tmp_path / "3"])
-    assert found.total_reward.tolist() == [2, 2]
-
-
-def test_what_has_no_compiled_copy_goes_one_by_one(tmp_path, monkeypatch, do_study, batches):
-    def refuse(*args):
-        raise NotCompilable("of a reason")
-
-    monkeypatch.setattr("agents.bandits.runs.run_batch", refuse)  # a rule that Numba cannot take
-    found = do_study(study_of({"ucb": AGENTS["ucb"]}, n_seeds=2), tmp_path).summary
-    assert found["engine"].unique().tolist() == ["one by one: of a reason"]
-    expected = batches.summary[batches.summary["agent"] == "ucb"]
-    assert found["regret"].tolist() == expected["regret"].tolist()[:2]
 
 
 def test_a_batch_that_is_there_is_not_done_again_and_a_longer_one_is(tmp_path, do_study):

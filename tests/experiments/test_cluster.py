@@ -43,7 +43,6 @@ from experiments.cluster.answers import (
 from experiments.cluster.cluster_launcher import MOST_SENDS, ClusterLauncher
 from experiments.cluster.schedulers import (
     SECONDS_TO_RESTART,
-    Connection,
     JobQueue,
     Jobs,
     LocalWorkers,
@@ -268,24 +267,6 @@ def test_an_order_holds_no_code(tmp_path):
     assert not mark.exists()
 
 
-def test_a_shared_folder_is_known_by_what_lies_in_it(tmp_path):
-    with probing(tmp_path) as probe:
-        assert probe.is_there
-        assert not replace(probe, content="x").is_there
-        assert not replace(probe, root=tmp_path / "x").is_there
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("root", "inside"), [("logs/s", "logs/s"), ("/far/s", "study"), ("../s", "study")]
-)
-def test_paths_of_a_worker_apart_stay_within_its_folder(root, inside):
-    found = order_of(runs_of(Path(root), tensorboard=True)[0], root=Path(root)).apart()
-    assert found.probe.root == Path(inside)
-    assert found.planned.path.is_relative_to(Path(inside, "runs"))
-    assert found.planned.spec.tensorboard_log.is_relative_to(Path(inside, "tensorboard"))
-
-
 # --- What --cluster may say, and which schedulers are spoken to.
 
 
@@ -368,52 +349,6 @@ def test_a_command_checks_before_it_connects(tmp_path, monkeypatch):
     ):
         pass
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("scheduler", "worker", "words"),
-    [
-        ("tcp://10.0.0.1:8786", "tls://10.0.0.2:1", "TLS"),
-        ("tcp://127.0.0.1:2", "tcp://0.0.0.0:8786", "TLS"),
-        ("tls://10.0.0.1:8786", "tls://10.0.0.2:2", None),
-    ],
-)
-def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, words):
-    client = SimpleNamespace(
-        scheduler_info=lambda n_workers: {"address": scheduler, "id": "s"},
-        nthreads=lambda: {worker: 2},
-        status="running",
-        close=lambda timeout: None,
-    )
-    for is_insecure in (False, True) if words else (False,):
-        connection = Connection(lambda: client, lambda client: None, is_insecure)
-        refusal = words and not is_insecure
-        with pytest.raises(UserError, match=words) if refusal else contextlib.nullcontext():
-            connection.begin()
-            assert connection.n_threads() == client.nthreads()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"walltime": "1-01:10:30"}, "--lifetime 90330s --lifetime-stagger 150s"),
-        ({"walltime": "00:10:00"}, "--lifetime 540s --lifetime-stagger 30s"),
-        ({"walltime": "01:00:00", "worker-extra-args": ["--lifetime", "1h"]}, "--lifetime 1h"),
-        ({"walltime": "90"}, ""),
-        ({"walltime": 3600}, None),  # YAML takes 01:00:00 for a number
-    ],
-)
-def test_workers_retire_before_their_job_ends(tmp_path, settings, words):
-    settings |= {"cores": 1, "memory": "1GB", "shared-temp-directory": str(tmp_path)}
-    asked = JobQueue("slurm", {**settings, "interface": "lo"}, 1, tmp_path / "slurm.yml")
-    if words is None:
-        with pytest.raises(UserError, match="quotes"):
-            opened_queue(asked)
-        return
-    with opened_queue(asked) as queue:
-        script = queue.job_script()
-    assert words in script
-    assert script.count("--lifetime ") == bool(words)
 
 
 # --- Jobs of a queue that have ended are sent again, and others are left alone.

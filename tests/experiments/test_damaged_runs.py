@@ -20,7 +20,6 @@ from experiments.child_processes import NO_LIMITS
 from experiments.plan import plan
 from experiments.results import (
     read_episodes,
-    read_evaluations,
     read_results,
     read_run,
     read_value_maps,
@@ -161,26 +160,6 @@ def test_what_a_comparison_does_not_read_is_not_held_against_it(grid):
     assert read_results(other, plan(other, root), root).left_out == ()
 
 
-WRONG_FIELDS = [
-    {"final": 3},
-    {"final": {"mean_return": "much"}},
-    {"final": {"mean_return": 1.0, "optimum": 2.0}},
-    {"final": {"optimum": 2.0, "baseline": 0.0, "optimum_at_least": "high"}},
-    {"seconds": "long"},
-    {"best_mean_return": 10**400},
-    {"versions": {"numpy": 2}},
-]
-
-
-@pytest.mark.parametrize("fields", WRONG_FIELDS, ids=str)
-def test_a_record_of_wrong_types(grid, fields):
-    study, planned, _ = grid
-    forget_digests(planned[0])
-    planned[0].run.update_info(**fields)
-    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: "):
-        read_run(study, planned[0])
-
-
 PULLS, STATISTICS, MAPS = (
     ("pulls", PULLS_FILE),
     ("batch", STATISTICS_FILE),
@@ -300,26 +279,6 @@ def test_a_monitor_file_of_no_form(tmp_path, text):
     with pytest.raises(DamagedFileError, match=r"0\.monitor\.csv is damaged: ") as error:
         read_episodes(Run(tmp_path, "x"))
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("timesteps", "results"),
-    [
-        ([1], None),
-        ([1], [1.0]),
-        ([1, 2], [[1.0]]),
-        ([1], [[np.nan]]),
-        ([2, 1], [[1.0], [1.0]]),
-        ([-1], [[1.0]]),
-        (["1"], [[1.0]]),
-    ],
-)
-def test_evaluations_of_no_form(tmp_path, timesteps, results):
-    run = Run(tmp_path, "x")
-    arrays = {} if results is None else {"results": results}
-    np.savez(run.evaluations_path, timesteps=timesteps, **arrays)
-    with pytest.raises(DamagedFileError, match=r"evaluations\.npz is damaged: "):
-        read_evaluations(run)
 
 
 @given(st.lists(st.floats(-1e300, 1e300), max_size=20))

@@ -1,6 +1,5 @@
 """Doing the runs of a study: drafts, faults, order, time left; and runs that are in the way."""
 
-import contextlib
 import json
 import math
 import os
@@ -9,8 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
-from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,13 +19,10 @@ import yaml
 from agents import ALGORITHMS
 from agents.registry import AlgorithmEntry
 from agents.tabular.algorithm import TabularAlgorithm
-from experiments import child_processes, launching
+from experiments import child_processes
 from experiments.launching import (
-    WINDOW,
     TimeLeft,
-    available_cores,
     execute,
-    expected_seconds,
     failure_log,
     local_launcher,
 )
@@ -235,54 +229,6 @@ def test_every_run_is_told_of_and_failures_are_kept(faulty):
     assert failure.log.read_text().endswith("RuntimeError: thin ice\n")
     assert [run.is_finished for run in runs] == [True, False]
     assert not (root / ".drafts").exists()
-
-
-def test_nothing_to_do_starts_nothing(tmp_path):
-    assert execute([], tmp_path, pytest.fail, pytest.fail) == []
-
-
-class Growing:
-    """Has no worker at first, and two from the moment on at which it has been given something."""
-
-    n_workers = 0
-    words = ""
-
-    def __init__(self):
-        self.given, self.most = [], 0
-
-    def submit(self, planned):
-        self.n_workers = 2
-        future = Future()
-        self.given.append(future)
-        self.most = max(self.most, sum(not future.done() for future in self.given))
-        threading.Timer(0.05, future.set_result, [None]).start()
-        return future
-
-
-def test_runs_are_handed_over_in_windows_as_wide_as_there_are_workers(tmp_path, monkeypatch):
-    monkeypatch.setattr(launching, "SECONDS_BETWEEN_LOOKS", 0.01)
-    runs, launcher, told, given_then = runs_of(tmp_path, n_seeds=12), Growing(), [], []
-
-    def meanwhile():
-        given_then.append(len(launcher.given))
-
-    def listen(run, failure):
-        told.append(run.seed)
-
-    where = contextlib.nullcontext(launcher)
-    assert execute(runs, tmp_path, lambda: where, listen, meanwhile) == []
-    assert sorted(told) == list(range(12))
-    assert launcher.most == 2 * WINDOW
-    assert given_then == [WINDOW]  # once, after the first runs are handed over
-
-
-def test_the_cores_that_this_process_may_use(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {pid, 3, 5}, raising=False)
-    assert available_cores() == 3
-    monkeypatch.delattr(os, "sched_getaffinity")  # not on every system
-    for known, expected in ((7, 7), (None, 1)):
-        monkeypatch.setattr(os, "cpu_count", lambda known=known: known)
-        assert available_cores() == expected
 
 
 # --- Drafts: whose are left alone, and whose are cleared away or taken over.
@@ -515,11 +461,6 @@ def test_after_a_tenth_of_the_runs_the_time_left_is_right_within_a_factor_of_two
         if n_ended >= 4 and n_ended % n_workers == 0:
             truth = 10.0 * (len(runs) - n_ended) / n_workers
             assert 0.5 < left.seconds(now, n_workers) / truth < 2
-
-
-def test_expectations_go_by_agent_and_budget():
-    table, network = (runs_of(Path(), algo=algo)[0].spec for algo in ("qlearning", "dqn"))
-    assert expected_seconds(table) < expected_seconds(network) < expected_seconds(network, 60.0)
 
 
 # --- What is compiled once for a study: rules of the user's own, and nothing else.

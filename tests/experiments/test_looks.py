@@ -21,7 +21,6 @@ from experiments.plan import plan
 from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from report.conclusions import conclusion
 from verdicts import level_of_look
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
@@ -241,15 +240,6 @@ def test_interrupted_at_any_look_it_ends_the_same(tmp_path, stop):
     assert undated[0] == undated[1]
 
 
-def test_after_a_look_by_hand_the_settled_ones_share_what_is_left(tmp_path):
-    assert look(tmp_path, agents=THREE) == (1, 1)
-    grow(study_of(THREE, n_seeds=6), tmp_path, most=40)
-    design = read_looks(tmp_path)["lake"].design
-    # At so low a level, six seeds could not decide anything.
-    assert (design.after, design.sizes[0] > 6, design.level) == (1, True, level(2))
-    assert look(tmp_path, agents=THREE, n_seeds=50)[1] == 3
-
-
 @pytest.mark.parametrize(
     ("changes", "most", "words"),
     [
@@ -270,14 +260,6 @@ def test_what_was_settled_cannot_change(tmp_path, changes, most, words):
     assert (tmp_path / LOOKS_FILE).read_bytes() == before
 
 
-def test_nothing_is_settled_that_could_not_be(tmp_path):
-    with pytest.raises(UserError, match="two agents or more"):
-        settled_looks(study_of(["qlearning"]), tmp_path, None)
-    with pytest.raises(UserError, match="--max-seeds is 9, the study begins with 10 seeds"):
-        settled_looks(study_of(), tmp_path, 9)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_runs_that_were_looked_at_and_are_others_now_are_refused(tmp_path):
     study = study_of(THREE)
     grow(study, tmp_path, most=40, steps=2)
@@ -286,24 +268,3 @@ def test_runs_that_were_looked_at_and_are_others_now_are_refused(tmp_path):
     # One that is missing now makes no such claim, nor one that was missing then.
     grow(study, tmp_path, ends=FEWER, steps=1)
     grow(study, tmp_path, steps=1)
-
-
-def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp_path):
-    study = study_of(THREE)
-    counts, steps = grow(study, tmp_path, most=40)
-    results = results_of(grown(study, counts), tmp_path, counts=counts)
-    analysis = analyse(results, looks={step.environment: step.standing for step in steps[-1]})
-    text = " ".join(conclusion(analysis.study, analysis.environments[0]).everything)
-    assert text.count(", with 10 seeds)") == 2
-    assert "is undecided on average against " in text
-    assert ", with 40 seeds" in text
-    assert "up to 4 looks that were fixed beforehand: claims at 1.1 % each." in text
-    assert "missing" not in text
-    # What was decided is what was said of those seeds then.
-    first = analyse(results_of(study, tmp_path), looks={"lake": steps[0][0].standing})
-    now, then = (
-        {frozenset((p.first, p.second)): p.mean for p in each.environments[0].pairs}
-        for each in (analysis, first)
-    )
-    for pair in (frozenset(("qlearning", other)) for other in THREE[1:]):
-        assert now[pair] == then[pair]

@@ -114,23 +114,6 @@ def test_an_arm_without_a_click_in_few_pulls_is_not_surely_worse():
 # --- Reward models.
 
 
-def test_an_arm_without_pulls_in_a_context_has_its_mean_elsewhere():
-    contexts, arms = np.array([0, 0, 1, 1]), np.array([0, 0, 0, 1])
-    model = ArmMeans(contexts, arms, np.array([1.0, 3, 5, 7]), 3, 2)
-    assert model.predict(np.array([0, 1])).tolist() == [[2, 7, 4], [5, 7, 4]]
-
-
-def test_an_arm_that_was_never_pulled_has_the_mean_reward_of_the_others():
-    rng = np.random.default_rng(0)
-    contexts, arms = rng.normal((50, -1), (10, 0.1), size=(4000, 2)), rng.integers(2, size=4000)
-    means = contexts @ np.array([[0.2, 3.0], [-0.1, 8.0]]).T + np.array([1.0, 2.0])
-    rewards = means[np.arange(4000), arms] + rng.normal(size=4000)
-    predicted = cross_fit(contexts, arms, rewards, 3).predicted
-    # The noise of 1,600 pulls and three coefficients, and a prior worth a pull.
-    assert np.abs(predicted[:, :2] - means).max() < 0.28
-    assert predicted[:, 2] == pytest.approx(np.full(4000, rewards.mean()), abs=0.3)
-
-
 @pytest.mark.parametrize("kind", ["means", "regressions"])
 def test_sensitivity_is_the_derivative(kind):
     rng = np.random.default_rng(1)
@@ -154,19 +137,6 @@ def test_sensitivity_is_the_derivative(kind):
         moved[[first, second]] += 1, -1
         derivative = total(moved) - total(rewards)
         assert derivative == pytest.approx(sensitivity[first] - sensitivity[second])
-
-
-@pytest.mark.parametrize(("n_pulls", "n_folds"), [(2, 2), (2, 5), (3, 2), (7, 3)])
-def test_folds_are_as_large_as_each_other(n_pulls, n_folds):
-    zeros = np.zeros(n_pulls, np.int64)
-    fitted = cross_fit(zeros, zeros, np.ones(n_pulls), 1, n_folds=n_folds)
-    assert len(fitted.models) == min(n_folds, n_pulls)
-    sizes = np.bincount(fitted.fold, minlength=len(fitted.models))
-    assert sizes.max() - sizes.min() <= 1
-    assert fitted.predicted.tolist() == [[1.0]] * n_pulls
-    for n, folds in ((n_pulls, 0), (n_pulls, 1), (1, 2), (0, 2)):
-        with pytest.raises(ValueError, match=f"or more: there are {n} and {folds}"):
-            cross_fit(zeros[:n], zeros[:n], np.ones(n), 1, n_folds=folds)
 
 
 # --- Laws.
@@ -357,18 +327,6 @@ def test_the_policies_asked_about_stand_before_their_alternatives(log):
     assert (first.ips + second.ips) / 2 == pytest.approx(logged.ips)
     assert (given.effective, logged.effective) == (60, 60)
     assert comparison.notes == ()
-
-
-def test_notes_on_a_log(log):
-    path = log("arm,reward,propensity\n0,1,0.5\n2,0,0.5\n0,1,0.5\n2,1,0.5\n")
-    comparison = compare_policies(read_logged(path), [])
-    assert [row.name for row in comparison.rows] == ["always arm 0", "always arm 2", "as logged"]
-    (note,) = comparison.notes
-    assert note.startswith(f"arm 1 on {path}: arm 1 was never logged")
-    words = compare_policies(read_logged(log(WORDS)), [])
-    assert words.notes == ("segment was read as 0 casual, 1 core",)
-    with pytest.raises(UserError, match="has no column 'propensity': off-policy evaluation needs"):
-        read_logged(log("arm,reward\n0,1\n1,0\n"))
 
 
 def test_figures_on_the_log_that_an_agent_was_trained_on_flatter_it(log):

@@ -169,17 +169,6 @@ def test_a_run_of_other_settings_does_not_count(tmp_path, changed):
     assert not only(changed, tmp_path).is_finished
 
 
-def test_what_is_shown_meanwhile_is_no_part_of_a_run(tmp_path):
-    planned = only(PLAIN, tmp_path)
-    loud = replace(planned.spec, verbose=2, progress=True, log_interval=7, pictures=True)
-    record(replace(planned, spec=loud))
-    assert planned.is_finished
-    logged = only(replace(PLAIN, tensorboard=True), tmp_path)
-    assert logged.is_finished
-    folder = tmp_path / "tensorboard" / "qlearning" / "FrozenLake-v1_1"
-    assert logged.spec.tensorboard_log == folder
-
-
 def test_checkpoints_are_asked_of_the_first_seed_alone(tmp_path):
     record(only(PLAIN, tmp_path))
     first, second = plan(replace(PLAIN, render_every=5, n_seeds=2), tmp_path)
@@ -288,19 +277,3 @@ def test_settings_of_the_studys_own_are_not_known_of_and_each_environment_has_it
     # Many names are cut short.
     told = seed_sentence(range(10), TuningSeeds({}, {}, tuple("abcdefgh")))
     assert "of a, b, c, d, e, f and 2 more were" in told
-
-
-def test_files_of_ones_own_say_it_or_it_is_not_known(tmp_path):
-    path = tmp_path / "mine.yml"
-    agents = [replace(DQN, conf_file=path)]
-    path.write_text("FrozenLake-v1: {gamma: 0.5}\n")
-    assert tuned(agents) == TuningSeeds({}, {}, ("dqn",))
-    path.write_text(
-        "tuned_on: {FrozenLake-v1: {first: 5, count: 2}}\nFrozenLake-v1: {gamma: 0.5}\n"
-    )
-    assert tuned(agents) == TuningSeeds({}, {"mine.yml": frozenset({5, 6})}, ())
-    assert seed_sentence(range(10), tuned(agents)) == (
-        "Seeds 0 to 9: the settings in mine.yml were tuned on 5 to 6 of these."
-    )
-    path.unlink()
-    assert tuned(agents) == TuningSeeds({}, {}, ("dqn",))

@@ -18,8 +18,6 @@ from experiments.plan import plan
 from experiments.results import (
     CURVE_COLUMNS,
     RUN_COLUMNS,
-    curves_by_agent,
-    mean_curve,
     mixed_versions,
     read_results,
     threshold_of,
@@ -195,22 +193,6 @@ def test_what_counts_as_solved(env_id, stated, ends, threshold):
     assert found is threshold is None or found == pytest.approx(threshold)
 
 
-def test_curves_that_share_no_point_are_left_out(tmp_path):
-    """One run ended after 2 episodes; the other is summed up in blocks of 3."""
-    study = study_of(n_seeds=2, agents=("qlearning",))
-    planned = plan(study, tmp_path)
-    write_run(planned[0], [(50, 1.0), (100, 3.0)], [(50, 1.0)] * 2)
-    write_run(planned[1], [(50, 1.0), (100, 3.0)], [(1, 1.0)] * 250)
-    results = read_results(study, planned, tmp_path)
-    curves = curves_by_agent(results, "Warehouse-v0")
-    assert mean_curve(curves["qlearning", "training"], "episode") is None
-    points, band = mean_curve(curves["qlearning", "evaluation"], "step")
-    assert (points.tolist(), band.point.tolist()) == ([50, 100], [1, 3])
-    assert (band.low <= band.point).all()
-    assert (band.point <= band.high).all()
-    write_figures(study_series(analyse(results)), episodes_table(results, 4))
-
-
 # --- Judgements and sentences.
 
 
@@ -355,18 +337,6 @@ def test_agents_that_were_trained_on_a_variant_are_known_and_told_of(tmp_path, f
     assert told == ["Warehouse-v0", "all environments", "Warehouse-v0"]
 
 
-def test_agents_that_do_not_learn_are_told_apart_by_what_they_are(tmp_path):
-    finals = {"optimal": [100] * 2, "value_iteration": [90] * 2, "qlearning": [100] * 2}
-    results = results_of(study_of(agents=tuple(finals), n_seeds=2), tmp_path, finals)
-    text = said(analyse(results))
-    assert "optimal is better on average than value_iteration (by 0.1 to 0.1 of the score)." in text
-    assert "All other pairs are undecided: 2 seeds are too few, whatever they score" in text
-    assert set(analyse(results).environments[0].failures) == {"qlearning"}
-    # Returns of sampled episodes depend on chance, whoever plays.
-    sampled = results.summary.assign(exact=False)
-    assert "better" not in said(analyse(replace(results, summary=sampled)))
-
-
 # --- Files, also of studies that went wrong.
 
 
@@ -422,22 +392,6 @@ def test_files_of_comma_separated_values(tmp_path):
     assert summary["exact"].tolist() == [True] * 8
     assert list(curves.columns) == list(CURVE_COLUMNS)
     assert curves["kind"].value_counts().to_dict() == {"training": 80, "evaluation": 16}
-
-
-def test_the_table_per_block_of_episodes(tmp_path):
-    study = study_of(n_seeds=2, agents=("qlearning",))
-    planned = plan(study, tmp_path)
-    write_run(planned[0], [(100, 1.0)], [(1, r) for r in (1.0, 2.0, 3.0, 4.0)])
-    write_run(planned[1], [(100, 1.0)], [(1, r) for r in (5.0, 6.0, 7.0)])
-    table = episodes_table(read_results(study, planned, tmp_path), 2)
-    assert table.to_dict("list") == {
-        "environment": ["Warehouse-v0"] * 2,
-        "agent": ["qlearning"] * 2,
-        "episode": [2, 4],
-        "average": [3.5, pytest.approx(14 / 3)],
-        "minimum": [1.0, 3.0],
-        "maximum": [6.0, 7.0],
-    }
 
 
 def test_versions_that_differ_are_named():

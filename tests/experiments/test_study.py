@@ -208,26 +208,6 @@ def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
         read(f"{TAXI}agents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
 
 
-@pytest.mark.parametrize(
-    ("sweep", "labels", "folder"),
-    [
-        ("exploration_initial_eps: [0.2, 1.0]", ["ε = 0.2", "ε = 1"], "epsilon=0.2"),
-        ("learning_rate: [0.00006103515625, 0.5]", ["α = 6.104e-05", "α = 0.5"], None),
-        ("gamma: [0.99991, 0.99992]", ["γ = 0.99991", "γ = 0.99992"], "gamma=0.99991"),
-        ("n_steps: [1, 4]", ["n_steps = 1", "n_steps = 4"], "n_steps=1"),
-        (
-            "learning_rate: [0.1], kappa: [0.5, 1]",
-            ["α = 0.1 with κ = 0.5", "α = 0.1 with κ = 1"],
-            "alpha=0.1_with_kappa=0.5",
-        ),
-    ],
-)
-def test_alone_an_agent_is_labelled_by_what_is_swept(read, sweep, labels, folder):
-    study = read(f"{TAXI}agents: {{as printed: {{algo: sarsa, sweep: {{{sweep}}}}}}}\n")
-    assert [agent.label for agent in study.agents] == labels
-    assert folder in (None, file_name(labels[0]))
-
-
 # --- Names and files.
 
 

@@ -1,7 +1,5 @@
 """What figures show, asked of Matplotlib's axes: numbers, colours, words; and nothing is cut."""
 
-import math
-from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -20,8 +18,6 @@ from experiments.analysis import OverallAnalysis
 from report.figures import (
     FigureFiles,
     draw_learning_curves,
-    draw_regret,
-    draw_runs,
     draw_sweeps,
     line_style,
     write_figures,
@@ -341,57 +337,11 @@ def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path):
             assert axes.bbox.height > 0.8 * inch, path.name
 
 
-def test_too_many_agents_make_no_lines(drawn, tmp_path):
-    series, _ = whole_study(tmp_path, [f"agent {n}" for n in range(15)], "lake")
-    series = replace(series, analysis=replace(series.analysis, overall=None))
-    found = [path.stem for path in write_figures(series, None)[::2]]
-    assert found == ["coins_agent_1_posteriors", "lake_sweep", "lake_swept_grid"]
-
-
 MARKS = {"first": Mark("first", 1, "dash"), "second": Mark("second", 0, "solid")}
-
-
-@pytest.mark.parametrize(
-    ("n_agents", "bound", "n_bands", "highest"),
-    [
-        (4, None, 4, 30 + 22 + 2 * 1.96),
-        (5, None, 0, 40 + 22),
-        (2, 90.0, 4, 10 + 22 + 12),  # cut, as above 1.5 times that
-        (2, 40.0, 4, 40),
-    ],
-)
-def test_bands_of_regret_are_few_and_the_axis_ends_with_them(n_agents, bound, n_bands, highest):
-    pulls = {f"agent {n}": made_up.pulls(10.0 * n) for n in range(n_agents)}
-    bounds = bound and RegretBounds(PULLS, np.array([10.0, 30.0, bound]), BOUNDS.lai_robbins)
-    axes = Figure().subplots()
-    marks = {name: Mark(name, 0, "solid") for name in pulls}
-    draw_regret(axes, PullSeries(pulls, None, bounds, None, ()), "coins", marks)
-    assert sum(line.startswith("band") for line in described(axes.figure)) == n_bands
-    assert axes.get_ylim() == pytest.approx((0, 1.05 * highest))
 
 
 BRACKET = {"optimum_at_least": 90.0}
 VARIANT = "trained on a variant of the environment"
-
-
-@pytest.mark.parametrize(
-    ("metric", "changes", "words", "lines"),
-    [
-        ("best", {}, "lake; the line is the optimum | return of the best policy during", [100]),
-        ("best", BRACKET, "lake; the optimum lies between the lines | return of the", [100, 90]),
-        ("final", {"optimum": None}, "lake | return of the final policy; mean, 95 %", []),
-        ("area", {}, "lake | mean return over the learning curve; mean, 95 %", []),
-    ],
-)
-def test_the_optimum_of_runs_is_drawn_where_they_can_reach_it(metric, changes, words, lines):
-    axes = Figure().subplots()
-    # A single seed has no interval.
-    alone = AgentRuns("first", made_up.estimate(5.0, math.nan, math.nan), [0], np.array([5.0]))
-    draw_runs(axes, [alone], made_up.environment(**changes), metric, MARKS)
-    assert described(axes.figure)[0].startswith(words)
-    _, interval, _, *references = (line.get_xdata() for line in axes.get_lines())
-    assert not np.isfinite(interval).any()
-    assert [x[0] for x in references] == lines
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,7 @@ import gzip
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
@@ -20,7 +18,6 @@ from pipeline.training import carry_out, prepare
 from report.page import learning
 from report.page.frame import as_json
 from report.page.learning import exactly, write_first_pages, write_learning_page
-from tests.report import made_up
 
 HOSTILE = "</script><script>document.title='taken'</script>"
 
@@ -67,23 +64,6 @@ def test_the_data_are_what_was_recorded_to_the_last_digit(watch):
     assert data["layout"]["rows"] == ["S..", "#.G"]  # the map of the training
     assert data["layout"]["moves"] == [[-1, 0], [1, 0], [0, -1], [0, 1]]
     assert (data["n_states"], len(data["actions"]), data["is_cut"]) == (6, 4, False)
-
-
-class Mirrored(gym.ObservationWrapper):
-    def observation(self, obs):
-        return 15 - obs
-
-
-def test_without_a_map_states_are_numbers(watch):
-    data, _, _ = watch("Taxi-v4", n_timesteps=50)
-    assert (data["layout"], data["n_states"], data["is_drawn"]) == (None, 500, True)
-    assert data["actions"][5] == "action 5"
-    data, _, _ = watch("LinearBandit-v0", "linucb", n_timesteps=20)
-    assert (data["n_states"], data["is_drawn"]) == (0, False)
-    # Nor is there one where observations are not the states.
-    mirrored = {"env_wrapper": {f"{__name__}.Mirrored": {}}}
-    data, _, _ = watch("FrozenLake-v1", settings=mirrored, gym_packages=("tests",))
-    assert (data["layout"], data["n_states"]) == (None, 16)
 
 
 def test_without_a_table_the_policy_in_every_state(watch):
@@ -208,14 +188,3 @@ def test_each_agent_that_learns_is_shown_once_and_kept(done, analysis, tmp_path)
     assert pages["Q-learning & co"].place == ""
     assert pages["Q-learning & co"].words.startswith("the agent came out otherwise than in the run")
     assert not list((tmp_path / "other").rglob("*.html"))
-
-
-def test_agents_without_a_run_of_their_own_are_named(done, tmp_path):
-    agents = [made_up.agent("ucb", 1.0), made_up.agent("fails", 0.0)]
-    analysis = made_up.analysis([made_up.environment(agents)], ["ucb", "fails"], tmp_path)
-    known = {"is_batch": True, "is_finished": True, "path": tmp_path}
-    batch = SimpleNamespace(agent="ucb", environment="lake", **known)
-    results = replace(analysis.results, planned=(batch,), finished=(batch,))
-    pages, _ = done(replace(analysis, results=results))
-    assert pages["ucb"].words == "its runs were done as one batch, which leaves no agent"
-    assert pages["fails"].words == "no run of it has finished"

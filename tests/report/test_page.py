@@ -14,12 +14,11 @@ import pytest
 from plotly.offline import get_plotlyjs
 
 from experiments.analysis import analyse
-from experiments.looks import Look, Looks, Question
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.conclusions import conclusion
 from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
-from report.page import SECTIONS, render, result_sections, world_sections, write_report
+from report.page import SECTIONS, render, result_sections, write_report
 from report.page.frame import LearningPage, Report, breakable, inline_script, packed, plain
 from report.series import (
     COLOURS,
@@ -161,18 +160,6 @@ def test_settings_command_versions_and_failures(page, report_study):
     assert re.search(r"on Warehouse-v0, seed 1:\s+ValueError: <the> disk & all is full", settings)
 
 
-def test_settings_have_the_looks_that_were_taken(report_study, written, monkeypatch):
-    question = Question("final", None, None, 5, False)
-    look = Look("2026-11-22 10:00:00", question, {"a": 4, "b": 4}, {}, {}, 0.045, planned=False)
-    # They lie in the folder of the study, which many tests share.
-    looks = {"Warehouse-v0": Looks((look,))}
-    monkeypatch.setattr(result_sections, "read_looks", lambda _: looks)
-    settings = written(report_study.analysis).sections["settings"]
-    assert "These runs have been looked at once." in settings
-    assert "2026-11-22: seeds 5 to 8; claims at 4.5 %." in settings
-    assert "None on this environment: too few runs." in settings
-
-
 def test_a_study_on_one_environment_compares_nothing_over_environments(one_environment, written):
     page = written(one_environment)
     assert [*page.sections] == [n for n in SECTION_NAMES if n not in {"overview", "overall"}]
@@ -233,18 +220,6 @@ def test_the_maps_are_those_of_the_run_folders(page, report_study):
     assert data["matters"] == "1111101011100110"
 
 
-def test_maps_share_the_room_of_the_page(report_study, monkeypatch):
-    # Two kinds of figures on 16 cells, of 2 agents, at 4 moments; another environment has as much.
-    monkeypatch.setattr(world_sections, "MAX_FIGURES", 2 * (2 * 16 * 2 * 4))
-    section = world_sections.policies(Report(study_series(report_study.analysis), ""))
-    lake, warehouse = section.places
-    assert [run["seed"] for run in lake["runs"]] == [0, 0]
-    for run in lake["runs"]:
-        assert len(run["steps"]) == len(run["values"]) == len(run["actions"]) == 4
-        assert run["steps"][-1] == 2000
-    assert [len(run["steps"]) for run in warehouse["runs"]] == [2, 2]
-
-
 def test_bandits_have_their_section_and_other_environments_theirs(tmp_path, do_study, written):
     agents = (
         AgentSpec("qlearning", "qlearning", tuned=False),
@@ -301,20 +276,6 @@ def test_a_film_is_small_and_made_once_but_anew_where_it_is_none(report_study):
         (run.path / name).write_text(damage)
         assert film_of(run).read_bytes() == content
         assert json.loads((run.path / "episode.json").read_text())["frames"] > 1
-
-
-def test_films_have_room_for_all_environments(report_study, monkeypatch):
-    """Two agents of one route share a film; what has no room is named."""
-    report = Report(study_series(report_study.analysis), "")
-    sizes = [film_of(run).stat().st_size for run in report_study.planned if run.seed == 0]
-    # Half of it is the first environment's.
-    monkeypatch.setattr(world_sections, "ALL_BYTES", 2 * min(sizes))
-    films = world_sections.played_episodes(report).context
-    told = zip(films["films"], films["without_room"], strict=True)
-    assert [len(shown) + len(left) for shown, left in told] == [3, 3]
-    assert any(films["without_room"])
-    monkeypatch.setattr(world_sections, "ALL_BYTES", 0)
-    assert world_sections.played_episodes(report) is None
 
 
 # --- nothing gets in, nothing gets out ------------------------------------------------------------

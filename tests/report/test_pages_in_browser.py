@@ -45,7 +45,6 @@ FLAGS = (
     "--disable-sync",
 )
 HOSTILE = "</script><script>document.title='taken'</script>"
-PAPER = 688  # CSS pixels between the margins of A4
 
 
 class Browser:
@@ -264,27 +263,6 @@ def test_what_is_taken_along_is_what_the_files_say_and_nothing_that_runs(page, r
         """
     )
     assert guarded == "a,b\n'=1+1,-2\n"
-
-
-def test_paper_has_every_environment_in_light_colours_and_loses_nothing(browser, report_study):
-    """As it is printed from a dark screen."""
-    browser.load(report_study.page, PAPER, prefers_color_scheme="dark")
-    browser.plots(5)
-    browser.emulate("print", {"prefers-color-scheme": "dark"})
-    browser.wait(lambda: browser.all(".sheet"))
-    # Ranking, learning curves, differences, policies, films, settings.
-    assert browser.shown("h2 .where") == ["FrozenLake-v1", "Warehouse-v0"] * 6
-    for css in (".sheet .plot .main-svg", ".sheet table", ".sheet .board", "#verdict .card"):
-        rights = browser.run(
-            "return [...document.querySelectorAll(arguments[0])]"
-            ".filter((e) => e.getClientRects().length)"
-            ".map((e) => e.getBoundingClientRect().right)",
-            css,
-        )
-        assert 0 < max(rights) <= PAPER, css
-    assert browser.all("details:not([open])") == []
-    ink = browser.run("return getComputedStyle(document.querySelector('.sheet .xtick text')).fill")
-    assert ink == "rgb(27, 31, 35)"
 
 
 # --- bandits, and a search ------------------------------------------------------------------------

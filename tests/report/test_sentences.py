@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from experiments.looks import Design, Look, Looks, Question, Standing
-from report.conclusions import conclusion, pairs_both_ways, places_without_a_run
+from report.conclusions import conclusion, pairs_both_ways
 from report.documents import duration
 from report.page.frame import setting
 from report.terminal import says_more, shown, sign
@@ -250,22 +250,6 @@ def test_pairs_with_one_verdict_stand_in_one_sentence_of_the_better_agent():
     )
 
 
-@pytest.mark.parametrize(
-    ("typical", "sentence"),
-    [
-        ("worse", "In the typical run, b is better than a (medians 90 and 100)."),
-        ("equivalent", "In the typical run, a and b are equal (medians 100 and 90)."),
-        ("undecided", None),
-    ],
-)
-def test_typical_runs_are_told_where_they_say_something_else(typical, sentence):
-    open_ = place_of({}, TWO, pairs=(made_up.pair(*"ab", "undecided", typical=typical),))
-    told = [text for text in said(open_).pairs if "typical" in text]
-    assert told == ([sentence] if sentence else [])
-    same = place_of({}, TWO, pairs=(made_up.pair(*"ab", "better", typical="better"),))
-    assert not any("typical" in text for text in said(same).pairs)
-
-
 def test_the_matrix_has_each_pair_from_both_sides():
     place = place_of({"ab": "<", "bc": "="})
     verdicts = {names: pair.verdict for names, pair in pairs_both_ways(place).items()}
@@ -339,19 +323,3 @@ GROWN = Standing(2, 0.015, 0.015, Design(QUESTION, (5, 8, 12), {}, 0))
 )  # fmt: skip
 def test_what_else_is_said(changes, notes):
     assert list(said(place_of({"ab": "?"}, TWO, **changes)).notes) == notes
-
-
-@pytest.mark.parametrize("metric", ["final", "training", "last_episodes"])
-def test_verdicts_on_training_say_which_agents_had_a_variant(metric):
-    agents = [made_up.agent(name, 90.0, on_variant=name != "a") for name in "abc"]
-    sentence = "b and c were trained on a variant of the environment, with returns of its own."
-    assert (sentence in said(made_up.environment(agents), metric).notes) is (metric != "final")
-    plain = made_up.environment([made_up.agent(name, 90.0) for name in "abc"])
-    assert not any("variant" in text for text in said(plain, metric).notes)
-
-
-def test_an_environment_without_a_run_is_named():
-    found = made_up.analysis([made_up.environment(label="lake")], "a")
-    asked = made_up.study("a", places=("lake", "hill"))
-    found = replace(found, results=replace(found.results, study=asked))
-    assert places_without_a_run(found) == ["On hill, no run has finished."]

@@ -81,22 +81,6 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
     }
 
 
-def test_other_headlines():
-    costs = table_as("md", headline(of_lake(metric="regret", is_score=False)))
-    assert "| `low` | 30 |" in costs
-    assert "| `open` | 80 ± 0.12 ?, 1 of 4 failed |" in costs
-    assert "Regret of a run: the mean; scores where they are known. ±: the" in costs
-    assert "processor" not in costs
-    some = made_up.agent("first", 90.0, n_missing=2)
-    absent = table_as("md", headline(of_lake(agents=(some,), pairs=())))
-    assert "| `low` | - |" in absent
-    assert "| `first` | 0.9 ?, 2 missing |" in absent
-    bracketed = replace(lake(), environment="hill", optimum_at_least=90.0)
-    assert r"\texttt{open} & 0.8 $\pm$ 0.12 ?, 1 of 4" in table_as("tex", headline(of_lake()))
-    caption = headline(made_up.analysis([lake(), bracketed], NAMES)).caption
-    assert "as 0. On hill the optimum is bracketed: 1 is the upper end. ±: the" in caption
-
-
 def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():
     study = made_up.study(NAMES)
     seen = {"first": "open", "same": "open", "open": "open", "low": "behind"}
@@ -308,24 +292,6 @@ def test_a_title_a_table_a_caption_and_sentences(width, options):
         assert below(lines) == NARROW_CAPTION + SENTENCES
     assert max(map(len, lines)) <= width
     assert not any("…" in line for line in lines)
-
-
-@pytest.mark.parametrize("width", [60, 120, 200])
-@pytest.mark.parametrize("name", ["[red]", "a name that is longer than twenty letters"])
-def test_no_figure_is_cut_and_no_border_lost(name, width):
-    agents = [made_up.agent(label, -27_427.0) for label in (name, "second")]
-    found = made_up.analysis([made_up.environment(agents)], [name, "second"])
-    lines = lines_of(print_analysis, found, width=width)
-    assert max(map(len, lines)) <= width
-    assert not any("…" in line for line in lines)
-    (top,) = [line for line in lines if line.startswith("┏")]
-    (bottom,) = [line for line in lines if line.startswith("└")]
-    assert top.endswith("┓")
-    assert len(top) == len(bottom)
-    headings, *rows = cells(lines)
-    assert "".join(row[0] for row in rows[:-1]).replace(" ", "") == name.replace(" ", "")
-    assert rows[-1][:2] == ["second", "-27,427 [-27,427, -27,427]"]
-    assert ("training" in headings) is (width == 200)
 
 
 def test_three_agents_have_their_verdicts_in_a_matrix():

@@ -141,10 +141,3 @@ def test_over_environments_a_seed_counts_by_its_mean():
     (sentence,) = overall_sentences(study_of(worlds))
     assert sentence.startswith("Over both environments, A (score 0.85")
     assert sentence.endswith("is best on average.")
-
-
-def test_of_regret_the_lower_mean_is_best():
-    rng = np.random.default_rng(0)
-    runs = {"ucb": 50 + 40 * rng.gamma(1.5, 1, 500), "greedy": 100 + 100 * rng.gamma(1.5, 1, 500)}
-    text = said(study_of({"bandit": runs}, metric="regret"))
-    assert "ucb is best on average: regret of a run" in text

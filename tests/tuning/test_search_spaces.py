@@ -13,7 +13,7 @@ from agents import ALGORITHMS, load_algorithm
 from pipeline.agent_settings import resolved_spec
 from pipeline.errors import UserError
 from pipeline.settings import hyperparams
-from pipeline.settings.components import build_algorithm_kwargs, default_policy, wrapper_factory
+from pipeline.settings.components import build_algorithm_kwargs, default_policy
 from pipeline.settings.hyperparams import entry_names, read_hyperparams, split
 from pipeline.settings.yaml import read_yaml
 from tuning import search_spaces
@@ -132,16 +132,6 @@ def test_an_agent_takes_every_end_and_every_choice(algo):
         if number < 2:
             algorithm(env=env, **{**kwargs, **one_transition(kwargs)})
     env.close()
-
-
-@pytest.mark.parametrize("algo", SEARCHED)
-def test_every_wrapper_is_there_and_takes_its_arguments(algo):
-    for env_id in read_yaml(FOLDER / f"{algo}.yml"):
-        for entry in read_search_space(algo, env_id).entries.values():
-            for option in getattr(entry, "options", {}).values():
-                for key, value in option.items():
-                    if key in {"env_wrapper", "train_env_wrapper"}:
-                        wrapper_factory(value, where=key)
 
 
 def one_transition(kwargs):
@@ -288,15 +278,6 @@ def test_a_grid_goes_from_end_to_end(space):
     assert grid["log2_batch_size"] == [5, 6, 7]
     assert grid["n_steps"] == [1, 3, 5]
     assert grid["gamma_form"] == ["constant", 1.0]
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "kind"), [("0", "1", "Int"), ("0.0", "1.0", "Float"), ("0e0", "1", "Float")]
-)
-def test_numbers_are_whole_where_both_ends_are_written_so(tmp_path, low, high, kind):
-    space = read(tmp_path, f"default: {{gamma: {{low: {low}, high: {high}}}}}")
-    expected = getattr(optuna.distributions, f"{kind}Distribution")(0, 1)
-    assert space.distributions() == {"gamma": expected}
 
 
 # --- mistakes -------------------------------------------------------------------------------------

@@ -87,18 +87,6 @@ def test_winning_always_leaves_a_doubt():
     assert [lost.point, *interval(lost)] == pytest.approx([0, 0, exact.high])
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_with_many_seeds_the_normal_interval_agrees_with_resampling(n_envs, monkeypatch):
-    first, second = np.random.default_rng(0).normal([[[0.4]], [[0]]], 1, size=(2, 201, n_envs))
-    normal = probability_of_improvement(first, second, seed=0)
-    monkeypatch.setattr("verdicts.pairs.MANY_SEEDS", 201)
-    resampled = probability_of_improvement(first, second, seed=0)
-    assert normal.point == resampled.point
-    assert interval(normal) != interval(resampled)
-    # A tenth of its half width.
-    assert interval(normal) == pytest.approx(interval(resampled), abs=0.006 / n_envs**0.5)
-
-
 @pytest.mark.parametrize(("truth", "n"), [(0.95, 5), (0.7, 30)])
 def test_the_interval_of_the_probability_covers(truth, n):
     rng = np.random.default_rng(0)
