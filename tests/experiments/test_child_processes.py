@@ -414,6 +414,12 @@ def test_what_a_run_must_not_share_its_process_with(name, value):
     assert not is_plain(replace(runs_of(Path("x"))[0].spec, **{name: value}))
 
 
+@pytest.mark.parametrize(("algo", "engine"), [("ppo", "library"), ("sac", "compiled")])
+def test_networks_share_a_process_only_in_our_engines(algo, engine):
+    hyperparams = replace(HYPERPARAMS, algorithm={"engine": engine})
+    assert not is_plain(replace(runs_of(Path("x"))[0].spec, algo=algo, hyperparams=hyperparams))
+
+
 # --- Limits: how they are written, and what a process takes.
 
 
