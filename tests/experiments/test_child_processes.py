@@ -265,6 +265,18 @@ def test_when_the_server_is_killed_all_go_on(chores, tmp_path, caplog):
     assert caplog.messages == [told]
 
 
+@pytest.mark.usefixtures("light_server")
+def test_a_stop_does_not_wait_for_a_server_that_imports(chores):
+    with local_executor(1) as executor:
+        os.kill(child_processes.server_pid(), signal.SIGSTOP)
+        future = executor.submit(alone, chores.add, 1, 1)
+        time.sleep(0.5)  # until it asks the server
+        began = time.monotonic()
+        stop_all()
+        assert isinstance(future.exception(), StoppedError)
+        assert time.monotonic() - began < 2
+
+
 def test_signals_of_a_whole_group_do_not_reach_the_children(chores):
     """The terminal sends Ctrl-C to all; what it means is decided above."""
     assert alone(chores.interrupt_itself, tries=1) == "still here"

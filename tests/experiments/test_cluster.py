@@ -43,6 +43,7 @@ from experiments.cluster.answers import (
 from experiments.cluster.cluster_launcher import MOST_SENDS, ClusterLauncher
 from experiments.cluster.schedulers import (
     SECONDS_TO_RESTART,
+    Connection,
     JobQueue,
     Jobs,
     LocalWorkers,
@@ -352,6 +353,29 @@ def test_a_command_checks_before_it_connects(tmp_path, monkeypatch):
 
 
 # --- Jobs of a queue that have ended are sent again, and others are left alone.
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "worker", "words"),
+    [
+        ("tcp://10.0.0.1:8786", "tls://10.0.0.2:1", "TLS"),
+        ("tcp://127.0.0.1:2", "tcp://0.0.0.0:8786", "TLS"),
+        ("tls://10.0.0.1:8786", "tls://10.0.0.2:2", None),
+    ],
+)
+def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, words):
+    client = SimpleNamespace(
+        scheduler_info=lambda n_workers: {"address": scheduler, "id": "s"},
+        nthreads=lambda: {worker: 2},
+        status="running",
+        close=lambda timeout: None,
+    )
+    for is_insecure in (False, True) if words else (False,):
+        connection = Connection(lambda: client, lambda client: None, is_insecure)
+        refusal = words and not is_insecure
+        with pytest.raises(UserError, match=words) if refusal else contextlib.nullcontext():
+            connection.begin()
+            assert connection.n_threads() == client.nthreads()
 
 
 class Queue:
