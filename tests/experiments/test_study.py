@@ -435,6 +435,17 @@ def test_a_run_of_other_settings_does_not_count(tmp_path, changed):
     assert not only(changed, tmp_path).is_finished
 
 
+def test_what_is_shown_meanwhile_is_no_part_of_a_run(tmp_path):
+    planned = only(PLAIN, tmp_path)
+    loud = replace(planned.spec, verbose=2, progress=True, log_interval=7, pictures=True)
+    record(replace(planned, spec=loud))
+    assert planned.is_finished
+    logged = only(replace(PLAIN, tensorboard=True), tmp_path)
+    assert logged.is_finished
+    folder = tmp_path / "tensorboard" / "qlearning" / "FrozenLake-v1_1"
+    assert logged.spec.tensorboard_log == folder
+
+
 def test_checkpoints_are_asked_of_the_first_seed_alone(tmp_path):
     record(only(PLAIN, tmp_path))
     first, second = plan(replace(PLAIN, render_every=5, n_seeds=2), tmp_path)

@@ -143,6 +143,19 @@ def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
     assert set(toy.states(place)) == {"COMPLETE", "WAITING"}
 
 
+def test_scores_are_not_compared_with_those_of_another_search_before(toy, tmp_path):
+    """The optimum of an environment may be known since an update."""
+    place = toy.opened(toy.tuning(), tmp_path)
+    toy.search(place, toy.Launcher(stops_after=7), judged_by="final")
+    with pytest.raises(UserError, match=r"judged by final, and now by score: --name NAME makes"):
+        toy.search(place, toy.Launcher())
+    assert toy.search(place, toy.Launcher(), judged_by="final").done
+    assert toy.states(place) == ["COMPLETE"] * 10
+    # Nor is another search under the same name gone on with.
+    with pytest.raises(UserError, match=r"toy: the tuning there is another .*objective: 'mean'"):
+        toy.opened(toy.tuning(objective="lower"), tmp_path)
+
+
 @pytest.mark.parametrize(("judged_by", "hopeless"), [("score", False), ("final", True)])
 def test_only_scores_have_1_to_hope_for_where_all_are_below_0(toy, tmp_path, judged_by, hopeless):
     """Of returns nobody knows how high they go: those seen so far have to do."""
@@ -204,6 +217,14 @@ def test_a_grid_goes_through_every_point_once(toy, tmp_path):
 
 
 # --- what suggests settings -----------------------------------------------------------------------
+
+
+def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
+    place = toy.opened(toy.tuning(settings={"gamma": 0.9}), tmp_path)
+    toy.search(place, toy.Launcher())
+    assert place.suggestions.n_free == 1
+    assert {p["gamma"] for p in toy.params(place)} == {0.9}
+    assert len({p["learning_rate"] for p in toy.params(place)}) == 10
 
 
 def asked(study, number):
