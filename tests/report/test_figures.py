@@ -314,12 +314,15 @@ def test_every_figure_of_a_study(drawn, tmp_path):
     assert "\n".join(shown) + "\n" == EXPECTED
 
 
-def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path):
-    names = [
-        f"a rule of our own, number {n}, that says all of its settings in its name, of $5"
-        for n in range(12)
-    ]
-    names[0] = "W" * 60
+LABELS = {
+    "long": "a rule of our own, number {n}, that says all of its settings in its name, of $5",
+    "unbroken": "W{n:02}" * 20,
+}
+
+
+@pytest.mark.parametrize(("n_agents", "kind"), [(7, "unbroken"), (12, "long")])
+def test_nothing_is_cut_by_matplotlibs_own_extents(drawn, tmp_path, n_agents, kind):
+    names = [LABELS[kind].format(n=n) for n in range(n_agents)]
     paths = write_figures(*whole_study(tmp_path, names, names[0], 79.0, names[1:2]))
     assert len(drawn) == 10
     for path, figure in zip(paths[::2], drawn, strict=True):
