@@ -58,11 +58,12 @@ def interval(found):
     ("first", "second", "point", "n", "n_missing"),
     [
         ([2], [1], 1, 1, 0),
-        ([NAN], [1], NAN, 0, 1),
+        ([1, NAN], [NAN, 1], NAN, 0, 2),
         ([np.inf, 1], [np.inf, 0], 0.625, 2, 0),
         ([0.3], [0.1 + 0.2], 0.5, 1, 0),  # in the last bits alone
         # Environments are averaged.
         ([[1, 5], [2, 5], [3, NAN]], [[0, 5], [0, 5], [0, 5]], 0.75, 5, 1),
+        ([[0, 5], [0, 5], [0, 5]], [[1, 5], [2, 5], [3, NAN]], 0.25, 5, 1),
     ],
 )
 def test_who_wins(first, second, point, n, n_missing):
