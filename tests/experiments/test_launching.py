@@ -444,6 +444,13 @@ def test_what_is_in_the_way_of_a_run_is_kept(done, change):
     assert contents(done / "replaced" / "1" / "mine" / "dry_lake_1") == before
 
 
+def test_an_empty_folder_is_not_kept(done):
+    planned = runs_of(done, n_seeds=3)
+    planned[2].path.mkdir()
+    assert move_replaced_aside(planned, done) == ([], None)
+    assert not planned[2].path.exists()
+
+
 # --- How long a study may still take.
 
 
