@@ -335,7 +335,8 @@ def test_which_tasks_share_a_process(chores, tmp_path):
 
 def test_a_limit_of_time_is_that_of_the_task_alone_and_a_stop_ends_all(chores):
     limits = RunLimits(seconds=5)
-    assert len({shared(chores.nap, 2, limits=limits) for _ in range(3)}) == 1
+    pid = shared(chores.who)  # on a busy machine it takes long until its process is there
+    assert {shared(chores.nap, 2, limits=limits) for _ in range(3)} == {pid}
     with pytest.raises(TaskFailedError, match="--run-timeout allows, 5 s") as error:
         shared(chores.nap, 60, limits=limits)
     assert not isinstance(error.value, TaskDiedError)
