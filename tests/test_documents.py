@@ -1,8 +1,12 @@
-"""The documents: their commands are accepted as they stand, and do what the page says of them."""
+"""The documents: their commands are accepted as they stand, and do what the page says of them.
+
+And no two pages disagree on a figure that they have in common.
+"""
 
 import re
 import shlex
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -159,3 +163,100 @@ def test_the_collector_reads_commands_wherever_they_stand():
         *(f"--env {e} --algo {a} --env-kwargs slip:0.1" for e in ("A-v0", "B-v0") for a in "xy"),
         "--env A-v0 --algo x",
     ]
+
+
+# --- one quantity, one figure ---------------------------------------------------------------------
+
+HEADLINE_PAGES = ("README.md", "docs/library-vs-hand-rolled.md")
+TABLES_PAGE = "docs/environments.md"  # two agents on many environments, medians
+# Pages that print what a comparison on the seeds from 1000 on says, and its environment.
+OUTPUTS = {"docs/compare.md": "CliffWalking-v1", "docs/start.md": "FrozenLake8x8-v1"}
+SCORE = re.compile(r"\**(\d\.\d+|\d)\**(?= |$)")
+FAILED = re.compile(r"(\d+) of 10 (?:runs of \w+ )?failed")
+# Figures that are known to be of an earlier version, by environment and agent.
+STALE = {("FrozenLake8x8-v1", "sarsa"): "the shipped settings are others since"}
+
+
+def cells(table):
+    """The cells of a Markdown table, by the headings of its row and of its column."""
+    lines = [line for line in table.splitlines() if line.startswith("|")]
+    (_, *headings), _, *rows = (
+        [cell.strip(" `†") for cell in line.strip("|").split("|")] for line in lines
+    )
+    return {
+        (name, heading): cell
+        for name, *row in rows
+        for heading, cell in zip(headings, row, strict=True)
+    }
+
+
+def figures():
+    """What pages say of an agent on an environment with ten seeds from 1000 on, by quantity."""
+    found = defaultdict(dict)
+
+    def note(page, environment, agent, cell, statistic):
+        place = (environment, agent)
+        found[statistic, *place][page] = float(SCORE.match(cell)[1])
+        failed = FAILED.search(cell)
+        found["failed", *place][page] = int(failed[1]) if failed else 0
+
+    for page in HEADLINE_PAGES:
+        text = (ROOT / page).read_text()
+        (block,) = re.findall(r"<!-- headline: held-out -->\n(.*?)<!-- end -->", text, re.DOTALL)
+        statistic = "median" if "Score of the median run" in block else "mean"
+        for (agent, environment), cell in cells(block).items():
+            found["cell", environment, agent][page] = cell
+            if page == "README.md":
+                note(page, environment, agent, cell, statistic)
+    text = (ROOT / TABLES_PAGE).read_text()
+    assert "--first-seed 1000" in text
+    table = text[text.index("| | `qlearning`") :].partition("\n\n")[0]
+    for (environment, agent), cell in cells(table).items():
+        note(TABLES_PAGE, environment, agent, cell, "median")
+    for page, environment in OUTPUTS.items():
+        said = re.search(
+            rf"--env {environment} [^\n]*--first-seed 1000.*?```\n(\w.*?\.)\n",
+            (ROOT / page).read_text(),
+            re.DOTALL,
+        )[1]
+        for agent, score in re.findall(r"(\w+) \(score ([\d.]+) \[", said):
+            failed = re.search(rf"\d+ of 10 runs of {agent} failed", said)
+            note(page, environment, agent, f"{score} {failed[0] if failed else ''}", "mean")
+    return found
+
+
+FIGURES = figures()
+SHARED = {what: pages for what, pages in FIGURES.items() if len(pages) > 1}
+
+
+def test_pages_share_figures():
+    pages = {page for shared in SHARED.values() for page in shared}
+    assert pages >= {*HEADLINE_PAGES, TABLES_PAGE, "docs/compare.md"}
+    assert len(SHARED) > 40
+
+
+@pytest.mark.parametrize("what", SHARED, ids=" ".join)
+def test_no_two_pages_disagree_on_a_figure(what):
+    """Scores to the digits of the coarser page; processor times within one study alone."""
+    by_page = SHARED[what]
+    first, *others = by_page.values()
+    for value in others:
+        assert value == (first if what[0] == "cell" else pytest.approx(first, abs=1.01e-3)), by_page
+
+
+# What both pages have with the shipped settings: the median of the ten seeds from 1000 on, and how
+# many of the 20 from there on solve it.
+COUNTED = {
+    tuple(place): (pages[TABLES_PAGE], reached()[training])
+    for (statistic, *place), pages in FIGURES.items()
+    if statistic == "median" and TABLES_PAGE in pages
+    if (training := "--env {} --algo {}".format(*place)) in reached()
+    if reached()[training].n_runs == 20 and "return" not in reached()[training].median
+}
+
+
+@pytest.mark.parametrize("place", COUNTED, ids=" ".join)
+def test_a_median_of_ten_seeds_fits_how_many_of_20_solve_it(place):
+    median, row = COUNTED[place]
+    least, most = (5, 20) if median >= 0.9 else (0, 15)
+    assert (least <= row.n_solved <= most) is (place not in STALE)

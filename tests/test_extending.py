@@ -12,6 +12,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 DOCUMENT = (DOCS / "extending.md").read_text() + (DOCS / "own-agent.md").read_text()
 FILES = re.findall(r"^`(\w+\.\w+)`[^\n]*(?:\n[^\n]+)*\n\n```\w+\n(.*?)```", DOCUMENT, re.M | re.S)
 CHECK = re.findall(r"```python\n((?:(?!```).)*check_transition_model.*?)```", DOCUMENT, re.S)
+CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text()
 COMMANDS = re.findall(r"^python ~/yardstick/(.*)$", DOCUMENT, re.M)
 
 
@@ -54,74 +55,7 @@ def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
 
 # --- one file, whose lines are counted ------------------------------------------------------------
 
-RULE = '''
-"""Cautious Q-learning."""
-
-from __future__ import annotations
-
-from typing import Any
-
-import numpy as np
-
-import agents
-from agents.common.exploration import highest_value
-from agents.common.settings import check_share, settings_of
-from agents.tabular.algorithm import TabularAlgorithm
-from agents.tabular.updates import TabularAgent
-from machine_code.compiling import inlined
-
-agents.register("cautious", "cautious:Cautious", observations="Discrete", actions="Discrete")
-
-
-@inlined
-def cautious_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
-    """The best next action's value, mixed with the mean of all."""
-    mean, caution = agent.room.values.mean(), agent.settings.caution
-    return caution * mean + (1.0 - caution) * highest_value(agent.room.values)
-
-
-class Cautious(TabularAlgorithm):
-    """Q-learning that trusts the best next action only in part: ``caution``, in [0, 1]."""
-
-    parameters = {"caution": np.float64}
-    next_value = cautious_value
-
-    def __init__(self, *args: Any, caution: float = 0.1, **kwargs: Any) -> None:
-        self.caution = caution
-        super().__init__(*args, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_share(settings_of(self, "caution"))
-'''
-INDEX = '''
-"""MOSS."""
-
-from __future__ import annotations
-
-import math
-
-import agents
-from agents.bandits.choosing import ScoreAgent
-from agents.bandits.upper_bounds import UpperBoundBandit
-from machine_code.compiling import inlined
-
-agents.register("moss", "moss:MOSS", observations="Discrete", for_bandits=True)
-
-
-@inlined
-def moss_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
-    """Mean plus sqrt(max(ln(t / (arms n)), 0) / n) after t pulls."""
-    share = pulls / (len(agent.arms) * count)
-    return mean + math.sqrt(max(math.log(share), 0.0) / count)
-
-
-class MOSS(UpperBoundBandit):
-    """An index that is optimal in the worst case (Audibert and Bubeck, 2009), at any time."""
-
-    upper_bound = moss_bound
-'''
-GRID = '''
+GRID = '''\
 """A pond: ice all around, and one hole."""
 
 import gymnasium as gym
@@ -154,20 +88,34 @@ class Pond(GridWorld):
 '''
 
 
+def contributed(title, entry):
+    """A rule as CONTRIBUTING writes it, and its entry in the table of agents."""
+    (text,) = re.findall(rf'```python\n("""{title}\."""\n.*?)```', CONTRIBUTING, re.DOTALL)
+    return f"{text}\n\nimport agents\n\nagents.register({entry})\n"
+
+
+RULE = contributed(
+    "Cautious Q-learning",
+    '"cautious", "cautious:CautiousQLearning", observations="Discrete", actions="Discrete"',
+)
+INDEX = contributed("MOSS", '"moss", "moss:MOSS", observations="Discrete", for_bandits=True')
+
+
 @pytest.mark.parametrize(
     ("name", "text", "most_lines", "words", "engine"),
     [
         ("cautious", RULE, 50, "--env FrozenLake-v1 --algo cautious -n 300 -params caution:0.3",
          "compiled"),
-        ("moss", INDEX, 30, "--env BernoulliBandit-v0 --algo moss -n 200", None),
+        ("moss", INDEX, 35, "--env BernoulliBandit-v0 --algo moss -n 200", None),
         ("pond", GRID, 35, "--env my/Pond-v0 --algo qlearning -n 2000", "compiled"),
     ],
+    ids=["cautious", "moss", "pond"],
 )  # fmt: skip
 def test_a_rule_an_index_or_a_grid_world_is_one_file(
     own_folder, type_in_own_folder, name, text, most_lines, words, engine
 ):
-    assert len(text.strip().splitlines()) <= most_lines
-    (own_folder / f"{name}.py").write_text(text.lstrip())
+    assert len(text.splitlines()) <= most_lines
+    (own_folder / f"{name}.py").write_text(text)
     command = ["train.py", "--gym-packages", name, "--seed", "0", *words.split()]
     assert type_in_own_folder(*command)[::2] == (0, "")
     (path,) = Path("logs").glob("*/*/run.json")

@@ -12,7 +12,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from tests.peers import peer_environment
 from tests.peers.peer_environment import peer_folder, peer_python
 
 ROOT = Path(__file__).parent.parent
@@ -152,17 +151,3 @@ def test_the_peers_alone_have_a_known_hole() -> None:
     theirs = pins("tests/peers/requirements.txt")
     old = {name for name in theirs if name in MENDED and theirs[name] < Version(MENDED[name][0])}
     assert old == {"pillow"}
-
-
-def test_peers_that_cannot_be_installed_are_told(tmp_path, monkeypatch) -> None:
-    """Nothing is skipped then: whatever needs them fails, with what pip says."""
-    wrong = tmp_path / "requirements.txt"
-    wrong.write_text("pip==0.0.1 --hash=sha256:" + 64 * "0" + "\n")
-    monkeypatch.setattr(peer_environment, "REQUIREMENTS", wrong)
-    monkeypatch.setattr(peer_environment, "FOLDER", tmp_path / "peers")
-    monkeypatch.setattr(peer_environment, "PYTHON", tmp_path / "peers" / "bin" / "python")
-    monkeypatch.setattr(peer_environment, "STAMP", tmp_path / "peers" / "installed")
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    with pytest.raises(RuntimeError, match=r"(?s)the peers cannot be installed.*pip==0\.0\.1"):
-        peer_python()
-    assert not peer_environment.STAMP.exists()

@@ -32,22 +32,6 @@ def test_true_values_are_those_of_the_model(env_kwargs):
     assert true_values(env_kwargs)[chain.states] == pytest.approx(solved, abs=1e-12)
 
 
-def test_an_agent_that_begins_anew_is_as_good_as_another():
-    from _figures import WALK, agent_on, errors_of_runs, true_values
-
-    settings = {"learning_rate": 0.1, "initial_q": 0.5}
-    both = errors_of_runs("qlearning", [0, 1], 20, {}, **settings)
-    assert both.shape == (2, 20)
-    np.testing.assert_array_equal(both[1:], errors_of_runs("qlearning", [1], 20, {}, **settings))
-    # Before anything is learnt, and after each episode by hand.
-    agent = agent_on(WALK, "qlearning", 0, **settings)
-    agent.set_random_seed(0)
-    agent.learn(1, log_interval=None)
-    untouched = np.sqrt(np.mean((0.5 - true_values({})[1:-1]) ** 2))
-    assert both[0, 0] != untouched
-    assert abs(both[0, 0] - untouched) < 0.05
-
-
 def test_the_policy_that_sticks_on_twenty_is_worth_what_its_rules_say():
     from figure_5_1 import exact_values, observations
 

@@ -6,7 +6,6 @@ import gc
 import io
 import ipaddress
 import json
-import math
 import os
 import runpy
 import socket
@@ -61,11 +60,10 @@ from experiments.launching import execute
 from experiments.plan import plan
 from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
-from experiments.run_limits import RunLimits
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
-from pipeline.user_modules import UserModule, import_typed
+from pipeline.user_modules import import_typed
 
 ROOT = Path(compare.__file__).parent
 
@@ -155,8 +153,8 @@ def test_answers_that_are_refused(content, words):
 def test_there_are_bounds_on_what_is_sent_and_taken(tmp_path, monkeypatch):
     (tmp_path / "x").write_bytes(bytes(100))
     (tmp_path / "link").symlink_to("/etc/passwd")
-    assert files_in(tmp_path, "run/") == {"run/x": bytes(100)}
-    content = packed(Answer("done", files={"run/x": bytes(100)}))
+    content = packed(Answer("done", files=files_in(tmp_path, "run/")))
+    assert unpacked(content).files == {"run/x": bytes(100)}
     monkeypatch.setattr(answers, "LARGEST", 99)  # a quarter of a gigabyte takes long
     with pytest.raises(ValueError, match="let it share"):
         files_in(tmp_path, "run/")
@@ -186,6 +184,12 @@ def test_a_run_is_put_in_place_to_the_last_bit(tmp_path, done, monkeypatch):
     assert files_in(run.path, "run/") == done
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
     check_in_place(run)
+    # Logs go to their own folder, in place of those of an earlier try.
+    logged = runs_of(tmp_path / "logged", tensorboard=True)[0]
+    logged.spec.tensorboard_log.mkdir(parents=True)
+    (logged.spec.tensorboard_log / "old").touch()
+    receive(logged, tmp_path / "logged", {**done, "tensorboard/events": b"x"})
+    assert [path.name for path in logged.spec.tensorboard_log.iterdir()] == ["events"]
 
 
 def lacking(name):
@@ -225,14 +229,6 @@ def test_whatever_else_comes_is_refused_and_leaves_nothing(tmp_path, done, lie):
     assert not tmp_path.exists() or not list(tmp_path.rglob("*"))
 
 
-def test_logs_go_to_their_own_folder(tmp_path, done):
-    run = runs_of(tmp_path, tensorboard=True)[0]
-    run.spec.tensorboard_log.mkdir(parents=True)
-    (run.spec.tensorboard_log / "old").touch()
-    receive(run, tmp_path, {**done, "tensorboard/events": b"x"})
-    assert [path.name for path in run.spec.tensorboard_log.iterdir()] == ["events"]
-
-
 # --- Orders travel as plain data, and arrive as they were.
 
 VALUES = st.recursive(
@@ -264,38 +260,12 @@ def test_whatever_an_environment_is_given_arrives_as_it_was(arguments):
     assert RunOrder.unpacked(order.packed()) == order
 
 
-def test_modules_folders_and_limits_arrive():
-    modules = (UserModule("./my envs.py", "my_envs", "/x/my envs.py"), UserModule("gym", "gym"))
-    folders = {"tensorboard_log": Path("tb"), "trained_agent": Path("a.zip")}
-    spec = replace(PLAIN.spec, user_modules=modules, gym_packages=("my_envs", "gym"), **folders)
-    order = order_of(replace(PLAIN, spec=spec), RunLimits(math.inf, 10**9))
-    assert RunOrder.unpacked(order.packed()) == order
-
-
 def test_an_order_holds_no_code(tmp_path):
     mark = tmp_path / "mark"
     code = f"x: !!python/object/apply:os.mkdir ['{mark}']\ncommand:".encode()
     with pytest.raises(yaml.constructor.ConstructorError):
         RunOrder.unpacked(order_of(PLAIN).packed().replace(b"command:", code))
     assert not mark.exists()
-
-
-def test_a_shared_folder_is_known_by_what_lies_in_it(tmp_path):
-    with probing(tmp_path) as probe:
-        assert probe.is_there
-        assert not replace(probe, content="x").is_there
-        assert not replace(probe, root=tmp_path / "x").is_there
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("root", "inside"), [("logs/s", "logs/s"), ("/far/s", "study"), ("../s", "study")]
-)
-def test_paths_of_a_worker_apart_stay_within_its_folder(root, inside):
-    found = order_of(runs_of(Path(root), tensorboard=True)[0], root=Path(root)).apart()
-    assert found.probe.root == Path(inside)
-    assert found.planned.path.is_relative_to(Path(inside, "runs"))
-    assert found.planned.spec.tensorboard_log.is_relative_to(Path(inside, "tensorboard"))
 
 
 # --- What --cluster may say, and which schedulers are spoken to.
@@ -382,57 +352,34 @@ def test_a_command_checks_before_it_connects(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("is_insecure", [False, True])
-@pytest.mark.parametrize(
-    ("scheduler", "worker", "is_open"),
-    [
-        ("tcp://10.0.0.1:8786", "tls://10.0.0.2:1", True),
-        ("tcp://127.0.0.1:2", "tcp://0.0.0.0:8786", True),
-        ("tls://10.0.0.1:8786", "tls://10.0.0.2:2", False),
-    ],
-)
-def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, is_open, is_insecure):
-    client = SimpleNamespace(
-        scheduler_info=lambda n_workers: {"address": scheduler, "id": "s"},
-        nthreads=lambda: {"tls://10.0.0.2:1": 1, worker: 2},
-        status="running",
-        close=lambda timeout: None,
-    )
-    connection = Connection(lambda: client, lambda client: None, is_insecure)
-    is_refused = is_open and not is_insecure
-    with pytest.raises(UserError, match="TLS") if is_refused else contextlib.nullcontext():
-        connection.begin()
-        assert connection.n_threads() == client.nthreads()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"walltime": "1-01:10:30"}, "--lifetime 90330s --lifetime-stagger 150s"),
-        ({"walltime": "00:10:00"}, "--lifetime 540s --lifetime-stagger 30s"),
-        ({"walltime": "01:00:00", "worker-extra-args": ["--lifetime", "1h"]}, "--lifetime 1h"),
-        ({"walltime": "90"}, ""),
-        ({"walltime": 3600}, None),  # YAML takes 01:00:00 for a number
-    ],
-)
-def test_workers_retire_before_their_job_ends(tmp_path, settings, words):
-    settings |= {"cores": 1, "memory": "1GB", "shared-temp-directory": str(tmp_path)}
-    asked = JobQueue("slurm", {**settings, "interface": "lo"}, 1, tmp_path / "slurm.yml")
-    if words is None:
-        with pytest.raises(UserError, match="quotes"):
-            opened_queue(asked)
-        return
-    with opened_queue(asked) as queue:
-        script = queue.job_script()
-    assert words in script
-    assert script.count("--lifetime ") == bool(words)
-
-
 # --- Jobs of a queue that have ended are sent again, and others are left alone.
 
 
+@pytest.mark.parametrize(
+    ("scheduler", "worker", "words"),
+    [
+        ("tcp://10.0.0.1:8786", "tls://10.0.0.2:1", "TLS"),
+        ("tcp://127.0.0.1:2", "tcp://0.0.0.0:8786", "TLS"),
+        ("tls://10.0.0.1:8786", "tls://10.0.0.2:2", None),
+    ],
+)
+def test_one_that_says_itself_that_it_is_open_is_refused(scheduler, worker, words):
+    client = SimpleNamespace(
+        scheduler_info=lambda n_workers: {"address": scheduler, "id": "s"},
+        nthreads=lambda: {worker: 2},
+        status="running",
+        close=lambda timeout: None,
+    )
+    for is_insecure in (False, True) if words else (False,):
+        connection = Connection(lambda: client, lambda client: None, is_insecure)
+        refusal = words and not is_insecure
+        with pytest.raises(UserError, match=words) if refusal else contextlib.nullcontext():
+            connection.begin()
+            assert connection.n_threads() == client.nthreads()
+
+
 class Queue:
-    """Two jobs of dask-jobqueue, of one worker each or of two."""
+    """Two jobs of dask-jobqueue; its loop calls at once."""
 
     def __init__(self):
         self.worker_spec = {"job-1": {}, "job-10": {}}
@@ -454,10 +401,11 @@ class Queue:
 # that pass; and which jobs have been closed by then.
 SENT_AGAIN = {
     # The other still waits in the queue, however long that takes, and so does the new one.
-    "at once where its worker has retired": [
-        ({"a": "job-1"}, "", "", 0, []),
-        ({}, "a", "a", 0, ["job-1"]),
-        ({}, "", "a", 10 * SECONDS_TO_RESTART, ["job-1"]),
+    "at once where the last of its workers has retired": [
+        ({"a": "job-1-0", "b": "job-1-1"}, "", "", 0, []),
+        ({}, "a", "a", 0, []),
+        ({}, "b", "ab", 0, ["job-1"]),
+        ({}, "", "ab", 10 * SECONDS_TO_RESTART, ["job-1"]),
     ],
     "after a while where it was lost": [
         ({"a": "job-10"}, "", "", 0, []),
@@ -465,11 +413,6 @@ SENT_AGAIN = {
         ({"b": "job-10"}, "", "", 0, []),
         ({}, "b", "", SECONDS_TO_RESTART, []),
         ({}, "", "", 1, ["job-10"]),
-    ],
-    "with the last of its workers": [
-        ({"a": "job-1-0", "b": "job-1-1", "c": "job-10-0"}, "", "", 0, []),
-        ({}, "a", "a", 0, []),
-        ({}, "b", "ab", 0, ["job-1"]),
     ],
 }
 

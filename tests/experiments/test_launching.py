@@ -1,8 +1,5 @@
 """Doing the runs of a study: drafts, faults, order, time left; and runs that are in the way."""
 
-import contextlib
-import errno
-import heapq
 import json
 import math
 import os
@@ -11,28 +8,21 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
-from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import yaml
 
-import agents
 from agents import ALGORITHMS
 from agents.registry import AlgorithmEntry
 from agents.tabular.algorithm import TabularAlgorithm
-from experiments import child_processes, launching, run_in_child
+from experiments import child_processes
 from experiments.launching import (
-    WINDOW,
     TimeLeft,
-    available_cores,
     execute,
-    expected_seconds,
     failure_log,
     local_launcher,
 )
@@ -49,7 +39,7 @@ from experiments.run_folders import (
     run_name,
     take_over,
 )
-from experiments.run_in_child import do_run, take_steps, warm_ups
+from experiments.run_in_child import do_run, warm_ups
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from machine_code.compiling import inlined
 from pipeline import state_saver
@@ -92,35 +82,6 @@ def test_a_run_says_what_it_is(tmp_path):
     (planned.path / "mark").touch()
     do_run(planned, draft, "again")
     assert (planned.path / "mark").exists()
-
-
-@pytest.mark.parametrize(
-    ("algo", "env_id"), [("qlearning", "FrozenLake-v1"), ("ucb", "GaussianBandit-v0")]
-)
-def test_a_draft_is_closed_and_on_the_disk_before_it_has_its_name(
-    tmp_path, monkeypatch, algo, env_id
-):
-    """Windows would not rename it else; and after a power cut it may not lack its files."""
-    (planned,) = runs_of(tmp_path, algo=algo, environment=replace(LAKE, env_id=env_id), n_seeds=1)
-    draft, fsync, rename, events = draft_path(tmp_path, planned), os.fsync, os.replace, []
-
-    def synced(number):
-        events.append(Path(f"/proc/self/fd/{number}").readlink().name)
-        fsync(number)
-
-    def named(source, target, **folder):
-        if Path(target) == planned.path:
-            still_open = [os.path.realpath(file) for file in Path("/proc/self/fd").iterdir()]
-            assert not [name for name in still_open if name.startswith(str(draft))]
-            events.append("named")
-        rename(source, target, **folder)
-
-    monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(os, "replace", named)
-    do_run(planned, draft, "")
-    place = events.index("named")
-    assert {path.name for path in planned.path.rglob("*")} <= set(events[:place])
-    assert planned.path.parent.name in events[place:]
 
 
 # An environment that fails as it is told, where it is trained on, with a state in its draft.
@@ -270,82 +231,6 @@ def test_every_run_is_told_of_and_failures_are_kept(faulty):
     assert not (root / ".drafts").exists()
 
 
-class Exhausted:
-    """A system that has none left of something."""
-
-    def __init__(self, error):
-        self.error = error
-
-    def get_start_method(self):
-        return "spawn"
-
-    def Pipe(self, **options):  # noqa: N802  # as it is called in Python
-        raise self.error
-
-
-@pytest.mark.parametrize(
-    "error", [EOFError("unexpected EOF"), BlockingIOError(errno.EAGAIN, "none left")]
-)
-def test_a_failure_whose_details_cannot_be_written_is_told(
-    tmp_path, monkeypatch, small_disk, error
-):
-    monkeypatch.setattr(child_processes, "context", Exhausted(error))
-    planned, _ = runs_of(tmp_path)
-    with local_launcher(tmp_path, "c", 1) as launcher, small_disk(0):
-        failure = launcher.submit(planned).result()
-    assert failure.reason == f"its process could not be started: {error}"
-    assert failure.log is None
-    assert "Traceback" in failure.details
-
-
-def test_nothing_to_do_starts_nothing(tmp_path):
-    assert execute([], tmp_path, pytest.fail, pytest.fail) == []
-
-
-class Growing:
-    """Has no worker at first, and two from the moment on at which it has been given something."""
-
-    n_workers = 0
-    words = ""
-
-    def __init__(self):
-        self.given, self.most = [], 0
-
-    def submit(self, planned):
-        self.n_workers = 2
-        future = Future()
-        self.given.append(future)
-        self.most = max(self.most, sum(not future.done() for future in self.given))
-        threading.Timer(0.05, future.set_result, [None]).start()
-        return future
-
-
-def test_runs_are_handed_over_in_windows_as_wide_as_there_are_workers(tmp_path, monkeypatch):
-    monkeypatch.setattr(launching, "SECONDS_BETWEEN_LOOKS", 0.01)
-    runs, launcher, told, given_then = runs_of(tmp_path, n_seeds=12), Growing(), [], []
-
-    def meanwhile():
-        given_then.append(len(launcher.given))
-
-    def listen(run, failure):
-        told.append(run.seed)
-
-    where = contextlib.nullcontext(launcher)
-    assert execute(runs, tmp_path, lambda: where, listen, meanwhile) == []
-    assert sorted(told) == list(range(12))
-    assert launcher.most == 2 * WINDOW
-    assert given_then == [WINDOW]  # once, after the first runs are handed over
-
-
-def test_the_cores_that_this_process_may_use(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {pid, 3, 5}, raising=False)
-    assert available_cores() == 3
-    monkeypatch.delattr(os, "sched_getaffinity")  # not on every system
-    for known, expected in ((7, 7), (None, 1)):
-        monkeypatch.setattr(os, "cpu_count", lambda known=known: known)
-        assert available_cores() == expected
-
-
 # --- Drafts: whose are left alone, and whose are cleared away or taken over.
 
 HERE, RUN = platform.node(), "mine@dry_lake_1"
@@ -448,37 +333,18 @@ def test_the_next_process_takes_over_what_a_dead_one_has_left(tmp_path, owners):
     assert own.is_dir()
 
 
-@pytest.mark.parametrize("error", [FileNotFoundError, PermissionError])
-def test_a_draft_that_cannot_be_renamed(tmp_path, owners, monkeypatch, error):
-    """Another process was faster; or it is Windows, where somebody has a file of it open."""
-    draft = draft_of(tmp_path, owners["dead"], state=True)
-
-    def refuse(path, target):
-        raise error(13, "is being used by another process", str(path))
-
-    monkeypatch.setattr(Path, "replace", refuse)
-    assert not take_over(draft.with_name(f"{OWN}@{HERE}@{RUN}"))
-    remove_draft(draft)
-    assert not draft.exists()
-
-
 def test_a_draft_says_whose_it_is_however_long_the_labels_are(tmp_path):
     paths = [draft_path(tmp_path, run) for run in runs_of(tmp_path)]
     names = [f"{OWN}@{HERE}@mine@dry_lake_{number}" for number in (1, 2)]
     assert paths == [tmp_path / ".drafts" / name for name in names]
     study = study_of(environment=replace(LAKE, label="ä" * 90))
     study = replace(study, agents=(AgentSpec("ö" * 90, "qlearning"),))
-    paths = [draft_path(tmp_path, run) for run in plan(study, tmp_path)]
-    assert len({path.name for path in paths}) == 2
-    drafts = [path.with_name(f"{path.name}.dead") for path in paths]
+    drafts = [draft_path(tmp_path, run) for run in plan(study, tmp_path)]
     for draft in drafts:
         claim_draft(draft)
-    (tmp_path / "study.yml").touch()
-    # To remove one leaves the others, and the study.
-    for draft, n_left in ((drafts[0], 1), (drafts[1], 0), (drafts[1], 0)):
-        remove_draft(draft)
-        assert len([*tmp_path.rglob("*.dead")]) == n_left
-    assert [path.name for path in tmp_path.iterdir()] == ["study.yml"]
+    # To remove one leaves the others.
+    remove_draft(drafts[0])
+    assert [draft.exists() for draft in drafts] == [False, True]
 
 
 def test_a_draft_is_a_new_folder_whatever_lies_there(tmp_path):
@@ -499,24 +365,6 @@ def test_a_draft_is_a_new_folder_whatever_lies_there(tmp_path):
     (tmp_path / "a").touch()
     with pytest.raises(FileExistsError):
         claim_draft(tmp_path / "a" / "b")
-
-
-@pytest.mark.parametrize(("n_times", "is_made"), [(3, True), (10**6, False)])
-def test_a_folder_is_made_while_another_run_removes_the_one_above(
-    tmp_path, monkeypatch, n_times, is_made
-):
-    tries, mkdir = [], Path.mkdir
-
-    def vanishing(path, *args, **kwargs):
-        tries.append(path)
-        if len(tries) <= n_times:
-            raise FileNotFoundError(path)
-        mkdir(path, *args, **kwargs)
-
-    monkeypatch.setattr(Path, "mkdir", vanishing)
-    with contextlib.nullcontext() if is_made else pytest.raises(FileNotFoundError):
-        claim_draft(tmp_path / "a" / "b")
-    assert (tmp_path / "a" / "b").is_dir() == is_made
 
 
 # --- Finished runs of other settings: named, kept, and moved aside when that is asked for.
@@ -578,98 +426,48 @@ def test_a_batch_of_more_seeds_takes_the_place_of_one_of_fewer(tmp_path, do_stud
         check_settings_kept(runs_of(tmp_path, algo="ucb", environment=longer), tmp_path)
 
 
-def test_first_runs_with_checkpoints_take_the_place_of_those_without(done):
-    planned = plan(replace(study_of(), render_every=2), done)
-    check_settings_kept(planned, done)
-    assert in_the_way(planned) == planned[:1]
-
-
-def test_a_run_that_was_cut_off_is_kept_and_an_empty_folder_is_not(done):
-    planned = runs_of(done, n_seeds=4)
-    planned[0].run.update_info(state="interrupted")
-    planned[2].path.mkdir()
-    check_settings_kept(planned, done)
-    assert move_replaced_aside(planned, done) == (planned[:1], done / "replaced" / "1")
-    assert not planned[2].path.exists()
-
-
-def test_another_driver_deletes_nothing_either(done):
-    """Programs of a user's own take no lock, and come without being checked."""
-    (run, _) = runs_of(done, gamma=0.5)
-    before = contents(run.path)
-    do_run(run, draft_path(done, run), "c")
-    assert run.is_finished
+@pytest.mark.parametrize("change", ["settings", "cut off", "checkpoints"])
+def test_what_is_in_the_way_of_a_run_is_kept(done, change):
+    """Also by programs of a user's own, which take no lock and come without being checked."""
+    planned = {
+        "settings": lambda: runs_of(done, gamma=0.5),
+        "cut off": lambda: runs_of(done),
+        "checkpoints": lambda: plan(replace(study_of(), render_every=2), done),
+    }[change]()
+    if change == "cut off":
+        planned[0].run.update_info(state="interrupted")
+    else:
+        assert in_the_way(planned) == (planned if change == "settings" else planned[:1])
+    before = contents(planned[0].path)
+    do_run(planned[0], draft_path(done, planned[0]), "c")
+    assert planned[0].is_finished
     assert contents(done / "replaced" / "1" / "mine" / "dry_lake_1") == before
 
 
-# --- How long a study may still take, held against simulated times.
-
-# What a run takes by agent, in seconds; environments change it twofold.
-TAKES = {"qlearning": 0.5, "sarsa": 0.6, "dqn": 40.0, "double_dqn": 90.0, "ppo": 25.0}
-PLACES = {"FrozenLake-v1": 0.7, "FrozenLake8x8-v1": 1.0, "Taxi-v4": 1.4, "CliffWalking-v1": 1}
-
-
-def runs_to_time(n_seeds):
-    specs = tuple(AgentSpec(algo, algo) for algo in TAKES)
-    places = tuple(EnvironmentSpec(name, name, {"n_timesteps": 9}) for name in PLACES)
-    return plan(StudySpec("s", "S", specs, places, n_seeds=n_seeds), Path("nowhere"))
+def test_an_empty_folder_is_not_kept(done):
+    planned = runs_of(done, n_seeds=3)
+    planned[2].path.mkdir()
+    assert move_replaced_aside(planned, done) == ([], None)
+    assert not planned[2].path.exists()
 
 
-def played(runs, takes, n_workers, expected, shares):
-    """The estimate by the truth, where so many of the runs have ended."""
-    left, now, n_ended, estimates = TimeLeft(runs, expected), 0.0, 0, {}
-    waiting, under_way = list(enumerate(runs)), []
-    left.start(now, n_workers)
-    for _ in range(n_workers):
-        number, run = waiting.pop(0)
-        heapq.heappush(under_way, (takes[number], number, run))
-    while under_way:
-        now, _, run = heapq.heappop(under_way)
-        n_ended += 1
+# --- How long a study may still take.
+
+
+@pytest.mark.parametrize("n_workers", [1, 4])
+@pytest.mark.parametrize("off", [0.6, 4.0])
+def test_after_a_tenth_of_the_runs_the_time_left_is_right_within_a_factor_of_two(n_workers, off):
+    """Also where all take more or less than was expected, as on a busy machine."""
+    runs = runs_of(Path("nowhere"), n_seeds=40)
+    left = TimeLeft(runs, {("mine", "dry lake"): 10.0 / off})
+    left.start(0.0, n_workers)
+    for n_ended, run in enumerate(runs[: len(runs) // 2], start=1):
+        now = 10.0 * math.ceil(n_ended / n_workers)  # each takes 10 s
         left.end(run, now)
         left.start(now, n_workers)
-        if waiting:
-            number, run = waiting.pop(0)
-            heapq.heappush(under_way, (now + takes[number], number, run))
-        for share in shares:
-            if share not in estimates and n_ended >= share * len(runs):
-                estimates[share] = (now, left.seconds(now, n_workers))
-    return {share: guess / (now - at) for share, (at, guess) in estimates.items()}
-
-
-@pytest.mark.parametrize("n_workers", [1, 2, 8])
-@pytest.mark.parametrize("off", [0.6, 1.7, 4.0])
-def test_after_a_tenth_of_the_runs_it_is_right_within_a_factor_of_two(n_workers, off):
-    """Also where all take more or less than was expected, as on a busy machine."""
-    for seed, runs in enumerate((runs_to_time(3), runs_to_time(10))):
-        rng = np.random.default_rng(seed)
-        usual = [TAKES[run.agent] * PLACES[run.environment] for run in runs]
-        takes = [time * rng.uniform(0.8, 1.25) for time in usual]
-        expected = {
-            (run.agent, run.environment): time / off * rng.uniform(0.8, 1.25)
-            for run, time in zip(runs, usual, strict=True)
-        }
-        found = played(runs, takes, n_workers, expected, (0.1, 0.25, 0.5))
-        assert all(0.5 < ratio < 2 for ratio in found.values()), found
-
-
-def test_expectations_go_by_agent_and_budget():
-    table, network = runs_to_time(1)[0].spec, runs_to_time(1)[2].spec
-    assert (table.algo, network.algo) == ("qlearning", "dqn")
-    assert expected_seconds(table) < expected_seconds(network) < expected_seconds(network, 60.0)
-
-
-def test_nothing_is_said_while_an_agent_of_the_users_has_not_ended_a_run(monkeypatch):
-    """Nobody knows whether it is compiled."""
-    monkeypatch.setitem(ALGORITHMS, "own", AlgorithmEntry("own:Own", "own"))
-    runs = [replace(run, spec=replace(run.spec, algo="own")) for run in runs_to_time(3)[:12]]
-    left = TimeLeft(runs, {})
-    left.start(0.0, 1)
-    assert left.seconds(1.0, 1) is None
-    for n, run in enumerate(runs, start=1):
-        left.end(run, 2.0 * n)
-        left.start(2.0 * n, 1)
-    assert left.seconds(24.0, 1) == pytest.approx(0.0)
+        if n_ended >= 4 and n_ended % n_workers == 0:
+            truth = 10.0 * (len(runs) - n_ended) / n_workers
+            assert 0.5 < left.seconds(now, n_workers) / truth < 2
 
 
 # --- What is compiled once for a study: rules of the user's own, and nothing else.
@@ -685,38 +483,16 @@ class Mean(TabularAlgorithm):
     next_value = mean_value
 
 
-class Other(agents.load_algorithm("dqn")):
-    """One that is not compiled."""
-
-
-MODULES = (UserModule("gymnasium", "gymnasium"),)
-
-
-@pytest.fixture
-def with_rules(tmp_path):
-    before = dict(ALGORITHMS)
-    for cls in (Mean, Other):
-        agents.register(cls.__name__.lower(), f"{__name__}:{cls.__name__}")
-    specs = tuple(AgentSpec(a, a, {"n_episodes": 50}) for a in ("mean", "other", "qlearning"))
+def test_each_rule_of_the_users_is_compiled_once_on_each_environment(tmp_path, monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, "mean", AlgorithmEntry(f"{__name__}:Mean", "mean"))
+    modules = (UserModule("gymnasium", "gymnasium"),)
+    specs = tuple(AgentSpec(a, a, {"n_episodes": 50}) for a in ("mean", "qlearning", "dqn"))
     places = tuple(EnvironmentSpec(name, name) for name in ("FrozenLake-v1", "Warehouse-v0"))
-    yield plan(StudySpec("s", "s", specs, places, n_seeds=2, user_modules=MODULES), tmp_path)
-    ALGORITHMS.clear()
-    ALGORITHMS.update(before)
-
-
-def test_each_rule_of_the_users_is_compiled_once_on_each_environment(with_rules, monkeypatch):
-    places = [("mean", "FrozenLake-v1"), ("mean", "Warehouse-v0")]
-    wanted = json.loads(warm_ups(with_rules))
-    assert [(item["algo"], item["env_id"]) for item in wanted] == places
-    trained = []
-    monkeypatch.setattr(run_in_child, "train_aside", trained.append)  # it would compile for seconds
-    take_steps(json.dumps([{"algo": "no_such", "modules": []}, {}, *wanted]))
-    assert [(spec.algo, spec.env_id) for spec in trained] == places
-    budgets = {(spec.hyperparams.n_timesteps, spec.hyperparams.n_episodes) for spec in trained}
-    assert budgets == {(run_in_child.N_STEPS, None)}
-    assert {spec.user_modules for spec in trained} == {MODULES}
-    # Without modules of the user's there is nothing to do, nor where they are too many to say.
-    bare = [replace(run, spec=replace(run.spec, user_modules=())) for run in with_rules]
+    runs = plan(StudySpec("s", "s", specs, places, n_seeds=2, user_modules=modules), tmp_path)
+    wanted = json.loads(warm_ups(runs))
+    assert [(item["algo"], item["env_id"]) for item in wanted] == [
+        ("mean", "FrozenLake-v1"),
+        ("mean", "Warehouse-v0"),
+    ]
+    bare = [replace(run, spec=replace(run.spec, user_modules=())) for run in runs]
     assert json.loads(warm_ups(bare)) == []
-    monkeypatch.setattr(run_in_child, "MAX_CHARACTERS", 10)
-    assert json.loads(warm_ups(with_rules)) == []

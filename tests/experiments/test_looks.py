@@ -1,5 +1,6 @@
 """What counts as a look at a study, what each may spend, and the file that remembers them."""
 
+import copy
 import json
 from dataclasses import replace
 
@@ -20,7 +21,6 @@ from experiments.plan import plan
 from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from report.conclusions import conclusion
 from verdicts import level_of_look
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
@@ -67,10 +67,6 @@ def level(k):
 
 def number_of_looks(root, environment="lake"):
     return len(read_looks(root).get(environment, Looks()).taken)
-
-
-def everything_said(analysis):
-    return " ".join(conclusion(analysis.study, analysis.environments[0]).everything)
 
 
 def test_a_look_counts_when_the_runs_or_the_question_are_others(tmp_path):
@@ -121,88 +117,66 @@ def test_a_run_that_is_damaged_since_costs_no_look_and_one_that_is_new_does(tmp_
     assert look(tmp_path) == (2, 2)
 
 
-def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
-    tmp_path, monkeypatch
-):
-    assert look(tmp_path) == (1, 1)
-    before = (tmp_path / LOOKS_FILE).read_bytes()
-
-    def cut_off(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("pipeline.files.put_in_place", cut_off)  # Ctrl-C at the worst moment
-        with pytest.raises(KeyboardInterrupt):
-            look(tmp_path, n_seeds=20)
-    assert [path.name for path in tmp_path.iterdir()] == [LOOKS_FILE]
-    assert (tmp_path / LOOKS_FILE).read_bytes() == before
-    assert look(tmp_path, n_seeds=20) == (2, 2)
-
-
-def test_page_and_terminal_say_which_look_it_is(tmp_path):
-    def said(n_seeds):
-        results = results_of(study_of(n_seeds=n_seeds), tmp_path)
-        return everything_said(analyse(results, looks=take_looks(results)))
-
-    assert "look" not in said(10)
-    assert "This is the second look at this study: claims at 0.25 %." in said(20)
-    text = said(6)
-    assert "; 6 seeds decide nothing, about " in text
-    assert "This would be the third look at this study, with claims at 0.083 %; runs that" in text
-    assert "This is the" not in text
-
-
 # --- The file.
 
-
-def damages(data):
-    """The data of a file, each time with something that was not written so."""
-    lake = data["environments"]["lake"]
-    first, *others = lake["taken"]
-    question = first["question"]
-    design = {"question": question, "sizes": [10, 20], "seeds": {"a": 10}, "after": 0}
-    yield from ({}, [], {**data, "format": 3})
-    changed = [[], *({k: v for k, v in lake.items() if k != key} for key in lake)]
-    changed += [{**lake, "taken": others}, {**lake, "taken": lake["taken"][::-1]}]
-    for key, value in [
-        ("level", 0.05),
-        ("level", None),
-        ("planned", True),
-        ("planned", 0),
-        ("seeds", {"qlearning": -1, "sarsa": 10}),
-        ("seeds", {"qlearning": 10}),
-        ("runs", {"qlearning": True, "sarsa": 10}),
-        ("digests", {"qlearning": 1, "sarsa": "2"}),
-        ("question", {**question, "metric": "luck"}),
-        ("question", {**question, "margin": 10**400}),
-        ("question", {**question, "margin": "1"}),
-        ("question", {}),
-        ("date", 5),
-        ("more", 5),
-    ]:
-        changed.append({**lake, "taken": [{**first, key: value}, *others]})
-    for key, value in [
-        ("sizes", []),
-        ("sizes", [20, 10]),
-        ("sizes", [0, 10]),
-        ("sizes", "10"),
-        ("seeds", {"a": 11}),
-        ("after", 3),
-        ("after", -1),
-        ("after", 0),  # right in itself, but the first look had the level of the first
-    ]:
-        changed.append({**lake, "design": {**design, key: value}})
-    yield from ({**data, "environments": {"lake": each}} for each in changed)
+LAKE_ENTRY = ("environments", "lake")
+FIRST = (*LAKE_ENTRY, "taken", 0)
+DESIGN = {"sizes": [10, 20], "seeds": {"a": 10}, "after": 0}
+# What stands where in a file of two looks in place of what was written.
+DAMAGES = [
+    ((), {}),
+    ((), []),
+    (("format",), 3),
+    (LAKE_ENTRY, []),
+    (LAKE_ENTRY, {}),
+    ((*LAKE_ENTRY, "taken"), lambda taken: taken[1:]),
+    ((*LAKE_ENTRY, "taken"), lambda taken: taken[::-1]),
+    *(((*FIRST, "level"), level) for level in (0.05, None)),
+    *(((*FIRST, "planned"), planned) for planned in (True, 0)),
+    *(((*FIRST, "seeds"), seeds) for seeds in ({"qlearning": -1, "sarsa": 10}, {"qlearning": 10})),
+    ((*FIRST, "runs"), {"qlearning": True, "sarsa": 10}),
+    ((*FIRST, "digests"), {"qlearning": 1, "sarsa": "2"}),
+    ((*FIRST, "question"), {}),
+    ((*FIRST, "question", "metric"), "luck"),
+    *(((*FIRST, "question", "margin"), margin) for margin in (10**400, "1")),
+    ((*FIRST, "date"), 5),
+    ((*FIRST, "more"), 5),
+    *(((*LAKE_ENTRY, "design", "sizes"), sizes) for sizes in ([], [20, 10], [0, 10], "10")),
+    ((*LAKE_ENTRY, "design", "seeds"), {"a": 11}),
+    # 0 is right in itself, but the first look had the level of the first.
+    *(((*LAKE_ENTRY, "design", "after"), after) for after in (3, -1, 0)),
+]
+NO_JSON = ["", "{", "[" * 100_000, "\x00", '{"format": 1e999}', "9" * 10_000]
 
 
-def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
-    look(tmp_path)
-    look(tmp_path, n_seeds=20)
+@pytest.fixture(scope="module")
+def looked_twice(tmp_path_factory):
+    root = tmp_path_factory.mktemp("looks")
+    look(root)
+    look(root, n_seeds=20)
+    return json.loads((root / LOOKS_FILE).read_text())
+
+
+@pytest.mark.parametrize(("place", "value"), DAMAGES)
+def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(
+    tmp_path, looked_twice, place, value
+):
+    data = within = {"file": copy.deepcopy(looked_twice)}
+    if "design" in place:
+        lake = data["file"]["environments"]["lake"]
+        lake["design"] = {**DESIGN, "question": lake["taken"][0]["question"]}
+    *above, last = ("file", *place)
+    for key in above:
+        within = within[key]
+    within[last] = value(within[last]) if callable(value) else value
+    (tmp_path / LOOKS_FILE).write_text(json.dumps(data["file"]))
+    with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
+        read_looks(tmp_path)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
     path = tmp_path / LOOKS_FILE
-    texts = [json.dumps(each) for each in damages(json.loads(path.read_text()))]
-    assert len(texts) > 25
-    texts += ["", "{", "[" * 100_000, "\x00", '{"format": 1e999}', "9" * 10_000]
-    for text in texts:
+    for text in NO_JSON:
         path.write_text(text)
         with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
             read_looks(tmp_path)
@@ -266,15 +240,6 @@ def test_interrupted_at_any_look_it_ends_the_same(tmp_path, stop):
     assert undated[0] == undated[1]
 
 
-def test_after_a_look_by_hand_the_settled_ones_share_what_is_left(tmp_path):
-    assert look(tmp_path, agents=THREE) == (1, 1)
-    grow(study_of(THREE, n_seeds=6), tmp_path, most=40)
-    design = read_looks(tmp_path)["lake"].design
-    # At so low a level, six seeds could not decide anything.
-    assert (design.after, design.sizes[0] > 6, design.level) == (1, True, level(2))
-    assert look(tmp_path, agents=THREE, n_seeds=50)[1] == 3
-
-
 @pytest.mark.parametrize(
     ("changes", "most", "words"),
     [
@@ -295,14 +260,6 @@ def test_what_was_settled_cannot_change(tmp_path, changes, most, words):
     assert (tmp_path / LOOKS_FILE).read_bytes() == before
 
 
-def test_nothing_is_settled_that_could_not_be(tmp_path):
-    with pytest.raises(UserError, match="two agents or more"):
-        settled_looks(study_of(["qlearning"]), tmp_path, None)
-    with pytest.raises(UserError, match="--max-seeds is 9, the study begins with 10 seeds"):
-        settled_looks(study_of(), tmp_path, 9)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_runs_that_were_looked_at_and_are_others_now_are_refused(tmp_path):
     study = study_of(THREE)
     grow(study, tmp_path, most=40, steps=2)
@@ -311,26 +268,3 @@ def test_runs_that_were_looked_at_and_are_others_now_are_refused(tmp_path):
     # One that is missing now makes no such claim, nor one that was missing then.
     grow(study, tmp_path, ends=FEWER, steps=1)
     grow(study, tmp_path, steps=1)
-
-
-def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp_path):
-    study = study_of(THREE)
-    counts, steps = grow(study, tmp_path, most=40)
-    results = results_of(grown(study, counts), tmp_path, counts=counts)
-    analysis = analyse(results, looks={step.environment: step.standing for step in steps[-1]})
-    text = everything_said(analysis)
-    assert text.startswith("qlearning is best on average: ")
-    assert "qlearning is better on average than " in text
-    assert text.count(", with 10 seeds)") == 2
-    assert "is undecided on average against " in text
-    assert ", with 40 seeds" in text
-    assert "up to 4 looks that were fixed beforehand: claims at 1.1 % each." in text
-    assert "missing" not in text
-    # What was decided is what was said of those seeds then.
-    first = analyse(results_of(study, tmp_path), looks={"lake": steps[0][0].standing})
-    now, then = (
-        {frozenset((p.first, p.second)): p.mean for p in each.environments[0].pairs}
-        for each in (analysis, first)
-    )
-    for pair in (frozenset(("qlearning", other)) for other in THREE[1:]):
-        assert now[pair] == then[pair]

@@ -5,16 +5,12 @@ import gzip
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
 
 from experiments.child_processes import TaskFailedError
-from experiments.results import difference
-from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -22,7 +18,6 @@ from pipeline.training import carry_out, prepare
 from report.page import learning
 from report.page.frame import as_json
 from report.page.learning import exactly, write_first_pages, write_learning_page
-from tests.report import made_up
 
 HOSTILE = "</script><script>document.title='taken'</script>"
 
@@ -53,14 +48,11 @@ def again(training, **changes):
     return json.loads(gzip.decompress(base64.b64decode(packed))), text
 
 
-def test_numbers_are_written_to_their_last_digit():
+def test_the_data_are_what_was_recorded_to_the_last_digit(watch):
     values = np.array([0.1 + 0.2, 1e-300, -2.0, np.nan, np.inf, 123456789.123456789])
     assert json.loads(as_json({"values": values}, exactly)) == {
         "values": [0.30000000000000004, 1e-300, -2, None, "Infinity", 123456789.12345679]
     }
-
-
-def test_the_data_are_what_was_recorded(watch):
     maps = {"env_kwargs": {"desc": ["S.G"]}, "train_env_kwargs": {"desc": ["S..", "#.G"]}}
     data, _, training = watch(settings=maps)
     moves, changes = training.watch.moves.rows, training.watch.changes.rows
@@ -72,23 +64,6 @@ def test_the_data_are_what_was_recorded(watch):
     assert data["layout"]["rows"] == ["S..", "#.G"]  # the map of the training
     assert data["layout"]["moves"] == [[-1, 0], [1, 0], [0, -1], [0, 1]]
     assert (data["n_states"], len(data["actions"]), data["is_cut"]) == (6, 4, False)
-
-
-class Mirrored(gym.ObservationWrapper):
-    def observation(self, obs):
-        return 15 - obs
-
-
-def test_without_a_map_states_are_numbers(watch):
-    data, _, _ = watch("Taxi-v4", n_timesteps=50)
-    assert (data["layout"], data["n_states"], data["is_drawn"]) == (None, 500, True)
-    assert data["actions"][5] == "action 5"
-    data, _, _ = watch("LinearBandit-v0", "linucb", n_timesteps=20)
-    assert (data["n_states"], data["is_drawn"]) == (0, False)
-    # Nor is there one where observations are not the states.
-    mirrored = {"env_wrapper": {f"{__name__}.Mirrored": {}}}
-    data, _, _ = watch("FrozenLake-v1", settings=mirrored, gym_packages=("tests",))
-    assert (data["layout"], data["n_states"]) == (None, 16)
 
 
 def test_without_a_table_the_policy_in_every_state(watch):
@@ -147,28 +122,6 @@ def test_a_page_is_no_larger_than_three_megabytes_and_replaced_whole(
     assert 1 < n_steps < 2000
     assert len(cut["moves"]["step"]) == n_steps
     assert max(cut["changes"]["step"]) < n_steps
-
-
-def test_the_fullest_page_is_no_larger_either(watch):
-    """As much as is kept at most, and nothing of it like anything else."""
-    _, _, training = watch("Taxi-v4", n_timesteps=20)
-    recorder, rng = training.watch, np.random.default_rng(0)
-    recorder.exact = None  # all that is kept is shown
-    recorder.initial = {"q_tables": rng.normal(size=(1, 500, 6))}
-    for rows, n, clock in (
-        (recorder.steps, 20_000, "timesteps"),
-        (recorder.moves, 20_000, "step"),
-        (recorder.changes, 60_000, "step"),
-    ):
-        more = np.zeros(n - len(rows), dtype=rows.rows.dtype)
-        for name in more.dtype.names:
-            whole = more.dtype[name] == np.int64
-            more[name] = rng.integers(500, size=len(more)) if whole else rng.normal(size=len(more))
-        more[clock] = np.sort(rng.integers(20, 20_000, size=len(more)))
-        rows.extend(more)
-    recorder.changes.rows["table"] = 0
-    again(training)
-    assert learning.MOST_BYTES / 2 < training.spec.watch_learning.stat().st_size < 3_000_000
 
 
 # --- those of a study -----------------------------------------------------------------------------
@@ -235,29 +188,3 @@ def test_each_agent_that_learns_is_shown_once_and_kept(done, analysis, tmp_path)
     assert pages["Q-learning & co"].place == ""
     assert pages["Q-learning & co"].words.startswith("the agent came out otherwise than in the run")
     assert not list((tmp_path / "other").rglob("*.html"))
-
-
-def test_runs_are_held_against_each_other_to_the_last_bit(analysis, monkeypatch):
-    one, other = (run.run for run in analysis.results.finished if run.agent == "sarsa")
-    assert difference(one, one) == ""
-    assert difference(one, other) == "the agent"
-    monkeypatch.setattr("experiments.results._tensors", lambda run: {})
-    assert difference(one, other) == "the episodes"
-    episodes = SimpleNamespace(steps=np.zeros(1), returns=np.zeros(1))
-    monkeypatch.setattr("experiments.results.read_episodes", lambda run: episodes)
-    assert difference(one, other) == "the evaluations"
-    monkeypatch.undo()
-    monkeypatch.setattr("pipeline.digests.RecordedFiles.read", lambda *_: b"PK")
-    with pytest.raises(DamagedFileError, match="is no whole zip"):
-        difference(one, one)
-
-
-def test_agents_without_a_run_of_their_own_are_named(done, tmp_path):
-    agents = [made_up.agent("ucb", 1.0), made_up.agent("fails", 0.0)]
-    analysis = made_up.analysis([made_up.environment(agents)], ["ucb", "fails"], tmp_path)
-    known = {"is_batch": True, "is_finished": True, "path": tmp_path}
-    batch = SimpleNamespace(agent="ucb", environment="lake", **known)
-    results = replace(analysis.results, planned=(batch,), finished=(batch,))
-    pages, _ = done(replace(analysis, results=results))
-    assert pages["ucb"].words == "its runs were done as one batch, which leaves no agent"
-    assert pages["fails"].words == "no run of it has finished"

@@ -14,12 +14,11 @@ import pytest
 from plotly.offline import get_plotlyjs
 
 from experiments.analysis import analyse
-from experiments.looks import Look, Looks, Question
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.conclusions import conclusion
 from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
-from report.page import SECTIONS, render, result_sections, world_sections, write_report
+from report.page import SECTIONS, render, result_sections, write_report
 from report.page.frame import LearningPage, Report, breakable, inline_script, packed, plain
 from report.series import (
     COLOURS,
@@ -125,19 +124,20 @@ def test_sections_headings_and_descriptions(page):
     assert sorted_headings == ["descending"] * 2  # the ranking of each environment
 
 
-def test_verdicts_come_first_and_rankings_hold_every_agent_the_best_first(page, report_study):
+def test_verdicts_are_those_of_the_files_and_rankings_begin_with_the_best(page, report_study):
     analysis = report_study.analysis
     said = [conclusion(analysis.study, place).everything for place in analysis.environments]
     expected = [sentence for one in said for sentence in one]
     assert len(expected) >= 3
     assert [sentence for sentence in expected if sentence not in page.sections["verdict"]] == []
-    rankings = [
-        text for attributes, text in page.all("table") if attributes.get("class") == "sortable"
-    ]
-    for environment, table in zip(analysis.environments, rankings, strict=False):
+    rankings = [text for a, text in page.all("table") if a.get("class") == "sortable"]
+    for environment, table in zip(analysis.environments, rankings, strict=True):
         places = [table.index(agent.agent) for agent in environment.agents]
         assert places == sorted(places)
-        assert len(places) == 3
+    # An agent has the colour of the printed figures.
+    printed = agent_marks(report_study.study)
+    for mark in page.data("data-page")["agents"]:
+        assert COLOURS[mark["colour"]] == line_style(printed[mark["label"]])["color"]
 
 
 def test_settings_command_versions_and_failures(page, report_study):
@@ -160,32 +160,9 @@ def test_settings_command_versions_and_failures(page, report_study):
     assert re.search(r"on Warehouse-v0, seed 1:\s+ValueError: <the> disk & all is full", settings)
 
 
-def test_settings_have_the_looks_mixed_versions_and_of_old_runs_no_machine(
-    report_study, written, monkeypatch
-):
-    question = Question("final", None, None, 5, False)
-    look = Look("2026-11-22 10:00:00", question, {"a": 4, "b": 4}, {}, {}, 0.045, planned=False)
-    looks = {"Warehouse-v0": Looks((look,))}
-    monkeypatch.setattr(result_sections, "read_looks", lambda _: looks)
-    assert result_sections.recorded("machine", [{"versions": {"numpy": "2"}}]) == {}
-    run = report_study.planned[0].run
-    before, versions = run.info_path.read_bytes(), run.read_info()["versions"]
-    run.update_info(versions={**versions, "torch": "0.0<b>"})
-    try:
-        settings = written(report_study.analysis).sections["settings"]
-    finally:
-        run.info_path.write_bytes(before)
-    assert "These runs have been looked at once." in settings
-    assert "2026-11-22: seeds 5 to 8; claims at 4.5 %." in settings
-    assert "None on this environment: too few runs." in settings
-    mixed = f"0.0<b> (1 run), {versions['torch']} ({len(report_study.planned) - 2} runs)."
-    assert f"Runs were done with different versions: torch {mixed}" in settings
-
-
 def test_a_study_on_one_environment_compares_nothing_over_environments(one_environment, written):
     page = written(one_environment)
     assert [*page.sections] == [n for n in SECTION_NAMES if n not in {"overview", "overall"}]
-    assert not [a for a, _ in page.all("select") if a.get("id") == "environment"]
 
 
 def test_links_to_pages_that_play_trainings(report_study, written):
@@ -226,12 +203,6 @@ def test_curves_end_with_the_final_evaluations_and_stand_in_a_table_too(page, re
             assert means == pytest.approx(shown, rel=1e-3, abs=1e-4)
 
 
-def test_an_agent_has_the_colour_of_the_printed_figures(page, report_study):
-    printed = agent_marks(report_study.study)
-    for mark in page.data("data-page")["agents"]:
-        assert COLOURS[mark["colour"]] == line_style(printed[mark["label"]])["color"]
-
-
 def test_the_maps_are_those_of_the_run_folders(page, report_study):
     data = page.data("data-policies-0")
     assert data["rows"] == ["S...", ".X.X", "...X", "X..G"]
@@ -247,33 +218,6 @@ def test_the_maps_are_those_of_the_run_folders(page, report_study):
         assert best == maps["optimal_actions"].tolist()
     # Holes and the goal end the episode: nothing is done there.
     assert data["matters"] == "1111101011100110"
-
-
-def test_maps_share_the_room_of_the_page(report_study, monkeypatch):
-    # Two kinds of figures on 16 cells, of 2 agents, at 4 moments; another environment has as much.
-    monkeypatch.setattr(world_sections, "MAX_FIGURES", 2 * (2 * 16 * 2 * 4))
-    section = world_sections.policies(Report(study_series(report_study.analysis), ""))
-    lake, warehouse = section.places
-    assert [run["seed"] for run in lake["runs"]] == [0, 0]
-    for run in lake["runs"]:
-        assert len(run["steps"]) == len(run["values"]) == len(run["actions"]) == 4
-        assert run["steps"][-1] == 2000
-    assert [len(run["steps"]) for run in warehouse["runs"]] == [2, 2]
-
-
-def test_small_figures_keep_the_lines_within(report_study):
-    found = result_sections.overview(Report(study_series(report_study.analysis), ""))
-    environments = report_study.analysis.environments
-    for figure, environment in zip(found.context["figures"], environments, strict=True):
-        assert figure.name == environment.environment
-        assert list(figure.lines) == [agent.agent for agent in environment.agents]
-        corners = [corner.split(",") for line in figure.lines.values() for corner in line.split()]
-        corners = np.array(corners, dtype=float)
-        assert (corners >= 0).all()
-        assert corners[:, 0].max() == result_sections.WIDTH
-        assert corners[:, 1].max() <= result_sections.HEIGHT
-        # Nothing lies above the optimum.
-        assert corners[:, 1].min() >= figure.optimum - 0.1
 
 
 def test_bandits_have_their_section_and_other_environments_theirs(tmp_path, do_study, written):
@@ -292,7 +236,7 @@ def test_bandits_have_their_section_and_other_environments_theirs(tmp_path, do_s
     assert [page.data(f"data-bandits-{place}") is None for place in (0, 1)] == [True, False]
     assert "This environment is a bandit" in page.sections["curves"]
     assert "This environment is no bandit" in page.sections["bandits"]
-    # A batch's agents are gone: there is nobody to film, and no return of a final policy.
+    # A batch's agents are gone: there is nobody to film.
     alone = StudySpec("s", "S", agents[1:], places[1:], n_seeds=2, metric="regret")
     analysis = analyse(do_study(alone, tmp_path / "alone"))
     page = written(analysis)
@@ -302,12 +246,10 @@ def test_bandits_have_their_section_and_other_environments_theirs(tmp_path, do_s
     statistics = analysis.results.pulls["<b>Greedy</b>", "coins"]
     curves = page.data("data-bandits-0")["curves"]["<b>Greedy</b>"]
     assert curves["x"] == statistics.pulls.tolist()
-    known = {"reward": "reward", "optimal": "optimal", "simple": "simple_regret"}
-    for name, attribute in known.items():
+    for name, attribute in {"optimal": "optimal", "simple": "simple_regret"}.items():
         assert curves[name] == pytest.approx(getattr(statistics, attribute), rel=1e-4), name
-    mean, runs = curves["regret"]["mean"], curves["regret"]["runs"]
-    assert mean["y"] == pytest.approx(statistics.cumulative_regret, rel=1e-4)
-    assert runs["y"] == pytest.approx(statistics.cumulative_regret_quantiles[2], rel=1e-4)
+    mean = curves["regret"]["mean"]["y"]
+    assert mean == pytest.approx(statistics.cumulative_regret, rel=1e-4)
 
 
 # --- films ----------------------------------------------------------------------------------------
@@ -334,24 +276,6 @@ def test_a_film_is_small_and_made_once_but_anew_where_it_is_none(report_study):
         (run.path / name).write_text(damage)
         assert film_of(run).read_bytes() == content
         assert json.loads((run.path / "episode.json").read_text())["frames"] > 1
-
-
-def test_films_have_room_for_all_environments(report_study, monkeypatch):
-    """Two agents of one route share a film; what has no room is named."""
-    report = Report(study_series(report_study.analysis), "")
-    everything = world_sections.played_episodes(report)
-    assert sum(map(len, everything.context["films"])) == 6
-    assert not any(everything.context["without_room"])
-    assert len(everything.data) == len(set(everything.data)) <= 6
-    sizes = [film_of(run).stat().st_size for run in report_study.planned if run.seed == 0]
-    # Half of it is the first environment's.
-    monkeypatch.setattr(world_sections, "ALL_BYTES", 2 * min(sizes))
-    films = world_sections.played_episodes(report).context
-    told = zip(films["films"], films["without_room"], strict=True)
-    assert [len(shown) + len(left) for shown, left in told] == [3, 3]
-    assert any(films["without_room"])
-    monkeypatch.setattr(world_sections, "ALL_BYTES", 0)
-    assert world_sections.played_episodes(report) is None
 
 
 # --- nothing gets in, nothing gets out ------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A study as tables: in Markdown, in LaTeX, in the terminal; and the columns of the ranking."""
+"""A study as tables: in Markdown, in LaTeX, in the terminal; and the ranking on the page."""
 
 import io
 import math
@@ -25,9 +25,13 @@ from report.documents import (
     verdicts_as,
     write_verdicts,
 )
+from report.page import result_sections
+from report.page.frame import Report
+from report.ranking import COLUMNS, Row
+from report.series import StudySeries
 from report.terminal import print_analysis, print_episodes_table
 from tests.report import made_up
-from verdicts import FailureCount, ThresholdSummary
+from verdicts import Estimate, FailureCount, ThresholdSummary
 
 NAMES = ["low", "same", "open", "first"]
 CHANGES = ("random starts", "rewards x 0.01")
@@ -79,22 +83,6 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
         ("first", "lake"): 40.4,
         ("same", "lake"): 0.1249,
     }
-
-
-def test_other_headlines():
-    costs = table_as("md", headline(of_lake(metric="regret", is_score=False)))
-    assert "| `low` | 30 |" in costs
-    assert "| `open` | 80 ± 0.12 ?, 1 of 4 failed |" in costs
-    assert "Regret of a run: the mean; scores where they are known. ±: the" in costs
-    assert "processor" not in costs
-    some = made_up.agent("first", 90.0, n_missing=2)
-    absent = table_as("md", headline(of_lake(agents=(some,), pairs=())))
-    assert "| `low` | - |" in absent
-    assert "| `first` | 0.9 ?, 2 missing |" in absent
-    bracketed = replace(lake(), environment="hill", optimum_at_least=90.0)
-    assert r"\texttt{open} & 0.8 $\pm$ 0.12 ?, 1 of 4" in table_as("tex", headline(of_lake()))
-    caption = headline(made_up.analysis([lake(), bracketed], NAMES)).caption
-    assert "as 0. On hill the optimum is bracketed: 1 is the upper end. ±: the" in caption
 
 
 def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():
@@ -185,23 +173,17 @@ def test_a_study_as_files(tmp_path):
     ("escaped", "text", "safe"),
     [
         (latex_text, "double_dqn by 2 [1, 3]", r"double\_dqn by 2 [1, 3]"),
-        (latex_text, "50 % of #1 & {2}", r"50 \% of \#1 \& \{2\}"),
         (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
         (latex_text, "<a>|", r"\textless{}a\textgreater{}\textbar{}"),
         (latex_text, '~ `b "c"', r"\textasciitilde{} {\char96}b {\char34}c{\char34}"),
         (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
         (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
-        (latex_text, "[1] *", r"{}[1] *"),
         (latex_text, "*x", r"{}*x"),
         (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
-        (latex_text, "· ≤ ≥ †", r"$\cdot$ $\leq$ $\geq$ $\dagger$"),
         (latex_text, "two\n\nlines \x1b[1m", r"two lines \textbackslash{}x1b[1m"),
-        (latex_text, "café 中", "café 中"),
-        (markdown_text, "double_dqn by 2 [1, 3]", "double_dqn by 2 [1, 3]"),
         (markdown_text, "a|b <b>*x*</b> [x](y) `c`",
          "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
         (markdown_text, "# one\n\ntwo _three_", "\\# one two \\_three\\_"),
-        (name_of, "dqn", "`dqn`"),
         (name_of, "a`b|", "a\\`b\\|"),
     ],
 )  # fmt: skip
@@ -266,32 +248,10 @@ def below(lines):
 
 
 TABLE = """
-lake: optimum 100, best random or constant policy 20
-┏━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━┳━━━━━━━━┳━━━━━━━━━━┓
-┃ agent  ┃            mean ┃             IQM ┃          score ┃        training ┃ stays from ┃ solved ┃ CPU time ┃
-┡━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━╇━━━━━━━━╇━━━━━━━━━━┩
-│ first  │ 90 [89.9, 90.2] │ 92 [91.9, 92.2] │ 0.9 [0.8, 1.1] │ 95 [94.9, 95.2] │        100 │    75% │     99 s │
-│ second │ 40 [39.9, 40.2] │ 42 [41.9, 42.2] │ 0.4 [0.3, 0.6] │ 45 [44.9, 45.2] │         50 │    75% │     49 s │
-└────────┴─────────────────┴─────────────────┴────────────────┴─────────────────┴────────────┴────────┴──────────┘
+agent  | mean            | IQM             | score          | training        | stays from | solved | CPU time
+first  | 90 [89.9, 90.2] | 92 [91.9, 92.2] | 0.9 [0.8, 1.1] | 95 [94.9, 95.2] | 100        | 75%    | 99 s
+second | 40 [39.9, 40.2] | 42 [41.9, 42.2] | 0.4 [0.3, 0.6] | 45 [44.9, 45.2] | 50         | 75%    | 49 s
 """  # noqa: E501  # as wide as it is printed
-CAPTION = (
-    "mean, IQM: return of the final policy, with 95 % intervals over 4 seeds; those of means allow "
-    "for runs that were not seen; training: return of the last 100 training episodes; stays from: "
-    "step from which on the median run stays at a return of 96 "
-)
-NARROW_CAPTION = (
-    "mean: return of the final policy, with 95 % intervals over 4 seeds; those of means allow for "
-    "runs that were not seen; stays from: step from "
-    "which on the median run stays at a return of 96; a wider terminal shows training and IQM too "
-)
-SENTENCES = (
-    "first is best on average: return of the final policy 90, score 0.9 [0.8, 1.1]; the optimum is "
-    "100. first is better on average than second (by 0.05 to 0.15 of the score). "
-    "second reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the median one from "
-    "step 50 on; first in 3 of 4 runs, the median one from step 100 on. "
-    "1 of 4 runs of second is missing. No run of third has finished. "
-    "Seeds 0 to 3: nothing was tuned on these."
-)
 
 
 @pytest.mark.parametrize("width", [80, 120])
@@ -303,35 +263,15 @@ def test_a_title_a_table_a_caption_and_sentences(width, options):
     place = made_up.environment(agents, pairs=pairs, missing=missing)
     found = made_up.analysis([place], ["first", "second", "third"])
     lines = lines_of(print_analysis, found, width=width, **options)
-    wide = TABLE.splitlines()
-    if width == 120:
-        assert lines[:8] == wide
-        assert below(lines) == CAPTION + SENTENCES
-    else:
-        assert cells(lines) == [
-            [cell for n, cell in enumerate(row) if n not in {2, 4}] for row in cells(wide)
-        ]
-        assert below(lines) == NARROW_CAPTION + SENTENCES
+    assert lines[1] == "lake: optimum 100, best random or constant policy 20"
+    expected = [[cell.strip() for cell in row.split("|")] for row in TABLE.split("\n")[1:-1]]
+    left_out = {2, 4} if width == 80 else {}
+    assert cells(lines) == [[c for n, c in enumerate(row) if n not in left_out] for row in expected]
     assert max(map(len, lines)) <= width
-    assert not any("…" in line for line in lines)
-
-
-@pytest.mark.parametrize("width", [60, 80, 120, 200])
-@pytest.mark.parametrize("name", ["[red]", "a name that is longer than twenty letters"])
-def test_no_figure_is_cut_and_no_border_lost(name, width):
-    agents = [made_up.agent(label, -27_427.0) for label in (name, "second")]
-    found = made_up.analysis([made_up.environment(agents)], [name, "second"])
-    lines = lines_of(print_analysis, found, width=width)
-    assert max(map(len, lines)) <= width
-    assert not any("…" in line for line in lines)
-    (top,) = [line for line in lines if line.startswith("┏")]
-    (bottom,) = [line for line in lines if line.startswith("└")]
-    assert top.endswith("┓")
-    assert len(top) == len(bottom)
-    headings, *rows = cells(lines)
-    assert "".join(row[0] for row in rows[:-1]).replace(" ", "") == name.replace(" ", "")
-    assert rows[-1][:2] == ["second", "-27,427 [-27,427, -27,427]"]
-    assert ("training" in headings) is (width == 200)
+    told = below(lines)
+    assert ("a wider terminal shows training and IQM too" in told) is (width == 80)
+    for sentence in (*conclusion(found.study, place).everything, "Seeds 0 to 3: nothing was tuned"):
+        assert sentence in told
 
 
 def test_three_agents_have_their_verdicts_in_a_matrix():
@@ -385,57 +325,115 @@ ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
 REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
 
 
-@pytest.mark.parametrize("width", [80, 120])
-def test_bandits_have_a_table_of_their_own(width):
+def test_bandits_have_a_table_of_their_own():
     pulls = pull_statistics(ARMS, REWARDS, np.where(ARMS == 0, 0.3, 0.0), None, 2)
     agents = (made_up.agent("first", 1.0), made_up.agent("no pulls", 3.0))
     place = made_up.environment(agents, "coins", optimum=None, is_score=False)
     names, found = ["first", "no pulls"], {("first", "coins"): pulls}
-    lines = lines_of(
-        print_analysis,
-        made_up.analysis([place], names, pulls=found, metric="regret"),
-        width=width,
-    )
+    lines = lines_of(print_analysis, made_up.analysis([place], names, pulls=found, metric="regret"))
     # The sums of regret are .6 and .3, and the last pulls .3 and 0; the last rewards 1 and 0.
     headings = ["agent", "mean regret", "5% to 95% of runs", "simple regret", "reward", "best arm"]
     row = ["first", "7 [6.9, 7.2]", "0.315 to 0.585", "0.15", "0.5", "50.0%", "10 s"]
-    wide = width == 120
-    kept = [n for n in range(7) if wide or n != 3]
-    assert cells(lines) == [[each[n] for n in kept] for each in ([*headings, "CPU time"], row)]
-    simple = "simple regret: of recommending the arm pulled most; " if wide else ""
-    more = "" if wide else "; a wider terminal shows simple regret too"
+    assert cells(lines) == [[*headings, "CPU time"], row]
     assert below(lines).startswith(
-        "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; "
-        f"{simple}reward, best arm: at the last pulls{more} Undecided on average: best is first "
-        "(1 [0.9, 1.2]) or no pulls (3 [2.9, 3.2])."
+        "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; simple regret: of "
+        "recommending the arm pulled most; reward, best arm: at the last pulls Undecided on "
+        "average: best is first (1 [0.9, 1.2]) or no pulls (3 [2.9, 3.2])."
     )
 
 
 EPISODES = ["environment", "agent", "episode", "average", "minimum", "maximum"]
 
 
-def test_blocks_of_episodes_agents_side_by_side():
-    rows = [("lake", "first", 1000, 1.5, 0, 5), ("lake", "first", 2000, -700.0, -800.0, 0.5)]
-    rows += [("lake", "second", 1000, 3, 2, 7), ("island", "first", 1000, 4, 3, 8)]
-    lines = lines_of(print_episodes_table, pd.DataFrame(rows, columns=EPISODES), 1000)
-    titles = " ".join(line for line in lines if not line.startswith(tuple("┏┃┡│└")))
-    what = "return per 1000 episodes (average, min, max; all seeds)"
-    assert " ".join(titles.split()) == f"lake: {what} island: {what}"
-    assert cells(lines) == [
-        ["episode", "first", "second"],
-        ["1,000", "1.5  0  5", "3  2  7"],
-        ["2,000", "-700  -800  0.5", "-"],
-        ["episode", "first"],
-        ["1,000", "4  3  8"],
-    ]
-
-
-@pytest.mark.parametrize("width", [80, 100, 200])
-def test_agents_for_whom_there_is_no_room_beside_the_others_come_below(width):
+@pytest.mark.parametrize("width", [80, 200])
+def test_blocks_of_episodes_agents_side_by_side_where_there_is_room(width):
     names = ["qlearning", "expected_sarsa", "dqn, engine: auto", "a name of more than 20 letters"]
-    rows = [("lake", name, 100, -27_427.5, -30_000.25, n) for n, name in enumerate(names)]
-    table = pd.DataFrame(rows, columns=EPISODES)
-    lines = lines_of(print_episodes_table, table, 100, width=width)
+    rows = [("lake", name, 1000, -27_427.5, -30_000.25, n) for n, name in enumerate(names)]
+    rows += [("lake", "qlearning", 2000, 1.5, 0, 0.5)]
+    lines = lines_of(print_episodes_table, pd.DataFrame(rows, columns=EPISODES), 1000, width=width)
+    assert "lake: return per 1000 episodes (average, min, max; all seeds)" in lines
     assert max(map(len, lines)) <= width
-    found = [cell for row in cells(lines) if row[0] != "episode" for cell in row[1:]]
-    assert found == [f"-27,428  -30,000  {n}" for n in range(len(names))]
+    figures = [f"-27,428  -30,000  {n}" for n in range(len(names))]
+    if width == 200:
+        assert cells(lines) == [
+            ["episode", *names],
+            ["1,000", *figures],
+            ["2,000", "1.5  0  0.5", *"---"],
+        ]
+    else:  # the others come below
+        assert [cell for row in cells(lines) for cell in row if cell in figures] == figures
+
+
+# === the ranking on the page ======================================================================
+
+
+def ranked(agents, metric="final", **changes):
+    """Headings of the page's table and its rows, of agents on an environment."""
+    place = made_up.environment(agents, **changes)
+    found = made_up.analysis([place], [agent.agent for agent in agents], metric=metric)
+    (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
+    return table["headings"], table["rows"]
+
+
+RANKING = """
+Mean       | over seeds          | descending | 90    89.9 to 90.2 | 40    39.9 to 40.2
+IQM        | middle half         | descending | 92    91.9 to 92.2 | 42    41.9 to 42.2
+Median     | over seeds          | descending | 91    90.9 to 91.2 | 41    40.9 to 41.2
+Score      | 1 is optimal        | descending | 0.9   0.8 to 1.1   | 0.4   0.3 to 0.6
+Gap        | to the optimum      | ascending  | 7     6.8 to 7.1   | 57    56.8 to 57.1
+Success    | in the end          | descending | 50.0% 25% to 62%   | 50.0% 25% to 62%
+Stays from | step, at 96         | ascending  | 100   75% of runs  | 50    75% of runs
+Episodes   | to stay at 96       | ascending  | 98    75% of runs  | 48    75% of runs
+CPU time   | seconds of training | ascending  | 99    98.9 to 99.2 | 49    48.9 to 49.2
+Runs       | finished            | descending | 4                  | 4     1 missing
+"""
+
+
+def test_figures_of_each_agent_the_best_first():
+    agents = [made_up.agent("first", 90.0), made_up.agent("second", 40.0, n_missing=1)]
+    headings, rows = ranked(agents)
+    assert [row.agent for row, _ in rows] == ["first", "second"]
+    expected = [[" ".join(x.split()) for x in row.split("|")] for row in RANKING.split("\n")[1:-1]]
+    assert [
+        [*each.values(), *(f"{cells[n].text} {cells[n].note}".strip() for _, cells in rows)]
+        for n, each in enumerate(headings)
+    ] == expected
+    # They are sorted by their figures.
+    cells = rows[0][1]
+    assert [cell.value for cell in cells] == pytest.approx(
+        [90, 92, 91, 0.9, 7, 0.5, 100, 98, 99, 4]
+    )
+    assert [cell.bar for cell in cells] == [None] * 3 + [(0.8, 0.9, 1.0)] + [None] * 6
+    assert cells[6].aside == (
+        "75% of runs are there at some evaluation, the median run first at step 97"
+    )
+    # The lowest regret is the best.
+    orders = [heading["order"] for heading in ranked(agents, metric="regret")[0]]
+    assert orders == ["ascending"] * 3 + ["descending", *[row[2] for row in expected[4:]]]
+
+
+def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
+    one = made_up.agent("first", 90.0, final=made_up.estimate(93.0, 92.0, 95.0))
+    (gap,) = [column for column in COLUMNS if column.page == "Gap"]
+    cell = gap.cell(Row(one, made_up.environment([one], optimum_at_least=97.0)))
+    assert (cell.text, cell.note) == ("7", "2 to 8")  # from one end of the bracket to the other
+    never = ThresholdSummary(Estimate(math.inf, 10, math.inf, 4), Estimate(0.25, 0, 0.5, 4))
+    nothing = ThresholdSummary(made_up.NOTHING, made_up.NOTHING)
+    without = dict.fromkeys(("final", "success_rate", "seconds"), made_up.NOTHING)
+    without |= {"steps_to_threshold": nothing, "steps_to_stay": nothing, "score": None}
+    agents = [
+        made_up.agent("slow", 1.0, steps_to_stay=never),
+        made_up.agent("without", math.nan, **without),
+    ]
+    headings, ((_, slow), (_, absent)) = ranked(agents)
+    titles = [heading["title"] for heading in headings]
+    stays = slow[titles.index("Stays from")]
+    assert (stays.text, stays.value, stays.note) == ("never", math.inf, "25% of runs")
+    for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
+        cell = absent[titles.index(title)]
+        assert (cell.text, cell.value, cell.note, cell.aside) == ("-", None, "", ""), title
+    few = dict.fromkeys(("score", "success_rate", "steps_to_stay", "episodes_to_stay"))
+    headings, _ = ranked([made_up.agent("alone", 1.0, **few)], optimum=None, threshold=None)
+    assert [heading["title"] for heading in headings] == [
+        *("Mean", "IQM", "Median", "CPU time", "Runs")
+    ]

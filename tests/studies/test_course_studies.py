@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 
 import compare
-from agents import load_algorithm
 from envs.warehouse import WarehouseEnv
 from experiments.plan import plan
 from experiments.results import read_episodes, read_results
 from experiments.run_in_child import do_run
-from experiments.study import QuickSpec, read_study
+from experiments.study import read_study
 from mdp import value_iteration
 from pipeline.models.load import load_model
 from pipeline.preparation import algorithm_kwargs
@@ -33,7 +32,6 @@ STUDIES = [
     path for path in sorted((ROOT / "studies").glob("*.yml")) if not path.name.startswith("bandit-")
 ]
 GUIDE = (ROOT / "docs" / "course.md").read_text()
-QUICK = QuickSpec(seeds=1, budget=0.01)
 
 
 def study(name):
@@ -144,16 +142,6 @@ def test_the_warehouse_with_the_rewards_of_the_text(tmp_path):
     assert set(results.summary["final"]) == {79.0}
 
 
-def test_with_discount_a_tenth_the_tie_rule_decides(tmp_path):
-    part = shrunk(study("warehouse-discount"), environments="shelf -1 ", n_seeds=5)
-    part = shrunk(part, ("first-index ties with γ = 0.1", "random ties with γ = 0.1"))
-    results = run(part, tmp_path)
-    first = training_returns(results, "first-index ties with γ = 0.1")[:, 200:300].mean()
-    at_random = training_returns(results, "random ties with γ = 0.1")[:, 200:300].mean()
-    assert first == pytest.approx(-985, abs=40)  # the mean of 30 seeds
-    assert at_random == pytest.approx(-11.7, abs=15)
-
-
 def test_with_discount_a_tenth_the_best_actions_are_no_better_than_others():
     """The exact values of actions at the start differ by less than a float can hold."""
     model = WarehouseEnv(shelf_reward=-1).transition_model()
@@ -189,24 +177,3 @@ def test_values_of_the_small_grid(tmp_path):
     assert corner["qlearning"] == pytest.approx([0.95**5] * 3, abs=1e-9)
     assert np.mean(corner["sarsa"]) < 0.95**5 - 0.02
     assert set(results.summary["optimum"]) == {1.0}
-
-
-def test_epsilon_falls_by_half_a_per_cent_after_each_episode():
-    planned = plan(shrunk(study("cartpole-dqn"), "as printed"), Path("unused"))
-    hyperparams = planned[0].spec.hyperparams
-    decay = hyperparams.callback[0].kwargs["decay"]
-    updates = hyperparams.algorithm["gradient_steps"]
-    assert decay**updates == pytest.approx(0.995, abs=1e-6)
-
-
-def test_a_deep_study_runs(tmp_path):
-    part = shrunk(study("frozenlake-replay"), n_seeds=1, quick=QUICK).quickened()
-    results = run(part, tmp_path)
-    assert list(results.summary["agent"]) == [agent.label for agent in part.agents]
-    assert (results.summary["n_episodes"] == 10).all()
-    assert results.summary["optimum"].eq(1).all()
-    without = next(one for one in results.planned if one.agent == "no replay")
-    model = load_algorithm("dqn").load(without.run.model_path)
-    assert model.buffer_size == model.batch_size == 1
-    # One update a step; the last step ends the run before it is learnt from.
-    assert model._n_updates == model.num_timesteps - 1

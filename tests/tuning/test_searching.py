@@ -1,27 +1,40 @@
-"""Searches over a toy: what is tried and ended, what it is worth, and what a kill changes."""
+"""Searches over a toy: what is tried, ended early, tested again, and what a kill changes."""
 
 import errno
 import json
 import math
 import os
+import statistics
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import optuna
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
 
 from experiments.results import Curve, RunResults
-from pipeline import locks
 from pipeline.errors import UserError
+from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
 from tuning import searching
+from tuning.pruning import PRUNERS, is_hopeless
+from tuning.retesting import (
+    Outcome,
+    Retested,
+    _winner,
+    best_trials,
+    chosen_for_retest,
+    entry_text,
+    optimism,
+    retest_study,
+    write_winner,
+)
 from tuning.searching import UnjudgedError, outcome_of
 from tuning.suggesting import make_sampler
 from tuning.trial_storage import FAILURE, FIGURES, SETTINGS
 from tuning.tuning_spec import SAMPLERS, judged
+from verdicts import Estimate
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -109,23 +122,6 @@ def test_a_kill_at_any_write_to_the_storage_changes_no_trial(toy, tmp_path, samp
         assert searched(storage) == undisturbed, k
 
 
-def test_the_trial_of_a_driver_that_was_killed_comes_before_those_that_nobody_began(
-    toy, tmp_path, monkeypatch
-):
-    whole = toy.opened(toy.tuning(), tmp_path / "whole")
-    toy.search(whole, toy.Launcher())
-    killed = toy.opened(toy.tuning(), tmp_path / "killed")
-    mark = locks.mark()
-    with monkeypatch.context() as patch:
-        patch.setattr(locks, "mark", lambda: {**mark, "began": 1})  # not this process
-        patch.setattr(killed.queue, "give_back", lambda _: None)
-        toy.search(killed, toy.Launcher(stops_after=11))
-    assert toy.states(killed).count("RUNNING") == 1
-    again = toy.opened(toy.tuning(), tmp_path / "killed")
-    toy.search(again, toy.Launcher())
-    assert toy.params(again) == toy.params(whole)
-
-
 def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path):
     place = toy.opened(toy.tuning(pruner="median", n_trials=20, n_seeds=5), tmp_path)
     launcher = toy.search(place, toy.Launcher())
@@ -147,7 +143,7 @@ def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
     assert set(toy.states(place)) == {"COMPLETE", "WAITING"}
 
 
-def test_scores_are_not_compared_with_returns_of_before(toy, tmp_path):
+def test_scores_are_not_compared_with_those_of_another_search_before(toy, tmp_path):
     """The optimum of an environment may be known since an update."""
     place = toy.opened(toy.tuning(), tmp_path)
     toy.search(place, toy.Launcher(stops_after=7), judged_by="final")
@@ -155,6 +151,9 @@ def test_scores_are_not_compared_with_returns_of_before(toy, tmp_path):
         toy.search(place, toy.Launcher())
     assert toy.search(place, toy.Launcher(), judged_by="final").done
     assert toy.states(place) == ["COMPLETE"] * 10
+    # Nor is another search under the same name gone on with.
+    with pytest.raises(UserError, match=r"toy: the tuning there is another .*objective: 'mean'"):
+        toy.opened(toy.tuning(objective="lower"), tmp_path)
 
 
 @pytest.mark.parametrize(("judged_by", "hopeless"), [("score", False), ("final", True)])
@@ -173,26 +172,6 @@ def test_only_scores_have_1_to_hope_for_where_all_are_below_0(toy, tmp_path, jud
     assert len(launcher.done) == (4 if hopeless else 5)
 
 
-def test_a_cost_is_made_small(toy, tmp_path):
-    place = toy.opened(toy.tuning(figure="steps"), tmp_path)
-    toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
-    assert place.study.best_value == min(trial.value for trial in place.queue.trials())
-
-
-def test_seeds_go_side_by_side_where_trials_are_few(toy, tmp_path):
-    place = toy.opened(toy.tuning(n_trials=1), tmp_path)
-    waiting = []
-
-    class Slow(toy.Launcher):
-        def submit(self, planned):
-            waiting.append(planned.seed)
-            return super().submit(planned)
-
-    toy.search(place, Slow(n_workers=3))
-    assert sorted(waiting) == [0, 1, 2]
-    assert toy.states(place) == ["COMPLETE"]
-
-
 def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tmp_path):
     place = toy.opened(toy.tuning(), tmp_path)
 
@@ -208,40 +187,36 @@ def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tm
         assert (FAILURE in trial.user_attrs) == fails
 
 
-def test_where_nothing_but_failures_comes_of_it_the_search_ends_and_says_why(
-    toy, tmp_path, monkeypatch
-):
+def test_where_nothing_but_failures_comes_of_it_the_search_ends_and_says_why(toy, tmp_path):
     place = toy.opened(toy.tuning(), tmp_path)
     with pytest.raises(UserError, match=r"all of the first 5 trials failed; seed \d: it broke"):
         toy.search(place, toy.Launcher(failing={0, 1, 2}))
 
 
-def test_after_the_time_no_run_is_begun(toy, tmp_path):
-    place = toy.opened(toy.tuning(), tmp_path)
-    launcher = toy.search(place, toy.Launcher(), deadline=-math.inf)
-    assert not launcher.done
-    assert toy.states(place) == ["WAITING"] * 10
+def test_how_many_runs_there_are(toy, tmp_path):
+    """None after the time is over; seeds side by side; more trials beside those that are there."""
+    late = toy.opened(toy.tuning(n_trials=4), tmp_path)
+    assert not toy.search(late, toy.Launcher(), deadline=-math.inf).done
+    assert toy.states(late) == ["WAITING"] * 4
+    assert len(toy.search(late, toy.Launcher(n_workers=3)).done) == 12
+    more = toy.opened(toy.tuning(n_trials=6), tmp_path)
+    assert len(toy.search(more, toy.Launcher()).done) == 6
+    assert toy.states(more) == ["COMPLETE"] * 6
 
 
 def test_a_grid_goes_through_every_point_once(toy, tmp_path):
-    place = toy.opened(toy.tuning(sampler="grid", n_trials=12), tmp_path)
-    toy.search(place, toy.Launcher())
+    place = toy.opened(toy.tuning(sampler="grid", n_trials=12, figure="steps"), tmp_path / "it")
+    toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
     tried = {(p["learning_rate"], p["gamma"]) for p in toy.params(place)[1:]}
     assert len(toy.params(place)) == 10  # three values of each, and what was shipped
     assert len(tried) == 9
     assert {gamma for _, gamma in tried} == {0.5, 0.75, 1.0}
-
-
-def test_a_grid_that_does_not_fit_is_refused(toy, tmp_path):
+    assert place.study.best_value == 50.0  # a cost is made small
     with pytest.raises(UserError, match="4 settings with two values of each number"):
-        toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path)
+        toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path / "too few")
 
 
-def test_more_trials_are_added_to_those_that_are_there(toy, tmp_path):
-    toy.search(toy.opened(toy.tuning(n_trials=4), tmp_path), toy.Launcher())
-    more = toy.opened(toy.tuning(n_trials=6), tmp_path)
-    assert len(toy.search(more, toy.Launcher()).done) == 6
-    assert toy.states(more) == ["COMPLETE"] * 6
+# --- what suggests settings -----------------------------------------------------------------------
 
 
 def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
@@ -250,16 +225,6 @@ def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
     assert place.suggestions.n_free == 1
     assert {p["gamma"] for p in toy.params(place)} == {0.9}
     assert len({p["learning_rate"] for p in toy.params(place)}) == 10
-
-
-def test_another_search_under_the_same_name_is_refused(toy, tmp_path):
-    toy.opened(toy.tuning(), tmp_path)
-    toy.opened(toy.tuning(n_trials=20, retest=0), tmp_path)
-    with pytest.raises(UserError, match=r"toy: the tuning there is another .*objective: 'mean'"):
-        toy.opened(toy.tuning(objective="lower"), tmp_path)
-
-
-# --- what suggests settings -----------------------------------------------------------------------
 
 
 def asked(study, number):
@@ -308,14 +273,6 @@ def test_by_hand(objective, is_cost, value):
     assert judged(VALUES, objective, is_cost=is_cost) == pytest.approx(value)
 
 
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30), st.sampled_from(["mean", "iqm"]))
-def test_a_cost_is_a_score_with_its_sign_turned(figures, objective):
-    for each in (objective, "lower"):
-        turned = judged([-figure for figure in figures], each, is_cost=True)
-        assert turned == pytest.approx(-judged(figures, each, is_cost=False), abs=1e-6)
-        assert min(figures) - 1e-6 <= -turned <= max(figures) + 1e-6
-
-
 def outcome(toy, monkeypatch, figure, **row):
     figures = {"step": [10, 20, 30], "seconds": [0.5, 1.0, 1.5], "value": [0.0, 0.6, 0.4]}
     evaluations = Curve({}, {name: np.array(values) for name, values in figures.items()})
@@ -343,12 +300,207 @@ def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value):
     assert (found.figure, found.seconds) == (value, 2.0)
 
 
-@pytest.mark.parametrize("value", [None, np.nan, np.inf])
-def test_a_run_without_the_figure_says_nothing(toy, monkeypatch, value):
+@pytest.mark.parametrize("regret", [None, np.nan, np.inf])
+def test_a_run_without_the_figure_says_nothing(toy, monkeypatch, regret):
     with pytest.raises(UnjudgedError, match="no figure for regret"):
-        outcome(toy, monkeypatch, "regret", regret=value)
-
-
-def test_steps_to_a_threshold_that_nobody_knows_are_refused(toy, monkeypatch):
+        outcome(toy, monkeypatch, "regret", regret=regret)
     with pytest.raises(UserError, match="give --threshold"):
         outcome(toy, monkeypatch, "steps", threshold=None)
+
+
+# === what is ended early ==========================================================================
+
+
+def scored(scores, first=0):
+    return {first + number: score for number, score in enumerate(scores)}
+
+
+@pytest.mark.parametrize("method", PRUNERS)
+def test_the_first_trial_and_the_best_one_go_on_and_the_worst_of_many_does_not(method):
+    assert not is_hopeless({}, [], method)
+    assert not is_hopeless(scored([0.1, 0.1]), [], method)
+    others = [scored([0.1 * n] * 12) for n in range(8)]
+    assert not any(is_hopeless(scored([0.8] * n), others, method) for n in range(1, 12))
+    better = [scored([0.5 + 0.05 * n] * 12) for n in range(8)]
+    ended = [is_hopeless(scored([0.0] * n), better, method) for n in range(1, 12)]
+    assert any(ended) is (method != "none")
+
+
+TWO = [[0.9, 0.9, 1.0], [1.0, 0.2]]
+FAILED = [[0.9, 0.9, 0.9], [1.0, 0.1]]
+SHORT, LONG = [[0.9, 0.9]], [[0.9, 0.9], [0.8, 0.8, 0.8]]
+# Their means are 0.5, 0.4, 0.6 and 0.8, the median of which is 0.55.
+FOUR = [[0.0, 1.0], [0.2, 0.6], [0.6, 0.6], [0.8, 0.8]]
+FIVE = [[0.1 * n] for n in range(1, 6)]
+WHOLE = [[0.1 * n] * 3 for n in range(1, 6)]
+# A score of 10 has been seen: with that, any trial could still win.
+NINE, TEN = ([[0.5] * n, [10.0]] for n in (9, 10))
+WORSE = [0.4, 0.39, 0.38, 0.37]
+RACE = [[0.9, 0.2, 0.8]]
+
+
+@pytest.mark.parametrize(
+    ("method", "scores", "others", "options", "hopeless"),
+    [
+        # What is left counts as perfect: 0.9 and twice 1.0 is more than 2.8, with 0.8 it is a draw.
+        ("bound", [0.9], TWO, {}, False),
+        ("bound", [0.8], TWO, {}, False),
+        ("bound", [0.79], TWO, {}, True),
+        ("bound", [1.0, 0.79], TWO, {}, True),
+        ("bound", [1.0, 1.0, 0.1], TWO, {}, False),  # nothing is left to save
+        # A trial under way is no measure.
+        ("bound", [0.1], SHORT, {}, True),
+        ("bound", [0.1], SHORT, {"n_seeds": 3}, False),
+        ("bound", [0.1], LONG, {"n_seeds": 3}, True),
+        # Perfect is the highest score that any trial has had.
+        ("bound", [-115.0], [[-110.0, -110.0], [-100.0, -200.0]], {}, False),
+        ("bound", [-115.0], [[-110.0, -110.0], [-108.0, -200.0]], {}, True),
+        # Where the optimum is known nothing less is.
+        ("bound", [0.6], [[0.7, 0.7, 0.7]], {}, True),
+        ("bound", [0.6], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, False),
+        ("bound", [0.05], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, True),
+        # One failed seed of three sinks a mean, and no median.
+        ("bound", [0.1], FAILED, {}, True),
+        ("bound", [0.1], FAILED, {"value": statistics.median}, False),
+        ("bound", [0.1, 0.1], FAILED, {"value": statistics.median}, True),
+        # Nothing is concluded from one seed, or from three others.
+        ("median", [0.5, 0.5], FOUR, {}, True),
+        ("median", [0.6, 0.5], FOUR, {}, False),
+        ("median", [0.0], FOUR, {}, False),
+        ("median", [0.0, 0.0], FOUR[1:], {}, False),
+        # Of six, two go on; two seeds are between the rungs.
+        ("halving", [0.45], FIVE, {}, False),
+        ("halving", [0.35], FIVE, {}, True),
+        ("halving", [0.0, 0.0], WHOLE, {}, False),
+        ("halving", [0.0, 0.0, 0.0], [*WHOLE, [1.0] * 9], {}, True),
+        # A paired t test sees a steady difference at two seeds.
+        ("racing", [0.8, 0.1], RACE, {}, True),
+        ("racing", [0.8, 0.2], RACE, {}, False),
+        ("racing", [0.9, 0.2], RACE, {}, False),
+        # The default takes ranks from ten seeds on.
+        ("auto", WORSE, NINE, {}, False),
+        ("auto", WORSE, TEN, {}, True),
+        ("bound", WORSE, TEN, {}, False),
+    ],
+)
+def test_what_is_hopeless(method, scores, others, options, hopeless):
+    found = is_hopeless(scored(scores), [scored(each) for each in others], method, **options)
+    assert found is hopeless
+
+
+def test_trials_are_compared_on_the_same_seeds():
+    assert not is_hopeless(scored([0.0, 0.0], first=1), [scored(each) for each in FOUR], "median")
+
+
+def test_a_signed_rank_test_needs_four_seeds():
+    best = scored([1.0 - 0.01 * n for n in range(10)])
+    worse = [score - 0.1 * (seed + 1) for seed, score in best.items()]
+    ended = [is_hopeless(scored(worse[:n]), [best], "wilcoxon") for n in range(1, 11)]
+    # All of n differences on one side have a probability of 1 in 2^n: 1 in 16 is below 0.1.
+    assert ended.index(True) + 1 == 4
+
+
+def test_an_unknown_pruner_is_one_line():
+    with pytest.raises(UserError, match="'medain': did you mean 'median'"):
+        is_hopeless(scored([1.0]), [], "medain")
+
+
+# === what is tested again =========================================================================
+
+
+def retested(number, held_out, verdict="undecided", in_search=0.9, n_runs=20, n_failed=0):
+    label = f"trial {number}" if number else "shipped"
+    interval = Estimate(held_out or 0.0, 0.5, 0.9, 20)
+    n_runs = 0 if held_out is None else n_runs
+    return Retested(label, number, in_search, held_out, interval, verdict, n_runs, n_failed)
+
+
+def test_seeds_of_the_search_and_of_the_re_test_are_apart(toy):
+    toy.tuning(first_retest_seed=3).check()
+    toy.tuning(first_retest_seed=2, retest=0).check()
+    with pytest.raises(UserError, match="seed 2 is one of the search and of the re-test"):
+        toy.tuning(first_retest_seed=2).check()
+
+
+@pytest.mark.parametrize(
+    ("is_cost", "in_search", "held_out", "fooled_by"),
+    [(False, 0.9, 0.7, 0.2), (False, 0.7, 0.9, -0.2), (True, 100.0, 130.0, 30.0)],
+)
+def test_optimism_is_how_much_better_it_looked_than_it_is(
+    toy, is_cost, in_search, held_out, fooled_by
+):
+    tuning = toy.tuning(figure="steps" if is_cost else "score")
+    best = retested(4, held_out, in_search=in_search)
+    assert optimism(tuning, best) == pytest.approx(fooled_by)
+    assert optimism(tuning, replace(best, held_out=None)) is None
+
+
+@pytest.mark.parametrize(
+    ("others", "figure", "winner"),
+    [
+        ([(1, 0.8, "undecided"), (2, 0.9, "better")], "score", 2),
+        ([(1, 0.8, "better, as seen"), (2, 0.75, "better")], "score", 1),
+        ([(1, 0.8, "undecided"), (2, 0.9, "undecided")], "score", None),
+        ([(1, 0.7, "undecided"), (2, 0.6, "worse")], "score", None),  # no better than before
+        ([(1, 0.7 + 1e-15, "equivalent")], "score", None),
+        ([(1, 0.9, "worse")], "score", None),
+        ([(1, None, "undecided")], "score", None),
+        ([(1, 0.9, "better", 0.9, 19), (2, 0.8, "better")], "score", 2),  # a run of it failed
+        ([(1, 0.9, "better", 0.9, 19)], "score", None),
+        ([(1, 0.65, "better"), (2, 0.6, "better")], "steps", 2),
+    ],
+)
+def test_what_wins_is_better_on_other_seeds_than_what_there_was(toy, others, figure, winner):
+    found, reason = _winner(
+        toy.tuning(figure=figure), [retested(0, 0.7, ""), *[retested(*each) for each in others]]
+    )
+    assert (found and found.number) == winner
+    assert bool(reason) == (winner is None)
+
+
+def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
+    place = toy.opened(toy.tuning(), tmp_path)
+    toy.search(place, toy.Launcher())
+    ranked = best_trials(place.queue.trials(), is_cost=False)
+    assert [each.value for each in ranked] == sorted((e.value for e in ranked), reverse=True)
+    twice = best_trials([*place.queue.trials(), *place.queue.trials()], is_cost=False)
+    assert twice == ranked
+    chosen = chosen_for_retest(ranked, 3)
+    assert len(chosen) == 3
+    assert all(each.number for each in chosen)
+    study = retest_study(place.tuning, tmp_path, chosen)
+    assert list(study.seeds) == list(range(1000, 1020))
+    assert [agent.label for agent in study.agents] == ["shipped", *[e.label for e in chosen]]
+    for agent, each in zip(study.agents[1:], chosen, strict=True):
+        assert read_hyperparams("qlearning", "FrozenLake-v1", agent.conf_file) == each.entry
+
+
+ENTRY = {
+    "policy": "MlpPolicy",
+    "n_timesteps": 1000,
+    "learning_rate": 3e-05,
+    "policy_kwargs": {"net_arch": [64, 64], "activation_fn": "nn.ReLU"},
+    "env_wrapper": [{"envs.wrappers.ScaleReward": {"scale": 0.1}}],
+    "normalize": None,
+}
+
+
+def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_path):
+    """The search's own, and those that the settings it began with were tuned on: 0 to 9."""
+    path = tmp_path / "entry.yml"
+    path.write_text(entry_text(toy.tuning(n_seeds=12), ENTRY, ["found: somewhere"]))
+    assert read_hyperparams("qlearning", "FrozenLake-v1", path) == ENTRY
+    assert seeds_tuned_on("qlearning", "FrozenLake-v1", path) == (range(12),)
+    assert "\n# found: somewhere\nFrozenLake-v1:\n  policy: MlpPolicy\n" in path.read_text()
+    assert "    net_arch: [64, 64]\n" in path.read_text()
+
+
+def test_the_file_of_the_winner_says_where_it_comes_from(toy, tmp_path):
+    winner = retested(4, 0.85, "better", n_failed=3)
+    outcome = Outcome((retested(0, 0.7, ""), winner), winner, 0.05, "")
+    path = write_winner(toy.tuning(), tmp_path, outcome, ENTRY, 10)
+    said = " ".join(line[2:] for line in path.read_text().splitlines() if line.startswith("# "))
+    assert "trial 4 of 10 (tpe), mean of score over the seeds 0 to 2: 0.9." in said
+    assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (95 % interval" in said
+    assert "0.5 to 0.9, 20 runs, 3 of them failed); the settings before, there: 0.7" in said
+    assert said.endswith("Verdict: better.")

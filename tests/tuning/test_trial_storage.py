@@ -13,21 +13,7 @@ from tuning.trial_storage import DRIVER, figures_of, open_storage, seconds_of
 from tuning.tuning_spec import failing_in_a_line, kind_of, without_secret
 
 
-@pytest.mark.parametrize(
-    ("given", "kind"),
-    [
-        ("trials.log", "journal"),
-        ("journal:a/trials.log", "journal"),
-        ("sqlite:///x.db", "database"),
-        ("postgresql+psycopg://u@h/db", "database"),
-        ("grpc://head:13000", "proxy"),
-    ],
-)
-def test_the_kinds(given, kind):
-    assert kind_of(given) == kind
-
-
-def test_passwords_are_left_out_of_refusals_and_commands():
+def test_passwords_are_left_out_of_refusals_and_commands(monkeypatch):
     with pytest.raises(UserError, match=r"'redis://u:\*\*\*@h' is no storage: a file for a "):
         kind_of("redis://u:secret@h")
     with pytest.raises(UserError) as error:
@@ -36,6 +22,9 @@ def test_passwords_are_left_out_of_refusals_and_commands():
     assert "postgresql://u:***@127.0.0.1:1/db" in str(error.value)
     for text in ("tune.py --storage postgresql://u:se%40cret@h/db -j 2", "no://x"):
         assert without_secret(text) == text.replace("se%40cret", "***")
+    monkeypatch.setitem(sys.modules, "psycopg", None)  # a package that is not there
+    with pytest.raises(UserError, match="it needs the package of psycopg: install that"):
+        open_storage(None, "postgresql://u@h/db")
 
 
 @pytest.mark.parametrize(
@@ -63,12 +52,6 @@ def test_storages_that_are_none_are_refused_in_a_line(tmp_path, monkeypatch, giv
         open_storage(tmp_path, given)
     assert "\n" not in str(error.value)
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == files
-
-
-def test_a_database_without_its_package_says_which(monkeypatch):
-    monkeypatch.setitem(sys.modules, "psycopg", None)
-    with pytest.raises(UserError, match="it needs the package of psycopg: install that"):
-        open_storage(None, "postgresql://u@h/db")
 
 
 def test_a_folder_of_any_name_keeps_its_own_file_and_one_that_is_damaged_is_one_line(tmp_path):
@@ -160,26 +143,17 @@ def test_one_elsewhere_counts_as_gone_once_it_has_been_silent(queue_of, elsewher
         assert here.free_dead() == freed
 
 
-def test_one_that_was_taken_and_not_signed_is_free_after_a_while(queue_of, clock):
-    queue = queue_of()
-    queue.storage.set_trial_state_values(queue.trials()[0]._trial_id, TrialState.RUNNING)
-    assert queue.free_dead() == []
-    clock[0] = 61.0
-    assert queue.free_dead() == [0]
-
-
-def test_what_is_given_back_is_not_taken_from_whoever_has_it_now(toy, queue_of, tmp_path):
-    queue = queue_of()
+def test_a_trial_is_given_back_by_whoever_has_it_and_freed_where_nobody_signs(queue_of, clock):
+    queue = queue_of(n_trials=4)
     trial = queue.claim(lambda _: {})
     trial.set_user_attr(DRIVER, {"token": "another"})
     queue.give_back(trial)
-    assert toy.states(toy.opened(toy.tuning(), tmp_path))[0] == "RUNNING"
-
-
-def test_places_beyond_those_that_were_asked_for_are_left_alone(queue_of):
-    more, fewer = queue_of(n_trials=6), queue_of(n_trials=4)
-    assert [fewer.claim(lambda _: {}) is None for _ in range(5)] == [False] * 4 + [True]
-    assert len(more.trials()) == 6
+    assert queue.trials()[0].state == TrialState.RUNNING
+    # One that was taken and not signed is free after a while.
+    queue.storage.set_trial_state_values(queue.trials()[1]._trial_id, TrialState.RUNNING)
+    assert queue.free_dead() == []
+    clock[0] = 61.0
+    assert 1 in queue.free_dead()
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,41 @@
-"""Comparisons of two agents: worked by hand, against closed forms, and in simulation."""
+"""Comparisons of two agents: pairs, rank-sum tests and means, by hand, by SciPy, in simulation."""
+
+from itertools import combinations, product
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from verdicts import (
+    Ends,
+    ahead_p_value,
+    apart_p_value,
+    compare_means,
     compare_pairs,
+    equivalent_p_value,
+    fewest_seeds,
     holm,
+    judge_means,
+    judge_pairs,
+    level_of_look,
+    mean_interval,
     paired_difference,
     probability_of_improvement,
+    rank_by_mean,
 )
+from verdicts.means import (
+    MeanVerdict,
+    ahead_on_average,
+    paired_p_value,
+    permutation_p_value,
+    seeds_needed,
+    seen_p_value,
+    welch_p_value,
+)
+from verdicts.rank_tests import interval_places, rank_sum_p_value, share_p_value, wins_of
 from verdicts.resampling import interval_tail
 
 NAN = np.nan
@@ -30,12 +54,23 @@ def interval(found):
 # --- probability of improvement ------------------------------------------------------------------
 
 
-def test_wins_and_ties_worked_by_hand():
-    # 1 beats nothing and ties with 1; 3 beats 1 and 2; 2 beats 1 and ties with 2; of nine 4 are
-    # won by the first row by row: (0.5 + 0 + 0), (1 + 1 + 0), (1 + 0.5 + 0).
-    found = probability_of_improvement([1, 3, 2], [1, 2, 4], seed=0)
-    assert found.point == pytest.approx(4 / 9)
-    assert (found.n, found.n_missing) == (3, 0)
+@pytest.mark.parametrize(
+    ("first", "second", "point", "n", "n_missing"),
+    [
+        ([2], [1], 1, 1, 0),
+        ([1, NAN], [NAN, 1], NAN, 0, 2),
+        ([np.inf, 1], [np.inf, 0], 0.625, 2, 0),
+        ([0.3], [0.1 + 0.2], 0.5, 1, 0),  # in the last bits alone
+        # Environments are averaged.
+        ([[1, 5], [2, 5], [3, NAN]], [[0, 5], [0, 5], [0, 5]], 0.75, 5, 1),
+        ([[0, 5], [0, 5], [0, 5]], [[1, 5], [2, 5], [3, NAN]], 0.25, 5, 1),
+    ],
+)
+def test_who_wins(first, second, point, n, n_missing):
+    found = probability_of_improvement(first, second, seed=0)
+    assert (found.n, found.n_missing) == (n, n_missing)
+    assert found.point == pytest.approx(point, nan_ok=True)
+    assert found.has_interval == (n > 1)
 
 
 @given(PAIRS)
@@ -53,25 +88,6 @@ def test_the_two_probabilities_add_up_to_one(pair):
     assert one.point + other.point == pytest.approx(1)
     assert interval(one) == pytest.approx([1 - other.high, 1 - other.low])
     assert 0 <= one.low <= one.point <= one.high <= 1
-
-
-def test_resampling_draws_both_agents_seeds_together():
-    rng = np.random.default_rng(0)
-    first, second = rng.normal(0.5, 1, size=(2, 8))
-    drawn = np.random.default_rng(3).integers(8, size=(500, 8))
-    wins = [np.mean(first[rows][:, None] > second[rows]) for rows in drawn]
-    found = probability_of_improvement(first, second, seed=3, n_resamples=500)
-    tail = stats.norm.cdf(-np.sqrt(8 / 7) * stats.t.ppf(0.975, 7))
-    assert interval(found) == pytest.approx(np.quantile(wins, [tail, 1 - tail]))
-
-
-def test_environments_are_averaged():
-    first, second = [[1, 5], [2, 5], [3, NAN]], [[0, 5], [0, 5], [0, 5]]
-    found = probability_of_improvement(first, second, seed=0)
-    assert found.point == 0.75
-    assert (found.n, found.n_missing) == (5, 1)
-    turned = probability_of_improvement(second, first, seed=0)
-    assert (turned.point, turned.n, turned.n_missing) == (0.25, 5, 1)
 
 
 def test_seeds_of_each_environment_are_resampled_by_themselves():
@@ -96,31 +112,7 @@ def test_winning_always_leaves_a_doubt():
     assert [lost.point, *interval(lost)] == pytest.approx([0, 0, exact.high])
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_with_many_seeds_the_normal_interval_agrees_with_resampling(n_envs, monkeypatch):
-    first, second = np.random.default_rng(0).normal([[[0.4]], [[0]]], 1, size=(2, 201, n_envs))
-    normal = probability_of_improvement(first, second, seed=0)
-    monkeypatch.setattr("verdicts.pairs.MANY_SEEDS", 201)
-    resampled = probability_of_improvement(first, second, seed=0)
-    assert normal.point == resampled.point
-    assert interval(normal) != interval(resampled)
-    # A tenth of its half width.
-    assert interval(normal) == pytest.approx(interval(resampled), abs=0.006 / n_envs**0.5)
-
-
-def test_infinite_scores_are_compared():
-    found = probability_of_improvement([np.inf, 1], [np.inf, 0], seed=0)
-    assert found.point == 0.625
-
-
-def test_without_seeds_there_is_no_probability():
-    assert np.isnan(probability_of_improvement([1, NAN], [NAN, 1], seed=0).point)
-    single = probability_of_improvement([2], [1], seed=0)
-    assert single.point == 1
-    assert not single.has_interval
-
-
-@pytest.mark.parametrize(("truth", "n"), [(0.5, 10), (0.95, 5), (0.7, 30)])
+@pytest.mark.parametrize(("truth", "n"), [(0.95, 5), (0.7, 30)])
 def test_the_interval_of_the_probability_covers(truth, n):
     rng = np.random.default_rng(0)
     ahead = stats.norm.ppf(truth) * np.sqrt(2)
@@ -146,47 +138,22 @@ def test_the_paired_interval_is_scipys():
     assert found.point == pytest.approx(np.mean(first - second))
 
 
-def test_seeds_that_one_agent_lacks_do_not_count():
-    found = paired_difference([1, NAN, 5, np.inf, 9, 7], [0, 3, 2, 1, 4, -np.inf])
-    assert (found.point, found.n, found.n_missing) == (3, 3, 3)
-
-
-def test_differences_without_spread():
-    same = paired_difference([1, 2, 3], [1, 2, 3])
-    assert [same.point, *interval(same)] == [0, 0, 0]
-    constant = paired_difference([0.4, 0.4], [0.1, 0.1])
-    assert constant.point == constant.low == constant.high == pytest.approx(0.3)
-
-
-def test_differences_in_the_last_bits_are_none():
-    exact, other = [0.3, 0.6], [0.1 + 0.2, 0.2 + 0.4]
-    assert exact != other
-    assert paired_difference(exact, other).low == 0
-    assert probability_of_improvement(exact[:1], other[:1], seed=0).point == 0.5
-
-
-def test_a_single_pair_decides_nothing():
-    found = paired_difference([3], [1])
-    assert found.point == 2
-    assert not found.has_interval
-    assert np.isnan(paired_difference([NAN], [1]).point)
-
-
-def draws(kind, rng, shape):
-    if kind == "normal":
-        return rng.normal(size=shape)
-    if kind == "skewed":  # a difference of skewed scores is not itself skewed
-        return rng.exponential(size=shape) - rng.exponential(size=shape)
-    return (rng.random(shape) < 0.7).astype(float) - (rng.random(shape) < 0.7)
-
-
-@pytest.mark.parametrize(("kind", "n"), [("normal", 5), ("skewed", 10), ("two peaks", 5)])
-def test_the_interval_of_a_difference_covers(kind, n):
-    differences = draws(kind, np.random.default_rng(1), (1000, n))
-    found = [paired_difference(row, np.zeros(n)) for row in differences]
-    hits = np.mean([one.low <= 0 <= one.high for one in found])
-    # Standard error 0.007; coarse differences of five seeds are tested cautiously.
-    assert 0.93 <= hits <= (0.995 if kind == "two peaks" else 0.98)
+@pytest.mark.parametrize(
+    ("first", "second", "expected", "n_missing"),
+    [
+        # Seeds that one agent lacks do not count.
+        ([1, NAN, 5, np.inf, 8, 7], [0, 3, 2, 1, 3, -np.inf], (3, -1.968, 7.968), 3),
+        ([1, 2, 3], [1, 2, 3], (0, 0, 0), 0),
+        ([0.4, 0.4], [0.1, 0.1], (0.3, 0.3, 0.3), 0),
+        ([0.3, 0.6], [0.1 + 0.2, 0.2 + 0.4], (0, 0, 0), 0),  # in the last bits alone
+        ([3], [1], (2, NAN, NAN), 0),
+        ([NAN], [1], (NAN, NAN, NAN), 1),
+    ],
+)
+def test_differences_by_hand(first, second, expected, n_missing):
+    found = paired_difference(first, second)
+    assert found.n_missing == n_missing
+    assert [found.point, *interval(found)] == pytest.approx(expected, abs=5e-4, nan_ok=True)
 
 
 # --- Holm ----------------------------------------------------------------------------------------
@@ -197,9 +164,7 @@ def test_holm_worked_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]).tolist() == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.9, 0.6]).tolist() == [1, 1]
     assert holm([]).tolist() == []
-
-
-def test_holm_does_not_count_tests_that_were_not_made():
+    # Tests that were not made do not count.
     assert holm([0.02, NAN, 0.01]).tolist() == pytest.approx([0.02, NAN, 0.02], nan_ok=True)
 
 
@@ -221,12 +186,6 @@ NOISE = np.array([-0.3, 0.2, 0.1, -0.2, 0.3, -0.1])
 def verdicts(scores, margin=0.0, **arguments):
     found = compare_pairs(scores, margin, **QUICK, **arguments)
     return {(one.first, one.second): one.verdict for one in found}
-
-
-def test_pairs_come_in_the_order_of_the_mapping():
-    pairs = compare_pairs({"b": [1, 2], "a": [1, 2], "c": [1, 2]}, **QUICK)
-    assert [(one.first, one.second) for one in pairs] == [("b", "a"), ("b", "c"), ("a", "c")]
-    assert compare_pairs({"alone": [1, 2]}, **QUICK) == []
 
 
 def test_each_verdict():
@@ -273,16 +232,12 @@ def test_the_typical_run_is_another_question_than_the_mean():
     assert one.mean.point > 0
 
 
-def test_many_pairs_ask_for_more():
+def test_many_pairs_and_later_looks_ask_for_more():
     first, second = np.arange(6) + 4.5, np.arange(6.0)
     (alone,) = compare_pairs({"x": first, "y": second}, **QUICK)
-    assert alone.verdict == "better"
     crowd = {name: second + 0.01 * k for k, name in enumerate("abcde")}
     among = compare_pairs({"x": first, "y": second, **crowd}, **QUICK)[0]
     assert among.mean.seen_low < alone.mean.seen_low
-
-
-def test_later_looks_ask_for_more():
     scores = {"x": np.arange(6) + 3.5, "y": np.arange(6.0)}
     pair = ("x", "y")
     assert verdicts(scores)[pair] == "better"
@@ -386,3 +341,308 @@ def test_scores_that_do_not_pair_up_are_refused():
         probability_of_improvement([1, 2], [1, 2, 3], seed=0)
     with pytest.raises(ValueError, match="do not pair up"):
         paired_difference([1, 2], [1, 2, 3])
+
+
+# === rank-sum tests ===============================================================================
+
+
+FEW_SCORES = st.lists(st.integers(0, 3), min_size=2, max_size=5)
+
+
+@given(FEW_SCORES, FEW_SCORES)
+def test_the_rank_sum_test_counts_every_split(first, second):
+    pooled = stats.rankdata([*first, *second])
+    sums = [sum(pooled[list(rows)]) for rows in combinations(range(len(pooled)), len(first))]
+    expected = np.mean(np.array(sums) >= pooled[: len(first)].sum())
+    found = rank_sum_p_value(np.array(first, float), np.array(second, float))
+    assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("n", "m"), [(5, 5), (4, 9), (20, 20)])
+def test_without_ties_it_is_scipys(n, m):
+    rng = np.random.default_rng(n)
+    first, second = rng.normal(size=n) + 0.5, rng.normal(size=m)
+    expected = stats.mannwhitneyu(first, second, alternative="greater", method="exact").pvalue
+    assert rank_sum_p_value(first, second) == pytest.approx(expected)
+
+
+def test_many_scores_with_ties_are_tested_as_counted_ones():
+    # Fisher's exact test is the rank-sum test of scores that are 0 or 1.
+    first, second = np.repeat([0.0, 1.0], [2, 28]), np.repeat([0.0, 1.0], [10, 20])
+    exact = stats.fisher_exact([[28, 2], [20, 10]], alternative="greater").pvalue
+    assert rank_sum_p_value(first, second) == pytest.approx(exact, rel=0.2)
+    assert rank_sum_p_value(np.ones(40), np.ones(40)) == 1
+
+
+def test_scores_that_differ_in_the_last_bits_are_equal():
+    assert wins_of(np.array([0.3]), np.array([0.1 + 0.2])).item() == 0.5
+    assert rank_sum_p_value(np.full(9, 0.1 + 0.2), np.full(9, 0.3)) == 1
+
+
+def test_a_share_of_won_pairs_is_no_surer_than_a_sign_test():
+    steady, erratic = np.zeros(7), np.array([1.0, 1, 1, 1, 1, 1, -1])
+    # Six of seven: (7 + 1) / 2**7.
+    assert share_p_value(erratic, steady) == pytest.approx(8 / 128)
+    assert share_p_value(np.ones(7), steady) == pytest.approx(1 / 128)
+    assert share_p_value(steady, erratic) == 1
+    # Nearly always is no surer than always.
+    nearly = np.array([0.0, 1, 2, 3, 4, 5.5]), np.array([5.0, 6, 7, 8, 9, 10])
+    assert share_p_value(*reversed(nearly)) == 1 / 2**6
+    # The rank-sum test alone would be surer.
+    assert 2 * rank_sum_p_value(erratic, steady) < 0.05 < apart_p_value(erratic, steady)
+
+
+def test_the_larger_of_two_p_values_counts():
+    rng = np.random.default_rng(0)
+    first, second = rng.normal([[0.8], [0]], 1, size=(2, 12))
+    both = rank_sum_p_value(first, second), share_p_value(first, second)
+    assert ahead_p_value(first, second) == max(both)
+    assert apart_p_value(first, second) == apart_p_value(second, first) == 2 * max(both)
+    sides = ahead_p_value(first + 2, second), ahead_p_value(second + 2, first)
+    assert equivalent_p_value(first, second, 2.0) == max(sides)
+    assert np.isnan(ahead_p_value(first, second[:0]))
+
+
+def test_the_interval_of_a_median_of_differences_worked_by_hand():
+    # Two-sided 0.05 leaves out two of the 25 on each side: 2 (1 + 1) / 252, (1 + 1 + 2) is 0.032.
+    assert interval_places(5, 5, 0.05) == (2, 22)
+    assert interval_places(4, 4, 0.05) is None
+
+
+@pytest.mark.parametrize("n", [8, 30])
+def test_the_interval_of_a_median_of_differences_covers(n):
+    rng = np.random.default_rng(n)
+    pairs = rng.exponential(size=(2000, 2, n))
+    apart = np.sort([np.subtract.outer(*pair).ravel() for pair in pairs])
+    low, high = apart[:, interval_places(n, n, 0.05)].T
+    # Standard error 0.5 %; steps of the exact test make it a little cautious.
+    assert 0.025 < ((low > 0) | (high < 0)).mean() < 0.065
+
+
+def test_looks_spend_no_more_than_there_is():
+    spent = [level_of_look(0.05, look) for look in range(1, 1000)]
+    assert 0.0499 < sum(spent) < 0.05
+    assert spent == sorted(spent, reverse=True)
+    assert sum(level_of_look(0.05, look, 5) for look in range(1, 6)) == pytest.approx(0.05)
+
+
+# --- error rates ---------------------------------------------------------------------------------
+
+STUDIES = 500
+TYPICAL_LEVEL = 0.5  # of which a tenth is for typical runs
+# A right test at 5 % exceeds this in one of 10,000 such checks.
+MOST_WRONG = stats.binom.isf(1e-4, STUDIES, 0.05) / STUDIES
+
+
+WORLDS = {
+    "log-normal": lambda rng, shape: rng.lognormal(size=shape),
+    "tied": lambda rng, shape: rng.choice([0.0, 0.5, 1.0], size=shape, p=[0.2, 0.2, 0.6]),
+    "a steady agent beside one around it": lambda rng, shape: (
+        np.array([[0.0], [1.0]]) * rng.choice([-1.0, 1.0], size=shape)
+    ),
+}
+
+
+@pytest.mark.parametrize("n", [5, 12])
+@pytest.mark.parametrize("world", WORLDS)
+def test_agents_are_rarely_told_apart_or_called_equal_wrongly(world, n):
+    rng, apart, equal = np.random.default_rng(0), 0, 0
+    for _ in range(STUDIES):
+        x, y = WORLDS[world](rng, (2, n))
+        apart += judge_pairs({"x": x, "y": y}, 0.0, TYPICAL_LEVEL)["x", "y"].typical in (
+            "better",
+            "worse",
+        )
+        moved = {"x": x, "y": y + 1}
+        equal += judge_pairs(moved, 1 - 1e-9, TYPICAL_LEVEL)["x", "y"].typical == "equivalent"
+    assert max(apart, equal) / STUDIES <= MOST_WRONG
+
+
+# === claims about expected scores =================================================================
+
+
+UNIT = Ends(0.0, 1.0)
+SCORES = arrays(float, st.integers(5, 12), elements=st.floats(0, 1, width=16))
+
+
+def normal_scores(n, mean=0.6, deviation=0.06):
+    """The quantiles of a normal law: a sample that is what is expected of one."""
+    z = stats.norm.ppf((np.arange(n) + 0.5) / n)
+    return mean + deviation * z / z.std(ddof=1)
+
+
+A, B = np.array([0.9, 0.8, 0.95, 0.7, 0.85]), np.array([0.6, 0.75, 0.5, 0.65, 0.72])
+
+
+def test_welchs_test_is_scipys():
+    expected = stats.ttest_ind(A, B, equal_var=False, alternative="greater").pvalue
+    assert welch_p_value(A, B) == pytest.approx(expected)
+
+
+def test_all_ways_to_deal_out_ten_scores_are_counted():
+    pooled, statistic = np.concatenate([A, B]), []
+    for first in combinations(range(10), 5):
+        x, y = pooled[list(first)], np.delete(pooled, first)
+        spread = x.var(ddof=1) / 5 + y.var(ddof=1) / 5
+        statistic.append((x.mean() - y.mean()) / np.sqrt(spread))
+    share = np.mean(np.array(statistic) >= statistic[0] - 1e-9)
+    assert permutation_p_value(A, B) == pytest.approx(share)
+
+
+def test_runs_that_share_their_seeds_are_held_against_each_other():
+    apart = A - B
+    flips = np.array([np.dot(signs, apart) for signs in product((1, -1), repeat=5)])
+    expected = stats.ttest_rel(A, B, alternative="greater").pvalue
+    assert paired_p_value(A, B) == pytest.approx(max(expected, np.mean(flips >= flips[0])))
+
+
+@pytest.mark.parametrize("n", [5, 10, 50])
+@pytest.mark.parametrize("share", [0, 0.2, 0.5, 1])
+def test_of_zeros_and_ones_the_interval_is_that_of_clopper_and_pearson(n, share):
+    n_ones = round(share * n)
+    scores = np.repeat([1.0, 0.0], [n_ones, n - n_ones])
+    low = stats.beta.ppf(0.025, n_ones, n - n_ones + 1) if n_ones else 0.0
+    high = stats.beta.isf(0.025, n_ones + 1, n - n_ones) if n_ones < n else 1.0
+    # The quantiles come from 4,000 draws.
+    assert mean_interval(scores, 0.05) == pytest.approx((low, high), abs=0.02)
+
+
+def test_what_does_not_depend_on_chance_has_no_interval():
+    assert mean_interval([0.8] * 5, 0.05, exact=True) == pytest.approx((0.8, 0.8))
+
+
+@given(SCORES, SCORES, st.sampled_from([0.05, 0.01]))
+def test_intervals_say_what_the_tests_say(first, second, level):
+    found, said = compare_means(first, second, level), judge_means(first, second, level)
+    seen = min(seen_p_value(first, second), seen_p_value(second, first))
+    sure = min(ahead_on_average(first, second), ahead_on_average(second, first))
+    assert (said.verdict != "undecided") == (seen <= level / 2)
+    if said.verdict != "undecided" and abs(sure - level / 2) > 0.1 * level:
+        assert said.is_conditional == (sure > level / 2)
+    by_interval = {"better": found.seen_low > -1e-4, "worse": found.seen_high < 1e-4}
+    assert by_interval.get(said.verdict, found.seen_low <= 1e-4 <= found.seen_high + 2e-4)
+    assert found.low <= found.seen_low <= found.seen_high <= found.high
+    assert found.low <= found.point + 1e-9
+    assert found.point <= found.high + 1e-9
+
+
+@given(SCORES, SCORES)
+def test_it_does_not_matter_who_stands_first(first, second):
+    one, other = compare_means(first, second, 0.05), compare_means(second, first, 0.05).swapped()
+    said = judge_means(first, second, 0.05, margin=0.02)
+    assert said == judge_means(second, first, 0.05, margin=0.02).swapped()
+    assert (one.low, one.high) == pytest.approx((other.low, other.high), abs=1e-4)
+
+
+CASES = {
+    # name: scores of two agents, the verdict on the first, and whether it has a condition
+    "far apart": ([0.95, 0.94, 0.96, 0.95, 0.95], [0.2, 0.25, 0.22, 0.2, 0.2], "better", False),
+    "three seeds": ([0.95, 0.94, 0.96], [0.2, 0.25, 0.22], "undecided", False),
+    "a standard deviation apart": (
+        normal_scores(20, 0.66),
+        normal_scores(20),
+        "better",
+        True,
+    ),
+    "steady, and one of ten fails": (
+        normal_scores(10, 0.95, 0.01),
+        [*normal_scores(9, 0.9856, 0.004), 0],
+        "undecided",
+        False,
+    ),
+    "none against three of ten": ([0.95] * 10, [0.95] * 7 + [0.0] * 3, "undecided", False),
+    "a fair coin that fell on one side": ([1.0] * 5, [0.5] * 5, "better", True),
+    "all alike": ([0.86] * 5, [0.86] * 5, "equivalent", True),
+    "the same at 200 seeds": (
+        normal_scores(200, 0.95, 0.01),
+        normal_scores(200, 0.95, 0.01),
+        "equivalent",
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_said_of_two_agents(case):
+    first, second, verdict, is_conditional = CASES[case]
+    said = judge_means(first, second, 0.05, margin=0.02)
+    assert (said.verdict, said.is_conditional) == (verdict, is_conditional)
+
+
+def test_a_claim_with_a_condition_turns_round_where_that_share_lies_outside():
+    x, y = normal_scores(20, 0.66), normal_scores(20)
+    found = compare_means(x, y, 0.05)
+    q = found.most_outside
+    worst = (1 - q) * x.mean() + q * 0, (1 - q) * y.mean() + q * 1
+    assert worst[0] - worst[1] == pytest.approx(x.mean() - y.mean() - found.seen_low)
+
+
+def test_the_best_is_told_from_each_other_without_a_price_for_their_number():
+    best, others = np.full(10, 0.97), [np.full(10, score) for score in (0.4, 0.3, 0.2)]
+    best, *others = (each + normal_scores(10, 0, 0.01) for each in (best, *others))
+    assert rank_by_mean([best, *others], 0.05) >= 1
+    assert rank_by_mean([best, best, *others], 0.05) == 0
+    judged = judge_pairs(dict(zip("abcd", [best, *others], strict=True)), 0.02, 0.05, ends=UNIT)
+    assert {judged["a", other].mean.verdict for other in "bcd"} == {"better"}
+    assert not any(judged["a", other].mean.is_conditional for other in "bcd")
+
+
+def test_who_is_best_may_have_a_condition_too():
+    # So far ahead that it shows against each, if not against all pairs at once, nor with the guard.
+    best, others = normal_scores(10, 0.66), [normal_scores(10, mean) for mean in (0.58, 0.579)]
+    scores = dict(zip("abc", [best, *others], strict=True))
+    assert rank_by_mean([*scores.values()], 0.02) == 0
+    assert rank_by_mean([*scores.values()], 0.02, seen_only=True) == 1
+    for pair in compare_pairs(scores, ends=(0, 1), seed=0)[:2]:
+        assert judge_means(best, scores[pair.second], 0.05 / 3) == MeanVerdict("better", True)
+        assert pair.said == MeanVerdict("better", True)
+        assert 0 < pair.mean.seen_low < 0.08 < pair.mean.seen_high
+        assert pair.mean.most_outside > 0
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ([1.0] * 9 + [0.9], MeanVerdict("better")),
+        ([1.0] * 9 + [1 - 1e-12], MeanVerdict("equivalent", True)),
+        ([1.0] * 4, MeanVerdict("undecided")),
+    ],
+)
+def test_who_always_has_the_most_there_is_is_ahead_of_whoever_once_had_less(other, said):
+    most = np.ones(len(other))
+    assert judge_means(most, other, 0.05, margin=0.02, exact=(True, False)) == said
+    assert judge_means(other, most, 0.05, margin=0.02, exact=(False, True)) == said.swapped()
+    # The same from below, where an agent always has the least.
+    least, other = 1 - most, 1 - np.array(other)
+    assert judge_means(other, least, 0.05, margin=0.02, exact=(False, True)) == said
+    # Of one that only had the most so far nothing is known.
+    assert judge_means(most, 1 - other, 0.05, margin=0.0).verdict == "undecided"
+
+
+@given(st.lists(SCORES, min_size=3, max_size=5), st.floats(0.01, 0.2))
+def test_better_has_no_circles(runs, level):
+    n = min(map(len, runs))
+    scores = {str(k): each[:n] for k, each in enumerate(runs)}
+    judged = judge_pairs(scores, 0.0, level, ends=UNIT)
+    said = {pair: each.mean for pair, each in judged.items()}
+    said |= {(b, a): mean.swapped() for (a, b), mean in said.items()}
+    better = {pair for pair, mean in said.items() if mean.verdict == "better"}
+    assert all(scores[a].mean() > scores[b].mean() for a, b in better)
+    sure = {pair for pair in better if not said[pair].is_conditional}
+    assert all((a, d) in sure for a, b in sure for c, d in sure if b == c)
+
+
+def test_few_seeds_claim_nothing():
+    assert fewest_seeds(0.045) == 5
+    assert fewest_seeds(0.045, n_pairs=45) == 7
+    needed = seeds_needed(np.array([0.95, 0.94, 0.96]), np.array([0.2, 0.25, 0.22]), 0.05)
+    assert needed == 5
+
+
+def test_a_fair_coin_beside_its_middle_is_called_ahead_only_with_a_condition():
+    """Two in 32 studies of five seeds see one side of it alone."""
+    for side in (0.0, 1.0):
+        scores = {"steady": np.full(5, 0.5), "coin": np.full(5, side)}
+        mean = judge_pairs(scores, 0, 0.045, ends=UNIT)["steady", "coin"].mean
+        assert mean.verdict in ("better", "worse")
+        assert mean.is_conditional

@@ -77,13 +77,6 @@ def test_who_is_told_from_all_others_gets_no_more_seeds():
     assert [each.mean.verdict for each in last.judged.values()] == ["better", "better", "undecided"]
 
 
-def test_agents_without_chance_are_decided_at_once_and_need_no_seed_more():
-    scores = {"plan": np.ones(6), "optimal": np.ones(6)}
-    found = grow(scores, SIZES, 0.0, LEVEL, certain=("plan", "optimal"))
-    assert found.judged["plan", "optimal"].mean.verdict == "equivalent"
-    assert (found.is_done, found.n_looks) == (True, 1)
-
-
 def test_an_agent_whose_runs_fail_makes_nobody_grow():
     scores = {"fails": np.full(6, np.nan), "runs": np.arange(6.0)}
     found = grow(scores, SIZES, 0.0, LEVEL)
