@@ -38,8 +38,8 @@ FEWEST_TO_TELL = 10
 class Evaluation:
     """The result of an evaluation: sampled episodes, or their exact expectation."""
 
-    # undiscounted return of each episode, shape (n_episodes,); if exact, the expected return,
-    # shape (1,)
+    # undiscounted return of each episode, shape (n_episodes,);
+    # if exact, the expected return, of shape (1,)
     returns: Floats
     lengths: NDArray[np.floating[Any] | np.integer[Any]]  # number of steps, likewise
     # whether each episode succeeded, or the probability of success, likewise; None if the
