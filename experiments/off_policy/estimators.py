@@ -273,7 +273,7 @@ def difference_in_value(
         first: the terms of one policy.
         second: the terms of the other, on the same log.
         n_comparisons: the number of comparisons; the intervals of all of them hold
-        simultaneously with 95 %.
+            simultaneously with 95 %.
     """
     confidence = 1 - 0.05 / n_comparisons
     found = paired_difference(first.doubly_robust, second.doubly_robust, confidence)
