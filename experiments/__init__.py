@@ -1,1 +1,1 @@
-"""Studies: agents on environments over seeds, from a file or flags to what came out."""
+"""Studies: agents on environments over seeds, from a file or flags to the results."""

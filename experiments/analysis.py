@@ -1,7 +1,7 @@
-"""From the runs of a study to judgements: estimates with intervals, verdicts on pairs, ranks.
+"""Analyses the runs of a study: estimates with intervals, verdicts on pairs, ranks.
 
-Beside typical scores it says who failed, who arrived when, and what the agents of failed runs do
-instead.
+Besides typical scores it reports failed runs, the time to the threshold, and what the agents of
+failed runs do instead of their task.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ from verdicts import (
     summarise_steps,
 )
 
-# Of the metrics, those on the scale of the best random or constant policy.
+# The metrics on the scale of the best random or constant policy.
 ON_THE_SCALE = ("final", "best")
 
-# Where the agents live whose policies do not depend on what they go through.
+# The module of agents whose policies do not depend on experience.
 FIXED_POLICIES = ("agents.planning:", "agents.reference:")
 
 
 def agents_without_chance(results: StudyResults, table: pd.DataFrame) -> frozenset[str]:
-    """The agents that do not learn, where policies are evaluated exactly: every run is the same."""
+    """The agents that do not learn, if policies are evaluated exactly: all their runs are equal."""
     if not (table["exact"] == True).all():  # noqa: E712  # None is no False here
         return frozenset()
     return frozenset(
@@ -81,10 +81,10 @@ def failures(
     level: float,
     certain: Collection[str],
 ) -> dict[str, FailureCount]:
-    """By agent that depends on chance, the runs that get less than half as far as the best do.
+    """Failed runs by agent that depends on chance: less than half as far as the best agent.
 
-    Both counted from the baseline. The bounds of all agents hold together. Nothing where the
-    baseline is not known.
+    Both distances count from the baseline. The bounds of all agents hold simultaneously. Empty if
+    the baseline is not known.
     """
     by_chance = {name: values for name, values in scores.items() if name not in certain}
     if metric not in ON_THE_SCALE or baseline is None or not by_chance:
@@ -103,7 +103,7 @@ def failures(
 def speeds(
     results: StudyResults, environment: str, agents: Sequence[str], level: float
 ) -> tuple[SpeedComparison, ...]:
-    """Which agents come to stay above the threshold sooner than others."""
+    """Compares how soon agents reach the threshold for good."""
     curves = results.curves
     chosen = (curves["environment"] == environment) & (curves["kind"] == "evaluation")
     spans = [
@@ -117,51 +117,51 @@ def speeds(
     return tuple(compare_speed({name: steps[name] for name in agents}, spacing, level))
 
 
-# --- What the verdicts on an environment rest on.
+# --- The evidence for verdicts on an environment.
 
 UNIT = Ends(0.0, 1.0)  # of scores
-MARGIN = 0.02  # of the way from the best random or constant policy to the optimum
+MARGIN = 0.02  # of the gap between the best random or constant policy and the optimum
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What verdicts on an environment rest on."""
+    """The evidence for verdicts on an environment."""
 
     environment: str  #: its label
-    #: By agent, the higher the better, shape (n_seeds,): NaN where there is no run.
+    #: By agent, higher is better, shape (n_seeds,): NaN for a missing run.
     scores: Mapping[str, Floats]
-    seeds: Mapping[str, int]  #: by agent, how many of the seeds it was to have
-    #: The highest expected return that any policy has, or of a bracket what none exceeds; or None.
+    seeds: Mapping[str, int]  #: by agent, the planned number of seeds
+    #: The highest expected return of any policy, or the upper end of its bracket; or None.
     optimum: float | None
-    optimum_at_least: float | None  #: the lower end of that bracket; None where there is none
+    optimum_at_least: float | None  #: the lower end of that bracket; None without a bracket
     baseline: float | None  #: that of the best random or constant policy, or None
     threshold: float | None  #: the return that counts as solved, or None
     margin: float  #: the difference within which agents count as equivalent
     certain: frozenset[str]  #: the agents that do not depend on chance
-    #: Between which means are judged: the best random or constant policy and the optimum, where the
-    #: verdicts are about that and it is known; else beyond all runs there are.
+    #: The range in which means are judged: from the best random or constant policy to the optimum,
+    #: if the verdicts use this scale and it is known; else a range beyond all runs.
     ends: Ends
-    is_score: bool  #: whether these are the ends of the score
+    is_score: bool  #: whether these ends define the score
     paired: bool  #: whether runs of one seed share their randomness
     n_environments: int  #: of the study, which share its error rate
 
     def share(self, level: float) -> float:
-        """What of the error rate of a look is for this environment."""
+        """This environment's share of a look's error rate."""
         return level_of_environment(level, self.n_environments)
 
     @property
     def given(self) -> dict[str, Floats]:
-        """The scores by agent, as many as it has seeds."""
+        """The scores by agent, one for each of its seeds."""
         return {name: values[: self.seeds[name]] for name, values in self.scores.items()}
 
     def fewest(self, level: float) -> int:
-        """With how few seeds anything can be said of any two agents at a look of this level."""
+        """The smallest number of seeds that can decide any pair at a look of this level."""
         there = sum(bool(np.isfinite(values).any()) for values in self.scores.values())
         return fewest_seeds(self.share(level), 2 if there > 2 else 1)
 
 
 def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
-    """What there is on an environment; None where no run has finished."""
+    """Collect the evidence on an environment; None if no run has finished."""
     study, table = results.study, results.summary
     table = table[table["environment"] == environment]
     if table.empty:
@@ -208,9 +208,9 @@ def _first(table: pd.DataFrame, column: str) -> float | None:
 
 
 def bounded_mean(values: Floats, ends: Ends, *, exact: bool = False) -> Estimate:
-    """The mean of scores or returns, with the interval that holds for every law between two ends.
+    """The mean of scores or returns, with an interval valid for every distribution in a range.
 
-    Where a run lies beyond an end, a few others may lie anywhere: then there is no interval.
+    If a run lies outside the range, further runs may lie anywhere: then there is no interval.
     """
     known = values[np.isfinite(values)]
     n_missing = len(values) - len(known)
@@ -233,21 +233,21 @@ def bounded_mean(values: Floats, ends: Ends, *, exact: bool = False) -> Estimate
 
 @dataclass(frozen=True)
 class OverallAnalysis:
-    """How the agents compare over all environments, by their scores."""
+    """The comparison of agents over all environments, by their scores."""
 
     scores: Mapping[str, Summary]  #: estimates by agent, the best first
-    #: By two agents' labels, the probability that the first scores higher.
+    #: By the labels of two agents, the probability that the first scores higher.
     improvement: Mapping[tuple[str, str], Estimate]
-    #: Every two agents, the better ranked first, by the means of their scores over environments.
+    #: All pairs, better ranked agent first, by the means of their scores over environments.
     pairs: tuple[PairComparison, ...]
-    thresholds: Floats  #: scores at which the profiles are given, shape (n,)
-    profiles: Mapping[str, Band]  #: by agent, the share of runs that score higher than each of them
+    thresholds: Floats  #: the scores of the profiles, shape (n,)
+    profiles: Mapping[str, Band]  #: by agent, the share of runs above each of these scores
 
 
 def analyse_overall(results: StudyResults, look: Standing | None = None) -> OverallAnalysis | None:
-    """Judge the agents over all environments; None for a single one, or without scores.
+    """Compare the agents over all environments; None for a single one, or without scores.
 
-    A seed counts by its mean score over all environments, so that each of them weighs the same.
+    Each seed has its mean score over all environments, so that environments have equal weights.
     """
     study = results.study
     labels = [environment.label for environment in study.environments]
@@ -298,7 +298,7 @@ def analyse_overall(results: StudyResults, look: Standing | None = None) -> Over
 
 
 def _improvement(scores: Mapping[str, Floats]) -> dict[tuple[str, str], Estimate]:
-    """How probable it is that one agent scores higher than another, seen from both sides."""
+    """The probability that one agent scores higher than another, for both orders of each pair."""
     found = {}
     for one, two in combinations(scores, 2):
         chance = probability_of_improvement(scores[one], scores[two], seed=RESAMPLING_SEED)
@@ -310,9 +310,9 @@ def _improvement(scores: Mapping[str, Floats]) -> dict[tuple[str, str], Estimate
 
 
 def not_behind(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[str]:
-    """The agents that none is shown to be better than, without a condition.
+    """The agents to which no other agent is shown to be superior, without a condition.
 
-    Each of the others is behind one of them.
+    Each other agent is behind one of these.
     """
     behind = {
         p.second if p.verdict == "better" else p.first
@@ -323,7 +323,7 @@ def not_behind(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[st
 
 
 def shown_best(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[str]:
-    """The agent that is shown to be ahead of all others, or several such that are equal."""
+    """The agent that is shown to be ahead of all others, or several equivalent ones."""
     ahead = not_behind(names, pairs)
     among = [pair for pair in pairs if {pair.first, pair.second} <= set(ahead)]
     are_equal = all(pair.said == MeanVerdict("equivalent") for pair in among)
@@ -332,83 +332,83 @@ def shown_best(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[st
 
 # --- Each environment.
 
-# Of agents that were trained on a changed environment.
+# The mark of agents that were trained on a changed environment.
 MARK = "†"
 
 
 @dataclass(frozen=True)
 class AgentAnalysis:
-    """How one agent did on one environment."""
+    """The results of one agent on one environment."""
 
     agent: str  #: its label
     algo: str  #: its name in the table of agents
-    judged: Estimate  #: its mean score between the ends on which means are judged
-    spread: float  #: the standard deviation over runs of these scores, or else of the metric
-    n_runs: int  #: runs that finished
-    n_missing: int  #: runs that did not
-    metric: Summary  #: estimates of what the verdicts are about, over seeds
-    #: The same of the final policy between the best random or constant policy (0) and the optimum
-    #: (1); None where those are not known.
+    judged: Estimate  #: its mean score in the range in which means are judged
+    spread: float  #: the standard deviation of these scores over runs, or else of the metric
+    n_runs: int  #: finished runs
+    n_missing: int  #: unfinished runs
+    metric: Summary  #: estimates of the metric of the verdicts, over seeds
+    #: Estimates of the final policy's score: 0 is the best random or constant policy, 1 the
+    #: optimum; None if these are not known.
     score: Summary | None
     final: Estimate  #: mean return of the final policy
     area: Estimate  #: mean return over the learning curve
     last_episodes: Estimate  #: mean return of the last training episodes
-    regret: Estimate  #: on bandits, the sum over all pulls; else without a figure
+    regret: Estimate  #: on bandits, the sum over all pulls; else NaN
     #: When the learning curve first reached the threshold; None without one.
     steps_to_threshold: ThresholdSummary | None
     episodes_to_stay: ThresholdSummary | None  #: likewise
-    success_rate: Estimate | None  #: of the final policy; None where the environment does not say
-    #: Processor time that training took; nan where older versions did not measure it.
+    success_rate: Estimate | None  #: of the final policy; None if not reported
+    #: Processor time of training; nan for runs of older versions, which did not measure it.
     seconds: Estimate
-    #: Whether it was trained on a variant of the environment, whose returns are not to be held
-    #: against those of evaluations or the optimum.
+    #: Whether it was trained on a variant of the environment, whose returns cannot be compared
+    #: with those of evaluations or the optimum.
     on_variant: bool = False
-    #: What training changed in the environment, as the runs recorded it, in words.
+    #: Training's changes of the environment in words, as the runs recorded them.
     changes: tuple[str, ...] = ()
     #: When it reached the threshold for good; likewise.
     steps_to_stay: ThresholdSummary | None = None
 
     @property
     def marked(self) -> str:
-        """The label, with a mark where the training was on a changed environment."""
+        """The label, with a mark if the agent was trained on a changed environment."""
         return f"{self.agent} {MARK}" if self.changes else self.agent
 
 
 @dataclass(frozen=True)
 class EnvironmentAnalysis:
-    """How the agents compare on one environment."""
+    """The comparison of agents on one environment."""
 
     environment: str  #: its label
     env_id: str  #: its Gymnasium id
-    #: The highest expected return that any policy has, or of a bracket what none exceeds; or None.
+    #: The highest expected return of any policy, or the upper end of its bracket; or None.
     optimum: float | None
     baseline: float | None  #: that of the best random or constant policy, or None
     threshold: float | None  #: the return that counts as solved, or None
     margin: float  #: the difference within which agents count as equivalent
-    exact: bool  #: whether all final returns are expectations rather than means of episodes
+    exact: bool  #: whether all final returns are exact expectations, not means of episodes
     agents: tuple[AgentAnalysis, ...]  #: the agents, the best first
-    pairs: tuple[PairComparison, ...]  #: every two of them, the better ranked first
-    #: By agent, also those of which no run has finished, the runs that are not there.
+    pairs: tuple[PairComparison, ...]  #: all pairs, better ranked agent first
+    #: Missing runs by agent, including agents without a finished run.
     missing: Mapping[str, int] = field(default_factory=dict)
-    fewest: int = FEWEST_SEEDS  #: with how few seeds any two agents can be told apart
-    #: By agent, the runs that failed; empty where nothing says what that is.
+    fewest: int = FEWEST_SEEDS  #: the smallest number of seeds that can decide a pair
+    #: Failed runs by agent; empty if failure is not defined here.
     failures: Mapping[str, FailureCount] = field(default_factory=dict)
-    #: The pairs of agents of which the first is shown to fail more often.
+    #: The pairs in which the first agent is shown to fail more often.
     unreliable: tuple[tuple[str, str], ...] = ()
-    #: Every two agents, as to which of them stays above the threshold sooner.
+    #: All pairs, compared by how soon they stay above the threshold.
     speeds: tuple[SpeedComparison, ...] = ()
-    #: By agent, how many seeds it was to have.
+    #: By agent, its planned number of seeds.
     seeds: Mapping[str, int] = field(default_factory=dict)
-    look: Standing = field(default_factory=Standing)  #: which look at these runs it is
-    #: The lower end of the optimum's bracket; None where there is none.
+    look: Standing = field(default_factory=Standing)  #: the look at these runs
+    #: The lower end of the optimum's bracket; None without a bracket.
     optimum_at_least: float | None = None
-    #: By agent, where agents play environments whose optima differ; else empty.
+    #: The optima by agent, if agents play environments with different optima; else empty.
     optima: Mapping[str, float] = field(default_factory=dict)
     advice: tuple[str, ...] = ()  #: sentences on runs that failed, see `experiments.analysis`
-    ends: Ends = UNIT  #: between which means are judged
-    is_score: bool = True  #: whether these are the ends of the score
+    ends: Ends = UNIT  #: the range in which means are judged
+    is_score: bool = True  #: whether these ends define the score
     is_same: bool = False  #: whether all runs of all agents have the same figure
-    #: The agents whose final returns are, by six standard errors, above what no policy exceeds.
+    #: The agents whose final returns exceed the upper bound of all policies by six standard errors.
     impossible: tuple[str, ...] = ()
 
     @property
@@ -419,28 +419,28 @@ class EnvironmentAnalysis:
 
 @dataclass(frozen=True)
 class StudyAnalysis:
-    """What a study has shown."""
+    """The analysis of a study."""
 
     results: StudyResults  #: the runs
     environments: tuple[EnvironmentAnalysis, ...]  #: by environment
-    #: Over all of them; None for a single one, or where a score is not known.
+    #: Over all environments; None for a single one, or if a score is not known.
     overall: OverallAnalysis | None
 
     @property
     def study(self) -> StudySpec:
-        """What was asked for."""
+        """The study's specification."""
         return self.results.study
 
 
 def analyse(
     results: StudyResults, tell: Tell = tell_nobody, looks: Mapping[str, Standing] | None = None
 ) -> StudyAnalysis:
-    """Judge the runs of a study.
+    """Analyse the runs of a study.
 
     Args:
         results: the runs.
-        tell: told how far it is.
-        looks: by environment, which look at its runs this is; the first, where it is not said.
+        tell: receives the progress.
+        looks: by environment, the current look at its runs; by default the first look.
     """
     environments = []
     for environment in results.study.environments:
@@ -468,13 +468,13 @@ def _analyse_environment(
     agents = [_analyse_agent(results, evidence, *each) for each in evidence.seeds.items()]
     missing = {agent.agent: agent.n_missing for agent in agents}
     agents = [agent for agent in agents if agent.n_runs]
-    last = -np.inf  # those without a figure
+    last = -np.inf  # agents without a figure
     agents.sort(key=lambda a: last if np.isnan(a.judged.point) else a.judged.point, reverse=True)
     names = [agent.agent for agent in agents]
     scores = {name: evidence.scores[name] for name in names}
     failed = failures(study.metric, scores, evidence.baseline, level, evidence.certain)
     fewest = evidence.fewest(look.level)
-    # Of agents with fewer runs nothing is claimed.
+    # No claim is made about agents with fewer runs.
     enough = {name: count for name, count in failed.items() if count.n >= fewest}
     return EnvironmentAnalysis(
         environment=environment,
@@ -516,7 +516,7 @@ def _impossible(evidence: Evidence, table: pd.DataFrame) -> tuple[str, ...]:
 
 
 def _are_alike(scores: Mapping[str, Floats]) -> bool:
-    """Whether there are runs of two agents or more, and all have the same figure."""
+    """Whether two or more agents have runs, and all runs have the same figure."""
     values = [each[np.isfinite(each)] for each in scores.values()]
     if len(values) < 2 or min(map(len, values)) == 0:
         return False
@@ -525,7 +525,7 @@ def _are_alike(scores: Mapping[str, Floats]) -> bool:
 
 
 def _differing_optima(table: pd.DataFrame) -> dict[str, float]:
-    """By agent, the optimum on the first seed, of which maps and arms may depend."""
+    """By agent, the optimum on the first seed, as maps and arms may depend on the seed."""
     known = table[table["seed"] == table["seed"].min()].dropna(subset=["optimum"])
     optima = {str(row["agent"]): float(row["optimum"]) for _, row in known.iterrows()}
     alike = len(optima) < 2 or np.allclose([*optima.values()], next(iter(optima.values())))
@@ -533,7 +533,7 @@ def _differing_optima(table: pd.DataFrame) -> dict[str, float]:
 
 
 def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[PairComparison]:
-    """Every two agents, as judged at this look, or at that of a design which decided them."""
+    """All pairs, judged at this look, or at the look of a design that decided them."""
     scores = {name: evidence.scores[name] for name in names}
     margin, certain = evidence.margin, evidence.certain
     ends, paired = evidence.ends, evidence.paired
@@ -622,20 +622,20 @@ def _analyse_agent(
 
 
 def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:
-    """By the first of its runs: its seeds share their settings."""
+    """The recorded changes of the agent's first run, because all seeds share the settings."""
     of_agent = (r for r in results.finished if r.labels == (agent, environment))
     run = next(of_agent, None)
     return () if run is None else training_changes(TrainSpec.of_data(run.run.read_info()["spec"]))
 
 
-# --- What the agents of failed runs do instead, and what to try first: once for each agent.
+# --- Advice on failed runs, once for each agent.
 
-# Agents of an environment that advice is given on, each of which is loaded and asked.
+# The largest number of agents per environment with advice, because each agent is loaded.
 MOST_TOLD = 4
 
 
 def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
-    """The analysis with sentences on runs that failed, where something can be said of them."""
+    """The analysis with sentences on failed runs, if there is advice."""
     failed = [_failed_runs(analysis.results, one.environment) for one in analysis.environments]
     asked = [runs[0] for several in failed for runs, _ in several[:MOST_TOLD]]
     answers = iter(do_aside(advice_on, asked) if asked else ())
@@ -659,7 +659,7 @@ def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
 
 
 def _failed_runs(results: StudyResults, environment: str) -> list[tuple[list[PlannedRun], int]]:
-    """For each agent with such: its runs that failed, by seed, and how many runs it has."""
+    """For each agent with failed runs: these runs by seed, and its number of runs."""
     table = results.summary[results.summary["environment"] == environment]
     runs = {
         (run.agent, run.seed): run for run in results.finished if run.environment == environment
@@ -667,7 +667,7 @@ def _failed_runs(results: StudyResults, environment: str) -> list[tuple[list[Pla
     found = []
     for agent, rows in table.groupby("agent", sort=False):
         has_failed = rows["score"].astype(float) < FAILED
-        # Such a policy may never end an episode; the advice looks whether it does.
+        # Such a policy may never end an episode; the advice checks this.
         has_failed |= rows["success_rate"].astype(float) < 1 - NEARLY_ALL
         seeds = rows[has_failed & rows["exact"].astype(bool)]["seed"]
         if len(seeds):
@@ -676,7 +676,7 @@ def _failed_runs(results: StudyResults, environment: str) -> list[tuple[list[Pla
 
 
 def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
-    """What the agent of each run does instead, and what to try first; None for nothing to say."""
+    """The advice on the agent of each run; None if there is none."""
     return [_advice_on(run) for run in runs]
 
 

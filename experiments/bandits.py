@@ -1,7 +1,7 @@
-"""Runs on bandits: done as one batch for each agent, and their figures pull by pull.
+"""Does runs on bandits as one batch for each agent, and computes figures pull by pull.
 
-All that reads here raises `DamagedFileError` for a file that is missing, changed, or holds anything
-else.
+Functions that read raise `DamagedFileError` for a file that is missing, changed, or of another
+form.
 """
 
 from __future__ import annotations
@@ -35,40 +35,40 @@ if TYPE_CHECKING:
     from agents.bandits.runs import BatchResult
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-FIRST_PULLS = 100  # kept one by one; of later ones fewer and fewer, `MAX_POINTS` in all
+FIRST_PULLS = 100  # kept one by one; later pulls ever more rarely, `MAX_POINTS` in all
 MAX_POINTS = 300
 
 
 @dataclass(frozen=True)
 class PullStatistics:
-    """Figures over the runs of one agent on one bandit, and the totals of each run.
+    """Statistics over the runs of one agent on one bandit, and the totals of each run.
 
-    Regret is the best expected reward less that of the arm pulled. Simple regret is that of
-    recommending the arm pulled most so far (Bubeck, Munos and Stoltz, 2009), in each context.
+    Regret is the best expected reward minus that of the pulled arm. Simple regret is the regret of
+    recommending the most pulled arm so far (Bubeck, Munos and Stoltz, 2009), in each context.
     """
 
-    # The pulls that the figures are given at, counted from 1.
+    # The pulls of the figures, counted from 1.
     pulls: Annotated[Ints, "points"]
-    reward: Annotated[Floats, "points"]  # mean reward of a pull since the point before
-    optimal: Annotated[Floats, "points"]  # share of those pulls that were of a best arm
+    reward: Annotated[Floats, "points"]  # mean reward of a pull since the previous point
+    optimal: Annotated[Floats, "points"]  # share of best arms among these pulls
     regret: Annotated[Floats, "points"]  # mean regret of those pulls
-    cumulative_regret: Annotated[Floats, "points"]  # mean sum of the regrets up to the point
+    cumulative_regret: Annotated[Floats, "points"]  # mean sum of regrets up to the point
     cumulative_regret_sem: Annotated[Floats, "points"]  # its standard error over runs
     cumulative_regret_quantiles: Annotated[Floats, "5 points"]  # over runs, see `QUANTILES`
     simple_regret: Annotated[Floats, "points"]  # mean over runs
     total_reward: Annotated[Floats, "runs"]
     total_regret: Annotated[Floats, "runs"]
-    shares: Annotated[Floats, "contexts arms"]  # of the pulls that went to each arm, by context
-    # Mean regret of a pull; nan where the arm was never pulled.
+    shares: Annotated[Floats, "contexts arms"]  # share of each arm among the pulls, by context
+    # Mean regret of a pull; nan if the arm was never pulled.
     context_regret: Annotated[Floats, "contexts arms"]
-    # Mean of the final estimates over runs; empty where the agent has none. An agent that sees no
-    # contexts has one row for all of them.
+    # Mean of the final estimates over runs; empty if the agent has no estimates. An agent without
+    # contexts has one row for all.
     estimates: Annotated[Floats, "seen arms_seen"]
     estimates_std: Annotated[Floats, "seen arms_seen"]  # their standard deviation over runs
-    # Of the arms, where all runs have the same; else empty.
+    # Means of the arms, if all runs have the same; else empty.
     true_means: Annotated[Floats, "known arms_known"]
-    moments: Annotated[Ints, "moments"]  # pulls after which posteriors were kept
-    # Of the first run's arms: parameters of Beta distributions, or mean and standard deviation;
+    moments: Annotated[Ints, "moments"]  # pulls after which posteriors were stored
+    # Of the first run's arms: parameters of Beta distributions, or means and standard deviations;
     # else empty.
     posteriors: Annotated[Floats, "kept contexts_kept arms_kept 2"]
 
@@ -80,10 +80,10 @@ class PullStatistics:
 
     @classmethod
     def load(cls, path: Path) -> PullStatistics:
-        """Read what `save` wrote.
+        """Read the file that `save` wrote.
 
         Raises:
-            DamagedFileError: if the file is missing or changed, or holds anything else.
+            DamagedFileError: if the file is missing, changed, or of another form.
         """
         kinds = get_type_hints(cls, include_extras=True)
         shapes = {name: kind.__metadata__[0] for name, kind in kinds.items()}
@@ -96,7 +96,7 @@ class PullStatistics:
 
 
 def points_of(n_pulls: int) -> Ints:
-    """The pulls to give figures at: the first one by one, later ones ever further apart."""
+    """The pulls of the figures: the first ones all, later ones at growing distances."""
     if n_pulls <= MAX_POINTS:
         return np.arange(1, n_pulls + 1)
     first = np.arange(1, FIRST_PULLS + 1)
@@ -116,7 +116,7 @@ def pull_statistics(
     moments: tuple[int, ...] = (),
     posteriors: Floats | None = None,
 ) -> PullStatistics:
-    """Sum up runs; arrays have a row for each run and a column for each pull.
+    """Compute the statistics of runs; arrays have a row for each run and a column for each pull.
 
     Estimates have the shape (n_runs, n_contexts, n_arms), true means (n_contexts, n_arms), and
     posteriors (n_runs, n_moments, n_contexts, n_arms, 2).
@@ -156,7 +156,7 @@ def pull_statistics(
 
 
 def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
-    """Over runs, leaving out nan; nan where no run has a figure."""
+    """Mean and deviation over runs, without nan; nan if no run has a figure."""
     is_known = ~np.isnan(estimates)
     with np.errstate(invalid="ignore"):
         n_known = is_known.sum(axis=0)
@@ -166,16 +166,16 @@ def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
 
 
 def _mean_since_last(by_pull: Floats, points: Ints) -> Floats:
-    """Means over the pulls from one point, not included, to the next."""
+    """Means over the pulls from one point (exclusive) to the next (inclusive)."""
     sums = np.cumsum(by_pull)[points - 1]
     return np.asarray(np.diff(sums, prepend=0.0) / np.diff(points, prepend=0))
 
 
 def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int]) -> Floats:
-    """Mean over runs of what recommending the arm pulled most so far falls short by.
+    """The mean simple regret over runs, for recommending the most pulled arm so far.
 
-    ``cells`` number context and arm, shape (n_runs, n_pulls); ``at`` are pulls counted from 0;
-    ``shape`` holds the numbers of contexts and arms.
+    ``cells`` are combined numbers of context and arm, shape (n_runs, n_pulls); ``at`` are pulls
+    counted from 0; ``shape`` has the numbers of contexts and arms.
     """
     n_runs, rows = len(cells), np.arange(len(cells))
     counts = np.zeros((n_runs, shape[0] * shape[1]))
@@ -190,20 +190,20 @@ def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int
         most = by_context.argmax(axis=2)[..., None]
         n_most = np.take_along_axis(by_context, most, axis=2)[..., 0]
         regret_of_most = np.take_along_axis(sums.reshape(n_runs, *shape), most, axis=2)[..., 0]
-        # Contexts count as often as they were seen.
+        # Contexts are weighted by how often they were seen.
         weights = by_context.sum(axis=2) / (last + 1)
         result[index] = (weights * regret_of_most / np.maximum(n_most, 1)).sum(axis=1).mean()
     return result
 
 
-# --- Results of batches, and of runs of their own.
+# --- Results of batches, and of single runs.
 
 STATISTICS_FILE = "pull_statistics.npz"
-_PULLS = ("arms", "rewards", "regrets")  # what figures are made of, beside contexts
+_PULLS = ("arms", "rewards", "regrets")  # the data of the figures, besides contexts
 
 
 def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStatistics]:
-    """Figures by pull of all runs on bandits."""
+    """Read the figures by pull of all runs on bandits."""
     batches = [run for run in finished if run.is_batch]
     pulls = {run.labels: PullStatistics.load(run.path / STATISTICS_FILE) for run in batches}
     one_by_one: dict[tuple[str, str], list[PlannedRun]] = {}
@@ -216,7 +216,7 @@ def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStat
 
 
 def run_regret(planned: PlannedRun) -> float | None:
-    """The regret of a run of its own, or None where it was on no bandit."""
+    """The regret of a single run, or None if it was not on a bandit."""
     files = planned.run.files
     if not files.matching(PULLS_FILE):
         return None
@@ -227,9 +227,9 @@ def run_regret(planned: PlannedRun) -> float | None:
 
 
 def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
-    """The pulls of a run of its own in the order of time, each of shape (n_pulls,).
+    """Read the pulls of a single run in the order of time, each of shape (n_pulls,).
 
-    Agents that collect whole rollouts go on beyond ``n_timesteps``; that is left out.
+    Agents that collect whole rollouts exceed ``n_timesteps``; the surplus is dropped.
     """
     path = folder / PULLS_FILE
     shapes = dict.fromkeys((*_PULLS, "contexts"), "environments pulls")
@@ -244,7 +244,7 @@ def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
 
 
 def check_pulls(spec: TrainSpec, folder: Path) -> None:
-    """Make sure that what a run pulled is there in the environment of its spec."""
+    """Check that a run's arms and contexts exist in the environment of its spec."""
     pulls = read_run(folder, spec.hyperparams.n_timesteps)
     with closing(make_single_env(spec)) as env:
         bandit: Any = env.unwrapped
@@ -255,7 +255,7 @@ def check_pulls(spec: TrainSpec, folder: Path) -> None:
 
 
 def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
-    """The same for runs that were done one by one, from the pulls in their folders."""
+    """The statistics of single runs, from the pulls in their folders."""
     runs = [read_run(folder, spec.hyperparams.n_timesteps) for folder in folders]
     n_pulls = min(len(run["arms"]) for run in runs)
     stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
@@ -265,7 +265,7 @@ def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
 def _statistics_on(
     spec: TrainSpec, arms: Any, rewards: Any, regrets: Any, contexts: Any, **more: Any
 ) -> PullStatistics:
-    """Figures of pulls on the bandit of a spec, see `pull_statistics`."""
+    """The statistics of pulls on the bandit of a spec, see `pull_statistics`."""
     with closing(make_single_env(spec)) as env:
         bandit: Any = env.unwrapped
         n_arms, n_contexts = bandit.n_arms, max(bandit.n_contexts, 1)
@@ -273,13 +273,13 @@ def _statistics_on(
         more["true_means"] = true_means(env)
     contexts = contexts if n_contexts > 1 else None
     found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
-    # No arm can be recommended where the worth of arms moves, or goes by a vector.
+    # No arm can be recommended if the means drift, or depend on a vector.
     nowhere = np.full_like(found.simple_regret, np.nan)
     return found if is_known else replace(found, simple_regret=nowhere)
 
 
 def true_means(env: gym.Env[Any, Any]) -> Floats | None:
-    """Means of the arms by context, shape (n_contexts, n_arms), where each run has the same."""
+    """Means of the arms by context, shape (n_contexts, n_arms), if all runs have the same."""
     bandit: Any = env.unwrapped
     moves = getattr(bandit, "redraws", False) or _is_drifting(bandit)
     means = getattr(bandit, "means", None)
@@ -294,7 +294,7 @@ def _is_drifting(bandit: Any) -> bool:
 
 
 def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
-    """Do ``n_runs`` runs, from the spec's seed on, and leave their statistics in the run folder."""
+    """Do ``n_runs`` runs, from the spec's seed on, and save their statistics in the run folder."""
     from machine_code import WorkTime
     from machine_code.compiling import compile_timer
 
@@ -328,7 +328,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
 
 
 def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
-    # Imported where runs are done: it takes seconds, and whoever reads results needs nothing of it.
+    # A slow import that only processes with runs need.
     from agents.bandits.runs import run_batch, run_one_by_one
     from agents.compiled.worlds import NotCompilable
     from pipeline.preparation import algorithm_kwargs
@@ -348,7 +348,7 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
 
 
 def _check_rewards(result: BatchResult, first_seed: int) -> None:
-    """Refuse rewards that are not finite, before anything is judged by them."""
+    """Refuse rewards that are not finite."""
     from pipeline.finite_numbers import NotFiniteError, is_finite
 
     for seed, rewards in enumerate(result.rewards, start=first_seed):

@@ -1,12 +1,12 @@
-"""Tasks in processes of their own, so that one that dies takes nothing else with it.
+"""Runs tasks in child processes, so that a crash does not affect other tasks.
 
-`supervise` runs a function in a child process and waits for it; any executor whose workers
-can call it launches a study. Here that is a pool of threads, each with one child at a time. A child
-is a fresh one, or for tasks that may share a process, the one that the thread had before.
+`supervise` runs a function in a child process and waits for it; any executor whose workers can call
+`supervise` can launch a study. This module uses a pool of threads, each with one child at a time. A
+task gets a new child, or if it may share a process, the previous child of the thread.
 
-Children begin on Linux from a server that is forked, and has imported the libraries once. Windows
-cannot fork, and on macOS a process that has used its libraries should not: there each child begins
-anew, and imports for some seconds.
+On Linux, children are forked from a fork server that has imported the libraries once. Windows
+cannot fork, and on macOS a process that has used its libraries should not fork: there each child
+is spawned, and imports for some seconds.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from pipeline.stopping import current
 
 RETURNED, RAISED, DIED = "returned", "raised", "died"
 
-# What reaches a whole group of processes at once; the supervisor decides what it means.
+# Signals to a whole process group; only the supervisor reacts to them.
 LEFT_TO_SUPERVISOR = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 
 
 def answer_from_child(line: Connection, last_words: Connection) -> None:
-    """Do pickled tasks until there are none any more, or one fails, and send what came of each.
+    """Do pickled tasks until the pipe closes or a task fails, and send each result.
 
-    ``last_words`` takes the traceback where the process crashes, or is about to be ended.
+    ``last_words`` receives the traceback when the process crashes, or is about to be killed.
     """
     leave_signals_to_supervisor()
-    if sys.platform != "win32":  # there a pipe has no number that a crash could write to
+    if sys.platform != "win32":  # a Windows pipe has no descriptor for a crash report
         faulthandler.enable(last_words.fileno())
-        faulthandler.register(signal.SIGUSR1, last_words.fileno())  # sent to learn where it is
+        faulthandler.register(signal.SIGUSR1, last_words.fileno())  # prints the traceback
     clean_ups: list[Callable[[], object]] = []
     threading.Thread(target=_end_with_parent, args=(clean_ups,), daemon=True).start()
     kind = RETURNED
@@ -58,7 +58,7 @@ def answer_from_child(line: Connection, last_words: Connection) -> None:
             task = line.recv_bytes()
         except (EOFError, OSError):
             break
-        # Only now is the task unpacked: in a process that begins anew, its imports take seconds.
+        # Unpickled only now, because the imports take seconds in a spawned process.
         try:
             function, args, clean_up = ForkingPickler.loads(task)
             clean_ups[:] = [clean_up]
@@ -71,19 +71,19 @@ def answer_from_child(line: Connection, last_words: Connection) -> None:
 
 
 def leave_signals_to_supervisor() -> None:
-    """Do nothing when such a signal comes; programs that this process starts get it as usual."""
+    """Ignore such signals in this process, but not in programs that it starts."""
     for number in LEFT_TO_SUPERVISOR:
-        signal.signal(number, _do_nothing)  # and not SIG_IGN, which they would inherit
+        signal.signal(number, _do_nothing)  # not SIG_IGN, which child programs inherit
     if sys.platform != "win32":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_SUPERVISOR)
 
 
 def _do_nothing(number: int, frame: FrameType | None) -> None:
-    """Handle a signal."""
+    """Ignore a signal."""
 
 
 def _words(error: BaseException) -> str:
-    """The message in one line; with the kind of what ends a program, where no mistake is meant."""
+    """The message in one line; for exceptions that end a program, with their type."""
     kind, message = type(error).__name__, " ".join(str(error).split())
     if isinstance(error, Exception):
         return message or kind
@@ -91,7 +91,7 @@ def _words(error: BaseException) -> str:
 
 
 def _end_with_parent(clean_ups: list[Callable[[], object]]) -> None:
-    """Leave nothing behind when the supervisor is gone."""
+    """When the supervisor dies, clean up and exit."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     wait([parent.sentinel])
@@ -105,11 +105,11 @@ def _end_with_parent(clean_ups: list[Callable[[], object]]) -> None:
 
 PRELOADED = ["experiments.fork_server_imports"]
 
-# One thread in each process: small networks are slower with more, and runs go side by side.
+# One thread per process: small networks are slower with more, and runs are parallel.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 START_METHOD = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
-# Set for the server alone, which takes it away again.
+# Set only for the server, which removes it again.
 WARM_UPS = "YARDSTICK_WARM_UPS"
 OUR_OWN = "yardstick"
 
@@ -118,15 +118,15 @@ context: Any = multiprocessing.get_context(START_METHOD)
 
 
 def start_server(warm_ups: str = "[]") -> None:
-    """Start what children begin from, in the background, and let them be started after `stop_all`.
+    """Start the fork server in the background, and allow new children after `stop_all`.
 
-    It compiles ``warm_ups`` once for all runs, see `experiments.run_in_child.warm_ups`.
+    The server compiles ``warm_ups`` once for all runs, see `experiments.run_in_child.warm_ups`.
     """
     _stopping.clear()
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
-    # Python would look in the folder where the command is typed before everywhere else, and take a
-    # module of the user's that lies there for one of ours, or of its own.
+    # Python would search the current folder first, and could import a user's module there instead
+    # of one of this project or of Python.
     os.environ.setdefault("PYTHONSAFEPATH", OUR_OWN)
     paths = [str(Path(__file__).resolve().parents[1])]
     paths += os.environ.get("PYTHONPATH", "").split(os.pathsep)
@@ -138,11 +138,11 @@ def start_server(warm_ups: str = "[]") -> None:
 
 
 def _ensure_fork_server() -> None:
-    """Start it where it is not there; signals to all processes at once leave it as it is."""
+    """Start the fork server if it does not run, shielded from signals to the process group."""
     if sys.platform != "win32":
         from multiprocessing import forkserver, resource_tracker
 
-        # It lets SIGINT through again after its own start, so that has to come first.
+        # The resource tracker unblocks SIGINT at its start, so it must start first.
         resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_SUPERVISOR)
         try:
@@ -155,20 +155,20 @@ def _ensure_fork_server() -> None:
 
 
 def server_pid() -> int | None:
-    """The process that children are forked from, where there is one."""
+    """The process number of the fork server, or None."""
     server = getattr(sys.modules.get("multiprocessing.forkserver"), "_forkserver", None)
     pid = getattr(server, "_forkserver_pid", None)
     return pid if isinstance(pid, int) else None
 
 
 def end_server() -> None:
-    """End the process that children are forked from, whatever it is at."""
+    """Kill the fork server, whatever it is doing."""
     if sys.platform != "win32":
         _send(server_pid(), signal.SIGKILL)
 
 
 def _send(pid: int | None, number: int) -> None:
-    """Send a signal to a process, if it is still there."""
+    """Send a signal to a process, if it still exists."""
     if sys.platform != "win32" and pid is not None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, number)
@@ -176,8 +176,8 @@ def _send(pid: int | None, number: int) -> None:
 
 # --- The supervisor.
 
-SECONDS_TO_START = 0.3  # that a server takes to fork, once it has imported
-# How long a process that is to be ended has to say where it is.
+SECONDS_TO_START = 0.3  # for a fork, once the server has imported
+# The time for a process to print its traceback before it is killed.
 SECONDS_FOR_LAST_WORDS = 0.3
 NO_LIMITS = RunLimits()
 
@@ -192,11 +192,11 @@ class TaskFailedError(Exception):
 
     def __init__(self, message: str, details: str) -> None:
         super().__init__(message)
-        self.details = details  # the traceback, or what is known
+        self.details = details  # the traceback, or other details
 
 
 class TaskDiedError(TaskFailedError):
-    """The process of the function died each time."""
+    """The process of the function died at each try."""
 
 
 class StoppedError(Exception):
@@ -211,16 +211,16 @@ def supervise(
     limits: RunLimits = NO_LIMITS,
     shares_process: bool = False,
 ) -> Any:
-    """Call ``function`` in a child process; again if the process dies without an answer.
+    """Call ``function`` in a child process; retry if the process dies without an answer.
 
-    ``clean_up`` is called here after each try, and in the child if this process dies before it.
-    With ``shares_process`` the task is done where others were done before, and leaves the process
-    to others; not so where memory is limited, which is that of the process. After a failure, and
-    for another try, there is a fresh process.
+    ``clean_up`` is called here after each try, and in the child if this process dies first. With
+    ``shares_process``, the task may use a process that earlier and later tasks share, unless
+    memory is limited, because the limit holds for a process. Retries and tasks after a failure
+    get a new process.
 
     Raises:
-        TaskFailedError: if it raised an exception or exceeded a limit, which is not tried again.
-        TaskDiedError: if its process died each time.
+        TaskFailedError: if it raised an exception or exceeded a limit; there is no retry.
+        TaskDiedError: if its process died at each try.
         StoppedError: if `stop_all` ended it.
     """
     task = bytes(ForkingPickler.dumps((function, args, clean_up)))
@@ -240,19 +240,19 @@ def supervise(
 
 
 def do_aside(function: Callable[..., Any], *args: Any) -> Any:
-    """Call a function in a child of the fork server, which has the libraries, where there is one.
+    """Call a function in a child of the fork server, which has imported the libraries.
 
-    Importing them here too would take more than a second and 200 MB. Without a server, and where
-    the child fails, it is called here, so that what it raises is raised from here.
+    Importing them here too would take more than a second and 200 MB. Without a server, or if the
+    child fails, the function is called in this process, which then raises its exceptions.
     """
     if server_pid() is not None and not _stopping.is_set():
         with contextlib.suppress(TaskFailedError, OSError, EOFError, RuntimeError):
-            return supervise(function, *args, clean_up=bool)  # there is nothing to clean up
+            return supervise(function, *args, clean_up=bool)  # nothing to clean up
     return function(*args)
 
 
 class _Child:
-    """A child process, and what goes to it and comes from it."""
+    """A child process with its pipes."""
 
     def __init__(self) -> None:
         self.line, line = context.Pipe()  # for tasks and answers
@@ -273,12 +273,12 @@ class _Child:
                 connection.close()
 
     def attempt(self, task: bytes, limits: RunLimits) -> tuple[str, Any]:
-        """Have a task done: `RETURNED` and value; `RAISED`, reason and details; or `DIED` and how.
+        """Do a task: returns `RETURNED` and value; `RAISED`, reason and details; or `DIED` and how.
 
-        The child is ended where it exceeds a limit. One that has returned a value may be given
-        another task; any other has ended.
+        A child that exceeds a limit is killed. Only a child that has returned a value can do
+        another task; otherwise it has ended.
         """
-        with contextlib.suppress(OSError):  # it is gone, as is found below
+        with contextlib.suppress(OSError):  # it is dead, which is noticed below
             self.line.send_bytes(task)
         if reason := self._exceeded(limits):
             self.process.join()
@@ -295,13 +295,13 @@ class _Child:
         return kind, answer
 
     def _exceeded(self, limits: RunLimits) -> str:
-        """Wait until there is an answer, or none will come; which limit ended it before."""
+        """Wait for an answer or the child's end; returns the exceeded limit, if any."""
         pid, started = self.process.pid, time.monotonic()
         while not self.line.poll(limits.pause):
             reason = limits.exceeded(pid or 0, time.monotonic() - started)
             if reason and not self.line.poll(0):
                 if sys.platform != "win32":
-                    _send(pid, signal.SIGUSR1)  # it says where it is
+                    _send(pid, signal.SIGUSR1)  # prints the traceback
                     self.line.poll(SECONDS_FOR_LAST_WORDS)
                 self.kill()
                 return reason
@@ -314,19 +314,19 @@ class _Child:
                 number = self.last_words.fileno()
                 while self.last_words.poll(0) and (piece := os.read(number, 1 << 16)):
                     text += piece
-        # Python also lists all modules in C, which is a page of them and tells nothing.
+        # Without Python's long list of extension modules.
         lines = text.decode(errors="replace").splitlines(keepends=True)
         return "".join(line for line in lines if not line.startswith("Extension modules: "))
 
     def kill(self) -> None:
-        """End it at once, also where the server that forked it has been killed."""
+        """Kill the child, even if the server that forked it is dead."""
         if sys.platform == "win32":
             self.process.kill()
-        else:  # `Process.kill` takes a child for dead when the process that forked it is
+        else:  # `Process.kill` considers a child dead if its fork server is
             _send(self.process.pid, signal.SIGKILL)
 
     def end(self) -> None:
-        """Wait until it is gone, which it is soon, since nothing is left to do."""
+        """Wait for the end of the child, which comes soon without further tasks."""
         self._close()
         self.process.join()
         with _lock:
@@ -338,7 +338,7 @@ class _Child:
 
 
 def _attempt(task: bytes, limits: RunLimits, shares_process: bool) -> tuple[str, Any]:
-    """What became of the task in this thread's child, or in a fresh one; see `_Child.attempt`."""
+    """Do the task in this thread's child, or in a new one; see `_Child.attempt`."""
     thread = threading.get_ident()
     child = _idle.pop(thread, None)
     if child is not None and not (shares_process and child.process.is_alive()):
@@ -361,13 +361,13 @@ def _attempt(task: bytes, limits: RunLimits, shares_process: bool) -> tuple[str,
 
 
 def _end_idle() -> None:
-    """End the children that wait for more."""
+    """End the children that wait for tasks."""
     while _idle:
         _idle.popitem()[1].end()
 
 
 def _start(child: BaseProcess) -> None:
-    """Start a child; from a new server, where somebody has killed the one there was."""
+    """Start a child; if the fork server was killed, start a new one first."""
     if context.get_start_method() != "forkserver":
         child.start()
         return
@@ -376,20 +376,20 @@ def _start(child: BaseProcess) -> None:
         with contextlib.suppress(EOFError, OSError):
             child.start()
             return
-        if _stopping.wait(0.2):  # a server that was killed is deaf some time before it is gone
+        if _stopping.wait(0.2):  # a killed server stops answering before it ends
             raise StoppedError
     child.start()
 
 
 @contextlib.contextmanager
 def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
-    """As many supervisors as processes that work at once; left early, it ends their children."""
+    """A pool with one supervisor thread per parallel process; early exit ends all children."""
     start_server()
     executor = ThreadPoolExecutor(n_workers)
     try:
         yield executor
     except BaseException:
-        with current().held():  # a second Ctrl-C finds it as short as it can be
+        with current().held():  # a second Ctrl-C must wait only briefly
             stop_all()
             executor.shutdown(cancel_futures=True)
             _end_idle()
@@ -399,10 +399,10 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def stop_all() -> None:
-    """End all children, and let none be started any more."""
+    """End all children, and refuse new ones."""
     _stopping.set()
     if not _lock.acquire(timeout=SECONDS_TO_START):
-        end_server()  # one is being started, by a server that is still importing
+        end_server()  # a child is starting while the server still imports
         _lock.acquire()
     try:
         for child in _children:

@@ -1,7 +1,7 @@
-"""Imported by the server that runs are forked from, so that what takes long is done once.
+"""Preloads slow imports into the fork server, so that runs need not repeat them.
 
-Imports alone take two seconds, and loading the compiled loops half a second: a short training does
-both. Where nothing is compiled yet, it is done here too.
+Imports take two seconds, and loading compiled loops half a second: a short training does both. If
+nothing is compiled yet, this module compiles it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def _warm_up() -> None:
     from pipeline.train_spec import TrainSpec
 
     raw = {"n_timesteps": 100}
-    # Where it fails, as without room for temporary files, runs compile for themselves.
+    # If this fails, for example without disk space, each run compiles for itself.
     with contextlib.suppress(Exception):
         train_aside(TrainSpec("qlearning", "Warehouse-v0", split(raw), raw, 0, eval_freq=50))
     take_steps(os.environ.pop(WARM_UPS, "[]"))
@@ -27,6 +27,6 @@ def _warm_up() -> None:
 
 leave_signals_to_supervisor()
 if os.environ.get("PYTHONSAFEPATH") == OUR_OWN:
-    del os.environ["PYTHONSAFEPATH"]  # what a run starts is to find its modules as usual
+    del os.environ["PYTHONSAFEPATH"]  # programs that a run starts search modules as usual
 with loading_libraries():
     _warm_up()

@@ -1,4 +1,4 @@
-"""Looks at a study that are taken and remembered, and studies that grow until all is decided."""
+"""Takes and records looks at a study, and grows studies until all pairs are decided."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from verdicts import Growth, grow, level_of_environment, look_sizes
 
 
 def take_looks(results: StudyResults) -> dict[str, Standing]:
-    """Look at the runs of a study, by environment, and remember it before anything is shown.
+    """Take a look at the runs of a study, by environment, and record it before showing results.
 
-    The same runs and the same question are the same look, however often it is taken.
+    A repeated look at the same runs with the same question counts once.
     """
     log = read_looks(results.root)
     question, standings, environments = question_of(results.study), {}, dict(log)
@@ -48,7 +48,7 @@ def take_looks(results: StudyResults) -> dict[str, Standing]:
 
 
 def remember(root: Path, before: LookLog, after: LookLog) -> None:
-    """Write the looks at a study down, if there are any that were not."""
+    """Save the looks at a study, if there are new ones."""
     if after != before:
         write_looks(root, after)
 
@@ -56,7 +56,7 @@ def remember(root: Path, before: LookLog, after: LookLog) -> None:
 def look_at(
     evidence: Evidence, seeds: Mapping[str, int], question: Question, level: float, *, planned: bool
 ) -> Look:
-    """A look at the first seeds of each agent, now."""
+    """Make a look at the first seeds of each agent, with the current date."""
     scores = {name: evidence.scores[name][:n] for name, n in seeds.items()}
     return Look(
         date=time.strftime("%Y-%m-%d %H:%M:%S"),
@@ -82,52 +82,52 @@ def _taken(looks: Looks, evidence: Evidence, question: Question) -> tuple[Looks,
 
 
 def _says_nothing(evidence: Evidence, level: float) -> bool:
-    """Whether so few runs claim nothing at this level, whatever they score: that is no look."""
+    """Whether so few runs can claim nothing at this level: such a look does not count."""
     there = sorted(int(np.isfinite(values).sum()) for values in evidence.scores.values())
     return len(there) < 2 or there[-2] < evidence.fewest(level)
 
 
 def _digest(scores: Floats) -> str:
-    """The same for the same scores, but for their last bits, on every machine."""
+    """A digest of scores, rounded so that it is the same on every machine."""
     text = ",".join(f"{score:.9g}" for score in scores)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-# --- Growing: the looks are settled before the first of them.
+# --- Growing studies: their looks are planned before the first one.
 
 MOST_SEEDS = 50
 
-# How many seeds, by labels of agent and environment.
+# The number of seeds, by labels of agent and environment.
 Counts = dict[tuple[str, str], int]
 
 
 @dataclass(frozen=True)
 class Step:
-    """What the looks at an environment have come to."""
+    """The state of an environment after a look."""
 
     environment: str  # its label
-    design: Design  # the looks that were settled, and how many seeds each agent has or gets next
-    growth: Growth  # what is decided
-    standing: Standing  # the last look's, among all
+    design: Design  # the planned looks, and each agent's current or next number of seeds
+    growth: Growth  # the decisions so far
+    standing: Standing  # the last look's place among all looks
 
     @property
     def undecided(self) -> list[tuple[str, str]]:
-        """The pairs that are."""
+        """The undecided pairs."""
         return [pair for pair, each in self.growth.judged.items() if not each.is_decided]
 
 
 def settled_looks(study: StudySpec, root: Path, most: int | None) -> LookLog:
-    """The looks at a study, with when to look at it until it is decided, settled now or before.
+    """The looks at a study with a design for all future looks, made now or earlier.
 
-    Nothing is written: see `remember`.
+    Writes nothing: see `remember`.
 
     Args:
         study: the study.
         root: its folder.
-        most: how many seeds an agent may get; None for what was settled, or else ``MOST_SEEDS``.
+        most: the largest number of seeds of an agent; None: as planned before, or ``MOST_SEEDS``.
 
     Raises:
-        UserError: if that is not what was settled before, or there is nothing to decide.
+        UserError: if this differs from an earlier design, or there is nothing to decide.
     """
     if len(study.agents) < 2:
         raise UserError(f"{study.name}: --until-decided takes two agents or more")
@@ -146,7 +146,7 @@ def settled_looks(study: StudySpec, root: Path, most: int | None) -> LookLog:
 
 
 def counts_of(study: StudySpec, log: LookLog) -> Counts:
-    """How many seeds the agents of a study are to have, as was settled."""
+    """The planned numbers of seeds of a study's agents."""
     return {
         (agent, environment.label): n
         for environment in study.environments
@@ -156,12 +156,12 @@ def counts_of(study: StudySpec, log: LookLog) -> Counts:
 
 
 def grown(study: StudySpec, counts: Counts) -> StudySpec:
-    """The study with as many seeds as the agent that has most of them."""
+    """The study with the largest number of seeds of any agent."""
     return replace(study, n_seeds=max(counts.values()))
 
 
 def take_planned_looks(results: StudyResults) -> list[Step]:
-    """Look at every environment as was settled, and write down who gets more seeds."""
+    """Take the planned look at every environment, and record which agents get more seeds."""
     log = read_looks(results.root)
     environments, steps = dict(log), []
     for environment in results.study.environments:
@@ -177,7 +177,7 @@ def take_planned_looks(results: StudyResults) -> list[Step]:
 
 
 def _settled(study: StudySpec, looks: Looks, most: int | None) -> Design:
-    """The looks that the study asks for now."""
+    """The design that the study asks for now."""
     after = sum(not look.planned for look in looks.taken)
     if looks.design is not None:
         after, most = looks.design.after, most or looks.design.sizes[-1]
@@ -189,7 +189,7 @@ def _settled(study: StudySpec, looks: Looks, most: int | None) -> Design:
 
 
 def _check_same(root: Path, there: Design, now: Design) -> None:
-    """Refuse to look otherwise than was settled, naming what differs."""
+    """Refuse a design that differs from the earlier one, and name the difference."""
     differences = [
         f"{key} {before}, now {after}"
         for key, before, after in (
@@ -211,10 +211,10 @@ def _check_same(root: Path, there: Design, now: Design) -> None:
 
 
 def _check_runs(root: Path, looks: Looks, evidence: Evidence) -> None:
-    """Refuse runs that have been done anew since they were looked at."""
+    """Refuse runs that were repeated after a look at them."""
     for there in looks.planned:
         now = look_at(evidence, there.seeds, there.question, there.level, planned=True)
-        # Some may be missing now, or may have been then.
+        # Some runs may be missing now, or may have been missing then.
         same = [name for name, n in there.runs.items() if now.runs[name] == n]
         if any(now.digests[name] != there.digests[name] for name in same):
             raise UserError(

@@ -1,4 +1,4 @@
-"""What a change to a run's settings does, over four seeds: the only ground for "because"."""
+"""Measures the effect of changed settings over four seeds, as evidence for causes."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from pipeline.train_spec import TrainSpec
 
 SEEDS = 4
 AS_IT_IS = "as it is"
-# Factors of the step size, and of the steps, that are tried where nothing is said.
+# Default factors for the step size and for the number of steps.
 FACTORS = (0.25, 4)
 MORE_TRAINING = 4
-# Settings of exploration: all of the training explores as in the beginning.
+# Settings that keep the initial exploration during the whole training.
 EXPLORES_ON = "exploration_fraction:1"
 
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A change, and what comes of it."""
+    """A change and its results."""
 
     change: str  #: as typed, or ``"as it is"``
-    returns: Floats  #: of the final policies, shape (n,), of the runs that finished
-    scores: Floats  #: on the scale of the yardstick, NaN where there is none, shape (n,)
+    returns: Floats  #: of the final policies of finished runs, shape (n,)
+    scores: Floats  #: on the yardstick's scale, NaN without one, shape (n,)
 
 
 def usual_changes(spec: TrainSpec, proposal: str | None, n_steps: int) -> list[str]:
-    """What is tried where no change is named: the proposal first, then one setting at a time."""
+    """The default changes: the proposal first, then one setting at a time."""
     settings = spec.saved_hyperparams
     found = [proposal] if proposal else []
     if isinstance(settings.get("gamma"), int | float):
@@ -47,15 +47,15 @@ def usual_changes(spec: TrainSpec, proposal: str | None, n_steps: int) -> list[s
 
 
 def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> StudySpec:
-    """The study of a run's agent as it is, and with each of the changes.
+    """Make a study of a run's agent, unchanged and with each of the changes.
 
     Args:
-        spec: of the run.
-        changes: each as ``key:value``, several of them apart by spaces.
-        name: of the run.
+        spec: the spec of the run.
+        changes: each as ``key:value``, or several of these separated by spaces.
+        name: the name of the run.
 
     Raises:
-        UserError: for a change that cannot be read.
+        UserError: if a change cannot be parsed.
     """
     own = dict(spec.saved_hyperparams)
     read: Mapping[str, Mapping[str, Any]] = {
@@ -78,12 +78,12 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
 
 
 def _fast(algo: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings on compiled code where that is possible, but for those that name an engine."""
+    """The settings with compiled code if possible, unless they name an engine."""
     return settings if "engine" in settings else with_engine(algo, settings, "auto")
 
 
 def tried(results: StudyResults) -> list[Tried]:
-    """What came of each change, the highest mean return first."""
+    """The results of each change, highest mean return first."""
     table = results.summary
     found = []
     for agent in results.study.agents:

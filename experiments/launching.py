@@ -1,8 +1,7 @@
-"""Where the runs of a study are done, in which order, and how long they may still take.
+"""Launches the runs of a study in order, and estimates the remaining time.
 
-A launcher takes runs one by one, and tells how each ended. `local_launcher` does them on this
-machine. Whatever asks for runs, a study or a search over settings, knows no more of the place than
-`Launcher` says.
+A launcher accepts runs one by one, and returns how each ended. `local_launcher` does them on this
+machine. A study or a search over settings uses only the interface `Launcher`.
 """
 
 from __future__ import annotations
@@ -45,45 +44,45 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunFailure:
-    """A run that failed."""
+    """A failed run."""
 
     planned: PlannedRun  #: the run
     reason: str  #: why, in one line
-    log: Path | None  #: the file with the details; None where it could not be written
-    details: str = ""  #: what is in it, which is for people alone: nothing reads the file back
+    log: Path | None  #: the file with the details; None if it could not be written
+    details: str = ""  #: its content, for readers: no program reads the file back
 
 
 class Launcher(Protocol):
-    """A place where runs are done."""
+    """The interface of a place that does runs."""
 
     @property
     def n_workers(self) -> int:
-        """How many runs it does at once, now."""
+        """The current number of parallel runs."""
 
     @property
     def words(self) -> str:
-        """What is to be said of it while runs are done; mostly nothing."""
+        """A text on the launcher to show during runs; mostly empty."""
 
     def submit(self, planned: PlannedRun) -> Future[RunFailure | None]:
-        """Have a run done.
+        """Submit a run.
 
         Returns:
-            How it failed; None once its folder is in place. Futures do not depend on each other.
-            They raise only where the place itself is gone.
+            A future of how it failed; None once its folder is in place. Futures are independent.
+            They raise only if the launcher itself is lost.
         """
 
 
-# Opens a place for as long as a ``with`` statement runs; left early, it ends what is under way.
+# Opens a launcher during a ``with`` statement; on early exit, it ends running runs.
 Launchers = Callable[[], AbstractContextManager[Launcher]]
 
 
 def available_cores() -> int:
-    """The cores that this process may use."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def failure_log(root: Path, planned: PlannedRun) -> Path:
-    """Where the details of a run's failure are written; there until it is done after all."""
+    """The file with the details of a run's failure; it exists until the run succeeds."""
     return root / "failures" / f"{file_name(planned.agent)}@{planned.path.name}.txt"
 
 
@@ -91,13 +90,13 @@ def failure_log(root: Path, planned: PlannedRun) -> Path:
 def local_launcher(
     root: Path, command: str, n_workers: int, limits: RunLimits = NO_LIMITS
 ) -> Iterator[Launcher]:
-    """Do runs on this machine, each in a child process of its own; plain ones share them.
+    """Do runs on this machine, each in its own child process; plain runs share processes.
 
     Args:
         root: the study's folder.
-        command: the command that asked for it, noted in every run folder.
-        n_workers: how many at once.
-        limits: what each may take.
+        command: the user's command, recorded in every run folder.
+        n_workers: the number of parallel runs.
+        limits: the limits of each run.
     """
     with local_executor(n_workers) as executor:
         yield _LocalLauncher(executor, n_workers, root, command, limits)
@@ -117,7 +116,7 @@ class _LocalLauncher:
 
     def _do(self, planned: PlannedRun) -> RunFailure | None:
         try:
-            if not is_gone(self.root):  # a run would make it anew
+            if not is_gone(self.root):  # a run would recreate it
                 do_supervised(planned, self.root, self.command, self.limits)
         except StoppedError:
             return None
@@ -129,13 +128,13 @@ class _LocalLauncher:
 def do_supervised(
     planned: PlannedRun, root: Path, command: str, limits: RunLimits, home: Path = Path()
 ) -> None:
-    """Do a run in a child process of this one, with two tries if it dies.
+    """Do a run in a child process, with one retry if the process dies.
 
-    Relative paths, those of the run and of the study too, begin at ``home``.
+    Relative paths, including those of run and study, start at ``home``.
 
     Raises:
-        TaskFailedError: if the run failed, or no process could be started for it.
-        StoppedError: if it was ended, since this process ends.
+        TaskFailedError: if the run failed, or no process could be started.
+        StoppedError: if the run was stopped because this process ends.
     """
     try:
         supervise(
@@ -148,13 +147,13 @@ def do_supervised(
             limits=limits,
             shares_process=is_plain(planned.spec) and not planned.is_batch,
         )
-    except (OSError, EOFError, RuntimeError) as error:  # no room, process, thread or file left
+    except (OSError, EOFError, RuntimeError) as error:  # no memory, process, thread or file left
         reason = f"its process could not be started: {one_line(error)}"
         raise TaskFailedError(reason, traceback.format_exc()) from error
 
 
 def _do_planned_run(planned: PlannedRun, root: Path, command: str, home: Path) -> None:
-    # Imported where runs are done: it takes seconds, and a supervisor needs nothing of it.
+    # A slow import that a supervisor does not need.
     from experiments.run_in_child import do_run
 
     if home.parts:
@@ -166,9 +165,9 @@ def _do_planned_run(planned: PlannedRun, root: Path, command: str, home: Path) -
 def ended(
     planned: PlannedRun, root: Path, reason: str = "", details: str = ""
 ) -> RunFailure | None:
-    """How a run failed, with its details written down; None where there is no reason.
+    """Write the details of a failure, and return it; None without a reason.
 
-    Where the disk is full, there are no details.
+    If the disk is full, no details are written.
     """
     log = failure_log(root, planned)
     if not reason:
@@ -182,12 +181,12 @@ def ended(
     return RunFailure(planned, reason, log, details)
 
 
-# --- Doing the runs that are missing, in the order of the plan.
+# --- Doing missing runs, in the order of the plan.
 
-# Runs that are handed over at a time, for each that is done at once: enough that no worker waits
-# for the next, and few enough that a hundred thousand are no burden to whoever does them.
+# Submitted runs per parallel run: enough that no worker waits for the next run, and few enough that
+# a hundred thousand runs do not overload a launcher.
 WINDOW = 2
-# So that workers that have joined meanwhile do not wait until a run has ended.
+# The time-out after which new workers get runs, even if no run has ended.
 SECONDS_BETWEEN_LOOKS = 1.0
 
 Listener = Callable[[PlannedRun, RunFailure | None], None]
@@ -203,14 +202,14 @@ def execute(
     """Do the runs.
 
     Args:
-        runs: those to do.
+        runs: the runs to do.
         root: the study's folder.
-        launchers: where; it is opened only if there is something to do.
-        listener: called for every run that has ended, with how it failed if it did.
-        meanwhile: called once, while the first runs are under way.
+        launchers: opens the launcher; called only if there are runs to do.
+        listener: called for every ended run, with its failure, if any.
+        meanwhile: called once, during the first runs.
 
     Returns:
-        Those that failed.
+        The failed runs.
 
     Raises:
         FolderGoneError: if somebody removes the folder.
@@ -239,30 +238,30 @@ def execute(
     return failures
 
 
-# --- How long the runs that are left may take, by the clock.
+# --- The remaining time of the runs, by the clock.
 
-# Agents differ a thousandfold in what a run takes, so each agent on each environment has an
-# estimate of its own: the mean of its runs that have ended, or else what it is expected to take,
-# times how far the expectations of like agents were off.
+# The time of a run differs a thousandfold between agents, so each agent on each environment has its
+# own estimate: the mean of its ended runs, or else its expected time, times the ratio by which the
+# expectations of similar agents were wrong.
 
 Key = tuple[str, str]
 
-# Seconds of a run in any case, and for each step: of compiled agents with tables or weights, and of
-# all others, of which nothing else is known.
+# Fixed seconds of a run, and seconds per step: of compiled agents with tables or weights, and of
+# all other agents.
 EACH_RUN = 0.3
 EACH_STEP, EACH_SLOW_STEP = 3e-7, 1e-3
-# Where a budget counts episodes, their length is guessed.
+# If a budget counts episodes, this is the assumed length.
 STEPS_OF_EPISODE = 100
-# A run that takes longer than was expected is expected to take so much of what it has taken.
+# An overdue run is expected to take this multiple of its elapsed time.
 LONGER = 1.2
-# By how much what tables took may lengthen what is expected of networks.
+# The largest factor by which times of tables may raise the estimates of networks.
 BUSY = 4.0
 
 
 def expected_seconds(spec: TrainSpec, processor_seconds: float | None = None) -> float | None:
-    """What a run is expected to take; of networks the processor time may be known.
+    """The expected seconds of a run; for networks, the processor time may be known.
 
-    None for an agent of the user's, which may be compiled or not.
+    None for the user's agents, which may be compiled or not.
     """
     if processor_seconds:
         return EACH_RUN + processor_seconds
@@ -278,13 +277,13 @@ def expected_seconds(spec: TrainSpec, processor_seconds: float | None = None) ->
 
 
 class TimeLeft:
-    """Estimates when the last of some runs will have ended.
+    """Estimates the time until all runs have ended.
 
-    Runs start in their order, one where another has ended: when each has begun need not be told.
+    Runs start in order, each when another one ends, so starts need not be reported.
 
     Args:
-        runs: to be done, in this order.
-        expected: seconds of a run by agent and environment, where something is known of them.
+        runs: the runs, in order.
+        expected: seconds of a run by agent and environment, as far as known.
     """
 
     def __init__(self, runs: Sequence[PlannedRun], expected: Mapping[Key, float]) -> None:
@@ -299,15 +298,15 @@ class TimeLeft:
         self._taken: dict[Key, list[float]] = {}
 
     def start(self, now: float, n_workers: int) -> None:
-        """Let runs begin, as many as there are free workers."""
+        """Start as many runs as there are free workers."""
         while self._waiting and len(self._began) < n_workers:
             run = self._waiting.popleft()
             self._n_waiting[run.labels] -= 1
             self._began[run.path] = (run, now)
 
     def end(self, run: PlannedRun, now: float) -> None:
-        """Count a run that has ended."""
-        if run.path not in self._began:  # another has not begun instead
+        """Record the end of a run."""
+        if run.path not in self._began:  # another run had not begun instead
             if not (self._began and run in self._waiting):
                 return
             path, (other, began) = next(iter(self._began.items()))
@@ -319,7 +318,7 @@ class TimeLeft:
         self._taken.setdefault(run.labels, []).append(now - self._began.pop(run.path)[1])
 
     def seconds(self, now: float, n_workers: int) -> float | None:
-        """How long all runs together may still take; None while that cannot be said."""
+        """The remaining seconds of all runs; None while there is no estimate."""
         each = self._estimates(now)
         missing = [*(key for key, _ in self._under_way()), *+self._n_waiting]
         if not each.keys() >= set(missing):
@@ -335,7 +334,7 @@ class TimeLeft:
         return [(run.labels, began) for run, began in self._began.values()]
 
     def _estimates(self, now: float) -> dict[Key, float]:
-        """Seconds of a run, by agent and environment."""
+        """The estimated seconds of a run, by agent and environment."""
         off = self._by_how_much_off(now)
         found = {}
         for key, expected in self._expected.items():
@@ -346,7 +345,7 @@ class TimeLeft:
                 like = [ratio for other, ratio in off if other == algo] or [
                     ratio for other, ratio in off if (other in NETWORKS) == (algo in NETWORKS)
                 ]
-                if not like:  # on a busy machine everything takes longer
+                if not like:  # on a busy machine, all runs take longer
                     like = [min(max(ratio, 1.0), BUSY) for _, ratio in off]
                 found[key] = expected * (sum(like) / len(like) if like else 1.0)
         for key, began in self._under_way():
@@ -355,7 +354,7 @@ class TimeLeft:
         return found
 
     def _by_how_much_off(self, now: float) -> list[tuple[str, float]]:
-        """Agents, and what their runs took by what they were expected to take."""
+        """Agents, and the ratio of actual to expected time of their runs."""
         off = [
             (self._algos[key], sum(taken) / len(taken) / expected)
             for key, taken in self._taken.items()
@@ -370,23 +369,23 @@ class TimeLeft:
         return off + [(algo, ratio) for algo, ratio in late if ratio > 1 and algo not in known]
 
 
-# --- What runs have to say, read while others are still under way.
+# --- Reading results while other runs are still running.
 
 
 class EarlyResults:
-    """What each run of a study has to say, read when it has ended."""
+    """Reads the results of each run of a study as soon as it has ended."""
 
     def __init__(self, study: StudySpec) -> None:
         self.study = study
         self._found: dict[Path, RunResults] = {}
 
     def get_ready(self) -> None:
-        """Load what reading takes, which is long: best while the first runs are under way."""
+        """Load the slow imports of reading; best called during the first runs."""
         with loading_libraries():
             import experiments.results  # noqa: F401
 
     def read(self, planned: PlannedRun) -> None:
-        """Read a run that has just ended; one that is damaged is found to be so at the end."""
+        """Read a run that has just ended; damage is reported later."""
         from experiments.results import read_run
 
         with contextlib.suppress(DamagedFileError):
@@ -395,7 +394,7 @@ class EarlyResults:
                 self._found[planned.path] = found
 
     def of(self, planned: PlannedRun) -> RunResults | None:
-        """As `read_run`, where that was not done before."""
+        """Like `read_run`, but returns a result that was read before."""
         from experiments.results import read_run
 
         return self._found.get(planned.path) or read_run(self.study, planned)

@@ -1,7 +1,7 @@
-"""How often a study has been looked at, and what each look may spend of the error rate.
+"""Counts the looks at a study, and assigns error rates to them.
 
-At most ``ALPHA`` of the studies say anything wrong: each environment, and all of them together, may
-spend its share. Looks are counted for each environment by itself.
+At most ``ALPHA`` of the studies contain a wrong claim: each environment, and all of them together,
+have a share of this rate. Looks are counted separately for each environment.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from pipeline.files import write_json
 from safe_files.files import UnsafeFileError, read_file
 from verdicts import level_of_look
 
-ALPHA = 0.05  # of the studies, at most, say anything wrong
+ALPHA = 0.05  # the largest share of studies with a wrong claim
 
 
 @dataclass(frozen=True)
 class Question:
-    """What the runs were asked; another question is another look at them."""
+    """The question of a look; another question about the same runs is another look."""
 
-    metric: str  # what verdicts are about
-    # Difference within which agents are equivalent; None for the usual share of the way from the
-    # best random or constant policy to the optimum.
+    metric: str  # the metric of the verdicts
+    # Difference within which agents are equivalent; None for the default share of the gap between
+    # the best random or constant policy and the optimum.
     margin: float | None
-    threshold: float | None  # return that counts as solved; None for the usual
+    threshold: float | None  # return that counts as solved; None for the default
     first_seed: int  # the first seed
     shared_randomness: bool  # whether agents are compared seed by seed
 
@@ -40,16 +40,16 @@ class Question:
 class Look:
     """One look at the runs on an environment."""
 
-    date: str  # when it was, for readers
-    question: Question  # what was asked
-    seeds: Mapping[str, int]  # by agent, with how many seeds
-    runs: Mapping[str, int]  # by agent, of how many of them there was a figure
-    digests: Mapping[str, str]  # by agent, of these figures
-    level: float  # the error rate that it spent
-    planned: bool  # whether it is one of those that were settled before the first
+    date: str  # date of the look, for readers
+    question: Question  # the question
+    seeds: Mapping[str, int]  # by agent, the number of seeds
+    runs: Mapping[str, int]  # by agent, the number of seeds with a figure
+    digests: Mapping[str, str]  # by agent, the digest of these figures
+    level: float  # its error rate
+    planned: bool  # whether it belongs to a design
 
     def shows(self, other: Look) -> bool:
-        """Whether this look showed what another would: the same runs, or more of those seeds."""
+        """Whether this look already used the same runs, or more runs of the same seeds."""
         return (
             (self.question, dict(self.seeds)) == (other.question, dict(other.seeds))
             and self.runs.keys() == other.runs.keys()
@@ -64,21 +64,21 @@ class Look:
 
 @dataclass(frozen=True)
 class Design:
-    """Looks that were settled before the first of them: they share the level of one."""
+    """Looks that were planned before the first of them: they share the level of one look."""
 
-    question: Question  # what is asked
-    sizes: tuple[int, ...]  # how many seeds a growing agent has at each
-    seeds: Mapping[str, int]  # by agent, how many it has, or is to get next
-    after: int  # how many looks that are none of these there had been
+    question: Question  # the question
+    sizes: tuple[int, ...]  # the seeds of a growing agent at each look
+    seeds: Mapping[str, int]  # by agent, its current or next number of seeds
+    after: int  # number of earlier looks outside the design
 
     @property
     def level(self) -> float:
-        """The error rate of all of its looks together."""
+        """The error rate of all looks of the design together."""
         return level_of_look(ALPHA, self.after + 1)
 
     @property
     def share(self) -> float:
-        """The error rate of each."""
+        """The error rate of each look."""
         return level_of_look(self.level, 1, len(self.sizes))
 
 
@@ -86,21 +86,21 @@ class Design:
 class Looks:
     """All looks at the runs on an environment."""
 
-    taken: tuple[Look, ...] = ()  # the looks, in the order of time
-    design: Design | None = None  # those that were settled beforehand; None where none were
+    taken: tuple[Look, ...] = ()  # the looks in order of time
+    design: Design | None = None  # the planned looks, if any
 
     @property
     def planned(self) -> tuple[Look, ...]:
-        """The looks of the design that have been taken."""
+        """The looks of the design that were taken."""
         return tuple(look for look in self.taken if look.planned)
 
     @property
     def next_level(self) -> float:
-        """The error rate of the next look that nobody has settled."""
+        """The error rate of the next look outside a design."""
         return self._unplanned_level(self.taken)
 
     def level_at(self, place: int) -> float:
-        """The error rate that the look at a place in ``taken`` may spend."""
+        """The error rate of the look at an index of ``taken``."""
         if not self.taken[place].planned:
             return self._unplanned_level(self.taken[:place])
         if self.design is None:
@@ -108,7 +108,7 @@ class Looks:
         return self.design.share
 
     def _unplanned_level(self, before: Sequence[Look]) -> float:
-        """That of a look after others: the design counts as one, whenever its looks are taken."""
+        """The error rate of an unplanned look; the design counts as one look."""
         n_before = sum(not look.planned for look in before)
         with_design = self.design is not None and self.design.after <= n_before
         return level_of_look(ALPHA, n_before + with_design + 1)
@@ -119,42 +119,42 @@ LookLog = Mapping[str, Looks]  # all looks at a study, by environment
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a look stands among all at the runs on an environment."""
+    """The place of a look among all looks at the runs on an environment."""
 
-    number: int = 1  # which look it is, counted from 1
+    number: int = 1  # number of the look, counted from 1
     level: float = level_of_look(ALPHA, 1)  # its error rate
-    next_level: float = level_of_look(ALPHA, 2)  # that of the next
-    # The looks that it is one of, which were settled beforehand; None for one by itself.
+    next_level: float = level_of_look(ALPHA, 2)  # error rate of the next look
+    # The design to which it belongs, or None.
     design: Design | None = None
-    is_counted: bool = True  # False where there are too few runs to claim anything
+    is_counted: bool = True  # False if there are too few runs for any claim
 
 
 def question_of(study: StudySpec) -> Question:
-    """What a study asks of its runs."""
+    """The question of a study."""
     return Question(
         study.metric, study.margin, study.threshold, study.first_seed, study.shared_randomness
     )
 
 
-# --- The file in the folder of a study that remembers the looks at it.
+# --- The file of looks in the folder of a study.
 
 LOOKS_FILE = "looks.json"
 _FORMAT, _ABOUT_TYPICAL_RUNS = 2, 1
-_LARGEST = 50_000_000  # bytes; a thousand agents looked at a hundred times take less
+_LARGEST = 50_000_000  # bytes; a hundred looks at a thousand agents take less
 _LARGEST_NUMBER = 1e300
 
 
 def write_looks(root: Path, log: LookLog) -> None:
-    """Replace the file, so that it is there whole and for good."""
+    """Replace the file atomically, and flush it to disk."""
     looks = {name: asdict(each) for name, each in log.items()}
     write_json(root / LOOKS_FILE, {"format": _FORMAT, "environments": looks})
 
 
 def read_looks(root: Path) -> LookLog:
-    """The looks that a study remembers; none where there is no file.
+    """Read the looks at a study; empty without a file.
 
     Raises:
-        UserError: if the file is not as it was written, so that nobody knows how many there were.
+        UserError: if the file is damaged, so that the number of looks is unknown.
     """
     path = root / LOOKS_FILE
     try:
@@ -186,13 +186,13 @@ def _wrong(path: Path, reason: str) -> UserError:
 
 
 class _MisfitError(Exception):
-    """Data are not what a dataclass was written as; the text says where."""
+    """Data do not match a dataclass; the text says where."""
 
 
 def _read_as(kind: Any, data: Any, where: str) -> Any:
-    """Plain data as a dataclass that has these fields and no others, each of its type.
+    """Convert plain data to a dataclass with exactly these fields and types.
 
-    Whole numbers are at least 0, and all numbers finite. `_MisfitError` names what is not so.
+    Integers must be at least 0, and all numbers finite; otherwise raises `_MisfitError`.
     """
     arguments = get_args(kind)
     if isinstance(kind, type) and is_dataclass(kind):
@@ -226,7 +226,7 @@ def _log(data: Any) -> LookLog:
 
 
 def _looks(data: Any, where: str) -> Looks:
-    """The looks on an environment: one that was taken out between others, or put in, shows."""
+    """Read the looks on an environment; detects a removed or inserted look."""
 
     def check(is_right: bool, what: str) -> None:
         if not is_right:

@@ -1,4 +1,4 @@
-"""From a study to the runs that it takes: one for each agent, environment and seed."""
+"""Plans the runs of a study: one for each agent, environment and seed."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ from pipeline.settings.hyperparams import (
 )
 from pipeline.train_spec import TrainSpec, completed
 
-# What a run of the same settings may differ in: where it is written, what is shown meanwhile, and
-# where the modules lie that its names come from.
+# Fields in which runs with the same settings may differ: output paths, display, and the location
+# of modules.
 _MAY_DIFFER = (
     "origins",
     "log_folder",
@@ -67,11 +67,11 @@ class PlannedRun:
     agent: str  #: label of the agent
     environment: str  #: label of the environment
     seed: int  #: its seed
-    spec: TrainSpec  #: what to train
-    path: Path  #: its folder, there once it has finished
-    #: Whether it stands for all seeds of a bandit agent, of which ``seed`` is the first.
+    spec: TrainSpec  #: its specification
+    path: Path  #: its folder, which exists once it has finished
+    #: Whether it is a batch of all seeds of a bandit agent; ``seed`` is the first.
     is_batch: bool = False
-    n_runs: int = 1  #: how many runs it stands for
+    n_runs: int = 1  #: the number of runs in the batch
 
     @property
     def labels(self) -> tuple[str, str]:
@@ -84,12 +84,12 @@ class PlannedRun:
         return Run(self.path, environment_name(self.spec.env_id))
 
     def read(self) -> ReadPlannedRun:
-        """The same, for what is asked of its folder from now on: the record is read once."""
+        """A copy that reads the record in its folder only once."""
         return ReadPlannedRun(**{field.name: getattr(self, field.name) for field in fields(self)})
 
     @property
     def is_finished(self) -> bool:
-        """Whether the folder holds this very run, to its end; what else it holds is not read."""
+        """Whether the folder contains this run and the run is finished; reads only the record."""
         info = _info(self.run)
         if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
             return False
@@ -99,16 +99,16 @@ class PlannedRun:
         )
 
     def is_of(self, run: Run) -> bool:
-        """Whether what a folder was begun with is this very run."""
+        """Whether a folder's record names this run."""
         info = _info(run)
         return bool(info and _identity(_recorded(info)) == _identity(self.spec.as_data()))
 
     @property
     def differences(self) -> dict[str, tuple[Any, Any]]:
-        """By name, the settings of a finished run in this folder beside those that are asked for.
+        """By name, the settings of a finished run in this folder and the requested ones.
 
-        Empty where they are the same: then a run is done again because it lacks something, such as
-        checkpoints, or in a batch the seeds that are new.
+        Empty if they are the same: then the run is repeated because something is missing, such as
+        checkpoints, or new seeds of a batch.
         """
         info = _info(self.run)
         if info.get("state") != FINISHED:
@@ -123,7 +123,7 @@ class PlannedRun:
 
     @property
     def is_to_do(self) -> bool:
-        """Whether there is no such run; one that is damaged is there."""
+        """Whether the run is missing; a damaged run is not missing."""
         if self.is_finished:
             return False
         try:
@@ -133,7 +133,7 @@ class PlannedRun:
         return True
 
     def check_record(self) -> None:
-        """Make sure that the folder, where there is one, says which run it holds.
+        """Check that the folder, if it exists, has a valid record.
 
         Raises:
             DamagedFileError: if its ``run.json`` is missing or damaged.
@@ -149,7 +149,7 @@ class PlannedRun:
 
 @dataclass(frozen=True)
 class ReadPlannedRun(PlannedRun):
-    """One that goes by what its folder said when it was first asked."""
+    """A planned run that caches ``run.json``."""
 
     @cached_property
     def run(self) -> Run:
@@ -158,7 +158,7 @@ class ReadPlannedRun(PlannedRun):
 
 
 def _info(run: Run) -> dict[str, Any]:
-    """The record of a run; empty where it is damaged."""
+    """The record of a run; empty if it is damaged."""
     try:
         return run.read_info()
     except DamagedFileError:
@@ -176,7 +176,7 @@ def _recorded(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _by_name(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as they are called, hyperparameters among them."""
+    """Settings by name, including hyperparameters."""
     settings = dict(identity)
     hyperparams = settings.pop("hyperparams", None)
     return {**settings, **(hyperparams if isinstance(hyperparams, dict) else {})}
@@ -184,26 +184,26 @@ def _by_name(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 # --- The plan of a study.
 
-_BYTES_PER_PULL = 24  # the arm, the reward and the regret
+_BYTES_PER_PULL = 24  # arm, reward and regret
 MOST_RUNS = 1_000_000
 
-# What a batch can follow, besides the agent's own arguments.
+# Settings that a batch supports, besides the agent's own arguments.
 _BATCH_SETTINGS = ("n_timesteps", "env_kwargs", "algorithm")
 
 
 def plan(
     study: StudySpec, root: Path, counts: Mapping[tuple[str, str], int] | None = None
 ) -> list[PlannedRun]:
-    """All runs of a study, those of one seed together, so that agents can be compared early.
+    """Plan all runs of a study, ordered by seed, so that agents can be compared early.
 
     Args:
         study: the study.
         root: its folder.
-        counts: by labels of agent and environment, with how many of the seeds; with all of them,
-            where it is not said.
+        counts: by labels of agent and environment, the number of seeds; by default all
+            seeds.
 
     Raises:
-        UserError: if an agent cannot be trained so, or does not fit an environment.
+        UserError: if an agent's settings are invalid, or it does not fit an environment.
     """
     n_agents, n_environments = len(study.agents), len(study.environments)
     n_runs = n_agents * n_environments * study.n_seeds
@@ -250,7 +250,7 @@ def _planned_run(
     spec: TrainSpec,
     n_in_batch: int,
 ) -> PlannedRun:
-    # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
+    # From 1, because 0 means the newest run in rl_zoo3's tools.
     folder = _environment_folder(environment, spec.env_id)
     place = Path(file_name(agent), f"{folder}_{seed + 1}")
     spec = replace(
@@ -264,15 +264,15 @@ def _planned_run(
 
 
 def _environment_folder(label: str, env_id: str) -> str:
-    """The label as a file name; where it is the id itself, as `train.py` writes that."""
+    """The label as a file name; for an id, the same name as in `train.py`."""
     return file_name(environment_name(label) if label == env_id else label)
 
 
 def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
-    """Make sure that the agents can be made with their settings, which takes the libraries.
+    """Check that the agents can be made with their settings, which imports the libraries.
 
     Raises:
-        UserError: if one cannot.
+        UserError: if an agent cannot be made.
     """
     from pipeline.preparation import algorithm_kwargs
     from pipeline.settings import components
@@ -288,7 +288,7 @@ def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
 
 @contextmanager
 def _naming_the_place(agent: AgentSpec) -> Iterator[None]:
-    """Say in mistakes where the study asks for the agent."""
+    """Add the place in the study file to errors about an agent."""
     try:
         yield
     except UserError as error:
@@ -296,10 +296,10 @@ def _naming_the_place(agent: AgentSpec) -> Iterator[None]:
 
 
 def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
-    """Refuse labels that are the same, or would have the same folder."""
+    """Refuse labels that are equal, or lead to the same folder."""
     taken: dict[str, str] = {}
     for label, folder in places:
-        # Some file systems do not tell upper from lower case, nor "ä" from "a" with two dots.
+        # Some file systems ignore case, and the difference of "ä" and "a" with a combining mark.
         key = normalize("NFC", folder.casefold())
         first = taken.get(key)
         if first is not None:
@@ -311,7 +311,7 @@ def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
 
 
 def _is_batch(spec: TrainSpec) -> bool:
-    """Whether the runs of a spec go as one batch: bandit agents as they are, for one episode."""
+    """Whether the runs of a spec form one batch: unchanged bandit agents for one episode."""
     entry, special = ALGORITHMS[spec.algo], spec.hyperparams
     untouched = Hyperparams()
     if not (entry.for_bandits and entry.package is None) or special.n_timesteps is None:
@@ -331,7 +331,7 @@ def _is_batch(spec: TrainSpec) -> bool:
 
 
 def _is_compiled_bandit(algo: str) -> bool:
-    """Whether an agent of the user's is of our bandit agents' kind."""
+    """Whether a user's agent is a subclass of this project's compiled bandit agents."""
     from agents.bandits.linear import LinearBanditAgent
     from agents.bandits.tables import TableBandit
 
@@ -342,7 +342,7 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
     check_algorithm(agent.algo)
     raw, gave_way = _raw_hyperparams(agent, environment)
     place = f"{agent.label} on {environment.label}"
-    # A field of the study that has the name of one of the run goes there as it is.
+    # Fields that study and run spec share are copied.
     named = {key.name for key in fields(TrainSpec)} & {key.name for key in fields(StudySpec)}
     spec = resolved_spec(
         with_maps_read(environment.env_id, raw),
@@ -368,7 +368,7 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
 def _raw_hyperparams(
     agent: AgentSpec, environment: EnvironmentSpec
 ) -> tuple[dict[str, Any], dict[str, str] | None]:
-    """The agent's file, changed by the environment's settings, and these by the agent's own."""
+    """The entry of the agent's file, changed by the environment's settings, then by the agent's."""
     raw: dict[str, Any] = {}
     own = layered(environment.settings, agent.settings)
     if agent.tuned or agent.conf_file is not None:
@@ -378,16 +378,16 @@ def _raw_hyperparams(
         except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
-    # What the environment's settings take away is gone before the agent's own come.
+    # Removals by the environment's settings come before the agent's own settings.
     kept = {
         key: value for key, value in raw.items() if environment.settings.get(key, key) is not None
     }
     return training_follows(layered(kept, own), own)
 
 
-# --- Which of its seeds the settings of a study were tuned on, as far as anybody says.
+# --- The seeds of a study on which its settings were tuned, as far as known.
 
-# How long a run is, and on what: nothing that an agent would be tuned in.
+# Settings of length and environment of a run, which are not tuned.
 _NO_TUNING = {"n_timesteps", "n_episodes", "env_kwargs", "eval_env_kwargs", "policy", "engine"}
 
 Seeds = frozenset[int]
@@ -395,19 +395,19 @@ Seeds = frozenset[int]
 
 @dataclass(frozen=True)
 class TuningSeeds:
-    """Where the settings of a study come from, and which of its seeds they were tuned on."""
+    """The origin of a study's settings, and the seeds of the study on which they were tuned."""
 
-    #: By agent, the seeds of the study that its settings in ``hyperparams/`` were tuned on; of
-    #: agents whose constructor's defaults are taken too, which are none.
+    #: By agent, the seeds of the study on which its settings in ``hyperparams/`` were tuned; empty
+    #: for agents with their constructor's defaults.
     shipped: Mapping[str, Seeds]
-    files: Mapping[str, Seeds]  #: likewise by the name of a file of the user's that says so
-    unknown: tuple[str, ...]  #: agents with settings of which nobody says what they were tuned on
-    #: Agents whose settings were tuned with other arguments of the environment.
+    files: Mapping[str, Seeds]  #: likewise, by the name of a user's file that lists seeds
+    unknown: tuple[str, ...]  #: agents whose settings have unknown tuning seeds
+    #: Agents whose settings were tuned with other environment arguments.
     elsewhere: tuple[str, ...] = ()
 
 
 def tuning_seeds(study: StudySpec) -> TuningSeeds:
-    """Find out for all agents of a study on all of its environments."""
+    """Find the tuning seeds for all agents of a study on all its environments."""
     shipped: dict[str, Seeds] = {}
     files: dict[str, Seeds] = {}
     unknown: dict[str, None] = {}
@@ -435,11 +435,11 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
 
 
 def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
-    """Whether the study has arguments of the environment that the entry does not have."""
+    """Whether the study has environment arguments that the entry does not have."""
     own = layered(environment.settings, agent.settings)
     places = agent.algo, environment.env_id, agent.conf_file
     entry = read_hyperparams(*places, own.get("env_kwargs"))
-    if entry != read_hyperparams(*places):  # that of the same environment by another name
+    if entry != read_hyperparams(*places):  # the entry of another id of the same environment
         del own["env_kwargs"]
     merged = layered(entry, own)
     usual = usual_kwargs(environment.env_id)
@@ -455,5 +455,5 @@ def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
 def _said(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:
     try:
         return seeds_tuned_on(algo, env_id, conf_file)
-    except UserError:  # a file that was there when the runs were planned
+    except UserError:  # the file existed when the runs were planned
         return None

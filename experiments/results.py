@@ -1,8 +1,8 @@
-"""What the finished runs of a study have to say, as tables with one row for each observation.
+"""Reads the results of a study's finished runs, as tables with one row per observation.
 
-Each file of a run is held against its digest and its form. Runs of earlier versions recorded no
-digests: of these a file counts that has the form. What reads here raises `DamagedFileError` for a
-file that is missing, changed, or holds anything else.
+Each file of a run is checked against its digest and its schema. Runs of earlier versions recorded
+no digests: only the schema of their files is checked. Functions that read raise `DamagedFileError`
+for a file that is missing, changed, or of another form.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from verdicts import (
     steps_to_threshold,
 )
 
-# --- The files that one run left.
+# --- The files of one run.
 
 LARGEST_FIGURE = 1e300
-_FORMER_BASELINE = "best_blind"  # what earlier versions called it
-_OPTIONAL = ("cpu_seconds",)  # older versions did not measure it
+_FORMER_BASELINE = "best_blind"  # its name in earlier versions
+_OPTIONAL = ("cpu_seconds",)  # missing in older versions
 _FINAL_FIGURES = (
     "mean_return",
     "std_return",
@@ -53,7 +53,7 @@ _FINAL_FIGURES = (
     "gap",
     "score",
 )
-# The last where the optimum is bracketed.
+# The last ones only if the optimum is bracketed.
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
 _MAPS = {
     "timesteps": "n",
@@ -67,21 +67,21 @@ _COLUMNS = ["r", "l", "t"]  # return, length, seconds since the beginning
 
 @dataclass(frozen=True)
 class Episodes:
-    """The training episodes of a run in the order in which they ended."""
+    """The training episodes of a run, ordered by their ends."""
 
-    steps: Floats  # environment steps done by then, over all environments, shape (n,)
+    steps: Floats  # steps up to the end, over all environments, shape (n,)
     returns: Floats  # undiscounted returns, shape (n,)
     seconds: Floats  # time since the beginning, shape (n,)
 
 
 def read_episodes(run: Run) -> Episodes:
-    """The training episodes that Monitor wrote down."""
+    """Read the training episodes in Monitor's files."""
     files = run.files
     paths = files.matching("*.monitor.csv")
     if not paths:
         raise DamagedFileError(run.path / "0.monitor.csv", "is missing")
     tables = [_monitor_table(path, files.read(path)) for path in paths]
-    # The environments are stepped together: all have done what one of them has.
+    # The environments step together, so all have done the same number of steps.
     steps = np.concatenate([len(paths) * table[:, 1].cumsum() for table in tables])
     order = np.argsort(steps, kind="stable")
     rows = np.concatenate(tables)[order]
@@ -89,7 +89,7 @@ def read_episodes(run: Run) -> Episodes:
 
 
 def _monitor_table(path: Path, content: bytes) -> Floats:
-    """Return, length and time of each episode, shape (n, 3)."""
+    """Read return, length and time of each episode, shape (n, 3)."""
     try:
         if not content.startswith(b"#"):
             raise ValueError("it does not begin with Monitor's line of settings")
@@ -102,13 +102,13 @@ def _monitor_table(path: Path, content: bytes) -> Floats:
 
 
 def _table_of(content: bytes) -> Floats:
-    """The columns of the figures; others, which environments may add, are not looked at."""
+    """Parse the columns of figures; ignores others, which environments may add."""
     _, names, rows = [*content.split(b"\n", 2), b"", b""][:3]
     found = next(csv.reader([names.decode()]), [])
     places = [found.index(name) for name in _COLUMNS]
     if not rows.strip():
         return np.empty((0, len(places)))
-    # NumPy's own reader takes three times as long, which is half of what reading a run takes.
+    # NumPy's own reader takes three times as long, which is half the time of reading a run.
     table = pd.read_csv(
         io.BytesIO(rows), header=None, usecols=places, dtype=np.float64, na_filter=False
     )
@@ -121,7 +121,7 @@ def _check_finite(path: Path, *arrays: NDArray[Any]) -> None:
 
 
 def read_evaluations(run: Run) -> tuple[Floats, Floats]:
-    """Steps and mean returns of the evaluations during training, each of shape (n_evaluations,)."""
+    """Read steps and mean returns of evaluations during training, each (n_evaluations,)."""
     path = run.evaluations_path
     if not run.files.matching(path.name):
         return np.empty(0), np.empty(0)
@@ -136,7 +136,7 @@ def read_evaluations(run: Run) -> tuple[Floats, Floats]:
 
 
 def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
-    """What ``run.json`` says came out, with ``required`` names; ``final`` maps names to figures."""
+    """Read the outcome in ``run.json``, with ``required`` names and ``final`` as a dictionary."""
     info = run.read_info()
     final = info.get("final")
     if not (final is None or isinstance(final, dict)):
@@ -175,7 +175,7 @@ def _is_figure(value: object) -> bool:
 
 
 def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
-    """The maps that a run kept, as `pipeline.evaluation.value_maps` writes them."""
+    """Read the maps of a run that `pipeline.evaluation.value_maps` wrote."""
     path = run.value_maps_path
     arrays = read_shaped(path, run.files.read(path), _MAPS)
     actions, best_actions = arrays["actions"], arrays["optimal_actions"]
@@ -193,8 +193,8 @@ def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
 
 TRAINING_POINTS = 100
 
-# Columns of `StudyResults.curves`. Each row is an evaluation, or the mean of some episodes of
-# training at the end of the last.
+# Columns of `StudyResults.curves`. Each row is an evaluation, or the mean of some training episodes
+# at the end of the last of them.
 CURVE_COLUMNS = (
     "agent",
     "environment",
@@ -211,12 +211,12 @@ CURVE_COLUMNS = (
 class Curve:
     """A learning curve of one run."""
 
-    labels: dict[str, Any]  # the columns of `CURVE_COLUMNS` that are the same all along
+    labels: dict[str, Any]  # the columns of `CURVE_COLUMNS` that are constant in the curve
     figures: dict[str, Floats]  # the other columns, each of shape (n,)
 
 
 def joined(curves: Sequence[Curve]) -> pd.DataFrame:
-    """The curves below each other."""
+    """The curves as one table."""
     if not curves:
         return pd.DataFrame(columns=CURVE_COLUMNS)
     lengths = [len(curve.figures["step"]) for curve in curves]
@@ -252,7 +252,7 @@ def evaluation_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
 
 
 def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
-    """Means over blocks of episodes, so that no run has more than `TRAINING_POINTS`."""
+    """Means over blocks of episodes, at most `TRAINING_POINTS` for each run."""
     n = len(episodes.returns)
     block = max(-(-n // TRAINING_POINTS), 1)
     ends = np.minimum(np.arange(block, n + block, block), n)
@@ -267,24 +267,24 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
     return _curve(planned, "training", columns)
 
 
-# --- What runs have to say.
+# --- The results of runs.
 
 LAST_EPISODES = 100
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A run that is there, and counts for nothing, since a file of it is damaged."""
+    """A run that is left out because one of its files is damaged."""
 
     planned: PlannedRun  #: the run
-    reason: str  #: which file, and what of it, in one line
+    reason: str  #: the file and its damage, in one line
 
 
 @dataclass(frozen=True)
 class RunResults:
-    """What one finished run, or one batch of them, has to say."""
+    """The results of one finished run or batch."""
 
-    rows: list[dict[str, Any]]  #: of the summary, see `RUN_COLUMNS`
+    rows: list[dict[str, Any]]  #: rows of the summary, see `RUN_COLUMNS`
     curves: list[Curve] = field(default_factory=list)  #: its learning curves
 
 
@@ -292,17 +292,17 @@ class RunResults:
 class StudyResults:
     """A study and its runs."""
 
-    study: StudySpec  #: what was asked for
+    study: StudySpec  #: the specification
     root: Path  #: its folder
     summary: pd.DataFrame  #: one row for each finished run, see `RUN_COLUMNS`
     curves: pd.DataFrame  #: learning curves of all runs, see `CURVE_COLUMNS`
-    planned: tuple[PlannedRun, ...]  #: all runs of the study, also those that failed
+    planned: tuple[PlannedRun, ...]  #: all runs of the study, including failed ones
     #: On bandits, figures by pull, by labels of agent and environment.
     pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
-    left_out: tuple[LeftOut, ...] = ()  #: the runs that are damaged
-    n_unchecked: int = 0  #: how many runs recorded no digests, so that damage in them may go unseen
-    finished: tuple[PlannedRun, ...] = ()  #: the runs that the results are of
-    #: Of runs that have just failed, the details, by their folders.
+    left_out: tuple[LeftOut, ...] = ()  #: the damaged runs
+    n_unchecked: int = 0  #: number of runs without digests, whose damage may go unnoticed
+    finished: tuple[PlannedRun, ...] = ()  #: the runs in the results
+    #: The details of runs that have just failed, by folder.
     failures: Mapping[Path, str] = field(default_factory=dict)
 
 
@@ -317,32 +317,32 @@ RUN_COLUMNS = (
     "final_std",  # standard deviation of an episode's return
     "final_length",
     "success_rate",
-    "exact",  # whether these are expectations rather than means of episodes
+    "exact",  # whether these are exact expectations, not means of episodes
     "optimum",
-    "optimum_at_least",  # where it is bracketed: ``optimum`` is then the upper end
+    "optimum_at_least",  # lower end of a bracket; ``optimum`` is then the upper end
     "baseline",
     "gap",  # optimum minus final
-    "score",  # final, with 0 at the best random or constant policy and 1 at the optimum
+    "score",  # final return, scaled: 0 is the best random or constant policy, 1 the optimum
     "best",  # highest return of an evaluation during training
     "best_timesteps",
     "area",  # mean return over the learning curve
     "training",  # mean return of the training episodes
     "last_episodes",  # of the last 100
-    "regret",  # on bandits, best expected rewards less those of the arms pulled, summed up
+    "regret",  # on bandits, the sum of best expected rewards minus those of the pulled arms
     "threshold",
-    "steps_to_threshold",  # infinite where it was never reached
-    "steps_to_stay",  # until it was reached for good
+    "steps_to_threshold",  # infinite if it was never reached
+    "steps_to_stay",  # until the threshold was reached for good
     "episodes_to_threshold",
     "episodes_to_stay",
     "n_timesteps",
     "n_episodes",
     "seconds",
-    "cpu_seconds",  # of the run's own process; missing in runs of older versions
+    "cpu_seconds",  # of the run's process; missing in runs of older versions
     "engine",
     "path",
 )
 
-# Columns that have the same name in ``run.json``.
+# Columns with the same name in ``run.json``.
 _FIGURES = ("success_rate", "exact", "optimum", "optimum_at_least", "baseline", "gap", "score")
 
 
@@ -353,14 +353,14 @@ def read_results(
     tell: Tell = tell_nobody,
     read: Callable[[PlannedRun], RunResults | None] | None = None,
 ) -> StudyResults:
-    """Read all runs that have finished; those whose files are damaged are left out.
+    """Read all finished runs, except runs with damaged files.
 
     Args:
-        study: whose runs they are.
+        study: the study.
         planned: the runs.
         root: the study's folder.
-        tell: told how far it is.
-        read: what to read a run with, for those that were read before; by default `read_run`.
+        tell: receives the progress.
+        read: a function that reads a run, for example from a cache; by default `read_run`.
     """
     rows, curves, done, left_out = [], [], [], []
     for place, run in enumerate(planned, start=1):
@@ -388,10 +388,10 @@ def read_results(
 
 
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
-    """What a run has to say, or None where it is not there or has not finished.
+    """Read the results of a run, or None if it is missing or not finished.
 
     Raises:
-        DamagedFileError: if a file that a comparison reads is missing, changed or no such file.
+        DamagedFileError: if a file that a comparison reads is missing, changed or invalid.
     """
     planned = planned.read()
     planned.check_record()
@@ -407,7 +407,7 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
 
 
 def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
-    """Make sure of the files that the page opens later: maps, and the agent that is filmed."""
+    """Check the files that the page opens later: maps, and the filmed agent."""
     run, files = planned.run, planned.run.files
     for path in files.matching(run.value_maps_path.name):
         files.check(path)
@@ -420,12 +420,12 @@ def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
 
 
 def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float | None:
-    """The return that counts as solved; None where nobody says."""
+    """The return that counts as solved; None if it is not defined."""
     import gymnasium as gym
 
     if study.threshold is not None:
         return study.threshold
-    # Of a bracket nobody knows whether its upper end can be reached.
+    # It is unknown whether the upper end of a bracket can be reached.
     reachable = final.get("optimum_at_least", final.get("optimum"))
     if "optimum_at_least" in final or reachable is None:
         registered = gym.spec(env_id.rpartition(":")[2]).reward_threshold
@@ -442,7 +442,7 @@ def _mean(values: Floats) -> float:
 
 
 def _batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
-    """A row of the summary for each run of a batch."""
+    """Make a row of the summary for each run of a batch."""
     info = read_outcome(planned.run, ("seconds",))
     cpu_seconds = info.get("cpu_seconds")
     path = planned.path / STATISTICS_FILE
@@ -506,7 +506,7 @@ def _summary_row(
 
 
 def _named(planned: PlannedRun) -> dict[str, Any]:
-    """The columns of the summary that say which run it is, but for its seed."""
+    """The columns of the summary that identify a run, without its seed."""
     return {
         "agent": planned.agent,
         "algo": planned.spec.algo,
@@ -523,12 +523,12 @@ def _episodes_by(episodes: Episodes, step: float) -> float:
 
 # --- Agents over their seeds.
 
-RESAMPLING_SEED = 0  # the same runs give the same figures
-CURVE_POINTS = TRAINING_POINTS  # no run has more of training; a figure shows no more of them
+RESAMPLING_SEED = 0  # so that the same runs give the same figures
+CURVE_POINTS = TRAINING_POINTS  # the most points of a run, and of a curve in a figure
 
 
 def values_over_seeds(results: StudyResults, environment: str, column: str) -> dict[str, Floats]:
-    """A column of the summary by agent, shape (n_seeds,); NaN where a run is missing."""
+    """A column of the summary by agent, shape (n_seeds,); NaN for a missing run."""
     table = results.summary
     table = table[table["environment"] == environment]
     pivot = table.pivot(index="seed", columns="agent", values=column)
@@ -541,7 +541,7 @@ def values_over_seeds(results: StudyResults, environment: str, column: str) -> d
 def curves_by_agent(
     results: StudyResults, environment: str
 ) -> dict[tuple[str, str], list[pd.DataFrame]]:
-    """The learning curve of each run on an environment, by agent and kind."""
+    """The learning curves of runs on an environment, by agent and kind."""
     table = results.curves
     table = table[table["environment"] == environment]
     found: dict[tuple[str, str], list[pd.DataFrame]] = {}
@@ -554,12 +554,12 @@ def mean_curve(curves: Sequence[pd.DataFrame], by: str) -> tuple[Floats, Band] |
     """The mean learning curve of an agent over its seeds.
 
     Args:
-        curves: those of its runs, from `curves_by_agent`.
+        curves: the curves of its runs, from `curves_by_agent`.
         by: ``"step"``, ``"episode"`` or ``"seconds"``.
 
     Returns:
-        The points, shape (n,), and the mean there with its interval; None without any run, or where
-        one ended before the first point of another.
+        The points, shape (n,), and the means there with intervals; None without runs, or if a run
+        ended before the first point of another one.
     """
     runs = [
         (rows[by].to_numpy(dtype=np.float64), rows["value"].to_numpy(dtype=np.float64))
@@ -572,11 +572,11 @@ def mean_curve(curves: Sequence[pd.DataFrame], by: str) -> tuple[Floats, Band] |
     return grid, curve_band(values, seed=RESAMPLING_SEED)
 
 
-# --- Runs beside each other.
+# --- Comparing two runs.
 
 
 def difference(run: Run, other: Run) -> str:
-    """In what two finished runs differ; empty where they are the same to the last bit."""
+    """The difference of two finished runs in words; empty if they are equal to the last bit."""
     if _tensors(run) != _tensors(other):
         return "the agent"
     one, another = read_episodes(run), read_episodes(other)
@@ -592,7 +592,7 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _tensors(run: Run) -> dict[str, bytes]:
-    """What the agent at the end has learnt, as its zip holds it."""
+    """Read the tensors in the zip of the final agent."""
     try:
         members = read_members(run.files.read(run.model_path))
     except UnsafeFileError as error:
@@ -601,7 +601,7 @@ def _tensors(run: Run) -> dict[str, bytes]:
 
 
 def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
-    """Which versions differ between the ``run.json`` of runs, in a line; empty where none does."""
+    """Versions that differ between the ``run.json`` of runs, in a line; empty if none differ."""
     counts: dict[str, Counter[str]] = {}
     for info in infos:
         for package, version in info.get("versions", {}).items():

@@ -1,8 +1,8 @@
-"""Folders of runs that are being written, and of runs that are not those of the plan.
+"""Manages drafts of running runs, and moves aside runs that do not match the plan.
 
-A draft is called ``<process>@<machine>@<run>``. One that holds a state to go on from is kept when
-its process ends before it; the next process that does this run takes it over, by renaming it. So is
-one without a state, of a process that was killed: it says that states have to come sooner.
+A draft is called ``<process>@<machine>@<run>``. If its process ends before the run, a draft with a
+saved state is kept; the next process that does this run takes it over by renaming it. A draft
+without a state, of a killed process, is taken over too: it shows that saves must come sooner.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from experiments.results import LeftOut
 
 DRAFTS_FOLDER = ".drafts"
-LONGEST_DRAFT_NAME = 150  # bytes, besides the numbers and names of process and machine
-# After this long without a sign, a process elsewhere counts as gone: sooner than a lock, so that
-# whoever takes over the lock of a driver finds its drafts to be free.
+LONGEST_DRAFT_NAME = 150  # bytes, in addition to process number and machine name
+# Time-out of heartbeats, after which a process elsewhere counts as dead: shorter than that of a
+# lock, so that a process that takes over a driver's lock finds its drafts free.
 SECONDS_OF_SILENCE = 45.0
 
 _OWNER = re.compile(r"(\d{1,10})-(\d{1,20})-([0-9a-f]{8})@")
@@ -42,12 +42,12 @@ _NAMING = ("host", "machine", "boot", "namespace")
 
 
 def run_name(planned: PlannedRun) -> str:
-    """What a run is called among the drafts of its study."""
+    """The name of a run among the drafts of its study."""
     return portable_name(f"{planned.path.parent.name}@{planned.path.name}", LONGEST_DRAFT_NAME)
 
 
 def draft_path(root: Path, planned: PlannedRun) -> Path:
-    """Where a run of this process is written until it is whole."""
+    """The folder in which this process writes a run until it is complete."""
     return root / DRAFTS_FOLDER / f"{_own_mark()}@{platform.node()}@{run_name(planned)}"
 
 
@@ -57,13 +57,13 @@ def _own_mark() -> str:
 
 
 def _place(mark: dict[str, object]) -> str:
-    """Where the numbers of processes mean what they mean in the process of the mark."""
+    """A digest of the namespace in which a mark's process number is valid."""
     named = "\n".join(str(mark[name]) for name in _NAMING)
     return hashlib.sha256(named.encode()).hexdigest()[:8]
 
 
 def _is_dead(draft: Path) -> bool:
-    """Whether the process that wrote a draft is certainly gone."""
+    """Whether the process that wrote a draft is certainly dead."""
     mark, owner = locks.mark(), _OWNER.match(draft.name)
     if owner is not None and owner[3] == _place(mark):
         began = int(owner[2]) or None
@@ -75,7 +75,7 @@ def _is_dead(draft: Path) -> bool:
 
 
 def holds_state(draft: Path) -> bool:
-    """Whether there is something in a draft to go on from."""
+    """Whether a draft contains a saved state."""
     state = draft / STATE_FOLDER
     return not draft.is_symlink() and not state.is_symlink() and has_state(state)
 
@@ -87,12 +87,12 @@ def _drafts(root: Path) -> list[Path]:
 
 
 def _run_of(draft: Path) -> str:
-    """The name of the run that a draft is of."""
+    """The name of a draft's run."""
     return draft.name.split("@", 2)[-1]
 
 
 def take_over(draft: Path) -> bool:
-    """Make ``draft`` of what a process that is gone has left of the run; whether it left any."""
+    """Rename a dead process's draft of the run to ``draft``; returns whether there was one."""
     left = [
         one
         for one in _drafts(draft.parent.parent)
@@ -102,19 +102,19 @@ def take_over(draft: Path) -> bool:
         and _is_dead(one)
     ]
     for one in sorted(left, key=holds_state, reverse=True):
-        with contextlib.suppress(OSError):  # another was faster
+        with contextlib.suppress(OSError):  # another process was faster
             one.replace(draft)
             return True
     return False
 
 
 def claim_draft(draft: Path) -> None:
-    """Make the folder of a run that begins, as a new one.
+    """Make the folder of a new run.
 
-    Others can tell its name beforehand: what is there already is an earlier process's, or a link to
-    where the run should not write, and is removed.
+    Its name is predictable: an existing folder belongs to an earlier process, or is a link to a
+    place where the run must not write, and is removed.
     """
-    for _ in range(1000):  # other runs remove the folder of drafts whenever it is empty
+    for _ in range(1000):  # other runs remove the drafts' folder when it is empty
         with contextlib.suppress(FileExistsError, FileNotFoundError):
             draft.parent.mkdir(parents=True, exist_ok=True)
             draft.mkdir()
@@ -126,11 +126,11 @@ def claim_draft(draft: Path) -> None:
 
 
 def remove_draft(draft: Path) -> None:
-    """Remove what an unfinished run has left, even while it is being written."""
+    """Remove the draft of an unfinished run, even while it is being written."""
     dead = draft.with_name(f"{draft.name}.dead")
     with contextlib.suppress(OSError):
         draft.replace(dead)
-    # Windows does not rename a folder of which a file is open.
+    # Windows does not rename a folder with an open file.
     for folder in (dead, draft):
         shutil.rmtree(folder, ignore_errors=True)
         if folder.is_symlink():
@@ -139,16 +139,16 @@ def remove_draft(draft: Path) -> None:
 
 
 def _remove_empty(folder: Path) -> None:
-    """Remove the folder of drafts if it is empty, and then the study's own if that is."""
+    """Remove the folder of drafts if it is empty, and then the study's folder likewise."""
     with contextlib.suppress(OSError):
         folder.rmdir()
         folder.parent.rmdir()
 
 
 def leave_drafts(root: Path, name: str) -> None:
-    """Remove what this process, or one that is gone, has not finished of the run of this name.
+    """Remove drafts of a run by this process or dead ones.
 
-    What can be gone on from stays.
+    Keeps drafts with a saved state.
     """
     for draft in _drafts(root):
         is_left = _run_of(draft) == name and (
@@ -160,26 +160,26 @@ def leave_drafts(root: Path, name: str) -> None:
 
 
 def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
-    """Remove what processes that are gone have left, but of ``kept`` runs, which are to be done."""
+    """Remove drafts of dead processes, except of ``kept`` runs, which are still to be done."""
     for draft in _drafts(root):
         if _is_dead(draft) and _run_of(draft) not in kept:
             remove_draft(draft)
     _remove_empty(root / DRAFTS_FOLDER)
 
 
-# --- Runs that are there and are not those of the plan, or damaged: moved aside and kept.
+# --- Existing runs that do not match the plan, or are damaged: moved aside and kept.
 
 REPLACED_FOLDER = "replaced"
 _MOST_NAMED = 3
 
 
 def in_the_way(planned: Sequence[PlannedRun]) -> list[PlannedRun]:
-    """Those whose folder holds another run, or one that was cut off; damaged ones do not count."""
+    """The planned runs whose folder has another or an unfinished run; ignores damaged ones."""
     return [run for run in planned if run.path.exists() and run.is_to_do]
 
 
 def check_settings_kept(planned: Sequence[PlannedRun], root: Path) -> None:
-    """Refuse to do runs again that have finished with other settings, and name the ways out."""
+    """Refuse to repeat runs that finished with other settings, and name the ways out."""
     others = [(run, run.differences) for run in in_the_way(planned)]
     others = [(run, differences) for run, differences in others if differences]
     if not others:
@@ -200,9 +200,9 @@ def check_settings_kept(planned: Sequence[PlannedRun], root: Path) -> None:
 def move_replaced_aside(
     planned: Sequence[PlannedRun], root: Path
 ) -> tuple[list[PlannedRun], Path | None]:
-    """Move all that is in the way of the plan to one folder, ``replaced/<number>``.
+    """Move all folders in the way of the plan to ``replaced/<number>``.
 
-    The runs that it was in the way of; and that folder, None where there were none.
+    Returns the runs whose folders were moved, and the new folder, or None.
     """
     moved = [run for run in in_the_way(planned) if _is_kept_aside(run.path)]
     if not moved:
@@ -214,7 +214,7 @@ def move_replaced_aside(
 
 
 def make_room(planned: PlannedRun, root: Path) -> None:
-    """Move aside what is in the way of one run that has been done."""
+    """Move aside the folder in the way of one finished draft."""
     with contextlib.suppress(DamagedFileError):
         planned.check_record()
         if planned.path.exists() and not planned.is_finished and _is_kept_aside(planned.path):
@@ -222,7 +222,7 @@ def make_room(planned: PlannedRun, root: Path) -> None:
 
 
 def put_run_in_place(planned: PlannedRun, draft: Path) -> None:
-    """Rename a draft that is whole; another's result that is there stays, and others give way."""
+    """Rename a complete draft into place; a finished result of another process stays."""
     settle(draft)
     try:
         planned.check_record()
@@ -239,7 +239,7 @@ def put_run_in_place(planned: PlannedRun, draft: Path) -> None:
 
 
 def _is_kept_aside(folder: Path) -> bool:
-    """Whether there is anything in a folder; one that is empty is removed."""
+    """Whether a folder has contents; removes an empty one."""
     with contextlib.suppress(OSError):
         folder.rmdir()
     return folder.exists()
@@ -261,7 +261,7 @@ def _new_folder(root: Path) -> Path:
 
 
 def move_aside(folder: Path) -> Path:
-    """Rename a folder to ``<its name>.damaged-<n>``, the first that is free; where it is now."""
+    """Rename a folder to the first free ``<its name>.damaged-<n>``; returns the new path."""
     names = (folder.with_name(f"{folder.name}.damaged-{n}") for n in itertools.count(1))
     place = next(path for path in names if not path.exists())
     put_in_place(folder, place)
@@ -271,7 +271,7 @@ def move_aside(folder: Path) -> Path:
 def move_damaged_aside(
     study: StudySpec, planned: Sequence[PlannedRun], tell: Tell = tell_nobody
 ) -> list[tuple[LeftOut, Path]]:
-    """Rename the folder of every run that would be left out; each with where it lies now."""
+    """Rename the folders of damaged runs; returns each run with its new path."""
     from experiments.results import LeftOut, read_run
 
     moved = []

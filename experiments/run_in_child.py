@@ -1,8 +1,8 @@
-"""What the processes do that runs are done in: a run, and before the first what all runs share.
+"""The work of child processes: do a run, and before the first run compile what runs share.
 
-A run begins anew, or goes on from a state that another process has left. Compiled once for all runs
-are learning rules of the user's own: machine code of ours is kept on disk, but of theirs nobody
-knows all the sources. So the server that runs are forked from takes a few steps with each rule.
+A run starts, or resumes from a state of another process. Machine code of this project is cached on
+disk, but not that of the user's learning rules, whose sources are not all known. So the fork server
+takes a few steps with each rule of the user, which compiles it once for all runs.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from pipeline.user_modules import UserModule, import_again
 
 
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
-    """Train in ``draft``, and rename it into place; another's result that is there stays.
+    """Train in ``draft``, and rename it into place; an existing result of another process stays.
 
-    Where a process that is gone has left the run with a state, it goes on from there.
+    If a dead process has left a state of the run, training resumes from it.
     """
     import_again(planned.spec.user_modules)
     take_over(draft)
@@ -57,10 +57,10 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
 
 
 def _do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
-    """Do a run in its draft, to its end.
+    """Finish a run in its draft.
 
-    The draft is there where another process has left it: the run goes on from its state if that is
-    whole, of these very settings, and saved by these very sources, and else begins anew.
+    If another process has left the draft, the run resumes from its state, provided that the state
+    is complete and saved with the same settings and sources; otherwise the run starts again.
     """
     run = Run(draft, planned.run.env_name)
     keeping = _to_go_on_with(planned, run)
@@ -77,36 +77,36 @@ def _do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
         train(planned.spec, Console(quiet=True), args, command, run, keeping)
     except Exception as error:
         if not is_of_the_machine(error):
-            remove_states(run.state_path)  # the next try begins anew, maybe with other code
+            remove_states(run.state_path)  # the next try starts again, maybe with other code
         raise
 
 
 def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:
-    """The state that another process has left, where there is one."""
+    """The state that another process has left, or None."""
     anew = StateKeeping(was_cut_off=run.path.is_dir())
     if planned.is_batch or not holds_state(run.path) or not planned.is_of(run):
         return anew
     try:
-        keeping = go_on(run, StateKeeping(), str)  # the report on a run is its folder
-    except UserError:  # it is damaged, or another user's
+        keeping = go_on(run, StateKeeping(), str)  # nobody reads messages here
+    except UserError:  # damaged, or another user's
         return anew
     is_ours = keeping.state is None or keeping.state.is_of_these_sources
     return keeping if is_ours else anew
 
 
-# --- What is compiled once for all runs.
+# --- Compiling once for all runs.
 
 N_STEPS = 10
-# It goes by an environment variable, which Linux bounds at 128 KB.
+# Passed in an environment variable, which Linux limits to 128 KB.
 MAX_CHARACTERS = 100_000
 
 
 def warm_ups(planned: Sequence[PlannedRun]) -> str:
-    """The trainings that compile what the runs need, as JSON for `take_steps`."""
+    """The trainings that compile the user's rules of these runs, as JSON for `take_steps`."""
     chosen: dict[tuple[str, str], dict[str, Any]] = {}
     for run in planned:
         spec, key = run.spec, (run.spec.algo, run.environment)
-        # A batch is one process, and a batch alone.
+        # A batch has its own process anyway.
         if not spec.user_modules or run.is_batch or key in chosen or not run.is_to_do:
             continue
         if _is_compiled_rule_of_users(spec.algo):
@@ -129,7 +129,7 @@ def _is_compiled_rule_of_users(algo: str) -> bool:
 
 
 def take_steps(wanted: str) -> None:
-    """Do the trainings of `warm_ups`; whatever goes wrong, the run itself will say so."""
+    """Do the trainings of `warm_ups`; ignores errors, which the run itself will report."""
     for item in json.loads(wanted):
         with contextlib.suppress(Exception):
             modules = tuple(UserModule(**module) for module in item["modules"])
@@ -150,7 +150,7 @@ def take_steps(wanted: str) -> None:
 
 
 def train_aside(spec: TrainSpec) -> None:
-    """Train, and keep nothing of it but what has been compiled."""
+    """Train in a temporary folder, only to compile."""
     with TemporaryDirectory() as folder:
         spec = replace(spec, log_folder=Path(folder), pictures=False, verbose=0)
         train(spec, Console(quiet=True), {}, "")

@@ -1,8 +1,8 @@
-"""How long a run may take and how much memory, and how much it has taken.
+"""Limits of time and memory for a run, and checks of its process.
 
-Memory is what lies in the machine's own (the resident set), which is looked at a few times a
-second. A limit of the system on addresses would be exact, but networks and compiled code reserve
-many times what they use.
+Memory means the resident set, which is checked a few times a second. The system's limit on
+addresses would be exact, but networks and compiled code reserve many times the memory that they
+use.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _QUANTITY = re.compile(r"([0-9]{1,30}(?:\.[0-9]{1,30})?)\s*([a-zA-Z]*)")
 
 
 def seconds(text: str) -> float:
-    """A time such as ``90``, ``90s``, ``10m``, ``1.5h``, in seconds.
+    """Parse a time such as ``90``, ``90s``, ``10m``, ``1.5h``, to seconds.
 
     Raises:
         ValueError: for any other text.
@@ -40,7 +40,7 @@ def seconds(text: str) -> float:
 
 
 def memory(text: str) -> int:
-    """A size such as ``500MB`` (millions of bytes), ``4GB`` or ``4GiB``, in bytes.
+    """Parse a size such as ``500MB`` (millions of bytes), ``4GB`` or ``4GiB``, to bytes.
 
     Raises:
         ValueError: for any other text.
@@ -52,7 +52,7 @@ def memory(text: str) -> int:
 
 
 def _quantity(text: str, units: dict[str, int]) -> float:
-    """The number times its unit; nan where it is no such thing."""
+    """Parse a number with a unit; nan if it is invalid."""
     match = _QUANTITY.fullmatch(text.strip())
     unit = units.get(match[2].lower()) if match else None
     return math.nan if match is None or unit is None else float(match[1]) * unit
@@ -60,15 +60,15 @@ def _quantity(text: str, units: dict[str, int]) -> float:
 
 @dataclass(frozen=True)
 class RunLimits:
-    """What a run may take.
+    """The limits of a run.
 
     Raises:
         UserError: if memory cannot be measured here.
     """
 
     seconds: float | None = None  # from the start of its process; None for no limit
-    memory: int | None = None  # bytes of the machine's memory; None for no limit
-    is_wanted: Callable[[], bool] | None = None  # a run that nobody waits for any more is ended
+    memory: int | None = None  # bytes of resident memory; None for no limit
+    is_wanted: Callable[[], bool] | None = None  # ends a run that is no longer wanted
 
     def __post_init__(self) -> None:
         if self.memory is not None and sys.platform == "win32":
@@ -76,11 +76,11 @@ class RunLimits:
 
     @property
     def pause(self) -> float | None:
-        """Seconds between two looks; None where there is nothing to look at."""
+        """Seconds between two checks; None if there is nothing to check."""
         return None if self == RunLimits() else SECONDS_BETWEEN_LOOKS
 
     def exceeded(self, pid: int, elapsed: float) -> str:
-        """Which limit a process exceeds after ``elapsed`` seconds, in words; empty for none."""
+        """The limit that a process exceeds after ``elapsed`` seconds, in words; empty for none."""
         if self.is_wanted is not None and not self.is_wanted():
             return "nobody waits for it any more"
         if self.seconds is not None and elapsed > self.seconds:
@@ -100,7 +100,7 @@ def _size(n_bytes: int) -> str:
 
 
 def resident_memory(pid: int) -> int:
-    """The bytes of the machine's memory that a process takes; 0 where there is none such."""
+    """The resident memory of a process in bytes; 0 if it does not exist."""
     status = Path(f"/proc/{pid}/status")
     try:
         if not Path("/proc/self/status").exists():

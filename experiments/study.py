@@ -1,6 +1,6 @@
-"""What a study is asked to do, as one immutable value, and its YAML file.
+"""The specification of a study as one immutable value, and its YAML file.
 
-Files are read strictly; mistakes are named with file and line.
+Files are read strictly; errors name file and line.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ METRIC_WORDS: dict[str, str] = {
     "regret": "regret of a run",
 }
 
-# Of these the lower is the better.
+# For these metrics, lower is better.
 COSTS = ("regret",)
 
 
-# These are of training episodes, the others of evaluations.
+# These metrics use training episodes, the others evaluations.
 OF_TRAINING = ("training", "last_episodes")
 
 
-# Settings that map names to values: such mappings are merged name by name.
+# Settings that are mappings: these are merged key by key.
 MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 
 
-# What settings change in the environment for training alone; with these it is as it comes.
+# Settings of a training variant of the environment, with the values that switch it off.
 AS_IT_COMES: dict[str, Any] = {"train_env_kwargs": None, "train_env_wrapper": None}
 
 
 def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with ``changes`` made to them."""
+    """The settings with ``changes`` applied."""
     merged = {
         key: {**settings[key], **changes[key]}
         for key in MERGED
@@ -63,7 +63,7 @@ def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     return override(settings, {**changes, **merged})
 
 
-# What settings are called in labels and on axes: as the field writes them.
+# Symbols of settings in labels and on axes, as usual in the field.
 _SYMBOLS = {
     "learning_rate": "α",
     "gamma": "γ",
@@ -73,57 +73,57 @@ _SYMBOLS = {
     "kappa": "κ",
     "initial_q": "initial Q",
 }
-# In names of files, on the other hand.
+# Their spelling in file names.
 _SPELT = {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa"}
 
 
 def symbol(setting: str) -> str:
-    """A setting as labels and axes call it: the field's letter, or else its own name."""
+    """The symbol of a setting for labels and axes, or else its name."""
     return _SYMBOLS.get(setting, setting)
 
 
 def file_name(label: str, longest: int = LONGEST_NAME) -> str:
-    """The label as the name of a folder, of ``longest`` bytes at most."""
+    """The label as a folder name of at most ``longest`` bytes."""
     label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
     return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
 
 
 @dataclass(frozen=True)
 class AgentSpec:
-    """One of the agents that are compared."""
+    """One of the compared agents."""
 
-    label: str  #: what it is called in tables and figures
+    label: str  #: its name in tables and figures
     algo: str  #: its name in the table of agents
-    #: Hyperparameters, which change those of its file.
+    #: Hyperparameters that override those of its file.
     settings: dict[str, Any] = field(default_factory=dict)
-    #: Whether to begin with the entry of ``hyperparams/<algo>.yml``; otherwise with the defaults of
+    #: Whether to start from the entry of ``hyperparams/<algo>.yml``; otherwise from the defaults of
     #: its constructor.
     tuned: bool = True
-    #: A file of hyperparameters to begin with, instead of that one; None for that one.
+    #: Another file of hyperparameters to start from; None for the shipped one.
     conf_file: Path | None = None
-    summary: str = ""  #: a few words on it, for the report
-    #: The place in a study file that asks for it, for error messages.
+    summary: str = ""  #: a short description for the report
+    #: Its place in a study file, for error messages.
     where: str = field(default="", compare=False)
-    group: str = ""  #: for one of a sweep, the label that its members share
-    swept: dict[str, Any] = field(default_factory=dict)  #: its values of what is swept
+    group: str = ""  #: for a member of a sweep, the common label
+    swept: dict[str, Any] = field(default_factory=dict)  #: its values of the swept settings
 
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """One of the environments that they are compared on."""
+    """One of the environments of a study."""
 
-    label: str  #: what it is called in tables and figures
+    label: str  #: its name in tables and figures
     env_id: str  #: its Gymnasium id
-    #: Hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``, which change
-    #: those of the agents' files.
+    #: Hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``, which
+    #: override those of the agents' files.
     settings: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class QuickSpec:
-    """How a study is cut down for a first look."""
+    """The reduction of a study for a quick look."""
 
-    seeds: int = 2  #: how many seeds then
+    seeds: int = 2  #: the number of seeds
     budget: float = 0.1  #: share of each run's steps or episodes
 
 
@@ -132,41 +132,41 @@ class StudySpec:
     """A study: every agent on every environment with every seed."""
 
     name: str  #: the name of its folder
-    title: str  #: one line on what it asks
-    agents: tuple[AgentSpec, ...]  #: what is compared
-    environments: tuple[EnvironmentSpec, ...]  #: where
-    n_seeds: int = 10  #: how many seeds there are
-    description: str = ""  #: what it asks, and what is known beforehand
-    #: Environment steps between two evaluations, or None for twenty in a run.
+    title: str  #: its question in one line
+    agents: tuple[AgentSpec, ...]  #: the compared agents
+    environments: tuple[EnvironmentSpec, ...]  #: their environments
+    n_seeds: int = 10  #: the number of seeds
+    description: str = ""  #: its question, and earlier knowledge
+    #: Environment steps between two evaluations; None for twenty evaluations in a run.
     eval_freq: int | None = None
-    eval_episodes: int = 20  #: episodes of each evaluation that has to be sampled
-    metric: Metric = "final"  #: what the verdicts are about
-    #: Difference of the metric within which two agents count as equivalent; None for 2 % of the way
-    #: from the best random or constant policy to the optimum, where that is known.
+    eval_episodes: int = 20  #: episodes of each sampled evaluation
+    metric: Metric = "final"  #: the metric of the verdicts
+    #: Difference of the metric within which two agents count as equivalent; None for 2 % of the gap
+    #: between the best random or constant policy and the optimum, if that is known.
     margin: float | None = None
-    #: Whether an agent's run and another's with the same seed share their randomness, as those of
-    #: bandits whose arms and rewards are drawn by the seed: they are then compared seed by seed.
+    #: Whether runs of different agents with the same seed share their randomness, as on bandits
+    #: whose arms and rewards are drawn by the seed; if so, they are compared seed by seed.
     shared_randomness: bool = False
-    #: Return that counts as solved; None for 95 % of that way, or else what the environment has
-    #: registered.
+    #: Return that counts as solved; None for 95 % of that gap, or else the environment's registered
+    #: threshold.
     threshold: float | None = None
-    #: Episodes in each row of the table of training returns; 0 for no table.
+    #: Episodes per row in the table of training returns; 0 for no table.
     episodes_table: int = 0
-    quick: QuickSpec = field(default_factory=QuickSpec)  #: how it is cut down for a first look
-    is_quick: bool = False  #: whether it has been
-    #: Names of modules of the user's, whose classes settings may name.
+    quick: QuickSpec = field(default_factory=QuickSpec)  #: its reduction for a quick look
+    is_quick: bool = False  #: whether it is reduced
+    #: Names of the user's modules, whose classes settings may name.
     gym_packages: tuple[str, ...] = ()
-    user_modules: tuple[UserModule, ...] = ()  #: the same, as another process can import them
+    user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
     tensorboard: bool = False  #: whether each run writes a TensorBoard log
-    render_every: int = 0  #: episodes between two that are filmed; 0 for no films
-    #: Whether the page links to others that play the first training of each agent.
+    render_every: int = 0  #: episodes between two films; 0 for no films
+    #: Whether the page links to pages that play the first training of each agent.
     learning_pages: bool = False
-    #: The formats that figures are written in: "png", "svg", "pdf".
+    #: The file formats of figures: "png", "svg", "pdf".
     figures: Sequence[str] = ("png", "svg")
     run_timeout: float | None = None  #: seconds that each run may take; None for no limit
     run_memory: int | None = None  #: bytes of memory that each run may take; None for no limit
-    source: Path | None = None  #: the file that it was read from, or None
-    first_seed: int = 0  #: the first of them; the others follow it
+    source: Path | None = None  #: its file, or None
+    first_seed: int = 0  #: the first seed; the others follow it
 
     @property
     def seeds(self) -> range:
@@ -174,7 +174,7 @@ class StudySpec:
         return range(self.first_seed, self.first_seed + self.n_seeds)
 
     def quickened(self) -> StudySpec:
-        """The study with few seeds and a small budget, in a folder of its own."""
+        """The study with few seeds and a small budget, in a separate folder."""
         return replace(
             self,
             name=f"{self.name}-quick",
@@ -185,14 +185,14 @@ class StudySpec:
 
 # --- Study files.
 
-# The studies that come with the project.
+# The studies that are shipped with the project.
 _SHIPPED = Path(__file__).resolve().parents[1] / "studies"
 
 MOST_AGENTS = 10_000
 
 BUDGETS = ("n_timesteps", "n_episodes")
 
-# Keys of a study, and what their values must be.
+# Keys of a study, and the types of their values.
 _STUDY_VALUES: dict[str, Any] = {
     "title": str,
     "description": str,
@@ -207,7 +207,7 @@ _STUDY_VALUES: dict[str, Any] = {
     "threshold": float,
     "episodes_table": int,
 }
-# Limits of each run, written as on the command line.
+# Limits of each run, in the format of the command line.
 _LIMITS: dict[str, Callable[[str], float]] = {
     "run_timeout": run_limits.seconds,
     "run_memory": run_limits.memory,
@@ -225,17 +225,17 @@ Keys = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class _Document:
-    """A study file and where things stand in it."""
+    """A study file with the line numbers of its values."""
 
     path: Path
     lines: Mapping[Keys, int]
 
     def at(self, *keys: str | int) -> str:
-        """Where a value stands, as ``file:line``."""
+        """The place of a value, as ``file:line``."""
         return f"{self.path}:{self.lines.get(keys, 1)}"
 
     def mapping(self, value: Any, *keys: str | int) -> dict[str, Any]:
-        """The value, if it maps names to values or, inside the document, is left empty."""
+        """The value if it is a mapping, or empty inside the document; otherwise an error."""
         if value is None and keys:
             return {}
         if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
@@ -244,7 +244,7 @@ class _Document:
         return value
 
     def check_names(self, names: Iterable[str], known: Iterable[str], *keys: str | int) -> None:
-        """Refuse a name that is not known."""
+        """Refuse an unknown name."""
         known = list(known)
         for name in names:
             if name not in known:
@@ -253,7 +253,7 @@ class _Document:
     def values(
         self, data: Mapping[str, Any], kinds: Mapping[str, Any], *keys: str | int
     ) -> dict[str, Any]:
-        """The plain values among ``data``, each as its kind asks."""
+        """Check and convert the plain values among ``data`` by their types."""
         result = {}
         for key, kind in kinds.items():
             if data.get(key) is None:
@@ -269,21 +269,21 @@ class _Document:
         return result
 
     def check_budget(self, data: Mapping[str, Any], *keys: str | int) -> None:
-        """Refuse two budgets in one place."""
+        """Refuse two budgets in one mapping."""
         if all(data.get(key) is not None for key in BUDGETS):
             place = self.at(*keys, BUDGETS[1])
             raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
 
 
 def find_study(given: str) -> Path:
-    """The file that is meant: the one of that path, or else the shipped study of that name.
+    """Find a study file: the given path, or else the shipped study of that name.
 
     Args:
         given: a path, or for a shipped study also its bare name: ``mine-maze``,
             ``mine-maze.yml`` or ``studies/mine-maze.yml``.
 
     Raises:
-        UserError: if it is a plain name, and there is neither.
+        UserError: if it is a plain name, and neither exists.
     """
     path = Path(given)
     if path.is_file() or path.parent not in (Path(), Path("studies")):
@@ -296,10 +296,10 @@ def find_study(given: str) -> Path:
 
 
 def read_study(path: Path) -> StudySpec:
-    """Read a study file, whose name is the study's.
+    """Read a study file; its name is the study's name.
 
     Raises:
-        UserError: if it cannot be read or says something that is not understood.
+        UserError: if it cannot be read, or contains unknown or invalid settings.
     """
     data = read_yaml(path)
     document = _Document(path, key_lines(path))
@@ -325,10 +325,10 @@ def read_study(path: Path) -> StudySpec:
 
 
 def write_study(root: Path, study: StudySpec) -> None:
-    """Write what a study was asked for as a study file in its folder, so that others can do it.
+    """Write the study's specification as a study file in its folder, so that others can repeat it.
 
-    What flags changed is in it, the rows of maps are too, and agents' own files of hyperparameters
-    are copied beside it. Of a quick look there is none.
+    The file includes changes by flags and the rows of maps; agents' own files of hyperparameters
+    are copied beside it. A quick look has no such file.
     """
     if study.is_quick:
         return
@@ -372,7 +372,7 @@ def _agent_entry(agent: AgentSpec, settings: Mapping[str, Any]) -> dict[str, Any
 
 
 def _swept_entry(members: Sequence[AgentSpec]) -> dict[str, Any] | None:
-    """One entry for the members of a sweep; None if there is none that means just them."""
+    """One entry for all members of a sweep; None if no entry gives exactly these members."""
     first = members[0]
     kept = {key: value for key, value in first.settings.items() if key not in first.swept}
     agent = replace(first, label=first.group or first.label, settings=kept, swept={}, group="")
@@ -388,7 +388,7 @@ def _swept_entry(members: Sequence[AgentSpec]) -> dict[str, Any] | None:
 
 
 def _seeds(document: _Document, given: Any) -> dict[str, int]:
-    """How many seeds, or the first and how many."""
+    """The seeds as a number, or as first seed and number."""
     if given is None:
         return {}
     if not isinstance(given, dict):
@@ -412,7 +412,7 @@ def _run_limits(document: _Document, data: Mapping[str, Any]) -> dict[str, float
 def _entries(
     document: _Document, data: Mapping[str, Any], key: str
 ) -> dict[str, tuple[Keys, dict[str, Any]]]:
-    """What stands under ``key`` by its labels, written as a list of names or as a mapping."""
+    """Read the entries under ``key`` by label, from a list of names or a mapping."""
     value = data.get(key)
     if isinstance(value, list) and all(isinstance(item, str) for item in value):
         entries: dict[str, tuple[Keys, dict[str, Any]]] = {
@@ -461,7 +461,7 @@ def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[
 
 
 def _conf_file(document: _Document, entry: Mapping[str, Any], keys: Keys) -> Path | None:
-    """The agent's own file of hyperparameters, from the study's folder; it need not be tuned."""
+    """The agent's own file of hyperparameters, relative to the study; it need not be tuned."""
     given = entry.get("conf_file")
     if given is None:
         return None
@@ -484,13 +484,13 @@ def _sweep(document: _Document, data: Mapping[str, Any], *keys: str | int) -> di
 
 
 def _as_texts(values: Sequence[Any]) -> list[str]:
-    """Values as labels have them: numbers with four digits where these tell them apart."""
+    """Values for labels: numbers with four digits if these distinguish them."""
     short = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in values]
     return short if len(set(short)) == len(set(map(str, values))) else [str(v) for v in values]
 
 
 def swept(agent: AgentSpec, sweep: Mapping[str, Sequence[Any]]) -> list[AgentSpec]:
-    """The agent once for each combination of the values that are swept, labelled by these."""
+    """The agent for each combination of swept values, labelled by these values."""
     agents = []
     texts = {name: _as_texts(values) for name, values in sweep.items()}
     for places in product(*(range(len(values)) for values in sweep.values())):

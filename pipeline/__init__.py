@@ -1,4 +1,4 @@
-"""One run: from a specification to a finished run folder, and playing what was trained."""
+"""One run: from a specification to a finished run folder, and playing trained agents."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def loading_libraries() -> Iterator[None]:
-    """Import without the garbage collector, which takes a fifth of it, and freeze what is there."""
+    """Import without the garbage collector, which takes a fifth of it; freeze all objects."""
     was_on = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Which agent fits an environment, and settings that are worked out from it (``auto``)."""
+"""Checks that an agent fits an environment, and computes settings that say ``auto``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pipeline.train_spec import TrainSpec
 
 
 def check_algorithm(algo: str) -> None:
-    """Make sure that there is such an agent and that what it needs is installed."""
+    """Check that the agent exists and that its requirements are installed."""
     entry = ALGORITHMS.get(algo)
     if entry is None and algo.lower() == "her":
         raise UserError(
@@ -41,7 +41,7 @@ def check_algorithm(algo: str) -> None:
 
 
 def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:
-    """The typed settings of an agent, with what ``--engine`` says; None where it says nothing."""
+    """The typed settings of an agent, with the value of ``--engine``, if given."""
     if word is None or algo not in ALGORITHMS:
         return dict(settings)
     said = settings.get("engine", word)
@@ -49,7 +49,7 @@ def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dic
         raise UserError(f"--engine {word} and -params engine:{said} disagree: give one of them")
     entry = ALGORITHMS[algo]
     engines: Sequence[str] = entry.engines
-    if not engines and not entry.entry_point.startswith("agents."):  # it is the user's own
+    if not engines and not entry.entry_point.startswith("agents."):  # the user's own agent
         parameter = algorithm_parameters(load_algorithm(algo)).get("engine")
         engines = () if parameter is None else get_args(parameter.annotation)
     if len(engines) > 1 and word in engines:
@@ -63,7 +63,7 @@ def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dic
 
 
 def check_fit(spec: TrainSpec) -> None:
-    """Make sure that the agent can work with the environment as it is wrapped for it."""
+    """Check that the agent can work with the wrapped environment."""
     with closing(make_single_env(spec, training=True)) as env:
         misfit = ALGORITHMS[spec.algo].env_misfit(env)
         fitting = fitting_algorithms(
@@ -76,16 +76,16 @@ def check_fit(spec: TrainSpec) -> None:
 
 # --- what the word ``auto`` stands for ------------------------------------------------------------
 #
-# A number that suits one map does not suit the next: an entry that says ``auto`` holds for a family
-# of environments. Agents, engines and model files know numbers alone. `TrainSpec.origins` keeps how
-# each was found.
+# A number that suits one map does not suit another, so an entry with ``auto`` is valid for a family
+# of environments. Agents, engines and model files get only numbers. `TrainSpec.origins` records how
+# each number was computed.
 
 AUTO = "auto"
-# Steps of training for each pair of an observation and an action, where only ``auto`` is said, and
-# the fewest pairs that are counted: a small map takes its time to be explored too.
+# Training steps for each pair of observation and action if the setting is just ``auto``, and the
+# smallest number of pairs that counts: exploring a small map takes time too.
 STEPS_PER_PAIR = 2500
 FEWEST_PAIRS = 100
-# A step size of 1 / n averages over the last n visits, about; where it begins, and may end.
+# A step size of 1 / n averages over about the last n visits; its start, and bounds of its end.
 VISITS_AVERAGED = 10
 FIRST_STEP_SIZE = 0.3
 LAST_STEP_SIZES = (0.003, 0.05)
@@ -93,10 +93,10 @@ _WORD = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 
 class Found(NamedTuple):
-    """The value that ``auto`` stands for."""
+    """The computed value of ``auto``."""
 
     value: Any  # the setting
-    how: str  # the formula with its numbers, for people
+    how: str  # the formula with its numbers, for readers
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class _Asked:
     """A setting that says ``auto``."""
 
     env: gym.Env[Any, Any]  # the environment that the agent is judged on
-    amount: str  # what follows the word, as in ``auto_1000``; empty for nothing
+    amount: str  # the number after the word, as in ``auto_1000``; empty if there is none
     n_timesteps: int | None  # of the training, where that is known already
     where: str  # begins every error message
 
@@ -126,7 +126,7 @@ def _budget(asked: _Asked) -> Found:
 
 
 def _discount(asked: _Asked) -> Found:
-    """So what lies a whole episode ahead still counts for 0.6."""
+    """Compute gamma: a reward one whole episode ahead still counts 0.6."""
     limit = time_limit(asked.env)
     if limit is None:
         raise UserError(f"{asked.where}: auto needs an environment with a time limit")
@@ -134,7 +134,7 @@ def _discount(asked: _Asked) -> Found:
 
 
 def _step_size(asked: _Asked) -> Found:
-    """In a short training the step size stays large: what is learnt late has far to go."""
+    """Compute the schedule of the step size; it stays large in a short training."""
     states, actions = asked.pairs()
     low, high = LAST_STEP_SIZES
     if asked.n_timesteps is None:  # counted in episodes
@@ -145,18 +145,18 @@ def _step_size(asked: _Asked) -> Found:
 
 
 def _highest_value(asked: _Asked) -> Found:
-    """No return is higher where only the end of an episode is rewarded, as on FrozenLake."""
+    """The highest return if only the end of an episode is rewarded, as on FrozenLake."""
     model = transition_model(asked.env)
     if model is None:
         raise UserError(f"{asked.where}: auto needs an environment whose model is known")
-    # Of cells that nobody comes to as well: to find these would take longer than all else here.
+    # Unreachable cells count too: finding them would take longer than all the rest here.
     ends = model.terminated & (model.prob > 0)
     if not ends.any():
         raise UserError(f"{asked.where}: auto needs an environment whose episodes can end")
     return Found(float(model.reward[ends].max()), "auto: the highest reward that ends an episode")
 
 
-# In this order: the step size goes by the number of steps.
+# In this order, because the step size depends on the number of steps.
 _RULES: Mapping[str, Callable[[_Asked], Found]] = {
     "n_timesteps": _budget,
     "gamma": _discount,
@@ -172,7 +172,7 @@ def _scale(rewards: NDArray[np.floating[Any]]) -> Found:
 
 
 def _lowest_reward(rewards: NDArray[np.floating[Any]]) -> Found:
-    """A network that meets dear mistakes long before its goal learns to stand still."""
+    """Compute the bound on costs: a network that meets large costs first learns to stand still."""
     highest, lowest = float(rewards.max()), float(rewards.min())
     if highest <= 0 or -highest / 10 < lowest:
         return Found(lowest, f"{lowest:g}, the lowest reward")
@@ -186,7 +186,7 @@ _REWARD_RULES: Mapping[str, Callable[[NDArray[np.floating[Any]]], Found]] = {
 
 
 def _wrappers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
-    """The wrappers of training with numbers for ``auto``, inner ones first; empty without it."""
+    """The training wrappers with numbers for ``auto``, inner ones first; empty without ``auto``."""
     wrappers = list(component_specs(raw.get("train_env_wrapper"), f"{where}: train_env_wrapper"))
     told = []
     for place, one in enumerate(wrappers):
@@ -207,14 +207,14 @@ def _wrappers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, 
 
 
 def without_auto(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry without the settings that say ``auto``."""
+    """The entry without settings that say ``auto``."""
     return {key: value for key, value in entry.items() if _word(key, value) is None}
 
 
 def training_follows(
     entry: Mapping[str, Any], typed: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, str] | None]:
-    """Let typed env_kwargs hold in training too: the entry, and what gave way, for `origins`."""
+    """Apply typed env_kwargs to training too; returns the entry, and notes for `origins`."""
     variant, own = entry.get("train_env_kwargs"), typed.get("train_env_kwargs")
     asked = typed.get("env_kwargs")
     if not (isinstance(variant, dict) and isinstance(asked, dict)):
@@ -233,17 +233,17 @@ def resolved_spec(
     origins: Mapping[str, str] | None = None,
     **fields: Any,
 ) -> TrainSpec:
-    """A spec with a number in place of each ``auto``.
+    """Make a spec with a number in place of each ``auto``.
 
     - ``gamma: auto`` is 1 - 1/(2 x time limit) of the environment that the agent is judged on.
-    - ``n_timesteps: auto_K`` is K steps for each pair of state and action, of which 100 are counted
-      at least; ``auto`` is ``auto_2500``.
+    - ``n_timesteps: auto_K`` is K steps for each pair of state and action, for at least 100 pairs;
+      ``auto`` is ``auto_2500``.
     - ``learning_rate: auto`` falls from 0.3 to ten pairs by the steps, within 0.003 and 0.05.
     - ``initial_q: auto`` and ``value_bound: auto`` are the highest reward that ends an episode.
     - ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1 by the largest reward of training,
-      its sign aside; ``min_reward: auto`` a tenth of the highest reward, below zero.
+      in absolute value; ``min_reward: auto`` is minus a tenth of the highest reward.
 
-    ``where`` begins every error message; ``fields`` are all others of `TrainSpec`.
+    ``where`` begins every error message; ``fields`` are the other fields of `TrainSpec`.
     """
     rest = without_auto(raw)
     spec = TrainSpec(hyperparams=split(rest, where), saved_hyperparams=rest, **fields)

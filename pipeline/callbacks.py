@@ -1,4 +1,4 @@
-"""Callbacks of a training: evaluations, checkpoints, pulls, and what settings name."""
+"""Callbacks of a training: evaluations, checkpoints, pulls, and callbacks from settings."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ from pipeline.settings import components
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
 
-# --- what settings name: checkpoints, and exploration that decays by the update -------------------
+# --- callbacks for settings: checkpoints, and exploration that decays per update ------------------
 
 
 class Checkpoint(BlockCallback):
-    """Keeps the agent as it is at some moments, as ``rl_model_<steps>_steps.zip``.
+    """Saves the agent at some moments, as ``rl_model_<steps>_steps.zip``.
 
-    Statistics of VecNormalize go with it, under the name that `CheckpointCallback` gives them, and
-    on demand the replay buffer.
+    It also saves VecNormalize statistics, under the file name of `CheckpointCallback`, and
+    optionally the replay buffer.
     """
 
     def __init__(self, save_path: str | Path, with_replay_buffer: bool = False) -> None:
@@ -57,7 +57,7 @@ class Checkpoint(BlockCallback):
         self.with_replay_buffer = with_replay_buffer
 
     def save(self) -> None:
-        """Write the agent as it is now."""
+        """Write the current agent."""
         path = self.save_path / f"rl_model_{self.num_timesteps}_steps.zip"
         with current().held():
             save_model(self.model, path)
@@ -67,7 +67,7 @@ class Checkpoint(BlockCallback):
 
 
 class StepCheckpoint(Checkpoint):
-    """A checkpoint every ``every_n_steps`` environment steps, counted over all environments."""
+    """Saves a checkpoint every ``every_n_steps`` steps, counted over all environments."""
 
     def __init__(
         self, every_n_steps: int, save_path: str | Path, with_replay_buffer: bool = False
@@ -83,12 +83,12 @@ class StepCheckpoint(Checkpoint):
 
 
 class EpisodeCheckpoint(Checkpoint):
-    """A checkpoint every ``every_n_episodes`` episodes, counted over all environments.
+    """Saves a checkpoint every ``every_n_episodes`` episodes, counted over all environments.
 
     Args:
         every_n_episodes: episodes between two checkpoints, at least 1.
-        save_path: folder to write to; in a hyperparameter file, the run's unless given.
-        with_replay_buffer: write the agent's replay buffer each time too, where it has one.
+        save_path: the target folder; in a hyperparameter file, by default the run folder.
+        with_replay_buffer: also write the agent's replay buffer, if it has one.
     """
 
     def __init__(
@@ -116,11 +116,11 @@ class EpisodeCheckpoint(Checkpoint):
 
 
 class ExponentialExploration(BaseCallback):
-    """Let epsilon of DQN fall by a constant factor at each gradient update.
+    """Multiplies DQN's epsilon by a constant factor at each gradient update.
 
     Args:
-        initial_eps: epsilon before the first update, within [0, 1] as the others.
-        final_eps: the value that it does not fall below.
+        initial_eps: epsilon before the first update, in [0, 1] like the others.
+        final_eps: the lower bound of epsilon.
         decay: the factor.
     """
 
@@ -144,7 +144,7 @@ class ExponentialExploration(BaseCallback):
     def _on_rollout_start(self) -> None:
         updates = self.model._n_updates
         epsilon = max(self.final_eps, self.initial_eps * self.decay**updates)
-        # The algorithm reads its schedule after each step: it must agree with the present rate.
+        # The algorithm reads its schedule after each step: it must equal the current rate.
         model: Any = self.model
         model.exploration_schedule = ConstantSchedule(epsilon)
         model.exploration_rate = epsilon
@@ -153,10 +153,10 @@ class ExponentialExploration(BaseCallback):
         return True
 
 
-# --- the first number that is none ends a training ------------------------------------------------
+# --- a number that is not finite ends a training --------------------------------------------------
 
-# Under these names the library's agents log what they minimise. Other entries may be nan, such as
-# the variance that is explained of nothing.
+# Names under which the library's agents log their losses. Other entries may be nan, for example the
+# explained variance of constant returns.
 LOSSES = (
     "train/loss",
     "train/actor_loss",
@@ -169,12 +169,12 @@ _NO_EPISODE: Mapping[str, float] = {"r": 0.0}
 
 
 class NumberWatch(BlockCallback):
-    """Checks all numbers of each step, or of the last in each compiled block, and losses."""
+    """Checks the numbers of each step (or of a compiled block's last step) and the losses."""
 
     takes_blocks = True
 
     def update_locals(self, locals_: dict[str, Any]) -> None:
-        """Take what the training loop shows, without a copy: this is called at each step."""
+        """Store the training loop's variables without a copy, because this runs at each step."""
         self.locals = locals_
 
     def _on_training_start(self) -> None:
@@ -190,7 +190,7 @@ class NumberWatch(BlockCallback):
 
     def _on_step(self) -> bool:
         seen = self.locals
-        # Algorithms that play whole episodes, as ARS does, show another function's names.
+        # Algorithms that play whole episodes, such as ARS, pass other variables.
         new_obs = seen.get("new_obs", seen.get("new_observations"))
         rewards, actions = seen.get("rewards"), seen.get("actions")
         if not (is_finite(rewards) and is_finite(new_obs) and is_finite(actions)):
@@ -201,7 +201,7 @@ class NumberWatch(BlockCallback):
         dones = seen.get("dones")
         if dones is None or True not in (ended := dones.tolist()):
             return True
-        # What was seen before resets, and the returns that Monitor wrote down.
+        # Observations before resets, and the returns in Monitor's records.
         for i, info in enumerate(seen["infos"]):
             if not ended[i]:
                 continue
@@ -218,19 +218,19 @@ class NumberWatch(BlockCallback):
 
 @dataclass(frozen=True)
 class PullSummary:
-    """Figures on the pulls of a training."""
+    """Summary of the pulls of a training."""
 
     n_pulls: int  # over all environments
-    n_matched: int  # that a log held the arm of; all where there is no log
-    reward: float | None  # mean of the pulls that matched; None where none did
-    # Sum of the best expected reward less that of the arm; None where nobody knows what arms are
-    # worth, as with a log.
+    n_matched: int  # pulls of an arm that the log contained; all pulls without a log
+    reward: float | None  # mean of the matched pulls; None if no pull matched
+    # Sum of the best expected reward minus that of the arm; None if the expected rewards are
+    # unknown, as with a log.
     regret: float | None
-    optimal: float | None  # share of a best arm among the last pulls, likewise
+    optimal: float | None  # share of best arms among the last pulls; None likewise
 
 
 def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
-    """Sum up arrays as `PullLog.arrays` gives them."""
+    """Compute the summary from the arrays of `PullLog.arrays`."""
     regrets, matched = pulls["regrets"], pulls["matched"]
     is_known = not bool(np.isnan(regrets).any())
     return PullSummary(
@@ -243,7 +243,7 @@ def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
 
 
 class PullRecorder(PullLog):
-    """Writes ``pulls.npz`` at the end of training; see `PullLog.arrays` for what is in it."""
+    """Writes ``pulls.npz`` at the end of training, with the contents of `PullLog.arrays`."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -253,21 +253,21 @@ class PullRecorder(PullLog):
         self.write()
 
     def write(self) -> None:
-        """Write the pulls so far."""
+        """Write the pulls up to now."""
         with replacing(self.folder / PULLS_FILE) as file:
             np.savez(file, allow_pickle=False, **self.arrays())
 
 
-# --- evaluations during training: when they are due, and what is kept of them ---------------------
+# --- evaluations during training: when they are due, and what they store --------------------------
 
 SECONDS_BETWEEN_WRITES = 1.0
 
 
 class EvaluationCallback(EvalCallback):
-    """`EvalCallback` with the evaluation handed to it, and files that are never half-written.
+    """An `EvalCallback` with a given evaluation function, and files that are never half-written.
 
-    It writes ``evaluations.npz`` and ``best_model.zip`` with its statistics of VecNormalize, and
-    feeds the same callbacks and log entries as its parent.
+    It writes ``evaluations.npz`` and ``best_model.zip`` with its VecNormalize statistics. It
+    triggers the same callbacks and log entries as its base class.
     """
 
     def __init__(
@@ -294,8 +294,8 @@ class EvaluationCallback(EvalCallback):
         self.last_evaluation: Evaluation | None = None
         self.best_timesteps = 0
         self.best_episodes = 0
-        self.taken = WorkTime()  # the time that evaluations have taken
-        self.n_episodes: list[int] = []  # of each evaluation, 0 of those that are exact
+        self.taken = WorkTime()  # the total time of evaluations
+        self.n_episodes: list[int] = []  # of each evaluation; 0 if it is exact
         self._is_written = True
         self._written_at = -np.inf
 
@@ -307,17 +307,17 @@ class EvaluationCallback(EvalCallback):
         )
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
-        """Count calls that were left out."""
+        """Count skipped calls."""
         self.n_calls += n_calls
         self.episodes_seen += n_episodes
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether there are to be evaluations during training."""
+        """Whether evaluations during training are wanted."""
         return self.eval_freq > 0 or self.eval_episode_freq > 0
 
     def _init_callback(self) -> None:
-        """Training and evaluation environments may be of different kinds here."""
+        """Skip the library's check that training and evaluation environments have one type."""
 
     def _on_step(self) -> bool:
         before = self.episodes_seen
@@ -334,7 +334,7 @@ class EvaluationCallback(EvalCallback):
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Add the time of the ``with`` statement to that of evaluations."""
+        """Add the duration of the ``with`` statement to the time of evaluations."""
         begun = WorkTime.now()
         try:
             yield
@@ -342,7 +342,7 @@ class EvaluationCallback(EvalCallback):
             self.taken += WorkTime.now() - begun
 
     def evaluate_now(self) -> bool:
-        """Evaluate the agent as it is; False where a callback asks to stop the training."""
+        """Evaluate the current agent; False if a callback asks to stop the training."""
         check_model(self.model)
         self.take_statistics()
         with self.during("evaluating"), self.timed():
@@ -364,7 +364,7 @@ class EvaluationCallback(EvalCallback):
         return self._on_event() if self.callback is not None else True
 
     def take_statistics(self) -> None:
-        """Let evaluation normalise by the statistics that training has now."""
+        """Copy training's current normalisation statistics to evaluation."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
 
@@ -376,12 +376,12 @@ class EvaluationCallback(EvalCallback):
             self.evaluations_successes.append(evaluation.successes.tolist())
         self.n_episodes.append(0 if evaluation.is_exact else len(evaluation.returns))
         self._is_written = False
-        # To replace a file takes longer than an exact evaluation.
+        # Replacing a file takes longer than an exact evaluation.
         if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
             self.write()
 
     def write(self) -> None:
-        """Write the evaluations, unless they are written already."""
+        """Write the evaluations that are not written yet."""
         if self._is_written:
             return
         arrays: dict[str, Any] = {
@@ -410,18 +410,18 @@ class EvaluationCallback(EvalCallback):
 
 
 def _table(rows: list[list[Any]]) -> NDArray[Any]:
-    """Rows as one array, shorter ones repeated; rl_zoo3's plots want at least two columns."""
+    """Rows as one array, shorter ones repeated; rl_zoo3's plots need at least two columns."""
     width = max(math.lcm(*map(len, rows)), 2)
     return np.array([row * (width // len(row)) for row in rows])
 
 
-# --- which callbacks a training has ---------------------------------------------------------------
+# --- the callbacks of a training ------------------------------------------------------------------
 
 EVALUATIONS_PER_RUN = 20
 
 
 def named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[BaseCallback]:
-    """The callbacks that the hyperparameters name, and the checkpoints that are asked for."""
+    """The callbacks from the hyperparameters, and the requested checkpoints."""
     callbacks: list[BaseCallback] = components.callbacks(
         spec.hyperparams.callback, spec.gym_packages, run.path
     )
@@ -450,7 +450,7 @@ def evaluation_intervals(
     if spec.eval_freq is not None:
         return (max(spec.eval_freq // n_envs, 1), 0) if spec.eval_freq > 0 else (0, 0)
     if is_judged_by_regret:
-        # An episode to evaluate on may have other arms, and says less than the pulls of training.
+        # An evaluation episode may have other arms, and says less than the pulls of training.
         return 0, 0
     if spec.hyperparams.n_timesteps is not None:
         return max(spec.hyperparams.n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1), 0

@@ -1,4 +1,4 @@
-"""Pictures of a run: its learning curve and its pulls."""
+"""Draws pictures of a run: its learning curve and its pulls."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def fix_layout(figure: Figure) -> None:
-    """Work the layout out now, by what is there: what is drawn later gets no room of its own."""
+    """Compute the layout now; artists that are added later do not change it."""
     engine = figure.get_layout_engine()
     assert engine is not None
     engine.execute(figure)
@@ -40,7 +40,7 @@ def write_png(figure: Figure, path: Path) -> None:
         canvas.print_png(file)
 
 
-# Okabe and Ito's colours, told apart by colour-blind readers too.
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
 GREEN = "#009E73"
@@ -48,11 +48,11 @@ GREY = "#9A9A9A"
 
 MOVING_AVERAGE_EPISODES = 100
 MAX_POINTS = 5000
-MOST_POWERS = 12  # of ten, that an axis goes over
+MOST_POWERS = 12  # powers of ten on an axis
 
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
-    """Steps done over all environments by the end of each training episode, and its return."""
+    """Steps over all environments until the end of each training episode, and its return."""
     contents = [read_file(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
     rows = [
         np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
@@ -61,8 +61,8 @@ def read_monitors(folder: Path) -> tuple[Floats, Floats]:
     ]
     if not rows:
         return np.empty(0), np.empty(0)
-    # The environments of a run are stepped together: by the time that one of them has done so many
-    # steps, all of them have.
+    # The environments of a run step together: when one environment has done so many steps, all
+    # have.
     steps = np.concatenate([len(contents) * np.cumsum(table[:, 1]) for table in rows])
     returns = np.concatenate([table[:, 0] for table in rows])
     order = np.argsort(steps, kind="stable")
@@ -70,7 +70,7 @@ def read_monitors(folder: Path) -> tuple[Floats, Floats]:
 
 
 def moving_average(values: Floats, width: int) -> Floats:
-    """Mean of the last ``width`` values at each position, or of as many as there are."""
+    """Mean of the last ``width`` values at each position, or of fewer at the beginning."""
     sums = np.cumsum(np.insert(values, 0, 0.0))
     ends = np.arange(1, len(values) + 1)
     starts = np.maximum(ends - width, 0)
@@ -78,7 +78,7 @@ def moving_average(values: Floats, width: int) -> Floats:
 
 
 def symlog_ticks(linear_up_to: float) -> list[float]:
-    """Ticks of a symmetric logarithmic axis: 0, one within the linear part, two for each power."""
+    """Ticks of a symmetric logarithmic axis: 0, one in the linear part, two for each power."""
     power = math.floor(math.log10(linear_up_to))
     within = max(m for m in (1, 2, 5) if m * 10.0**power <= linear_up_to) * 10.0**power
     beyond = [m * 10.0**k for k in range(power, power + MOST_POWERS) for m in (1, 3)]
@@ -87,7 +87,7 @@ def symlog_ticks(linear_up_to: float) -> list[float]:
 
 
 def _compress_outliers(axes: Axes, returns: Floats) -> None:
-    """Use a symmetric logarithmic axis where early returns dwarf those at the end."""
+    """Use a symmetric logarithmic axis if early returns are far larger than the last ones."""
     from matplotlib.ticker import FixedLocator, StrMethodFormatter
 
     if not len(returns):
@@ -131,7 +131,7 @@ def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
 
 
 def _places(figure: Figure, *, apart: bool) -> tuple[Axes, Axes]:
-    """Axes for evaluations and for training: the same ones, or one above the other."""
+    """Axes for evaluations and for training: shared, or one above the other."""
     if not apart:
         axes = figure.subplots()
         axes.set(xlabel="environment steps", ylabel="return of an episode")
@@ -178,11 +178,11 @@ def draw_learning_curve(
     for axes in dict.fromkeys((judged, trained)):
         _style(axes)
     if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
-        # Below, where it covers no episode.
+        # At the bottom, where it covers no episode.
         legend = figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
         for handle in legend.legend_handles:
             if isinstance(handle, Line2D) and handle.get_color() == GREY:
-                handle.set(markersize=6, alpha=1)  # a dot as small as those drawn is hard to see
+                handle.set(markersize=6, alpha=1)  # a dot of the drawn size is hard to see
     fix_layout(figure)
     write_png(figure, run.curve_path)
 
@@ -200,7 +200,7 @@ def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> Non
     from matplotlib.figure import Figure
     from matplotlib.ticker import PercentFormatter
 
-    # A pull that a log does not hold has no reward.
+    # A pull that is not in the log has no reward.
     kept = pulls["matched"].T.ravel()
     rewards, regrets = (pulls[name].T.ravel()[kept] for name in ("rewards", "regrets"))
     if not len(rewards):

@@ -1,9 +1,8 @@
-"""What the files of a run were when it ended: their SHA-256, which ``run.json`` keeps in ``files``.
+"""Records SHA-256 digests of a run's files in ``run.json`` (``files``), and checks them.
 
-The entry of ``run.json`` itself is the digest of all else in it, as JSON without spaces and with
-sorted keys. A file that is not listed is the user's own. Runs of earlier versions have no such
-field, and no ``record_version``, which is written when a run begins: their files are taken as they
-are.
+The entry of ``run.json`` itself is the digest of its other contents, as JSON without spaces and
+with sorted keys. A file that is not listed is the user's own. Runs of earlier versions have neither
+this field nor ``record_version``, which a run writes first: their files are not checked.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ if TYPE_CHECKING:
 
 RECORD = "run.json"
 FIELD = "files"
-LOCK = ".lock"  # of the process at work
-STATE_FOLDER = "state"  # of what a run goes on from, which is no part of what it leaves
+LOCK = ".lock"  # of the running process
+STATE_FOLDER = "state"  # saved states, which are not part of a run's results
 VERSION_FIELD = "record_version"
-VERSION = 2  # of records with digests; those before had no such field
-# What a run may say of itself before it has digests.
+VERSION = 2  # of records with digests; earlier records had no such field
+# States of a run that has no digests yet.
 _UNDER_WAY = ("running", "failed")
 LARGEST_RECORD = 64 << 20  # bytes
-LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
+LARGEST_READ = 2 << 30  # bytes, of a file that is read at once
 _PIECE = 1 << 20  # bytes
 _DEEPEST_RECORD = 100  # lists and objects inside each other
 
@@ -47,7 +46,7 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class DamagedFileError(UserError):
-    """The file at ``path`` is missing, or is not what the run left."""
+    """The file at ``path`` is missing, or differs from the file that the run wrote."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path} {reason}")
@@ -56,21 +55,21 @@ class DamagedFileError(UserError):
 
 @dataclass(frozen=True)
 class RecordedFiles:
-    """The files of a run, checked against the digests of its end."""
+    """Reads the files of a run, checked against the recorded digests."""
 
     folder: Path  # the run folder
-    # by name relative to the folder; None where the run recorded none
+    # by name relative to the folder; None if the run recorded no digests
     digests: Mapping[str, str] | None
 
     def matching(self, pattern: str) -> list[Path]:
-        """The files in the folder itself that the run left, by name; see `fnmatch`."""
+        """The run's files in the folder itself whose names match a pattern of `fnmatch`."""
         if self.digests is None:
             return sorted(self.folder.glob(pattern))
         names = (name for name in self.digests if "/" not in name and fnmatchcase(name, pattern))
         return [self.folder / name for name in sorted(names)]
 
     def read(self, path: Path, limit: int = LARGEST_READ) -> bytes:
-        """All of a file of no more than ``limit`` bytes, which is as the run left it."""
+        """Read a whole file of at most ``limit`` bytes, and check its digest."""
         with _as_damage(path):
             content = read_file(path, limit)
         recorded = self._recorded(path)
@@ -79,15 +78,15 @@ class RecordedFiles:
         return content
 
     def check(self, path: Path) -> None:
-        """Check the digest of a file that need not fit the memory."""
+        """Check the digest of a file that may be larger than memory."""
         recorded = self._recorded(path)
         with _as_damage(path):
             if recorded is not None and digest_of(path) != recorded:
                 raise DamagedFileError(path, "is not as the run left it")
 
     def _recorded(self, path: Path) -> str | None:
-        """The digest of a file; None where the run recorded none, or the file is not its own."""
-        # Not where a link leads that somebody put in the file's place.
+        """The recorded digest of a file; None if there is none, or the file is not the run's."""
+        # Does not follow a link that someone put in the file's place.
         if self.digests is None:
             return None
         if path.is_relative_to(self.folder):
@@ -100,7 +99,7 @@ class RecordedFiles:
 
 
 def digests_of(folder: Path) -> dict[str, str]:
-    """The digests of all files of a run folder but ``run.json``, by relative name."""
+    """The digests of all files of a run folder except ``run.json``, by relative name."""
     paths = [path for path in sorted(files_below(folder)) if path.parent != folder / STATE_FOLDER]
     names = {path.relative_to(folder).as_posix(): path for path in paths}
     return {
@@ -120,7 +119,7 @@ def digest_of(path: Path) -> str:
 
 
 def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
-    """The record with its own digest, where it has those of the run's files."""
+    """The record with its own digest, if it contains digests of the run's files."""
     if FIELD not in record:
         return dict(record)
     whole: dict[str, Any] = plain(record)
@@ -128,7 +127,7 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The contents of a ``run.json``, checked against its digest."""
+    """Read a ``run.json``, and check its digest."""
     hold(path.parent)
     try:
         content = read_file(path, LARGEST_RECORD)
@@ -168,13 +167,13 @@ def _as_damage(path: Path) -> Iterator[None]:
         raise DamagedFileError(path, str(error).removeprefix(f"{path} ")) from error
 
 
-# What the objects of a training, and what is recorded of them, are made by.
+# The packages that make the objects of a training, and its records.
 OF_TRAINING = ("safe_files", "machine_code", "mdp", "envs", "agents", "pipeline")
 
 
 @cache
 def source_digest(*more: str) -> str:
-    """The digest of the sources of `OF_TRAINING` and ``more``, as they are when first asked for."""
+    """The digest of the sources of `OF_TRAINING` and ``more``; cached at the first call."""
     from machine_code.sources import content_lines, source_paths
     from machine_code.sources import digest_of as digest_of_lines
 
@@ -198,7 +197,7 @@ def _is_too_deep(value: Any) -> bool:
 
 
 def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of numbers in an archive of NumPy's, by name."""
+    """Read the arrays of numbers in a NumPy archive, by name."""
     import numpy as np
     from numpy.lib.npyio import NpzFile
 
@@ -213,7 +212,7 @@ def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
                 raise ValueError("it holds an array twice, or too many of them")
             if not all(info.compress_type in _METHODS for info in infos):
                 raise ValueError("it is compressed in a way that is not read here")
-            # The bytes, those without the header, and the array.
+            # Charged: the bytes, the bytes without the header, and the array.
             Budget(len(content)).charge(3 * sum(info.file_size for info in infos))
             arrays = {name: archive[name] for name in archive.files}
             for array in arrays.values():
@@ -222,14 +221,14 @@ def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
                 if array.dtype.kind not in _KINDS:
                     raise ValueError(f"it holds {array.dtype} where numbers belong")
             return arrays
-    except Exception as error:  # at damaged files, zipfile and NumPy raise whatever they meet
+    except Exception as error:  # for damaged files, zipfile and NumPy may raise anything
         raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error
 
 
 def read_shaped(
     path: Path, content: bytes, shapes: Mapping[str, str], optional: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """As `read_arrays`; a shape names the lengths of its axes, those of one name are alike."""
+    """Like `read_arrays`, with checked shapes: axes of the same name have the same length."""
     arrays = read_arrays(path, content)
     lengths: dict[str, int] = {}
     for name, shape in shapes.items():

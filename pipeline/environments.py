@@ -1,4 +1,4 @@
-"""From a spec to the environments that an agent is trained and evaluated on."""
+"""Makes the training and evaluation environments of a spec."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
 from safe_files.files import memory_bytes
 
-# Where neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
-# policy that runs in a circle would never end.
+# If neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
+# policy that moves in a circle would never end.
 EVALUATION_TIME_LIMIT = 1000
 
-# What environments raise when they are made with wrong arguments.
+# Exceptions of environments that are made with wrong arguments.
 _OF_ARGUMENTS = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 MISTAKES = (*_OF_ARGUMENTS, AssertionError, OSError, ImportError, MemoryError, gym.error.Error)
 
@@ -40,7 +40,7 @@ TRAINING_VEC_ENVS = {"dummy": "DummyVecEnv", "subproc": "SubprocVecEnv"}
 
 
 def check_memory(what: str, n_bytes: int, where: str) -> None:
-    """Refuse what this machine's memory cannot hold."""
+    """Refuse settings that need more memory than this machine has."""
     if n_bytes > memory_bytes():
         needed, present = (f"{max(round(n / 2**30), 1):,} GB" for n in (n_bytes, memory_bytes()))
         raise UserError(
@@ -50,7 +50,7 @@ def check_memory(what: str, n_bytes: int, where: str) -> None:
 
 
 def check_env_id(env_id: str) -> None:
-    """Make sure that the environment is registered; no module is imported for that."""
+    """Check that the environment is registered, without importing a module."""
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:
         raise UserError(
@@ -62,7 +62,7 @@ def check_env_id(env_id: str) -> None:
 
 
 def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    """`gym.make` with mistakes in one line; the module of ``module:Env-v0`` is not imported."""
+    """`gym.make` with errors in one line; does not import the module of ``module:Env-v0``."""
     try:
         return gym.make(env_id.rpartition(":")[2], **kwargs)
     except MISTAKES as error:
@@ -70,22 +70,22 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
 
 
 def training_kwargs(spec: TrainSpec) -> dict[str, Any]:
-    """Arguments of the environments that the agent is trained on."""
+    """Arguments of the training environments."""
     return {**spec.hyperparams.env_kwargs, **spec.hyperparams.train_env_kwargs}
 
 
 def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
-    """Arguments of the environments that it is evaluated on, which always have a time limit."""
+    """Arguments of the evaluation environments, which always have a time limit."""
     kwargs = {**spec.hyperparams.env_kwargs, **spec.hyperparams.eval_env_kwargs}
     registered = gym.spec(spec.env_id.rpartition(":")[2]).max_episode_steps
-    # Gymnasium takes -1 for no limit at all.
+    # For Gymnasium, -1 means no limit.
     if kwargs.get("max_episode_steps", registered) in (None, -1):
         kwargs["max_episode_steps"] = EVALUATION_TIME_LIMIT
     return kwargs
 
 
 def trains_on_variant(spec: TrainSpec) -> bool:
-    """Whether training's returns, below all wrappers, are of another environment."""
+    """Whether training has other environment arguments than evaluation; ignores wrappers."""
     special = spec.hyperparams
     changes = special.train_env_kwargs, special.eval_env_kwargs
     if not any(changes):
@@ -96,7 +96,7 @@ def trains_on_variant(spec: TrainSpec) -> bool:
 
 
 def training_changes(spec: TrainSpec) -> tuple[str, ...]:
-    """What the settings change in the environment for training alone, in words."""
+    """The changes of the environment that apply to training only, in words."""
     special = spec.hyperparams
     usual = {**usual_kwargs(spec.env_id), **special.env_kwargs}
     told = []
@@ -119,7 +119,7 @@ def training_changes(spec: TrainSpec) -> tuple[str, ...]:
 
 
 def usual_kwargs(env_id: str) -> dict[str, Any]:
-    """The arguments that an environment has where none are given, as far as they are known."""
+    """The default arguments of an environment, as far as they are known."""
     registered, make = gym.spec(env_id.rpartition(":")[2]), _creator(env_id)
     parameters = {} if make is None else inspect.signature(make).parameters
     defaults = {p.name: p.default for p in parameters.values() if p.default is not p.empty}
@@ -127,7 +127,7 @@ def usual_kwargs(env_id: str) -> dict[str, Any]:
 
 
 def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> Wrap | None:
-    """The named wrappers as one function, or None; outermost, masks for agents that need them."""
+    """The named wrappers as one function, or None; masks, for agents that need them, outermost."""
     from pipeline.settings.components import wrapper_factory
 
     named = {"env_wrapper": spec.hyperparams.env_wrapper}
@@ -145,7 +145,7 @@ def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> 
 
         wraps.append(with_masks)
     elif spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks:
-        # Where there are none, `pipeline.agent_settings` names the agents that would fit.
+        # Without masks, `pipeline.agent_settings` names the agents that would fit.
         wraps.append(lambda env: ActionMasks(env) if has_masks(env) else env)
     if not wraps:
         return None
@@ -153,7 +153,7 @@ def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> 
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gym.Env[Any, Any]:
-    """One wrapped environment, outside any VecEnv."""
+    """Make one wrapped environment, outside any VecEnv."""
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
     env = make_env(spec.env_id, {**kwargs, **extra})
     wrap = env_wrapper(spec, training)
@@ -164,14 +164,14 @@ def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gy
 
 
 def make_training_env(spec: TrainSpec, monitor_folder: Path | None) -> Any:
-    """The environments of the training, each under a Monitor that writes into the folder."""
+    """Make the training environments, each in a Monitor that writes into the folder."""
     return _make_vec_env(spec, spec.hyperparams.n_envs, first_slot_seed(spec), True, monitor_folder)
 
 
 def first_slot_seed(spec: TrainSpec) -> int:
-    """The seed of the first environment of a training; the next has one more, and so on.
+    """The seed of the first training environment; each next environment adds 1.
 
-    No two runs with different seeds and as many environments share one.
+    Two runs with different seeds and equally many environments share no seed.
     """
     return spec.seed * spec.hyperparams.n_envs
 
@@ -183,7 +183,7 @@ def make_evaluation_env(
     monitor_folder: Path | None = None,
     **extra: Any,
 ) -> Any:
-    """A VecEnv to evaluate on; ``extra`` are further arguments of the environments."""
+    """Make the evaluation VecEnv; ``extra`` are further arguments of the environments."""
     return _make_vec_env(spec, n_envs, None, False, monitor_folder, extra, wrap_innermost)
 
 
@@ -208,12 +208,12 @@ def _make_vec_env(
         shield_workers()
 
     def make(**given: Any) -> gym.Env[Any, Any]:
-        import_again(spec.user_modules)  # this may be another process
+        import_again(spec.user_modules)  # this may run in another process
         env = make_env(spec.env_id, given)
         return env if wrap_innermost is None else wrap_innermost(env)
 
     def wrap_elsewhere(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-        wrap = env_wrapper(spec, training, monitor_folder)  # its classes would be unpickled sooner
+        wrap = env_wrapper(spec, training, monitor_folder)  # after the import of its classes
         return env if wrap is None else wrap(env)
 
     wrapper = env_wrapper(spec, training, monitor_folder)
@@ -233,7 +233,7 @@ def _make_vec_env(
         wrap = vec_wrapper_factory(wrappers, spec.gym_packages, folder=monitor_folder)
         env = env if wrap is None else wrap(env)
         if (normalize := spec.hyperparams.normalize) is not None:
-            # Statistics come from training, and returns of evaluation are reported as they are.
+            # Statistics come from training, and evaluation reports unnormalised returns.
             fixed = {} if training else {"norm_reward": False, "training": False}
             env = vec_env.VecNormalize(env, **{**normalize, **fixed})
         if spec.hyperparams.frame_stack is not None:
@@ -243,14 +243,14 @@ def _make_vec_env(
     return env
 
 
-# What `gymnasium.make` takes itself.
+# Arguments that `gymnasium.make` uses itself.
 _OF_MAKE = ("max_episode_steps", "render_mode")
-# It adds this to some errors, and all arguments once more.
+# Gymnasium adds this to some errors, followed by all arguments.
 _ADDED = " was raised from the environment creator"
 
 
 def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception) -> UserError:
-    """The line for an environment that raised ``error`` when it was made with ``kwargs``."""
+    """The one-line message for an ``error`` from making an environment with ``kwargs``."""
     parameters: Mapping[str, inspect.Parameter] = {}
     creator: Any = None
     with suppress(ImportError, AttributeError, TypeError, ValueError):
@@ -262,12 +262,12 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
         known = [name for name in (*parameters, *_OF_MAKE) if name != "render_mode"]
         return unknown(f"{env_id}: unknown argument", foreign, known)
     if isinstance(error, KeyError):
-        # It looked something up that is not there: an argument, as a rule.
+        # A failed look-up, mostly of an argument.
         key = error.args[0] if error.args else None
         name = next((name for name, value in kwargs.items() if value is key or value == key), None)
         if name is None:
             return UserError(f"{env_id}: it looks for {shown(key)}, which is not there")
-        # Known are the keys of a table in its module that has the argument's default among them.
+        # The known values are the keys of a table in its module that contains the default.
         default = parameters[name].default if name in parameters else None
         module = sys.modules.get(getattr(creator, "__module__", ""), object)
         tables = (table for table in vars(module).values() if isinstance(table, dict))
@@ -281,7 +281,7 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
 
 @contextmanager
 def lacking_packages_told(env_id: str) -> Iterator[None]:
-    """Say in a line which package an environment lacks, as it may only find when it is drawn."""
+    """Report a package that an environment lacks, in one line; rendering may find it only later."""
     try:
         yield
     except gym.error.DependencyNotInstalled as error:
@@ -289,7 +289,7 @@ def lacking_packages_told(env_id: str) -> Iterator[None]:
 
 
 def _creator(env_id: str) -> Any:
-    """The class or function that makes the environment."""
+    """The class or function that creates the environment."""
     entry_point = gym.spec(env_id.rpartition(":")[2]).entry_point
     return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
 
@@ -298,7 +298,7 @@ _ENV_KWARGS = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 
 
 def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The hyperparameters of a grid world with the rows of each map in place of its file's path."""
+    """Hyperparameters of a grid world with the rows of each map in place of its file's path."""
     named = _naming(settings, "desc", env_id, GridWorld)
     try:
         read = {
@@ -310,7 +310,7 @@ def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The hyperparameters of a ReplayBandit with the full path to each log of pulls."""
+    """Hyperparameters of a ReplayBandit with absolute paths of its logs."""
     named = _naming(settings, "log", env_id, ReplayBandit)
     paths = {key: str(Path(settings[key]["log"]).absolute()) for key in named}
     return {**settings, **{key: {**settings[key], "log": path} for key, path in paths.items()}}
@@ -319,7 +319,7 @@ def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any
 def _naming(
     settings: Mapping[str, Any], argument: str, env_id: str, kind: type[gym.Env[Any, Any]]
 ) -> list[str]:
-    """The keys that give an environment of that kind a text as that argument."""
+    """The keys whose environment arguments give this argument as a text."""
     given = {key: settings.get(key) for key in _ENV_KWARGS}
     named = [
         key

@@ -1,4 +1,4 @@
-"""Mistakes of the user's, and how messages name them."""
+"""User errors, and helpers for their messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 _SHORT_LIST = 12
 
-# What hyperparameters are called elsewhere, where no likeness of the letters tells.
+# Other names of hyperparameters whose spelling is too different to be found by similarity.
 OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("lr", "alpha", "step_size", "eta"), ("learning_rate",)),
     **dict.fromkeys(
@@ -43,34 +43,34 @@ _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
 
 
-# What a terminal obeys instead of showing it, but for ends of lines and tabs; what turns the
-# direction of writing round; and halves of characters, which no file can hold.
+# Control characters except line ends and tabs; characters that change the writing direction; and
+# surrogates, which no file can contain.
 _OBEYED = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 
 
 class UserError(Exception):
-    """A mistake of the user's: one line that says what is wrong, where, and what would be right."""
+    """A user error: one line that says what is wrong, where, and how to correct it."""
 
     def __init__(self, message: str) -> None:
         super().__init__(visible(" ".join(line.strip() for line in message.splitlines())))
 
 
 def visible(text: str) -> str:
-    """The text with control characters spelt out: a terminal shows them, and does not obey."""
+    """The text with control characters escaped, so that a terminal shows them."""
     return _OBEYED.sub(lambda sign: sign[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def shown(value: object) -> str:
-    """The value as an error message quotes it, shortened where it is long."""
+    """The value as error messages quote it, shortened if it is long."""
     return _brief.repr(value)
 
 
 def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
-    """What ``name`` was meant to be, as a question; all known names where none is near.
+    """A hint with the known names nearest to ``name``, or all known names if none is near.
 
-    Where there are many known names and none is near, the hint is empty.
+    If there are many known names and none is near, the hint is empty.
     """
     known = list(dict.fromkeys(known))
     by_lower_case = {option.lower(): option for option in known}
@@ -91,5 +91,5 @@ def unknown(what: str, name: str, known: Iterable[str], n: int = 1) -> UserError
 
 
 def one_line(error: BaseException) -> str:
-    """The message of a foreign exception in one line, or its kind where it has none."""
+    """The message of an exception in one line, or its type if it has no message."""
     return " ".join(str(error).split()) or type(error).__name__

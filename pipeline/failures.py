@@ -1,7 +1,7 @@
-"""What may go wrong in a run, and whose fault it is.
+"""Classifies failures of a run: by the machine, the user's code, or a library.
 
-A machine that has nothing left to give; code of the user's that raises what ends a program; a
-library that gives up. Commands load this before their first words, so it imports little.
+The machine runs out of a resource; the user's code raises SystemExit; a library fails. Commands
+load this module before their first output, so it imports little.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.errors import UserError, one_line
 from pipeline.stopping import Stopped, current
 
-# PyTorch's allocator, the dynamic linker, and Python's threads have no exception of their own.
+# PyTorch's allocator, the dynamic linker, and Python's threads have no own exception class.
 _SIGNS = {
     "can't allocate memory": "memory",
     "cannot allocate memory": "memory",
@@ -28,7 +28,7 @@ _SIGNS = {
 
 
 def exhaustion(error: BaseException) -> str | None:
-    """Say in one line what the machine has run out of; None where that was not it."""
+    """Say in one line what the machine has run out of; None for other errors."""
     text = one_line(error)
     if isinstance(error, MemoryError):
         return "this machine gives no more memory" + (f": {error}" if str(error) else "")
@@ -38,12 +38,12 @@ def exhaustion(error: BaseException) -> str | None:
     return None
 
 
-class OwnExit(SystemExit):  # no more an error than the one it is derived from
-    """The end of a command by its own will."""
+class OwnExit(SystemExit):  # not an error, like its base class
+    """A command ends itself."""
 
 
 class ForeignExitError(UserError):
-    """SystemExit or KeyboardInterrupt from code of the user's, where nobody pressed Ctrl-C."""
+    """The user's code raised SystemExit or KeyboardInterrupt without Ctrl-C."""
 
     def __init__(self, error: BaseException) -> None:
         kind, text = type(error).__name__, str(error)
@@ -54,13 +54,13 @@ class ForeignExitError(UserError):
 
 @contextmanager
 def exits_as_mistakes() -> Iterator[None]:
-    """Let what is called inside the ``with`` statement end no program: it has failed."""
+    """Treat an exit inside the ``with`` statement as a failure of the called code."""
     try:
         yield
     except OwnExit:
         raise
     except (SystemExit, KeyboardInterrupt) as error:
-        # Where signals are noticed, or left to others, Ctrl-C raises no bare KeyboardInterrupt.
+        # With `stops_noticed`, or handlers of others, Ctrl-C raises no bare KeyboardInterrupt.
         if isinstance(error, KeyboardInterrupt) and (
             isinstance(error, Stopped)
             or current().number is not None
@@ -79,7 +79,7 @@ class LibraryError(UserError):
 
 
 def blame_settings(algo: str, model: Any, error: Exception) -> None:
-    """Blame an agent's settings where a library gave up, unless through code of the user's."""
+    """Turn a library's error into one about the settings, unless the user's code raised it."""
     frames = list(traceback.walk_tb(error.__traceback__))
     packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame, _ in frames]
     is_of_library = packages[-1] in _LIBRARIES and set(packages) <= _LIBRARIES | _AROUND_THEM
@@ -91,7 +91,7 @@ def blame_settings(algo: str, model: Any, error: Exception) -> None:
 
 
 def is_of_the_machine(error: BaseException | None) -> bool:
-    """Whether a run has failed by a full disk or memory, and by no fault of its own."""
+    """Whether a run has failed because disk or memory is full."""
     from pipeline.files import DISK_ERRORS
 
     while error is not None:

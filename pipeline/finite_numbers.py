@@ -1,7 +1,7 @@
-"""Refuses nan and infinity before anything is learnt or judged by them.
+"""Refuses nan and infinity before an agent learns from them or is evaluated by them.
 
-Infinity is refused like nan, also where an observation space has no bounds: the first update of a
-network turns it into nan, and so does the first mean that it is part of.
+Infinity is refused like nan, also in an observation space without bounds: the first update of a
+network turns infinity into nan, and so does the first difference from a mean that contains it.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ from numpy.typing import NDArray
 from agents.bandits.tables import BanditPolicy
 from pipeline.errors import UserError
 
-# Single and double precision, whose scalar products are worked out by BLAS.
+# Single and double precision, whose scalar products BLAS computes.
 _FAST = frozenset("fd")
 _FAST_TENSORS = frozenset({th.float32, th.float64})
 _WHOLE = frozenset("?bBhHiIlLqQ")
 
 
 class NotFiniteError(UserError):
-    """A number that has to be finite is not."""
+    """A number is nan or infinite where it must be finite."""
 
     def __init__(self, place: str, value: float) -> None:
         super().__init__(f"{place} is {value}")
 
 
 def is_finite(values: Any) -> bool:
-    """Whether all numbers of an array or a mapping of arrays are finite; asked at every step."""
+    """Whether all numbers of an array or a mapping of arrays are finite; fast, for every step."""
     if type(values) is not np.ndarray:
         return values is None or all(is_finite(array) for _, array in _parts(values))
     kind = values.dtype.char
     if kind in _FAST:
-        # One call instead of two and an array between; it overflows where values are merely large.
+        # One call instead of two with a temporary array; it also overflows for large finite values.
         return isfinite(vdot(values, values)) or bool(np.isfinite(values).all())
     return kind in _WHOLE or bool(np.isfinite(values).all())
 
 
 def check_numbers(values: Any, what: str, when: str) -> None:
-    """Make sure that the numbers of an array, of a mapping's arrays, or of None are finite."""
+    """Check that all numbers of an array or a mapping of arrays are finite; None passes."""
     for name, array in _parts(values):
         if not is_finite(array):
             raise NotFiniteError(f"{what}{name} {when}", _culprit(array))
 
 
 def check_rows(values: Any, what: str, when: str) -> None:
-    """As `check_numbers`, for values with a row for each environment, shape (n_envs, ...)."""
+    """Like `check_numbers`, for values with a row for each environment, shape (n_envs, ...)."""
     for name, array in _parts(values):
         if not is_finite(array):
             rows = np.isfinite(array).reshape(len(array), -1).all(axis=1)
@@ -59,12 +59,12 @@ def check_rows(values: Any, what: str, when: str) -> None:
 
 
 def check_model(model: Any) -> None:
-    """Make sure that what an agent has learnt is finite: tables or weights, and its statistics."""
+    """Check that an agent's tables or weights and its statistics are finite."""
     when = f"at step {model.num_timesteps:,}"
     policy = getattr(model, "policy", None)
     if isinstance(policy, th.nn.Module):
         for name, table in policy.state_dict().items():
-            # The score of an arm that was never pulled says so by being infinite.
+            # An infinite score marks an arm that was never pulled.
             is_scores = name == "scores" and isinstance(policy, BanditPolicy)
             tensor = table[policy.get_buffer("counts") > 0] if is_scores else table
             if not _is_finite_tensor(tensor):
@@ -88,21 +88,21 @@ def _is_finite_tensor(tensor: th.Tensor) -> bool:
 
 
 class FinitePlayer:
-    """An agent that refuses to act on observations that are not finite."""
+    """Wraps an agent, and refuses observations that are not finite."""
 
     def __init__(self, player: Any, when: str) -> None:
         self._player = player
         self._when = when
 
     def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """Predict, once the observation was checked."""
+        """Check the observation, then predict."""
         check_rows(observation, "observation", self._when)
         actions, state = self._player.predict(observation, **kwargs)
         return actions, state
 
 
 def _parts(values: Any) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays among values, each with its name for a message."""
+    """The arrays among values, each with its name for messages."""
     if isinstance(values, Mapping):
         for name, array in values.items():
             yield f" {name!r}", np.asarray(array)
@@ -111,6 +111,6 @@ def _parts(values: Any) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def _culprit(values: NDArray[Any]) -> float:
-    """The first number that is not finite."""
+    """Find the first number that is not finite."""
     flat = np.ravel(values)
     return float(np.real(flat[np.argmin(np.isfinite(flat))]))

@@ -1,12 +1,12 @@
-"""One process at a time on a study or a run: a lock file says who is at work.
+"""Locks a study or a run for one process at a time, by a lock file that names its owner.
 
-The file appears in one step, as a link to one that is written already; that works on network
-folders too. Its owner touches it every five seconds, by the clock of the folder, which all machines
-that share it agree on. On its own machine the process is looked for; elsewhere an owner counts as
-gone once it has been silent for a minute.
+The lock file is created atomically, as a link to a finished file; that works on network folders
+too. Its owner touches it every five seconds. Times are those of the folder's clock, which all
+machines share. On the owner's machine, we check whether its process exists; on other machines, an
+owner counts as dead after a minute without a touch.
 
-Process numbers are used again, after a reboot, in each container and on each machine. So on Linux a
-process is named by its number, the kernel's ticks when it began, the boot and the namespace.
+Process numbers repeat: after a reboot, in each container and on each machine. So on Linux the lock
+names a process by its number, its start in kernel ticks, the boot id and the namespace.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from safe_files.files import NEW, NO_LIMIT, UnsafeFileError, open_number, opened
 
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _MACHINES = ("/etc/machine-id", "/var/lib/dbus/machine-id")
-_STATE, _BEGAN = 0, 19  # places in /proc/<pid>/stat, counted from behind the program's name
+_STATE, _BEGAN = 0, 19  # fields in /proc/<pid>/stat, counted after the program's name
 _ENDED = "ZXx"
 
 SECONDS_BETWEEN_SIGNS = 5.0
 SECONDS_OF_SILENCE = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2
 _LARGEST = 10_000  # bytes
-_GONE: dict[str, Any] = {}  # told from others by being this one
+_GONE: dict[str, Any] = {}  # compared by identity
 
-# What is written beside its place for an instant, here and by `pipeline.files.replacing`.
+# Short-lived temporary files, of this module and of `pipeline.files.replacing`.
 _FOR_AN_INSTANT = re.compile(r"\..*[0-9a-f]{16}(\.dead)?\.tmp")
 _SECONDS_OF_AN_INSTANT = 5.0
 
 
 def mark() -> dict[str, Any]:
-    """The identity of this process, as JSON; None for what the platform does not tell."""
+    """The identity of this process as JSON; None for parts that the platform does not report."""
     pid, machine, namespace = os.getpid(), _first_line(*_MACHINES), None
     with contextlib.suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115  # it leads to no path
     return {
         "pid": pid,
         "host": platform.node(),
-        # Which itself is not for others.
+        # Hashed, because the machine id is confidential.
         "machine": machine and hashlib.sha256(f"yardstick {machine}".encode()).hexdigest()[:32],
         "boot": _first_line(_BOOT),
         "namespace": namespace,
@@ -63,9 +63,9 @@ def mark() -> dict[str, Any]:
 
 
 def is_alive(record: object) -> bool | None:
-    """Whether the process that a `mark` names is still there.
+    """Whether the process of a `mark` still exists.
 
-    None where one cannot tell: of another host or container, and of anything that is no mark.
+    None if this cannot be known: on another host or container, or if the record is no mark.
     """
     pid = record.get("pid") if isinstance(record, Mapping) else None
     if not isinstance(record, Mapping) or type(pid) is not int or not 0 < pid < 2**31:
@@ -75,7 +75,7 @@ def is_alive(record: object) -> bool | None:
         is_same_machine = own["machine"] is not None and record.get("machine") == own["machine"]
         is_known = None not in (own["boot"], record.get("boot"))
         return False if is_known and is_same_host and is_same_machine else None
-    if own["boot"] is None:  # the system does not tell
+    if own["boot"] is None:  # the system does not report it
         return _has_process(pid) if is_same_host else None
     if record.get("namespace") != own["namespace"]:
         return None
@@ -95,12 +95,12 @@ def _first_line(*files: str) -> str | None:
 
 
 def _ticks_at_begin(pid: int) -> int | None:
-    """When the process began, by the kernel's ticks since the boot; -1 for one that has ended."""
+    """The start of the process in kernel ticks since the boot; -1 if it has ended."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return None
-    # The program's name stands in brackets, and may hold some itself.
+    # The program's name is in brackets, and may contain brackets.
     fields = text.rpartition(")")[2].split()
     if len(fields) <= _BEGAN:
         return None
@@ -111,7 +111,7 @@ if sys.platform == "win32":
     import _winapi
 
     def _has_process(pid: int) -> bool:
-        # Here `os.kill` would end the process or send Ctrl-C to it, whatever the signal.
+        # On Windows, `os.kill` would end the process or send Ctrl-C, whatever the signal.
         try:
             process = _winapi.OpenProcess(_winapi.SYNCHRONIZE, False, pid)
         except PermissionError:
@@ -135,8 +135,8 @@ else:
 
 
 def give_sign(path: Path) -> None:
-    """Touch a file or folder, to show that its owner is alive."""
-    # Without a time, so that a network folder takes that of its server.
+    """Touch a file or folder as a heartbeat of its owner."""
+    # Without a time, so that a network folder uses the clock of its server.
     os.utime(path, follow_symlinks=os.utime not in os.supports_follow_symlinks)
 
 
@@ -156,13 +156,13 @@ def last_sign(path: Path) -> float:
     """When a path was last touched, by the folder's clock."""
     if path.is_dir():
         return path.stat().st_mtime
-    # Network folders remember for a while what a file was, but not beyond its being opened.
+    # Network folders cache file attributes, but opening the file refreshes them.
     with opened(path, NO_LIMIT) as file:
         return os.fstat(file.fileno()).st_mtime
 
 
 def remove_remains(root: Path) -> None:
-    """Remove what processes that were killed have left half written, in a folder or one below."""
+    """Remove temporary files of killed processes from a folder and its direct subfolders."""
     for folder in (root, *(root / name for name in _names_in(root))):
         for name in filter(_FOR_AN_INSTANT.fullmatch, _names_in(folder)):
             path = folder / name
@@ -175,25 +175,25 @@ def remove_remains(root: Path) -> None:
 
 
 def _names_in(folder: Path) -> list[str]:
-    """The names in a folder; none where it is gone."""
+    """The names in a folder; empty if the folder does not exist."""
     with contextlib.suppress(OSError):
         return [path.name for path in folder.iterdir()]
     return []
 
 
 class FolderInUseError(UserError):
-    """Another process is at work in the folder."""
+    """Another process has locked the folder."""
 
 
 class FolderGoneError(UserError):
-    """A folder that this process works on has been removed or renamed."""
+    """A folder in use by this process was removed or renamed."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(f"{root}: this folder is gone: somebody has removed or renamed it")
 
 
 def is_gone(path: Path) -> bool:
-    """Whether there is no such file or folder; False where it cannot be reached."""
+    """Whether the file or folder does not exist; False if it cannot be reached."""
     try:
         return not path.exists()
     except OSError:
@@ -202,7 +202,7 @@ def is_gone(path: Path) -> bool:
 
 @contextmanager
 def told_if_gone(root: Path) -> Iterator[None]:
-    """Say that a folder is gone, in place of whatever fails by that in the ``with`` statement."""
+    """Raise `FolderGoneError` for errors in the ``with`` statement if the folder is gone."""
     try:
         yield
     except Exception as error:
@@ -217,11 +217,11 @@ def told_if_gone(root: Path) -> Iterator[None]:
 def folder_lock(
     root: Path, on_loss: Callable[[], object], say: Callable[[str], object]
 ) -> Iterator[None]:
-    """Be the only process at work in a folder inside the ``with`` statement.
+    """Lock a folder for this process inside the ``with`` statement.
 
-    The folder is made, and removed again if nothing else came into it. ``on_loss`` is called in
-    another thread if the lock is lost, and has to end the work: another process has taken this one
-    for dead, or somebody has removed the folder. ``say`` is told why it takes long.
+    Makes the folder, and removes it again if it stays empty. ``on_loss`` is called in another
+    thread if the lock is lost, and must end the work: another process has considered this one
+    dead, or somebody has removed the folder. ``say`` gets the reason for a long wait.
     """
     lost: list[UserError] = []
 
@@ -241,7 +241,7 @@ def folder_lock(
         try:
             yield
         except KeyboardInterrupt as stop:
-            if lost:  # nobody else asked for it
+            if lost:  # the loss of the lock caused it
                 raise lost[0] from stop
             raise
         finally:
@@ -267,7 +267,7 @@ def _take(path: Path, token: str, say: Callable[[str], object]) -> None:
 
 
 def _appears(path: Path, content: str) -> bool:
-    """Create the lock in one step; False where it is there already."""
+    """Create the lock atomically; False if it exists already."""
     draft = path.with_name(f"{LOCK}.{secrets.token_hex(8)}.tmp")
     try:
         with os.fdopen(open_number(draft, NEW), "wb") as file:
@@ -277,9 +277,9 @@ def _appears(path: Path, content: str) -> bool:
         return False
     except FileNotFoundError:
         if path.parent.is_dir():
-            return False  # who has the lock has cleared the draft away
+            return False  # the owner of the lock has removed the draft
         raise
-    except OSError:  # a file system without links: the lock is empty for an instant
+    except OSError:  # a file system without links: the lock is briefly empty
         try:
             with path.open("x", encoding="utf-8") as file:
                 file.write(content)
@@ -296,7 +296,7 @@ def _appears(path: Path, content: str) -> bool:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The contents of a lock; empty where they are damaged, `_GONE` where it is gone."""
+    """Read a lock; empty if it is damaged, `_GONE` if it does not exist."""
     try:
         owner = json.loads(read_file(path, _LARGEST))
     except FileNotFoundError:
@@ -307,7 +307,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object]) -> bool:
-    """Whether the owner of a lock is alive; waits for a sign of one on another machine."""
+    """Whether the owner of a lock is alive; waits for a heartbeat from another machine."""
     alive = is_alive(owner)
     if alive is not None:
         return alive
@@ -327,21 +327,21 @@ def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object])
 
 
 def _remove_dead(path: Path, owner: dict[str, Any]) -> None:
-    """Remove a dead owner's lock: one process alone can make the folder of its digest."""
+    """Remove a dead owner's lock; a folder named by its digest admits one process at a time."""
     digest = hashlib.sha256(repr(owner.get("token")).encode()).hexdigest()[:32]
     grave = path.with_name(f"{LOCK}.{digest}.dead.tmp")
     try:
         grave.mkdir()
     except FileExistsError:
-        # Another is at it, or was killed while it was.
-        with contextlib.suppress(OSError, UnsafeFileError):  # it may come and go meanwhile
+        # Another process is removing the lock, or was killed while it did.
+        with contextlib.suppress(OSError, UnsafeFileError):  # it may disappear meanwhile
             if seconds_silent(grave) > SECONDS_BETWEEN_SIGNS:
                 grave.rmdir()
         time.sleep(_SECONDS_BETWEEN_LOOKS)
         return
     try:
         now = _read(path)
-        # In the place of one that is gone the next may come before it is unlinked.
+        # A new owner's lock may have replaced the dead one by now.
         if now is not _GONE and now.get("token") == owner.get("token"):
             path.unlink(missing_ok=True)
     finally:

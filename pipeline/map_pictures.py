@@ -1,7 +1,7 @@
 """Draws a policy and its values on the map of a grid world.
 
-Columns count along the horizontal axis, rows down the vertical one, and a cell's middle lies at
-whole numbers. ``cell`` is the width of a cell in points.
+Columns are on the horizontal axis, rows on the vertical one, downwards; the centre of a cell has
+integer coordinates. ``cell`` is the width of a cell in points.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
 BELOW: Colour = (222, 222, 222)
 BELOW_HATCH: Colour = (196, 196, 196)
 GROUND = {WALL: SHELF, GOAL: PALE_GREEN, TRAP: PALE_RED}
-# Marker, its size as a share of the cell, its colour.
+# Marker, its size as a share of the cell, and its colour.
 MARKS = {GOAL: ("*", 0.55, GREEN), TRAP: ("X", 0.36, INK), PRIZE: ("D", 0.15, AMBER)}
-# Points; below these, numbers and grid lines are noise.
+# In points; in smaller cells, numbers and grid lines are left out.
 SMALLEST_FONT = 5.5
 SMALLEST_GRID = 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A policy in one layer of the map; arrays have an entry for each cell, row by row."""
+    """A policy in one layer of the map; arrays have one entry for each cell, row by row."""
 
     layout: GridLayout
-    layer: int  # which prizes are collected
+    layer: int  # the set of collected prizes
     matters: Bools  # where the agent may have to act
-    visited: Bools  # where the policy comes to from the start
-    differs: Bools  # where agent and optimum part
+    visited: Bools  # the cells that the policy reaches from the start
+    differs: Bools  # where agent and optimum differ
     values: Floats  # expected return from there on
     actions: Bools  # the actions to draw, shape (cells, A)
 
     def places(self, chosen: Bools) -> tuple[Ints, Ints]:
-        """Columns and rows of the chosen cells."""
+        """The columns and rows of the chosen cells."""
         rows, columns = np.divmod(np.flatnonzero(chosen), self.layout.n_columns)
         return columns, rows
 
@@ -71,7 +71,7 @@ def policies_in(found: ValueMap, layer: int) -> tuple[Policy, Policy]:
 
 
 def draw_ground(axes: Axes, policy: Policy, scale: Normalize, colours: Colormap) -> None:
-    """Colour the cells: by their value where the agent acts, else by what stands there."""
+    """Colour the cells: by value where the agent acts, else by their contents."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
@@ -82,7 +82,7 @@ def draw_ground(axes: Axes, policy: Policy, scale: Normalize, colours: Colormap)
         picture[letters == letter] = shade(colour)
     matters = policy.matters.reshape(letters.shape)
     picture[matters] = colours(np.clip(scale(policy.values), 0, 1))[policy.matters, :3]
-    # As a mesh: an image would be sampled anew for every pixel.
+    # As a mesh, because an image would be resampled for every pixel.
     n_rows, n_columns = letters.shape
     axes.pcolormesh(np.arange(n_columns + 1) - 0.5, np.arange(n_rows + 1) - 0.5, picture)
     low = policy.matters & is_below(policy.values, scale)
@@ -95,12 +95,12 @@ def draw_ground(axes: Axes, policy: Policy, scale: Normalize, colours: Colormap)
 
 
 def is_below(values: Floats, scale: Normalize) -> Bools:
-    """Which values lie below the scale, and by more than rounding."""
+    """Which values lie below the scale by more than rounding."""
     return np.asarray(scale(values) < -1e-9)
 
 
 def draw_grid(axes: Axes, layout: GridLayout, cell: float) -> None:
-    """Lines between the cells."""
+    """Draw lines between the cells."""
     if cell >= SMALLEST_GRID:
         colour, width = shade(WHITE), min(cell / 30, 1.0)
         rows, columns = np.arange(layout.n_rows) + 0.5, np.arange(layout.n_columns) + 0.5
@@ -109,11 +109,11 @@ def draw_grid(axes: Axes, layout: GridLayout, cell: float) -> None:
 
 
 def draw_marks(axes: Axes, policy: Policy, cell: float) -> None:
-    """Goals, traps, prizes and starts."""
+    """Draw goals, traps, prizes and starts."""
     letters = np.array(list("".join(policy.layout.rows_in(policy.layer))))
     for letter, (marker, size, colour) in MARKS.items():
         columns, rows = policy.places(letters == letter)
-        # A prize leaves room for what is to do there.
+        # The mark of a prize leaves room for the action.
         aside = 0.32 if letter == PRIZE else 0.0
         axes.scatter(
             columns + aside,
@@ -139,7 +139,7 @@ def draw_marks(axes: Axes, policy: Policy, cell: float) -> None:
 
 
 def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) -> None:
-    """An arrow for each action, or a ring for staying; dark where the policy comes to."""
+    """Draw an arrow for each action, or a ring for staying; dark in visited cells."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Annulus
 
@@ -179,7 +179,7 @@ def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) ->
 
 
 def draw_numbers(axes: Axes, policy: Policy, font: float, decimals: int) -> None:
-    """The values at the foot of the cells, ``font`` points high."""
+    """Write the values at the bottom of the cells, ``font`` points high."""
     columns, rows = policy.places(policy.matters)
     for x, y, value in zip(columns, rows, policy.values[policy.matters], strict=True):
         axes.text(
@@ -195,7 +195,7 @@ def draw_numbers(axes: Axes, policy: Policy, font: float, decimals: int) -> None
 
 
 def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
-    """A frame inside the cells where the agent's action is not an optimal one."""
+    """Draw a frame in the cells where the agent's action is not optimal."""
     from matplotlib.collections import LineCollection
 
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.44
@@ -212,7 +212,7 @@ def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
 
 
 def short_number(value: float, decimals: int) -> str:
-    """A value in few characters: no decimals from 100 on, thousands as ``k``, millions as ``M``."""
+    """Format a value briefly: no decimals from 100 on, ``k`` for thousands, ``M`` for millions."""
     size = abs(value)
     if size >= 999_500:
         text = f"{size / 1e6:.1f}M"
@@ -224,14 +224,14 @@ def short_number(value: float, decimals: int) -> str:
 
 
 def shade(colour: Colour) -> tuple[float, float, float]:
-    """A colour as Matplotlib takes it."""
+    """Convert a colour for Matplotlib."""
     red, green, blue = colour
     return red / 255, green / 255, blue / 255
 
 
-# --- the whole picture: the agent's policy, and beside it the optimal ones ------------------------
+# --- the whole picture: the agent's policy beside the optimal one ---------------------------------
 
-# Pale enough for dark arrows and numbers; in print and to colour-blind readers, darker is better.
+# Pale enough for dark arrows and numbers; darker means better, also in print and without colours.
 VALUE_COLOURS = ("#FFFBD6", "#D3ECC0", "#8FD0C0", "#55B0CC", "#4A97CF")
 MAX_LAYERS = 4
 MAX_TICKS = 6
@@ -240,7 +240,7 @@ MARGIN = 1.3  # inches, for title, legend and colour bar
 
 
 def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
-    """Draw a map into a PNG file; colours are exact values on the scale of the optimal ones."""
+    """Draw a map into a PNG file; colours are exact values, scaled by the optimal ones."""
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
     layers, cell = shown_layers(found), cell_inches(found.layout)
@@ -259,8 +259,8 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
             pair[0].set_ylabel(layer_name(found.layout, layer))
     _explain(figure, found, scale, colours)
     figure.suptitle(title, x=0.01, ha="left")
-    # What stands inside the panels needs no room around them. Fixed now, the layout is worked
-    # out once, and without asking hundreds of numbers for their size.
+    # Artists inside the panels need no margin. Fixing the layout now computes it only once, without
+    # measuring hundreds of numbers.
     fix_layout(figure)
     for pair, layer in zip(pairs, layers, strict=True):
         for axes, policy in zip(pair, policies_in(found, layer), strict=True):
@@ -273,13 +273,13 @@ COST_COLOURS = ("#FFFFFF", "#FBD9B5", "#F2994A", "#C8501E")
 
 
 def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> None:
-    """Draw an agent's values into a PNG file, and beside them what its actions cost.
+    """Draw an agent's values and the losses of its actions into a PNG file.
 
     Args:
         path: the file.
         title: of the picture.
         found: the map of the agent.
-        losses: what is lost in each state, in return per episode, shape (S,).
+        losses: the loss in each state, in return per episode, shape (S,).
     """
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -310,14 +310,14 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
 
 
 def shown_layers(found: ValueMap) -> list[int]:
-    """The layers that a policy comes to, up to four, those with the fewest prizes first."""
+    """The layers that a policy reaches, up to four, those with the fewest prizes first."""
     come_to = found.matters & (found.visited | found.optimal_visited)
     layers = np.unique(found.layout.layers[come_to]).tolist()
     return sorted(layers, key=lambda layer: (layer.bit_count(), layer))[:MAX_LAYERS]
 
 
 def layer_name(layout: GridLayout, layer: int) -> str:
-    """What is collected in a layer, in words."""
+    """The collected prizes of a layer, in words."""
     cells = layout.collected_in(layer)
     if not cells:
         return "nothing collected"
@@ -326,13 +326,13 @@ def layer_name(layout: GridLayout, layer: int) -> str:
 
 
 def cell_inches(layout: GridLayout) -> float:
-    """The width of a cell, so that small maps are not tiny and large ones fit on a screen."""
+    """The width of a cell that makes small maps readable and lets large ones fit on a screen."""
     longest, is_wide = max(layout.n_rows, layout.n_columns), layout.n_columns >= 2 * layout.n_rows
     return min(max(0.5 * longest, 3.2), 9.0 if is_wide else 7.0) / longest
 
 
 def decimals_for(found: ValueMap) -> int:
-    """Decimals that tell values apart: none where all of them are whole."""
+    """Decimals that distinguish the values: none if all values are integers."""
     values = np.concatenate([found.values[found.matters], found.optimal_values[found.matters]])
     if np.abs(values - np.round(values)).max() < 1e-9:
         return 0
@@ -341,24 +341,24 @@ def decimals_for(found: ValueMap) -> int:
 
 
 def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, list[list[Axes]]]:
-    """A figure with two empty panels for each layer, cells ``cell`` inches wide."""
+    """Make a figure with two empty panels for each layer, cells ``cell`` inches wide."""
     from matplotlib.figure import Figure
 
-    is_wide = layout.n_columns >= 2 * layout.n_rows  # panels look better above each other
+    is_wide = layout.n_columns >= 2 * layout.n_rows  # panels are then stacked
     n_rows, n_columns = (2 * n_layers, 1) if is_wide else (n_layers, 2)
     width = n_columns * (cell * layout.n_columns + 0.3) + MARGIN
     height = n_rows * (cell * layout.n_rows + 0.35) + MARGIN
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
     panels = figure.subplots(n_rows, n_columns, squeeze=False)
     longest = max(layout.n_rows, layout.n_columns)
-    # Labels cost more time than anything else.
+    # Labels take more time than all the rest.
     step = next(step for step in (1, 2, 5, 10, longest) if longest <= MAX_TICKS * step)
     for number, axes in enumerate(panels.flat):
         named = number % n_columns == 0
         axes.set(
             xlim=(-0.5, layout.n_columns - 0.5), ylim=(layout.n_rows - 0.5, -0.5), aspect="equal"
         )
-        # Counted from 1, as everywhere.
+        # Counted from 1, as in all output.
         for axis, length in ((axes.xaxis, layout.n_columns), (axes.yaxis, layout.n_rows)):
             shown = range(step - 1, length if named or axis is axes.xaxis else 0, step)
             axis.set_ticks(shown, [str(place + 1) for place in shown])
@@ -385,7 +385,7 @@ def _explain(
     colours: Colormap,
     told: str = "expected return from here on",
 ) -> None:
-    """The colour bar, which tells what its numbers are, and the legend."""
+    """Draw the labelled colour bar and the legend."""
     from matplotlib.cm import ScalarMappable
 
     source = ScalarMappable(scale, colours)
@@ -402,7 +402,7 @@ def _explain(
 
 
 def _legend(found: ValueMap, scale: Normalize) -> Iterator[Artist]:
-    """An entry for each thing that the picture shows."""
+    """Make a legend entry for each kind of mark in the picture."""
     from matplotlib.patches import Patch
 
     yield _sample(INK, ">", 6, "on the way from the start", linewidth=2)

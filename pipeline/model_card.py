@@ -1,4 +1,4 @@
-"""Writes the card of a pack: metadata for model hubs, results, and how to play the agent."""
+"""Writes the model card of a pack: metadata for model hubs, results, and how to play."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from agents import ALGORITHMS
 from pipeline.errors import visible
 from pipeline.user_modules import copy_of
 
-# Wrappers that a plain script would have to build too.
+# Wrappers that a plain script would need too.
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 _LIBRARIES = ("stable_baselines3", "sb3_contrib")
 _DEEP = {"dqn", "double_dqn", "deep_qlearning"}
-# Agents of this project whose model files are the library's, where they go by no action masks.
+# Agents of this project whose model files the library can read, unless they use action masks.
 _OF_THE_LIBRARY = {"dqn": "DQN", "ppo": "PPO", "a2c": "A2C"}
 
 
 def card(record: Mapping[str, Any], files: Collection[str]) -> str:
-    """The README.md of a pack, from its ``run.json`` and the names of its other files."""
+    """Make the README.md of a pack from its ``run.json`` and the names of its other files."""
     spec = record["spec"]
     algo, env_id = spec["algo"], spec["env_id"]
     pictures = [name for name in ("value_map.png", "learning_curve.png") if name in files]
@@ -49,13 +49,13 @@ def card(record: Mapping[str, Any], files: Collection[str]) -> str:
 
 
 def plain_text(value: object) -> str:
-    """A value as Markdown in which nothing is markup: the run may be anybody's."""
+    """Escape a value for Markdown, because the run may come from anyone."""
     return re.sub(r"[\\`*<>|&\[\]]", lambda found: f"\\{found[0]}", " ".join(str(value).split()))
 
 
 def _front_matter(record: Mapping[str, Any]) -> str:
     spec, final = record["spec"], record.get("final") or {}
-    figures: list[tuple[str, str, Any]] = []  # the first as hubs write it, the others exact
+    figures: list[tuple[str, str, Any]] = []  # the first in the format of hubs, the others exact
     if final:
         told = f"{final['mean_return']:.2f} +/- {final['std_return']:.2f}"
         names = {"mean_return": "mean return", **_measured(final), "success_rate": "success rate"}
@@ -103,7 +103,7 @@ def _figures(record: Mapping[str, Any]) -> str:
 
 
 def _measured(final: Mapping[str, Any]) -> dict[str, str]:
-    """Labels of the figures that compare the return with the optimum."""
+    """The labelled figures that compare the return with the optimum."""
     if "optimum_at_least" not in final:
         return {
             "optimum": "optimum",
@@ -155,19 +155,19 @@ def _flag(packages: Sequence[str]) -> str:
 
 
 def _is_known(spec: Mapping[str, Any]) -> bool:
-    """Whether the environment is one of Gymnasium's own."""
+    """Whether the environment belongs to Gymnasium."""
     registered = gym.registry.get(spec["env_id"])
     return registered is not None and str(registered.entry_point).startswith("gymnasium.")
 
 
 def to_type(spec: Mapping[str, Any], files: Collection[str]) -> list[str]:
-    """What to type after ``--gym-packages``: the copy of a module in the pack, or else its name."""
+    """The argument for ``--gym-packages``: the module's copy in the pack, or else its name."""
     names = map(str, spec.get("gym_packages") or [])
     return [copy_of(name, files.__contains__) or name for name in names]
 
 
 def _plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:
-    """Library and class that load an agent's zip without this project; None where none does."""
+    """Library and class that load an agent's zip without this project, or None."""
     algo = spec["algo"]
     if spec["hyperparams"].get("mask_actions"):
         return None
@@ -180,7 +180,7 @@ def _plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:
 
 
 def _script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
-    """A script that plays the agent without any command; None where that takes more."""
+    """A short script that plays the agent without this project's commands, or None."""
     spec, env_name = record["spec"], record["env_name"]
     settings = spec["hyperparams"]
     if any(settings.get(name) for name in _WRAPPERS) or spec.get("gym_packages"):
@@ -209,14 +209,14 @@ def _script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
 
 
 def fenced(language: str, text: str) -> str:
-    """A text as a block of code, with a fence that the text does not hold."""
+    """A text as a block of code, with a fence that does not occur in the text."""
     longest = max((len(run) for run in re.findall(r"`+", text)), default=0)
     fence = "`" * max(3, longest + 1)
     return f"{fence}{language}\n{text}{fence}\n"
 
 
 def results(record: Mapping[str, Any]) -> str | None:
-    """The ``results.json`` that rl_zoo3 has beside a model on a hub; None without evaluation."""
+    """The ``results.json`` in rl_zoo3's format for a hub; None without evaluation."""
     final = record.get("final")
     if not final:
         return None

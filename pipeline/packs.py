@@ -1,4 +1,4 @@
-"""Writes packs of runs and of studies, and reads packs of anybody as data."""
+"""Writes packs of runs and studies, and reads packs of any origin as data."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ from safe_files.archives import opened_zip, read_member, read_members
 from safe_files.files import MAX_ARCHIVE_BYTES, Budget, UnsafeFileError, hold, read_file
 
 CARD = "README.md"
-STUDY_RECORD = "study.json"  # of the pack of a study, with the digests of its files
+STUDY_RECORD = "study.json"  # in the pack of a study, with the digests of its files
 FILMS = (".mp4", ".gif")
 MOST_FILM_BYTES = 64 << 20
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """The files of a pack of a finished run, by name, each checked and scrubbed."""
+    """The files of a pack of a finished run, by name, checked and without private data."""
     run = run_in(folder)
     if not run.recorded_spec():
         raise UserError(f"{folder} does not say what was trained: it is no run of ours")
@@ -71,7 +71,7 @@ def contents(folder: Path) -> dict[str, bytes]:
         record = record_to_tell(info)
         files = dict(_files(run, record))
         files[CARD] = card(record, files.keys()).encode()
-    except (TypeError, ValueError, LookupError, AttributeError) as error:  # of whatever it says
+    except (TypeError, ValueError, LookupError, AttributeError) as error:  # strange contents
         raise UserError(f"{folder} cannot be packed: {one_line(error)}") from error
     record |= {VERSION_FIELD: VERSION, FIELD: {name: _digest(files[name]) for name in files}}
     files[RECORD] = (json_text(sealed(record), indent=2) + "\n").encode()
@@ -80,7 +80,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def _files(run: Run, record: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
-    """All files but the card and the record; of the run's, only those that its record names."""
+    """All files except the card and the record; of the run's files, only the recorded ones."""
     recorded = run.files.digests
     if recorded is None:
         raise UserError(f"{run.path} recorded no digests of its files: train again to pack it")
@@ -114,7 +114,7 @@ def _digest(content: bytes) -> str:
 
 # --- packs on disk --------------------------------------------------------------------------------
 
-_DEEPEST = 2  # folders of a name, the file itself counted
+_DEEPEST = 2  # parts of a name, including the file
 _DEEPEST_MODULE = 8
 _DEEPEST_OF_STUDY = 3
 _MOST, _MOST_OF_STUDY = 1000, 100_000  # files
@@ -123,7 +123,7 @@ _DAMAGE = (OSError, ValueError, LookupError, RuntimeError, EOFError, zipfile.Bad
 
 
 def pack(run_folder: Path, target: Path) -> Path:
-    """Write a finished run as a pack: a new folder, or a zip, which is replaced."""
+    """Write a finished run as a pack: a new folder, or a zip, which may replace another."""
     _check_parent(target)
     is_zip = target.suffix == ".zip"
     if target.is_dir() if is_zip else (target.exists() or target.is_symlink()):
@@ -149,7 +149,7 @@ def pack(run_folder: Path, target: Path) -> Path:
 
 
 def check_pack(path: Path) -> int:
-    """Hold every file of a pack against its digest, and return how many there are."""
+    """Check the digest of every file in a pack, and return the number of files."""
     if is_packed(path, STUDY_RECORD):
         return _check_study(path)
     with unpacked(path) as (folder, _):
@@ -159,7 +159,7 @@ def check_pack(path: Path) -> int:
 
 
 def _check_files(folder: Path, shown_as: Path, names: Collection[str] = ()) -> int:
-    """Hold the files of a pack against their digests; ``names`` are those that there are."""
+    """Check the digests of the files in a pack; ``names`` are the existing files."""
     try:
         digests = read_record(folder / RECORD).get(FIELD)
         if not isinstance(digests, dict):
@@ -192,7 +192,7 @@ def _check_study(path: Path) -> int:
 
 @contextmanager
 def _opened_study(path: Path) -> Iterator[tuple[Callable[[str], bytes], set[str]]]:
-    """A function that reads a file in the pack of a study, and the checked names of all files."""
+    """Open a study's pack: a function that reads a file, and the checked names of all files."""
     content = read_file(path, MAX_ARCHIVE_BYTES)
     with opened_zip(content, Budget(len(content))) as archive:
         infos = archive.infolist()
@@ -202,7 +202,7 @@ def _opened_study(path: Path) -> Iterator[tuple[Callable[[str], bytes], set[str]
 
         def read(name: str) -> bytes:
             info = archive.getinfo(name)
-            # Twice: Python puts it together from pieces. Not by what the zip says of its own size.
+            # Twice, because Python joins pieces. The size in the zip is not trusted.
             Budget(len(content)).charge(2 * info.file_size)
             return read_member(archive, info)
 
@@ -211,10 +211,10 @@ def _opened_study(path: Path) -> Iterator[tuple[Callable[[str], bytes], set[str]
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
-    """The folder of a pack, and the zip that it was unpacked from, or None.
+    """Yield the folder of a pack, and the zip from which it was unpacked, or None.
 
-    Of a zip it is a temporary one, with nothing in it but what its record lists. Any other path is
-    given as it is. In the pack of a study, a run is ``study.zip/runs/<agent>/<run>.zip``.
+    For a zip, the folder is temporary, and contains only files in the record. Any other path is
+    yielded unchanged. A run in the pack of a study is ``study.zip/runs/<agent>/<run>.zip``.
     """
     beside = path.with_name(f"{path.name}.zip") if path.name else path
     path = beside if not path.exists() and is_packed(beside) else path
@@ -243,7 +243,7 @@ def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
 
 
 def _run_of(study: Path, name: str) -> bytes:
-    """The pack of a run in the pack of a study; its suffix may be missing."""
+    """Find the pack of a run in the pack of a study; the suffix may be missing."""
     with _opened_study(study) as (read, names):
         found = next((n for n in (name, f"{name}.zip") if n in names), None)
         if found is not None:
@@ -252,14 +252,14 @@ def _run_of(study: Path, name: str) -> bytes:
 
 
 def _a_run(study: Path) -> str:
-    """An example of the runs in the pack of a study."""
+    """The name of one run in the pack of a study, as an example for messages."""
     with _opened_study(study) as (_, names):
         runs = sorted(name for name in names if name.endswith(".zip"))
         return f"such as {study}/{runs[0]}" if runs else "but it holds none"
 
 
 def is_packed(path: Path, record: str = RECORD) -> bool:
-    """Whether a file is a zip with the record of a run in it, as no model has, or of a study."""
+    """Whether a file is a zip with the record of a run or study, which models do not have."""
     if not path.is_file():
         return False
     try:
@@ -270,7 +270,7 @@ def is_packed(path: Path, record: str = RECORD) -> bool:
 
 
 def _check_members(infos: Collection[zipfile.ZipInfo], deepest: int = _DEEPEST) -> None:
-    """Refuse members that would not be files of their own, inside of the folder."""
+    """Refuse members that would not become separate files inside the folder."""
     for info in infos:
         kind = stat.S_IFMT(info.external_attr >> 16)
         if kind not in (0, stat.S_IFREG):
@@ -285,7 +285,7 @@ def _check_members(infos: Collection[zipfile.ZipInfo], deepest: int = _DEEPEST) 
 
 
 def check_name(name: str, deepest: int = _DEEPEST) -> None:
-    """Refuse a name that leads elsewhere, or that some file system does not take."""
+    """Refuse a name that leads out of the folder, or is invalid on some file system."""
     parts = name.split("/")
     deepest = _DEEPEST_MODULE if parts[0] == COPIES else deepest
     is_good = {"", ".", ".."}.isdisjoint(parts) and len(parts) <= deepest
@@ -307,7 +307,7 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def default_target(run_folder: Path) -> Path:
-    """A name for the pack of a run, in the present folder: agent, environment, seed."""
+    """The default name for the pack of a run, in the current folder: agent, environment, seed."""
     run = run_in(run_folder)
     spec = run.recorded_spec()
     name = "-".join(str(spec.get(key)) for key in ("algo", "env_id", "seed"))
@@ -317,7 +317,7 @@ def default_target(run_folder: Path) -> Path:
 # --- the pack of a study: page, tables and settings, packs of its runs, the user's modules --------
 
 RUNS = "runs"
-SETTINGS = "study.yml"  # written beside the page, see `experiments.study`
+SETTINGS = "study.yml"  # beside the page, see `experiments.study`
 _RUN = re.compile(r".*_\d+", re.DOTALL)  # not ``<run>.damaged-1``
 _PAGE = "report.html"
 _SHOWN = (_PAGE, "learning/*/*.html", "verdicts.*", "summary.csv", "curves.csv.gz", "figures/*")
@@ -329,16 +329,16 @@ _LARGEST_FILE = 64 << 20  # bytes
 
 @dataclass
 class StudyPack:
-    """What has come into the pack of a study."""
+    """Collects the contents of a study's pack while it is written."""
 
     digests: dict[str, str] = field(default_factory=dict)  # of its files, by name
-    # by agent and environment: record and pack of the first run, and how many runs there are
+    # by agent and environment: record and pack of the first run, and the number of runs
     agents: dict[tuple[str, str], tuple[dict[str, Any], str, int]] = field(default_factory=dict)
-    modules: list[str] = field(default_factory=list)  # what to type for the modules of all runs
+    modules: list[str] = field(default_factory=list)  # arguments for the modules of all runs
 
     @property
     def n_runs(self) -> int:
-        """How many packs of runs it holds."""
+        """The number of packs of runs."""
         return sum(n_runs for _, _, n_runs in self.agents.values())
 
     @property
@@ -348,13 +348,13 @@ class StudyPack:
 
 
 def is_study(folder: Path) -> bool:
-    """Whether a folder is that of a study."""
+    """Whether a folder contains a study."""
     has_parts = any((folder / name).exists() for name in (RUNS, SETTINGS, LOCK))
     return has_parts and not os.path.lexists(folder / RECORD)
 
 
 def pack_study(root: Path, target: Path, say: Callable[[str], object]) -> StudyPack:
-    """Write a study, on which no other command may be at work, as a zip, which is replaced."""
+    """Write a study as a zip, which may replace another; no other command may use the study."""
     hold(root)
     if target.suffix != ".zip" or target.is_dir():
         raise UserError(f"{target}: a study is packed as a file: name it {target.name}.zip")
@@ -364,7 +364,7 @@ def pack_study(root: Path, target: Path, say: Callable[[str], object]) -> StudyP
         folders = sorted(path for path in root.glob(f"{RUNS}/*/*") if _RUN.fullmatch(path.name))
         if not folders:
             raise UserError(f"{root} holds no finished run: there is nothing to pack")
-        # A file without a name leaves nothing behind if this process is killed.
+        # An anonymous file disappears if this process is killed.
         with tempfile.TemporaryFile(dir=target.absolute().parent) as draft:
             made = _write_study(draft, root, folders)
             draft.seek(0)
@@ -422,7 +422,7 @@ def _study_files(root: Path, folders: list[Path], made: StudyPack) -> Iterator[t
 
 
 def _without_folders(summary: bytes) -> bytes:
-    """The table of all runs, with their packs in place of their folders."""
+    """The table of all runs, with packs in place of folders."""
     try:
         head, *rows = list(csv.reader(io.StringIO(summary.decode())))
         place = head.index("path")

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 RenderMode = Literal["human", "ansi", "rgb_array"]
 
-# What an environment draws in these modes is handed over rather than shown at once.
+# In these modes, an environment returns frames instead of showing them.
 KEPT_MODES: tuple[RenderMode, ...] = ("ansi", "rgb_array")
 
-# An episode repeats itself after so many known frames in a row.
+# After so many known frames in a row, an episode counts as repeating itself.
 FRAMES_OF_A_REPETITION = 20
 
 
@@ -38,12 +38,12 @@ def playing_env(
     n_envs: int = 1,
     monitor_folder: Path | None = None,
 ) -> VecEnv:
-    """The VecEnv to play on, drawn in that mode; `FrameTaker` hands over what is kept of it."""
+    """Make the VecEnv for playing, with this render mode; `FrameTaker` returns its frames."""
     if mode == "rgb_array":
-        # Drawing into memory needs no display, and SDL complains where it finds none.
+        # Rendering into memory needs no display, but SDL complains if there is none.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     extra = {} if mode is None else {"render_mode": mode}
-    # A VecEnv resets a finished environment at once: frames are kept before that happens.
+    # A VecEnv resets a finished environment at once, so frames are stored before that.
     wrap_innermost = None
     if mode in KEPT_MODES:
         from gymnasium.wrappers import RenderCollection
@@ -70,10 +70,10 @@ def play_episodes(
     before_step: Callable[[Any, Any], object] = lambda obs, actions: None,
     after_step: Callable[[bool], object] = lambda done: None,
 ) -> Iterator[tuple[float, int]]:
-    """Play until so many episodes have ended, or so many steps are done over all environments.
+    """Play a number of episodes, or a number of steps over all environments.
 
-    ``before_step`` is told what the agent observes, and what it will do; ``after_step`` whether the
-    step ended an episode of the first environment.
+    ``before_step`` gets the observations and the actions; ``after_step`` gets whether the step
+    ended an episode of the first environment.
 
     Yields:
         Return and length of each episode as it ends.
@@ -85,8 +85,8 @@ def play_episodes(
     obs: Any = env.reset()
     state = None
     starts = np.ones(env.num_envs, dtype=bool)
-    # An equal share for each environment, as in `evaluate_policy`: were it the first to end that
-    # count, they would be the short ones.
+    # An equal share for each environment, as in `evaluate_policy`: the first episodes to end over
+    # all environments would mostly be short ones.
     due: Any = np.full(env.num_envs, np.inf)
     if n_episodes is not None:
         due = (n_episodes + np.arange(env.num_envs)) // env.num_envs
@@ -98,7 +98,7 @@ def play_episodes(
         steps += env.num_envs
         after_step(bool(starts[0]))
         for index in np.flatnonzero(starts & (due > 0)):
-            # Missing where a wrapper begins anew although the episode itself has not ended.
+            # Missing if a wrapper restarts although the episode itself has not ended.
             episode = infos[index].get("episode")
             if episode is not None:
                 due[index] -= 1
@@ -107,11 +107,11 @@ def play_episodes(
 
 
 class Repetition:
-    """Notices when an episode only repeats frames."""
+    """Detects that an episode only repeats frames."""
 
     def __init__(self) -> None:
         self._seen: set[Any] = set()
-        self._n_known = 0  # one after the other
+        self._n_known = 0  # consecutive
 
     def goes_on(self, frame: Any) -> bool:
         """Whether this frame and the last `FRAMES_OF_A_REPETITION` were all shown before."""
@@ -120,20 +120,20 @@ class Repetition:
         return self._n_known > FRAMES_OF_A_REPETITION
 
     def forget(self) -> None:
-        """Begin anew, with another episode."""
+        """Start again with another episode."""
         self._seen.clear()
         self._n_known = 0
 
 
 class FrameTaker:
-    """Hands over what an environment of `playing_env` has drawn, and keeps the episodes apart."""
+    """Returns the frames of an environment of `playing_env`, separated by episode."""
 
     def __init__(self, env: VecEnv) -> None:
         self.env = env
         self._first_of_next: list[Any] = []
 
     def take(self, done: bool) -> list[Any]:
-        """What was drawn since the last call; the first frame of the next episode waits."""
+        """The frames since the last call; keeps the first frame of the next episode back."""
         drawn: list[Any] = self._first_of_next + self.env.env_method("render")[0]
         self._first_of_next = [drawn.pop()] if done else []
         return drawn
@@ -146,7 +146,7 @@ FRAMES_PER_SECOND = 10
 
 
 def check_film_path(path: Path) -> None:
-    """Make sure that a film can be written before anything is played."""
+    """Check that a film can be written, before anything is played."""
     if path.suffix not in FILM_SUFFIXES:
         raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
     if not path.absolute().parent.is_dir():
@@ -160,7 +160,7 @@ def check_film_path(path: Path) -> None:
 def film_episode(
     model: BaseAlgorithm, env: VecEnv, max_steps: int, *, deterministic: bool
 ) -> tuple[list[Any], tuple[float, int] | None]:
-    """Play an episode, and return its frames; and its return and length, None if it did not end."""
+    """Play an episode; returns its frames, and return and length, None if it did not end."""
     taker = FrameTaker(env)
     frames: list[Any] = []
 
@@ -192,12 +192,12 @@ def as_gif(frames: list[Any]) -> bytes:
 def _as_mp4(frames: list[Any]) -> bytes:
     import imageio.v2 as imageio
 
-    # Encoders want even sides.
+    # Encoders need even side lengths.
     even = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]
     film: bytes = imageio.mimwrite(
         "<bytes>", even, format="mp4", fps=FRAMES_PER_SECOND, macro_block_size=1
     )
-    # It goes through a temporary file, and on a full disk nobody says so.
+    # The library uses a temporary file, and does not report a full disk.
     if b"moov" not in film:
         raise OSError(errno.EIO, "the encoder wrote no whole film: is the disk full?")
     return film

@@ -1,4 +1,4 @@
-"""`prepare`: the run folder and all parts of a training, made before its first step."""
+"""`prepare` makes the run folder and all parts of a training before its first step."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ NEW = StateKeeping()
 class Training:
     """A run that is set up and can be started."""
 
-    spec: TrainSpec  # with what an agent that goes on has brought along
+    spec: TrainSpec  # including settings of an agent that continues
     run: Run
     model: BaseAlgorithm  # the agent, with its environments
     eval_env: VecEnv
@@ -101,9 +101,9 @@ class Training:
     evaluation: EvaluationCallback  # one of them
     saver: StateSaver  # likewise
     keeping: StateKeeping
-    pulls: PullRecorder | None  # on bandits, but where a compiled loop was asked for
-    watch: Watch | None  # keeps how the agent learns, for a page
-    refusal: str | None  # why the model that the environment brings is not believed
+    pulls: PullRecorder | None  # on bandits, unless a compiled loop was requested
+    watch: Watch | None  # records how the agent learns, for a page
+    refusal: str | None  # why the environment's own model is rejected
 
 
 @exits_as_mistakes()
@@ -115,11 +115,11 @@ def prepare(
     run: Run | None = None,
     keeping: StateKeeping = NEW,
 ) -> Training:
-    """Make all parts of the training, and the run folder unless ``run`` is there already.
+    """Make all parts of the training, and the run folder unless ``run`` is given.
 
-    ``args`` and ``command`` are written to it; ``keeping`` says what becomes of the state. If
-    UserError is raised, since the spec does not work out or the environment asks the program to
-    end, or `Stopped`, no folder is left behind.
+    Writes ``args`` and ``command`` to the folder; ``keeping`` decides about saved states. Raises
+    UserError if the spec is invalid or the environment asks the program to end, and `Stopped` on
+    a signal; then no folder stays behind.
     """
     if spec.num_threads > 0:
         th.set_num_threads(spec.num_threads)
@@ -153,7 +153,7 @@ def prepare(
 
 @contextmanager
 def _library_errors_in_one_line() -> Iterator[None]:
-    """Turn errors of settings that only the library checks into one line."""
+    """Turn the library's errors about settings into one line."""
     try:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
@@ -161,7 +161,7 @@ def _library_errors_in_one_line() -> Iterator[None]:
 
 
 def load_for_optimizer(model: Any) -> None:
-    """Import PyTorch's compiler, as optimizers do at their first step; it takes over a second."""
+    """Import PyTorch's compiler, as optimizers do at their first step; takes over a second."""
     has_optimizer = getattr(getattr(model, "policy", None), "optimizer", None) is not None
     if has_optimizer and getattr(model, "engine", "library") == "library":
         with loading_libraries():
@@ -169,7 +169,7 @@ def load_for_optimizer(model: Any) -> None:
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
-    """The arguments of the agent's constructor, checked and made into objects."""
+    """Check the arguments of the agent's constructor, and build their objects."""
     algorithm, kwargs = agent_class(spec.algo), spec.hyperparams.algorithm
     check_action_noise(spec.hyperparams, algorithm, spec.algo)
     if needs_policy(algorithm, kwargs):
@@ -188,7 +188,7 @@ def _set_up(
     undo: ExitStack,
     keeping: StateKeeping,
 ) -> Training:
-    """Make all parts of the training, and add to ``undo`` how to remove them again."""
+    """Make all parts of the training, and register their removal in ``undo``."""
     undo.callback(end_workers_after_stop)
     spec, env = _training_env(spec, trained, run, undo, appends=keeping.state is not None)
     model = make_model(spec, trained, env, kwargs)
@@ -222,8 +222,8 @@ def _set_up(
     shows_evaluations = isinstance(watch, EvaluationMaps)
     if shows_evaluations:
         evaluation.callback = watch
-    # In this order: of a broken number nothing is kept, and no other callback sees a moment that a
-    # training goes back from.
+    # In this order: a number that is not finite is never stored, and no other callback sees a
+    # moment before the training returns to its saved state.
     first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
     others = [*filter(None, [pulls, None if shows_evaluations else watch]), evaluation]
     if spec.hyperparams.n_episodes is not None:
@@ -272,7 +272,7 @@ def _say(console: Console, line: str) -> None:
 def _exact_evaluator(
     spec: TrainSpec, model: BaseAlgorithm, console: Console
 ) -> ExactEvaluator | None:
-    """The exact evaluator, if the environment's model is known and the agent allows it."""
+    """Make the exact evaluator, if the environment's model is known and the agent permits it."""
     exact = evaluator_of(spec)
     if exact is None:
         return None
@@ -293,14 +293,14 @@ def _exact_evaluator(
 def _training_env(
     spec: TrainSpec, trained: ModelFile | None, run: Run, undo: ExitStack, appends: bool
 ) -> tuple[TrainSpec, VecEnv]:
-    """What the agent is trained on, and the spec, which follows an agent that goes on."""
+    """Make the training environments, and the spec with settings of an agent that continues."""
     if trained is not None:
         spec = telling_masks(spec, trained)
     statistics = statistics_to_continue(spec)
     if statistics is not None:
         spec = continuing(spec, statistics)
     made = spec
-    if appends:  # Monitor goes on in the files that are there
+    if appends:  # Monitor appends to the existing files
         monitor_kwargs = {**spec.hyperparams.monitor_kwargs, "override_existing": False}
         made = replace(spec, hyperparams=replace(spec.hyperparams, monitor_kwargs=monitor_kwargs))
     env = make_training_env(made, run.path)
@@ -311,16 +311,16 @@ def _training_env(
 
 
 def is_unread(spec: TrainSpec) -> bool:
-    """Whether nobody reads the library's log, so that it need not be computed."""
+    """Whether the library's log has no reader, so that it need not be computed."""
     return spec.tensorboard_log is None and spec.verbose < 2
 
 
 def make_model(
     spec: TrainSpec, trained: ModelFile | None, env: VecEnv, kwargs: dict[str, Any]
 ) -> BaseAlgorithm:
-    """The agent of a run: a new one, or the one that it goes on from; its environments seeded."""
+    """Make or load the agent of a run, and seed its environments."""
     model = _model(spec, trained, env, kwargs)
-    # The library seeds slot i with s + i: most streams of one run would be those of the next.
+    # The library seeds slot i with s + i, so consecutive seeds would share most random streams.
     env.seed(first_slot_seed(spec))
     return model
 
@@ -337,13 +337,13 @@ def _model(
     }
     if trained is not None:
         return load_to_continue(spec, trained, env, **common, **kwargs)
-    # What a constructor does not take of these is set afterwards.
+    # Arguments that the constructor does not accept are set afterwards.
     algorithm, given = agent_class(spec.algo), {"device": spec.device, **common}
     parameters = algorithm_parameters(algorithm)
     taken = {name: value for name, value in given.items() if name in parameters}
     if "seed" not in taken:
         set_random_seed(spec.seed)
-    # The type checker knows the arguments of the base class, which has more of them.
+    # The type checker knows only the arguments of the base class, which has more.
     model: BaseAlgorithm = cast(Any, algorithm)(env=env, **taken, **kwargs)
     for name in common.keys() - taken.keys():
         setattr(model, name, common[name])
@@ -352,23 +352,23 @@ def _model(
     return model
 
 
-# --- the engine of networks, found out before a training begins -----------------------------------
+# --- the engine of networks, determined before a training begins ----------------------------------
 
 
 @dataclass(frozen=True)
 class EngineOutlook:
-    """On which engine a training will run, and on which it could."""
+    """The engine of a training, and its alternative."""
 
-    plan: EnginePlan  # the engine that it will run on
-    auto: EnginePlan  # the one that ``engine: auto`` would choose
-    work: Work | None  # None where nobody knows what a step of the environment takes
+    plan: EnginePlan  # the engine of the training
+    auto: EnginePlan  # the choice of ``engine: auto``
+    work: Work | None  # None if the time of an environment step is unknown
 
 
 def engine_outlook(
     model: BaseAlgorithm, spec: TrainSpec, callbacks: list[BaseCallback]
 ) -> EngineOutlook | None:
-    """The outlook of an agent; None for one without compiled networks."""
-    from agents.networks.engine_setting import CompiledNetworks  # it takes a while to load
+    """The outlook of an agent; None if it has no compiled networks."""
+    from agents.networks.engine_setting import CompiledNetworks  # slow import
 
     if not isinstance(model, CompiledNetworks) or model.env is None:
         return None
@@ -383,7 +383,7 @@ def engine_outlook(
 
 
 def planned_outlook(spec: TrainSpec) -> EngineOutlook | None:
-    """The outlook of a run of another process, which itself says what is wrong."""
+    """The outlook of a run in another process, which reports any errors itself."""
     if spec.algo not in NETWORKS:
         return None
     with (

@@ -1,4 +1,4 @@
-"""What a person watching a training run sees."""
+"""Shows the progress of a training run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COMPILING = "compiling the training loop"
 
 
 class ProgressDisplay(BlockCallback):
-    """A live bar in a terminal; elsewhere a line for each tenth, and every ten seconds."""
+    """A live bar in a terminal; elsewhere a line per tenth of the training and every 10 s."""
 
     takes_blocks = True
 
@@ -39,11 +39,11 @@ class ProgressDisplay(BlockCallback):
         self.console = console
         self.bar: Progress | None = None
         self.live = live
-        self.on_variant = on_variant  # returns of training are not those of evaluation
+        self.on_variant = on_variant  # training and evaluation returns differ
         self.has_begun = False
         self.updated = 0.0
         self.tenths_shown = 0
-        # Moments and the share that was done by then, a thousandth or more apart.
+        # Times with the share done, at least a thousandth apart.
         self.marks: list[tuple[float, float]] = []
         self.figures = ""
         self.activity = ""
@@ -71,7 +71,7 @@ class ProgressDisplay(BlockCallback):
 
     def _on_rollout_start(self) -> None:
         self.activity = ""
-        if not self.has_begun:  # a run that goes on is where it was by now
+        if not self.has_begun:  # a resumed run has restored its state by now
             self.num_timesteps = self.model.num_timesteps
             self.has_begun, self.marks = True, [(time.monotonic(), self.share_done)]
 
@@ -91,7 +91,7 @@ class ProgressDisplay(BlockCallback):
         self.close()
 
     def close(self) -> None:
-        """Give the terminal back; may be called again."""
+        """Release the terminal; may be called repeatedly."""
         self.notice.stop()
         self.heart.stop()
         if self.bar is not None:
@@ -100,7 +100,7 @@ class ProgressDisplay(BlockCallback):
 
     @contextmanager
     def doing(self, activity: str) -> Iterator[None]:
-        """Name what goes on besides training, if it takes long."""
+        """Name an activity besides training, shown if it takes long."""
         before, self.activity = self.activity, activity
         try:
             yield
@@ -109,11 +109,11 @@ class ProgressDisplay(BlockCallback):
 
     @property
     def share_done(self) -> float:
-        """The share of the training that is done."""
+        """The finished share of the training."""
         return min(self.num_timesteps / max(self.model._total_timesteps, 1), 1.0)
 
     def look(self) -> None:
-        """Show that the training is alive, also while it does not say how far it is."""
+        """Show that the training is alive, also while its progress does not change."""
         if self.bar is not None:
             self._draw()
         elif not self.live and self.silence.is_too_long:
@@ -140,7 +140,7 @@ class ProgressDisplay(BlockCallback):
         self.console.print(line, highlight=False, soft_wrap=True)
 
     def _words(self) -> list[str]:
-        """The figures and, where the training itself stands still, what goes on and how long."""
+        """The figures, and if the training pauses, the current activity and its duration."""
         words = [self.figures] if self.figures else []
         if self.activity and (seconds := time.monotonic() - self.updated) >= 1:
             words.append(f"{self.activity}, {seconds:.0f} s")
@@ -163,7 +163,7 @@ class ProgressDisplay(BlockCallback):
         return figures if left is None else f"{figures}  about {duration(left)} left by the clock"
 
     def _seconds_left(self) -> float | None:
-        """By the speed of the last half: off-policy agents are faster before they learn."""
+        """Estimate by the last half's speed: off-policy agents are faster before they learn."""
         now, share = time.monotonic(), self.share_done
         if share >= self.marks[-1][1] + 0.001:
             self.marks.append((now, share))

@@ -1,7 +1,7 @@
-"""One run folder: the names of its files, its number, and what it says of itself.
+"""One run folder: its file names, its number, and its ``run.json``.
 
-The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, and so are the names of files that
-it has too, so that its tools read our runs. ``run.json`` is ours.
+The layout is that of rl_zoo3, ``<log folder>/<algo>/<env>_<number>/``. Files that rl_zoo3 has too
+have the same names, so that its tools can read our runs. ``run.json`` belongs to this project.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ if TYPE_CHECKING:
     from pipeline.train_spec import TrainSpec
 
 PULLS_FILE = "pulls.npz"
-LAST_PULLS = 100  # the mean of so many tells how it went at the end
+LAST_PULLS = 100  # pulls at the end whose mean is reported
 
-# States in a folder: the newest two, so that one is whole.
+# Keeps the newest two states, so that one is complete.
 GENERATIONS = 2
 
 
 def state_file(folder: Path, number: int) -> Path:
-    """Where the state of that number lies, in place of the one before the last."""
+    """The path of a state by its number; replaces the state before the last one."""
     return folder / f"{'odd' if number % GENERATIONS else 'even'}.state"
 
 
 def state_files(folder: Path) -> list[Path]:
-    """Where states may lie."""
+    """The possible paths of states."""
     return [state_file(folder, number) for number in range(GENERATIONS)]
 
 
 def has_state(folder: Path) -> bool:
-    """Whether there is a file that may be a state."""
+    """Whether a file exists that may be a state."""
     return any(path.is_file() for path in state_files(folder))
 
 
@@ -71,7 +71,7 @@ def remove_states(folder: Path) -> None:
 
 
 def environment_name(env_id: str) -> str:
-    """The environment's id as a file name: no module before it, and no slash in it."""
+    """The environment's id as a file name, without module prefix and slashes."""
     return portable_name(env_id.rpartition(":")[2].replace("/", "-"))
 
 
@@ -80,19 +80,19 @@ FINISHED = "finished"
 INTERRUPTED = "interrupted"
 FAILED = "failed"
 
-# What ``run.json`` says of the end of a run.
+# Values of ``state`` in ``run.json`` after the end of a run.
 _OF_END = ("state", "reason", "stopped_by", "n_timesteps", "seconds", "cpu_seconds", FIELD)
 _BEST = ("best_mean_return", "best_timesteps", "best_episodes", "evaluation_steps")
 OUTCOME = (*_OF_END, "final", *_BEST, "engine", "regret", "pulls")
-# The field of ``run.json`` that says, while a run is running, which process is at work on it.
+# The field of ``run.json`` with the process of a running run.
 PROCESS = "process"
-# Reserved while a run is under way, so that its last ``run.json`` fits on a full disk.
+# Space reserved during a run, so that its last ``run.json`` fits on a full disk.
 ROOM = ".room"
 ROOM_BYTES = 16 << 10
 
 
 class NoRunError(UserError):
-    """An agent has not been trained on an environment yet."""
+    """The agent has not been trained on the environment yet."""
 
     def __init__(self, algo: str, env_id: str, log_folder: Path) -> None:
         super().__init__(f"no run of {algo} on {environment_name(env_id)} in {log_folder}")
@@ -100,14 +100,14 @@ class NoRunError(UserError):
 
 
 def _run_number(name: str, env_name: str) -> int:
-    """The number in a run folder's name, with or without a unique suffix; 0 if it is none."""
+    """The number in a run folder's name, with or without a unique suffix; 0 if there is none."""
     match = re.fullmatch(re.escape(env_name) + r"_(\d+)(?:_[0-9a-f-]{36})?", name)
     return int(match[1]) if match else 0
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder; nothing in it is read or written through a link."""
+    """A run folder; it never reads or writes through a link in it."""
 
     path: Path
     env_name: str  # the environment's name in file names
@@ -117,7 +117,7 @@ class Run:
 
     @classmethod
     def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
-        """Make the folder of a new run, with the first number that is free."""
+        """Make the folder of a new run, with the first free number."""
         name = environment_name(env_id)
         parent = log_folder / algo
         draft = cls(parent / f".{name}.{secrets.token_hex(8)}.tmp", name)
@@ -125,7 +125,7 @@ class Run:
             draft.params_path.mkdir(parents=True)
             draft.update_info(state=RUNNING)
             number = max((n for n, _ in numbered_runs(parent, name)), default=0) + 1
-            # Renaming is what claims the number: two runs never share one.
+            # Renaming claims the number atomically: two runs never share one.
             while not _renamed(draft.path, path := parent / f"{name}_{number}{suffix}"):
                 number += 1
         except OSError as error:
@@ -135,9 +135,9 @@ class Run:
 
     @classmethod
     def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
-        """The run of that number, the newest where it is 0, that without a number where it is -1.
+        """Find a run by number; 0: the newest, -1: the one without a number.
 
-        The latter lies in ``<log folder>/<algo>/``, and is also the newest where no other is.
+        The latter is in ``<log folder>/<algo>/``; 0 finds it too if there is no other run.
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
@@ -155,7 +155,7 @@ class Run:
         raise UserError(f"no run {number} of {algo} on {name} in {log_folder}: there is {numbers}")
 
     @property
-    def params_path(self) -> Path:  # settings and statistics of VecNormalize
+    def params_path(self) -> Path:  # settings and VecNormalize statistics
         return self.path / self.env_name
 
     @property
@@ -171,7 +171,7 @@ class Run:
         return self.path / f"rl_model_{n_steps}_steps.zip"
 
     def checkpoints(self) -> list[Path]:
-        """The checkpoints that there are, by rising number of steps."""
+        """The existing checkpoints, by rising number of steps."""
         steps = (
             re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name) for path in self.path.iterdir()
         )
@@ -186,11 +186,11 @@ class Run:
         return self.params_path / "vecnormalize.pkl"
 
     @property
-    def state_path(self) -> Path:  # the folder of the states that a training goes on from
+    def state_path(self) -> Path:  # the folder of saved states
         return self.path / STATE_FOLDER
 
     @property
-    def info_path(self) -> Path:  # what the run was asked for and what came out
+    def info_path(self) -> Path:  # settings and results of the run
         return self.path / RECORD
 
     @property
@@ -211,7 +211,7 @@ class Run:
         return _run_number(self.path.name, self.env_name)
 
     def read_info(self) -> dict[str, Any]:
-        """The contents of ``run.json``; empty where there is none."""
+        """Read ``run.json``; empty if there is none."""
         try:
             return read_record(self.info_path)
         except FileNotFoundError:
@@ -219,7 +219,7 @@ class Run:
 
     @property
     def state(self) -> str | None:
-        """The state in ``run.json``; interrupted if its process is gone."""
+        """The ``state`` in ``run.json``; ``interrupted`` if the run's process no longer exists."""
         info = self.read_info()
         state = info.get("state")
         if state == RUNNING and is_alive(info.get(PROCESS)) is False:
@@ -227,12 +227,12 @@ class Run:
         return state if isinstance(state, str) else None
 
     def recorded_spec(self) -> dict[str, Any]:
-        """What ``run.json`` says was asked for; empty where it says nothing."""
+        """The spec in ``run.json``; empty if there is none."""
         spec = self.read_info().get("spec")
         return spec if isinstance(spec, dict) else {}
 
     def update_info(self, **fields: Any) -> None:
-        """Set fields of ``run.json``, which names this process while the run is running."""
+        """Set fields of ``run.json``; adds this process while the run is running."""
         info = {**self.read_info(), **fields}
         info.pop(PROCESS, None)
         if info.get("state") == RUNNING:
@@ -240,7 +240,7 @@ class Run:
         write_json(self.info_path, sealed(info))
 
     def reopen(self) -> None:
-        """Remove the outcome from ``run.json``: the run continues."""
+        """Remove the outcome from ``run.json``, because the run continues."""
         info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
         write_json(self.info_path, {**info, "state": RUNNING, PROCESS: mark()})
 
@@ -250,31 +250,31 @@ class Run:
             file.write(bytes(ROOM_BYTES))
 
     def fail(self, reason: str) -> None:
-        """Note in ``run.json`` that the run has failed, if anything can be written at all."""
+        """Record in ``run.json`` that the run has failed, if writing is possible."""
         with contextlib.suppress(OSError):
             (self.path / ROOM).unlink(missing_ok=True)
             self.update_info(state=FAILED, reason=reason)
 
     def end(self, **fields: Any) -> None:
-        """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
+        """Write ``run.json``, the last file of a run, with the digests of all other files."""
         (self.path / ROOM).unlink(missing_ok=True)
-        for draft in drafts_in(self.path):  # of a file that was not to be finished any more
+        for draft in drafts_in(self.path):  # of an unfinished file
             draft.unlink(missing_ok=True)
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
 
     def add_file(self, path: Path) -> None:
-        """Add the digest of a file that was written after the end of the run."""
+        """Record the digest of a file that was written after the end of the run."""
         digests = self.files.digests
         if digests is not None and path.parent.resolve() == self.path.resolve():
             self.update_info(**{FIELD: {**digests, path.name: digest_of(path)}})
 
     @property
     def files(self) -> RecordedFiles:
-        """The files that the run left, checked against their digests."""
+        """The run's files, checked against their digests when read."""
         return RecordedFiles(self.path, self.read_info().get(FIELD))
 
     def discard(self) -> None:
-        """Remove the folder of a run that left nothing, and those above it that are empty then."""
+        """Remove the folder of a run without results, and parent folders that become empty."""
         shutil.rmtree(self.path, ignore_errors=True)
         for folder in list(self.path.parents)[:2]:
             try:
@@ -285,7 +285,7 @@ class Run:
 
 @dataclass(frozen=True)
 class ReadRun(Run):
-    """A run folder that is only read; caches ``run.json``."""
+    """A read-only run folder; caches ``run.json``."""
 
     @cached_property
     def _info(self) -> dict[str, Any]:
@@ -300,13 +300,13 @@ class ReadRun(Run):
 
 
 def _renamed(draft: Path, path: Path) -> bool:
-    """Rename a folder that holds something, unless something has the name already."""
+    """Rename a folder that is not empty, unless the new name exists."""
     if os.path.lexists(path):
         return False
     try:
         put_in_place(draft, path)
     except OSError:
-        if os.path.lexists(path):  # since a moment ago
+        if os.path.lexists(path):  # created meanwhile
             return False
         raise
     return True
@@ -320,28 +320,28 @@ def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:
     return sorted((number, path) for number, path in numbered if number > 0)
 
 
-# The field of ``run.json`` with the digest of the zip that a run goes on with.
+# The field of ``run.json`` with the digest of the zip from which a run continues.
 TRAINED_AGENT = "trained_agent_digest"
 _PROCESSORS = Path("/proc/cpuinfo")
 RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
 
 
 def write_settings(run: Run, spec: TrainSpec, command: str) -> None:
-    """Write the hyperparameters and the command, where rl_zoo3 has them; keep the user's files."""
+    """Write hyperparameters and command at rl_zoo3's places; copy the user's files."""
     write_text(run.params_path / "config.yml", _yaml(spec.saved_hyperparams))
     write_text(run.params_path / "command.txt", command + "\n")
     keep_copies(spec.user_modules, run.path)
 
 
 def write_arguments(run: Run, spec: TrainSpec, args: Mapping[str, Any]) -> None:
-    """Write the arguments of the command, as rl_zoo3 does."""
-    # Its tools take env_kwargs for the environment's arguments and let them win over config.yml.
+    """Write the arguments of the command, like rl_zoo3."""
+    # Its tools use env_kwargs as the environment's arguments, before those in config.yml.
     args = {**args, "env_kwargs": spec.saved_hyperparams.get("env_kwargs")}
     write_text(run.params_path / "args.yml", _yaml(args))
 
 
 def _yaml(data: Mapping[str, Any]) -> str:
-    """As `yaml.safe_dump`, in C where the library has it."""
+    """Like `yaml.safe_dump`, with the faster C version if available."""
     import yaml
 
     return str(yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
@@ -349,7 +349,7 @@ def _yaml(data: Mapping[str, Any]) -> str:
 
 @cache
 def recorded_versions() -> dict[str, str]:
-    """The versions that a run's results may depend on."""
+    """The versions of software that may affect a run's results."""
     from importlib.metadata import version
 
     packages = {package: version(package) for package in RECORDED_PACKAGES}
@@ -358,7 +358,7 @@ def recorded_versions() -> dict[str, str]:
 
 @cache
 def recorded_machine() -> dict[str, str]:
-    """What times and the bits of networks may depend on; nothing names the machine itself."""
+    """Hardware that may affect times and the bits of networks; does not identify the machine."""
     return {
         "processor": _processor(),
         "cores": str(os.cpu_count() or "unknown"),
@@ -367,7 +367,7 @@ def recorded_machine() -> dict[str, str]:
 
 
 def _processor() -> str:
-    """The processor's model, as Linux tells it."""
+    """The processor's model, as Linux reports it."""
     try:
         lines = _PROCESSORS.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -385,7 +385,7 @@ def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
 
 
 def check_left(run: Run) -> None:
-    """Make sure that nobody is at work on a run that has no lock, as those of a study."""
+    """Check that no process works on a run without a lock, such as a study's run."""
     info = run.read_info()
     process: Any = info.get(PROCESS)
     if info.get("state") == RUNNING and is_alive(process):
@@ -396,10 +396,10 @@ _CLAIM = re.compile(r"\.(.+)\.[0-9a-f]{16}\.tmp")
 
 
 def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
-    """Remove drafts of runs that were killed, and runs killed before their first step."""
+    """Remove drafts of killed runs, and runs that were killed before their first step."""
     parent, env_name = log_folder / algo, environment_name(env_id)
     names = {path: env_name for _, path in numbered_runs(parent, env_name)}
-    for path in list(parent.glob(".*.tmp")):  # that have no number yet
+    for path in list(parent.glob(".*.tmp")):  # without a number yet
         if claim := _CLAIM.fullmatch(path.name):
             names[path] = claim[1]
     for path, name in names.items():
@@ -407,7 +407,7 @@ def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
             continue
         run = Run(path, name)
         with contextlib.suppress(OSError, UserError):
-            drafts = drafts_in(path)  # before looking: who goes on with a run may write some
+            drafts = drafts_in(path)  # first: a resuming process may write new ones
             if run.model_path.exists() and not drafts:
                 continue
             info = run.read_info()
@@ -421,7 +421,7 @@ def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
 
 
 def _is_mere_set_up(run: Run) -> bool:
-    """Whether nothing lies in the folder but what is written before the first step."""
+    """Whether the folder contains only files that are written before the first step."""
     own_files = "|".join(map(re.escape, (RECORD, LOCK, ROOM)))
     own = re.compile(
         rf"{own_files}|\d+\.monitor\.csv|{re.escape(run.env_name)}(/(config|args)\.yml|/command\.txt)?"

@@ -1,4 +1,4 @@
-"""What a pack may not tell: paths of this machine, and so names of people and folders; secrets."""
+"""Removes private data from packs: paths of this machine, with names in them, and secrets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.errors import UserError
 from pipeline.runs import Run
 from safe_files.archives import read_members
 
-# Fields of a spec that name places or code of the machine that the run was done on.
+# Fields of a spec with paths or code of the run's machine.
 _PLACES: Mapping[str, Any] = {
     "log_folder": "logs",
     "tensorboard_log": None,
@@ -25,23 +25,23 @@ _PLACES: Mapping[str, Any] = {
     "watch_learning": None,
     "user_modules": [],
 }
-# Fields of ``run.json`` that say what came out, and nothing of where.
+# Fields of ``run.json`` with results, but without paths.
 _TOLD_OF_RUN = ("state", "record_version", "env_name", "versions", "n_timesteps", "final")
 _TOLD_OF_BEST = ("best_mean_return", "best_timesteps", "best_episodes")
 _TOLD = (*_TOLD_OF_RUN, *_TOLD_OF_BEST, "engine", "regret", "pulls")
 _DATE = (1980, 1, 1, 0, 0, 0)
 _SERIALIZED = re.compile(rb'":serialized:": "([A-Za-z0-9+/=]*)"')
 _SCRIPT = re.compile(rb"(<script\b.*?</script>)", re.DOTALL)
-# Numbers of a page: gzip in base64.
+# The data of a page: gzip in base64.
 _SIGN = rb"[A-Za-z0-9+/]"
 _PACKED = re.compile(rb">(H4sI(?:%b{4})*(?:%b{3}=|%b{2}==)?)<" % (_SIGN, _SIGN, _SIGN))
 _LARGEST = 64 << 20  # bytes
 _SECRET = re.compile(r"passw|secret|token|credential|api_?key", re.IGNORECASE)
-_SHORTEST = 4  # letters of a path that is looked for: "/" is everywhere
+_SHORTEST = 4  # letters of a path to search for: "/" is everywhere
 
 
 def without_places(value: Any) -> Any:
-    """Settings in which a path from the root, or from somebody's home, is the file's name alone."""
+    """Settings with absolute paths and paths from a home folder shortened to the file's name."""
     if isinstance(value, str):
         windows = PureWindowsPath(value)
         if windows.is_absolute() or windows.drive or value.startswith("~"):
@@ -53,7 +53,7 @@ def without_places(value: Any) -> Any:
 
 
 def record_to_tell(info: Mapping[str, Any]) -> dict[str, Any]:
-    """A ``run.json`` for others, without digests yet."""
+    """A ``run.json`` without private data, still without digests."""
     spec = info["spec"]
     told = {name: info[name] for name in _TOLD if name in info}
     hyperparams = without_places(spec["hyperparams"])
@@ -62,7 +62,7 @@ def record_to_tell(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_secrets(settings: Any, place: str = "hyperparams") -> None:
-    """Refuse settings that look like something that nobody else should have."""
+    """Refuse settings that look like secrets."""
     if isinstance(settings, dict):
         for key, value in settings.items():
             if isinstance(value, str) and value and _SECRET.search(str(key)):
@@ -76,7 +76,7 @@ def check_secrets(settings: Any, place: str = "hyperparams") -> None:
 
 
 def zip_to_tell(content: bytes) -> bytes:
-    """A model's zip without the folder of its TensorBoard log; as it is where it names none."""
+    """A model's zip without the folder of its TensorBoard log; unchanged if it has none."""
     members = dict(read_members(content))
     data = json.loads(members["data"])
     if not data.get("tensorboard_log"):
@@ -86,7 +86,7 @@ def zip_to_tell(content: bytes) -> bytes:
 
 
 def zipped(members: Mapping[str, bytes]) -> bytes:
-    """A zip of these members, the same bytes each time."""
+    """A zip of these members, with reproducible bytes."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, content in members.items():
@@ -95,19 +95,19 @@ def zipped(members: Mapping[str, bytes]) -> bytes:
 
 
 def member_of(name: str) -> zipfile.ZipInfo:
-    """A member of a zip, which does not say when and where it was written."""
+    """A member of a zip, without time and system of its creation."""
     return zipfile.ZipInfo(name, _DATE)
 
 
 def names_alone(name: str, content: bytes, run: Run) -> bytes:
-    """A page or table in which the paths of this machine are the names of their files alone."""
+    """A page or table with this machine's paths shortened to file names."""
     if not name.endswith(".html"):
         return _without_paths(content, run)
     parts = _SCRIPT.split(content)
     for place, part in enumerate(parts):
         if place % 2 == 0:
             parts[place] = _without_paths(part, run)
-        else:  # a script of the page's own, or numbers and texts, packed
+        else:  # the page's own script, or packed data
             parts[place] = _PACKED.sub(lambda found: _packed_anew(found[1], run), part)
     return b"".join(parts)
 
@@ -119,7 +119,7 @@ def _packed_anew(packed: bytes, run: Run) -> bytes:
 
 
 def _unpacked(content: bytes) -> bytes:
-    """What was packed by gzip, as far as it is looked at; nothing where it is no such thing."""
+    """Unpack gzip data up to a limit; empty if it is not gzip."""
     try:
         return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(content, _LARGEST)
     except zlib.error:
@@ -128,14 +128,14 @@ def _unpacked(content: bytes) -> bytes:
 
 def _without_paths(text: bytes, run: Run) -> bytes:
     for place in _places_of(run):
-        for way in {place, place.replace(b"_", rb"\_")}:  # as Markdown and LaTeX write it
+        for way in {place, place.replace(b"_", rb"\_")}:  # the escaped form in Markdown and LaTeX
             path = rb"(?<![\w.])%b(?:[/\\]+[^\s\"'<>&|,;:/\\]*)*(?![\w.-])" % re.escape(way)
             text = re.sub(path, lambda found: re.split(rb"[/\\](?!_)", found[0])[-1], text)
     return text
 
 
 def check_untold(files: Mapping[str, bytes], run: Run) -> None:
-    """Look through all files for the paths of this machine, also into models and pages."""
+    """Search all files, including models and pages, for paths of this machine."""
     places = _places_of(run)
     for name, content in files.items():
         for piece in _pieces(name, content):
@@ -145,7 +145,7 @@ def check_untold(files: Mapping[str, bytes], run: Run) -> None:
 
 
 def _places_of(run: Run) -> list[bytes]:
-    """Folders that only this machine has: where the user and the run are at home, and modules."""
+    """Folders specific to this machine: the user's home, the run's folder, and modules."""
     spec = run.recorded_spec()
     named = [spec.get(name) for name in ("log_folder", "tensorboard_log", "trained_agent")]
     named += [m.get("path") for m in spec.get("user_modules") or () if isinstance(m, dict)]

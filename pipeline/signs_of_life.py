@@ -1,4 +1,4 @@
-"""What is being done now: shown at once on a terminal, and elsewhere said where it takes long."""
+"""Shows the current activity: at once on a terminal, elsewhere as lines if it takes long."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-# What is shorter than that goes without a word where lines stay.
+# Where output is lines, a shorter activity is not reported.
 SECONDS_BEFORE_A_LINE = 5.0
 SECONDS_BETWEEN_LINES = 10.0
 
 SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_FRAMES = 0.25
-SPINNER = "line"  # plain letters, which every terminal has
+SPINNER = "line"  # ASCII, which every terminal can show
 
-# Told how far something is, in a few words.
+# A function that receives the progress in a few words.
 Tell = Callable[[str], object]
 
 COMPILING = "compiling (the first time, some seconds)"
 
 
 def can_move(console: Console) -> bool:
-    """Whether what is shown on a console can be replaced: on no plain teletype, nor in a file."""
+    """Whether a console can replace its output; plain terminals and files cannot."""
     return console.is_terminal and not console.is_dumb_terminal
 
 
@@ -38,7 +38,7 @@ def tell_nobody(detail: str) -> None:
 
 
 def duration(seconds: float) -> str:
-    """A time in hours, minutes and seconds, as far as they matter."""
+    """Format a time in hours, minutes and seconds, without irrelevant units."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
@@ -47,7 +47,7 @@ def duration(seconds: float) -> str:
 
 
 class Silence:
-    """Tells when the next line is due; the first after so many seconds."""
+    """Decides when the next line is due; the first one after a given number of seconds."""
 
     def __init__(self, allowed: float = SECONDS_BEFORE_A_LINE) -> None:
         self._ends = time.monotonic() + allowed
@@ -58,12 +58,12 @@ class Silence:
         return time.monotonic() > self._ends
 
     def end(self) -> None:
-        """Note that something is being said now."""
+        """Record that a line is printed now."""
         self._ends = time.monotonic() + SECONDS_BETWEEN_LINES
 
 
 class Heartbeat:
-    """Calls a function in a thread of its own, with so many seconds between two calls."""
+    """Calls a function in a separate thread, with a fixed pause between two calls."""
 
     def __init__(self, function: Callable[[], object], seconds: float) -> None:
         self._function = function
@@ -72,11 +72,11 @@ class Heartbeat:
         self._stopping = threading.Event()
 
     def start(self) -> None:
-        """Begin to call the function."""
+        """Start calling the function."""
         self.stop()
         self._stopping = threading.Event()
-        # Where the machine has no thread left, the work goes on without these signs. `Thread` would
-        # wait until the thread runs, and again until it is gone: longer than a short work takes.
+        # If the machine cannot start a thread, work continues without heartbeats. `Thread` would
+        # wait for the thread's start and end, which takes longer than a short task.
         with contextlib.suppress(RuntimeError):
             _thread.start_new_thread(self._beat, (self._stopping,))
 
@@ -86,7 +86,7 @@ class Heartbeat:
             self._stopping.set()
 
     def _beat(self, stopping: threading.Event) -> None:
-        # Where nothing can be written any more, the main thread learns of it by itself.
+        # If writing fails, the main thread finds out by itself.
         with contextlib.suppress(OSError):
             while not stopping.wait(self._seconds):
                 with self._calling:
@@ -95,7 +95,7 @@ class Heartbeat:
 
 
 class CompilationNotice(logging.Handler):
-    """Says once that something is being compiled."""
+    """Reports the first compilation."""
 
     def __init__(self, say: Callable[[], object]) -> None:
         super().__init__(logging.INFO)
@@ -104,7 +104,7 @@ class CompilationNotice(logging.Handler):
         self.level_before = self.log.level
 
     def listen(self) -> None:
-        """Begin to wait for something to be compiled."""
+        """Start listening for compilations."""
         self.log.addHandler(self)
         self.log.setLevel(logging.INFO)
 
@@ -120,7 +120,7 @@ class CompilationNotice(logging.Handler):
 
 
 class Activity:
-    """What is being done now; `doing` shows it."""
+    """The current activity; `doing` shows it."""
 
     def __init__(self, console: Console, text: str) -> None:
         self.console = console
@@ -129,22 +129,22 @@ class Activity:
         self.now(text)
 
     def now(self, text: str) -> None:
-        """Go on to something else."""
+        """Switch to another activity."""
         self._text = text
         self._detail = ""
         self._since = time.monotonic()
 
     def at(self, detail: str) -> None:
-        """Tell how far it is; cheap enough for every step of a loop."""
+        """Set the progress; cheap enough for every step of a loop."""
         self._detail = detail
 
     def say(self, line: str) -> None:
-        """Print a line that stays."""
+        """Print a permanent line."""
         self._silence.end()
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def look(self) -> None:
-        """Show how far things are, or say it where only lines can be had and one is due."""
+        """Show the progress; on a console with lines only, print one if it is due."""
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], description=escape(self._words), refresh=True)
         elif self._silence.is_too_long:
@@ -156,7 +156,7 @@ class Activity:
 
     @contextmanager
     def shown(self) -> Iterator[None]:
-        """Show the activity while the ``with`` statement runs; a terminal keeps nothing of it."""
+        """Show the activity while the ``with`` statement runs; a terminal is cleared afterwards."""
         with ExitStack() as stack:
             if can_move(self.console):
                 columns = (
@@ -180,7 +180,7 @@ class Activity:
             yield
 
     def _on_compiling(self) -> None:
-        if self._bar is None:  # a line that stays says what it was for
+        if self._bar is None:  # a permanent line names its activity
             self.say(f"{self._text}: {COMPILING}")
         else:
             self.at(COMPILING)
@@ -188,10 +188,10 @@ class Activity:
 
 @contextmanager
 def doing(console: Console, text: str) -> Iterator[Activity]:
-    """Show what is being done while the ``with`` statement runs.
+    """Show an activity while the ``with`` statement runs.
 
-    On a terminal that is a line that moves and is gone at the end. Elsewhere lines stay, so there
-    is none for what is over in five seconds, and then one every ten. A quiet console shows nothing.
+    On a terminal, this is an animated line that disappears at the end. Elsewhere, it prints a line
+    after five seconds and then every ten seconds. A quiet console shows nothing.
     """
     activity = Activity(console, text)
     if console.quiet:

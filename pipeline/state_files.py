@@ -1,4 +1,4 @@
-"""Files of states, signed with a key that only this user has.
+"""Reads and writes files of training states, signed with a key of this user.
 
 | bytes | |
 |---|---|
@@ -9,8 +9,8 @@
 | | the parts: the pickle, then memory of arrays and tensors, each without the zeros at its end |
 
 A pickle can run any code when it is loaded. So the header's HMAC and the SHA-256 of each part are
-checked first, and what is unpickled are the very bytes that were checked. The newest two states of
-a run are kept, so that one is whole.
+checked first, and exactly the checked bytes are unpickled. A run keeps its newest two states, so
+that one is complete.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ _PIECE = 1 << 20  # bytes
 
 
 class BadStateError(Exception):
-    """A file holds no state, a damaged one, or one that was made under another key."""
+    """A file has no state, a damaged state, or one that was signed with another key."""
 
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state that was read back and whose signature is right; nothing is unpickled yet."""
+    """A state from a file with a valid signature; not unpickled yet."""
 
     content: Pickled  # the training
-    note: dict[str, Any]  # what else was written down
+    note: dict[str, Any]  # further data
 
     @property
     def is_of_these_sources(self) -> bool:
@@ -65,7 +65,7 @@ class SavedState:
 
 
 def save_state(folder: Path, number: int, content: Pickled, note: dict[str, Any]) -> None:
-    """Write the state of that number in place of the one before the last."""
+    """Write a state with its number, in place of the state before the last one."""
     key = state_key()
     folder.mkdir(exist_ok=True)
     with replacing(state_file(folder, number)) as file:
@@ -74,7 +74,7 @@ def save_state(folder: Path, number: int, content: Pickled, note: dict[str, Any]
 
 
 def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | None:
-    """The newest whole state, or None; a damaged one is told, and refused if there is no other."""
+    """The newest valid state, or None; reports a damaged one, and raises if there is no other."""
     key, found, reasons = state_key(), [], []
     for path in filter(Path.is_file, state_files(folder)):
         try:
@@ -93,7 +93,7 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
 
 
 def write_state(file: BufferedWriter, content: Pickled, note: dict[str, Any], key: bytes) -> None:
-    """Write a state, with a note as JSON, and flush it to the disk."""
+    """Write a state, with a note as JSON, and flush it to disk."""
     memories = [(_as_array(memory), isinstance(memory, th.Tensor)) for memory in content.memories]
     parts = [np.frombuffer(content.pickled, np.uint8)]
     parts += [_without_zeros(memory) for memory, _ in memories]
@@ -116,7 +116,7 @@ def write_state(file: BufferedWriter, content: Pickled, note: dict[str, Any], ke
 
 
 def read_state(file: BufferedReader, key: bytes) -> SavedState:
-    """Read a state and check it, without unpickling anything."""
+    """Read a state and check its signature, without unpickling anything."""
     if file.read(len(MAGIC)) != MAGIC:
         raise BadStateError("it is no state, or one of another version of Yardstick")
     signature, length = file.read(hashlib.sha256().digest_size), file.read(8)
@@ -127,7 +127,7 @@ def read_state(file: BufferedReader, key: bytes) -> SavedState:
         raise BadStateError(
             "it is damaged, or another user or machine made it, or the key was replaced"
         )
-    # From here on the header is this user's own, and says what each part has to be.
+    # From here on, the header is authentic, and describes each part.
     header = json.loads(text)
     if header["python"] not in (None, sys.implementation.cache_tag):
         raise BadStateError(f"functions in it were compiled by {header['python']}, another Python")
@@ -141,7 +141,7 @@ def read_state(file: BufferedReader, key: bytes) -> SavedState:
 def _part(
     file: BufferedReader, n_bytes: int, digest: str, size: int, is_tensor: bool
 ) -> NDArray[np.uint8] | th.Tensor:
-    """A part of a file, in memory as its library has it."""
+    """Read a part of a file into memory of its library."""
     part = th.zeros(size, dtype=th.uint8) if is_tensor else np.zeros(size, np.uint8)
     content = _as_array(part)[:n_bytes]
     n_read = file.readinto(content.data)
@@ -163,7 +163,7 @@ def _signature(key: bytes, text: bytes) -> bytes:
 
 
 def _without_zeros(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The bytes up to the last that is not zero, as those of a buffer not yet full."""
+    """The bytes without trailing zeros, which a buffer has until it is full."""
     for begin in reversed(range(0, len(content), _PIECE)):
         piece = content[begin : begin + _PIECE]
         if piece.any():
@@ -172,7 +172,7 @@ def _without_zeros(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def state_key() -> bytes:
-    """The key that this user's states are signed with."""
+    """The key that signs this user's states."""
     try:
         return user_key(APPLICATION)
     except OSError as error:
@@ -182,7 +182,7 @@ def state_key() -> bytes:
 
 
 def configuration_folder(application: str) -> Path:
-    """Where an application keeps what belongs to the user; the folder need not be there."""
+    """The folder of an application's user data; it need not exist."""
     try:
         home = Path.home()
     except RuntimeError as error:
@@ -195,11 +195,11 @@ def configuration_folder(application: str) -> Path:
 
 
 def user_key(application: str) -> bytes:
-    """The user's key for an application; made at the first call, readable by the user alone."""
+    """The user's key for an application; made at the first call, readable only by the user."""
     path = configuration_folder(application) / "snapshots.key"
     if not os.path.lexists(path):
         _make(path)
-    # Without waiting, as for a pipe; what is checked is what is read.
+    # Does not wait, for example for a pipe; checks the same file that it reads.
     number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     try:
         status = os.fstat(number)
@@ -216,7 +216,7 @@ def user_key(application: str) -> bytes:
 
 
 def _make(path: Path) -> None:
-    """Write a new key; where two processes do so at once, the first one's stays."""
+    """Write a new key; if two processes do so at once, the first key stays."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     draft = path.with_name(f".{secrets.token_hex(8)}.tmp")
     try:

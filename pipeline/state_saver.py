@@ -1,4 +1,4 @@
-"""Saves the state of a training, and puts a training back into it."""
+"""Saves the state of a training, and restores it."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ from pipeline.stopping import current
 from pipeline.unfinished_runs import StateKeeping, log_positions, settings_digest
 from pipeline.user_modules import UserModule
 
-# Saving may take this share of the time, where the user has not said how often.
+# Saving may take this share of the time, unless the user has set the interval.
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
-FIRST_COST = 0.05  # seconds; of states of which nothing is known
-# What was cut off may be so again soon, and has to get ahead each time: its pauses begin short, and
-# double, so that half of what was done since is kept.
+FIRST_COST = 0.05  # seconds; assumed before the first save
+# A run that was cut off may be cut off again soon, and must make progress each time: its pauses
+# begin short and double, so that at least half of the work since then is saved.
 SHORTEST_PAUSE = 0.1
 
 
 class StateSaver(BlockCallback):
-    """Saves all that a training consists of; ends the training where a signal asks for it.
+    """Saves the state of a training; ends the training after a signal to stop.
 
-    Both happen at a safe moment: after the last update and before the environments move. The state
-    is that of the agent with its environments, of all callbacks with the environments that they
-    evaluate on, of the user's modules, and of the generators that libraries share.
+    Both happen at a safe moment: after the last update and before the environments step. The state
+    consists of the agent with its environments, all callbacks with their evaluation environments,
+    the user's modules, and the generators that libraries share.
     """
 
     takes_blocks = True
@@ -65,12 +65,12 @@ class StateSaver(BlockCallback):
     ) -> None:
         super().__init__()
         self.run = run
-        self.root: BaseCallback = self  # all callbacks, this one among them
+        self.root: BaseCallback = self  # all callbacks, including this one
         self.modules = modules  # the user's
         self.told: set[str] = set()
         self.interval = keeping.interval
-        self.tell = tell  # told in one line why no state is kept
-        self.state = keeping.state  # that the training goes on from
+        self.tell = tell  # receives one line on why no state is saved
+        self.state = keeping.state  # the state to resume from
         self.is_off = keeping.interval.is_off
         note = {} if self.state is None else self.state.note
         self.n_saved = int(note.get("number", 0))
@@ -79,19 +79,19 @@ class StateSaver(BlockCallback):
             float(note.get("seconds", 0.0)), float(note.get("cpu_seconds", 0.0))
         )
         self.started = WorkTime.now()
-        self.stamps: dict[Path, tuple[int, int, int]] = {}  # of files, at the last state
+        self.stamps: dict[Path, tuple[int, int, int]] = {}  # of files, at the last save
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
         self.was_cut_off = keeping.was_cut_off
-        self.pause = self.interval.seconds  # until the next state
-        if self.pause == 0.0:  # the user has not said how often
+        self.pause = self.interval.seconds  # until the next save
+        if self.pause == 0.0:  # no interval from the user
             self.pause = FIRST_COST / SHARE_OF_TIME
             if self.was_cut_off:
                 self.pause = max(float(note.get("pause", 0.0)) * SHARE_OF_TIME, SHORTEST_PAUSE)
 
     @property
     def taken(self) -> WorkTime:
-        """The time that the training has taken, in all processes that worked on it."""
+        """The time of the training in all its processes."""
         return self.time_before + (WorkTime.now() - self.started)
 
     def horizon(self) -> Horizon:
@@ -140,7 +140,7 @@ class StateSaver(BlockCallback):
         return time.monotonic() - self.saved_at >= self.pause
 
     def save(self) -> None:
-        """Save the state as it is, which must be a moment between two updates."""
+        """Save the current state; must be called between two updates."""
         begun = time.monotonic()
         try:
             with _garbage_left():
@@ -162,7 +162,7 @@ class StateSaver(BlockCallback):
             self.pause = min(pause, 2 * (self.pause + seconds)) if self.was_cut_off else pause
 
     def _tell_once(self, line: str) -> None:
-        """Say a line once that would be the same at each state, as long as a disk is full."""
+        """Report a line only once, for example while the disk stays full."""
         if line not in self.told:
             self.told.add(line)
             self.tell(line)
@@ -185,13 +185,13 @@ class StateSaver(BlockCallback):
             "pause": self.pause,
             "spec": settings_digest(self.run.recorded_spec()),
         }
-        # The disk has to have what the state is checked against, and what is not written again.
+        # Flush the files that the state is checked against, and files that are not written again.
         sync(*self._changed_files(positions), *self.run.path.parents[:2])
         save_state(self.run.state_path, self.n_saved + 1, content, note)
         self.n_saved += 1
 
     def _changed_files(self, logs: Iterable[str]) -> set[Path]:
-        """Files of run and logs that changed since the last state, and their folders."""
+        """Files of run and logs that changed since the last save, and their folders."""
         paths = {*files_below(self.run.path), *(self.run.path / name for name in logs)}
         before, self.stamps = self.stamps, {}
         for path in paths:
@@ -231,20 +231,20 @@ class StateSaver(BlockCallback):
         self.saved_at = time.monotonic()
 
     def _folder_names(self) -> list[str]:
-        """The run folder as it was given, and from the root."""
+        """The run folder as given, and as an absolute path."""
         return [str(self.run.path), str(self.run.path.absolute())]
 
 
 @contextmanager
 def _garbage_left() -> Iterator[None]:
-    """Do without the garbage collector, which takes several times as long as the state."""
+    """Disable the garbage collector, which would take several times as long as saving."""
     was_on = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         if was_on:
-            gc.collect(0)  # else what was made meanwhile would set off the search as soon as it can
+            gc.collect(0)  # else the new objects would trigger a full collection soon
             gc.enable()
 
 
@@ -253,7 +253,7 @@ def _log_folder(model: BaseAlgorithm) -> str | None:
     return None if folder is None else str(Path(folder).absolute())
 
 
-# What is made anew from the settings, and holds nothing that training changes.
+# Rebuilt from the settings; training changes nothing in them.
 _OF_THIS_PROCESS = (
     ExactEvaluator,
     KVWriter,
@@ -265,7 +265,7 @@ _OF_THIS_PROCESS = (
 )
 
 
-# --- the generators that libraries draw from without being told ---
+# --- the global generators of libraries ---
 
 
 def generator_states() -> dict[str, Any]:
@@ -290,13 +290,13 @@ def set_generators(states: dict[str, Any]) -> None:
         th.cuda.set_rng_state_all([th.from_numpy(state.copy()) for state in states["cuda"]])
 
 
-# --- what the user's own modules keep outside of objects ---
+# --- global state of the user's modules ---
 
 _CODE = (ModuleType, type, FunctionType)
 
 
 def user_state(modules: Iterable[UserModule]) -> dict[str, dict[str, Any]]:
-    """Global names and class attributes of the user's modules and what lies beside them."""
+    """Global names and class attributes of the user's modules and files beside them."""
     return {name: _values(holder) for name, holder in _holders(modules)}
 
 
@@ -324,7 +324,7 @@ def _holders(modules: Iterable[UserModule]) -> Iterator[tuple[str, ModuleType | 
 
 
 def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
-    """Whether a module is the user's: the one that was typed, part of it, or a file beside it."""
+    """Whether a module is the typed one, part of it, or a file beside it."""
     top = user.name.partition(".")[0]
     if name == top or name.startswith(f"{top}."):
         return True
@@ -334,13 +334,13 @@ def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
 
 
 def _values(holder: ModuleType | type) -> dict[str, Any]:
-    """The data that a module or class holds: no code, and nothing of Python's own."""
+    """The data in a module or class: no code, and nothing of Python's own."""
     return {
         name: value
         for name, value in vars(holder).items()
         if not name.startswith(("__", "_abc_"))
         and not isinstance(value, _CODE)
-        # No methods and the like of a class, but its caches.
+        # Of a class, no methods and similar members, but its caches.
         and not (
             isinstance(holder, type)
             and hasattr(type(value), "__get__")
@@ -349,14 +349,14 @@ def _values(holder: ModuleType | type) -> dict[str, Any]:
     }
 
 
-# --- the log of a training that goes on: the same folder, and iterations counted on ---
+# --- the log of a resumed training: the same folder, and continued iteration counts ---
 
-# On-policy algorithms of the library count them from 1 at each `learn`.
+# The library's on-policy algorithms count iterations from 1 at each `learn`.
 ITERATIONS = "time/iterations"
 
 
 class IterationInterval(int):
-    """An interval that iterations are taken modulo; adds those of an earlier `learn`."""
+    """A log interval; adds the iterations of an earlier `learn` before taking the remainder."""
 
     before: int
 
@@ -365,22 +365,22 @@ class IterationInterval(int):
 
 
 class IterationLogger(Logger):
-    """A logger that adds the iterations of an earlier `learn` to those that it is told."""
+    """A logger that adds the iterations of an earlier `learn` to recorded ones."""
 
     before = 0
 
     def record(self, key: str, value: Any, *args: Any, **kwargs: Any) -> None:
-        """As in the library, but for the number of iterations."""
+        """As in the library, except for the number of iterations."""
         super().record(key, value + self.before if key == ITERATIONS else value, *args, **kwargs)
 
 
 def iterations_before(model: BaseAlgorithm, note: dict[str, Any]) -> int:
-    """Iterations before a saved state, of an algorithm that counts from 1 at each `learn`."""
+    """Iterations before a saved state, for algorithms that count from 1 at each `learn`."""
     return int(note["rollouts"]) if isinstance(model, OnPolicyAlgorithm) else 0
 
 
 def default_log_interval(model: BaseAlgorithm) -> int:
-    """The interval that ``learn`` has where none is given: 1 for PPO, 100 for A2C."""
+    """The default log interval of ``learn``: 1 for PPO, 100 for A2C."""
     learns = (vars(kind)["learn"] for kind in type(model).__mro__ if "learn" in vars(kind))
     named = (signature(learn).parameters.get("log_interval") for learn in learns)
     return next((int(each.default) for each in named if each is not None), 1)

@@ -1,13 +1,13 @@
-"""The state of a training under way as one pickle, and back into a training that was built anew.
+"""Pickles the state of a running training, and restores it into a newly built training.
 
-- What belongs to the process (log files, threads, windows, the run) is not pickled. The state keeps
-  its place in the training, and takes what is at that place of the newly built one.
-- Agent, environments, buffers and callbacks are filled into those that were built anew, because
-  running functions hold them.
-- The memory of arrays and tensors stands beside the pickle, without a copy; what shared memory
-  shares it again.
+- Objects of the process (log files, threads, windows, the run) are not pickled. The state records
+  their place in the training, and uses the object at that place of the newly built training.
+- Attributes of agent, environments, buffers and callbacks are filled into the newly built ones,
+  because running functions refer to these objects.
+- The memory of arrays and tensors is stored beside the pickle, without a copy; objects that
+  shared memory share it again.
 
-A pickle can run any code: `pipeline.state_files` has only this user's own loaded.
+A pickle can run any code: `pipeline.state_files` loads only pickles that this user has signed.
 """
 
 from __future__ import annotations
@@ -43,28 +43,28 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-# What functions that are running hold, so that it has to stay the same object.
+# Running functions refer to these objects, so they must stay the same objects.
 FILLED_IN = (BaseAlgorithm, BasePolicy, BaseBuffer, BaseCallback, ActionNoise, VecEnv, gym.Env)
 
-# Attributes that no state keeps, by the names of the classes. A class names its own in an attribute
+# Attributes that are not saved, by class name. A class of this project lists its own in
 # `excluded_from_states`.
 _EXCLUDED = {
     "stable_baselines3.common.callbacks.BaseCallback": ("locals", "globals"),
     "stable_baselines3.common.vec_env.base_vec_env.VecEnvWrapper": ("class_attributes",),
 }
-# Compiled functions, windows and their clocks, bars, writers of rows: made anew when needed.
+# Compiled functions, windows and their clocks, progress bars, row writers: rebuilt when needed.
 _MADE_ANEW = ("numba", "llvmlite", "pygame", "_csv", "moviepy", "tensorboard", "rich", "tqdm")
-# Among these is what holds data.
+# Exceptions among these, which contain data.
 _HOLDING_DATA = ("numba.typed", "numba.experimental", "_csv.reader")
 _GAME_DATA = ("Rect", "FRect", "Vector2", "Vector3", "Color", "Mask", "PixelArray", "BufferProxy")
-# What stands for something outside of this process, of which nothing can be copied.
+# Handles of things outside this process, which cannot be copied.
 _OUTSIDE = (
     "subprocess.Popen",
     "multiprocessing.process.BaseProcess",
     "multiprocessing.connection._ConnectionBase",
     "tempfile.TemporaryDirectory",
 )
-# Those that libraries share: each has to be that one again, and not a copy.
+# Shared generators of libraries: each must be the same object again, not a copy.
 _SHARED: dict[int, tuple[Any, str]] = {
     id(random._inst): (random, "_inst"),
     id(np.random.mtrand._rand): (np.random.mtrand, "_rand"),
@@ -79,15 +79,15 @@ _POINTER = 8  # bytes
 
 
 class NotKeepableError(Exception):
-    """Something in a training cannot be pickled; the message says where it is, and why."""
+    """An object in a training cannot be pickled; the message says where it is, and why."""
 
 
 class NotFittingError(Exception):
-    """A state does not fit what was built anew."""
+    """A state does not fit the newly built training."""
 
 
 class Place(NamedTuple):
-    """Where an object was: the steps that `_children` names, and the name of its class."""
+    """The place of an object: the steps to it, as `_children` names them, and its class name."""
 
     steps: Sequence[str]
     class_name: str
@@ -95,13 +95,13 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Pickled:
-    """Objects as a pickle, and what it needs beside it."""
+    """A pickle with the data that it refers to."""
 
     pickled: bytes | memoryview
-    places: Sequence[Place]  # of what it takes from the newly built training
+    places: Sequence[Place]  # of objects from the newly built training
     memories: Sequence[NDArray[np.uint8] | th.Tensor]
     has_code: bool = False  # functions, which another version of Python cannot read
-    lost: Sequence[str] = ()  # what is not kept and may make a difference, with its place
+    lost: Sequence[str] = ()  # relevant objects that are not saved, with their places
 
 
 # --- from objects to a pickle --------------------------------------------------------------------
@@ -109,7 +109,7 @@ class Pickled:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """Bytes that arrays and tensors look into."""
+    """A memory block that arrays and tensors share."""
 
     begin: int
     content: NDArray[np.uint8]
@@ -120,10 +120,10 @@ class Memory:
 
 
 def pickled(roots: dict[str, Any], kept: tuple[type, ...] = ()) -> Pickled:
-    """Pickle objects by name; those of the classes ``kept`` belong to the process.
+    """Pickle named objects; instances of the classes ``kept`` belong to the process.
 
-    The memories are those of the objects: write them out before they go on. What cannot be pickled
-    raises `NotKeepableError`, which names its place.
+    The memories are not copied: write them before the training continues. An object that cannot be
+    pickled raises `NotKeepableError`, which names its place.
     """
     stream = io.BytesIO()
     pickler = _Pickler(stream, roots, kept)
@@ -136,7 +136,7 @@ def pickled(roots: dict[str, Any], kept: tuple[type, ...] = ()) -> Pickled:
 
 
 class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
-    """Pickles a training; what each kind of object becomes is said in `reducer_override`."""
+    """Pickles a training; `reducer_override` decides how each type of object is pickled."""
 
     def __init__(self, file: io.BytesIO, roots: dict[str, Any], kept: tuple[type, ...]) -> None:
         super().__init__(file, protocol=5, buffer_callback=lambda _: None)
@@ -158,14 +158,14 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
             self.dump(self.roots)
         except (NotKeepableError, MemoryError):
             raise
-        except Exception as error:  # objects may raise anything where they are looked into
+        except Exception as error:  # reading objects may raise anything
             deep = isinstance(error, RecursionError) or isinstance(error.__cause__, RecursionError)
             if deep or "recursion" in str(error):
                 raise NotKeepableError("objects lie too deep inside each other") from None
             raise self._not_keepable(self._last, error) from error
 
     def reducer_override(self, obj: Any) -> Any:  # noqa: PLR0912  # a table
-        """How an object is pickled; never called for containers, numbers and texts."""
+        """Decide how an object is pickled; never called for containers, numbers and texts."""
         self._last = obj
         kind: Any = type(obj)
         if kind is Memory:
@@ -197,8 +197,8 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
             return _torch_generator, (obj.get_state(),)
         if kind is memoryview:
             raise self._not_keepable(obj)
-        # What a class of attributes says in `__getstate__` is not asked: it may leave out what a
-        # model file does not need, or have the object made anew, as an `EzPickle` does.
+        # `__getstate__` of a class with plain attributes is not used: it may omit data that a model
+        # file does not need, or rebuild the object, as `EzPickle` does.
         has_own_reduce = (
             kind.__reduce_ex__ is not object.__reduce_ex__
             or kind.__reduce__ is not object.__reduce__
@@ -207,7 +207,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         return NotImplemented if has_own_reduce or _hides_state(kind) else self._attributes(obj)
 
     def _is_of_process(self, obj: Any) -> bool:
-        """Whether an object belongs to the process, and is taken from the newly built training."""
+        """Whether an object belongs to the process, and comes from the newly built training."""
         kind = type(obj)
         if isinstance(obj, io.IOBase):
             if kind in (io.BytesIO, io.StringIO):
@@ -228,10 +228,10 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         return _blank, (kind,), held, None, None, _fill
 
     def _code(self, obj: Any) -> Any:
-        """Classes and functions go by their names; those that have none are pickled as they are."""
+        """Pickle classes and functions by name; those without an importable name by value."""
         name = _name_of(obj)
         if not isinstance(obj, ModuleType) and name and _find(name) is obj:
-            # cloudpickle would copy those of `__main__`.
+            # cloudpickle would copy classes and functions of `__main__`.
             return (_find, (name,)) if obj.__module__ == "__main__" else NotImplemented
         reduced = super().reducer_override(obj)
         if reduced is NotImplemented or isinstance(obj, ModuleType):
@@ -248,7 +248,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         return _function, arguments, state, None, None, _fill_function
 
     def _cached(self, obj: Any) -> Any:
-        """A function of `lru_cache`: by its name, or else that of the newly built training."""
+        """Pickle a function with `lru_cache` by name, or else by its place."""
         if obj.cache_info().currsize:
             self.lost.append(f"the cache of {self._where(obj)}")
         name = _name_of(obj)
@@ -303,7 +303,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         return memory
 
     def _place_of(self, obj: Any) -> int:
-        """The number of the place at which an object is."""
+        """The number of an object's place."""
         place = Place(self._steps_of(obj), _name_of(type(obj)))
         if not place.steps and not _is_made_anew(type(obj)):
             raise self._not_keepable(obj)
@@ -330,7 +330,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
 
 
 def _steps_to(roots: Mapping[str, Any], everything: bool) -> dict[int, tuple[str, ...]]:
-    """How objects are reached from the roots, by id: all, or only through what is filled in."""
+    """The steps from the roots to objects, by id: to all, or only through filled-in objects."""
     found: dict[int, tuple[str, ...]] = {}
     pending: deque[tuple[tuple[str, ...], Any, bool]] = deque(
         ((name,), value, True) for name, value in roots.items()
@@ -344,13 +344,13 @@ def _steps_to(roots: Mapping[str, Any], everything: bool) -> dict[int, tuple[str
         opens = _is_filled_in(kind)
         few = kind is MethodType or (kind in (list, tuple, dict) and len(value) <= _FEW)
         if opens or everything or (few and is_near):
-            with suppress(Exception):  # the pickler comes there too, and says so
+            with suppress(Exception):  # the pickler will report it
                 pending.extend(((*steps, step), held, opens) for step, held in _children(value))
     return found
 
 
 def _children(value: Any) -> Iterator[tuple[str, Any]]:  # noqa: PLR0912  # a table
-    """The values inside a value, each with the step to it, as written in Python."""
+    """The values inside a value, each with the step to it in Python syntax."""
     if isinstance(value, dict):
         for key, held in value.items():
             if isinstance(key, str | int) and not isinstance(held, _SIMPLE):
@@ -391,18 +391,18 @@ def _attributes_of(obj: Any) -> Iterator[tuple[str, Any]]:
 
 @functools.cache
 def _slots(kind: Any) -> tuple[str, ...]:
-    """The names of the slots of a class and those above it, as attributes are called."""
-    # `object.__reduce_ex__` goes by the same list, and the type checker does not know it.
+    """The attribute names of the slots of a class and its base classes."""
+    # `object.__reduce_ex__` uses the same list, which the type checker does not know.
     slot_names: Any = getattr(copyreg, "_slotnames")  # noqa: B009
     return tuple(slot_names(kind))
 
 
 def _hides_state(kind: type) -> bool:
-    """Whether objects of a class hold more than attributes, as those written in C do."""
+    """Whether objects of a class have state besides attributes, as classes in C do."""
     declares_slots = any("__slots__" in vars(base) for base in kind.__mro__)
     if kind is not object and not kind.__dictoffset__ and not declares_slots:
-        return True  # no class of Python's has nowhere to put its attributes
-    # An object's head, its attributes' dictionary and its weak references, and a pointer a slot.
+        return True  # every class in Python has a dictionary or slots
+    # Object header, attribute dictionary, weak references, and a pointer for each slot.
     plain = object.__basicsize__ + 2 * _POINTER + _POINTER * len(_slots(kind))
     return kind.__itemsize__ > 0 or kind.__basicsize__ > plain
 
@@ -431,13 +431,13 @@ def _excluded(kind: Any) -> frozenset[str]:
 
 
 def _name_of(value: Any) -> str:
-    """Module and qualified name of a class or a function; empty where it has none."""
+    """Module and qualified name of a class or function; empty if it has none."""
     module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
     return f"{module}:{name}" if isinstance(module, str) and isinstance(name, str) else ""
 
 
 def _find(name: str) -> Any:
-    """The class or function of a `_name_of`, in a module that is there already; else None."""
+    """The class or function of a `_name_of`, in an imported module; else None."""
     module, _, path = name.partition(":")
     found: Any = sys.modules.get(module)
     for part in path.split("."):
@@ -454,7 +454,7 @@ def _is_empty(cell: CellType) -> bool:
 
 
 def _bytes_at(begin: int, n_bytes: int, owner: Any) -> NDArray[np.uint8]:
-    """The memory at an address; with it its owner stays alive, which has the address until then."""
+    """The memory at an address as an array, which keeps the memory's owner alive."""
     if not n_bytes:
         return np.zeros(0, np.uint8)
     interface = {"data": (begin, False), "shape": (n_bytes,), "typestr": "|u1", "version": 3}
@@ -467,11 +467,11 @@ def _bytes_at(begin: int, n_bytes: int, owner: Any) -> NDArray[np.uint8]:
 def unpickled(
     state: Pickled, roots: dict[str, Any], moved: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Unpickle what this user has pickled, into objects of the same names that were built anew.
+    """Unpickle a state of this user into the newly built objects of the same names.
 
-    Texts that begin with a folder that has ``moved`` are changed. What was saved is returned by
-    name; objects of `FILLED_IN` are those of ``roots``. `NotFittingError` names what belongs to the
-    process and is missing there.
+    Texts that begin with a folder in ``moved`` are changed. Returns the saved objects by name;
+    objects of `FILLED_IN` are those of ``roots``. `NotFittingError` names an object of the process
+    that is missing in the new training.
     """
     renamed = {before: now for before, now in (moved or {}).items() if before != now}
     existing = [_follow(roots, place) for place in state.places]
@@ -483,7 +483,7 @@ def unpickled(
 
 
 def _follow(roots: Mapping[str, Any], place: Place) -> Any:
-    """The object at a place; None where there is nothing."""
+    """The object at a place; None if there is none."""
     first, *steps = place.steps or ("",)
     found: Any = roots.get(first)
     for step in steps:
@@ -492,7 +492,7 @@ def _follow(roots: Mapping[str, Any], place: Place) -> Any:
 
 
 class _Existing:
-    """Looks up what the newly built training has at the places of a state."""
+    """Looks up the newly built training's objects at the places of a state."""
 
     existing: list[Any]
     places: Sequence[Place]
@@ -524,7 +524,7 @@ class _Unpickler(_Existing, pickle.Unpickler):
 
 
 class _MovingUnpickler(_Existing, pickle._Unpickler):
-    """Changes texts that begin with a folder that was moved; slower, as it is written in Python."""
+    """Changes texts that begin with a moved folder; slower, because it is written in Python."""
 
     dispatch: ClassVar = dict(pickle._Unpickler.dispatch)
 
@@ -555,7 +555,7 @@ def _blank(kind: type) -> Any:
 
 
 def _fill(obj: Any, attributes: dict[str, Any]) -> None:
-    """Replace the attributes of an object, except those that no state keeps."""
+    """Replace the attributes of an object, except those that are not saved."""
     kind: Any = type(obj)
     slots, inside = _slots(kind), getattr(obj, "__dict__", {})
     for name in inside.keys() - attributes.keys() - _excluded(kind):
@@ -611,7 +611,7 @@ def _torch_generator(state: th.Tensor) -> th.Generator:
 
 
 def _weak_reference(referent: Any, callback: Any) -> Any:
-    # One whose object is gone: to one that goes as soon as it is made.
+    # A dead reference becomes a reference to a new object that is deleted at once.
     return weakref.ref(type("Gone", (), {})() if referent is None else referent, callback)
 
 
@@ -620,7 +620,7 @@ def _empty_cell() -> CellType:
 
 
 def _function(code: CodeType, module: str, name: str, cells: tuple[CellType, ...]) -> FunctionType:
-    """A nested function; it sees the global names of its module."""
+    """Rebuild a nested function with the global names of its module."""
     return FunctionType(code, vars(importlib.import_module(module)), name, None, cells)
 
 

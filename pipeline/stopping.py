@@ -1,8 +1,8 @@
-"""How a command is stopped: Ctrl-C, SIGTERM and SIGHUP all ask for the same, and lose nothing.
+"""Stops a command cleanly on Ctrl-C, SIGTERM and SIGHUP, without losing results.
 
-Within `stops_noticed` the first signal raises `Stopped` in the main thread, as Ctrl-C raises
-KeyboardInterrupt: at once, or where the work can wait for a better moment, then or when it has
-waited long enough. The second one waits for nothing but what is `held`. The third ends the process.
+Within `stops_noticed`, the first signal raises `Stopped` in the main thread, as Ctrl-C raises
+KeyboardInterrupt: at once, or inside `waiting` at a better moment or after a time-out. The second
+signal is delayed only by `held`. The third signal ends the process.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 
-# Those that a platform lacks are left out: Windows has no SIGHUP.
+# Without signals that a platform lacks: Windows has no SIGHUP.
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 
-# A key that is held down, or a shell that hands on the signal of a closed terminal, asks once.
+# Repeated signals, from a held key or a shell that forwards SIGHUP, count as one request.
 SECONDS_OF_ONE_REQUEST = 0.2
-# What swallows the exception, as a bare `except` does, is told again.
+# Code that swallows the exception, such as a bare `except`, gets it again.
 SECONDS_BEFORE_RAISING_AGAIN = 0.5
 _SOON = 0.02  # seconds
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal of this ``number`` asked the process to stop."""
+    """The signal ``number`` asked the process to stop."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -49,30 +49,30 @@ class Stopped(KeyboardInterrupt):
 
 
 class StopRequest:
-    """What signals have asked for, and how long it may wait."""
+    """A request to stop by signals, and how long it may be delayed."""
 
     def __init__(self) -> None:
         self.number: int | None = None  # the first signal that asked
         self.n_asked = 0  # how often; signals in quick succession count once
         self._asked_at = self._signalled_at = -math.inf
-        self._patience = 0.0  # seconds; infinite where nothing may be raised
-        self._is_waiting = False  # inside `waiting`, and so reminded by a timer
+        self._patience = 0.0  # seconds; infinite if nothing may be raised
+        self._is_waiting = False  # inside `waiting`, with a timer
 
     @property
     def is_urgent(self) -> bool:
-        """Whether a second signal has come: what can be left out should be."""
+        """Whether a second signal has come, so that optional work should be skipped."""
         return self.n_asked > 1
 
     def raise_if_asked(self) -> None:
-        """Stop here, if a stop was asked for: call it where nothing is half done."""
+        """Raise `Stopped` if a stop was requested; call it when no work is half done."""
         if self.number is not None:
             raise Stopped(self.number)
 
     @contextmanager
     def waiting(self, seconds: float) -> Iterator[None]:
-        """Let a stop wait so long inside the ``with`` statement, unless a second signal comes.
+        """Delay a stop in the ``with`` statement by at most ``seconds``, until a second signal.
 
-        When the time is over `Stopped` is raised, also in the place of an error that comes of it.
+        After the time-out, `Stopped` is raised, also in place of an error that it has caused.
         """
         before = self._patience, self._is_waiting
         self._patience, self._is_waiting = seconds, True
@@ -89,7 +89,7 @@ class StopRequest:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Let nothing be raised inside the ``with`` statement, but in a `waiting` inside it."""
+        """Raise no `Stopped` inside the ``with`` statement, except in a nested `waiting`."""
         before, self._patience = self._patience, math.inf
         try:
             yield
@@ -98,7 +98,7 @@ class StopRequest:
             self._set_timer(self._seconds_left())
 
     def notice(self, number: int, frame: FrameType | None = None) -> None:
-        """Handle a signal, by raising `Stopped` if that need not wait."""
+        """Handle a signal: raise `Stopped` unless it is delayed."""
         now = time.monotonic()
         is_another = now - self._signalled_at > SECONDS_OF_ONE_REQUEST
         self._signalled_at = now
@@ -114,7 +114,7 @@ class StopRequest:
         self._raise_if_due()
 
     def _seconds_left(self) -> float:
-        """Seconds until `Stopped` is to be raised; infinite if nobody has asked, or it is held."""
+        """Seconds until `Stopped` is due; infinite without a request, or while it is held."""
         if self.number is None or self._patience == math.inf:
             return math.inf
         return 0.0 if self.is_urgent else self._asked_at + self._patience - time.monotonic()
@@ -126,7 +126,7 @@ class StopRequest:
             self.raise_if_asked()
 
     def _set_timer(self, seconds: float) -> None:
-        """Have `_raise_if_due` called then, even in a call that waits; not on Windows."""
+        """Schedule `_raise_if_due`, also during a blocking call; not on Windows."""
         if sys.platform != "win32" and self.number is not None:
             is_timed = self._is_waiting and seconds < math.inf
             if is_timed:
@@ -139,12 +139,12 @@ _noticed: list[int] = []
 
 
 def n_stops() -> int:
-    """How many of the `stops_noticed` of this process a signal has asked to stop."""
+    """The number of `stops_noticed` blocks in this process that a signal has asked to stop."""
     return len(_noticed)
 
 
 def current() -> StopRequest:
-    """What signals have asked for; outside of `stops_noticed` nothing ever has."""
+    """The current stop request; outside `stops_noticed`, one without a signal."""
     if _current and threading.current_thread() is threading.main_thread():
         return _current[-1]
     return StopRequest()
@@ -152,10 +152,10 @@ def current() -> StopRequest:
 
 @contextmanager
 def stops_noticed() -> Iterator[StopRequest]:
-    """Notice the signals that ask to stop; inside another such ``with`` statement, the same ones.
+    """Handle stop signals in the ``with`` statement; a nested one shares the outer request.
 
-    A signal that is ignored from outside stays so, as ``nohup`` and a shell's ``&`` want it, and
-    one that has a handler keeps it. Outside the main thread Python delivers none.
+    A signal that the parent process ignores stays ignored, as for ``nohup`` and a shell's ``&``.
+    A signal with a handler keeps it. Outside the main thread, Python delivers no signals.
     """
     if _current or threading.current_thread() is not threading.main_thread():
         yield current()
@@ -169,14 +169,14 @@ def stops_noticed() -> Iterator[StopRequest]:
             tell(unraisable)
 
     try:
-        # What C code calls back cannot raise, as in Numba's compiler: it will be told again.
+        # A callback from C code, as in Numba's compiler, cannot raise: a timer raises later.
         sys.unraisablehook = tell_others
         for number, handler in before.items():
             if handler in (signal.SIG_DFL, signal.default_int_handler):
                 signal.signal(number, request.notice)
         yield request
     finally:
-        request._patience = math.inf  # before a call, in which a signal could still be handled
+        request._patience = math.inf  # first: a signal could still arrive during the next call
         request._set_timer(math.inf)
         sys.unraisablehook = tell
         for number, handler in before.items():
@@ -186,7 +186,7 @@ def stops_noticed() -> Iterator[StopRequest]:
 
 
 def default_for_signals() -> None:
-    """Let signals end the process at once and without a word, where it has nothing more to do."""
+    """Let signals end the process at once and silently, when its work is done."""
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             with contextlib.suppress(ValueError):  # outside the main thread
@@ -195,16 +195,16 @@ def default_for_signals() -> None:
 
 # --- the processes of a SubprocVecEnv -------------------------------------------------------------
 
-SECONDS_FOR_CLOSING = 1.8  # after a stop was asked for: what takes longer is ended
+SECONDS_FOR_CLOSING = 1.8  # after a stop request; slower processes are killed
 SECONDS_TO_END = 1.0  # for a process whose pipe is closed
 
 
 def shield_workers() -> None:
-    """Let processes that start from now on leave signals to this one, which needs them still."""
+    """Let new child processes ignore stop signals, because this process still needs them."""
     if sys.platform != "win32" and "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing import forkserver, resource_tracker
 
-        # It lets SIGINT through again after its own start, so that has to come first.
+        # The resource tracker unblocks SIGINT at its start, so it must start first.
         resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
@@ -215,7 +215,7 @@ def shield_workers() -> None:
 
 @contextmanager
 def deaths_told(env: VecEnv) -> Iterator[None]:
-    """Say which process of a SubprocVecEnv has ended, in the place of what its pipe raises."""
+    """Name the process of a SubprocVecEnv that has ended, instead of the error of its pipe."""
     try:
         yield
     except (EOFError, ConnectionError) as error:
@@ -231,7 +231,7 @@ def deaths_told(env: VecEnv) -> Iterator[None]:
 
 
 def close_environments(env: Any) -> None:
-    """Close a VecEnv; where a stop was asked for, do not wait for what its processes still do."""
+    """Close a VecEnv; after a stop request, without waiting for its processes."""
     stop = current()
     try:
         with stop.waiting(SECONDS_FOR_CLOSING):
@@ -245,7 +245,7 @@ def close_environments(env: Any) -> None:
 
 
 def end_workers_after_stop() -> None:
-    """End the processes of environments that are still there, if a stop was asked for."""
+    """After a stop request, end environment processes that still run."""
     if current().number is not None:
         for process in multiprocessing.active_children():
             with contextlib.suppress(OSError):

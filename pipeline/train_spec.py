@@ -1,8 +1,8 @@
-"""What a training run is asked to do, as one immutable value, and whether it is a plain run.
+"""The specification of a training run as one immutable value, and the test for plain runs.
 
-Plain runs are those of which all that takes part comes from this project or from Gymnasium. What
-they leave depends on their spec alone, and they leave nothing behind in their process: any number
-of them can be done there one after the other.
+A plain run uses only code of this project, the libraries and Gymnasium. Its results depend on the
+spec alone, and it leaves nothing behind in its process: any number of plain runs can follow each
+other in one process.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ class TrainSpec:
     env_id: str  #: id of the environment
     hyperparams: Hyperparams  #: merged, read but not yet made into objects
     saved_hyperparams: dict[str, Any]  #: the same as plain data, for the run folder
-    seed: int  #: of everything random in the run
-    #: environment steps between two evaluations; below 0 for none, None for twenty over the run
+    seed: int  #: the seed of all randomness in the run
+    #: environment steps between two evaluations; below 0: none, None: twenty over the run
     eval_freq: int | None = None
-    eval_episodes: int | None = 20  #: of each evaluation in training; None for as few as will do
+    eval_episodes: int | None = 20  #: of each evaluation in training; None: as few as needed
     final_episodes: int | None = 100  #: of the evaluation at the end, likewise
-    n_eval_envs: int = 10  #: environments that an evaluation plays on at once
+    n_eval_envs: int = 10  #: parallel environments of an evaluation
     save_freq: int = -1  #: environment steps between two checkpoints; below 1 for none
     save_every_n_episodes: int = -1  #: episodes between two checkpoints; below 1 for none
     save_replay_buffer: bool = False  #: at the end and at checkpoints, if the agent has one
     log_folder: Path = Path("logs")  #: the folder above all runs
     tensorboard_log: Path | None = None  #: folder for TensorBoard
-    #: a zip to go on training, with the statistics and the replay buffer that belong to it
+    #: a zip to continue from, together with its statistics and replay buffer
     trained_agent: Path | None = None
     vec_env: str = "dummy"  #: or ``"subproc"``
     device: str = "auto"  #: torch device of the networks
-    num_threads: int = 1  #: of PyTorch, on which results may depend; below 1 for its own choice
+    num_threads: int = 1  #: of PyTorch, may affect results; below 1: PyTorch's choice
     log_interval: int = -1  #: episodes or rollouts a log record; -1: library's default, -2: none
     verbose: int = 1  #: 0 silent, 1 progress and summary, 2 the library's own log as well
     progress: bool = False  #: draw a live bar wherever the output goes
-    gym_packages: tuple[str, ...] = ()  #: modules of the user's, whose classes settings may name
-    user_modules: tuple[UserModule, ...] = ()  #: the same, as another process can import them
-    unique_id: bool = False  #: give the folder a name that no other machine's run can have
-    pictures: bool = True  #: draw the learning curve and the like into the run folder
+    gym_packages: tuple[str, ...] = ()  #: modules of the user, whose classes settings may name
+    user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
+    unique_id: bool = False  #: give the folder a name that is unique over all machines
+    pictures: bool = True  #: draw the learning curve and other pictures into the run folder
     watch_learning: Path | None = None  #: file of a page that plays the training step by step
-    watch_episodes: int = 0  #: that it shows of an agent with tables; 0 for as many as have room
-    #: where values come from that do not stand in the entry: ``"auto: 1 - 1/(2 x time limit ..."``
+    watch_episodes: int = 0  #: shown for an agent with tables; 0: as many as have room
+    #: the origin of values that are not in the entry: ``"auto: 1 - 1/(2 x time limit ..."``
     origins: dict[str, str] | None = None
 
     def as_data(self) -> dict[str, Any]:
@@ -67,7 +67,7 @@ class TrainSpec:
 
     @classmethod
     def of_data(cls, recorded: Mapping[str, Any]) -> Self:
-        """The spec of `as_data`, maybe of long ago; UserError if its hyperparameters are none."""
+        """The spec from `as_data`, also of old versions; UserError for invalid hyperparameters."""
         data = completed(recorded)
         raw = data.pop("hyperparams")
         paths = {name: None if data[name] is None else Path(data[name]) for name in _PATHS}
@@ -77,7 +77,7 @@ class TrainSpec:
 
 
 def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """A recorded spec with the fields of today: under a new one's default, runs do as before."""
+    """A recorded spec with today's fields: the default of a new field keeps the old behaviour."""
     known = _defaults()
     defaults = {key: value for key, value in known.items() if value is not MISSING}
     return {**defaults, **{key: recorded[key] for key in known if key in recorded}}
@@ -85,30 +85,30 @@ def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _defaults() -> Mapping[str, Any]:
-    """The fields as `TrainSpec.as_data` names them; `MISSING` where one has no default."""
+    """The defaults of the fields in `TrainSpec.as_data`; `MISSING` for fields without one."""
     required = {key.name for key in fields(TrainSpec) if key.default is MISSING}
     data = TrainSpec("", "", Hyperparams(), {}, 0).as_data()
     return {key: MISSING if key in required else value for key, value in data.items()}
 
 
-# Agents whose random numbers are all their own, or drawn after they have been seeded.
+# Agents that use only their own random numbers, or draw them after seeding.
 FAMILIES = frozenset({"tabular", "linear"})
-# Those of the library, once they train on compiled code: weights are drawn after that too. In the
-# library's own loop they take too long to gain anything, but for what `auto` leaves there.
+# The library's agents in compiled code, which draw weights after seeding too. In the library's own
+# loop, runs are too long to gain from sharing, except those that `auto` leaves there.
 NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})
 
 HOMES = ("envs.", "gymnasium.envs.")
-# Around the environments of a training: they hold nothing but numbers.
+# Training wrappers whose state is only numbers.
 _OWN_WRAPPERS = {"envs.wrappers.ScaleReward", "envs.wrappers.TerminationReward"}
 WRAPPERS = frozenset(_OWN_WRAPPERS | {"gymnasium.wrappers.ClipReward"})
 
-# What such a run may ask for besides: nothing that names code.
+# Settings that a plain run may have: none of them names code.
 _ENV_SETTINGS = ("n_envs", "env_kwargs", "train_env_kwargs", "eval_env_kwargs", "train_env_wrapper")
 _SETTINGS = ("algorithm", "n_timesteps", "n_episodes", *_ENV_SETTINGS)
 
 
 def is_plain(spec: TrainSpec) -> bool:
-    """Whether a run is such a one."""
+    """Whether a run is a plain run."""
     wrappers = {wrapper.name for wrapper in spec.hyperparams.train_env_wrapper}
     if not wrappers <= WRAPPERS or spec.tensorboard_log or spec.trained_agent:
         return False
@@ -127,7 +127,7 @@ def is_plain(spec: TrainSpec) -> bool:
 
 
 def is_known_environment(env_id: str) -> bool:
-    """Whether an environment is one of Gymnasium's or of this project's, as it was registered."""
+    """Whether an environment is an unchanged one of Gymnasium or this project."""
     import gymnasium as gym
 
     registered = gym.registry.get(env_id)

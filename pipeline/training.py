@@ -1,4 +1,4 @@
-"""A training run, from a spec to a finished folder: `prepare`, then `carry_out`."""
+"""Runs a training from a spec to a finished folder: `prepare`, then `carry_out`."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ from pipeline.stopping import close_environments, current, deaths_told
 from pipeline.train_spec import TrainSpec
 from pipeline.unfinished_runs import StateKeeping
 
-# After a signal that asks to stop: how long the training may go on to where nothing is half done,
-# and when evaluating and drawing what was learnt has to be over.
+# After a stop signal: how long the training may continue to the next safe moment, and when
+# evaluating and drawing must be finished.
 SECONDS_TO_A_SAFE_MOMENT = 1.0
 SECONDS_TO_THE_PICTURES = 1.6
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of a run."""
+    """The result of a run."""
 
     run: Run  #: its folder
     state: str  #: ``"finished"`` or ``"interrupted"``
-    n_steps: int  #: environment steps that were run
-    taken: WorkTime  #: for these, with evaluations, without compiling, which is done once
-    final: Evaluation | None  #: by episodes used for nothing else; None if turned off
+    n_steps: int  #: environment steps done
+    taken: WorkTime  #: their time, with evaluations, but without compiling, which happens once
+    final: Evaluation | None  #: on separate episodes; None if turned off
     best_return: float | None  #: mean return of the best evaluation during training, if any
-    best_timesteps: int  #: when that was
+    best_timesteps: int  #: the time step of that evaluation
     engine: str | None  #: for tabular agents, whether training was compiled, and if not, why
-    best_episodes: int  #: that the best return is the mean of; 0 where it is exact
-    evaluating: WorkTime  #: what all evaluations have taken, the last one included
-    evaluation_steps: int  #: environment steps of those that were sampled
+    best_episodes: int  #: number of episodes behind the best return; 0 if it is exact
+    evaluating: WorkTime  #: the time of all evaluations, including the last one
+    evaluation_steps: int  #: environment steps of sampled evaluations
     pulls: PullSummary | None = None  #: on bandits, figures on the pulls of training
 
 
@@ -70,12 +70,12 @@ def train(
 
 
 def carry_out(training: Training, tell: Callable[[Outcome], object] = lambda _: None) -> Outcome:
-    """Train, and save, judge and draw what was learnt, also until a signal ends the training early.
+    """Train, then save, evaluate and draw the agent, also after a signal ended training early.
 
-    ``tell`` is called with what came out before it is drawn and recorded.
+    ``tell`` gets the outcome before it is drawn and recorded.
 
     Raises:
-        UserError: if the agent cannot take its first step; no folder is left behind then.
+        UserError: if the agent cannot take its first step; then no folder is left behind.
         ForeignExitError: if the environment or a callback asks the program to end.
         KeyboardInterrupt: if it is stopped before the first step, likewise.
     """
@@ -88,7 +88,7 @@ def carry_out(training: Training, tell: Callable[[Outcome], object] = lambda _: 
             close(training)
         except BaseException as error:
             if not is_over:
-                with suppress(BaseException):  # it would hide what the run broke by
+                with suppress(BaseException):  # it would hide the original error
                     close(training)
             give_up(training, error)
             raise
@@ -145,19 +145,19 @@ def _learn(training: Training) -> None:
                 **kwargs,
             )
     except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as e:
-        check_model(training.model)  # PyTorch refuses distributions of nan, and says nothing of why
+        check_model(training.model)  # PyTorch refuses distributions of nan without the reason
         blame_settings(spec.algo, training.model, e)
         raise
 
 
 def has_begun(training: Training) -> bool:
-    """Whether there is something that was learnt, by this process or the ones before it."""
+    """Whether the agent has trained, in this process or earlier ones."""
     model, is_back = training.model, training.saver.state is None
     return is_back and model.num_timesteps > model._num_timesteps_at_start
 
 
 def _judged(training: Training, state: str, taken: WorkTime, activity: Activity) -> Outcome:
-    """Save what was learnt, and judge it."""
+    """Save and evaluate the agent."""
     model, evaluation = training.model, training.evaluation
     pulls = _save(training, state)
     final: Evaluation | None = None
@@ -184,7 +184,7 @@ def _judged(training: Training, state: str, taken: WorkTime, activity: Activity)
 
 
 def _save(training: Training, state: str) -> PullSummary | None:
-    """Save what was learnt, and what was pulled; the figures on the latter."""
+    """Save the agent and the pulls; returns the summary of the pulls."""
     run, model, recorder = training.run, training.model, training.pulls
     save_model(model, run.model_path)
     save_normalization(model, run.vecnormalize_path)
@@ -193,17 +193,17 @@ def _save(training: Training, state: str) -> PullSummary | None:
     if recorder is None or not recorder.n_calls:
         return None
     if state == INTERRUPTED:
-        recorder.write()  # as it does by itself where the training was not interrupted
+        recorder.write()  # the recorder does so itself unless the training was interrupted
     return summarise_pulls(recorder.arrays())
 
 
 def _judge(training: Training, state: str) -> Evaluation | None:
-    """The evaluations not done yet, and the final one if the training was not cut off."""
+    """Do missing evaluations, and the final one if the training was not interrupted."""
     evaluation, model = training.evaluation, training.model
     if not evaluation.is_asked_for:
         return None
     if not evaluation.evaluations_timesteps:
-        # The run was shorter than the time to its first evaluation, or called no callback.
+        # The run was shorter than the first evaluation interval, or called no callback.
         evaluation.init_callback(model)
         evaluation.evaluate_now()
     evaluation.write()
@@ -219,7 +219,7 @@ def _judge(training: Training, state: str) -> Evaluation | None:
 
 
 def _drawn(training: Training, state: str, outcome: Outcome, activity: Activity) -> Outcome:
-    """Draw what was learnt; ``run.json`` is written when all else is there."""
+    """Draw the results; then write ``run.json`` as the last file."""
     try:
         with _stoppable(state):
             activity.now("drawing the pictures")
@@ -249,14 +249,14 @@ def _drawn(training: Training, state: str, outcome: Outcome, activity: Activity)
 
 @contextmanager
 def _stoppable(state: str) -> Iterator[None]:
-    """Let a signal end this: at once, or where training was ended by one, some time after that."""
+    """Let a signal end the block: at once, or some time after a signal has ended training."""
     seconds_left = SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0
     with current().waiting(seconds_left), exits_as_mistakes():
         yield
 
 
 def draw(training: Training, final: Evaluation | None) -> None:
-    """Draw the pulls, the learning curve and the map of the final policy, where there are such."""
+    """Draw the pulls, the learning curve and the map of the final policy, if they exist."""
     run, spec, recorder = training.run, training.spec, training.pulls
     title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
     has_pulls = recorder is not None and recorder.n_calls > 0
@@ -273,12 +273,12 @@ def draw(training: Training, final: Evaluation | None) -> None:
             draw_value_map(run.value_map_path, title, found)
 
 
-# --- the end of a training, and of one that breaks ------------------------------------------------
+# --- the end of a training, also after an error ---------------------------------------------------
 
 
 @exits_as_mistakes()
 def close(training: Training) -> None:
-    """Close what is open, each part also where another cannot be closed."""
+    """Close all open parts, each one even if another cannot be closed."""
     model = training.model
     with ExitStack() as stack:
         if model.env is not None:
@@ -289,18 +289,18 @@ def close(training: Training) -> None:
 
 
 def give_up(training: Training, error: BaseException) -> None:
-    """Note the reason; or remove the folder, where the agent failed before its first step."""
+    """Record the reason; or remove the folder if the agent failed before its first step."""
     run, is_new = training.run, not training.keeping.goes_on
     if is_gone(run.path):
         raise FolderGoneError(run.path) from error
     is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt | LibraryError)
     if is_new and is_expected and not has_begun(training):
         run.discard()
-        if not isinstance(error, ValueError):  # the others say for themselves what it was
+        if not isinstance(error, ValueError):  # the other errors explain themselves
             return
         message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
         raise UserError(message) from error
-    with suppress(OSError):  # what the run has failed by says more
+    with suppress(OSError):  # the original error says more
         training.evaluation.write()
     if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
         run.end(state=INTERRUPTED)

@@ -1,4 +1,4 @@
-"""Runs that were cut off, and what is needed to go on with one; imported before PyTorch is."""
+"""Finds interrupted runs, and prepares resuming them; imported before PyTorch."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 if TYPE_CHECKING:
     from pipeline.state_files import SavedState
 
-# What may be given anew, and what stands in no settings of a run.
+# Settings that may change when a run resumes, and that its record ignores.
 _SHOWN_ONLY = ("verbose", "progress", "log_folder", "gym_packages", "user_modules", "unique_id")
 
 EVENT_FILES = "events.out.tfevents.*"
-# By the numbers of the environments: a wrapper that the settings name begins its file anew.
+# Named by the numbers of environments; a wrapper in the settings restarts its file.
 MONITOR_FILES = "[0-9]*.monitor.csv"
 _PIECE = 1 << 20  # bytes
 
-# A file's length in bytes and the checksum of them.
+# A file's length in bytes and their checksum.
 Position = tuple[int, int]
 
 
@@ -47,24 +47,24 @@ Position = tuple[int, int]
 class SaveInterval:
     """How often to save the state."""
 
-    seconds: float = 0.0  # between two states; 0 for as often as takes `SHARE_OF_TIME`
-    steps: int = 0  # instead, environment steps between them, counted over all environments
-    is_off: bool = False  # to save none
+    seconds: float = 0.0  # between two saves; 0: so that saving takes `SHARE_OF_TIME`
+    steps: int = 0  # instead, steps between two saves, counted over all environments
+    is_off: bool = False  # saves no state
 
 
 @dataclass(frozen=True)
 class StateKeeping:
-    """What becomes of a training's state."""
+    """How a training saves, resumes and removes its state."""
 
     interval: SaveInterval = SaveInterval()
-    state: SavedState | None = None  # that the training goes on from
-    goes_on: bool = False  # in the run folder of an earlier process, which may have left no state
-    was_cut_off: bool = False  # by the end of another process: states come sooner
-    stays: bool = False  # once the run is finished
+    state: SavedState | None = None  # the state to resume from
+    goes_on: bool = False  # uses the run folder of an earlier process, maybe without a state
+    was_cut_off: bool = False  # an earlier process died: save sooner
+    stays: bool = False  # keeps the state of a finished run
 
 
 def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
-    """The newest run of an agent on an environment that is not finished."""
+    """The newest unfinished run of an agent on an environment."""
     name = environment_name(env_id)
     runs = [Run(path, name) for _, path in numbered_runs(log_folder / algo, name)]
     for run in reversed(runs):
@@ -76,7 +76,7 @@ def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
 
 
 def run_of_spec(spec: TrainSpec, any_seed: bool) -> Run | None:
-    """The newest run of the very same settings, finished or not; None where there is none."""
+    """The newest run with the same settings, finished or not; None if there is none."""
     name = environment_name(spec.env_id)
     wanted = _settings(spec.as_data(), any_seed)
     for _, path in reversed(numbered_runs(spec.log_folder / spec.algo, name)):
@@ -91,12 +91,12 @@ def run_of_spec(spec: TrainSpec, any_seed: bool) -> Run | None:
 
 
 def is_finished(run: Run) -> bool:
-    """Whether a run came to its end."""
+    """Whether a run is finished."""
     return run.read_info().get("state") == FINISHED
 
 
 def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
-    """What a run was asked to do; its modules of the user's have to be typed again."""
+    """The spec of a run; its user modules have to be typed again."""
     recorded = run.recorded_spec()
     if not recorded:
         raise UserError(f"{run.path} does not say what it was asked for: it is no run of ours")
@@ -119,8 +119,8 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
 
 
 def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> StateKeeping:
-    """Put a run's files back to its newest state, or its beginning; tell what will differ."""
-    from pipeline.state_files import newest_state  # it takes PyTorch
+    """Reset a run's files to its newest state, or its beginning; report differences."""
+    from pipeline.state_files import newest_state  # imports PyTorch
 
     versions, now = run.read_info().get("versions"), recorded_versions()
     before = versions if isinstance(versions, dict) else {}
@@ -130,9 +130,9 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
         what = "the run began with other versions, so that its result may differ"
         tell(f"{what}: {', '.join(changed)}")
     state = newest_state(run.state_path, tell) if has_state(run.state_path) else None
-    if state is None:  # what a run that begins anew would not overwrite is removed
+    if state is None:  # remove files that a restarted run would not overwrite
         remove_states(run.state_path)
-        for path in monitor_files(run.path):  # another name of one keeps what it holds
+        for path in monitor_files(run.path):  # a hard link keeps the content
             path.unlink()
     else:
         if state.note["spec"] != settings_digest(run.recorded_spec()):
@@ -147,7 +147,7 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
 
 
 def tell_changes(run: Run, spec: TrainSpec, tell: Callable[[str], object]) -> None:
-    """Tell which files have changed since a run began: the user's modules, the agent of -i."""
+    """Report files that changed since a run began: the user's modules, the agent of -i."""
     changed = changed_since(spec.user_modules, run.path)
     agent, before = spec.trained_agent, run.read_info().get(TRAINED_AGENT)
     if agent is not None and before is not None and agent.is_file() and digest_of(agent) != before:
@@ -167,20 +167,20 @@ def settings_digest(spec: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-# --- what the files hold that a training only appends to ----------------------------------------
+# --- files to which a training only appends ------------------------------------------------------
 
 
 def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Position]:
-    """How far Monitor's files have come, by name, and TensorBoard's, by path from the root."""
+    """Positions in Monitor's files, by name, and in TensorBoard's, by absolute path."""
     paths = {path.name: path for path in monitor_files(run_folder)}
     paths |= {str(path): path for path in _event_files(log_folder)}
     return {name: _position(path, path.stat().st_size) for name, path in paths.items()}
 
 
 def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, Position]) -> None:
-    """Remove what was appended since, in new files: other links to the old stay as they are."""
+    """Remove appended data by writing new files, so that hard links to the old ones keep it."""
     for name, position in positions.items():
-        path = run_folder / name  # or the name itself, where that begins at the root
+        path = run_folder / name  # or the name itself, if it is absolute
         try:
             found = _position(path, position[0])
         except (FileNotFoundError, UnsafeFileError):
@@ -208,7 +208,7 @@ def _position(path: Path, length: int) -> Position:
 
 
 def _pieces(path: Path, length: int) -> Iterator[bytes]:
-    """So many bytes of a file, or all if it has fewer."""
+    """The first bytes of a file, or all if it has fewer."""
     with opened(path, NO_LIMIT) as file:
         while piece := file.read(min(_PIECE, length)):
             yield piece
@@ -216,7 +216,7 @@ def _pieces(path: Path, length: int) -> Iterator[bytes]:
 
 
 def monitor_files(run_folder: Path) -> list[Path]:
-    """The files that Monitor appends to."""
+    """The files to which Monitor appends."""
     return sorted(run_folder.glob(MONITOR_FILES))
 
 

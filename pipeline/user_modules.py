@@ -1,9 +1,9 @@
-"""Modules of the user's: environments and agents that live outside of this project.
+"""Imports the user's modules: environments and agents outside this project.
 
-They are imported because the user typed their names, and for no other reason: a file may say what
-it needs, and the user is told what to type. What lies beside them is found for their own code
-alone, and after all else, so that an ``agents.py`` of the user's never comes before ours; where two
-modules share a name, it is refused.
+A module is imported only if the user typed its name. A file may name modules that it needs; then
+the user is told what to type. Files beside a user's module are visible only to its own code, and
+are searched last, so that a user's ``agents.py`` never hides this project's. Two modules of the
+same name are refused.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pipeline.errors import UserError, one_line, shown
 from pipeline.files import files_below, replacing
 from safe_files.files import NO_LIMIT, read_file
 
-# Where this project is installed, libraries lie beside it.
+# If this project is installed, libraries are beside it.
 _PROJECT = Path(__file__).resolve().parents[1]
 _OWN = (
     "safe_files machine_code mdp verdicts envs agents pipeline experiments tuning report commands "
@@ -38,20 +38,20 @@ _OWN = (
 
 @dataclass(frozen=True)
 class UserModule:
-    """A module that the user asked for."""
+    """A module that the user typed."""
 
-    typed: str  # the words for it on the command line
-    name: str  # what it is imported as
-    path: str | None = None  # its file, or a package's folder, from the root; None if installed
+    typed: str  # as on the command line
+    name: str  # its import name
+    path: str | None = None  # absolute path of its file or package folder; None if installed
 
     @property
     def search_folder(self) -> str | None:
-        """The folder that has to be searched for it; None where Python searches it anyway."""
+        """The folder to search for it; None if Python searches the folder anyway."""
         return None if self.path is None else str(Path(self.path).parents[self.name.count(".")])
 
 
 class _TypedFolder(MetaPathFinder):
-    """Finds what was typed and what its code names; `sys.path` would serve libraries too."""
+    """Finds typed modules and modules that their code names; `sys.path` would affect libraries."""
 
     def __init__(self, folder: str, typed: str) -> None:
         self.folder = folder
@@ -67,7 +67,7 @@ class _TypedFolder(MetaPathFinder):
         return spec
 
     def _is_named(self, name: str) -> bool:
-        """Whether the code of a module that was found here has the name in it."""
+        """Whether the code of a module from this folder contains the name."""
         found = [m for n, m in list(sys.modules.items()) if n.partition(".")[0] in self.names]
         files = [Path(file) for module in found if (file := getattr(module, "__file__", None))]
         texts = (f.read_text(encoding="utf-8", errors="replace") for f in files if f.is_file())
@@ -75,7 +75,7 @@ class _TypedFolder(MetaPathFinder):
 
 
 def _search(folder: str, typed: str) -> None:
-    """Let a top-level module that was typed be found in a folder, and what its code names."""
+    """Search a folder for a typed top-level module, and for modules that its code names."""
     for finder in sys.meta_path:
         if isinstance(finder, _TypedFolder) and finder.folder == folder:
             finder.names.add(typed)
@@ -84,7 +84,7 @@ def _search(folder: str, typed: str) -> None:
 
 
 def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[UserModule, ...]:
-    """Import what was typed after ``--gym-packages`` and before colons; ours are left out."""
+    """Import the modules after ``--gym-packages`` and before colons; returns the user's own."""
     prefixes = [env_id.rpartition(":")[0] for env_id in env_ids]
     modules = []
     for typed in dict.fromkeys([*words, *filter(None, prefixes)]):
@@ -96,7 +96,7 @@ def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[Use
 
 
 def import_again(modules: Iterable[UserModule]) -> None:
-    """Import what `import_typed` did, in another process and from any folder."""
+    """Import the modules of `import_typed` in another process, from any folder."""
     for module in modules:
         if module.name not in sys.modules:
             _import(module)
@@ -107,10 +107,10 @@ def _is_path(typed: str) -> bool:
 
 
 def _at_path(typed: str) -> UserModule:
-    """The module in a file or a folder; inside a package, under its full name."""
+    """The module in a file or folder; inside a package, with its full name."""
     try:
         path = Path(typed).expanduser()
-    except RuntimeError as error:  # there is no such user
+    except RuntimeError as error:  # unknown user after ~
         raise _refused(typed, one_line(error)) from error
     path = path.resolve() if path.is_dir() else path.parent.resolve() / path.name
     path = path.parent if path.name == "__init__.py" else path
@@ -130,7 +130,7 @@ def _at_path(typed: str) -> UserModule:
 
 
 def _by_name(typed: str) -> UserModule:
-    """The module of that name, beside the place where the command is typed or installed."""
+    """The module of that name in the current folder, or an installed one."""
     if typed.startswith("__") or not all(part.isidentifier() for part in typed.split(".")):
         raise _refused(typed, "it is neither the name of a module nor the path of one")
     here = Path.cwd()
@@ -150,7 +150,7 @@ def _source(folder: Path, name: str) -> Path | None:
 
 
 def found_beside(folder: Path, top: str) -> Path | None:
-    """The file or package of that name in a folder, if Python takes no other for it."""
+    """The file or package of that name in a folder, unless Python would find another one."""
     place = _source(folder, top)
     if place is None or top in sys.stdlib_module_names or is_ours(top):
         return None
@@ -167,12 +167,12 @@ def _import(module: UserModule) -> ModuleType:
         _check_name(module, Path(folder))
     try:
         return importlib.import_module(module.name)
-    except (Exception, SystemExit) as error:  # whatever a stranger's module does when imported
+    except (Exception, SystemExit) as error:  # an import may raise anything
         raise _refused(module.typed, _what_failed(error, module)) from error
 
 
 def _check_name(module: UserModule, folder: Path) -> None:
-    """Make sure that the user's module is the one that is found under its name."""
+    """Check that Python finds the user's module under its name, and no other."""
     top = module.name.partition(".")[0]
     wanted = _source(folder, top) or folder / top
     found = _places(top)
@@ -189,7 +189,7 @@ def _check_name(module: UserModule, folder: Path) -> None:
 
 
 def _places(top: str) -> set[Path]:
-    """Where Python finds a module of that name, which lies in no package."""
+    """The places where Python finds a top-level module of that name."""
     try:
         spec = importlib.util.find_spec(top)
     except ValueError:  # of `__main__`
@@ -199,21 +199,21 @@ def _places(top: str) -> set[Path]:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a module of that name is one of this project's."""
+    """Whether a module of that name belongs to this project."""
     top = name.partition(".")[0]
     own = {_PROJECT / f"{top}.py", _PROJECT / top / "__init__.py"}
     return top in _OWN.split() and not own.isdisjoint(_places(top))
 
 
 def _what_failed(error: BaseException, module: UserModule) -> str:
-    """What went wrong in an import, with file and line."""
+    """The error of an import, with file and line."""
     if isinstance(error, ModuleNotFoundError) and f"{module.name}.".startswith(f"{error.name}."):
         return f"cannot import {error.name}: it is neither in {Path.cwd()} nor installed"
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.filename}:{error.lineno}: {type(error).__name__}: {error.msg}"
     what = f"{type(error).__name__}: {one_line(error)}"
     frames = traceback.extract_tb(error.__traceback__)[1:]
-    if module.search_folder is None:  # it is installed itself, so that all but Python may be its
+    if module.search_folder is None:  # installed: any file outside Python may be its own
         pythons = ("<", str(Path(importlib.__file__).parent))
         own = [frame for frame in frames if not frame.filename.startswith(pythons)]
     else:
@@ -225,21 +225,21 @@ def _refused(typed: str, reason: str) -> UserError:
     return UserError(f"--gym-packages {shlex.quote(typed)}: {reason}")
 
 
-# --- what a run remembers of them, and how it asks for them ---------------------------------------
+# --- copies of modules in run folders, and requests to type their names ---------------------------
 
-COPIES = "modules"  # the folder of a run that keeps copies of them
-MAX_COPY_BYTES = 1_000_000  # of a module, with all that it imports from beside it
-_FOLDERS_ABOVE = 3  # that a study's modules may lie from the pack of one of its runs
+COPIES = "modules"  # the folder in a run for copies of modules
+MAX_COPY_BYTES = 1_000_000  # of a module, with its imports from beside it
+_FOLDERS_ABOVE = 3  # parent folders of a run's pack to search for a study's modules
 
 
 def as_flag(modules: Iterable[UserModule], env_id: str = "") -> str:
-    """The flag to type that imports the modules again; none for the one before an id's colon."""
+    """The flag that imports the modules again; none for a module before an id's colon."""
     words = [m.typed for m in modules if m.typed != env_id.rpartition(":")[0]]
     return f" --gym-packages {shlex.join(words)}" if words else ""
 
 
 def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
-    """Put copies of the modules, and of what they import from beside them, into a run folder."""
+    """Copy the modules, and their imports from beside them, into a run folder."""
     for module in modules:
         sources = _sources(module)
         if sum(path.stat().st_size for path in sources.values()) > MAX_COPY_BYTES:
@@ -252,7 +252,7 @@ def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
 
 
 def _sources(module: UserModule) -> dict[str, Path]:
-    """The Python files of a module and of those that it imports from beside it, by their names."""
+    """The Python files of a module and of its imports from beside it, by name."""
     if module.search_folder is None:
         return {}
     beside, files = Path(module.search_folder), {}
@@ -271,7 +271,7 @@ def _sources(module: UserModule) -> dict[str, Path]:
 
 
 def _named_in(path: Path) -> Iterator[str]:
-    """The modules that a file imports, or names in a text such as ``"module:Class"``."""
+    """The modules that a file imports, or names in texts such as ``"module:Class"``."""
     try:
         tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError, RecursionError):
@@ -288,7 +288,7 @@ def _named_in(path: Path) -> Iterator[str]:
 
 
 def changed_since(modules: Iterable[UserModule], folder: Path) -> list[Path]:
-    """The files of modules that are no more what a run folder has copies of."""
+    """The files of modules that differ from their copies in a run folder."""
     files = {name: path for module in modules for name, path in _sources(module).items()}
     return [
         path
@@ -299,7 +299,7 @@ def changed_since(modules: Iterable[UserModule], folder: Path) -> list[Path]:
 
 
 def copy_of(module: str, is_there: Callable[[str], bool]) -> str | None:
-    """What to type for the copy of a module among the files of a run or pack; None without one."""
+    """The path to type for a module's copy in a run or pack; None without a copy."""
     place = f"{COPIES}/{module.replace('.', '/')}"
     if is_there(f"{place}/__init__.py"):
         return place
@@ -309,7 +309,7 @@ def copy_of(module: str, is_there: Callable[[str], bool]) -> str | None:
 def check_recorded(
     recorded: Mapping[str, Any], folder: Path, zipped_in: Path | None = None
 ) -> None:
-    """Make sure that the modules of a run, maybe of a pack, are imported; else say what to type."""
+    """Check that the modules of a run or pack are imported; else say what to type."""
     names = [name for name in recorded.get("gym_packages") or () if isinstance(name, str)]
     missing = [name for name in names if name not in sys.modules]
     if not missing:
@@ -318,7 +318,7 @@ def check_recorded(
     if zipped_in is None:
         known = [m for m in recorded.get("user_modules") or () if isinstance(m, dict)]
         words = []
-        for name in missing:  # where it was, or else the run's copy
+        for name in missing:  # its original place, or else the run's copy
             path = next((m.get("path") for m in known if m.get("name") == name), None)
             if isinstance(path, str) and Path(path).exists():
                 words.append(_near(Path(path)))
@@ -328,7 +328,7 @@ def check_recorded(
         whose, how = f"{folder} was made with modules of yours ({told})", "add"
     else:
         inside = {name: copy for name in missing if (copy := _copy_in(folder, name))}
-        near = {}  # beside the pack, or in a folder above it
+        near = {}  # beside the pack, or in a parent folder
         for name in missing:
             above = list(zipped_in.resolve().parents)[:_FOLDERS_ABOVE]
             copies = (_near(f / copy) for f in above if (copy := _copy_in(f, name)))
@@ -346,14 +346,14 @@ def check_recorded(
 
 
 def _copy_in(folder: Path, name: str) -> str | None:
-    """What to type for the copy of a module in a folder, relative to it; None without one."""
+    """The path to type for a module's copy, relative to its folder; None without a copy."""
     if not all(part.isidentifier() for part in name.split(".")):
         return None
     return copy_of(name, lambda path: (folder / path).is_file())
 
 
 def _near(path: Path) -> str:
-    """A path as short as it may be typed here, and never taken for the name of a module."""
+    """The shortest path to type here that cannot be mistaken for a module name."""
     if path.is_relative_to(Path.cwd()):
         return _printable(f".{os.sep}{path.relative_to(Path.cwd())}")
     return _printable(str(path))

@@ -1,6 +1,6 @@
-"""Records what a training looks like while it goes on, for a page that plays it.
+"""Records a training while it runs, for a page that plays it.
 
-Agents with tables are recorded step by step; of all others, maps of the greedy policy are kept.
+For agents with tables it records each step; for all others, maps of the greedy policy.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pipeline.train_spec import TrainSpec
 
 
 class GrowingRows:
-    """An array of records that grows by doubling; saving it with the training is fast."""
+    """An array of records that grows by doubling; fast to save with the training."""
 
     def __init__(self, kind: np.dtype[np.void]) -> None:
         self._rows: NDArray[np.void] = np.zeros(256, dtype=kind)
@@ -40,7 +40,7 @@ class GrowingRows:
 
     @property
     def rows(self) -> NDArray[np.void]:
-        """All that was appended, shape (n,)."""
+        """All appended records, shape (n,)."""
         return self._rows[: self._n]
 
     def append(self, *fields: Any) -> None:
@@ -58,7 +58,7 @@ class GrowingRows:
         self._n = end
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
-        """Forget all records but the chosen ones; bool of shape (n,)."""
+        """Remove all records except the chosen ones; bool of shape (n,)."""
         kept = self.rows[chosen]
         self._rows[: len(kept)] = kept
         self._n = len(kept)
@@ -66,12 +66,12 @@ class GrowingRows:
 
 # --- maps -----------------------------------------------------------------------------------------
 
-# Of more maps than a page has room for, every second one is kept, then every fourth, and so on.
+# If a page has no room for more maps, every second one is kept, then every fourth, and so on.
 MOST_MAPS = 1000
-MOST_FIGURES = 200_000  # of all maps together
+MOST_FIGURES = 200_000  # numbers in all maps together
 FEWEST_MAPS = 2  # the first and the last
 
-# What the library's agents log of a training, by the names that it has here.
+# Log entries of the library's agents, by their names on the page.
 LOGGED = {
     "loss": "train/loss",
     "policy_loss": "train/policy_loss",
@@ -81,9 +81,9 @@ LOGGED = {
 
 
 class MapRecorder(BaseCallback):
-    """Keeps the greedy policy and what each state is worth under it, at many moments."""
+    """Records the greedy policy and its state values at many moments."""
 
-    unit: ClassVar[str]  # what a map is kept after
+    unit: ClassVar[str]  # a map follows each unit
 
     def __init__(self, evaluator: ExactEvaluator) -> None:
         super().__init__()
@@ -91,12 +91,12 @@ class MapRecorder(BaseCallback):
         self.evaluator = evaluator
         self.moments = GrowingRows(_moment_type(n_states))
         self.most = min(max(MOST_FIGURES // (2 * n_states), FEWEST_MAPS), MOST_MAPS)
-        self.stride = 1  # of how many units one is kept
+        self.stride = 1  # one map is kept for so many units
         self.n_units = 0
 
     @property
     def has_begun(self) -> bool:
-        """Whether there is anything to show."""
+        """Whether anything was recorded."""
         return len(self.moments) > 0
 
     def _on_training_start(self) -> None:
@@ -104,7 +104,7 @@ class MapRecorder(BaseCallback):
             self._append()
 
     def finish(self) -> None:
-        """Keep what the agent does at the end, unless that was kept already or is no number."""
+        """Record the map at the end, unless it exists already or is not finite."""
         with suppress(NotFiniteError):
             check_model(self.model)
             self._keep_end()
@@ -115,7 +115,7 @@ class MapRecorder(BaseCallback):
             self._append()
 
     def _count(self) -> None:
-        """Count a unit, and keep its map if its number is a multiple of the stride."""
+        """Count a unit, and record its map if its number is a multiple of the stride."""
         self.n_units += 1
         if self.n_units % self.stride:
             return
@@ -129,7 +129,7 @@ class MapRecorder(BaseCallback):
         if policy is None:
             return
         agent: Any = self.model
-        # The schedule: the agent's rate is set with the first step.
+        # From the schedule, because the agent's rate is set at the first step.
         schedule = getattr(agent, "exploration_schedule", lambda progress: math.nan)
         log = agent.logger.name_to_value if self.n_units else {}
         returns = [episode["r"] for episode in agent.ep_info_buffer or ()]
@@ -145,7 +145,7 @@ class MapRecorder(BaseCallback):
 
 
 class EvaluationMaps(MapRecorder):
-    """Keeps a map after every evaluation."""
+    """Records a map after every evaluation."""
 
     unit = "evaluation"
 
@@ -155,13 +155,13 @@ class EvaluationMaps(MapRecorder):
 
 
 class UpdateMaps(MapRecorder, BlockCallback):
-    """Keeps a map after every update; it acts where a rollout begins, which engines can compile."""
+    """Records a map after every update, at the start of rollouts, which engines can compile."""
 
     unit = "update"
 
     def __init__(self, evaluator: ExactEvaluator) -> None:
         super().__init__(evaluator)
-        self._seen = 0  # updates, as the agent counts them: several in a training
+        self._seen = 0  # updates in the agent's count: several per training phase
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -180,7 +180,7 @@ class UpdateMaps(MapRecorder, BlockCallback):
         return True
 
     def _keep_end(self) -> None:
-        self._on_rollout_start()  # the last training comes after the last rollout
+        self._on_rollout_start()  # the last training phase follows the last rollout
         super()._keep_end()
 
 
@@ -189,7 +189,7 @@ def _moment_type(n_states: int) -> np.dtype[np.void]:
         [
             ("number", np.int64),  # of the unit that it follows; 0 before the training
             ("timesteps", np.int64),
-            ("exploration", np.float64),  # nan where the agent has no such rate
+            ("exploration", np.float64),  # nan if the agent has no such rate
             *((name, np.float64) for name in LOGGED),  # of the last training; nan for none
             ("training_return", np.float64),  # mean of the last episodes, nan for none
             ("values", np.float64, (n_states,)),
@@ -200,20 +200,20 @@ def _moment_type(n_states: int) -> np.dtype[np.void]:
 
 # --- steps ----------------------------------------------------------------------------------------
 
-# All that a page of three megabytes can hold, and what it holds where nobody says how much.
+# The capacity of a page of three megabytes, and the default.
 MOST_MOVES = 20_000
 MOST_CHANGES = 60_000
 MOVES_UNASKED = 5_000
 MOST_ENTRIES = 100_000
-# For the rise of the return so many steps are looked through, and the policy is judged so often.
+# The search for the rise of the return covers so many steps, and evaluates the policy so often.
 MOVES_SEARCHED = 50_000
 CHANGES_SEARCHED = 1_000_000
 STEPS_BETWEEN_RETURNS = 100
-# It has risen where so much of the way to the highest return is behind.
+# The return has risen once it has covered this share of the way to its maximum.
 FIRST_OF_RISE, LAST_OF_RISE = 0.1, 0.9
-STEPS_AROUND = 500  # that are kept before and after it
+STEPS_AROUND = 500  # steps kept before and after the rise
 
-# How an episode ended with a step, if it did.
+# How a step ended an episode, if it did.
 GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
 NO_STATE = -1
 
@@ -222,31 +222,31 @@ STEP = np.dtype(
     [
         ("timesteps", np.int64),  # after it, over all environments
         ("exploration", np.float64),
-        ("learning_rate", np.float64),  # nan where it is no number of the schedule's
+        ("learning_rate", np.float64),  # nan if it does not come from the schedule
     ]
 )
-# What one environment did in a step.
+# One environment's part of a step.
 MOVE = np.dtype(
     [
         ("step", np.int64),  # number of the step
         ("env", np.int64),
         ("episode", np.int64),  # of this environment, from 0 on
-        ("obs", np.int64),  # `NO_STATE` where observations are no numbers
+        ("obs", np.int64),  # `NO_STATE` if observations are not numbers
         ("action", np.int64),
         ("reward", np.float64),
         ("next_obs", np.int64),  # before any reset
         ("end", np.int64),
-        ("target", np.float64),  # nan where nothing was learnt, or the agent does not tell
+        ("target", np.float64),  # nan without an update, or if the agent does not report it
         ("td_error", np.float64),
-        ("episode_return", np.float64),  # sum of the rewards so far
+        ("episode_return", np.float64),  # sum of rewards so far
     ]
 )
-# An entry of a table that a step changed.
+# A table entry that a step has changed.
 CHANGE = np.dtype(
     [
         ("step", np.int64),
         ("table", np.int64),
-        ("entry", np.int64),  # place in the table as one row
+        ("entry", np.int64),  # index in the flattened table
         ("after", np.float64),
     ]
 )
@@ -255,9 +255,9 @@ CHANGE = np.dtype(
 class TableRecorder(BlockCallback):
     """Records the steps of the first ``n_episodes``, over all environments.
 
-    For 0 episodes it records the steps in which the return of the greedy policy rises, as ``exact``
-    computes it, or the first 5000 where that is not known. Which entries have moved is seen by
-    comparing the tables before and after an update, whatever the rule moves.
+    For 0 episodes, it records the steps in which the greedy policy's return rises, computed by
+    ``exact``, or the first 5000 steps without ``exact``. It finds changed entries by comparing the
+    tables before and after an update, for any learning rule.
     """
 
     def __init__(self, n_episodes: int, exact: ExactEvaluator | None = None) -> None:
@@ -266,25 +266,25 @@ class TableRecorder(BlockCallback):
         self.exact = None if n_episodes else exact
         self._greedy_returns: list[float] = []  # one after each `STEPS_BETWEEN_RETURNS` steps
         self.names: list[str] = []  # of the tables
-        self.has_actions = False  # whether the first of them has a number for each state and action
+        self.has_actions = False  # whether the first table has a number for each state and action
         self.initial: dict[str, Floats] = {}  # the tables before the first step
         self.steps = GrowingRows(STEP)
         self.moves = GrowingRows(MOVE)
         self.changes = GrowingRows(CHANGE)
         self.is_full = False
-        self.is_cut = False  # whether these episodes have more steps than are kept
-        self._tables: list[Floats] = []  # as they were last
+        self.is_cut = False  # whether these episodes have more steps than recorded
+        self._tables: list[Floats] = []  # after the previous step
         self._obs: Any = None
         self._returns = np.zeros(0)
         self._episodes = np.zeros(0, dtype=np.int64)
 
     @property
     def has_begun(self) -> bool:
-        """Whether there is anything to show."""
+        """Whether anything was recorded."""
         return len(self.steps) > 0
 
     def horizon(self) -> Horizon:
-        """After each step, as long as steps are kept."""
+        """After each step, as long as steps are recorded."""
         return Horizon() if self.is_full else Horizon(calls=1)
 
     def _on_rollout_start(self) -> None:
@@ -300,7 +300,7 @@ class TableRecorder(BlockCallback):
             self._note_return()
         self._obs = np.array(self.model._last_obs)
         told = getattr(self.model, "last_steps", None)
-        if told is not None:  # so that no number of an earlier step is taken for one of the next
+        if told is not None:  # cleared, so that the next step cannot read an old number
             told["target"] = told["td_error"] = np.nan
 
     def _on_step(self) -> bool:
@@ -336,7 +336,7 @@ class TableRecorder(BlockCallback):
             last["target"], last["td_error"] = told["target"], told["td_error"]
         for number, now in enumerate(tables_of(agent).values()):
             before = self._tables[number]
-            # nan is unequal to itself, but did not change.
+            # nan is unequal to itself, but has not changed.
             moved = np.flatnonzero((before != now) & ~(np.isnan(before) & np.isnan(now)))
             if len(moved):
                 changes = np.zeros(len(moved), dtype=CHANGE)
@@ -367,7 +367,7 @@ class TableRecorder(BlockCallback):
             self._greedy_returns.append(self.exact(self.model).mean_return)
 
     def _has_risen(self) -> bool:
-        """Whether enough steps follow the first policy that is near the optimum."""
+        """Whether enough steps follow the first near-optimal policy."""
         assert self.exact is not None
         first, best = self._greedy_returns[0], self.exact.yardstick.optimum
         near = first + LAST_OF_RISE * (best - first)
@@ -377,7 +377,7 @@ class TableRecorder(BlockCallback):
         return len(self.steps) >= STEPS_BETWEEN_RETURNS * risen + STEPS_AROUND
 
     def window(self) -> tuple[int, int]:
-        """The steps to show, from and to: whole episodes around the rise of the greedy return."""
+        """The first and last step to show: whole episodes around the rise of the greedy return."""
         n, n_envs = len(self.steps), self.model.n_envs
         returns = np.array(self._greedy_returns)
         if self.exact is None or not len(returns):
@@ -406,7 +406,7 @@ class TableRecorder(BlockCallback):
 
 
 def tables_of(agent: BaseAlgorithm) -> dict[str, Floats]:
-    """The tables that an agent learns in, by name, those with a number for each action first."""
+    """The agent's tables by name, those with a number for each action first."""
     tables = {
         name: buffer.numpy()
         for name, buffer in agent.policy.named_buffers()
@@ -416,7 +416,7 @@ def tables_of(agent: BaseAlgorithm) -> dict[str, Floats]:
 
 
 def has_actions(agent: BaseAlgorithm, table: Floats) -> bool:
-    """Whether a table has a row for each state, or one for all, with a number for each action."""
+    """Whether a table's rows, one per state or one for all, have a number for each action."""
     states, actions = agent.observation_space, agent.action_space
     if not isinstance(states, spaces.Discrete) or not isinstance(actions, spaces.Discrete):
         return False
@@ -427,7 +427,7 @@ Watch = TableRecorder | MapRecorder
 
 
 def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None) -> Watch | None:
-    """The recorder for an untrained agent; None without ``--watch-learning``."""
+    """Make the recorder for an untrained agent; None without ``--watch-learning``."""
     if spec.watch_learning is None:
         return None
     can_be_mapped = exact is not None and exact.model.n_states <= MAX_STATES

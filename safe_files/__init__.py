@@ -1,6 +1,6 @@
-"""Model files of unknown origin, read so that nothing in them is ever run.
+"""Reads model files of unknown origin without running any code in them.
 
-A room of its own: it knows the libraries whose files it reads, and nothing of this project.
+The package depends on the libraries whose files it reads, and on nothing else in this project.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = [
     "load_vec_normalize",
 ]
 
-# Imported when they are asked for: the libraries take two seconds.
+# Lazy imports: the libraries take two seconds.
 _MODULES = {
     "Report": "models",
     "inspect_model": "models",

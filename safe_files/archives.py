@@ -1,6 +1,6 @@
 """Reads members and settings from zips of models, without importing the libraries.
 
-No more is unpacked than the budget of the file allows.
+It unpacks no more than the budget of the file allows.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ SETTINGS = "data"
 _NETWORKS = "policy policy.optimizer actor.optimizer critic.optimizer ent_coef_optimizer"
 TENSORS = frozenset(f"{name}.pth" for name in f"{_NETWORKS} pytorch_variables tensors".split())
 MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
-# Algorithms of the user's may keep further files of tensors.
+# The user's algorithms may add further files of tensors.
 _TENSORS = re.compile(r"\w[\w.]*\.pth", re.ASCII)
 
 MAX_MEMBERS = 64
-# Counters of steps need far fewer.
+# Far more digits than a step counter needs.
 MAX_INTEGER_BITS = 128
-# What begins each entry of a zip's list of members, and what Python makes of one.
+# The signature of each entry in a zip's directory, and the bytes of Python's object for it.
 _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
-# The library stores members as they are. Whoever packs a zip anew may deflate them; then twice
-# what is unpacked is paid for, as Python puts it together from pieces.
+# The library stores members uncompressed. A repacked zip may deflate them; then the budget is
+# charged twice the unpacked size, because Python joins the pieces.
 _COPIES = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
 
-# What Python raises for zips that are damaged, encrypted, or of an unknown kind.
+# Python's exceptions for zips that are damaged, encrypted, or of an unknown kind.
 _ODD = (OverflowError, RuntimeError, ValueError)
 _DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, *_ODD)
 
@@ -43,7 +43,7 @@ def read_members(
     budget: Budget | None = None,
     most: int = MAX_MEMBERS,
 ) -> dict[str, bytes]:
-    """The members of a zip, by their names; those expected, if any are, and at most so many."""
+    """Read the members of a zip, by name: only the expected ones, if given, and at most so many."""
     budget = budget or Budget(len(content))
     with opened_zip(content, budget) as archive:
         infos = archive.infolist()
@@ -57,7 +57,7 @@ def read_members(
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """A member of a zip, of which no more is unpacked than it declares."""
+    """Read a member of a zip; unpacks no more than the member's declared size."""
     with archive.open(info) as member:
         content = member.read(info.file_size)
     if len(content) != info.file_size:
@@ -67,7 +67,7 @@ def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 @contextmanager
 def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
-    """A zip in which no member stands twice."""
+    """Open a zip that contains no member twice."""
     budget.charge(content.count(_ENTRY) * _BYTES_PER_ENTRY)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -84,9 +84,9 @@ def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
 
 
 def first_look(content: bytes) -> dict[str, Any]:
-    """The settings in a zip, which is one of a model as far as can be said without the libraries.
+    """Read the settings in a model's zip, checked as far as possible without the libraries.
 
-    What is pickled in them stays text.
+    Pickled settings stay text.
     """
     budget = Budget(len(content))
     members = read_members(content, budget=budget)
@@ -105,7 +105,7 @@ def first_look(content: bytes) -> dict[str, Any]:
 
 
 def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
-    """The settings of a model as JSON."""
+    """Parse the settings of a model, which are JSON."""
     if SETTINGS not in members:
         raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
     budget.charge_json(members[SETTINGS])

@@ -1,4 +1,4 @@
-"""Loads replay buffers and the statistics of VecNormalize from files of unknown origin."""
+"""Loads replay buffers and VecNormalize statistics from files of unknown origin."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ def load_replay_buffer(
     *,
     classes: Iterable[type[ReplayBuffer]] = (),
 ) -> None:
-    """As ``model.load_replay_buffer``, without running anything that the file names.
+    """Like ``model.load_replay_buffer``, but runs no code from the file.
 
     Args:
         model: the agent to give the buffer to.
         path: the file, or a stream of its bytes.
-        truncate_last_traj: with `HerReplayBuffer`, end the episode under way in the buffer.
-        classes: of your own, made with the arguments of `ReplayBuffer`, that the file may hold.
+        truncate_last_traj: with `HerReplayBuffer`, end the unfinished episode in the buffer.
+        classes: your own subclasses that the file may name, with `ReplayBuffer`'s arguments.
 
     Raises:
-        UnsafeFileError: if the file is no replay buffer, or does not fit the model.
+        UnsafeFileError: if the file is not a replay buffer, or does not fit the model.
     """
     known: tuple[type[ReplayBuffer], ...] = (*_CLASSES, *classes)
     makers = {name: partial(_stored, cls) for name, cls in by_name(known).items()}
@@ -85,7 +85,7 @@ def _stored(cls: type[ReplayBuffer], made: Made, build: Build) -> _Stored:
 
 
 def _buffer(found: _Stored, device: th.device) -> ReplayBuffer:
-    """A buffer made by its constructor, and filled."""
+    """Make a buffer by its constructor, and fill it."""
     state = dict(found.state)
     names = (*_ARGUMENTS, *_MORE_ARGUMENTS.get(found.cls, ()))
     given: dict[str, Any] = {name: state[name] for name in names if name in state}
@@ -94,7 +94,7 @@ def _buffer(found: _Stored, device: th.device) -> ReplayBuffer:
     given["buffer_size"] *= given.get("n_envs", 1)
     if found.cls is HerReplayBuffer:
         given["env"] = None
-        # The constructor makes a dictionary for each row: the file must hold as many.
+        # The constructor makes a dictionary for each row: the file must contain as many.
         if not isinstance(state.get("infos"), np.ndarray) or state["infos"].shape != shape:
             raise UnsafeFileError("holds a replay buffer with wrong infos")
     try:
@@ -137,20 +137,20 @@ _REST = ("observation_space", "obs_rms", "ret_rms")
 
 @dataclass(frozen=True)
 class Normalization:
-    """What a file says of a `VecNormalize`."""
+    """The settings and statistics of a `VecNormalize` in a file."""
 
     settings: dict[str, Any]  # its constructor's arguments
     observation_space: spaces.Space[Any]
-    # A dictionary where observations are dictionaries, None where they are left as they are.
+    # A dictionary for Dict observations, None if observations are not normalised.
     obs_rms: RunningMeanStd | dict[str, RunningMeanStd] | None
     ret_rms: RunningMeanStd
 
 
 def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
-    """As `VecNormalize.load` of a path or stream, without running anything that the file names.
+    """Like `VecNormalize.load` of a path or stream, but runs no code from the file.
 
     Raises:
-        UnsafeFileError: if the file is no such statistics, or they do not fit the environments.
+        UnsafeFileError: if the file has no such statistics, or they do not fit the environments.
     """
     found, space = (
         read_normalization(content_of(path, MAX_STATISTICS_BYTES)),
@@ -172,7 +172,7 @@ def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
 
 
 def read_normalization(pickled: bytes) -> Normalization:
-    """The statistics in a pickled `VecNormalize`."""
+    """Read the statistics in a pickled `VecNormalize`."""
     found = read_pickle(pickled, makers={_VEC_NORMALIZE: _normalization})
     if not isinstance(found, Normalization):
         raise UnsafeFileError("holds no statistics of VecNormalize")
@@ -180,7 +180,7 @@ def read_normalization(pickled: bytes) -> Normalization:
 
 
 def _normalization(made: Made, build: Build) -> Normalization:
-    # Its other attributes are not looked at.
+    # Its other attributes are ignored.
     trees = made.state if isinstance(made.state, dict) else {}
     if not trees.keys() >= {*_FLAGS, *_NUMBERS, *_REST}:
         raise wrong(made)

@@ -1,8 +1,8 @@
-"""Opens files of unknown origin, limits their sizes, and refuses them.
+"""Opens files of unknown origin safely, and limits their sizes.
 
-A folder of runs may come from a stranger, with a link, a pipe or a device under any of its names.
-Once such a folder is held, what lies below it is opened step by step from the folder itself, where
-no step may be a link. A link on the way to the folder is the user's own, and is followed.
+A folder of runs may come from a stranger, and any name in it may be a link, a pipe or a device.
+Once the folder is held, each path below it is opened step by step from the folder itself, and no
+step may be a link. A link on the way to the folder is the user's own, and is followed.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ NO_LIMIT = 1 << 62  # bytes
 MAX_ARCHIVE_BYTES = 1 << 30
 MAX_STATISTICS_BYTES = 64 << 20
 MAX_BUFFER_BYTES = 32 << 30
-# Reading a file may take so many times its size, and these bytes.
+# Reading a file may take this multiple of its size, plus these bytes.
 _TIMES = 4
 _FREE_BYTES = 64 << 20
-# Of an empty dictionary, with its place in what holds it: no value takes more beside its text.
+# An empty dictionary and its slot in a container: no value takes more in addition to its text.
 _BYTES_PER_JSON_VALUE = 100
-# If the system does not tell.
+# If the system does not report its memory.
 _MEMORY_IF_UNKNOWN = 16 << 30
 
 
 class UnsafeFileError(ValueError):
-    """A file holds what may not stand in it, is damaged, or is too large: one line that says what.
+    """A file has forbidden contents, is damaged, or is too large; the message is one line.
 
     Attributes:
-        key: the entry of a model file that is at fault, or None.
+        key: the faulty entry of a model file, or None.
     """
 
     def __init__(self, message: str, key: str | None = None) -> None:
@@ -46,20 +46,20 @@ class UnsafeFileError(ValueError):
 
 
 def shown(value: object) -> str:
-    """Quote a name from a file in a message: shortened, control characters escaped."""
+    """Quote a name from a file for a message: shortened, with control characters escaped."""
     text = ascii(value)
     return text if len(text) <= 80 else f"{text[:76]}...'"
 
 
 class Budget:
-    """The memory that reading a file may take; it is charged before something is made."""
+    """The memory that reading a file may take; charged before each allocation."""
 
     def __init__(self, n_bytes: int) -> None:
         self.n_bytes = n_bytes
         self.left = _FREE_BYTES + _TIMES * n_bytes
 
     def charge(self, n_bytes: int) -> None:
-        """Take so many bytes."""
+        """Charge so many bytes."""
         self.left -= n_bytes
         if self.left < 0:
             raise UnsafeFileError(
@@ -68,14 +68,14 @@ class Budget:
             )
 
     def charge_json(self, text: bytes) -> None:
-        """Take what Python makes of a text of JSON; see `charge`."""
-        # Of characters that are not of ASCII, one can make all others four bytes wide.
+        """Charge the memory of parsing a JSON text; see `charge`."""
+        # One non-ASCII character can make all others of a text four bytes wide.
         self.charge(len(text) * (2 if text.isascii() else 8))
         self.charge(sum(map(text.count, (b"[", b"{", b",", b":"))) * _BYTES_PER_JSON_VALUE)
 
 
 def memory_bytes() -> int:
-    """Bytes of memory in this machine."""
+    """The memory of this machine in bytes."""
     size = _MEMORY_IF_UNKNOWN
     if sys.platform != "win32":
         with contextlib.suppress(ValueError, OSError):
@@ -85,13 +85,13 @@ def memory_bytes() -> int:
 
 # --- opening --------------------------------------------------------------------------------------
 
-# What is read: a path, or a stream of bytes that were read already.
+# A file to read: a path, or a stream of bytes that were read already.
 Source = Path | str | io.BufferedIOBase
 
-# Each 0 where the system has no such thing. Who opens a pipe so does not wait for its other end.
+# Each is 0 if the system lacks it. With NONBLOCK, opening a pipe does not wait for its other end.
 _BYTES = getattr(os, "O_BINARY", 0)
 _ALWAYS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | _BYTES
-NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BYTES  # what is not there yet, not even as a link
+NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BYTES  # fails if the name exists, even as a link
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 _STEP = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)
 _LINKS = {errno.ELOOP: "it is a link", errno.ENOTDIR: "it lies behind a link, or no folder"}
@@ -102,12 +102,12 @@ _held: set[str] = set()
 
 
 def hold(folder: Path) -> None:
-    """Follow no link inside a folder from now on, in this process."""
+    """From now on, follow no link inside this folder in this process."""
     _held.add(_whole(folder))
 
 
 def take_up(folder: Path) -> None:
-    """Hold a folder with nothing but files and folders, in which libraries may open paths."""
+    """Hold a folder that contains only files and folders, so that libraries may open its paths."""
     hold(folder)
     pending = [str(folder)]
     while pending:
@@ -121,15 +121,15 @@ def take_up(folder: Path) -> None:
                             f"{entry.path} is a link, a pipe or a device: only files and folders "
                             "may lie there"
                         )
-        except FileNotFoundError:  # of others who are at work there
+        except FileNotFoundError:  # another process works there
             continue
 
 
 @contextmanager
 def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
-    """The folder of a path as functions of `os` take it: what to put before a name, and ``dir_fd``.
+    """The folder of a path for functions of `os`: a prefix for names, and ``dir_fd``.
 
-    An OSError says that it is not there, or lies behind a link in a folder that is held.
+    Raises OSError if the folder is missing, or lies behind a link in a held folder.
     """
     whole = _whole(path)
     held = _held_above(whole)
@@ -151,7 +151,7 @@ def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
 
 
 def open_number(path: Path, flags: int) -> int:
-    """The descriptor of a file, whatever kind it is of, opened without waiting for it."""
+    """Open a file of any kind without waiting, and return its descriptor."""
     held = _held_above(_whole(path))
     if held is None:  # the user's own place
         return os.open(path, flags | _ALWAYS)
@@ -163,13 +163,13 @@ def open_number(path: Path, flags: int) -> int:
 
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[io.BufferedReader]:
-    """A regular file of at most so many bytes, open for reading: what is checked is what is used.
+    """Open a regular file of at most so many bytes; checks the file that it has opened.
 
-    A pipe or a device is refused, which could go on for ever, and what lies behind a link in a
-    folder that is held.
+    Refuses pipes and devices, which could be endless, and files behind a link in a held
+    folder.
     """
     try:
-        # Of a folder, Python says so itself, and closes it again.
+        # For a folder, Python raises the error itself, and closes the folder.
         file = open(  # noqa: SIM115  # what it raises is told apart from what its user raises
             path, "rb", opener=lambda _path, _flags: open_number(path, os.O_RDONLY)
         )
@@ -189,14 +189,14 @@ def opened(path: Path, limit: int) -> Iterator[io.BufferedReader]:
 
 
 def read_file(path: Path, limit: int) -> bytes:
-    """All of a regular file; see `opened`."""
+    """Read a whole regular file; see `opened`."""
     with opened(path, limit) as file:
-        # It may grow meanwhile: what is read is no more than was there.
+        # The file may grow meanwhile: read no more than its first size.
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def content_of(source: Source, limit: int) -> bytes:
-    """All of a regular file, or of a stream, of at most so many bytes."""
+    """Read a whole regular file or stream of at most so many bytes."""
     if not isinstance(source, io.BufferedIOBase):
         return read_file(Path(source), limit)
     content = source.read(limit + 1)
@@ -206,7 +206,7 @@ def content_of(source: Source, limit: int) -> bytes:
 
 
 def _held_above(path: str) -> str | None:
-    """The outermost of the held folders that a path lies in."""
+    """The outermost held folder that contains a path."""
     end = path.find(os.sep, 1) if _held else -1
     while end > 0 and path[:end] not in _held:
         end = path.find(os.sep, end + 1)
@@ -214,7 +214,7 @@ def _held_above(path: str) -> str | None:
 
 
 def _whole(path: Path) -> str:
-    """The path from the root, with no link of it followed."""
+    """The absolute path, without following links."""
     return os.path.normpath(path.absolute())
 
 
@@ -229,7 +229,7 @@ def _opened(name: str, flags: int, folder: int | None, path: Path) -> int:
 
 
 def _check_steps(path: Path, held: str | None) -> None:
-    """Refuse links between a held folder and a path, where they cannot be refused by opening."""
+    """Refuse links between a held folder and a path, if opening cannot refuse them."""
     for step in () if held is None else (path.absolute(), *path.absolute().parents):
         if str(step) == held:
             return

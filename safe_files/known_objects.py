@@ -1,4 +1,4 @@
-"""The objects that may stand in files of models, each made by its constructor of checked values."""
+"""Makers of the objects that model files may contain, each from checked values."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ MAX_ROWS = 1_000_000_000  # of a buffer
 
 
 def _called(make: Callable[..., Any], *kinds: type) -> Maker:
-    """A maker that calls ``make`` with the arguments in the file, checked for these types."""
+    """A maker that checks the types of the file's arguments, and calls ``make`` with them."""
     return lambda made, build: make(*arguments(made, build, *kinds))
 
 
@@ -77,7 +77,7 @@ def _of_state(make: Callable[..., Any], /, **kinds: tuple[type, ...]) -> Maker:
 # --- NumPy's types, arrays, numbers and generators ------------------------------------------------
 
 _NUMBERS = (int, float, np.number, np.ndarray)
-# Booleans, whole numbers, floats; no texts, records, dates, and no Python objects.
+# Booleans, integers, floats; no texts, records, dates or Python objects.
 _TYPES = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"])
 _MAX_POOL = 64
 
@@ -104,12 +104,12 @@ def _array(data: Any, dtype: Any, shape: Any, order: Any) -> NDArray[Any]:
     )
     if not fits:
         raise UnsafeFileError("holds an array that is not as NumPy writes it")
-    # Objects are dictionaries and plain values, such as the infos of a replay buffer.
+    # Arrays of objects hold dictionaries and plain values, such as the infos of a replay buffer.
     kind, size = (list, 1) if dtype.hasobject else (bytes, dtype.itemsize)
     if not isinstance(data, kind) or len(data) != math.prod(shape) * size:
         raise UnsafeFileError("holds an array whose size does not match its data")
     if isinstance(data, bytes):
-        # A copy, since what is read from bytes cannot be written to.
+        # A copy, because an array on bytes is read-only.
         return np.frombuffer(data, dtype).reshape(shape, order=order).copy(order=order)
     flat = np.empty(len(data), dtype=object)
     for index, value in enumerate(data):
@@ -122,12 +122,12 @@ def _from_buffer(made: Made, build: Build) -> NDArray[Any]:
     data, dtype, shape, order, *axes = arguments(made, build, *kinds[: max(len(made.args), 4)])
     if not axes:
         return _array(data, dtype, shape, order)
-    # Since NumPy 2.3, of an array whose axes lie in the memory in another order.
+    # Since NumPy 2.3, for an array with another memory order of its axes.
     return _array(data, dtype, shape, "C").transpose(axes[0])
 
 
 def _state_of_five(made: Made, build: Build) -> tuple[Any, ...]:
-    """The state of five parts that NumPy gives to an array or a seed sequence."""
+    """Check NumPy's state of five parts of an array or a seed sequence."""
     state = build(made.state)
     if not (isinstance(state, tuple) and len(state) == 5) or made.items or made.pairs:
         raise wrong(made)
@@ -160,7 +160,7 @@ def _bit_generator(made: Made, build: Build) -> np.random.PCG64:
 
 
 def _generator(made: Made, build: Build) -> np.random.Generator:
-    # Older files name the maker of the inner generator as a second argument.
+    # Older files have the constructor of the inner generator as a second argument.
     inner = build(made.args[0]) if made.args else None
     if not isinstance(inner, np.random.PCG64):
         raise wrong(made)
@@ -191,9 +191,8 @@ _CLASSES_OF_NUMPY: Mapping[str, type] = {
 
 # --- tensors --------------------------------------------------------------------------------------
 
-# PyTorch's own reader believes what a file says of its tensors: a few bytes can stand for any
-# number of elements. Here a tensor is made of the bytes of its storage, and shows each of them at
-# most once.
+# PyTorch's own reader trusts the sizes in a file: a few bytes can declare any number of elements.
+# Here a tensor is built from the bytes of its storage, and uses each byte at most once.
 
 _DTYPES: Mapping[str, th.dtype] = {
     f"torch.{kind}Storage": getattr(th, kind.lower())
@@ -208,7 +207,7 @@ _STORAGE = Name("torch.storage", "TypedStorage")
 
 
 class _TensorReader(Reader):
-    """Reads pickles of protocol 2, as PyTorch writes them: storages stand beside the pickle."""
+    """Reads PyTorch's pickles of protocol 2, whose storages are separate files."""
 
     prices = PRICES | {"GLOBAL": 104, "BINPUT": 104, "LONG_BINPUT": 104, "BINPERSID": 320}
 
@@ -217,7 +216,7 @@ class _TensorReader(Reader):
         self.storages: dict[tuple[Name, str], Made] = {}
 
     def persistent_load(self, pid: Any) -> Made:
-        """Note down a storage; the same one, where a file says it twice."""
+        """Record a storage; a storage that the file names twice is one object."""
         _, kind, key, _, size, *_ = pid
         if not (isinstance(kind, Name) and isinstance(key, str) and isinstance(size, int)):
             raise UnsafeFileError("a storage that is not as PyTorch writes it")
@@ -225,12 +224,12 @@ class _TensorReader(Reader):
 
 
 def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
-    """What a ``.pth`` file holds: tensors in dictionaries and lists."""
+    """Load a ``.pth`` file: tensors in dictionaries and lists."""
     budget = budget or Budget(len(content))
     try:
         with opened_zip(content, budget) as archive:
             infos = archive.infolist()
-            # PyTorch stores its records as they are; one that was deflated is a bomb.
+            # PyTorch stores its records uncompressed; a deflated one is a zip bomb.
             if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
                 raise UnsafeFileError("compressed tensors, which PyTorch does not write")
             members = {info.filename.partition("/")[2]: info for info in infos}
@@ -238,7 +237,7 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
                 raise UnsafeFileError("a record twice")
 
             def record(name: str) -> bytes:
-                # For what is read, and what is made of it.
+                # For the bytes, and for the tensors made from them.
                 budget.charge(members[name].file_size)
                 return read_member(archive, members[name])
 
@@ -257,7 +256,7 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
 
 
 def _flat(made: Made, content: bytes) -> th.Tensor:
-    """The tensor of one dimension that a storage is."""
+    """A storage as a one-dimensional tensor."""
     kind, _, size = made.args
     dtype = _DTYPES[kind.name]
     if made.state is not None:
@@ -270,17 +269,17 @@ def _flat(made: Made, content: bytes) -> th.Tensor:
 
 
 def _lone_storage(made: Made, build: Build) -> th.Tensor:
-    """A storage in a file of its own, as PyTorch pickles it where tensors are in other pickles."""
+    """A storage in the legacy format, which PyTorch uses for tensors in other pickles."""
     (content,) = arguments(made, build, bytes)
     file = io.BytesIO(content)
     reader = _TensorReader(file, build.budget)
-    # Three headers come before the storage, a list of keys and the size after it.
+    # Three headers precede the storage; a list of keys and the size follow it.
     storage = [reader.load() for _ in range(5)][3]
     return _flat(storage, file.read()[8:])
 
 
 def _tensor(made: Made, build: Build) -> th.Tensor:
-    """A view of a storage in which no two elements lie at the same place."""
+    """A view of a storage in which no two elements overlap."""
     storage, offset, shape, strides, requires_grad = map(build, made.args[:5])
     is_tensor = isinstance(storage, th.Tensor) and len(shape) <= MAX_DIMENSIONS
     if made.state is not None or len(made.args) > 7 or not is_tensor:
@@ -302,7 +301,7 @@ def _parameter(made: Made, build: Build) -> nn.Parameter:
 
 
 def _state_dict(made: Made, build: Build, has_versions: bool = True) -> OrderedDict[str, Any]:
-    """An OrderedDict; what PyTorch says of the versions of a network's parts is left out."""
+    """An OrderedDict without PyTorch's metadata on module versions."""
     is_plain = all(isinstance(key, str) for key, _ in made.pairs)
     if made.args or made.items or not is_plain or (made.state is not None and not has_versions):
         raise wrong(made)
@@ -317,7 +316,7 @@ _OF_TENSORS: Mapping[str, Maker] = {
 
 
 def check_values(files: Mapping[str, Any]) -> None:
-    """Make sure that all tensors are finite numbers."""
+    """Check that all values are tensors of finite numbers."""
     for name, content in files.items():
         for path, tensor in tensors_in(content):
             where = f"{name}: {shown(path)[1:-1]}"
@@ -328,7 +327,7 @@ def check_values(files: Mapping[str, Any]) -> None:
 
 
 def tensors_in(content: Any, path: str = "") -> Iterator[tuple[str, th.Tensor]]:
-    """The tensors in nested dictionaries and lists, each with the way to it."""
+    """The tensors in nested dictionaries and lists, each with its path."""
     if isinstance(content, th.Tensor):
         yield path, content
         return
@@ -341,7 +340,7 @@ def tensors_in(content: Any, path: str = "") -> Iterator[tuple[str, th.Tensor]]:
 
 # --- Gymnasium's spaces ---------------------------------------------------------------------------
 
-# Beyond this no table or network has an input.
+# No table or network has a larger input.
 _MAX_SIZE = 10_000_000
 
 
@@ -374,7 +373,7 @@ def _space(made: Made, build: Build) -> spaces.Space[Any]:
         space = spaces.MultiBinary(n)
     generator = state.get("_np_random")
     if isinstance(generator, np.random.Generator):
-        # Sampling goes on where it was.
+        # Sampling continues from the saved state.
         space._np_random = generator
     return space
 
@@ -386,18 +385,18 @@ _SPACES: Mapping[str, Maker] = {
 }
 
 
-# --- schedules: the library's, rl_zoo3's, and ours of PyTorch's parts -----------------------------
+# --- schedules: the library's, rl_zoo3's, and ours from PyTorch classes ---------------------------
 
 _NUMBER = (int, float)
 
 
 def proportional(initial_value: float) -> Callable[[float], float]:
-    """A linear schedule to 0 that a zip holds without any class of ours."""
+    """A linear schedule to 0 that a zip can contain without a class of this project."""
     return partial(operator.mul, initial_value)
 
 
 def _partial(made: Made, build: Build) -> Callable[[float], float]:
-    """What `proportional` returns, once it was saved; any other partial is refused."""
+    """Rebuild a saved result of `proportional`; refuse any other partial."""
     inner, args, *_ = made.state
     partials, number = Name("functools", "partial"), args[0]
     fits = made.args == (partials,) and inner == Name("_operator", "mul") and len(args) == 1
@@ -422,7 +421,7 @@ def _affine(loc: Any, scale: Any, event_dim: int) -> AffineTransform:
 
 
 def _composed(parts: list[Any]) -> ComposeTransform:
-    """One transform after another: a schedule made of PyTorch's parts, such as exp(a + b x)."""
+    """Rebuild a schedule from PyTorch transforms in sequence, such as exp(a + b x)."""
     kinds = ComposeTransform | AffineTransform | ExpTransform
     if not all(isinstance(part, kinds) for part in parts):
         raise TypeError("no transform")
@@ -430,8 +429,8 @@ def _composed(parts: list[Any]) -> ComposeTransform:
 
 
 def _code(made: Made, build: Build) -> None:
-    """A function that was pickled with its code, as all schedules were before version 2.6."""
-    # The last text among the arguments of its code is its name.
+    """Replace a function that was pickled with its code, as schedules were before version 2.6."""
+    # The last text among the arguments of the code object is the function's name.
     code = made.args[0] if made.args else None
     texts = [one for one in getattr(code, "args", ()) if isinstance(one, str)]
     raise UnsafeFileError(", ".join(["holds a function with its code", *map(shown, texts[-1:])]))
@@ -464,7 +463,7 @@ _NOISES = NormalActionNoise | OrnsteinUhlenbeckActionNoise
 
 
 def _deque(made: Made, build: Build) -> deque[Any]:
-    # The arguments are what it holds, always nothing, and its greatest length.
+    # The arguments are its contents, always empty, and its maximum length.
     args = build(made.args)
     if made.state is not None or made.pairs or (args and args[0] not in ((), [])) or len(args) > 2:
         raise wrong(made)
@@ -481,7 +480,7 @@ def _vectorized_noise(made: Made, build: Build) -> VectorizedActionNoise:
     noises, base = state.get("_noises"), state.get("_base_noise")
     if not isinstance(noises, list) or not all(isinstance(one, _NOISES) for one in (base, *noises)):
         raise wrong(made)
-    # The constructor would make as many copies as the file says.
+    # The constructor would make as many copies as the file asks for.
     vectorized = VectorizedActionNoise(cast(Any, base), 1)
     vectorized.n_envs, vectorized.noises = len(noises), noises
     return vectorized
@@ -509,7 +508,7 @@ _OF_LIBRARIES: Mapping[str, Maker] = {
     "stable_baselines3.her.goal_selection_strategy.GoalSelectionStrategy": _called(
         GoalSelectionStrategy, int
     ),
-    # The reader decides the device.
+    # The caller chooses the device.
     "torch.device": lambda made, build: (
         arguments(made, build, *(str, int)[: max(len(made.args), 1)]) and th.device("cpu")
     ),
@@ -518,11 +517,11 @@ _OF_LIBRARIES: Mapping[str, Maker] = {
 }
 
 
-# --- classes, and the tables as a whole -----------------------------------------------------------
+# --- classes, and the complete tables -------------------------------------------------------------
 
 
 def by_name(classes: Iterable[type]) -> dict[str, type]:
-    """Classes by their module and qualified name."""
+    """Classes by their full names (module and qualified name)."""
     return {f"{cls.__module__}.{cls.__qualname__}": cls for cls in classes}
 
 
@@ -572,7 +571,7 @@ def read_pickle(
     makers: Mapping[str, Maker] | None = None,
     budget: Budget | None = None,
 ) -> Any:
-    """What a pickle stands for, made without unpickling; it may hold further objects by name."""
+    """Build the value of a pickle without unpickling; arguments allow further objects."""
     budget = budget or Budget(len(pickled))
     build = Build({**_MAKERS, **(makers or {})}, {**_library_classes(), **(classes or {})}, budget)
     return build.whole(read_tree(pickled, budget))

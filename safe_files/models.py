@@ -1,8 +1,8 @@
 """Loads models of Stable-Baselines3 and sb3-contrib from files of unknown origin.
 
-The library's own `load` gets a zip that is written anew from what was checked, so that it meets
-nothing to unpickle. It would make any networks and buffers that the settings describe, and PyTorch
-turns one kind of numbers into another without a word, so sizes and kinds are checked here.
+The library's own `load` gets a new zip with the checked contents, so it has nothing to unpickle.
+`load` would make networks and buffers of any size in the settings, and PyTorch silently converts
+dtypes. So this module checks sizes and dtypes.
 """
 
 from __future__ import annotations
@@ -51,22 +51,22 @@ from safe_files.known_objects import (
 )
 from safe_files.pickles import Reader
 
-# Trained variables outside of networks: the entropy coefficient of SAC and others.
+# Trained variables outside networks, such as the entropy coefficient of SAC.
 _OF_ENTROPY = frozenset({"log_ent_coef", "ent_coef_tensor"})
 
-# The files of those; the second is the name that the first once had.
+# The files of these variables; the second name is the older one.
 _VARIABLES = frozenset({"pytorch_variables.pth", "tensors.pth"})
 
-# Attributes that the reader decides, whatever the file says.
+# Attributes that the caller sets, regardless of the file.
 _NOT_READ = frozenset(
     {"env", "device", "policy", "rollout_buffer", "replay_buffer", "tensorboard_log"}
     | {"_logger", "_custom_logger", "_vec_normalize_env", "_episode_storage"}
 )
-# Made anew from the learning rate and the shares of exploration.
+# Rebuilt from the learning rate and the exploration settings.
 _DERIVED = frozenset({"lr_schedule", "exploration_schedule"})
 _SERIALIZED = ":serialized:"
 
-# What a class may have as the default of an attribute.
+# Types of a class's default value of an attribute.
 _PLAIN = (bool, int, float, str, type(None))
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
@@ -82,20 +82,20 @@ def load_model(
     custom_objects: Mapping[str, Any] | None = None,
     **replaced: Any,
 ) -> Algorithm:
-    """Load a model as ``algorithm.load`` does, without running anything that the file names.
+    """Like ``algorithm.load``, but runs no code from the file.
 
     Args:
-        algorithm: of Stable-Baselines3, sb3-contrib, or your own that is made and saved likewise.
+        algorithm: a class of Stable-Baselines3, sb3-contrib, or your own with the same interface.
         path: the zip, or a stream of its bytes.
-        env: the environment to go on with, or None.
-        device: where the tensors go.
-        classes: classes of your own that the file may name, by their full names.
-        custom_objects: values for those of these attributes that the file has; these are not read.
-        replaced: attributes to set instead of those in the file, which are not read then.
+        env: the environment for further training, or None.
+        device: the device of the tensors.
+        classes: your own classes that the file may name, by their full names.
+        custom_objects: values that replace attributes in the file; replaced ones are not read.
+        replaced: attributes to set, whether or not the file has them; the file's are not read.
 
     Raises:
-        UnsafeFileError: if the file holds what may not stand in it, is damaged, or too large.
-        ValueError: if the model does not fit ``env``, as the library says it.
+        UnsafeFileError: if the file has forbidden contents, is damaged, or is too large.
+        ValueError: if the model does not fit ``env``; the message is the library's.
     """
     files, variables = _tensors_of(algorithm)
     content = content_of(path, MAX_ARCHIVE_BYTES)
@@ -117,7 +117,7 @@ def load_model(
     check_values(tensors)
     _check_variables(tensors, variables)
     _check_sizes({**plain, **objects, **replaced}, budget)
-    # The library looks for the keys of its custom objects among those of the file.
+    # The library applies only custom objects whose keys are in the file.
     data = json.dumps({**plain, **dict.fromkeys(objects)}).encode()
     try:
         with charged_tensors(budget):
@@ -127,10 +127,10 @@ def load_model(
         model.__class__ = algorithm
         _check_fit(model, tensors)
     except ValueError:
-        raise  # it does not fit the environment
-    except Exception as error:  # settings and weights that do not go together can fail anywhere
+        raise  # the model does not fit the environment
+    except Exception as error:  # settings and weights that do not match can fail anywhere
         lines = str(error).strip().splitlines()
-        # PyTorch says below a heading which tensor it is.
+        # PyTorch's first line is a heading; the next line names the tensor.
         n_lines = 2 if lines and lines[0].endswith(":") else 1
         text = " ".join(line.strip() for line in lines[:n_lines])
         reason = text.partition(". ")[0] or type(error).__name__
@@ -139,7 +139,7 @@ def load_model(
 
 
 def _with_tensors(algorithm: type[Algorithm], tensors: Mapping[str, Any]) -> type[Algorithm]:
-    """The algorithm, which fills in the parameters of which it finds the names in a zip."""
+    """A subclass of the algorithm that loads these tensors for the names in the zip."""
 
     def set_parameters(
         self: BaseAlgorithm, found: Any, exact_match: bool = True, device: Any = "auto"
@@ -154,7 +154,7 @@ def _with_tensors(algorithm: type[Algorithm], tensors: Mapping[str, Any]) -> typ
 def _read_settings(
     members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The attributes in a zip that are plain data, and the pickles of those that are not."""
+    """The plain attributes in a zip, and the pickles of the others."""
     plain: dict[str, Any] = {}
     pickled: dict[str, bytes] = {}
     for key, value in parse_settings(members, budget).items():
@@ -170,14 +170,14 @@ def _read_settings(
 
 
 def hides(algorithm: type, name: str) -> bool:
-    """Whether an attribute of that name would hide something of the class but a plain default."""
+    """Whether an attribute of that name would hide a class member other than a plain default."""
     return not isinstance(inspect.getattr_static(algorithm, name, None), _PLAIN)
 
 
 def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozenset[str]]:
-    """The files of tensors that such a model has, and its variables that are part of no network."""
+    """The files of tensors of such a model, and its variables outside networks."""
     try:
-        # Those of the libraries need no more than the class to say it, or are known.
+        # For the libraries' classes, the class alone is enough, or the answer is known.
         own: Any = algorithm._get_torch_save_params(algorithm.__new__(algorithm))
         files, variables = frozenset(f"{name}.pth" for name in own[0]), frozenset(own[1])
     except AttributeError:
@@ -186,7 +186,7 @@ def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozens
 
 
 def _decoded(key: str, text: Any) -> bytes:
-    """The pickle that stands in JSON as base64."""
+    """Decode a pickle from base64 in JSON."""
     try:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, TypeError, ValueError) as error:
@@ -194,7 +194,7 @@ def _decoded(key: str, text: Any) -> bytes:
 
 
 def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
-    """Refuse variables that the library does not write: it would set any attribute by its path."""
+    """Refuse variables that the library never writes, because it would set any attribute."""
     for name in sorted(_VARIABLES):
         variables = tensors.get(name, {})
         if not isinstance(variables, dict):
@@ -211,7 +211,7 @@ def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
 
 
 def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
-    """A zip of what was checked, written anew; of the parameters, it has the names alone."""
+    """Write a new zip of the checked contents; of the parameters, it has only the names."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(SETTINGS, data)
@@ -224,28 +224,28 @@ def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
 
 # --- sizes in proportion to the file, and tensors of such a model ---------------------------------
 
-# Attributes that say how many rows a buffer has; they multiply where there are several.
+# Attributes that determine the rows of a buffer; several of them multiply.
 _BUFFERS = (("buffer_size",), ("n_steps", "n_envs"))
 _FLAT_BYTES = 4
-# Of what a network tries its input with; the weights behind each take more than that.
+# Bytes of a network's trial input per number; the weights behind each number take more.
 _BYTES_PER_INPUT = 40
-# What makes new tensors of sizes that it is told, or of what is there already.
+# Operations that make new tensors of given sizes, or of existing ones.
 _MAKERS = frozenset(
     {th.empty, th.zeros, th.ones, th.full, th.rand, th.randn, th.eye, th.arange, th.Tensor.repeat}
     | {th.empty_like, th.zeros_like, th.ones_like, th.Tensor.clone, th.clone}
 )
 # Python's overhead of a tensor and its layer.
 _BYTES_PER_TENSOR = 4096
-# Of the dictionary in which `HerReplayBuffer` keeps what environments say of each step.
+# Bytes of the dictionary in which `HerReplayBuffer` keeps the info of each step.
 _BYTES_PER_INFO = 136
 
-# Those that keep, of each parameter, tensors of its own shape, and numbers.
+# Optimizers whose state is numbers and tensors of the shape of each parameter.
 _NAMES = "Adadelta Adagrad Adam Adamax AdamW ASGD NAdam RAdam RMSprop Rprop SGD"
 _BY_ELEMENT = (*(getattr(optim, name) for name in _NAMES.split()), RMSpropTFLike)
 
 
 class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a function is
-    """Charges the budget for each tensor before PyTorch makes it."""
+    """A mode of PyTorch that charges the budget for each tensor before it is made."""
 
     def __init__(self, budget: Budget) -> None:
         super().__init__()
@@ -256,7 +256,7 @@ class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a funct
     ) -> Any:
         kwargs = kwargs or {}
         if function in _MAKERS:
-            # PyTorch's own device for tensors that take no memory.
+            # PyTorch's device for tensors without memory.
             like = [arg.to("meta") if isinstance(arg, th.Tensor) else arg for arg in args]
             where = {} if like and isinstance(like[0], th.Tensor) else {"device": "meta"}
             self.budget.charge(function(*like, **{**kwargs, **where}).nbytes + _BYTES_PER_TENSOR)
@@ -264,7 +264,7 @@ class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a funct
 
 
 def _check_sizes(settings: Mapping[str, Any], budget: Budget) -> None:
-    """Make sure that the settings say their spaces, and that their buffers fit the memory."""
+    """Check that the settings name their spaces, and that their buffers fit into memory."""
     for key in ("observation_space", "action_space"):
         if not isinstance(settings.get(key), spaces.Space):
             raise UnsafeFileError(f"does not say its {key}", key)
@@ -287,7 +287,7 @@ def _check_sizes(settings: Mapping[str, Any], budget: Budget) -> None:
 
 
 def _check_fit(model: BaseAlgorithm, tensors: Mapping[str, Any]) -> None:
-    """Check kinds and shapes of the tensors against those of the model."""
+    """Check dtypes and shapes of the tensors against those of the model."""
     for name in model._get_torch_save_params()[0]:
         part, found = recursive_getattr(model, name), tensors.get(f"{name}.pth", {})
         if isinstance(part, nn.Module):
@@ -316,7 +316,7 @@ def _check_optimizer(name: str, found: Any, optimizer: optim.Optimizer) -> None:
     keys = [key for group in found["param_groups"] for key in group["params"]]
     own = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     if len(keys) != len(own):
-        return  # of DQN before 2.4, which the library does without
+        return  # DQN before 2.4: the library does not need it
     parameters = dict(zip(keys, own, strict=True))
     for key, state in found["state"].items():
         if key not in parameters:
@@ -330,7 +330,7 @@ def _check_optimizer(name: str, found: Any, optimizer: optim.Optimizer) -> None:
 
 
 def _is_setting(value: Any, like: Any) -> bool:
-    """Whether a value is such as an optimizer is told, where ``like`` is its default."""
+    """Whether a value is a valid optimizer setting; ``like`` is the default."""
     if isinstance(like, tuple):
         fits = isinstance(value, tuple | list) and len(value) == len(like)
         return fits and all(_is_setting(*pair) for pair in zip(value, like, strict=True))
@@ -340,21 +340,21 @@ def _is_setting(value: Any, like: Any) -> bool:
     return is_number and not isinstance(like, bool)
 
 
-# --- looking into a zip, without making a model of it ---------------------------------------------
+# --- inspecting a zip, without making a model from it ---------------------------------------------
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a file holds."""
+    """The contents of a model file."""
 
     sizes: dict[str, int]  #: bytes of each member of the zip
     weights: dict[str, tuple[int, ...]]  #: shapes of the tensors, by member and name
-    settings: dict[str, str]  #: what each attribute is, as a text of one line
-    suspicious: tuple[str, ...]  #: what should make a reader wary, each in one line
+    settings: dict[str, str]  #: each attribute as a text of one line
+    suspicious: tuple[str, ...]  #: warnings for the reader, each in one line
 
 
 def inspect_model(path: Path | str) -> Report:
-    """Look into a model's zip; UnsafeFileError if it is none at all."""
+    """Inspect a model's zip; UnsafeFileError if the file is not one."""
     content = read_file(Path(path), MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     members = read_members(content, MEMBERS, budget)
@@ -378,7 +378,7 @@ def inspect_model(path: Path | str) -> Report:
 
 
 def _setting(key: str, value: Any, budget: Budget) -> tuple[str, list[str]]:
-    """An attribute in one line, and what is suspicious about it."""
+    """An attribute in one line, and a warning if it is suspicious."""
     is_odd = key in _NOT_READ - {"tensorboard_log"} and value
     name = shown(key).strip("'")
     doubts = [f"{name} is set, which models do not keep"] if is_odd else []

@@ -1,8 +1,8 @@
-"""Reads pickles as data: what a file asks for is noted down, and made by fixed tables.
+"""Reads pickles as data: records the requested calls, and builds objects by fixed tables.
 
-Python's own reader steps through a pickle. Its instructions that ask for a class or a call note
-down what was asked for, and nothing is imported or called. From these notes, `Build` makes what the
-tables of `safe_files.known_objects` know, and refuses the rest.
+Python's own reader steps through a pickle. Instructions that ask for a class or a call only record
+the request: nothing is imported or called. From these records, `Build` makes the objects that the
+tables of `safe_files.known_objects` know, and refuses all others.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any, ClassVar
 from safe_files.archives import MAX_INTEGER_BITS
 from safe_files.files import Budget, UnsafeFileError, shown
 
-# What protocols 4 and 5 write, which the library has used throughout its second version, by the
-# most bytes that an instruction makes beside those that stand in the file. Left out are persistent
-# ids, extension codes, buffers out of band, and keyword arguments.
+# The instructions of protocols 4 and 5, which version 2 of the library writes, with the most bytes
+# that an instruction allocates beyond its bytes in the file. Not supported are persistent ids,
+# extension codes, out-of-band buffers, and keyword arguments.
 _BY_PRICE = {
     32: "PROTO FRAME STOP NONE NEWTRUE NEWFALSE EMPTY_TUPLE POP POP_MARK APPEND APPENDS ADDITEMS "
     "SETITEM SETITEMS BINGET LONG_BINGET BUILD",
@@ -32,24 +32,24 @@ _BY_PRICE = {
     320: "EMPTY_SET FROZENSET REDUCE NEWOBJ",
 }
 PRICES = {name: price for price, names in _BY_PRICE.items() for name in names.split()}
-# Which values on the stack an instruction makes keys of dictionaries or members of sets.
+# The values on the stack that an instruction uses as dictionary keys or members of sets.
 _KEYS: Mapping[str, slice] = {
     "SETITEM": slice(-2, -1),
     "SETITEMS": slice(None, None, 2),
     "ADDITEMS": slice(None),
     "FROZENSET": slice(None),
 }
-# What keys may be: the hash of a nested tuple can take for ever. Whole numbers are their own hash
-# up to here; of larger ones any number can have the same.
+# Types of keys: hashing a nested tuple can take for ever. Integers up to here are their own hash;
+# any number of larger ones can share a hash.
 _KINDS_OF_KEYS = (str, int, float, bytes, type(None))
 _END_OF_INTEGERS = (1 << 61) - 1
 _BYTES_PER_KEY = 160
 
 MAX_DEPTH = 40
-# What a value takes, with its place in what holds it; a list, dictionary or object besides; and
-# what is noted down about one that is not empty.
+# Bytes of a value with its slot in a container; extra bytes of a list, dictionary or object; and
+# bytes of the records about one that is not empty.
 _BYTES_PER_VALUE, _BYTES_PER_HOLDER, _BYTES_PER_NOTE = 32, 80, 256
-# Constructors of spaces make several arrays of each that they are given.
+# Constructors of spaces make several arrays from each argument.
 _SPACES, _COPIES_OF_A_SPACE = "gymnasium.spaces.", 4
 _REFUSED = "which may not stand in such a file"
 
@@ -58,26 +58,26 @@ _PLAIN = (type(None), bool, int, float, str, bytes)
 
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A class or function that the file refers to, by its module's name and its own in there."""
+    """The name of a class or function in the file: its module and its name in the module."""
 
     module: str
     qualname: str
 
     @property
     def name(self) -> str:
-        """The full name."""
+        """The full dotted name."""
         return f"{self.module}.{self.qualname}"
 
 
 @dataclass(eq=False, repr=False, slots=True)
 class Made:
-    """An object that the file asks for; Python's instructions fill it as they would the object."""
+    """A record of an object that the file requests; pickle instructions fill it like the object."""
 
-    maker: Name | Made  # the class or function to call, or what is to make it first
-    args: tuple[Any, ...]  # what to call it with
-    state: Any = None  # what to give it as its state
-    items: list[Any] = field(default_factory=list)  # what to append to it
-    pairs: list[tuple[Any, Any]] = field(default_factory=list)  # keys and values to set in it
+    maker: Name | Made  # the class or function to call, or the record of it
+    args: tuple[Any, ...]  # arguments of the call
+    state: Any = None  # the state to set
+    items: list[Any] = field(default_factory=list)  # items to append
+    pairs: list[tuple[Any, Any]] = field(default_factory=list)  # keys and values to set
 
     def append(self, item: Any) -> None:
         self.items.append(item)
@@ -87,12 +87,12 @@ class Made:
 
     @property
     def name(self) -> str:
-        """What makes it, in words. Of its arguments nothing: written out, they may have no end."""
+        """Its class or function in words, without arguments, which could be endless."""
         return self.maker.name if isinstance(self.maker, Name) else "a call of what a call returns"
 
 
 class Reader(pickle._Unpickler):
-    """Python's own reader of pickles, which calls nothing and imports nothing."""
+    """Python's own pickle reader, changed so that it calls and imports nothing."""
 
     prices: ClassVar[Mapping[str, int]] = PRICES
     dispatch: ClassVar[dict[int, Any]]
@@ -103,15 +103,15 @@ class Reader(pickle._Unpickler):
     def __init__(self, file: io.BytesIO, budget: Budget) -> None:
         super().__init__(file)
         self.budget = budget
-        self.names: set[Name] = set()  # all that the file refers to
+        self.names: set[Name] = set()  # all names in the file
 
     def load(self) -> Any:
-        """The next pickle of the file, as lists, names, objects to make, and plain data."""
+        """Read the next pickle of the file as lists, names, object records, and plain data."""
         try:
             tree = super().load()
         except UnsafeFileError:
             raise
-        except Exception as error:  # a damaged one can fail at any instruction
+        except Exception as error:  # a damaged pickle can fail at any instruction
             reason = str(error) or type(error).__name__
             raise UnsafeFileError(f"is no whole pickle: {reason}") from error
         if self.stack or self.metastack:
@@ -119,7 +119,7 @@ class Reader(pickle._Unpickler):
         return tree
 
     def follow(self, name: str, run: Callable[[Reader], None]) -> None:
-        """Run an instruction, if it is known and paid for, and look at what it leaves."""
+        """Run a known instruction after charging the budget, and check its result."""
         if name not in self.prices:
             raise UnsafeFileError(f"a pickle with the instruction {name}")
         self.budget.charge(self.prices[name])
@@ -138,7 +138,7 @@ class Reader(pickle._Unpickler):
             self.budget.charge(4 * len(top))
 
     def find_class(self, module: str, name: str) -> Name:
-        """Note down a name, where Python would import something."""
+        """Record a name where Python would import a class."""
         found = Name(module, name)
         self.names.add(found)
         return found
@@ -158,14 +158,14 @@ class Reader(pickle._Unpickler):
         top.state = state
 
     def load_bytearray8(self) -> None:
-        # Python would make room for all that it says, before it sees what there is.
+        # Python would allocate the declared size before it checks the bytes.
         (size,) = struct.unpack("<Q", self.read(8))
         self.stack.append(self.read(size))
 
 
 def _instruction(op: pickletools.OpcodeInfo) -> Callable[[Reader], None]:
     pythons: Any = pickle._Unpickler.dispatch
-    # Those that the reader has of its own go by the names of Python's.
+    # The reader's own instructions have the names of Python's.
     run = getattr(Reader, pythons[ord(op.code)].__name__)
     return lambda reader: reader.follow(op.name, run)
 
@@ -174,7 +174,7 @@ Reader.dispatch = {ord(op.code): _instruction(op) for op in pickletools.opcodes}
 
 
 def read_tree(pickled: bytes, budget: Budget | None = None) -> Any:
-    """What a pickle of protocol 4 or 5 says; a part that the file shares is shared."""
+    """Read a pickle of protocol 4 or 5 as a tree; shared parts stay shared."""
     budget = budget or Budget(len(pickled))
     budget.charge(len(pickled))
     return Reader(io.BytesIO(pickled), budget).load()
@@ -188,15 +188,15 @@ def _parts_of(tree: Any) -> Iterable[Any]:
     return tree if isinstance(tree, list | tuple | set | frozenset) else ()
 
 
-# --- making what was noted down -------------------------------------------------------------------
+# --- building the recorded objects ----------------------------------------------------------------
 
 Maker = Callable[[Made, "Build"], Any]
 
 
 class Build:
-    """Makes the parts of a tree by tables of makers, each found by the full name in the file.
+    """Builds the parts of a tree by tables of makers, keyed by the full name in the file.
 
-    What is shared is made once.
+    A shared part is built once.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class Build:
         self._made: dict[int, Any] = {}
 
     def whole(self, tree: Any) -> Any:
-        """Make all of a tree, once it is paid for; what is shared, at each of its places."""
+        """Build a whole tree after charging it; a shared part is charged at each of its places."""
         try:
             self.budget.charge(self._measure(tree)[0])
         except RecursionError:
@@ -217,7 +217,7 @@ class Build:
         return self(tree)
 
     def _measure(self, tree: Any) -> tuple[int, int]:
-        """Bytes of a part, and how deep it is."""
+        """The bytes and the depth of a part."""
         if isinstance(tree, _PLAIN):
             return _BYTES_PER_VALUE + (len(tree) if isinstance(tree, str | bytes) else 0), 0
         if not isinstance(tree, Name | Made) and not tree:
@@ -225,7 +225,7 @@ class Build:
         key = id(tree)
         if key not in self._measures:
             self.budget.charge(_BYTES_PER_NOTE)
-            self._measures[key] = None  # it is under way
+            self._measures[key] = None  # in progress
             size, depth = _BYTES_PER_HOLDER, 0
             for part in _parts_of(tree):
                 size_of_part, depth_of_part = self._measure(part)
@@ -240,7 +240,7 @@ class Build:
         return measure
 
     def __call__(self, tree: Any) -> Any:
-        """Make one part of the tree."""
+        """Build one part of the tree."""
         if isinstance(tree, _PLAIN):
             return tree
         if not isinstance(tree, Name | Made) and not tree:
@@ -254,7 +254,7 @@ class Build:
             return {key: self(value) for key, value in tree.items()}
         if not isinstance(tree, Name | Made):
             return type(tree)(map(self, tree))  # a list, tuple or set
-        # As the present versions of the libraries have it: NumPy 2 renamed its inner package.
+        # The name in current versions of the libraries: NumPy 2 renamed its inner package.
         name = tree.name.replace("numpy.core.", "numpy._core.", 1)
         if isinstance(tree, Name):
             if name not in self.classes:
@@ -274,11 +274,11 @@ def _quoted(name: str) -> str:
     return shown(name).strip("'")
 
 
-# --- what makers are written with -----------------------------------------------------------------
+# --- helpers for makers ---------------------------------------------------------------------------
 
 
 def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
-    """The arguments of a call, which must be of these kinds, and nothing besides them."""
+    """The arguments of a call, which must have exactly these types, and nothing besides."""
     values = build(made.args)
     fits = len(values) == len(kinds) and all(map(isinstance, values, kinds))
     if not fits or made.state is not None or made.items or made.pairs:
@@ -287,7 +287,7 @@ def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tupl
 
 
 def fields(made: Made, build: Build) -> dict[str, Any]:
-    """The attributes that an object is given."""
+    """The recorded attributes of an object."""
     state = {} if made.state is None else build(made.state)
     fits = isinstance(state, dict) and all(isinstance(key, str) for key in state)
     if not fits or made.args or made.items or made.pairs:
@@ -296,5 +296,5 @@ def fields(made: Made, build: Build) -> dict[str, Any]:
 
 
 def wrong(made: Made) -> UnsafeFileError:
-    """The refusal of an object that is not given what genuine files give it."""
+    """The error for an object whose contents differ from genuine files."""
     return UnsafeFileError(f"holds a {_quoted(made.name)} that is not as the library writes it")

@@ -1,1 +1,1 @@
-"""Settings searched for: spaces of them, trials over several seeds, and the re-test of what won."""
+"""Searches for settings: search spaces, trials over several seeds, and the re-test of the best."""

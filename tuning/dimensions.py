@@ -1,8 +1,8 @@
-"""One thing that a search chooses: one of several values, or a number between two ends.
+"""The dimensions of a search space: a choice of values, or a range of numbers.
 
-Each dimension knows its settings and the parameters that Optuna stores for them, and leads from one
-to the other. Settings are flat here: the name of one inside another is dotted, as in
-``policy_kwargs.net_arch``. A setting that is `LEFT_OUT` is not said.
+Each dimension converts between its settings and the parameters that Optuna stores for them.
+Settings are flat here: the name of a nested setting is dotted, as in ``policy_kwargs.net_arch``. A
+setting with the value `LEFT_OUT` is not given.
 """
 
 from __future__ import annotations
@@ -25,61 +25,61 @@ from pipeline.errors import UserError
 from pipeline.settings.values import DottedName, parse_schedule
 from tuning.tuning_spec import SHIPPED
 
-# What Optuna stores of a choice.
+# The value that Optuna stores for a choice.
 Word = str | int | float | bool | None
-# Chooses a value for the parameter of this name.
+# A function that chooses a value for the parameter of this name.
 Pick = Callable[[str, BaseDistribution], Any]
-# For other choices by name, the words of which one must be chosen; empty for always.
+# By the names of other choices, the words of which one must be chosen; empty: no condition.
 Conditions = Mapping[str, tuple[Word, ...]]
 
 Scale = Literal["linear", "log", "log_below_one", "powers_of_two"]
-# What a number may be: itself at all times, or where a schedule begins.
+# The meaning of a number: a constant, or the start of a schedule.
 FORMS = ("constant", "linear", "exponential")
 FINAL_SHARE = (0.001, 1.0)
 _DIGITS = 6
 _PREFIXES: Mapping[str, str] = {"log_below_one": "one_minus_", "powers_of_two": "log2_"}
 
 
-LEFT_OUT = object()  # in place of a setting that is not said
+LEFT_OUT = object()  # in place of a setting that is not given
 
 
 @dataclass(frozen=True)
 class Choice:
     """One of several values, or one of several sets of settings."""
 
-    name: str  # of the parameter
-    options: Mapping[Word, Mapping[str, Any]]  # the flat settings that each word stands for
+    name: str  # name of the parameter
+    options: Mapping[Word, Mapping[str, Any]]  # the flat settings of each word
     when: Conditions = field(default_factory=dict)
 
     @cached_property
     def keys(self) -> tuple[str, ...]:
-        """The settings that it decides."""
+        """The names of its settings."""
         return tuple(dict.fromkeys(key for option in self.options.values() for key in option))
 
     @cached_property
     def distributions(self) -> dict[str, BaseDistribution]:
-        """What each of its parameters is drawn from."""
+        """The distribution of each of its parameters."""
         return {self.name: CategoricalDistribution(tuple(self.options))}
 
     def settings(self, pick: Pick) -> dict[str, Any]:
-        """What is chosen, asking for those parameters alone that it takes."""
+        """The chosen settings; calls ``pick`` only for the needed parameters."""
         return self._decided(self.options[pick(self.name, self.distributions[self.name])])
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that lead to these settings; LookupError if none do."""
+        """The parameters that give these settings; LookupError if there are none."""
         for word, option in self.options.items():
             if same(self._decided(option), self._decided(settings)):
                 return {self.name: word}
         raise LookupError(self.name)
 
     def including(self, settings: Mapping[str, Any]) -> Choice:
-        """As much wider as it takes to have these settings among its choices."""
+        """This dimension, widened if necessary to include these settings."""
         try:
             self.params_of(settings)
         except LookupError:
             added = self._decided(settings)
             value = added.get(self.name, LEFT_OUT)
-            # The value itself where that tells the reader more.
+            # The value itself, if that is clearer for readers.
             speaks = all(is_word(option.get(self.name)) for option in self.options.values())
             speaks = speaks and is_word(value) and value not in self.options
             word = value if speaks else SHIPPED
@@ -92,25 +92,25 @@ class Choice:
 
 @dataclass(frozen=True)
 class NumberRange:
-    """A number between two ends, whole where both are, or a schedule or word in its place.
+    """A number between two ends (an integer if both are), or a schedule or word in its place.
 
-    Chosen numbers have six digits, so that files stay readable.
+    Chosen numbers have six digits to keep files readable.
     """
 
-    name: str  # of the setting
+    name: str  # name of the setting
     low: float  # included
     high: float  # included
-    scale: Scale = "linear"  # on which steps are alike; powers of two are all that it then takes
-    forms: tuple[str, ...] = ("constant",)  # the words of `FORMS` that it may take
-    # The ends of the share of its start at which an exponential schedule ends.
+    scale: Scale = "linear"  # the scale of equal steps; on "powers_of_two" only these are values
+    forms: tuple[str, ...] = ("constant",)  # the allowed words of `FORMS`
+    # The range of an exponential schedule's end, as a share of its start.
     final_share: tuple[float, float] = FINAL_SHARE
-    # What may stand in place of a number, by the word that Optuna knows it by.
+    # Values in place of a number, by Optuna's words for them.
     instead: Mapping[Word, Any] = field(default_factory=dict)
     when: Conditions = field(default_factory=dict)
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The settings that it decides."""
+        """The names of its settings."""
         return (self.name,)
 
     @property
@@ -131,7 +131,7 @@ class NumberRange:
 
     @cached_property
     def distributions(self) -> dict[str, BaseDistribution]:
-        """What each of its parameters is drawn from."""
+        """The distribution of each of its parameters."""
         found: dict[str, BaseDistribution] = {}
         if len(self._words) > 1:
             found[self._form] = CategoricalDistribution(self._words)
@@ -146,13 +146,13 @@ class NumberRange:
         return found
 
     def _parameter(self, number: float) -> float:
-        """What Optuna is told of a number."""
+        """Convert a number to Optuna's parameter."""
         if self.scale == "log_below_one":
             return tidy(1.0 - number)
         return int(number).bit_length() - 1 if self.scale == "powers_of_two" else number
 
     def _number_of(self, parameter: float) -> float:
-        """The number that a parameter stands for."""
+        """Convert Optuna's parameter to a number."""
         if self.scale == "log_below_one":
             return round(1.0 - tidy(parameter), 12)
         if self.scale == "powers_of_two":
@@ -161,7 +161,7 @@ class NumberRange:
         return min(max(number, self.low), self.high)
 
     def settings(self, pick: Pick) -> dict[str, Any]:
-        """What is chosen, asking for those parameters alone that it takes."""
+        """The chosen settings; calls ``pick`` only for the needed parameters."""
         ranges = self.distributions
         form = pick(self._form, ranges[self._form]) if self._form in ranges else self._words[0]
         if form not in self.forms:
@@ -175,7 +175,7 @@ class NumberRange:
         return {self.name: f"exp_{number}_{end}"}
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that lead to these settings; LookupError if none do."""
+        """The parameters that give these settings; LookupError if there are none."""
         value = settings.get(self.name, LEFT_OUT)
         for word, other in self.instead.items():
             if same(value, other):
@@ -200,7 +200,7 @@ class NumberRange:
         return isinstance(kind, CategoricalDistribution) and value in kind.choices
 
     def including(self, settings: Mapping[str, Any]) -> NumberRange:
-        """As much wider as it takes to have these settings among its choices."""
+        """This dimension, widened if necessary to include these settings."""
         value = settings.get(self.name, LEFT_OUT)
         form, start, end = _read(value)
         wider = [self]
@@ -228,7 +228,7 @@ Dimension = Choice | NumberRange
 
 
 def spread(distribution: BaseDistribution, n: int) -> list[Any]:
-    """At most ``n`` values from one end of a distribution to the other; of words all."""
+    """At most ``n`` values from one end of a distribution to the other; all words of a choice."""
     if isinstance(distribution, CategoricalDistribution):
         return list(distribution.choices)
     assert isinstance(distribution, FloatDistribution | IntDistribution)
@@ -241,12 +241,12 @@ def spread(distribution: BaseDistribution, n: int) -> list[Any]:
 
 
 def tidy(number: float) -> float:
-    """The number with six digits."""
+    """Round a number to six digits."""
     return float(f"{number:.{_DIGITS}g}")
 
 
 def _read(value: Any) -> tuple[str | None, float, float]:
-    """Form, start and end of a number or schedule; no form for what is neither."""
+    """Form, start and end of a number or schedule; no form for other values."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return "constant", value, value
     if isinstance(value, str):
@@ -257,12 +257,12 @@ def _read(value: Any) -> tuple[str | None, float, float]:
 
 
 def is_word(value: object) -> bool:
-    """Whether Optuna can store the value as one of a choice."""
+    """Whether Optuna can store the value in a choice."""
     return value is None or isinstance(value, str | int | float)
 
 
 def same(first: object, second: object) -> bool:
-    """Whether two values mean the same setting: 1 is 1.0, and not true; a tuple is a list."""
+    """Whether two values are the same setting: 1 equals 1.0 but not true; tuples equal lists."""
     return _comparable(first) == _comparable(second)
 
 

@@ -1,8 +1,8 @@
-"""Whether a trial is hopeless after some of its seeds: pure functions of scores.
+"""Pruning rules: decide from scores whether a trial is hopeless after some of its seeds.
 
-All trials go through the same seeds in the same shuffled order, so that any two are compared seed
-by seed. Scores are the better the higher; a cost is handed over with its sign turned.
-docs/search-spaces.md says what each rule saves and errs.
+All trials use the same seeds in the same shuffled order, so that any two trials are compared seed
+by seed. Higher scores are better; costs are passed with the opposite sign. docs/search-spaces.md
+reports the savings and errors of each rule.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from pipeline.errors import unknown
 Scores = Mapping[int, float]  # by seed
 Value = Callable[[Sequence[float]], float]
 
-# The least that anything is concluded from.
+# The smallest numbers of seeds and of other trials for a decision.
 MIN_SEEDS = 2
 MIN_OTHERS = 4
-# Of a test that a trial is worse than the best one, as Optuna's WilcoxonPruner has it.
+# The level of a test that a trial is worse than the best one, as in Optuna's WilcoxonPruner.
 P_THRESHOLD = 0.1
-# Of three settings one goes on.
+# One of three settings continues.
 REDUCTION = 3
-# From so many seeds on a rank test can tell two settings apart before most are done.
+# From so many seeds on, a rank test can decide before most seeds are done.
 SEEDS_FOR_RANKS = 10
 
 
@@ -33,30 +33,30 @@ SEEDS_FOR_RANKS = 10
 class Rivals:
     """The other trials."""
 
-    others: Sequence[Scores]  # of ended trials and those under way
-    n_seeds: int  # how many a whole trial has
-    value: Value  # what scores are worth together
-    ceiling: float  # no score is above that; minus infinity where nobody knows
+    others: Sequence[Scores]  # scores of ended and running trials
+    n_seeds: int  # number of seeds of a complete trial
+    value: Value  # the value of several scores
+    ceiling: float  # the highest possible score; minus infinity if unknown
 
     @property
     def best(self) -> Scores:
-        """The best of those with all seeds; one under way may be lucky yet. Empty without any."""
+        """The best complete trial, as running ones may have been lucky; empty if there is none."""
         whole = [each for each in self.others if len(each) == self.n_seeds]
         return max(whole, key=lambda each: self.value([*each.values()]), default={})
 
     def lead(self, scores: Scores) -> list[float]:
-        """By how much a trial is better than the best one on each of the seeds in common."""
+        """The trial's score minus the best one's, on each common seed."""
         best = self.best
         return [score - best[seed] for seed, score in scores.items() if seed in best]
 
     def values(self, seeds: Scores) -> list[float]:
-        """On these seeds, of those that have them all."""
+        """The values on these seeds of all trials that have done them."""
         having = [each for each in self.others if seeds.keys() <= each.keys()]
         return [self.value([each[seed] for seed in seeds]) for each in having]
 
 
 def mean(scores: Sequence[float]) -> float:
-    """The mean of scores."""
+    """Mean of scores."""
     return sum(scores) / len(scores)
 
 
@@ -68,15 +68,15 @@ def is_hopeless(
     n_seeds: int | None = None,
     ceiling: float = -math.inf,
 ) -> bool:
-    """Whether to end a trial early, by its scores and those of all others, the higher the better.
+    """Whether to end a trial early, by its scores and those of all others; higher is better.
 
     Args:
-        scores: of the trial's seeds so far.
-        others: the same of ended trials and those under way.
+        scores: the trial's scores by seed so far.
+        others: the same for ended and running trials.
         method: a key of `PRUNERS`.
-        value: what scores are worth together.
-        n_seeds: how many a whole trial has; None for as many as any has so far.
-        ceiling: no score is above that; what has been seen counts where it is not said.
+        value: the value of several scores.
+        n_seeds: number of seeds of a complete trial; None for the largest number so far.
+        ceiling: the highest possible score; by default, the highest score so far.
     """
     if method not in PRUNERS:
         raise unknown("--pruner: there is none called", method, PRUNERS)
@@ -113,9 +113,9 @@ def out_of_the_race(scores: Scores, rivals: Rivals) -> bool:
 
 
 def worse_by_ranks(scores: Scores, rivals: Rivals) -> bool:
-    """Whether a signed-rank test on the seeds in common finds the trial worse than the best one.
+    """Whether a signed-rank test on the common seeds finds the trial worse than the best one.
 
-    A trial whose mean is not below the best one's goes on whatever the test says.
+    A trial whose mean is not below the best one's always continues.
 
     Source: Wilcoxon (1945); as Optuna's WilcoxonPruner.
     """
@@ -129,7 +129,7 @@ def worse_by_ranks(scores: Scores, rivals: Rivals) -> bool:
 
 
 def worse_by_means(scores: Scores, rivals: Rivals) -> bool:
-    """Whether a paired t test on the seeds in common finds the trial worse than the best one.
+    """Whether a paired t test on the common seeds finds the trial worse than the best one.
 
     Source: racing as in Birattari et al. (2002), "A racing algorithm for configuring
     metaheuristics", GECCO, with the t test that irace offers.
@@ -146,10 +146,10 @@ def worse_by_means(scores: Scores, rivals: Rivals) -> bool:
 
 
 def cannot_win(scores: Scores, rivals: Rivals) -> bool:
-    """Whether the trial stays below the best one even if all that is left goes perfectly.
+    """Whether the trial stays below the best one even with perfect scores on all other seeds.
 
-    Perfect is the highest score that there can be, or else that any trial has had. The only rule
-    that ends no trial that would have been chosen, as far as that holds.
+    A perfect score is the highest possible one, or else the highest of any trial. If that bound
+    holds, this is the only rule that never ends a trial that would have been chosen.
     """
     best, missing = rivals.best, rivals.n_seeds - len(scores)
     if not best or missing <= 0:
@@ -162,7 +162,7 @@ def cannot_win(scores: Scores, rivals: Rivals) -> bool:
 
 
 def no_chance(scores: Scores, rivals: Rivals) -> bool:
-    """Whether the trial cannot win, or has many seeds to come and loses by ranks."""
+    """Whether the trial cannot win, or has many seeds left and is worse by ranks."""
     has_many = rivals.n_seeds >= SEEDS_FOR_RANKS
     return cannot_win(scores, rivals) or (has_many and worse_by_ranks(scores, rivals))
 

@@ -1,7 +1,7 @@
-"""The best settings on seeds that the search has not seen, and the files that say what came of it.
+"""Re-tests the best settings on held-out seeds, and writes the result files of a search.
 
-They run beside the settings that the search began with, in a study like any other. A setting that
-is better there is written as an entry of hyperparameters; ``tuning.json`` holds all figures.
+The best settings and the initial settings of the search run in a normal study. If a setting is
+better there, it is written as an entry of hyperparameters; ``tuning.json`` has all figures.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ LIBRARY_LOOP = "Stable-Baselines3's own loop, in which the agent trains unless t
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting that is run again."""
+    """A setting in the re-test."""
 
-    number: int  # of its trial
+    number: int  # number of its trial
     entry: Mapping[str, Any]  # its hyperparameters
-    value: float  # what the search found it to be worth
+    value: float  # its value in the search
 
     @property
     def label(self) -> str:
-        """What it is called in the re-test."""
+        """Its label in the re-test."""
         return f"trial {self.number}" if self.number else SHIPPED
 
 
 def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candidate]:
-    """The settings that have all their seeds, the best first, the earlier where they are equal.
+    """The settings of complete trials, best first; equal ones in order of their trials.
 
-    Each is there once, however many trials tried it.
+    A setting of several trials appears once.
     """
     found: dict[str, Candidate] = {}
     for trial in trials:
@@ -64,12 +64,12 @@ def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candida
 
 
 def chosen_for_retest(ranked: Sequence[Candidate], k: int) -> list[Candidate]:
-    """The best ``k``, but for the settings that the search began with, which are run anyway."""
+    """The best ``k`` settings without the initial ones, which are re-tested anyway."""
     return [each for each in ranked if each.number][:k]
 
 
 def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]) -> StudySpec:
-    """The study that judges them, with a file for each which says what it was tuned on."""
+    """Make the study of the re-test; the file of each setting names its tuning seeds."""
     agents = [tuning.agent]
     for each in candidates:
         path = root / FOLDER / f"{each.label.replace(' ', '-')}.yml"
@@ -77,7 +77,7 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
         write_text(path, entry_text(tuning, each.entry, ()))
         agents.append(AgentSpec(each.label, tuning.agent.algo, conf_file=path))
     seeds = ", ".join(map(str, sorted(tuning.seeds)))
-    metric = tuning.figure if tuning.figure in METRICS else "final"  # of scores and costs too
+    metric = tuning.figure if tuning.figure in METRICS else "final"  # for scores and costs too
     return replace(
         tuning.study,
         name=FOLDER,
@@ -94,33 +94,33 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
 
 @dataclass(frozen=True)
 class Retested:
-    """What one of the settings came to on other seeds."""
+    """The result of one setting on held-out seeds."""
 
-    label: str  # what it is called
-    number: int  # of its trial; 0 for the settings that the search began with
-    in_search: float | None  # what the search found it to be worth, where judged to the end
-    held_out: float | None  # the same on the other seeds; None where no run is there
-    interval: Estimate  # of the mean of the scores there, or of what was asked for instead
-    verdict: str  # on it beside the settings that the search began with; empty for these
-    n_runs: int  # how many runs there are
-    # How many of them got less than half as far as the best typical run; None where nothing says
-    # what that is.
+    label: str  # its label
+    number: int  # number of its trial; 0 for the initial settings
+    in_search: float | None  # its value in the search, if its trial is complete
+    held_out: float | None  # its value on held-out seeds; None without runs
+    interval: Estimate  # of the mean of the held-out scores, or of the chosen objective
+    verdict: str  # compared with the initial settings; empty for these
+    n_runs: int  # number of runs
+    # Number of failed runs, which got less than half as far as the best typical run; None if
+    # that is not defined.
     n_failed: int | None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a tuning comes to."""
+    """The result of a tuning."""
 
-    # The settings that the search began with, then the others, the best in the search first.
+    # The initial settings, then the others, best in the search first.
     retested: tuple[Retested, ...]
-    # Of the others that ran on all other seeds, the best there, where it is better than those that
-    # the search began with, and no verdict says otherwise.
+    # The best of the other settings with runs on all held-out seeds and a verdict that it is better
+    # than the initial settings.
     winner: Retested | None
-    # By how much the best of the search was better there than on the other seeds; None where it was
-    # not run again.
+    # By how much the best setting of the search was better there than on held-out seeds; None if
+    # it was not re-tested.
     optimism: float | None
-    reason: str  # why there is no winner; empty where there is one
+    reason: str  # why there is no winner; empty if there is one
 
 
 def concluded(
@@ -129,7 +129,7 @@ def concluded(
     candidates: Sequence[Candidate],
     analysis: StudyAnalysis,
 ) -> Outcome:
-    """What the re-test shows: of all settings that were judged to the end, those run again."""
+    """The result of the re-test of ``candidates``; ``ranked`` are all complete settings."""
     in_search = {each.number: each.value for each in ranked}
     numbers = {SHIPPED: 0} | {each.label: each.number for each in candidates}
     retested = [
@@ -142,7 +142,7 @@ def concluded(
 
 
 def optimism(tuning: TuningSpec, best: Retested) -> float | None:
-    """By how much a setting looked better in the search than it is; above 0 where it did."""
+    """The optimism of the search: positive if a setting looked better there than held out."""
     if best.in_search is None or best.held_out is None:
         return None
     apart = best.in_search - best.held_out
@@ -158,7 +158,7 @@ def _retested(
 ) -> Retested:
     figures = []
     for run in analysis.results.planned:
-        # The study says which runs are not there, and why.
+        # The study reports missing runs and their reasons.
         with contextlib.suppress(UnjudgedError, DamagedFileError):
             if run.agent == label:
                 figures.append(outcome_of(tuning, run).figure)
@@ -195,10 +195,10 @@ def _verdict(environment: EnvironmentAnalysis | None, label: str) -> str:
 
 
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
-    """The best of those that the verdict calls better than what the search began with.
+    """The best setting that the verdict calls better than the initial settings.
 
-    That is on seeds that the search has not seen. Where runs of it failed it is out: those that are
-    left are the luckier ones.
+    It counts only held-out seeds. A setting with failed runs is excluded, because its remaining
+    runs are the luckier ones.
     """
     shipped, *others = retested
     there = [each for each in others if each.n_runs >= tuning.retest_seeds]
@@ -213,11 +213,11 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     return max(better, key=lambda each: sign * (each.held_out or 0.0)), ""
 
 
-# Entries of hyperparameters, which say what they were tuned on.
+# Entries of hyperparameters with their tuning seeds.
 
 
 def entry_text(tuning: TuningSpec, entry: Mapping[str, Any], lines: Sequence[str]) -> str:
-    """A file with one entry, as `hyperparams/` has them, and lines of what is said of it."""
+    """The text of a file with one entry in the format of `hyperparams/`, and lines of comments."""
     env_id = tuning.environment.env_id.partition(":")[2] or tuning.environment.env_id
     seeds = [{"first": each.start, "count": len(each)} for each in tuned_seeds(tuning)]
     said = {TUNED_ON: {env_id: seeds[0] if len(seeds) == 1 else seeds}}
@@ -226,9 +226,9 @@ def entry_text(tuning: TuningSpec, entry: Mapping[str, Any], lines: Sequence[str
 
 
 def tuned_seeds(tuning: TuningSpec) -> list[range]:
-    """The seeds that settings of a search have seen, in as few ranges as can be.
+    """The seeds that a search has used, in as few ranges as possible.
 
-    They are the search's own, and those of where it began.
+    They are the search's own seeds, and the tuning seeds of the initial settings.
     """
     agent = tuning.agent
     before = seeds_tuned_on(agent.algo, tuning.environment.env_id, agent.conf_file) or ()
@@ -242,7 +242,7 @@ def tuned_seeds(tuning: TuningSpec) -> list[range]:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes a setting a line; lists of plain values, and seeds, in one."""
+    """Writes each setting on its own line, and lists of plain values and seeds on one line."""
 
     def represent_sequence(
         self, tag: str, sequence: Any, _: bool | None = None
@@ -265,7 +265,7 @@ def _yaml(data: Mapping[str, Any]) -> str:
 def write_winner(
     tuning: TuningSpec, root: Path, outcome: Outcome, entry: Mapping[str, Any], n_trials: int
 ) -> Path:
-    """Write the winner's entry, as `hyperparams/` and ``--conf-file`` take it; the file."""
+    """Write the winner's entry for `hyperparams/` and ``--conf-file``; returns the file."""
     path = root / WINNER
     write_text(path, entry_text(tuning, entry, _provenance(tuning, outcome, entry, n_trials)))
     return path
@@ -274,7 +274,7 @@ def write_winner(
 def _provenance(
     tuning: TuningSpec, outcome: Outcome, entry: Mapping[str, Any], n_trials: int
 ) -> list[str]:
-    """Where the winner's settings come from, in lines."""
+    """Lines on the origin of the winner's settings."""
     winner, shipped = outcome.winner, outcome.retested[0]
     assert winner is not None
     seeds, held_out = tuning.study.seeds, tuning.held_out
@@ -300,13 +300,13 @@ def _figure(value: float | None) -> str:
 
 
 def _held_out(tuning: TuningSpec, each: Retested) -> str:
-    """The figure, and an interval."""
+    """The held-out figure with an interval, in words."""
     found, text = each.interval, _figure(each.held_out)
     if math.isnan(found.low):
         return text
     ends = f"{found.low:.4g} to {found.high:.4g}"
     failed = f", {each.n_failed} of them failed" if each.n_failed else ""
-    # There are no intervals for quartiles and times to a threshold.
+    # Quartiles and times to a threshold have no intervals.
     statistic = "interquartile mean" if tuning.objective == "iqm" else "mean"
     of_what = f"{statistic} of {tuning.figure if tuning.figure in METRICS else 'score'}"
     return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs{failed})"
@@ -316,7 +316,7 @@ def _held_out(tuning: TuningSpec, each: Retested) -> str:
 
 
 def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> dict[str, Any]:
-    """Write what there is, and return it: for the page, and for whoever wants to know."""
+    """Write the record of the tuning to ``tuning.json``, and return it for the page."""
     tuning = place.tuning
     data: dict[str, Any] = {
         "name": tuning.study.name,

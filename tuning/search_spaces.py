@@ -1,8 +1,8 @@
-"""Spaces of settings to search: read from files, asked by Optuna, and back from settings.
+"""Search spaces: reads them from files, samples them by Optuna, and inverts settings.
 
 ``hyperparams/search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see
-`docs/search-spaces.md`. What an environment's entry says replaces what ``default`` says of the same
-name; null takes it out.
+`docs/search-spaces.md`. An environment's entry overrides ``default`` name by name; null removes a
+name.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from tuning.dimensions import (
     spread,
 )
 
-# Of a range; so many that hardly any whole numbers are as far apart.
+# Points over a range: with so many, the second one is hardly ever an integer.
 _PARTS = 98
 
 _FOLDER = Path(__file__).resolve().parents[1] / "hyperparams" / "search_spaces"
-# What would make the task another one, so that the easiest would win.
+# Settings that change the task, so that a search would choose the easiest task.
 _TASK = ("env_kwargs", "eval_env_kwargs")
-# The keys of each kind of entry, and their types.
+# The keys of each type of entry, and their types.
 _RANGE: Mapping[str, Any] = {
     "low": float,
     "high": float,
@@ -70,27 +70,27 @@ _SETS: Mapping[str, Any] = {"sets": dict[str, dict[str, Any]], "when": dict[str,
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """What a search chooses for one agent on one environment."""
+    """The search space of one agent on one environment."""
 
-    entries: Mapping[str, Dimension]  #: dimensions by name, in the order in which they are asked
-    #: What a setting is where none is said; those not named are just left out.
+    entries: Mapping[str, Dimension]  #: dimensions by name, in the order of sampling
+    #: The default values of settings; settings without one are left out.
     defaults: Mapping[str, Any]
-    widened: tuple[str, ...] = ()  #: names of the dimensions that `including` made wider
+    widened: tuple[str, ...] = ()  #: names of the dimensions that `including` widened
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The settings that the space decides, inner ones dotted: ``policy_kwargs.net_arch``."""
+        """The names of the space's settings, nested ones dotted: ``policy_kwargs.net_arch``."""
         return tuple(dict.fromkeys(key for each in self.entries.values() for key in each.keys))
 
     def suggest(self, trial: BaseTrial) -> dict[str, Any]:
-        """Settings in the form of hyperparameter files, to be put into an entry by `merged`.
+        """Sample settings in the form of hyperparameter files; `merged` puts them into an entry.
 
-        Only what exists under what was chosen before is asked for. A FixedTrial does too.
+        Samples a conditional parameter only if its conditions hold. ``trial`` may be a FixedTrial.
         """
         return self._chosen(lambda name, ends: _ask(trial, name, ends))
 
     def at(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings under parameters, of which there may be more than those that exist."""
+        """The settings of parameters; parameters whose conditions do not hold are ignored."""
         return self._chosen(lambda name, _: params[name])
 
     def _chosen(self, pick: Pick) -> dict[str, Any]:
@@ -112,7 +112,7 @@ class SearchSpace:
         return nested
 
     def distributions(self) -> dict[str, BaseDistribution]:
-        """All of Optuna's parameters, those that exist under a condition too."""
+        """The distributions of all Optuna parameters, including conditional ones."""
         return {
             name: ends
             for each in self.entries.values()
@@ -120,14 +120,14 @@ class SearchSpace:
         }
 
     def grid(self, n: int) -> dict[str, list[Any]]:
-        """Values for each parameter: all words, and at most ``n`` numbers from end to end."""
+        """Grid values of each parameter: all words, or at most ``n`` numbers from end to end."""
         return {name: spread(ends, n) for name, ends in self.distributions().items()}
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that make `suggest` say these settings; what they leave out is default.
+        """The parameters for which `suggest` returns these settings; missing ones have defaults.
 
         Raises:
-            UserError: if they lie outside of the space, see `including`.
+            UserError: if the settings lie outside the space, see `including`.
         """
         flat = self.flat(settings)
         params: dict[str, Any] = {}
@@ -143,7 +143,7 @@ class SearchSpace:
         return params
 
     def including(self, settings: Mapping[str, Any]) -> SearchSpace:
-        """The space, as much wider as it takes to hold these settings; see ``widened``."""
+        """The space, widened if necessary to include these settings; see ``widened``."""
         flat = self.flat(settings)
         params: dict[str, Any] = {}
         entries, widened = dict(self.entries), list(self.widened)
@@ -157,10 +157,10 @@ class SearchSpace:
         return replace(self, entries=entries, widened=tuple(widened))
 
     def merged(self, shipped: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The shipped entry of hyperparameters with the settings in it that `suggest` returned.
+        """The shipped entry of hyperparameters, changed by the settings that `suggest` returned.
 
-        What the space decides and the settings do not hold is taken out: it exists under
-        conditions that are not met.
+        Removes settings of the space that are not in ``settings``, because their conditions do not
+        hold.
         """
         kept = _with_mappings(shipped, self.keys)
         for key in self.keys:
@@ -178,7 +178,7 @@ class SearchSpace:
         return {key: value for key, value in override(kept, changes).items() if value != {}}
 
     def flat(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The values of an entry under the space's keys; of what it leaves out, the defaults."""
+        """The values of an entry for the space's keys; missing settings have their defaults."""
         given, found = _with_mappings(settings, self.keys), {}
         for key in self.keys:
             outer, _, inner = key.partition(".")
@@ -190,7 +190,7 @@ class SearchSpace:
 
 
 def _with_mappings(settings: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """The settings, with mappings that are written as texts read where keys lead into them."""
+    """The settings; mappings that are written as texts are parsed if the keys are nested."""
     outer = {key.partition(".")[0] for key in keys if "." in key}
     return {
         key: _plain(parse_literal(value, key)) if key in outer and isinstance(value, str) else value
@@ -199,7 +199,7 @@ def _with_mappings(settings: Mapping[str, Any], keys: Iterable[str]) -> dict[str
 
 
 def _plain(value: Any) -> Any:
-    """Names of classes as the texts that a file holds."""
+    """Replace class names by texts, as in a file."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -208,7 +208,7 @@ def _plain(value: Any) -> Any:
 
 
 def _is_there(dimension: Dimension, chosen: Mapping[str, Any]) -> bool:
-    """Whether the choices that a dimension depends on are made so that it exists."""
+    """Whether a dimension's conditions hold under the chosen words."""
     return all(
         other in chosen and any(same(chosen[other], word) for word in words)
         for other, words in dimension.when.items()
@@ -230,7 +230,7 @@ def _ask(trial: BaseTrial, name: str, kind: BaseDistribution) -> Any:
 
 
 def corners(space: SearchSpace) -> Iterator[dict[str, Any]]:
-    """Settings at the ends of the space: all low, all high, and each end and word by itself."""
+    """Settings at the ends of the space: all low, all high, and each end or word separately."""
     lowest, highest = _ends(space)
     yield space.at(lowest)
     yield space.at(highest)
@@ -238,8 +238,8 @@ def corners(space: SearchSpace) -> Iterator[dict[str, Any]]:
 
 
 def steps_aside(space: SearchSpace, params: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Settings that differ from those under the parameters by one end or word."""
-    base = {**_ends(space)[0], **params}  # with those that exist under other conditions
+    """Settings that differ from those of the parameters in one end or word."""
+    base = {**_ends(space)[0], **params}  # including parameters of other conditions
     for changed, values in space.grid(2).items():
         for value in values:
             yield _with_one(space, base, changed, value)
@@ -254,7 +254,7 @@ def _ends(space: SearchSpace) -> tuple[dict[str, Any], dict[str, Any]]:
 def _with_one(
     space: SearchSpace, params: Mapping[str, Any], changed: str, value: Any
 ) -> dict[str, Any]:
-    """Settings under the parameters but for one, with the words under which that one is there."""
+    """Settings of the parameters with one changed, and words that fulfil its conditions."""
     needed: dict[str, Any] = {}
     names = [name for name, each in space.entries.items() if changed in each.distributions]
     while names:
@@ -264,20 +264,20 @@ def _with_one(
     return space.at({**params, **needed, changed: value})
 
 
-# Read from a file.
+# Reading from a file.
 
 
 def read_search_space(algo: str, env_id: str, path: Path | str | None = None) -> SearchSpace:
-    """Read what a search chooses for an agent on an environment.
+    """Read the search space of an agent on an environment.
 
     Args:
         algo: the agent, whose file is ``hyperparams/search_spaces/<algo>.yml``.
-        env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts.
+        env_id: the environment; for ``envs:Warehouse-v0``, the part after the colon is used.
         path: another file to read.
 
     Raises:
-        UserError: if the file cannot be read, is not of this format, says nothing to search, or
-            chooses what the agent does not take.
+        UserError: if the file cannot be read, is not of this format, has nothing to search, or
+            has settings that the agent refuses.
     """
     path = _FOLDER / f"{algo}.yml" if path is None else Path(path)
     if not path.is_file():
@@ -293,7 +293,7 @@ def read_search_space(algo: str, env_id: str, path: Path | str | None = None) ->
     space = replace(space, defaults={key: known[key] for key in space.keys if key in known})
     for settings in corners(space):
         _check_settings(algo, settings, where)
-    for name, kind in space.distributions().items():  # between the ends, too
+    for name, kind in space.distributions().items():  # also between the ends
         if isinstance(kind, FloatDistribution):
             between = _with_one(space, _ends(space)[0], name, spread(kind, _PARTS)[1])
             try:
@@ -304,7 +304,7 @@ def read_search_space(algo: str, env_id: str, path: Path | str | None = None) ->
 
 
 def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
-    """Where an environment's entry stands, and what it says together with the default."""
+    """The place of an environment's entry, and the entry merged with the default."""
     file = read_yaml(path)
     for name, entry in file.items() if isinstance(file, dict) else [("", None)]:
         is_entry = isinstance(entry, dict) and all(isinstance(key, str) for key in entry)
@@ -320,7 +320,7 @@ def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
 
 
 def _dimension(name: str, said: Any, place: str) -> Dimension:
-    """Read what stands beside a name: a list, or a mapping as `docs/search-spaces.md` has it."""
+    """Read the value of a name: a list, or a mapping as described in `docs/search-spaces.md`."""
     if isinstance(said, list):
         said = {"choices": said}
     if not isinstance(said, dict):
@@ -337,7 +337,7 @@ def _dimension(name: str, said: Any, place: str) -> Dimension:
     when = {other: _words(said, place) for other, said in checked.get("when", {}).items()}
     if known is _RANGE:
         ends = {end: said[end] for end in ("low", "high") if isinstance(said.get(end), int)}
-        # A range is of whole numbers where both ends are written so.
+        # A range has integers if both ends are written as integers.
         whole = ends if len(ends) == 2 else {}
         return replace(_number_range(name, {**checked, **whole}, place), when=when)
     options = checked["sets"] if known is _SETS else _options(name, checked["choices"], place)
@@ -396,7 +396,7 @@ def _number_range(name: str, checked: Mapping[str, Any], place: str) -> NumberRa
 
 
 def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
-    """Make sure that nothing is chosen twice, and that the task is not chosen at all."""
+    """Check that no setting has two dimensions, and that none changes the task."""
     deciders: dict[str, str] = {}
     for name, each in entries.items():
         task = next((key for key in each.keys if key.partition(".")[0] in _TASK), None)
@@ -405,7 +405,7 @@ def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
                 f"{where}: {task} is what settings are judged on, and not searched: give it by "
                 "--env-kwargs, or search train_env_kwargs"
             )
-        decided = () if each.when else each.keys  # under conditions it may be one or the other
+        decided = () if each.when else each.keys  # conditional ones may exclude each other
         for key in (*decided, *each.distributions):
             other = deciders.setdefault(key, name)
             if other != name:
@@ -413,7 +413,7 @@ def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
 
 
 def _check_conditions(entries: Mapping[str, Dimension], where: str) -> None:
-    """Make sure that conditions speak of choices further up, and of words that these have."""
+    """Check that conditions name earlier choices, and existing words of these."""
     before: dict[str, Choice] = {}
     for name, each in entries.items():
         for other, words in each.when.items():
@@ -429,13 +429,13 @@ def _check_conditions(entries: Mapping[str, Dimension], where: str) -> None:
 
 
 def _check_settings(algo: str, settings: Mapping[str, Any], where: str) -> None:
-    """Make sure that an agent takes settings, by their names, types and bounds."""
+    """Check that an agent accepts settings, by names, types and bounds."""
     parameters = algorithm_parameters(agent_class(algo))
     check_algorithm_kwargs(split(settings, where).algorithm, parameters, where)
 
 
 def _defaults(algo: str) -> dict[str, Any]:
-    """What settings of an agent are where none is said, as far as there is a default for each."""
+    """The default values of an agent's settings, as far as there are defaults."""
     algorithm = agent_class(algo)
     policy = algorithm.policy_aliases.get(default_policy(algorithm, is_dict=False), object)
     return {

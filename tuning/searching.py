@@ -1,4 +1,4 @@
-"""The search itself: trials side by side, each going through its seeds until it is hopeless."""
+"""The search: parallel trials, each of which runs its seeds until it is hopeless."""
 
 from __future__ import annotations
 
@@ -47,26 +47,26 @@ from tuning.tuning_spec import AUTO, TuningSpec, judged
 from verdicts import steps_to_threshold
 
 SECONDS_BETWEEN_LOOKS = 1.0
-# So many that fail in a row, and none before that did not: then it is not their settings.
+# If so many trials fail at the start without a success, the settings are not the reason.
 MOST_FAILURES = 5
-_ROOM_FOR_A_RUN = 1 << 18  # bytes, of a small one
-# Penalty for never reaching the threshold: twice the budget (PAR-2). At the cost of what was done,
-# giving up early would look cheap.
+_ROOM_FOR_A_RUN = 1 << 18  # bytes of a small run
+# Penalty for never reaching the threshold: twice the budget (PAR-2). If only the steps done
+# counted, giving up early would look cheap.
 WHOLE_RUNS = 2
 
 
 @dataclass(frozen=True)
 class OpenTuning:
-    """A tuning that is ready: everything checked, and what keeps its trials open."""
+    """A checked tuning with open storage."""
 
-    tuning: TuningSpec  # what is asked for
+    tuning: TuningSpec  # its specification
     root: Path  # its folder
-    study: Study  # of Optuna
+    study: Study  # Optuna's study
     queue: TrialQueue  # its trials
-    suggestions: Suggestions  # what they try
+    suggestions: Suggestions  # the settings of its trials
 
     def hopeless(self, number: int, figures: Mapping[int, float]) -> bool:
-        """Whether a trial has no more hope to be the best, by its seeds so far."""
+        """Whether a trial can no longer be the best, by its seeds so far."""
         sign = -1.0 if self.tuning.is_cost else 1.0
         others = [
             {seed: sign * figure for seed, figure in figures_of(trial.user_attrs).items()}
@@ -74,10 +74,10 @@ class OpenTuning:
             if trial.number != number
         ]
         scores = {seed: sign * figure for seed, figure in figures.items()}
-        # Costs have their sign turned: of what is left, higher is better.
+        # Costs change their sign, so that higher is better.
         value = partial(judged, objective=self.tuning.objective, is_cost=False)
-        # A score of 1 is the optimum. Where nobody knows that, returns stand in its place, of which
-        # no 1 says anything.
+        # A score of 1 is the optimum. Without a known optimum, figures are returns, for which 1
+        # means nothing.
         is_score = self.queue.known_figure == "score"
         return is_hopeless(
             scores,
@@ -90,10 +90,10 @@ class OpenTuning:
 
 
 def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:
-    """Check what is asked for, and open what keeps its trials.
+    """Check a tuning, and open the storage of its trials.
 
-    The folder is made, where there is nothing to complain of; ``storage`` is what ``--storage``
-    says.
+    Makes the folder if all checks pass; ``storage`` is the value of
+    ``--storage``.
     """
     take_up(root)
     run = shipped_run(tuning, root)
@@ -113,7 +113,7 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
     as_json = {name: distribution_to_json(kind) for name, kind in ranges.items()}
     asked = tuning.identity(suggestions.shipped, as_json)
     with _made(root):
-        with turn(root):  # of several that make a file's tables at once, all but one would fail
+        with turn(root):  # parallel drivers that create the tables of one file would fail
             opened = open_storage(root, storage)
         study = open_study(tuning, root, opened, make_sampler(tuning), asked)
     return OpenTuning(tuning, root, study, TrialQueue(study, root, n_trials), suggestions)
@@ -121,7 +121,7 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
 
 @contextlib.contextmanager
 def _made(root: Path) -> Iterator[None]:
-    """A folder that is there, and gone again where something fails and nothing came into it."""
+    """Make a folder; on an error, remove it again if it is empty."""
     root.mkdir(parents=True, exist_ok=True)
     try:
         yield
@@ -132,33 +132,33 @@ def _made(root: Path) -> Iterator[None]:
         raise
 
 
-# What a run is worth.
+# The figure of a run.
 
 
 class UnjudgedError(Exception):
-    """A run is there, and says nothing that a search could go by."""
+    """A run exists, but has no figure for a search."""
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What came of a run."""
+    """The result of a run."""
 
-    figure: float  # what it is judged by
-    seconds: float  # processor time that it took
-    name: str  # of the figure: as asked for, but the final return where no score is known
+    figure: float  # the figure for the search
+    seconds: float  # its processor time
+    name: str  # name of the figure: as requested, or the final return if no score is known
 
 
 def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
-    """What a finished run is judged by, and what it took.
+    """Read the figure of a finished run, and its time.
 
-    UnjudgedError if it has no such figure, DamagedFileError if a file of it is missing or changed,
-    UserError if no run can have one here, since nobody says what the threshold is.
+    UnjudgedError if it has no such figure, DamagedFileError if one of its files is missing or
+    changed, UserError if no run can have the figure because the threshold is not defined.
     """
     results = read_run(tuning.study, planned)
     if results is None:
         raise UnjudgedError("it has not finished")
     row, name = results.rows[0], tuning.figure
-    if name == "score" and row.get(name) is None:  # where no optimum is known
+    if name == "score" and row.get(name) is None:  # no known optimum
         name = "final"
     is_cost = name in ("steps", "seconds")
     figure = _cost(tuning, row, results.curves[0]) if is_cost else row.get(name)
@@ -168,7 +168,7 @@ def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
 
 
 def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> float:
-    """Steps or seconds until the learning curve comes to the threshold.
+    """Steps or seconds until the learning curve reaches the threshold.
 
     Source: for PAR-k, Hutter et al. (2009), "ParamILS", JAIR 36.
     """
@@ -189,30 +189,30 @@ def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> flo
 
 
 class Listener(Protocol):
-    """Who is told how far the search is."""
+    """Receives the progress of a search."""
 
     def run_ended(self) -> None:
         """A run of a trial has ended."""
 
     def trial_ended(self, number: int, value: float | None, reason: str) -> None:
-        """A trial has ended; without a value, where it was ended early or failed."""
+        """A trial has ended; without a value if it was pruned or failed."""
 
 
 @dataclass
 class TrialUnderWay:
-    """A setting that is being judged."""
+    """A running trial."""
 
-    trial: Trial  # of Optuna
+    trial: Trial  # Optuna's trial
     entry: dict[str, Any]  # its hyperparameters
-    seeds: list[int]  # those that have not begun, in their order
-    figures: dict[int, float]  # what came of those that are done
-    seconds: float  # what they took
-    n_running: int = 0  # how many are under way
-    is_over: bool = False  # whether what still comes is of no interest
+    seeds: list[int]  # seeds that have not begun, in order
+    figures: dict[int, float]  # figures of finished seeds
+    seconds: float  # time of finished seeds
+    n_running: int = 0  # number of running seeds
+    is_over: bool = False  # whether further results are ignored
 
 
 class Search:
-    """A driver's part in a search; after the deadline, by `time.monotonic`, no run is begun."""
+    """A driver's part in a search; starts no run after the deadline (`time.monotonic`)."""
 
     def __init__(
         self,
@@ -225,10 +225,10 @@ class Search:
         self.launcher, self.listener, self.deadline = launcher, listener, deadline
         self._trials: list[TrialUnderWay] = []
         self._runs: dict[Future[RunFailure | None], tuple[TrialUnderWay, PlannedRun]] = {}
-        self._failures: list[str] | None = []  # in a row from the first on; None after a success
+        self._failures: list[str] | None = []  # since the start; None after a success
 
     def run(self) -> None:
-        """Do trials until there are none left, or the time is over."""
+        """Do trials until all have ended, or the deadline has passed."""
         try:
             while not self._is_at_end():
                 if is_gone(self.place.root):
@@ -247,7 +247,7 @@ class Search:
         return not self._runs and (self._is_late or (not self._trials and self.queue.is_done()))
 
     def _hand_out(self) -> None:
-        """Give every worker something to do, as far as there is anything."""
+        """Submit runs to all free workers, as long as there are any."""
         while len(self._runs) < self.launcher.n_workers and not self._is_late:
             chosen = self._idle_trial() or self._new_trial() or self._any_trial()
             if chosen is None:
@@ -258,7 +258,7 @@ class Search:
         return next((each for each in self._trials if each.seeds and not each.n_running), None)
 
     def _any_trial(self) -> TrialUnderWay | None:
-        """Where no trial is left to begin, workers would idle: seeds go side by side then."""
+        """A trial for parallel seeds, so that workers do not idle if no trial is left to begin."""
         open_ones = [each for each in self._trials if each.seeds]
         return min(open_ones, key=lambda each: each.n_running, default=None)
 
@@ -270,7 +270,7 @@ class Search:
             seeds = [seed for seed in self.tuning.seeds if seed not in known]
             new = TrialUnderWay(trial, entry, seeds, known, seconds)
             self._trials.append(new)
-            if known:  # its driver may have ended between the last of them and the judgement
+            if known:  # its driver may have died after the last seed
                 self._judge(new)
             if not new.is_over:
                 return new
@@ -283,7 +283,7 @@ class Search:
             self._fail(each, str(error))
             return
         each.n_running += 1
-        if planned.is_finished:  # by a trial of equal settings, or a driver before
+        if planned.is_finished:  # by an equal trial, or an earlier driver
             future: Future[RunFailure | None] = Future()
             future.set_result(None)
         else:
@@ -291,7 +291,7 @@ class Search:
         self._runs[future] = (each, planned)
 
     def _look(self) -> None:
-        """Wait until a run has ended, or it is time to look for trials that others left."""
+        """Wait for the end of a run, or for the time to check for abandoned trials."""
         if not self._runs:
             if not self.queue.free_dead() and not self._is_at_end():
                 time.sleep(SECONDS_BETWEEN_LOOKS)
@@ -305,7 +305,7 @@ class Search:
             self.listener.run_ended()
 
     def _note(self, each: TrialUnderWay, planned: PlannedRun, failure: RunFailure | None) -> None:
-        """Take in what came of a run."""
+        """Process the result of a run."""
         if failure is not None:
             _check_room(self.place.root)
             where = "" if failure.log is None else f"; see {failure.log}"
@@ -320,7 +320,7 @@ class Search:
         before = self.queue.known_figure
         if before is None:
             self.place.study.set_user_attr(JUDGED_BY, outcome.name)
-        elif before != outcome.name:  # an optimum may be known since an update
+        elif before != outcome.name:  # after an update, an optimum may be known
             raise UserError(
                 f"{self.tuning.study.name}: runs there were judged by {before}, and now by "
                 f"{outcome.name}: --name NAME makes a search of its own"
@@ -330,10 +330,10 @@ class Search:
         with _lost_to_others():
             step = len(each.figures)
             there = self.queue.storage.get_trial(each.trial._trial_id).intermediate_values
-            if step not in there:  # a driver that was killed may have told it
+            if step not in there:  # a killed driver may have reported it
                 each.trial.report(self._value(each), step)
             each.trial.set_user_attr(SECONDS, each.seconds)
-            # The last: from now on the seed is done.
+            # Last, because it marks the seed as done.
             figures = {str(seed): figure for seed, figure in each.figures.items()}
             each.trial.set_user_attr(FIGURES, figures)
         self._judge(each)
@@ -343,14 +343,14 @@ class Search:
         return judged(figures, self.tuning.objective, is_cost=self.tuning.is_cost)
 
     def _judge(self, each: TrialUnderWay) -> None:
-        """End a trial that has all its seeds, or is hopeless."""
+        """End a trial that is complete or hopeless."""
         if len(each.figures) == len(self.tuning.seeds):
             self._end(each, self._value(each), "")
         elif each.trial.number and self.place.hopeless(each.trial.number, each.figures):
             self._end(each, None, "")
 
     def _fail(self, each: TrialUnderWay, reason: str) -> None:
-        """End a trial of which a run failed: to samplers it is one of the worst there are."""
+        """End a trial with a failed run; samplers treat it as one of the worst."""
         with _lost_to_others():
             each.trial.set_user_attr(FAILURE, reason)
         self._end(each, None, reason)
@@ -360,7 +360,7 @@ class Search:
                 raise UserError(f"all of the first {MOST_FAILURES} trials failed; {reason}")
 
     def _end(self, each: TrialUnderWay, value: float | None, reason: str) -> None:
-        """End a trial, without a value where it was ended early or failed."""
+        """End a trial; without a value if it was pruned or failed."""
         state = TrialState.PRUNED if value is None else TrialState.COMPLETE
         with _lost_to_others():
             self.place.study.tell(each.trial, value, state, skip_if_finished=True)
@@ -368,12 +368,12 @@ class Search:
         self._trials.remove(each)
         for future, (other, _) in self._runs.items():
             if other is each:
-                future.cancel()  # those that have begun go on, and their folders stay
+                future.cancel()  # running ones continue, and their folders stay
         self.listener.trial_ended(each.trial.number, value, reason)
 
 
 def _check_room(root: Path) -> None:
-    """Make sure that it is no full disk that runs fail of, which says nothing of their settings."""
+    """Check that a full disk is not the reason of a failed run, instead of its settings."""
     try:
         with tempfile.TemporaryFile(dir=root) as file:
             file.write(bytes(_ROOM_FOR_A_RUN))
@@ -387,6 +387,6 @@ def _check_room(root: Path) -> None:
 
 @contextlib.contextmanager
 def _lost_to_others() -> Iterator[None]:
-    """Let go of a trial that another driver has taken, since this one was silent for long."""
+    """Ignore errors about a trial that another driver took after this driver's time-out."""
     with contextlib.suppress(UpdateFinishedTrialError, ValueError):
         yield

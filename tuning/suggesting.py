@@ -1,10 +1,10 @@
-"""What trials try, and the runs that this takes.
+"""Suggests the settings of trials, and plans their runs.
 
-The first trial has the shipped settings; the others are points of a grid, or what one of Optuna's
-samplers says. A sampler that several drivers seed alike would draw the same settings in all of
-them, and one that goes on after a kill would draw its first again. So each trial has a generator of
-its own, seeded by the search's seed and the trial's number: which driver asks, and when it was
-started, is no matter.
+The first trial has the shipped settings; the others are points of a grid, or come from one of
+Optuna's samplers. Samplers with the same seed in several drivers would draw the same settings, and
+a sampler that restarts after a kill would draw its first settings again. So each trial has its own
+generator, seeded by the search's seed and the trial's number: its settings do not depend on the
+driver, nor on the driver's start.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from pipeline.files import json_text
 from tuning.search_spaces import SearchSpace
 from tuning.tuning_spec import TuningSpec
 
-# Values of each number in the finest grid there is.
+# Values of each number in the finest grid.
 MOST_VALUES = 100
-# Of a product, so that one of many parameters is refused before it fills the memory.
+# The largest grid, so that a grid of many parameters is refused before it fills the memory.
 MOST_POINTS = 1_000_000
 
 
 class SeededSampler(BaseSampler):
-    """A sampler made anew for each trial, and for each parameter that is drawn alone."""
+    """Makes a new sampler for each trial, and for each independently drawn parameter."""
 
     def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
         self._make, self._seed = make, seed
@@ -54,7 +54,7 @@ class SeededSampler(BaseSampler):
     def infer_relative_search_space(
         self, study: Study, trial: FrozenTrial
     ) -> dict[str, BaseDistribution]:
-        # The first that a trial asks; the sampler remembers it for the second.
+        # Optuna calls this first; the sampler is kept for the second call.
         self._sampler = self._made(trial.number)
         return self._sampler.infer_relative_search_space(study, trial)
 
@@ -70,18 +70,18 @@ class SeededSampler(BaseSampler):
         param_name: str,
         param_distribution: BaseDistribution,
     ) -> Any:
-        # By its name: after a kill some of a trial's parameters are in the storage, and not drawn.
+        # Seeded by name, because after a kill some parameters of a trial are stored and not drawn.
         sampler = self._made(trial.number, zlib.crc32(param_name.encode()))
         return sampler.sample_independent(study, trial, param_name, param_distribution)
 
 
 def make_sampler(tuning: TuningSpec) -> BaseSampler:
-    """The sampler that a tuning asks for; of a grid, whose trials are settled, one for nothing.
+    """Make the sampler of a tuning; a grid has fixed trials, and ignores its sampler.
 
-    Options are said although they are version 5's defaults: version 5 changed them. By TPE
-    parameters are drawn together, those that exist only under a condition with the others of that
-    condition (``group``), and settings under way count as bad ones (``constant_liar``), so that
-    trials side by side do not try the same.
+    Options are explicit although they are version 5's defaults, because version 5 changed them. TPE
+    draws parameters jointly (``multivariate``), conditional ones together with others of the same
+    condition (``group``), and treats running trials as bad ones (``constant_liar``), so that
+    parallel trials do not try the same settings.
     """
 
     def make(seed: int) -> BaseSampler:
@@ -112,7 +112,7 @@ def make_sampler(tuning: TuningSpec) -> BaseSampler:
 
 
 class Suggestions:
-    """Entries of hyperparameters by trial; ``shipped`` has what the user has fixed, too."""
+    """Suggests hyperparameters for each trial; ``shipped`` includes the user's fixed settings."""
 
     def __init__(self, tuning: TuningSpec, space: SearchSpace, shipped: Mapping[str, Any]) -> None:
         self.tuning, self.shipped = tuning, dict(shipped)
@@ -121,7 +121,7 @@ class Suggestions:
         self._fixed = self._settled()
 
     def _settled(self) -> dict[str, Any]:
-        """Parameters of settings that the user has fixed."""
+        """The parameters of settings that the user has fixed."""
         given = set(self.tuning.agent.settings)
         dimensions = [each for each in self.space.entries.values() if given.issuperset(each.keys)]
         names = [name for each in dimensions for name in each.distributions]
@@ -129,12 +129,12 @@ class Suggestions:
 
     @property
     def n_free(self) -> int:
-        """How many parameters there are to choose."""
+        """The number of parameters to choose."""
         return len(self.space.distributions().keys() - self._fixed.keys())
 
     @cached_property
     def grid(self) -> list[dict[str, Any]]:
-        """The points of the finest grid that the trials allow, in an order of chance."""
+        """The points of the finest grid that the number of trials allows, in random order."""
         n_trials, found = self.tuning.n_trials - 1, self._points(2)
         if len(found) > n_trials:
             raise UserError(
@@ -151,7 +151,7 @@ class Suggestions:
         return found
 
     def _points(self, n: int) -> list[dict[str, Any]]:
-        """What is asked for at each point, each once: some parameters exist under conditions."""
+        """The distinct points of a grid; conditional parameters can make points equal."""
         values = {**self.space.grid(n), **{name: [v] for name, v in self._fixed.items()}}
         points: dict[str, dict[str, Any]] = {}
         for number, point in enumerate(itertools.product(*values.values())):
@@ -164,13 +164,13 @@ class Suggestions:
 
     @property
     def n_trials(self) -> int:
-        """How many trials there are to do: those of a grid are no more than its points."""
+        """The number of trials; a grid has at most as many as points."""
         if self.tuning.sampler == "grid":
             return min(self.tuning.n_trials, 1 + len(self.grid))
         return self.tuning.n_trials
 
     def params(self, number: int) -> dict[str, Any]:
-        """Parameters of a trial that are settled before any sampler is asked."""
+        """Parameters of a trial that are fixed before sampling."""
         if number == 0:
             return self.first
         if self.tuning.sampler == "grid":
@@ -178,34 +178,34 @@ class Suggestions:
         return self._fixed
 
     def entry(self, trial: Trial) -> dict[str, Any]:
-        """The hyperparameters that a trial is to run with."""
+        """The hyperparameters of a trial."""
         suggested = self.space.suggest(trial)
         if trial.number == 0:
             return self.shipped
         return self.merged(suggested)
 
     def merged(self, suggested: Mapping[str, Any]) -> dict[str, Any]:
-        """The hyperparameters with what is suggested, and what the user has fixed."""
+        """The shipped hyperparameters with suggested settings and the user's fixed settings."""
         entry = self.space.merged(self.shipped, suggested)
         return layered(entry, self.tuning.agent.settings)
 
 
-# The runs of a trial: one for each seed, in folders that equal settings share.
+# The runs of a trial: one for each seed; trials with equal settings share folders.
 
 
 def name_of(entry: Mapping[str, Any]) -> str:
-    """What settings are called: the same for the same, in whatever order they stand."""
+    """The name of settings; independent of their order."""
     text = json_text({key: entry[key] for key in sorted(entry)})
     return f"settings-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
 def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
-    """A run of the agent as it is without the search."""
+    """A planned run of the agent with the initial settings."""
     return plan(replace(tuning.study, n_seeds=1), root)[0]
 
 
 def check_entry(tuning: TuningSpec, root: Path, entry: Mapping[str, Any]) -> None:
-    """Make sure that the agent can be made with settings of the space."""
+    """Check that the agent can be made with settings of the space."""
     where = "its space" if tuning.search_space is None else str(tuning.search_space)
     agent = replace(_agent(tuning, tuning.agent.algo, entry), where=where)
     study = replace(tuning.study, agents=(agent,), n_seeds=1)
@@ -213,7 +213,7 @@ def check_entry(tuning: TuningSpec, root: Path, entry: Mapping[str, Any]) -> Non
 
 
 def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
-    """One run of a trial."""
+    """Plan one run of a trial."""
     agent = _agent(tuning, name_of(entry), entry)
     study = replace(tuning.study, agents=(agent,), first_seed=seed, n_seeds=1)
     (planned,) = plan(study, root)

@@ -1,9 +1,9 @@
-"""Where the trials of a tuning are kept, and how any number of drivers share them.
+"""Stores the trials of a tuning, and shares them between any number of drivers.
 
-A study of Optuna's has as many places as trials were asked for. A driver takes a free one, says in
-it who it is, and gives it back where it is stopped. A place whose driver is gone is free again: the
-same settings are tried on, with the seeds that are done. Optuna's own heartbeat would try them as
-another trial, and a journal has none.
+An Optuna study has one place for each requested trial. A driver claims a free place, records its
+identity there, and gives the place back if it is stopped. A dead driver's place is free again: the
+trial continues with the same settings and the seeds that are done. Optuna's own heartbeat would
+repeat the settings as a new trial, and journal storage has no heartbeat.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from pipeline.locks import FolderGoneError, FolderInUseError, folder_lock, is_go
 from pipeline.signs_of_life import Heartbeat
 from tuning.tuning_spec import OWN_FILE, TuningSpec, kind_of, reason_of, without_secret
 
-SECONDS_TO_WAIT = 120  # for others who write into the same SQLite file
-SECONDS_TO_CONNECT = 15  # to a proxy
+SECONDS_TO_WAIT = 120  # time-out for other writers of the same SQLite file
+SECONDS_TO_CONNECT = 15  # time-out for a proxy
 _LONGEST_LINE = 1 << 20  # bytes
 _TRIES, _SECONDS_BETWEEN_TRIES = 5, 0.2
 _JOURNAL = "journal:"
 _ANY_PORT = 13000  # of Optuna's proxy
 
-# What the study says of all of its trials.
+# Attributes of the study.
 ASKED, JUDGED_BY = "asked", "judged by"
-# What a trial says of itself, besides what Optuna knows.
+# Attributes of a trial, besides Optuna's own data.
 DRIVER, FAILURE, FIGURES = "driver", "failure", "figures"
 SETTINGS, SECONDS = "settings", "seconds"
 
 SECONDS_BETWEEN_SIGNS = 15.0
 SECONDS_OF_SILENCE = 60.0
 _SECONDS_BETWEEN_TURNS = 0.02
-_MOST_NAMED = 3  # of what makes it another search
+_MOST_NAMED = 3  # differences from another search, in a message
 
 
 def open_storage(root: Path, given: str | None) -> BaseStorage:
-    """What ``--storage`` names; a SQLite file in the folder of the tuning where it says nothing."""
+    """Open the storage of ``--storage``; by default, a SQLite file in the tuning's folder."""
     if given is None:
         return _own_file(root / OWN_FILE)
     try:
@@ -72,7 +72,7 @@ def open_storage(root: Path, given: str | None) -> BaseStorage:
 
 
 def _own_file(path: Path) -> BaseStorage:
-    """A SQLite file. In an address, some signs of its path would mean something else."""
+    """Open a SQLite file by path, because in a URL some characters have another meaning."""
 
     def connect() -> sqlite3.Connection:
         return sqlite3.connect(path, timeout=SECONDS_TO_WAIT, check_same_thread=False)
@@ -88,7 +88,7 @@ def _journal(path: Path) -> BaseStorage:
 
 
 def _check_journal(path: Path) -> None:
-    """Refuse a file of something else, before a line is written to it, and one that is cut off."""
+    """Refuse a file that is not a journal, or is truncated, before writing to it."""
     if path.is_dir() or not path.name:
         raise UserError(f"--storage journal:FILE: {path} is no file")
     if not path.exists():
@@ -106,7 +106,7 @@ def _check_journal(path: Path) -> None:
 
 
 def _ends_whole(path: Path) -> bool:
-    """Whether a file ends with a line; if not, after a while in which another may write it."""
+    """Whether a file ends with a complete line; waits a while for another writer."""
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - 1, 0))
         is_whole = file.read(1) in (b"", b"\n")
@@ -121,7 +121,7 @@ def _proxy(url: str) -> BaseStorage:
         raise UserError(f"--storage: which machine? {shown(url)} names none: grpc://HOST:PORT")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ExperimentalWarning)  # of the proxy, since 4.2
+            warnings.simplefilter("ignore", ExperimentalWarning)  # about the proxy, since 4.2
             proxy = GrpcStorageProxy(host=parts.hostname, port=parts.port or _ANY_PORT)
         proxy.wait_server_ready(SECONDS_TO_CONNECT)
     except (ValueError, OSError) as error:
@@ -135,7 +135,7 @@ def _database(url: str) -> BaseStorage:
         if url.partition("://")[2].strip("/") in ("", ":memory:"):
             raise UserError(f"--storage {url}: names no file: sqlite:///FILE")
         options = {"connect_args": {"timeout": SECONDS_TO_WAIT}}
-    # Optuna fills braces in.
+    # Optuna replaces braces.
     return _opened(url.replace("{", "{{").replace("}", "}}"), options, without_secret(url))
 
 
@@ -158,9 +158,9 @@ def open_study(
     sampler: BaseSampler,
     asked: Mapping[str, Any],
 ) -> Study:
-    """The study of a tuning, a new one where there is none; refused where another has its name.
+    """Open or create the study of a tuning; refuses another study of the same name.
 
-    ``asked`` is what makes it this tuning and no other, as JSON.
+    ``asked`` is the identity of the tuning as JSON.
     """
     name = tuning.study.name
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -169,7 +169,7 @@ def open_study(
             study_name=name,
             storage=storage,
             sampler=sampler,
-            pruner=optuna.pruners.NopPruner(),  # what is hopeless is said by `tuning.pruning`
+            pruner=optuna.pruners.NopPruner(),  # `tuning.pruning` decides
             direction="minimize" if tuning.is_cost else "maximize",
             load_if_exists=True,
         )
@@ -184,7 +184,7 @@ def open_study(
 def _difference(name: str, before: Any, asked: Mapping[str, Any]) -> str:
     there, now = _flat(before), _flat(asked)
     named = [
-        # Distributions as JSON are no reading matter.
+        # Distributions as JSON are not readable in a message.
         key
         if key.startswith("search_space")
         else f"{key}: {shown(there.get(key))} there, {shown(now.get(key))} now"
@@ -197,7 +197,7 @@ def _difference(name: str, before: Any, asked: Mapping[str, Any]) -> str:
 
 
 def _flat(asked: object) -> dict[str, Any]:
-    """Settings as they are called, hyperparameters and parts of the space among them."""
+    """Settings by name, including hyperparameters and parts of the search space."""
     flat: dict[str, Any] = {}
     for key, value in asked.items() if isinstance(asked, Mapping) else ():
         if isinstance(value, Mapping):
@@ -211,14 +211,14 @@ def _flat(asked: object) -> dict[str, Any]:
 
 
 class TrialQueue:
-    """The places of a study, as one driver sees them; those beyond ``n_trials`` are left alone.
+    """A driver's view of the places of a study; ignores places beyond ``n_trials``.
 
     Drivers that share the folder ``root`` take turns.
     """
 
     def __init__(self, study: Study, root: Path, n_trials: int) -> None:
         self.study, self.root, self.n_trials = study, root, n_trials
-        # The one that the study asks, which remembers what it has read.
+        # The study's own storage, which caches what it has read.
         self.storage = study._storage
         self._token = secrets.token_hex(8)
         self._n_signs = 0
@@ -226,14 +226,14 @@ class TrialQueue:
         self._heart = Heartbeat(self._beat, SECONDS_BETWEEN_SIGNS)
 
     def add_places(self) -> None:
-        """Make sure that the study has a place for each trial."""
+        """Add missing places, so that the study has one for each trial."""
         with turn(self.root):
             for _ in range(len(self.study.get_trials(deepcopy=False)), self.n_trials):
                 self.study.add_trial(create_trial(state=TrialState.WAITING))
 
     def __enter__(self) -> TrialQueue:
         self.add_places()
-        self.free_dead()  # of a driver that was killed, its trial comes first, as it would have
+        self.free_dead()  # so that a killed driver's trial is continued first
         self.give_sign()
         self._heart.start()
         return self
@@ -242,13 +242,13 @@ class TrialQueue:
         self._heart.stop()
 
     def trials(self) -> list[FrozenTrial]:
-        """All that there is a place for, by number."""
+        """The trials of all places, by number."""
         found = self.study.get_trials(deepcopy=False)
         return sorted(found, key=lambda trial: trial.number)[: self.n_trials]
 
     @property
     def known_figure(self) -> str | None:
-        """What runs of the study are judged by; None before the first."""
+        """The figure by which runs of the study are judged; None before the first run."""
         known = self.study.user_attrs.get(JUDGED_BY)
         return None if known is None else str(known)
 
@@ -258,8 +258,8 @@ class TrialQueue:
         return len(trials) >= self.n_trials and all(t.state.is_finished() for t in trials)
 
     def claim(self, params: Callable[[int], Mapping[str, Any]]) -> Trial | None:
-        """Take a free place, if there is one; ``params`` says what is settled by its number."""
-        with turn(self.root):  # SQLite would let two drivers take the same place
+        """Claim a free place, if there is one; ``params`` gives fixed parameters by its number."""
+        with turn(self.root):  # SQLite would let two drivers claim the same place
             for place in self.trials():
                 number = place._trial_id
                 if place.state != TrialState.WAITING or not self.storage.set_trial_state_values(
@@ -274,7 +274,7 @@ class TrialQueue:
         return None
 
     def give_back(self, trial: Trial) -> None:
-        """Let another driver, or this one later, go on with a trial."""
+        """Free a trial's place, so that another driver, or this one later, continues the trial."""
         with contextlib.suppress(OptunaError, ValueError), turn(self.root):
             now = self.storage.get_trial(trial._trial_id)
             is_mine = now.user_attrs.get(DRIVER, {}).get("token") == self._token
@@ -282,19 +282,19 @@ class TrialQueue:
                 self.storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
 
     def free_dead(self) -> list[int]:
-        """Give back the trials of drivers that are gone; their numbers."""
+        """Free the places of dead drivers' trials; returns the numbers of these trials."""
         if not any(map(self._is_dead, self.trials())):
             return []
         freed = []
         with turn(self.root):
-            for trial in self.trials():  # as they are now: another may have freed them
+            for trial in self.trials():  # read again: another driver may have freed them
                 if self._is_dead(trial):
                     self.storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
                     freed.append(trial.number)
         return freed
 
     def _is_dead(self, trial: FrozenTrial) -> bool:
-        """Whether nobody is at work on it: of a driver elsewhere, once it has long been silent."""
+        """Whether the trial's driver is dead; on another machine, after a time-out."""
         if trial.state != TrialState.RUNNING:
             return False
         owner = trial.user_attrs.get(DRIVER)
@@ -305,7 +305,7 @@ class TrialQueue:
         is_alive = locks.is_alive(owner)
         if is_alive is not None:
             return not is_alive
-        # Without an owner it may have been taken a moment ago.
+        # A trial without an owner may have just been claimed.
         sign, now = self.study.user_attrs.get(f"driver {token}"), time.monotonic()
         last, since = self._heard.setdefault((trial.number, token), (sign, now))
         if last != sign:
@@ -314,34 +314,34 @@ class TrialQueue:
         return now - since > SECONDS_OF_SILENCE
 
     def give_sign(self) -> None:
-        """Tell drivers on other machines that this one is at work."""
+        """Send a heartbeat to drivers on other machines."""
         self._n_signs += 1
         self.study.set_user_attr(f"driver {self._token}", self._n_signs)
 
     def _beat(self) -> None:
-        # A storage that is gone for a moment is no reason to fall silent for good.
+        # After a short failure of the storage, heartbeats must continue.
         with contextlib.suppress(Exception):
             self.give_sign()
 
 
 @contextlib.contextmanager
 def turn(root: Path) -> Iterator[None]:
-    """Be the only driver inside the ``with`` statement, of those that share a folder."""
+    """Lock the shared folder for this driver inside the ``with`` statement."""
     with contextlib.ExitStack() as stack:
         while True:
             if is_gone(root):
                 raise FolderGoneError(root)
             try:
-                # Of a lock that is held for an instant nobody needs to be told.
+                # Without messages, because the lock is held only briefly.
                 stack.enter_context(folder_lock(root, lambda: None, lambda _: None))
                 break
-            except (FolderInUseError, FileNotFoundError):  # another removed it, as it was empty
+            except (FolderInUseError, FileNotFoundError):  # another driver removed the empty folder
                 time.sleep(_SECONDS_BETWEEN_TURNS)
         yield
 
 
 def figures_of(said: Mapping[str, Any]) -> dict[int, float]:
-    """What is known of a trial's seeds; nothing where it is no such thing that stands there."""
+    """The figures of a trial's seeds; empty if the attribute is invalid."""
     given = said.get(FIGURES)
     if not isinstance(given, Mapping):
         return {}
@@ -353,6 +353,6 @@ def figures_of(said: Mapping[str, Any]) -> dict[int, float]:
 
 
 def seconds_of(said: Mapping[str, Any]) -> float:
-    """What the runs of a trial took together, as far as it is said."""
+    """The total time of a trial's runs; 0 if it is not recorded."""
     given = said.get(SECONDS)
     return float(given) if isinstance(given, int | float) else 0.0

@@ -1,4 +1,4 @@
-"""What a tuning is asked to do, as one immutable value, and what a setting is worth to it."""
+"""The specification of a tuning as one immutable value, and the value of a setting."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Objective = Literal["mean", "iqm", "lower"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
-# What a run is judged by: a figure of compare's, the score, or what a threshold took.
+# The figure of a run: a metric of compare.py, the score, or the cost to reach the threshold.
 FIGURES = ("score", *METRICS, "steps", "seconds")
 CHEAPER_IS_BETTER = (*COSTS, "steps", "seconds")
 
@@ -30,67 +30,67 @@ AUTO = "auto"
 SHIPPED = "shipped"
 LOWER = 0.25
 
-# What may change when a tuning goes on; all else makes another tuning.
+# Fields that may change when a tuning is continued; any other change makes another tuning.
 _MAY_CHANGE = ("study", "n_trials", "retest", "retest_seeds", "first_retest_seed")
 
 
 @dataclass(frozen=True)
 class TuningSpec:
-    """A search over settings of one agent on one environment, and the re-test of what it finds."""
+    """A search over settings of one agent on one environment, and the re-test of the best."""
 
-    #: The agent, called `SHIPPED`, as it is without the search, the environment, and what every run
-    #: has in common. Its seeds are those of trials. What the agent's ``settings`` say holds in
-    #: every trial, whatever is suggested.
+    #: The agent with its initial settings, called `SHIPPED`, the environment, and the common
+    #: settings of all runs. Its seeds are the seeds of trials. The agent's ``settings`` are fixed
+    #: in every trial.
     study: StudySpec
-    n_trials: int = 100  #: how many settings to try
-    figure: str = AUTO  #: one of `FIGURES`; or `AUTO`, until it is known what the runs are
-    objective: Objective = "mean"  #: how a setting is judged by its seeds, see `judged`
-    sampler: Sampler = "tpe"  #: what suggests settings
-    pruner: str = "auto"  #: what ends trials early
-    n_startup_trials: int = 10  #: drawn at random before the sampler learns from them
-    seed: int = 0  #: of the sampler, and of the order of seeds
+    n_trials: int = 100  #: number of settings to try
+    figure: str = AUTO  #: one of `FIGURES`; or `AUTO`, until the kind of runs is known
+    objective: Objective = "mean"  #: the value of a setting over its seeds, see `judged`
+    sampler: Sampler = "tpe"  #: the sampler of settings
+    pruner: str = "auto"  #: the rule that ends trials early
+    n_startup_trials: int = 10  #: random trials before the sampler learns
+    seed: int = 0  #: seed of the sampler, and of the order of seeds
     search_space: Path | None = None  #: a file with the space; None for the agent's own
-    retest: int = 3  #: how many of the best are run again on other seeds
-    retest_seeds: int = 20  #: on how many
-    first_retest_seed: int = 1000  #: the first of them
+    retest: int = 3  #: number of best settings in the re-test on held-out seeds
+    retest_seeds: int = 20  #: number of held-out seeds
+    first_retest_seed: int = 1000  #: the first held-out seed
 
     @property
     def agent(self) -> AgentSpec:
-        """The agent as it is without the search."""
+        """The agent with its initial settings."""
         return self.study.agents[0]
 
     @property
     def environment(self) -> EnvironmentSpec:
-        """Where it is tuned."""
+        """The environment of the tuning."""
         return self.study.environments[0]
 
     @property
     def is_cost(self) -> bool:
-        """Whether the lower figure is the better."""
+        """Whether a lower figure is better."""
         return self.figure in CHEAPER_IS_BETTER
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """The seeds of every trial, in the order in which all of them go through these."""
+        """The seeds of every trial, in their common order."""
         order = np.random.default_rng(self.seed).permutation(self.study.n_seeds)
         return tuple(self.study.first_seed + int(place) for place in order)
 
     @property
     def held_out(self) -> range:
-        """The seeds of the re-test."""
+        """The held-out seeds of the re-test."""
         return range(self.first_retest_seed, self.first_retest_seed + self.retest_seeds)
 
     def searched(self, entry: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings as the search runs them, which may be on another engine than the agent's own.
+        """Settings for runs of the search, which may use another engine than the agent's own.
 
-        The library's agents compile wherever ``auto`` does, unless somebody says otherwise. The
-        re-test is of what will be used, and leaves them to the engine that they train in.
+        In the search, the library's agents use ``engine: auto`` unless the settings name an engine.
+        The re-test uses the engine of normal training.
         """
         engines = ALGORITHMS[self.agent.algo].engines
         return {**({"engine": "auto"} if "auto" in engines[1:] else {}), **entry}
 
     def check(self) -> None:
-        """Make sure that the seeds of the search are none of the re-test's."""
+        """Check that search and re-test share no seeds."""
         shared = sorted(set(self.seeds) & set(self.held_out))
         if self.retest and shared:
             raise UserError(
@@ -99,7 +99,7 @@ class TuningSpec:
             )
 
     def identity(self, shipped: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
-        """What makes it this tuning and no other, as JSON."""
+        """The identity of this tuning as JSON."""
         entry = self.searched(shipped)
         data = plain(
             {
@@ -121,14 +121,13 @@ class TuningSpec:
 
 
 def judged(figures: Sequence[float], objective: Objective, *, is_cost: bool) -> float:
-    """What a setting is worth by its runs.
+    """The value of a setting by its runs.
 
     Args:
-        figures: of its runs, at least one.
-        objective: ``mean``; ``iqm``, the mean of the middle half; ``lower``, the quarter below
-            which the worst lie.
-        is_cost: whether the lower figure is the better; ``lower`` is then the quarter above which
-            the worst lie.
+        figures: the figures of its runs, at least one.
+        objective: ``mean``; ``iqm``, the mean of the middle half; ``lower``, the quartile on the
+            side of the worst runs.
+        is_cost: whether a lower figure is better; ``lower`` is then the upper quartile.
     """
     values = np.sort(np.asarray(figures, dtype=np.float64))
     if objective == "mean":
@@ -139,11 +138,11 @@ def judged(figures: Sequence[float], objective: Objective, *, is_cost: bool) -> 
     return float(np.quantile(values, 1 - LOWER if is_cost else LOWER))
 
 
-# What ``--storage`` names, and in a line what a storage fails of: Optuna itself is loaded later.
+# The type of ``--storage``, and one-line messages for its failures: Optuna itself is loaded later.
 
 OWN_FILE = "trials.db"
 KNOWN = "a file for a journal, sqlite:///FILE, postgresql://..., mysql://..., grpc://HOST:PORT"
-# Whose errors are the storage's.
+# Packages whose errors are failures of the storage.
 _LIBRARIES = frozenset({"optuna", "sqlalchemy", "sqlite3", "grpc", "json"})
 _DATABASES = ("sqlite", "postgresql", "mysql", "mariadb")
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://)", re.IGNORECASE)
@@ -151,7 +150,7 @@ _SECRET = re.compile(r"(?<=://)([^\s/@:]*):[^\s/@]*@")
 
 
 def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
-    """What a storage is by its name."""
+    """The type of a storage by its name."""
     scheme = _SCHEME.match(given)
     if scheme is None:
         return "journal"
@@ -162,13 +161,13 @@ def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
 
 
 def without_secret(text: str) -> str:
-    """The text with the password of each address in it left out."""
+    """The text without the passwords in its URLs."""
     return _SECRET.sub(r"\1:***@", text)
 
 
 @contextlib.contextmanager
 def failing_in_a_line(given: str | None) -> Iterator[None]:
-    """Say in one line what the storage fails of, whenever it does: full, gone, or damaged."""
+    """Report a failure of the storage in one line: full, unreachable, or damaged."""
     try:
         yield
     except Exception as error:
@@ -182,7 +181,7 @@ def failing_in_a_line(given: str | None) -> Iterator[None]:
 
 
 def reason_of(error: Exception) -> str:
-    """What a library says in a line, without its questions, its manual's address and passwords."""
+    """A library's message in one line, without questions, links to its manual, and passwords."""
     cause = error.__cause__ if type(error).__name__ == "StorageInternalError" else None
     said = one_line(cause or error)
     for rest in ("(Background on", "[SQL: "):

@@ -1,1 +1,1 @@
-"""What every hand-written agent shares."""
+"""Base classes and functions that all hand-written agents share."""

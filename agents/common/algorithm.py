@@ -1,8 +1,8 @@
 """The base of every hand-written agent: one environment step at a time.
 
 `OnlineAlgorithm` is a Stable-Baselines3 algorithm whose callbacks, logger and Monitor statistics
-behave as those of the library's own off-policy algorithms do. What an agent adds is how it chooses
-actions and what it learns from them.
+behave like those of the library's own off-policy algorithms. Each agent adds how it chooses actions
+and what it learns from them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Transitions:
     """One step of every environment."""
 
     obs: Any  # observations before the step, shape (n_envs, ...)
-    actions: Any  # what was done, shape (n_envs, ...)
+    actions: Any  # actions taken, shape (n_envs, ...)
     rewards: Floats  # float64 of shape (n_envs,)
     terminated: Bools  # the episode ended for good, bool of shape (n_envs,)
     dones: Bools  # it ended for good or was truncated, bool of shape (n_envs,)
@@ -41,10 +41,10 @@ class Transitions:
 
 
 class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
-    """Acts and learns one step at a time, with generators of its own.
+    """Acts and learns one step at a time, with its own random generators.
 
-    Subclasses define `_setup_model`, which calls ``set_random_seed``, and `_choose_actions`, and
-    override `_learn_from` where they learn.
+    Subclasses define `_setup_model`, which calls ``set_random_seed``, and `_choose_actions`.
+    Subclasses that learn override `_learn_from`.
 
     Args:
         policy: name of the policy.
@@ -100,16 +100,16 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
 
     @abstractmethod
     def _choose_actions(self) -> NDArray[Any]:
-        """Actions for `_last_obs`, shape (n_envs, ...)."""
+        """Choose actions for `_last_obs`, shape (n_envs, ...)."""
 
     def _begin_episodes(self) -> None:
-        """Forget what belongs to episodes under way: all environments are about to be reset."""
+        """Drop the state of running episodes: all environments are about to be reset."""
 
     def _learn_from(self, transitions: Transitions) -> None:
-        """Learn from one step of every environment; an agent that does not learn leaves it."""
+        """Learn from one step of every environment; by default, learn nothing."""
 
     def _record_training(self) -> None:
-        """Hand the agent's own figures to the logger, just before it writes."""
+        """Pass the agent's own figures to the logger, just before the logger writes."""
 
     def learn(
         self,
@@ -127,7 +127,7 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
             callback: one or several callbacks, called at every step.
             log_interval: episodes between two log records, or None for none.
             tb_log_name: name of the TensorBoard run; by default the class's name.
-            reset_num_timesteps: start counting anew rather than go on.
+            reset_num_timesteps: restart the step count at 0 instead of continuing it.
             progress_bar: show one.
 
         Returns:
@@ -160,20 +160,20 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        # As in the library, a training of no steps is none, and no error.
+        # As in the library, a training of 0 steps does nothing and is no error.
         self._update_current_progress_remaining(self.num_timesteps, max(self._total_timesteps, 1))
         return total_timesteps, callback
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        """Step until ``num_timesteps`` is reached or a callback asks to stop."""
+        """Step until ``total_timesteps`` is reached or a callback asks to stop."""
         while self.num_timesteps < total_timesteps and self._step(callback, log_interval):
             pass
 
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Act, tell the callbacks, learn; False once a callback asks to stop.
 
-        The order is that of the library's off-policy algorithms. Unlike there, the last transition
-        is learnt from even when a callback stops the training on it.
+        The order is that of the library's off-policy algorithms. Unlike them, the agent learns from
+        the last transition even if a callback stops the training there.
         """
         assert self.env is not None
         callback.on_rollout_start()
@@ -181,7 +181,7 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         new_obs, rewards, dones, infos = self.env.step(actions)
         self.num_timesteps += self.env.num_envs
 
-        # Written out, since `locals()` would take longer than all that callbacks do.
+        # Written out, because `locals()` would take longer than all callbacks together.
         callback.update_locals(
             {
                 "obs": obs,
@@ -216,8 +216,8 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
     def dump_logs(self) -> None:
         """Write the log: episode statistics, speed, and what the agent records.
 
-        Where nothing reads it, nothing is worked out; what others have recorded is forgotten then,
-        as it is when it has been written.
+        If nothing reads the log, this computes nothing. It still clears the recorded values, as
+        writing them would.
         """
         if not is_read(self.logger):
             self.logger.dump(self.num_timesteps)
@@ -228,8 +228,8 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the agent's generators, its action space and its environments.
 
-        The global generators of NumPy, Python and torch are left alone: no hand-written agent draws
-        from them.
+        It does not seed the global generators of NumPy, Python and torch, because no hand-written
+        agent draws from them.
         """
         self.rng, self.predict_rng = np.random.default_rng(seed).spawn(2)
         if seed is None:
@@ -240,10 +240,10 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
 
 
 def is_read(logger: Logger) -> bool:
-    """Whether a logger writes anything; True for one that was changed by hand, as it may do so.
+    """Whether a logger writes anything; True for a logger that was changed by hand.
 
-    ``learn`` makes one without outputs where nothing else was asked for. One that is disabled keeps
-    what is recorded.
+    ``learn`` makes a logger without outputs if the user asked for none. A disabled logger keeps
+    recorded values.
     """
     by_hand = any(hasattr(Logger, name) for name in vars(logger))
     changed = type(logger) is not Logger or by_hand
@@ -251,7 +251,7 @@ def is_read(logger: Logger) -> bool:
 
 
 def true_outcome(new_obs: Any, dones: Bools, infos: list[dict[str, Any]]) -> tuple[Any, Bools]:
-    """What the environments showed before they were reset, and whether they had terminated.
+    """The observations before any reset, and whether each environment had terminated.
 
     A VecEnv resets a finished environment within the same step.
     """

@@ -1,7 +1,7 @@
-"""How far training may run before a callback has to be asked.
+"""Callbacks that say how many steps training may run before they act again.
 
-The compiled engine takes many steps at once. A block of steps ends where a callback can act, so
-that everything happens at the same time step as in a loop that asks after each step.
+The compiled engine takes many steps in one block. A block ends at the step where a callback may
+act, so callbacks act at the same time steps as in a loop that calls them after each step.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ NEVER = 2**62
 
 @dataclass(frozen=True)
 class Horizon:
-    """When a callback may act next.
+    """The earliest moment at which a callback may act.
 
     Attributes:
-        calls: number of the call of ``on_step``, counted from now, on which it may act.
-        episodes: number of ended episodes, counted from now, on which it may act.
+        calls: number of calls of ``on_step`` from now until the callback may act.
+        episodes: number of ended episodes from now until the callback may act.
     """
 
     calls: int = NEVER
@@ -41,29 +41,29 @@ class Horizon:
 
 
 class BlockCallback(BaseCallback):
-    """A callback that says when it will act, so that it need not be called before that.
+    """A callback that says when it will act, so that the engine need not call it earlier.
 
-    The short way is ``every_n_steps``: `_on_step` is called then, and at no other step, by every
-    algorithm and every engine. Whoever wants other moments says them in `horizon` and looks in
-    `_on_step` whether this is one: it is called wherever any callback acts.
+    The simple way is ``every_n_steps``: every algorithm and engine then calls `_on_step` at these
+    steps only. For other moments, override `horizon`, and check in `_on_step` whether the moment
+    has come: `_on_step` is called whenever any callback acts.
 
     Attributes:
         every_n_steps: environment steps between two calls of `_on_step`, counted over all
-            environments since ``num_timesteps`` was 0; where several environments step at once, it
-            is called after the step that reaches a multiple or passes it. ``n_calls`` goes on
-            counting all steps. None for what `horizon` says.
-        takes_blocks: whether ``_on_rollout_start`` and ``_on_rollout_end`` may be called around
-            each block of steps that compiled networks train for. Else blocks end with rollouts.
+            environments since ``num_timesteps`` was 0; if several environments step at once, the
+            call comes after the step that reaches or passes a multiple. ``n_calls`` still counts
+            all steps. None: `horizon` decides.
+        takes_blocks: whether the engine may call ``_on_rollout_start`` and ``_on_rollout_end``
+            around each block of compiled networks. If not, a block ends with each rollout.
 
     Raises:
-        ValueError: at the start of the training, if ``every_n_steps`` is no number from 1 on.
+        ValueError: at the start of the training, if ``every_n_steps`` is not a number >= 1.
     """
 
     every_n_steps: int | None = None
     takes_blocks: ClassVar[bool] = False
 
     def init_callback(self, model: BaseAlgorithm) -> None:
-        """Take note of the model."""
+        """Store the model."""
         every: object = self.every_n_steps
         if every is not None and not (isinstance(every, int) and every >= 1):
             name = type(self).__name__
@@ -71,7 +71,7 @@ class BlockCallback(BaseCallback):
         super().init_callback(model)
 
     def on_step(self) -> bool:
-        """Count the step, and act where that is due."""
+        """Count the step, and call `_on_step` if it is due."""
         if self.every_n_steps is None:
             return super().on_step()
         self.n_calls += 1
@@ -80,22 +80,22 @@ class BlockCallback(BaseCallback):
         return self._on_step() if is_due else True
 
     def horizon(self) -> Horizon:
-        """When it may act next; without ``every_n_steps`` never by itself."""
+        """When the callback may act next; without ``every_n_steps`` never."""
         if self.every_n_steps is None:
             return Horizon()
         steps = self.every_n_steps - self.num_timesteps % self.every_n_steps
         return Horizon(calls=-(-steps // self.training_env.num_envs))
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
-        """Count ``n_calls`` calls that were left out, in which ``n_episodes`` ended."""
+        """Count ``n_calls`` skipped calls, during which ``n_episodes`` ended."""
         self.n_calls += n_calls
 
     def wants_position(self) -> bool:
-        """Whether, at the start of the next rollout, it reads or changes where environments are."""
+        """Whether the callback reads or changes environments at the start of the next rollout."""
         return False
 
     def at_safe_moment(self) -> None:
-        """Between two updates, with no step under way: told by agents whose rollouts lie inside."""
+        """Hook between two updates, when no step is running; called inside rollouts too."""
 
 
 class EpisodeBudget(BlockCallback):
@@ -126,7 +126,7 @@ class EpisodeBudget(BlockCallback):
 
 
 def calls_until_multiple(n_calls: int, frequency: int) -> int:
-    """Calls until their number is a multiple of ``frequency``; never where that is below 1."""
+    """Calls until the count is a multiple of ``frequency``; never if ``frequency`` < 1."""
     return frequency - n_calls % frequency if frequency > 0 else NEVER
 
 
@@ -151,14 +151,14 @@ _LIBRARY_HORIZONS: dict[type[BaseCallback], Callable[[Any], Horizon]] = {
 
 
 def members(callback: BaseCallback) -> list[BaseCallback]:
-    """The callback, or those in it where it is a list, down to the last."""
+    """The callback, or for a callback list all members, nested lists included."""
     if type(callback) is CallbackList:
         return [callback, *(m for child in callback.callbacks for m in members(child))]
     return [callback]
 
 
 def unknown_callbacks(callback: BaseCallback) -> list[str]:
-    """Names of the callbacks that must be asked after each step, each once."""
+    """Names of the callbacks that must be called after each step, without repeats."""
     names = (type(member).__name__ for member in members(callback) if not _is_known(member))
     return list(dict.fromkeys(names))
 
@@ -171,7 +171,7 @@ def _is_known(callback: BaseCallback) -> bool:
 
 
 def horizon(callback: BaseCallback) -> Horizon:
-    """When the first of the callbacks may act."""
+    """The earliest moment at which one of the callbacks may act."""
     horizons = []
     for member in members(callback):
         ask = getattr(member, "horizon", None)
@@ -186,7 +186,7 @@ def horizon(callback: BaseCallback) -> Horizon:
 
 
 def heeds_rollouts(callback: BaseCallback) -> bool:
-    """Whether it acts where a rollout begins or ends, and cannot take blocks of steps for them."""
+    """Whether the callback acts at the start or end of a rollout, and cannot take blocks."""
     kind = type(callback)
     if kind is CallbackList or getattr(kind, "takes_blocks", False):
         return False
@@ -195,7 +195,7 @@ def heeds_rollouts(callback: BaseCallback) -> bool:
 
 
 def wants_position(callback: BaseCallback) -> bool:
-    """Whether one of the callbacks does, see `BlockCallback.wants_position`."""
+    """Whether `BlockCallback.wants_position` holds for one of the callbacks."""
     return any(isinstance(m, BlockCallback) and m.wants_position() for m in members(callback))
 
 
@@ -207,7 +207,7 @@ def tell_safe_moment(callback: BaseCallback) -> None:
 
 
 def pass_over(callback: BaseCallback, n_calls: int, n_episodes: int) -> None:
-    """Let each of the callbacks count calls that were left out."""
+    """Let each callback count skipped calls."""
     for member in members(callback):
         if hasattr(member, "pass_over"):
             member.pass_over(n_calls, n_episodes)

@@ -1,7 +1,7 @@
-"""How an agent that knows the value of each action chooses one.
+"""Chooses an action by the values of all actions.
 
-Pure compiled functions: they are handed their random numbers, so that an interpreted and a compiled
-training loop that draw from the same generator choose the same actions. A choice takes a row of
+All functions are pure and compiled. They take their random numbers as arguments, so an interpreted
+and a compiled loop with the same generator choose the same actions. A choice takes a row of
 `draws_per_choice` numbers: standard normal ones for `GAUSSIAN_NOISE`, else uniform in [0, 1).
 
 Sutton and Barto (2nd edition): epsilon-greedy section 2.2, softmax section 2.8.
@@ -46,8 +46,8 @@ def highest_value(values: Floats) -> float:
 
 @inlined
 def greedy_action(values: Floats, uniform: float) -> int:
-    """A best action; ``uniform`` picks among ties, and 0 picks the first, as argmax does."""
-    # Without branches: which value is higher is hard to foresee, for a processor as well.
+    """An action of highest value; ``uniform`` breaks ties, and 0 takes the first, like argmax."""
+    # Without branches: a processor cannot predict well which value is higher.
     highest = values[0]
     best_action = 0
     n_best = 1
@@ -79,7 +79,7 @@ def first_best(values: Any) -> int:
 
 @inlined
 def random_action(strategy: int, n_actions: int, rate: float, draws: Floats) -> int:
-    """The action that is chosen whatever the values are; -1 where they decide."""
+    """A random action chosen regardless of the values; -1 if the values decide."""
     if strategy == EPSILON_GREEDY and draws[0] < rate:
         return int(draws[1] * n_actions)
     return -1
@@ -94,7 +94,7 @@ def epsilon_greedy_action(values: Floats, epsilon: float, tie_scale: float, draw
 
 @inlined
 def softmax_weight(value: float, highest: float, temperature: float) -> float:
-    """exp((value - highest) / temperature), and its limit where a schedule has come to 0."""
+    """exp((value - highest) / temperature), or its limit if the temperature is 0."""
     if temperature <= 0.0:
         return 1.0 if value == highest else 0.0
     return math.exp((value - highest) / temperature)
@@ -128,7 +128,7 @@ def make_probabilities(preferences: Floats) -> None:
 
 @inlined
 def drawn_action(probabilities: Floats, uniform: float) -> int:
-    """The action on which ``uniform``, in [0, 1), falls."""
+    """Draw an action by its probability with ``uniform``, a number in [0, 1)."""
     for action in range(len(probabilities) - 1):
         uniform -= probabilities[action]
         if uniform < 0.0:
@@ -138,7 +138,7 @@ def drawn_action(probabilities: Floats, uniform: float) -> int:
 
 @inlined
 def noisy_greedy_action(values: Floats, noise_std: float, draws: Floats) -> int:
-    """The best action after Gaussian noise of standard deviation ``noise_std`` on each value."""
+    """The best action after adding Gaussian noise (``noise_std``) to each value."""
     best_action = 0
     best_value = values[0] + noise_std * draws[0]
     for action in range(1, len(values)):
@@ -153,7 +153,7 @@ def noisy_greedy_action(values: Floats, noise_std: float, draws: Floats) -> int:
 def choose_action(
     strategy: int, values: Floats, rate: float, tie_scale: float, draws: Floats
 ) -> int:
-    """Choose by ``strategy``.
+    """Choose an action by ``strategy``.
 
     ``rate`` is epsilon, a temperature or a standard deviation; ``tie_scale`` 1 breaks ties at
     random, 0 takes the first; ``draws`` are random numbers, shape (draws_per_choice,).
@@ -169,8 +169,8 @@ def choose_action(
 def expected_value(strategy: int, values: Floats, rate: float) -> float:
     """Mean of ``values``, shape (A,), under the exploring policy.
 
-    Ties do not matter, since tied actions are of equal value. Gaussian noise has no closed form and
-    is refused where an agent is built.
+    Ties do not matter, because tied actions have equal values. Gaussian noise has no closed form,
+    so agents that need this mean refuse it.
     """
     highest = highest_value(values)
     if strategy == EPSILON_GREEDY:
@@ -191,7 +191,7 @@ def expected_value(strategy: int, values: Floats, rate: float) -> float:
 def action_probability(
     strategy: int, values: Floats, rate: float, tie_scale: float, action: int
 ) -> float:
-    """How probable one action is, as `action_probabilities` has it of all."""
+    """The probability of one action; equals its entry in `action_probabilities`."""
     highest = highest_value(values)
     if strategy == EPSILON_GREEDY:
         n_best, n_before = 0, 0
@@ -219,7 +219,7 @@ def action_probabilities(
 ) -> Floats:
     """The exploring policy as a matrix of the shape of ``values``, (S, A).
 
-    Where a row of ``masks`` is False, or there are no rows, all actions are allowed.
+    If a row of ``masks`` is all False, or ``masks`` has no rows, all actions are allowed.
     """
     if strategy == GAUSSIAN_NOISE:
         raise ValueError("Gaussian noise on the values has no closed-form action probabilities")

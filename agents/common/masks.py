@@ -1,4 +1,4 @@
-"""Which actions the environment allows: read from it, checked, and kept by policies."""
+"""Action masks: reads them from environments, checks them, and stores them in policies."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from envs.known_models import action_masks_of_states, observations_of_states
 from envs.wrappers import METHOD, action_masks, mask_source
 from mdp.transition_model import Bools, Ints
 
-# Observations of `Discrete` spaces, as tables are looked up by them.
+# Observations of `Discrete` spaces, as indices of tables.
 
 
 def numbers_in(space: Any, observations: Any) -> Ints:
-    """Observations as whole numbers, in their own shape; ValueError for one outside the space."""
+    """Observations as integers of the same shape; ValueError for one outside the space."""
     given = np.asarray(observations)
     outside = given[~((given >= 0) & (given < space.n) & (given == np.floor(given)))]
     if outside.size:
@@ -25,11 +25,11 @@ def numbers_in(space: Any, observations: Any) -> Ints:
     return given.astype(np.int64)
 
 
-# Action masks of environments in a VecEnv, checked: what agents with ``mask_actions`` ask for.
+# Checked action masks of the environments in a VecEnv, for agents with ``mask_actions``.
 
 
 def check_masks_exist(env: VecEnv) -> None:
-    """Refuse environments that do not say what may be done."""
+    """Refuse environments that have no action masks."""
     inside = env.unwrapped
     if isinstance(inside, DummyVecEnv):
         found = all(mask_source(one) is not None for one in inside.envs)
@@ -43,7 +43,7 @@ def check_masks_exist(env: VecEnv) -> None:
 
 
 def present_masks(env: VecEnv, obs: Any) -> Bools:
-    """What may be done now, bool of shape (n_envs, n_actions); ``obs`` is named in errors."""
+    """The current masks, bool of shape (n_envs, n_actions); errors name ``obs``."""
     inside = env.unwrapped
     if isinstance(inside, DummyVecEnv):
         masks = [action_masks(one) for one in inside.envs]
@@ -69,10 +69,10 @@ def checked_masks(masks: Any, obs: Any, n_actions: int) -> Bools:
 
 
 def masks_of_observations(env: VecEnv, n_observations: int) -> Bools | None:
-    """What may be done at each observation, bool of shape (n_observations, n_actions).
+    """The mask of each observation, bool of shape (n_observations, n_actions).
 
-    A row is False for what is observed in no state. None where masks are not known for all states,
-    or differ between environments or between states that look alike.
+    The row of an observation that no state has is all False. The result is None if masks are not
+    known for all states, or differ between environments or between states that look alike.
     """
     inside = env.unwrapped
     if not isinstance(inside, DummyVecEnv):
@@ -92,31 +92,31 @@ def masks_of_observations(env: VecEnv, n_observations: int) -> Bools | None:
     return found
 
 
-# Policies that keep what the environment allows at each observation.
+# Policies that store the mask of each observation.
 
 
 class MaskBufferPolicy(TablePolicy):
-    """A policy that may hold a mask for each observation, in its model file too."""
+    """A policy that can store a mask for each observation, also in its model file."""
 
-    # Bool of shape (S, A), a row of False where masks are not known; there after `keep_masks`.
+    # Bool of shape (S, A), rows of False for unknown masks; exists after `keep_masks`.
     allowed_actions: th.Tensor
 
     def keep_masks(self) -> None:
-        """Make room for what the environment allows, where both spaces are `Discrete`."""
+        """Create the mask buffer if both spaces are `Discrete`."""
         sizes: Any = (self.observation_space, self.action_space)
         shape = tuple(int(space.n) for space in sizes)
         self.register_buffer("allowed_actions", th.zeros(shape, dtype=th.bool))
 
     @property
     def masks(self) -> Bools:
-        """`allowed_actions` as an array that shares its memory, of no rows where there are none."""
+        """`allowed_actions` as an array that shares its memory; without masks it has no rows."""
         if "allowed_actions" not in self._buffers:
             n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
             return np.zeros((0, n_actions), dtype=np.bool_)
         return np.asarray(self.allowed_actions.numpy())
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over tables; an agent may go by masks that was saved without them, or no longer."""
+        """Load tables; masks may be missing in the file, and are ignored if unused here."""
         tables = {name: state_dict[name] for name in state_dict if name != "allowed_actions"}
         if "allowed_actions" in self._buffers:
             unknown = th.zeros_like(self.allowed_actions)

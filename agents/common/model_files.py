@@ -1,4 +1,4 @@
-"""Model files without pickles: tables as ``policy.pth``, everything else as JSON."""
+"""Reads and writes model files without pickles: tables as ``policy.pth``, the rest as JSON."""
 
 from __future__ import annotations
 
@@ -45,35 +45,35 @@ from safe_files.files import (
 from safe_files.known_objects import check_values, load_tensors
 from safe_files.models import charged_tensors, hides
 
-# `encode` turns the attributes of an agent into JSON, `decode` turns them back. An object of
-# another kind is written as ``{"type": name, ...}`` and rebuilt from the fixed table `CODECS`, so
-# that reading a file can build nothing else.
+# `encode` turns the attributes of an agent into JSON, `decode` reverses it. An object that JSON
+# lacks is written as ``{"type": name, ...}`` and rebuilt by the fixed table `CODECS`, so reading a
+# file can build nothing else.
 
 TYPE = "type"
 
-# Of a space: no table is larger, and each has a row or a column for each of them.
+# Largest number of elements in a space: each table has a row or a column for each element.
 _MAX_VALUES = 10_000_000
 
-# Truth values and numbers of at most 64 bits, which JSON holds without loss.
+# Booleans and numbers of at most 64 bits, which JSON stores without loss.
 _ARRAY_DTYPE = re.compile(r"[<>|][biuf][1248]")
 
-# What building an object of the wrong values raises.
+# Exceptions that a constructor may raise for wrong values.
 _DAMAGE = (TypeError, LookupError, AttributeError, AssertionError, ArithmeticError, RecursionError)
 
-# What most of an agent's attributes are made of.
+# Types of most attributes of an agent.
 _AS_THEY_ARE = frozenset({type(None), bool, int, float, str})
 
 
 class UnknownTypeError(TypeError):
-    """An object that the file format has no place for."""
+    """The file format cannot represent an object."""
 
 
 @dataclass(frozen=True)
 class Codec:
-    """How objects of one class are taken apart and built again."""
+    """Encodes and decodes the objects of one class."""
 
     cls: type
-    # For each field of the file, how it is read off an object.
+    # For each field in the file, the function that reads its value from an object.
     fields: Mapping[str, Callable[[Any], Any]]
     build: Callable[..., Any]
 
@@ -82,7 +82,7 @@ def encode(value: Any) -> Any:
     """Turn ``value`` into JSON."""
     if type(value) in _AS_THEY_ARE:
         return value
-    if type(value) is dict:  # as its codec has it, for the hundred of them that Monitor has told of
+    if type(value) is dict:  # fast path for Monitor's hundred episode records
         return {TYPE: "dict", "pairs": [_encode_all(pair) for pair in value.items()]}
     if isinstance(value, np.generic):
         value = value.item()
@@ -102,7 +102,7 @@ def _encode_all(values: Iterable[Any]) -> list[Any]:
 
 
 def decode(data: Any) -> Any:
-    """Rebuild what `encode` wrote."""
+    """Rebuild the value that `encode` wrote."""
     if isinstance(data, list):
         return [decode(item) for item in data]
     if not isinstance(data, dict):
@@ -124,7 +124,7 @@ def _attributes(*names: str) -> dict[str, Callable[[Any], Any]]:
 
 
 def _space(cls: type, make: Callable[..., Any], **fields: Callable[[Any], Any]) -> Codec:
-    """A space travels with its generator, so that it goes on sampling where it was."""
+    """Rebuild a space with its generator, so that sampling continues where it was."""
 
     def build(*values: Any) -> Any:
         *arguments, rng = values
@@ -142,7 +142,7 @@ def _pairs(mapping: Mapping[Any, Any]) -> list[list[Any]]:
 
 
 def _generator_state(generator: np.random.Generator) -> Mapping[str, Any]:
-    # The kind that `default_rng` makes, and the only one that `_generator` makes again.
+    # `default_rng` makes this kind, and `_generator` rebuilds only this kind.
     if not isinstance(generator.bit_generator, np.random.PCG64):
         raise UnknownTypeError(f"cannot be written as JSON: {generator}")
     return generator.bit_generator.state
@@ -182,7 +182,7 @@ def _box(low: np.ndarray[Any, Any], high: np.ndarray[Any, Any]) -> spaces.Box:
 
 
 def _dict_space(pairs: list[list[Any]]) -> spaces.Dict:
-    # Pairs, since a Dict space puts the keys of a plain mapping into an order of its own.
+    # Pairs, because a Dict space sorts the keys of a plain mapping.
     return spaces.Dict([(key, space) for key, space in pairs])
 
 
@@ -218,9 +218,9 @@ MOST_ENVS = 100_000
 
 
 class JsonAlgorithm(BaseAlgorithm):
-    """An algorithm whose zip holds JSON where the library's holds pickles."""
+    """An algorithm whose zip contains JSON instead of the library's pickles."""
 
-    # Rebuilt by `_setup_model`, or belonging to one process alone.
+    # `_setup_model` rebuilds these, or they belong to one process.
     _rebuilt: ClassVar[tuple[str, ...]] = ("lr_schedule", "policy_class", "start_time")
 
     def save(
@@ -232,9 +232,9 @@ class JsonAlgorithm(BaseAlgorithm):
         """Write the agent as a zip: JSON for its attributes, ``policy.pth`` for its tables.
 
         Args:
-            path: where to; ``.zip`` is appended where a path has no suffix.
+            path: the target; ``.zip`` is appended to a path without a suffix.
             exclude: attributes to leave out.
-            include: attributes to write although they are left out by default.
+            include: attributes to write that are left out by default.
         """
         left_out = {*self._excluded_save_params(), *self._rebuilt, *(exclude or ())}
         left_out -= set(include or ())
@@ -254,7 +254,7 @@ class JsonAlgorithm(BaseAlgorithm):
         except UnknownTypeError:
             if not callable(value):
                 raise
-            # Losing what was learnt would be worse than losing the shape of a schedule.
+            # Losing the learnt tables would be worse than losing the shape of a schedule.
             present = float(value(self._current_progress_remaining))
             warnings.warn(
                 f"{name} is a Python function, which a model file cannot hold: "
@@ -274,28 +274,28 @@ class JsonAlgorithm(BaseAlgorithm):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> Self:
-        """Build the agent anew from a zip that `save` wrote.
+        """Build an agent from a zip that `save` wrote.
 
         Args:
-            path: where the zip lies.
-            env: environment to go on with, or None to predict only.
+            path: the zip.
+            env: environment for further training, or None to predict only.
             device: ignored, as tables live on the CPU.
-            custom_objects: values that replace those of the same name in the file, which are not
-                read then; other names are passed over, as the library does.
+            custom_objects: values that replace those of the same name in the file; the replaced
+                ones are not read. Unknown names are ignored, as in the library.
             print_system_info: print the library versions that the file was written with.
             force_reset: begin a new episode at the next `learn`.
             kwargs: attributes to change.
 
         Raises:
-            ValueError: if the zip is of another agent, or damaged, or does not fit ``env``; or if
-                ``custom_objects`` is no dictionary.
+            ValueError: if the zip holds another agent, is damaged, or does not fit ``env``; or if
+                ``custom_objects`` is not a dictionary.
         """
         content = _content(path)
         budget = Budget(len(content))
         members = read_members(content, MEMBERS, budget)
         if print_system_info:
             text = members.get("system_info.txt", b"").decode("ascii", "replace")
-            # Nothing that a terminal obeys.
+            # No control characters for the terminal.
             sys.stdout.writelines(f"{shown(line)[1:-1]}\n" for line in text.splitlines())
         data = {**cls._read_data(members, budget, path, custom_objects), **kwargs}
         if env is not None:
@@ -311,12 +311,12 @@ class JsonAlgorithm(BaseAlgorithm):
             if not isinstance(data.get(name), spaces.Space):
                 raise UnsafeFileError(f"does not say its {name}")
         n_envs = data.get("n_envs")
-        # An agent makes room for the episodes of all its environments as soon as it is made.
+        # The constructor allocates memory for the episodes of all environments.
         if not isinstance(n_envs, int) or not 1 <= n_envs <= MOST_ENVS:
             raise UnsafeFileError(
                 f"is of an agent on {shown(n_envs)} environments, not on 1 to {MOST_ENVS}"
             )
-        # Without a seed, setting up leaves alone what was saved with its state.
+        # With seed None, `_setup_model` does not reseed the loaded spaces.
         model.__dict__.update({**data, "seed": None})
         with charged_tensors(budget):
             model._setup_model()
@@ -336,7 +336,7 @@ class JsonAlgorithm(BaseAlgorithm):
         path: Any,
         replaced: dict[str, Any] | None,
     ) -> dict[str, Any]:
-        """The decoded attributes of a zip of this very class, but for those that are replaced."""
+        """The decoded attributes of a zip of this class, without the replaced ones."""
         if not (replaced is None or isinstance(replaced, dict)):
             raise ValueError("custom_objects must be a dictionary or None")
         known = replaced or {}
@@ -349,13 +349,13 @@ class JsonAlgorithm(BaseAlgorithm):
         return {
             name: known[name] if name in known else decode(value)
             for name, value in raw.items()
-            # Files that are older may hold more.
+            # Older files may contain more.
             if name not in cls._rebuilt
         }
 
 
 def _content(path: str | Path | io.BufferedIOBase) -> bytes:
-    """All of a file, read once; ``.zip`` is appended where there is none of that name."""
+    """The whole file, read once; ``.zip`` is appended if no file of that name exists."""
     if not isinstance(path, io.BufferedIOBase):
         path = Path(path)
         if not path.exists():
@@ -364,7 +364,7 @@ def _content(path: str | Path | io.BufferedIOBase) -> bytes:
 
 
 def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:
-    """Make sure that a file sets only what a new agent has, and hides none of its methods."""
+    """Check that a file sets only attributes of a new agent, and hides no method."""
     declared = (vars(cls).get("__annotations__", {}) for cls in type(model).__mro__)
     known = {*vars(model)}.union(*declared)
     for name in data:
@@ -373,9 +373,9 @@ def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:
 
 
 def _check_tables(found: Any, expected: Mapping[str, th.Tensor]) -> None:
-    """Make sure that tables are of numbers, and of the kind that a new agent's have.
+    """Check that tables hold numbers, of the same dtype as in a new agent.
 
-    PyTorch would turn one kind into another; of shapes, the policies make sure themselves.
+    PyTorch would convert one dtype into another. The policies check the shapes themselves.
     """
     if not isinstance(found, dict):
         raise UnsafeFileError(f"holds no {TABLES}")
@@ -383,7 +383,7 @@ def _check_tables(found: Any, expected: Mapping[str, th.Tensor]) -> None:
         like = expected.get(key)
         if not isinstance(table, th.Tensor) or (like is not None and table.dtype != like.dtype):
             raise UnsafeFileError(f"{TABLES}: {shown(key)} is not of the kind of such agents")
-        # Scores of arms that were never pulled are infinite from the beginning.
+        # The score of an arm is infinite until its first pull.
         if like is not None and like.shape == table.shape and bool(th.isinf(like).any()):
             check_values({"policy": {key: table[~th.isinf(table)]}})
         else:
@@ -391,10 +391,10 @@ def _check_tables(found: Any, expected: Mapping[str, th.Tensor]) -> None:
 
 
 def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
-    """The members that the library writes, with the JSON at the end.
+    """The zip with the members that the library writes, the JSON last.
 
-    A line for each attribute: indented further, as the library does it, writing takes Python twice
-    as long as all the rest.
+    The JSON has one line for each attribute. With the library's deeper indentation, writing would
+    take twice as long as all the rest.
     """
     members = {"pytorch_variables.pth": _saved({})}
     members |= {f"{name}.pth": _saved(tables) for name, tables in params.items()}
@@ -421,19 +421,19 @@ def _system_info() -> str:
 
 
 class TablePolicy(BasePolicy):
-    """A policy whose knowledge is in buffers, which live on the CPU."""
+    """A policy that stores what it has learnt in buffers on the CPU."""
 
     def _sizes(self) -> dict[str, Any]:
-        """Arguments of the constructor without which the buffers would have other shapes."""
+        """The constructor's arguments that determine the shapes of the buffers."""
         return {}
 
     @classmethod
     def _remade(cls, arguments: Mapping[str, Any]) -> Self:
-        """A new policy from its spaces and what `_sizes` said."""
+        """A new policy from its spaces and the result of `_sizes`."""
         return cls(**arguments)
 
     def save(self, path: str) -> None:
-        """Write tensors, and what else the policy is made of as JSON: no pickle that is run."""
+        """Write the tensors, and the policy's arguments as JSON, so that loading runs no code."""
         data = {
             "observation_space": self.observation_space,
             "action_space": self.action_space,
@@ -444,7 +444,7 @@ class TablePolicy(BasePolicy):
 
     @classmethod
     def load(cls, path: str, device: th.device | str = "cpu") -> Self:
-        """Load a policy that `save` wrote; nothing in the file is run."""
+        """Load a policy that `save` wrote; loading runs no code from the file."""
         content = read_file(Path(path), MAX_ARCHIVE_BYTES)
         budget = Budget(len(content))
         saved = load_tensors(content, budget)

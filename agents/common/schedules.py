@@ -1,8 +1,8 @@
 """Schedules of a number over training, beside those of Stable-Baselines3.
 
 A schedule maps ``progress_remaining``, which falls from 1 at the first step to 0 at the last, to a
-value. `schedule_row` puts the schedules known here into four numbers, so that compiled code can
-evaluate them; `schedule_value` does so, and is the only place where the arithmetic stands.
+value. `schedule_row` writes a known schedule as four numbers, so that compiled code can evaluate
+it. `schedule_value` evaluates these four numbers, and is the only place with the arithmetic.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ EXPONENTIAL = 1.0
 
 
 class ScheduleRow(NamedTuple):
-    """A schedule as four numbers, which a record of compiled code holds as well."""
+    """A schedule as four numbers; records of compiled code store the same four."""
 
     kind: float  # `LINEAR` or `EXPONENTIAL`
     start: float  # the value at the first step
@@ -32,12 +32,12 @@ class ScheduleRow(NamedTuple):
 
 @inlined
 def schedule_value(schedule: ScheduleRow, progress_remaining: float) -> float:
-    """Value of a schedule, where ``progress_remaining`` falls from 1 to 0."""
+    """The value of a schedule at ``progress_remaining``, which falls from 1 to 0."""
     elapsed = 1.0 - progress_remaining
     if elapsed > schedule.end_fraction:
         return schedule.end
     if schedule.kind == LINEAR:
-        if schedule.start == schedule.end:  # a division at every step, for nothing
+        if schedule.start == schedule.end:  # saves a division at every step
             return schedule.start
         change = elapsed * (schedule.end - schedule.start)
         return schedule.start + change / schedule.end_fraction
@@ -46,7 +46,7 @@ def schedule_value(schedule: ScheduleRow, progress_remaining: float) -> float:
 
 
 class ExponentialSchedule:
-    """Decay from ``start`` to ``end`` by a constant factor a step.
+    """Decay from ``start`` to ``end`` by a constant factor per step.
 
     Args:
         start: the value at the first step, above 0.
@@ -79,10 +79,10 @@ class ExponentialSchedule:
 
 
 def library_schedule(schedule: ExponentialSchedule) -> Schedule:
-    """The same schedule out of PyTorch's parts: exp(log(end) + log(start / end) * remaining).
+    """The schedule from PyTorch classes: exp(log(end) + log(start / end) * remaining).
 
-    A library agent's zip pickles its schedules by the names of their classes. This one opens where
-    PyTorch is, which is wherever that agent is; ours would need this project.
+    A library agent's zip pickles its schedules by the names of their classes. PyTorch is installed
+    wherever that agent runs, but a class of ours would need this project.
     """
     assert schedule.end_fraction == 1
     log_end = th.tensor(math.log(schedule.end), dtype=th.float64)
@@ -92,7 +92,7 @@ def library_schedule(schedule: ExponentialSchedule) -> Schedule:
 
 
 def epsilon_schedule(agent: Any) -> Schedule:
-    """How epsilon falls over training, by the agent's settings; ``"constant"`` stays."""
+    """The schedule of epsilon by the agent's settings; ``"constant"`` never changes."""
     start, end = agent.exploration_initial_eps, agent.exploration_final_eps
     if agent.exploration_decay == "constant":
         return FloatSchedule(start)

@@ -1,4 +1,4 @@
-"""Settings of agents: checks of their values, and signatures that name all of them."""
+"""Settings of agents: checks of values, and complete constructor signatures."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gymnasium import spaces
 
 from machine_code.compiling import inlined
 
-# Constructors that hand arguments on to their base class, and yet name all of them.
+# Constructors that pass arguments on to their base class, and still name all of them.
 #
 # A constructor may take ``**kwargs: Unpack[CommonArguments]``. Hyperparameter files are checked
-# against the signature, and `help` shows it: so the arguments behind ``**kwargs`` are written out.
+# against the signature, and `help` shows it. So the signature lists the arguments in ``**kwargs``.
 
 TieBreaking = Literal["random", "first"]
 ExplorationDecay = Literal["constant", "linear", "exponential"]
@@ -26,7 +26,7 @@ _STARRED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 class CommonArguments(TypedDict, total=False):
-    """What every hand-written agent's constructor takes; see `OnlineAlgorithm`."""
+    """Arguments of every hand-written agent's constructor; see `OnlineAlgorithm`."""
 
     stats_window_size: int
     tensorboard_log: str | None
@@ -37,13 +37,13 @@ class CommonArguments(TypedDict, total=False):
 
 
 class LearningArguments(CommonArguments, total=False):
-    """What that of every learning agent takes; see `LearningAlgorithm`."""
+    """Arguments of every learning agent's constructor; see `LearningAlgorithm`."""
 
     tie_breaking: TieBreaking
 
 
 class CheckedConstructor(ABCMeta):
-    """The class of classes whose constructors take what their signature names, and nothing else."""
+    """Metaclass: the constructor refuses arguments that its signature does not name."""
 
     __signature__: inspect.Signature
 
@@ -55,17 +55,17 @@ class CheckedConstructor(ABCMeta):
 
 
 def full_signature(cls: type) -> inspect.Signature:
-    """The constructor's own arguments, and in place of ``**kwargs`` those of the base class.
+    """The constructor's signature, with the base class's arguments in place of ``**kwargs``.
 
-    Where ``**kwargs`` is annotated with the keys that it may have, no others are added. A
-    constructor that takes ``*args`` hands those on as well, and adds what is given by name.
+    If ``**kwargs`` is annotated with its possible keys, only these are added. A constructor that
+    takes ``*args`` passes positional arguments on as well, and adds keyword arguments.
     """
     merged = _merged([base for base in cls.__mro__ if "__init__" in vars(base)])
     return inspect.Signature(sorted(merged.values(), key=lambda parameter: parameter.kind))
 
 
 def _merged(owners: list[Any]) -> dict[str, inspect.Parameter]:
-    """The arguments of the first constructor, and behind ``**kwargs`` those of the others."""
+    """The arguments of the first constructor, and for ``**kwargs`` those of the others."""
     if owners[0] is object:
         return {}
     own = _parameters(owners[0])
@@ -87,7 +87,7 @@ def _parameters(owner: Any) -> list[inspect.Parameter]:
         return list(inspect.signature(owner.__init__).parameters.values())
 
 
-# How far an estimate moves towards its target.
+# Step sizes: how far an estimate moves towards its target.
 #
 # Sutton and Barto (2nd edition), section 2.4 (sample averages) and 2.5 (constant step size).
 
@@ -96,19 +96,19 @@ SAMPLE_AVERAGE = "sample_average"
 
 @inlined
 def step_size(learning_rate: float, sample_average: bool, visit_count: int) -> float:
-    """1/N for the N-th visit where ``sample_average``, else the learning rate."""
+    """1/N at the N-th visit if ``sample_average``, else the learning rate."""
     if sample_average:
         return 1.0 / visit_count
     return learning_rate
 
 
-# Checks of agents' arguments: each failure is one line that names the argument and its range.
+# Checks of arguments: each error is one line that names the argument and its range.
 
 Settings = Iterable[tuple[str, Any]]
 
 
 def settings_of(agent: object, *names: str) -> Settings:
-    """The named arguments of an agent with their values."""
+    """The values of the named arguments of an agent."""
     return [(name, getattr(agent, name)) for name in names]
 
 
@@ -121,26 +121,26 @@ def check_space(agent: object, role: str, space: spaces.Space[Any]) -> None:
 
 
 def check_vectors(agent: object, space: spaces.Space[Any]) -> None:
-    """Refuse observations that are neither vectors nor in a space that `check_space` takes."""
+    """Refuse observation spaces that hold no vectors and that `check_space` refuses."""
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
         check_space(agent, "observations of shape (d,) in a Box space or", space)
 
 
 def check_option(name: str, value: object, options: Any) -> None:
-    """Refuse words that are not in the Literal ``options``."""
+    """Refuse a word that is not in the Literal ``options``."""
     if value not in get_args(options):
         raise ValueError(f"{name} must be one of {', '.join(get_args(options))}, not {value!r}")
 
 
 def check_at_least(low: float, settings: Settings) -> None:
-    """Refuse numbers below ``low``; what is no number is left alone."""
+    """Refuse numbers below ``low``; other types pass."""
     for name, value in settings:
         if isinstance(value, int | float) and not value >= low:
             raise ValueError(f"{name} must be at least {low:g}, not {value}")
 
 
 def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
-    """Refuse what is no whole number, and numbers below ``low`` or above ``high``."""
+    """Refuse values that are not integers from ``low`` to ``high``."""
     for name, value in settings:
         if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
             raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
@@ -149,7 +149,7 @@ def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
 
 
 def check_above_zero(settings: Settings) -> None:
-    """Refuse numbers that are not above 0; what is no number is left alone."""
+    """Refuse numbers that are not above 0; other types pass."""
     for name, value in settings:
         if isinstance(value, int | float) and not value > 0:
             raise ValueError(f"{name} must be above 0, not {value}")
@@ -170,14 +170,14 @@ def check_finite(settings: Settings) -> None:
 
 
 def check_epsilons(agent: Any) -> None:
-    """Check what says how epsilon falls."""
+    """Check the settings of the epsilon schedule."""
     check_option("exploration_decay", agent.exploration_decay, ExplorationDecay)
     names = ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
     check_share(settings_of(agent, *names))
 
 
 def check_learning_rate(learning_rate: object) -> None:
-    """Refuse words other than that for sample averages, and numbers that are no step sizes."""
+    """Refuse words except ``"sample_average"``, and numbers that are not step sizes."""
     if isinstance(learning_rate, int | float):
         check_at_least(0.0, [("learning_rate", learning_rate)])
         check_finite([("learning_rate", learning_rate)])

@@ -1,1 +1,1 @@
-"""The compiled engine: environments, random streams, the loop, batches of runs."""
+"""The compiled engine: environments, random streams, the training loop, batches of runs."""

@@ -1,4 +1,4 @@
-"""The compiled engine: when it is used, and how it drives the loop."""
+"""Chooses between compiled and interpreted training, and drives the compiled loop."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ _SIGNALS = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHU
 
 @contextmanager
 def interrupts_held() -> Iterator[Callable[[], bool]]:
-    """Hold what the first signal raises until the ``with`` statement is left; not a second one.
+    """Delay the exception of the first signal to the end of the ``with`` statement.
 
-    That is KeyboardInterrupt on Ctrl-C, and whatever the handlers raise that a program has set for
-    SIGINT, SIGTERM and SIGHUP; they are called at once. Outside the main thread, where Python
-    delivers no signals, nothing is held. Yields what tells whether an exception is waiting.
+    The handlers of SIGINT, SIGTERM and SIGHUP run at once; only the exception of the first one is
+    delayed. Outside the main thread, where Python delivers no signals, this does nothing. Yields
+    a function that tells whether an exception is waiting.
     """
     n_signals = 0
     waiting: list[BaseException] = []
@@ -90,14 +90,14 @@ def interrupts_held() -> Iterator[Callable[[], bool]]:
             raise waiting[0]
 
 
-# Some hundredths of a second: what a signal waits for.
+# A block takes some hundredths of a second: so long a signal waits.
 MAX_BLOCK_STEPS = 262_144
 
 
 class CompiledEngine:
     """One call of ``learn`` on the compiled loop."""
 
-    # Whether statistics hear of a step on which a callback ends training.
+    # Whether statistics include the step on which a callback ends training.
     counts_where_stopped = True
 
     def __init__(
@@ -112,7 +112,7 @@ class CompiledEngine:
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
         self.states = self._make_states()
         self.envs = self.states.records
-        # Handles do not keep the generators alive that they stand for.
+        # Handles do not keep their generators alive.
         self.generators = [env.unwrapped.np_random for env in agent.env.envs]
         self.handles = handles_of(self.generators)
         self.progress = np.zeros(1, dtype=PROGRESS)
@@ -130,7 +130,7 @@ class CompiledEngine:
         return EnvStates(self.agent.env, self.world)
 
     def _most_records(self) -> int:
-        """How many records of the log can be due in a block."""
+        """The largest number of log records that can be due in a block."""
         takes_records = getattr(self.agent, "logs_by_records", False)
         if not takes_records or self.log_interval is None or self.log_interval < 1:
             return 0
@@ -138,12 +138,12 @@ class CompiledEngine:
         return int(min(self.block_steps, n_episodes // self.log_interval + 1))
 
     def _playground(self, vec_env: VecEnv) -> Playground:
-        """The compiled counterpart of environments to evaluate on."""
+        """The compiled counterpart of evaluation environments."""
         world: Any = compile_envs(vec_env)
         return world, EnvStates(cast(DummyVecEnv, vec_env), world), None
 
     def _learner(self) -> Any:
-        """The agent as compiled functions see it, also after a callback has changed it."""
+        """The agent as compiled functions see it, updated after changes by callbacks."""
         agent, progress = self.agent, self.progress[0]
         made_from = agent.made_from(agent.rng)
         if made_from != self.made_from:
@@ -158,7 +158,7 @@ class CompiledEngine:
         return self.agent.compiled_agent(self.agent.rng)
 
     def _take_generators(self) -> None:
-        """A callback may have seeded the environments anew."""
+        """Make new handles, because a callback may have reseeded the environments."""
         generators = [env.unwrapped.np_random for env in self.agent.env.envs]
         if any(a is not b for a, b in zip(generators, self.generators, strict=True)):
             self.generators, self.handles = generators, handles_of(generators)
@@ -209,7 +209,7 @@ class CompiledEngine:
         return keep_going
 
     def _keep_records(self) -> None:
-        """Let the loop note what the log is to say, where that can wait until the block ends."""
+        """Let the loop store log records, if writing them can wait until the block ends."""
         progress, interval = self.progress[0], self.log_interval
         progress["record_interval"] = progress["n_records"] = 0
         if interval is not None and keeps_records(self.agent, interval):
@@ -217,27 +217,27 @@ class CompiledEngine:
             progress["next_record"] = (self.agent._episode_num // interval + 1) * interval
 
     def _episodes_to_log(self) -> int:
-        """Episodes until something is written that somebody reads, and that cannot wait."""
+        """Episodes until the next log record that cannot wait for the end of the block."""
         waits = self.progress[0]["record_interval"] > 0
         if self.log_interval is None or waits or not is_read(self.agent.logger):
             return NEVER
         return self.log_interval - int(self.agent._episode_num) % self.log_interval
 
     def _tell(self, episodes: Episodes, n_steps: int, began: int = 0) -> bool:
-        """Tell Monitor, statistics and callbacks; False once a callback asks to stop."""
+        """Update Monitor, statistics and callbacks; False once a callback asks to stop."""
         agent = self.agent
         records = self.log.records[: self.progress[0]["n_records"]]
         before = Statistics(agent) if len(records) else None
         self.states.keep_rewards(episodes, self.log.rewards[:n_steps])
         times = record_in_monitors(self.states.monitors, episodes, n_steps)
-        # The statistics hear of the last step after the callbacks, as in the interpreted loop.
+        # As in the interpreted loop, the statistics get the last step after the callbacks.
         earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._update_statistics(episodes, 0, earlier, times)
         agent.num_timesteps += n_steps * agent.n_envs
         n_recorded = 0
         if before is not None:
             n_recorded = self._write_records(before, records, episodes, n_steps, began)
-        # Callbacks come before the last step is learnt from: until then the counters end before it.
+        # Callbacks run before the agent learns from the last step, so the counters exclude it yet.
         self._take_over_counts(n_steps - 1, earlier - n_recorded)
         if n_steps > 1:
             self._record_earlier()
@@ -252,7 +252,7 @@ class CompiledEngine:
     def _write_records(
         self, before: Statistics, records: Any, episodes: Episodes, n_steps: int, began: int
     ) -> int:
-        """Write the records of the log, and return how many episodes they have counted."""
+        """Write the log records, and return the number of episodes that they count."""
         agent = self.agent
         n_done = (records["step"] + 1) * agent.n_envs
         steps = agent.num_timesteps - n_steps * agent.n_envs + n_done
@@ -271,7 +271,7 @@ class CompiledEngine:
         return int(records["episodes"][-1]) - n_before
 
     def _record_earlier(self) -> None:
-        """Hand the logger what callbacks may read there of a block's steps but the last."""
+        """Give the logger values that callbacks may read there, of all steps except the last."""
 
     def _update_statistics(
         self, episodes: Episodes, start: int, stop: int, times: list[float]
@@ -284,7 +284,7 @@ class CompiledEngine:
             agent.ep_success_buffer.extend(episodes.successes[remembered].tolist())
 
     def _last_step(self, episodes: Episodes, earlier: int, times: list[float]) -> dict[str, Any]:
-        """What callbacks read of the last step, under the names of the interpreted loop."""
+        """The last step's values for callbacks, under the names of the interpreted loop."""
         envs = self.envs
         infos: list[dict[str, Any]] = [
             {"TimeLimit.truncated": bool(done and not terminated)}
@@ -304,7 +304,7 @@ class CompiledEngine:
         }
 
     def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
-        """Let the algorithm's own counters follow, and log where it is time to."""
+        """Update the algorithm's own counters, and write the log if it is due."""
         agent = self.agent
         agent._current_progress_remaining = float(self.progress[0]["remaining"])
         agent._n_updates += n_steps * agent.n_envs
@@ -317,7 +317,7 @@ class CompiledEngine:
         self.agent.take_over(self.envs, self.progress)
 
     def _write(self) -> None:
-        """Put agent and environments where the records are."""
+        """Copy the records into the state of agent and environments."""
         self._take_over_position()
         self.states.write()
 
@@ -339,8 +339,8 @@ class CompiledEngine:
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]
 
-# What a class may say anew in Python: all of it ends up in the settings, schedules, tables and the
-# memory that compiled functions are handed.
+# What a class may override in Python: all of it reaches compiled functions through the settings,
+# schedules, tables and memory.
 SETTINGS = (
     "__dict__",
     "__init__",
@@ -363,11 +363,11 @@ def choose_engine(
     make_world: Callable[[VecEnv], Any] = compile_envs,
     engine: type[CompiledEngine] = CompiledEngine,
 ) -> CompiledEngine | None:
-    """The compiled engine where the agent wants it and it can be had; None for interpreting.
+    """The compiled engine, if the agent asks for it and can be compiled; else None.
 
-    An environment that draws in its own way is equal to its compiled copy in distribution alone:
-    such a copy has to be asked for, so that results do not hang on what else kept an agent from
-    compiling. The choice and its reason are left in ``agent.engine_in_use``.
+    If an environment draws random numbers in its own way, its compiled copy has only the same
+    distribution. ``auto`` does not use such a copy, so that results do not depend on whether
+    compilation was possible. ``agent.engine_in_use`` records the choice and its reason.
     """
     if agent.engine == "interpreted":
         agent.engine_in_use = "interpreted: asked for"
@@ -409,7 +409,7 @@ def _world_for(
 
 
 def check_class(algorithm: type) -> None:
-    """Make sure that compiled functions do all that the algorithm does at a step."""
+    """Check that no Python method of the algorithm replaces a compiled part of a step."""
     order = algorithm.__mro__
     settings: Any = algorithm.settings_type.names  # type: ignore[attr-defined]
     for place, cls in enumerate(order[: order.index(LearningAlgorithm)]):

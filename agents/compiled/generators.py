@@ -1,11 +1,11 @@
-"""NumPy's random generators as compiled functions draw from them.
+"""Lets compiled functions draw from NumPy's random generators.
 
-Handing a `numpy.random.Generator` to a compiled function takes longer than a step of training, and
-an array cannot hold several. A handle is a record of the four addresses that drawing needs: of the
-generator's state and of three functions. A draw by a handle is the generator's own next number.
+Passing a `numpy.random.Generator` to a compiled function takes longer than a training step, and an
+array cannot hold generators. A handle is a record of the four addresses that drawing needs: the
+generator's state and three functions. Drawing by a handle gives the generator's own next number.
 
-Calling such a function takes longer than drawing. So PCG64, which NumPy's `default_rng` and
-Gymnasium use, is written out here, and a handle has the address of its 256 bits. We use the address
+Calling such a function takes longer than drawing. So this module implements PCG64, which NumPy's
+`default_rng` and Gymnasium use, and a handle has the address of its 256 bits. We use the address
 only if its bytes equal `bit_generator.state`.
 
 Source: O'Neill, PCG: A Family of Simple Fast Space-Efficient Statistically Good Algorithms for
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _ADDRESSES = ("state", "next_uint64", "next_uint32", "next_double")
 
-_PCG64 = "pcg64"  # the place of its state and increment, 0 for other generators
+_PCG64 = "pcg64"  # address of its state and increment, 0 for other generators
 
 HANDLE = np.dtype([(name, np.uintp) for name in (*_ADDRESSES, _PCG64)], align=True)
 
@@ -43,7 +43,7 @@ _WORD, _WIDE = ir.IntType(64), ir.IntType(128)
 
 
 def handles_of(generators: Sequence[Generator]) -> NDArray[np.void]:
-    """A handle for each generator, shape (n,); good for as long as the generators live."""
+    """A handle for each generator, shape (n,); valid while the generators exist."""
     handles = np.zeros(len(generators), dtype=HANDLE)
     for handle, generator in zip(handles, generators, strict=True):
         bits: Any = generator.bit_generator.ctypes
@@ -55,7 +55,7 @@ def handles_of(generators: Sequence[Generator]) -> NDArray[np.void]:
 
 
 def _place_of_pcg64(bits: Any) -> int:
-    """The address of PCG64's state and increment; 0 for other generators, or where it is unsure."""
+    """The address of PCG64's state and increment; 0 for other generators, or if in doubt."""
     if type(bits) is not PCG64 or sys.byteorder != "little":
         return 0
     place = ctypes.cast(bits.ctypes.state_address, ctypes.POINTER(ctypes.c_void_p))[0] or 0
@@ -107,7 +107,7 @@ def _pcg64(typing_context: Any, place: Any) -> Any:
 def _generator(
     typing_context: Any, state: Any, next_uint64: Any, next_uint32: Any, next_double: Any
 ) -> Any:
-    """A generator as Numba has it, made of the four addresses."""
+    """Numba's representation of a generator, built from the four addresses."""
 
     def build(context: Any, builder: Any, signature: Any, addresses: Any) -> Any:
         struct: Any = cgutils.create_struct_proxy
@@ -122,7 +122,7 @@ def _generator(
     return types.npy_rng(*[types.uintp] * len(_ADDRESSES)), build
 
 
-# Numba takes the first argument away, which type checkers cannot see.
+# Numba removes the first argument, which type checkers cannot know.
 _generator_of_addresses: Any = _generator
 _pcg64_at: Any = _pcg64
 _step_at: Any = _step_of_pcg64
@@ -130,7 +130,7 @@ _step_at: Any = _step_of_pcg64
 
 @internal
 def generator_of(handle: Any) -> Generator:
-    """The generator that a handle stands for, within compiled code."""
+    """The generator of a handle, for use in compiled code."""
     generator: Generator = _generator_of_addresses(
         handle.state, handle.next_uint64, handle.next_uint32, handle.next_double
     )
@@ -139,7 +139,7 @@ def generator_of(handle: Any) -> Generator:
 
 @inlined
 def next_uniform(handle: Any) -> float:
-    """The next number in [0, 1) of the generator that a handle stands for, as `random` has it."""
+    """Draw a number in [0, 1) from the handle's generator, like `Generator.random`."""
     if handle.pcg64 != 0:
         return float(_pcg64_at(handle.pcg64))
     return float(generator_of(handle).random())
@@ -147,7 +147,7 @@ def next_uniform(handle: Any) -> float:
 
 @inlined
 def skip_uniform(handle: Any) -> None:
-    """Skip the next number."""
+    """Advance the handle's generator by one number."""
     if handle.pcg64 != 0:
         _step_at(handle.pcg64)
     else:

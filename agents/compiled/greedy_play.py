@@ -1,4 +1,4 @@
-"""Environments' states in and out of compiled records, and episodes played without learning."""
+"""Copies environments' states to and from compiled records, and plays without learning."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ from mdp.transition_model import Bools, Floats, Ints
 
 # The state of environments, read into the records of the compiled loop and written back.
 #
-# What comes next, interpreted or compiled, then goes on from the same place.
+# Interpreted or compiled code can then continue from the same state.
 
-# Python's sum of floats makes up for rounding from this version on.
+# From this version on, Python's sum of floats compensates for rounding.
 COMPENSATED_SUM = sys.version_info >= (3, 12)
 
-# Of environments whose state is a vector: what it consists of, and their records.
+# For environments with a vector as state: the names of its parts, and the record type.
 VECTOR_STATES: dict[type, tuple[tuple[str, ...], np.dtype[np.void]]] = {
     CartPole: (STATE, CART_POLE_ENV),
     MountainCar: (CAR_STATE, MOUNTAIN_CAR_ENV),
@@ -61,25 +61,25 @@ VECTOR_STATES: dict[type, tuple[tuple[str, ...], np.dtype[np.void]]] = {
 
 
 class EnvStates:
-    """Environments of a training, and a record for each of them."""
+    """The training environments, with a record for each of them."""
 
     def __init__(
         self, vec_env: DummyVecEnv, world: World, kind: np.dtype[np.void] | None = None
     ) -> None:
         self.vec_env = vec_env
-        # Of what state the records are: of vectors, or of numbers.
+        # The state is a vector of these names, or a number if there are none.
         self.vector_state, own_kind = VECTOR_STATES.get(type(world), ((), FINITE_ENV))
         self.records = env_records(vec_env.num_envs, own_kind if kind is None else kind)
         self.monitors = [monitor_of(env) for env in vec_env.envs]
-        # Monitor holds the rewards of the episode that is under way: so must we.
+        # Monitor keeps the rewards of the running episode, so we keep them too.
         self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]
 
     def observations(self, records: Any, prefix: str) -> Any:
-        """What is shown now (no prefix), before (``next_``) or after a reset (``new_``)."""
+        """Observations: current (no prefix), before (``next_``) or after a reset (``new_``)."""
         return records[f"{prefix}obs"].copy()
 
     def take_observations(self, last_obs: Any) -> None:
-        """Let the records begin with these observations, shape (n, ...)."""
+        """Store the current observations, shape (n, ...), in the records."""
         self.records["obs"] = last_obs
 
     def read(self) -> None:
@@ -102,7 +102,7 @@ class EnvStates:
                 self._unfinished[i] = [np.array(monitor.rewards)]
 
     def write(self) -> None:
-        """Put the environments where their records are."""
+        """Copy the records into the state of the environments."""
         for i, env in enumerate(self.vec_env.envs):
             self._write_state(env.unwrapped, self.records[i])
             for layer in layers(env):
@@ -128,7 +128,7 @@ class EnvStates:
             base.pulls_done = int(record["elapsed"])
 
     def keep_rewards(self, episodes: Episodes, rewards: Floats) -> None:
-        """Keep the rewards of episodes under way after a block."""
+        """Keep the rewards of unfinished episodes after a block."""
         for i in range(len(self.records)):
             ends = episodes.steps[episodes.envs == i]
             if len(ends):
@@ -139,7 +139,7 @@ class EnvStates:
 
 
 def _elapsed_steps(env: gym.Env[Any, Any]) -> int:
-    """Steps of the episode under way, by whichever counter knows them."""
+    """Steps of the running episode, by the first wrapper that counts them."""
     for layer in layers(env):
         if isinstance(layer, TimeLimit):
             return int(vars(layer)["_elapsed_steps"] or 0)
@@ -148,36 +148,36 @@ def _elapsed_steps(env: gym.Env[Any, Any]) -> int:
     return 0
 
 
-# Episodes that an agent plays on compiled environments, learning nothing.
+# Episodes that an agent plays on compiled environments without learning.
 #
-# They are the episodes that the library's `evaluate_policy` plays, from the same generators, which
-# are left in the same state. `EvalCallback`s of a compiled training are answered by them.
+# They equal the episodes of the library's `evaluate_policy`: the same generators, which end in the
+# same state. `EvalCallback`s of a compiled training use them.
 
-# Some hundredths of a second with networks: what a signal waits for.
+# Some hundredths of a second with networks: so long a signal waits.
 STEPS_AT_ONCE = 4096
 
-# What the library says, for whom it evaluates without Monitor.
+# The library's warning about an evaluation without Monitor.
 UNMONITORED = (
     "Evaluation environment is not wrapped with a ``Monitor`` wrapper. "
     "This may result in reporting modified episode lengths and rewards, if other wrappers happen "
     "to modify these. Consider wrapping environment first with ``Monitor`` wrapper."
 )
 
-# Whoever has set one of these on a callback gets what is set.
+# A callback with one of these attributes overridden keeps its own evaluation.
 _HOOKS = {"_on_step", "_log_success_callback"}
 
-# A compiled environment, the state of what it stands for, and how its observations are read.
+# A compiled environment, the states of the originals, and how to read its observations.
 Playground = tuple[Any, EnvStates, Any]
 
 
 class Plan(NamedTuple):
-    """Takes a fixed action for each number that is observed."""
+    """A player with a fixed action for each observed number."""
 
     actions: Ints  # one for each number, shape (S,)
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
-        """Look it up."""
+        """Look the action up."""
         env.action = self.actions[env.obs]
 
     @inlined
@@ -188,14 +188,14 @@ class Plan(NamedTuple):
 
 
 class Explorer(NamedTuple):
-    """Acts as an agent does at one moment of its training."""
+    """A player that acts like the agent at one moment of its training."""
 
-    agent: Any  # as compiled functions see it, drawing from another generator
-    progress: Any  # how far the training is, of type `PROGRESS`, alone in an array
+    agent: Any  # the agent for compiled functions, with another generator
+    progress: Any  # the training's progress: an array of one `PROGRESS` record
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
-        """Choose anew; nothing was committed to."""
+        """Choose a new action; no earlier choice is kept."""
         env.next_action = UNDECIDED
         act(self.agent, env, self.progress[0])
 
@@ -209,15 +209,15 @@ class Explorer(NamedTuple):
 def play_episodes(
     world: Any, player: Any, states: EnvStates, observations: Any, wanted: Ints
 ) -> Episodes:
-    """Play on environments that have just been reset.
+    """Play the wanted numbers of episodes on environments that have just been reset.
 
-    All of them step until each has ended as many episodes as are wanted of it. The environments,
-    their generators and their Monitors end where the library's `evaluate_policy` would leave them.
+    All environments step until each has ended its number of episodes. The environments, their
+    generators and their Monitors end in the state in which `evaluate_policy` would leave them.
     """
     states.read()
     states.take_observations(observations)
     n_envs = len(wanted)
-    # Handles do not keep the generators alive that they stand for.
+    # Handles do not keep their generators alive.
     generators = [env.unwrapped.np_random for env in states.vec_env.envs]
     handles, progress = handles_of(generators), np.zeros(1, dtype=PROGRESS)
     log = EpisodeLog(
@@ -227,7 +227,7 @@ def play_episodes(
     )
     ended: Any = np.zeros(0, dtype=EPISODE)
     while n_missing := _n_missing(ended["env"], wanted):
-        # Before so many more have ended, not all can be there.
+        # Until so many more episodes have ended, some are missing for certain.
         limits = STEPS_AT_ONCE, n_missing, COMPENSATED_SUM
         n_steps = run_block(world, player, states.records, handles, progress[0], log, *limits)
         learn_from_last_step(player, states.records, progress[0])
@@ -243,12 +243,12 @@ def play_episodes(
 
 
 def _n_missing(envs: Ints, wanted: Ints) -> int:
-    """How many episodes are still to end, of those that are wanted."""
+    """The number of wanted episodes that have not ended yet."""
     return int((wanted - np.bincount(envs, minlength=len(wanted))).clip(0).sum())
 
 
 def _are_first(envs: Ints, wanted: Ints) -> Bools:
-    """Which episodes are among the first of their environment, as many as are wanted of it."""
+    """Which episodes are among the first ``wanted`` of their environment."""
     chosen = np.zeros(len(envs), dtype=np.bool_)
     for i, n_episodes in enumerate(wanted):
         chosen[np.flatnonzero(envs == i)[:n_episodes]] = True
@@ -256,12 +256,12 @@ def _are_first(envs: Ints, wanted: Ints) -> Bools:
 
 
 class CompiledEvaluations:
-    """Lets each `EvalCallback` of a training play its episodes in compiled code.
+    """Runs the evaluations of each `EvalCallback` of a training in compiled code.
 
-    The callback's own code runs, and finds this where it looks for the library's `evaluate_policy`.
-    What is not covered is handed on to that: environments or agents that are not, or not all,
-    compiled bit for bit; networks that draw their actions, which PyTorch's generator does; what is
-    shown on the screen.
+    The callback's own code runs, with `evaluate_policy` replaced by the method of this class. The
+    library's function still runs for the rest: environments or agents that are not compiled bit
+    for bit; networks that draw actions, because PyTorch's generator draws them; and rendering on
+    the screen.
     """
 
     def __init__(
@@ -277,7 +277,7 @@ class CompiledEvaluations:
 
     @contextmanager
     def taking_over(self) -> Iterator[None]:
-        """Let the callbacks evaluate in compiled code within the ``with`` statement."""
+        """Make the callbacks evaluate in compiled code within the ``with`` statement."""
         for callback in self.callbacks:
             vars(callback)["_on_step"] = partial(self.on_step, callback)
         try:
@@ -287,7 +287,7 @@ class CompiledEvaluations:
                 del vars(callback)["_on_step"]
 
     def evaluate_policy(self, model: Any, env: VecEnv, **given: Any) -> Any:
-        """Stands in for the library's function, with the arguments that `EvalCallback` gives it."""
+        """Replace the library's function, with the arguments that `EvalCallback` gives it."""
         playground = None if given["render"] else self._playground(model, env)
         player = self._player(given["deterministic"], playground)
         if playground is None or player is None:
@@ -308,7 +308,7 @@ class CompiledEvaluations:
         return [info["r"] for info in infos], [info["l"] for info in infos]
 
     def _playground(self, model: Any, env: VecEnv) -> Playground | None:
-        """The environments in compiled code, where they draw and count as they do in Python."""
+        """The compiled environments, if they draw and count exactly as in Python; else None."""
         of_agent = (self.agent.observation_space, self.agent.action_space)
         if model is not self.agent or of_agent != (env.observation_space, env.action_space):
             return None
@@ -326,7 +326,7 @@ class CompiledEvaluations:
         return (world, states, seen) if is_alike else None
 
     def _player(self, deterministic: bool, playground: Playground | None) -> Any:
-        """What acts as the agent's `predict`; None where that is not compiled."""
+        """The compiled counterpart of the agent's `predict`; None if it cannot be compiled."""
         name = "greedy_player" if deterministic else "exploring_player"
         make = getattr(self.agent, name, None)
         if playground is None or make is None or not _predicts_as_ours(self.agent):
@@ -335,7 +335,7 @@ class CompiledEvaluations:
 
 
 def _evaluating(callback: BaseCallback) -> Iterator[EvalCallback]:
-    """The `EvalCallback`s among the callbacks and those that they trigger, but for changed ones."""
+    """The unchanged `EvalCallback`s among the callbacks and the callbacks that they trigger."""
     if library_callbacks.evaluate_policy is not evaluate_policy:  # type: ignore[attr-defined]
         return
     for member in members(callback):
@@ -346,7 +346,7 @@ def _evaluating(callback: BaseCallback) -> Iterator[EvalCallback]:
 
 
 def _predicts_as_ours(agent: Any) -> bool:
-    """Whether nobody has put a `predict` of their own into the agent or its policy."""
+    """Whether agent and policy still have the `predict` of this project or the library."""
     asked = ((agent, "predict"), (agent.policy, "predict"), (agent.policy, "_predict"))
     modules = [getattr(type(thing), name).__module__ for thing, name in asked]
     known = all(module.partition(".")[0] in ("agents", "stable_baselines3") for module in modules)
@@ -354,10 +354,10 @@ def _predicts_as_ours(agent: Any) -> bool:
 
 
 def _counts(world: Any, states: EnvStates) -> bool:
-    """Whether the returns that the library sums up are known to the bit.
+    """Whether compiled returns equal the library's to the last bit.
 
-    Without Monitor it adds what the agent is handed, in single precision: the same where all
-    rewards are whole numbers.
+    Without Monitor, the library adds the agent's rewards in single precision: the sum is the same
+    if all rewards are integers.
     """
     monitored = [monitor is not None for monitor in states.monitors]
     if any(monitored):

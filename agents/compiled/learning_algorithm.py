@@ -1,4 +1,4 @@
-"""What tabular and bandit agents share: step sizes, exploration, ties, and a record of settings."""
+"""The base class of tabular and bandit agents: step sizes, exploration, ties, settings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from agents.common.settings import (
 from agents.compiled.loop import CompiledClass, check_functions, settings_dtype
 from agents.compiled.worlds import PROGRESS, NotCompilable
 
-# Training, and exploring by another generator for a few numbers of observations.
+# One for training, and some for exploring with another generator or number of observations.
 MOST_WORKSPACES = 4
 
 StepSize = float | Schedule | Literal["sample_average"]
@@ -35,9 +35,9 @@ StepSize = float | Schedule | Literal["sample_average"]
 class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     """Learns with a step size, explores by a schedule, and breaks ties between best actions.
 
-    How it acts and learns stands in compiled functions, which are attributes of the class. They are
-    handed a record of the agent's settings: those that a class names in ``parameters``, and those
-    of the classes above it.
+    Compiled functions, which are attributes of the class, define how the agent acts and learns.
+    They get a record of the agent's settings: those that the class names in ``parameters``, and
+    those of its base classes.
 
     Args:
         policy: name of the policy.
@@ -49,11 +49,10 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         kwargs: as in `OnlineAlgorithm`.
 
     Attributes:
-        parameters: types of the settings that compiled functions read, by the names of the agent's
-            attributes.
+        parameters: types of the settings that compiled functions read, by attribute name.
         settings_type: the type of the record.
-        logs_by_records: whether `log_columns` has all that `_record_training` hands to the logger
-            besides the number of updates.
+        logs_by_records: whether `log_columns` has everything that `_record_training` logs, apart
+            from the number of updates.
     """
 
     parameters: ClassVar[Mapping[str, Any]] = {
@@ -63,7 +62,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     }
     settings_type: ClassVar[np.dtype[np.void]]
     logs_by_records: ClassVar[bool] = False
-    # Arrays of the algorithm's own that compiled functions work on.
+    # The algorithm's own arrays for compiled functions.
     _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
 
@@ -100,19 +99,19 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         self.exploration_schedule = self._make_exploration_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy()
-        # A model file holds nothing of episodes under way.
+        # A model file contains nothing about running episodes.
         self._begin_episodes()
 
     @abstractmethod
     def _check_arguments(self) -> None:
-        """Refuse what does not work out, before anything is made of it."""
+        """Refuse invalid arguments before anything is built."""
 
     @abstractmethod
     def _make_policy(self) -> BasePolicy:
-        """The policy at the start."""
+        """Make the untrained policy."""
 
     def _make_exploration_schedule(self) -> Schedule:
-        """How much to explore, by the progress remaining."""
+        """Make the schedule of the exploration rate."""
         return FloatSchedule(0.0)
 
     @property
@@ -127,35 +126,35 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
 
     @property
     def strategy(self) -> int:
-        """How the agent explores around its values, one of `agents.common.exploration`."""
+        """The exploration strategy, a constant of `agents.common.exploration`."""
         return EPSILON_GREEDY
 
     @property
     def exploration_rate(self) -> float:
-        """How much the agent explores now; 0 for agents that explore by a rule of their own."""
+        """The current exploration rate; 0 for agents with their own rule of exploration."""
         return self.exploration_schedule(self._current_progress_remaining)
 
     def check_compilable(self) -> None:
-        """Make sure that compiled functions are handed all that the training asks for."""
+        """Raise `NotCompilable` if the training needs something that compiled functions lack."""
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
-        """What compiled functions work on: for ``n`` environments, drawing from ``rng``."""
+        """Make the arrays of compiled functions for ``n`` environments and ``rng``."""
         return None
 
     def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
-        """What a workspace is made from: once this differs, it is out of date.
+        """The inputs of a workspace: once they differ, the workspace is out of date.
 
-        Callbacks may change settings, replace a table or the memory, or seed the agent anew.
+        Callbacks may change settings, replace a table or the memory, or reseed the agent.
         """
-        # Looked up in one go each: this is asked after every step.
+        # Fast look-ups, because this runs after every step.
         tables = [
             buffer.data_ptr() for buffer in self.policy._buffers.values() if buffer is not None
         ]
-        # What was made from it keeps the memory alive, so that no other one has its number.
+        # The workspace keeps the memory alive, so no other memory can get the same id.
         return rng, self._read_settings(self), id(self._memory), *tables
 
     def _workspace_for(self, rng: np.random.Generator, n: int) -> Any:
-        """A workspace that is up to date, and keeps the generator alive that it draws from."""
+        """A cached workspace that is up to date, and keeps its generator alive."""
         made_from = self.made_from(rng)
         known = self._workspaces.get((id(rng), n))
         if known is None or known[0] != made_from:
@@ -166,7 +165,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         return known[1]
 
     def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
-        """What `_record_training` hands to the logger, at many moments of the training."""
+        """The values that `_record_training` logs, at many moments of the training."""
         return {
             "rollout/exploration_rate": records["exploration"].tolist(),
             "train/mean_absolute_td_error": records["mean_td_error"].tolist(),
@@ -174,22 +173,22 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy's arrays would no longer be its policy's.
+        # A copied workspace would not share its arrays with the copied policy.
         return {**self.__dict__, "_workspaces": {}}
 
     def settings(self) -> NDArray[np.void]:
-        """The record of the agent's settings, alone in an array."""
+        """The agent's settings: an array of one record."""
         settings = np.zeros(1, dtype=self.settings_type)
         # The first field is the class.
         settings[0] = (0, *self._read_settings(self))
         return settings
 
     def schedules(self) -> dict[str, Schedule]:
-        """The schedules, by the names that they have in the record of how far the training is."""
+        """The schedules, by their field names in the `PROGRESS` record."""
         return {"exploration": self.exploration_schedule, "learning_rate": self.lr_schedule}
 
     def progress(self) -> NDArray[np.void]:
-        """The record of how far the training is, alone in an array."""
+        """The training's progress: an array of one record."""
         progress = np.zeros(1, dtype=PROGRESS)
         remaining = self._current_progress_remaining
         for name, schedule in self.schedules().items():
@@ -199,7 +198,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
 
 
 def compiled_schedule(schedule: Schedule) -> ScheduleRow:
-    """The schedule as compiled code reads it."""
+    """The schedule in the form that compiled code reads."""
     row = schedule_row(schedule)
     if row is None:
         raise NotCompilable("a schedule is a Python function")

@@ -1,4 +1,4 @@
-"""The compiled training loop, and how it finds the functions that it calls."""
+"""The compiled training loop, and the dispatch to the functions that it calls."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from machine_code.compiling import (
 )
 from mdp.transition_model import Floats
 
-# Which function a compiled loop calls: decided by type, while the loop is compiled.
+# Dispatch by type: the compiler decides which function a loop calls.
 #
-# A loop calls ``act(agent, ...)`` or ``step(world, ...)``. Of an environment, the function is the
-# attribute of that name of the world's class. Of an agent, it is that of the algorithm's class,
-# which the record of its settings names. So each environment and each algorithm has a loop of its
-# own, in which nothing is looked up any more, and a new one is a class in a file of its own.
+# A loop calls ``act(agent, ...)`` or ``step(world, ...)``. For an environment, the function is the
+# attribute of that name of the world's class. For an agent, it is the attribute of the algorithm's
+# class, which the settings record names. So each pair of environment and algorithm has its own
+# loop without look-ups, and a new environment or algorithm is a class in its own file.
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -39,11 +39,11 @@ _NAMES: set[str] = set()
 
 
 class CompiledOnlyError(TypeError):
-    """A function of `by_type` was called from Python, where nothing stands behind it."""
+    """A function of `by_type` was called from Python; it exists in compiled code only."""
 
 
 def by_type(stub: Function) -> Function:
-    """Make a compiled function that calls its first argument's own function of that name."""
+    """Make a compiled function that calls the function of that name of its first argument."""
     if is_interpreted():
         raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
     name = stub.__name__
@@ -58,8 +58,8 @@ def by_type(stub: Function) -> Function:
 
 
 def _class_of(argument: Any) -> type | None:
-    """The world's class, or the algorithm's that the agent's settings name."""
-    # A reference has that of what it refers to.
+    """The world's class, or the class of the algorithm that the settings record names."""
+    # A reference has the class of its target.
     argument = getattr(argument, "content", argument)
     if not isinstance(argument, types.BaseNamedTuple):
         return None
@@ -72,7 +72,7 @@ def _class_of(argument: Any) -> type | None:
 
 
 class CompiledClass(CheckedConstructor):
-    """The class of algorithms; what their loops are compiled from cannot be exchanged."""
+    """Metaclass of algorithms; refuses to replace functions that are compiled into loops."""
 
     def __setattr__(cls, name: str, value: object) -> None:  # noqa: N805  # of a metaclass
         if name in _NAMES:
@@ -83,7 +83,7 @@ class CompiledClass(CheckedConstructor):
 
 
 def check_functions(algorithm: type) -> None:
-    """Make sure that what the compiled loop calls of an algorithm is compiled."""
+    """Check that all functions of an algorithm that the loop calls are compiled."""
     for name in _NAMES & vars(algorithm).keys():
         if not hasattr(vars(algorithm)[name], "py_func"):
             raise TypeError(
@@ -97,18 +97,18 @@ def settings_dtype(algorithm: type, fields: Mapping[str, Any]) -> np.dtype[np.vo
     name = f"{RULE_PREFIX}{algorithm.__module__} {algorithm.__qualname__}"
     _DEFINITIONS[name] += 1
     if _DEFINITIONS[name] > 1:
-        # Defined anew, as in a notebook: what was compiled for the old one must not run.
+        # Redefined, as in a notebook: code compiled for the old class must not run.
         name = f"{name} {_DEFINITIONS[name]}"
     _ALGORITHMS[name] = algorithm
     return np.dtype([(name, np.uint8), *fields.items()], align=True)
 
 
-# What every compiled environment does around its own step: sums, time limit, episodes.
+# Bookkeeping of every compiled environment around its own step: sums, time limit, episodes.
 
 
 @inlined
 def add_to_return(env: Any, reward: float, compensated: bool) -> None:
-    """Add as Python's `sum` does: since 3.12 it keeps track of what rounding takes."""
+    """Add like Python's `sum`, which compensates for rounding since 3.12."""
     total = env.episode_return
     new_total = total + reward
     if compensated:
@@ -121,7 +121,7 @@ def add_to_return(env: Any, reward: float, compensated: bool) -> None:
 
 @inlined
 def begin_episode(env: Any) -> None:
-    """Start counting anew."""
+    """Reset the counters of the episode."""
     env.elapsed = 0
     env.episode_return = 0.0
     env.compensation = 0.0
@@ -129,18 +129,18 @@ def begin_episode(env: Any) -> None:
 
 @inlined
 def end_step(env: Any, time_limit: int, compensated: bool) -> None:
-    """Sum up the rewards, and see whether the episode is over; a limit of 0 is none."""
+    """Add the reward, and set whether the episode is over; limit 0 means no limit."""
     add_to_return(env, env.monitor_reward, compensated)
     env.elapsed += 1
-    # A step that terminates and runs out of time counts as terminated, as DummyVecEnv has it.
+    # A step that terminates at the time limit counts as terminated, as in DummyVecEnv.
     env.done = env.terminated or (time_limit > 0 and env.elapsed >= time_limit)
     env.new_obs = env.next_obs
 
 
 # The compiled training loop: many steps of acting and learning in one call.
 #
-# It does what the interpreted loop of `OnlineAlgorithm` does, in the same order, with the same
-# functions and the same random numbers, so that both end in the same bits.
+# It does the same as the interpreted loop of `OnlineAlgorithm`, in the same order, with the same
+# functions and random numbers, so both give bit-for-bit equal results.
 
 
 @by_type
@@ -150,12 +150,12 @@ def act(agent: Any, env: Any, progress: Any) -> None:
 
 @by_type
 def learn_from_step(agent: Any, envs: Any, progress: Any) -> None:
-    """Learn from the step that all environments have taken, and move on to where it has led."""
+    """Learn from the step that all environments have taken, and go on to the next observations."""
 
 
 @by_type
 def step(world: Any, env: Any, handle: Any) -> None:
-    """Take one step of an environment, whose generator the handle stands for."""
+    """Take one step of an environment; the handle is that of its generator."""
 
 
 @by_type
@@ -165,31 +165,31 @@ def reset(world: Any, env: Any, handle: Any) -> None:
 
 @by_type
 def note_step(log: Any, env: Any, i: int, step: int) -> None:
-    """Write down what environment ``i`` has done."""
+    """Record the step of environment ``i``."""
 
 
 @by_type
 def note_progress(log: Any, progress: Any, step: int) -> None:
-    """Write down how far the training is, where that is due."""
+    """Record the training's progress if a log record is due."""
 
 
 class EpisodeLog(NamedTuple):
-    """What Monitor and the logger are told of a block."""
+    """Data of a block for Monitor and the logger."""
 
     episodes: NDArray[Any]  # of type `EPISODE`, filled with those that end, shape (capacity,)
-    # What Monitor sees of the episode under way, from its first step in the block on; of shape
+    # Rewards that Monitor sees in the running episode, from its first step in the block on; shape
     # (steps, n_envs).
     rewards: Floats
     records: NDArray[Any]  # of type `RECORD`, filled where the log is due, shape (capacity,)
 
     @inlined
     def note_step(self, env: Any, i: int, step: int) -> None:
-        """Write down the reward, over those of the episode before."""
+        """Store the reward, which overwrites one of the previous episode."""
         self.rewards[min(step, env.elapsed - 1), i] = env.monitor_reward
 
     @inlined
     def note_progress(self, progress: Any, step: int) -> None:
-        """Write down what the log is to say, every so many episodes."""
+        """Store a log record every ``record_interval`` episodes."""
         interval = progress.record_interval
         if interval > 0 and progress.episodes >= progress.next_record:
             record = self.records[progress.n_records]
@@ -217,7 +217,7 @@ def note_episode(episodes: Any, env: Any, progress: Any, i: int, step: int) -> N
 
 @inlined
 def advance(progress: Any, n_done: int) -> None:
-    """How much of the training remains, and what the schedules say to that."""
+    """Update the remaining share of training, and the values of the schedules."""
     if progress.episode_budget > 0:
         progress.budget_episodes += n_done
         share_done = max(float(progress.budget_episodes), 1e-9) / progress.episode_budget
@@ -229,7 +229,7 @@ def advance(progress: Any, n_done: int) -> None:
 
 @inlined
 def learn_and_count(agent: Any, envs: Any, progress: Any) -> None:
-    """What the interpreted loop does between two steps."""
+    """Do what the interpreted loop does between two steps."""
     n_done = 0
     for i in range(len(envs)):
         n_done += envs[i].done
@@ -240,7 +240,7 @@ def learn_and_count(agent: Any, envs: Any, progress: Any) -> None:
 
 @kernel
 def learn_from_last_step(agent: Any, envs: Any, progress: Any) -> None:
-    """Learn from the step that `run_block` has left."""
+    """Learn from the last step of `run_block`."""
     learn_and_count(agent, envs, progress)
 
 
@@ -256,10 +256,10 @@ def run_block(
     max_episodes: int,
     compensated: bool,
 ) -> int:
-    """Act for ``n_steps``, learning after each of them but the last.
+    """Act for ``n_steps``, and learn after each step except the last.
 
-    The last step is left to be learnt from by `learn_from_last_step`, since callbacks come before
-    that.
+    `learn_from_last_step` learns from the last step, because callbacks must run before that
+    update.
     """
     progress.logged_episodes = 0
     for t in range(n_steps):

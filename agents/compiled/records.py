@@ -1,4 +1,4 @@
-"""What Monitor and the logger are told of a block of compiled steps."""
+"""Passes the episodes and log records of a compiled block to Monitor and the logger."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from agents.common.algorithm import is_read
 from machine_code.compiling import inlined, kernel
 from mdp.transition_model import Bools, Floats, Ints
 
-# Rows of Monitor's files as text, written by compiled code where returns are whole numbers.
+# Rows of Monitor's files as text; compiled code writes them if returns are integers.
 
 MOST_DIGITS = 19
-# Python writes larger whole numbers with an exponent.
+# Python writes larger integers with an exponent.
 LARGEST = 1e15
 COMMA, MINUS, POINT, ZERO = b",-.0"
 
@@ -30,7 +30,7 @@ Bytes = NDArray[np.uint8]
 
 
 def whole_rows(returns: Floats, lengths: Ints, end: str) -> str | None:
-    """A row ``<return>.0,<length>,<end>`` for each episode; None where a return is not whole."""
+    """A row ``<return>.0,<length>,<end>`` for each episode; None if a return is no integer."""
     room = np.empty(len(returns) * (2 * MOST_DIGITS + len(end) + 5), dtype=np.uint8)
     n_bytes = _write_all(returns, lengths, np.frombuffer(end.encode("ascii"), np.uint8), room)
     return None if n_bytes < 0 else room[:n_bytes].tobytes().decode("ascii")
@@ -38,7 +38,7 @@ def whole_rows(returns: Floats, lengths: Ints, end: str) -> str | None:
 
 @kernel
 def _write_all(returns: Floats, lengths: Ints, end: Bytes, room: Bytes) -> int:
-    """Fill the room, and return how many bytes there are; -1 where a return is not whole."""
+    """Fill the buffer, and return the number of bytes; -1 if a return is no integer."""
     place = 0
     for i in range(len(returns)):
         if not abs(returns[i]) < LARGEST or returns[i] != np.floor(returns[i]):
@@ -62,7 +62,7 @@ def _write_all(returns: Floats, lengths: Ints, end: Bytes, room: Bytes) -> int:
 
 @inlined
 def _write_number(number: int, room: Bytes, place: int) -> int:
-    """Write a number that is not negative, and return the place behind it."""
+    """Write a non-negative number, and return the position after it."""
     n_digits, power = 1, 10
     while number >= power:
         n_digits += 1
@@ -73,7 +73,7 @@ def _write_number(number: int, room: Bytes, place: int) -> int:
     return place + n_digits
 
 
-# What Monitor and the logger learn of many episodes at once.
+# Data of many episodes at once, for Monitor and the logger.
 
 DECIMALS = 6
 MOST_BEGINNINGS = 10_000
@@ -81,7 +81,7 @@ MOST_BEGINNINGS = 10_000
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes that ended in a block, in the order in which they did."""
+    """Episodes that ended in a block, in order of time."""
 
     envs: Ints  # which environment each ran in, shape (n_episodes,)
     steps: Ints  # at which step of the block it ended, shape (n_episodes,)
@@ -95,7 +95,7 @@ class Episodes:
         return cls(log["env"], log["step"], log["episode_return"], log["length"], log["success"])
 
     def rounded_returns(self) -> Floats:
-        """Returns as Monitor tells them, shape (n_episodes,)."""
+        """Returns as Monitor reports them, shape (n_episodes,)."""
         if (self.returns == np.rint(self.returns)).all():
             return self.returns
         return np.array([_rounded(total) for total in self.returns.tolist()])
@@ -116,9 +116,9 @@ class Episodes:
 def record_in_monitors(
     monitors: list[Monitor | None], episodes: Episodes, n_steps: int
 ) -> list[float]:
-    """Do for a block of episodes what each Monitor does at the end of each.
+    """Record a block of episodes in the Monitors, as each does at the end of an episode.
 
-    All get the time of the end of the block, which is returned, in seconds since each was made.
+    Returns the time at the end of the block, which all get, in seconds since each was made.
     """
     times = []
     for i, monitor in enumerate(monitors):
@@ -143,7 +143,7 @@ def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> No
     end = f"{seconds}\r\n"
     text = whole_rows(np.ascontiguousarray(returns), np.ascontiguousarray(lengths), end)
     if text is None:
-        # As one number, which is found sooner than a pair of them.
+        # A complex number as key, because its look-up is faster than that of a pair.
         rows = (returns + 1j * lengths).tolist()
         text = end.join(map(_beginnings.__getitem__, rows)) + end
     file.write(text)
@@ -151,9 +151,9 @@ def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> No
 
 
 class _Beginnings(dict[complex, str]):
-    """Caches how the row of an episode begins: printing takes long, and equal episodes are common.
+    """Caches the beginning of rows: formatting is slow, and equal episodes are common.
 
-    By the return of an episode, and its length as the imaginary part.
+    The key is the return of an episode, with its length as the imaginary part.
     """
 
     def __missing__(self, key: complex) -> str:
@@ -171,19 +171,19 @@ def _rounded(episode_return: float) -> float:
     return round(episode_return, DECIMALS)
 
 
-# Records of the log that are due within a block of compiled steps, written when it has ended.
+# Log records that are due within a block of compiled steps, written at its end.
 #
-# A log of every 100 episodes is due some ten thousand times a second. The compiled loop notes what
-# each record depends on, and all that the logger's outputs are told of a block is worked out at
-# once. TensorBoard's file is appended to in one go: its own writer opens it for each number.
+# A log of every 100 episodes is due some ten thousand times a second. The compiled loop stores the
+# inputs of each record, and Python computes all records of a block at once. We append to
+# TensorBoard's file once per block, because its own writer opens the file for each number.
 #
 # Format of the file: TensorFlow's `tfrecord`, each record an `Event` of TensorBoard with one value,
-# as `SummaryWriter.add_scalar` has it; checksums are CRC-32C (RFC 3720), masked.
+# as `SummaryWriter.add_scalar` writes it; checksums are CRC-32C (RFC 3720), masked.
 
-# Numbers that lie in memory at once, where windows of them are averaged.
+# Numbers in memory at once while windows are averaged.
 _AT_ONCE = 1_000_000
 
-# What follows a tag has to fit behind lengths of one byte.
+# Longer tags would need length fields of more than one byte.
 _LONGEST_TAG = 100
 _FRAME = 16  # bytes: the length and two checksums
 _MOST_BYTES = _FRAME + 32 + _LONGEST_TAG
@@ -192,9 +192,9 @@ Row = tuple[dict[str, Any], dict[str, Any]]
 
 
 def keeps_records(agent: Any, log_interval: int | None) -> bool:
-    """Whether records of an agent's log can wait for the end of a block.
+    """Whether log records can wait for the end of a block.
 
-    Not if somebody else has a say in what is recorded, or when.
+    They cannot if code of others decides what is recorded, or when.
     """
     logger = agent.logger
     return (
@@ -213,7 +213,7 @@ def keeps_records(agent: Any, log_interval: int | None) -> bool:
 
 
 class Statistics:
-    """The episodes that the log's means are taken of, before a block."""
+    """The episodes before a block over which the log averages."""
 
     def __init__(self, agent: Any) -> None:
         self.size = int(agent._stats_window_size)
@@ -222,7 +222,7 @@ class Statistics:
         self.successes = list(agent.ep_success_buffer)
 
     def columns(self, episodes: Episodes, counts: Ints) -> dict[str, list[float]]:
-        """Their means when so many of the block's episodes had ended, each of shape (n,)."""
+        """The means after so many of the block's episodes, each of shape (n,)."""
         means = {
             "rollout/ep_rew_mean": (self.returns, episodes.rounded_returns()),
             "rollout/ep_len_mean": (self.lengths, episodes.lengths),
@@ -235,9 +235,9 @@ class Statistics:
 
 
 def window_means(values: Floats, ends: Ints, size: int) -> list[float]:
-    """Means of the ``size`` numbers before each of the ends, or of all where there are fewer.
+    """Means of the ``size`` numbers before each end, or of all if there are fewer.
 
-    They are added up as NumPy adds up each by itself.
+    Each sum has the same rounding as a separate NumPy sum.
     """
     means = np.empty(len(ends))
     short = ends < size
@@ -251,10 +251,10 @@ def window_means(values: Floats, ends: Ints, size: int) -> list[float]:
 
 
 def write_records(agent: Any, columns: Mapping[str, Any], times: Ints) -> None:
-    """Let the logger's outputs have the records of a block.
+    """Write the records of a block to the logger's outputs.
 
-    What they consist of is asked of the agent: once with what callbacks have recorded since the
-    last one, and once without.
+    The agent's own `dump_logs` says which keys a record has: once with the values that callbacks
+    have recorded since the last record, and once without.
     """
     steps = columns["time/total_timesteps"]
     begin = 0
@@ -271,7 +271,7 @@ def write_records(agent: Any, columns: Mapping[str, Any], times: Ints) -> None:
 
 
 def _kinds(agent: Any, n_records: int) -> list[Row]:
-    """What the first record consists of, and all others."""
+    """The keys of the first record, and of all others."""
     logger, kept = agent.logger, _Kept()
     outputs, logger.output_formats = logger.output_formats, [kept]
     try:
@@ -283,7 +283,7 @@ def _kinds(agent: Any, n_records: int) -> list[Row]:
 
 
 class _Kept(KVWriter):
-    """Keeps what is written."""
+    """An output that stores the written rows."""
 
     def __init__(self) -> None:
         self.rows: list[Row] = []
@@ -312,7 +312,7 @@ def _append(
     steps: Sequence[int],
     times: Ints,
 ) -> bool:
-    """Append the numbers to TensorBoard's file; False where it takes more than that."""
+    """Append the numbers to TensorBoard's file; False if this way is not possible."""
     keys = [key for key in sorted(table) if "tensorboard" not in (excluded[key] or ())]
     writer: Any = output.writer
     events: Any = getattr(writer._get_file_writer(), "event_writer", None)
@@ -329,7 +329,7 @@ def _append(
 
 
 def event_bytes(tags: Sequence[str], numbers: NDArray[Any], steps: Ints, times: Floats) -> bytes:
-    """A piece of an event file, one event for each number."""
+    """Bytes of an event file, with one event for each number."""
     encoded = [tag.encode() for tag in tags]
     tag_bytes = np.frombuffer(b"".join(encoded), np.uint8)
     ends = np.cumsum([len(tag) for tag in encoded])
@@ -360,7 +360,7 @@ def _write_events(
     checksums: Any,
     room: Bytes,
 ) -> int:
-    """Fill the room, and return how many bytes there are."""
+    """Fill the buffer, and return the number of bytes."""
     place = 0
     for row in range(len(steps)):
         begin = 0
@@ -390,7 +390,7 @@ def _write_event(
     room: Bytes,
     place: int,
 ) -> int:
-    """Write the event of one number, and return the place behind it."""
+    """Write the event of one number, and return the position after it."""
     room[place] = 0x09  # wall_time
     for k in range(8):
         room[place + 1 + k] = times[row, k]
@@ -420,7 +420,7 @@ def _write_event(
 
 @inlined
 def _write_checksum(checksums: Any, room: Bytes, begin: int, end: int) -> None:
-    """Write the masked checksum of some bytes behind them."""
+    """Write the masked checksum of some bytes after them."""
     crc = 0xFFFFFFFF
     for k in range(begin, end):
         crc = (crc >> 8) ^ int(checksums[(crc ^ room[k]) & 0xFF])
@@ -431,7 +431,7 @@ def _write_checksum(checksums: Any, room: Bytes, begin: int, end: int) -> None:
 
 
 def time_columns(agent: Any, steps: Ints, times: Ints) -> dict[str, list[int]]:
-    """What the log says of time, at so many steps of the training."""
+    """The log's entries on time, at so many steps of the training."""
     elapsed = np.maximum((times - agent.start_time) / 1e9, sys.float_info.epsilon)
     speed = (steps - agent._num_timesteps_at_start) / elapsed
     return {

@@ -1,4 +1,4 @@
-"""Environments as compiled code sees them, and which ones it knows."""
+"""Compiled counterparts of environments, and the conversion to them."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ from envs.wrappers import (
 from machine_code.compiling import inlined
 from mdp.transition_model import Floats, Ints, TransitionModel
 
-# What the compiled loop works on, as records in arrays.
+# The data of the compiled loop, as records in arrays.
 #
-# Handing on a record costs compiled code nothing, where as many arrays would cost more than the
+# Passing a record costs compiled code nothing. Passing as many arrays would cost more than the
 # learning itself.
 
 SCHEDULE = np.dtype(
     [(name, np.float64) for name in ("kind", "start", "end", "end_fraction")], align=True
 )
 
-# One environment and the step that it took last.
+# One environment and its last step.
 _ENV_FIELDS = [
     ("elapsed", np.int64),  # steps of the episode
     ("episode_return", np.float64),  # sum of the rewards that Monitor sees
-    ("compensation", np.float64),  # what rounding has taken from it
+    ("compensation", np.float64),  # lost to rounding
     ("obs", np.int64),
     ("action", np.int64),
-    ("probability", np.float64),  # of the action, where the agent tells
+    ("probability", np.float64),  # of the action, if the agent reports it
     ("reward", np.float64),
     ("monitor_reward", np.float64),
     ("terminated", np.bool_),
@@ -60,8 +60,8 @@ _ENV_FIELDS = [
     ("next_obs", np.int64),  # before any reset
     ("new_obs", np.int64),  # after it
     ("next_action", np.int64),  # committed to, or UNDECIDED
-    ("uniform", np.float64),  # in [0, 1), for updates that are partly random
-    ("target", np.float64),  # of the last update, where the agent tells; else nan
+    ("uniform", np.float64),  # in [0, 1), for partly random updates
+    ("target", np.float64),  # of the last update, if the agent reports it; else nan
     ("td_error", np.float64),  # likewise
 ]
 
@@ -69,28 +69,28 @@ UNDECIDED = -1
 
 
 def env_dtype(*state: tuple[str, type]) -> np.dtype[np.void]:
-    """The record of an environment whose own state has these fields."""
-    # First: behind the others they would make the record a subtype of `ENV` in Numba's eyes.
+    """The record type of an environment whose own state has these fields."""
+    # First: after the other fields, they would make the record a subtype of `ENV` for Numba.
     return np.dtype([*state, *_ENV_FIELDS], align=True)
 
 
 def env_records(n: int, kind: np.dtype[np.void]) -> NDArray[np.void]:
-    """Records of n environments that nothing was learnt in yet, of a type from `env_dtype`."""
+    """New records of n environments, of a type from `env_dtype`."""
     records = np.zeros(n, dtype=kind)
     records["target"] = records["td_error"] = np.nan
     return records
 
 
-# An environment that is stepped outside of compiled code keeps its state to itself.
+# An environment that Python steps keeps its own state.
 ENV = env_dtype()
 
-# How far the training is; there is one record of it.
+# The progress of the training; there is one such record.
 PROGRESS = np.dtype(
     [
         ("num_timesteps", np.int64),
         ("total_timesteps", np.float64),
         ("remaining", np.float64),
-        ("exploration", np.float64),  # what its schedule says now
+        ("exploration", np.float64),  # current value of its schedule
         ("exploration_schedule", SCHEDULE),
         ("learning_rate", np.float64),
         ("learning_rate_schedule", SCHEDULE),
@@ -134,8 +134,8 @@ EPISODE = np.dtype(
 
 # Environments with a known transition model as compiled code.
 #
-# A `FiniteModel` does what the environment's own `step` and `reset` do, bit for bit, from the same
-# generator: each takes one uniform number.
+# A `FiniteModel` repeats the environment's own `step` and `reset` bit for bit, with the same
+# generator: each call draws one uniform number.
 
 FINITE_ENV = env_dtype(("state", np.int64))
 
@@ -144,7 +144,7 @@ OUTCOME = np.dtype(
     [
         ("cumulative", np.float64),  # probability of this outcome or one before it
         ("reward", np.float64),  # as Monitor sees it
-        ("agent_reward", np.float32),  # as the agent is given it, rounded to single precision
+        ("agent_reward", np.float32),  # as the agent gets it, in single precision
         ("next_state", np.int32),
         ("terminated", np.bool_),
         ("success", np.bool_),
@@ -155,7 +155,7 @@ OUTCOME = np.dtype(
 
 @inlined
 def pick_outcome(outcomes: Any, state: int, action: int, uniform: float) -> int:
-    """The first outcome whose cumulative probability exceeds ``uniform``, else 0, as toy_text."""
+    """The first outcome whose cumulative probability exceeds ``uniform``, else 0, like toy_text."""
     for outcome in range(outcomes.shape[2]):
         if outcomes[state, action, outcome].cumulative > uniform:
             return outcome
@@ -164,8 +164,8 @@ def pick_outcome(outcomes: Any, state: int, action: int, uniform: float) -> int:
 
 @inlined
 def pick_start(starts: Ints, start_cumulative: Floats, uniform: float) -> int:
-    """The state that an episode begins in."""
-    # Halving what is left; NumPy's search takes longer to compile than the rest of an environment.
+    """Choose the first state of an episode."""
+    # Binary search; NumPy's takes longer to compile than the rest of an environment.
     below, above = 0, len(start_cumulative)
     while below < above:
         middle = (below + above) // 2
@@ -177,9 +177,9 @@ def pick_start(starts: Ints, start_cumulative: Floats, uniform: float) -> int:
 
 
 class FiniteModel(NamedTuple):
-    """Dynamics, shared by all environments of a training."""
+    """The dynamics that all environments of a training share."""
 
-    time_limit: int  # steps after which an episode is truncated, or 0 for never
+    time_limit: int  # steps after which an episode is truncated, 0 for never
     outcomes: NDArray[np.void]  # records of type `OUTCOME`, shape (S, A, K)
     starts: Ints  # states where an episode may begin, shape (m,)
     start_cumulative: Floats  # their cumulative probabilities, shape (m,)
@@ -187,7 +187,7 @@ class FiniteModel(NamedTuple):
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
-        """Do ``env.action`` in ``env.state``."""
+        """Take ``env.action`` in ``env.state``."""
         outcome = 0
         if self.outcomes.shape[2] > 1:
             uniform = next_uniform(handle)
@@ -204,12 +204,12 @@ class FiniteModel(NamedTuple):
 
     @inlined
     def reset(self, env: Any, handle: Any) -> None:
-        """Draw a state to begin in."""
+        """Draw the first state of an episode."""
         env.state = pick_start(self.starts, self.start_cumulative, next_uniform(handle))
         env.new_obs = self.observation[env.state]
 
 
-# CartPole as compiled code, which shows numbers of bins.
+# CartPole as compiled code; observations may be bin numbers.
 
 STATE = ("x", "x_dot", "theta", "theta_dot")
 CART_POLE_ENV = env_dtype(*((name, np.float64) for name in STATE))
@@ -217,7 +217,7 @@ CART_POLE_ENV = env_dtype(*((name, np.float64) for name in STATE))
 
 @inlined
 def swing(world: CartPole, env: Any) -> bool:
-    """One step of Gymnasium's CartPole in its order of operations; whether it terminates."""
+    """One step of CartPole in Gymnasium's order of operations; returns whether it terminates."""
     x, x_dot, theta, theta_dot = env.x, env.x_dot, env.theta, env.theta_dot
     force = world.force_mag if env.action == 1 else -world.force_mag
     cos_theta = math.cos(theta)
@@ -243,7 +243,7 @@ def swing(world: CartPole, env: Any) -> bool:
 
 @inlined
 def bin_index(world: CartPole, env: Any) -> int:
-    """What `DiscretizeObservation` shows of CartPole's state, rounded to single precision first."""
+    """The observation of `DiscretizeObservation`, computed from the state in single precision."""
     dims, bins = world.dims, world.bins
     index = 0
     for d in range(len(dims)):
@@ -261,7 +261,7 @@ def bin_index(world: CartPole, env: Any) -> int:
 
 
 class CartPole(NamedTuple):
-    """CartPole's constants, as Gymnasium names them, and the bins it is seen through, if any."""
+    """CartPole's constants under Gymnasium's names, and the bins of its observations, if any."""
 
     time_limit: int  # steps after which an episode is truncated, or 0 for never
     gravity: float
@@ -279,7 +279,7 @@ class CartPole(NamedTuple):
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
-        """Push the cart as ``env.action`` says; nothing is drawn for that."""
+        """Push the cart by ``env.action``; this draws no random number."""
         env.terminated = swing(self, env)
         env.reward = 1.0
         env.monitor_reward = 1.0
@@ -288,7 +288,7 @@ class CartPole(NamedTuple):
 
     @inlined
     def reset(self, env: Any, handle: Any) -> None:
-        """Draw a state as ``Generator.uniform(-0.05, 0.05, 4)`` does."""
+        """Draw a state like ``Generator.uniform(-0.05, 0.05, 4)``."""
         width = 0.05 - -0.05
         env.x = -0.05 + width * next_uniform(handle)
         env.x_dot = -0.05 + width * next_uniform(handle)
@@ -298,7 +298,7 @@ class CartPole(NamedTuple):
 
     @inlined
     def show_state(self, env: Any, vector: Any) -> None:
-        """What the agent sees where there are no bins, in single precision, shape (4,)."""
+        """The observation without bins, in single precision, shape (4,)."""
         vector[0] = np.float32(env.x)
         vector[1] = np.float32(env.x_dot)
         vector[2] = np.float32(env.theta)
@@ -313,7 +313,7 @@ MOUNTAIN_CAR_ENV = env_dtype(*((name, np.float64) for name in CAR_STATE))
 
 @inlined
 def drive(world: MountainCar, env: Any) -> bool:
-    """One step of Gymnasium's MountainCar in its order of operations; whether it terminates."""
+    """One step of MountainCar in Gymnasium's order of operations; returns whether it terminates."""
     position, velocity = env.position, env.velocity
     push = (env.action - 1) * world.force
     velocity += push + math.cos(3 * position) * (-world.gravity)
@@ -327,7 +327,7 @@ def drive(world: MountainCar, env: Any) -> bool:
 
 
 class MountainCar(NamedTuple):
-    """MountainCar's constants, as Gymnasium names them."""
+    """MountainCar's constants under Gymnasium's names."""
 
     time_limit: int  # steps after which an episode is truncated, or 0 for never
     force: float
@@ -340,7 +340,7 @@ class MountainCar(NamedTuple):
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
-        """Push the car as ``env.action`` says; nothing is drawn for that."""
+        """Push the car by ``env.action``; this draws no random number."""
         env.terminated = drive(self, env)
         env.reward = -1.0
         env.monitor_reward = -1.0
@@ -349,7 +349,7 @@ class MountainCar(NamedTuple):
 
     @inlined
     def reset(self, env: Any, handle: Any) -> None:
-        """Draw a position as ``Generator.uniform(-0.6, -0.4)`` does; the car stands still."""
+        """Draw a position like ``Generator.uniform(-0.6, -0.4)``, with velocity 0."""
         width = -0.4 - -0.6
         env.position = -0.6 + width * next_uniform(handle)
         env.velocity = 0.0
@@ -357,17 +357,17 @@ class MountainCar(NamedTuple):
 
     @inlined
     def show_state(self, env: Any, vector: Any) -> None:
-        """What the agent sees, in single precision, shape (2,)."""
+        """The observation, in single precision, shape (2,)."""
         vector[0] = np.float32(env.position)
         vector[1] = np.float32(env.velocity)
 
 
-# From the environments of a training to the compiled ones that stand for them.
+# Conversion of training environments to compiled ones.
 
 Env = gym.Env[Any, Any]
 World = FiniteModel | CartPole | MountainCar
 
-# Wrappers whose work the engine does itself, or that have none to do.
+# Wrappers whose work the engine does itself, or that do nothing at a step.
 COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
 CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
 MODEL_WRAPPERS = {
@@ -378,11 +378,11 @@ MODEL_WRAPPERS = {
 
 
 class NotCompilable(ValueError):  # noqa: N818  # no error: the interpreted loop takes over
-    """Why there is no compiled counterpart, of environments or of an agent."""
+    """An environment or agent has no compiled counterpart; the message says why."""
 
 
 def layers(env: Env) -> list[Env]:
-    """The environment and what it wraps, the outermost first."""
+    """The environment and all environments inside it, outermost first."""
     chain = [env]
     while isinstance(env, gym.Wrapper):
         env = env.env
@@ -391,12 +391,12 @@ def layers(env: Env) -> list[Env]:
 
 
 def monitor_of(env: Env) -> Monitor | None:
-    """The Monitor around the environment, if there is one."""
+    """The outermost Monitor of the environment, or None."""
     return next((layer for layer in layers(env) if isinstance(layer, Monitor)), None)
 
 
 def compile_envs(vec_env: VecEnv) -> World:
-    """The compiled counterpart of environments that are all alike."""
+    """The compiled counterpart of identical environments."""
     if type(vec_env) is not DummyVecEnv:
         raise NotCompilable(f"{type(vec_env).__name__} is not DummyVecEnv")
     for env in vec_env.envs:
@@ -414,7 +414,7 @@ def compile_envs(vec_env: VecEnv) -> World:
 
 
 def draws_alike(vec_env: DummyVecEnv) -> bool:
-    """Whether compiled environments draw the very numbers that these draw, for the same things."""
+    """Whether compiled environments use the same random numbers for the same purposes."""
     own = [env for env in vec_env.envs if not is_trusted(env.unwrapped)]
     return all(check is None or check.bit_for_bit for check in map(model_check, own))
 
@@ -450,7 +450,7 @@ def _finite_model(env: Env) -> FiniteModel:
         raise NotCompilable("the environment's transition model is not known")
     if model.reward_variance is not None:
         raise NotCompilable("rewards are drawn, and the environment's model holds their means")
-    # A wrapper may leave the dynamics alone and yet have to see every step, to film it say.
+    # A wrapper may keep the dynamics but still need every step, for example to film it.
     watching = {type(layer) for layer in layers(env)[:-1]} - MODEL_WRAPPERS
     if watching:
         names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
@@ -471,7 +471,7 @@ def _finite_model(env: Env) -> FiniteModel:
 
 
 def _numbers(observations: NDArray[Any]) -> NDArray[np.int64]:
-    """What is observed in each state, as numbers; the states' own where it is something else."""
+    """Integer observations of all states; other observations are replaced by state numbers."""
     if np.issubdtype(observations.dtype, np.integer) and observations.ndim == 1:
         return observations.astype(np.int64)
     return np.arange(len(observations))
@@ -481,7 +481,7 @@ def _outcomes(env: Env, model: TransitionModel, seen_by_monitor: TransitionModel
     outcomes = np.zeros(model.prob.shape, dtype=OUTCOME)
     outcomes["cumulative"] = np.cumsum(model.prob, axis=2)
     outcomes["reward"] = seen_by_monitor.reward
-    # A VecEnv hands rewards on in single precision.
+    # A VecEnv passes rewards on in single precision.
     outcomes["agent_reward"] = model.reward.astype(np.float32)
     outcomes["next_state"] = model.next_state
     outcomes["terminated"] = model.terminated
@@ -515,7 +515,7 @@ def _cart_pole(env: Env) -> CartPole:
 
 
 def _constants(base: Any, world: Any) -> dict[str, float]:
-    """An environment's constants that the world has under the same names."""
+    """The environment's constants that are fields of the world."""
     return {name: float(getattr(base, name)) for name in world._fields if hasattr(base, name)}
 
 

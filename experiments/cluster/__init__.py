@@ -1,14 +1,14 @@
-"""Runs on many machines, by Dask distributed.
+"""Does runs on many machines, by Dask distributed.
 
-The one function that Dask is told to call stands here: the scheduler has to import it, and so this
-imports nothing. What a run is, only workers know.
+This module has the only function that Dask calls. The scheduler has to import the module too, so it
+imports nothing at the top. Only workers know what a run is.
 """
 
 from __future__ import annotations
 
 
 def do_order(order: bytes) -> bytes:
-    """Do the run of an `experiments.cluster.working.RunOrder`; the answer is of `.answers`."""
+    """Do the run of an `experiments.cluster.working.RunOrder`; returns a packed `Answer`."""
     from experiments.cluster.working import answer_to
 
     return answer_to(order)

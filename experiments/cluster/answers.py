@@ -1,8 +1,8 @@
-"""What comes back of a run: how it ended, and where folders are not shared, the files it left.
+"""Answers of workers: how a run ended, and its files if no folder is shared.
 
-An answer is a zip after its SHA-256, which shows damage. Whoever reads one trusts nothing in it:
-names and sizes are checked before anything is written, and what the run was asked for and the
-digests in its record after.
+An answer is a zip, preceded by its SHA-256, which reveals damage. The reader trusts nothing in it:
+it checks names and sizes before it writes anything, and then the run's spec and the digests in
+its record.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pipeline.locks import is_gone
 from safe_files.archives import read_members
 from safe_files.files import UnsafeFileError
 
-# The last is for a worker that can do no run at all.
+# The last one is for a worker that cannot do any run.
 DONE, FAILED, STOPPED, UNFIT = "done", "failed", "stopped", "unfit"
 KINDS = (DONE, FAILED, STOPPED, UNFIT)
 LARGEST = 256 << 20  # bytes, of all files of a run
@@ -38,22 +38,22 @@ _DEEPEST = 8  # folders
 
 
 class RefusedAnswerError(ValueError):
-    """An answer is none, or holds what it may not."""
+    """Bytes are not a valid answer, or contain something forbidden."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a worker says of a run."""
+    """A worker's answer about a run."""
 
     kind: str  # one of `KINDS`
     reason: str = ""  # why it failed
     details: str = ""  # the same at length
-    # What it left, by relative name; None where it says that it lies in its place already.
+    # The run's files by relative name; None if they are already in their place.
     files: dict[str, bytes] | None = field(default=None, repr=False)
 
 
 def packed(answer: Answer) -> bytes:
-    """The answer as bytes."""
+    """Convert an answer to bytes."""
     head = {
         "kind": answer.kind,
         "reason": answer.reason[:LONGEST_TEXT],
@@ -69,12 +69,12 @@ def packed(answer: Answer) -> bytes:
 
 
 def sealed(content: bytes) -> bytes:
-    """Bytes after their own SHA-256."""
+    """Bytes preceded by their SHA-256."""
     return hashlib.sha256(content).digest() + content
 
 
 def unpacked(content: object) -> Answer:
-    """The answer that bytes hold; refused if they hold none, or files that may not be written."""
+    """Read an answer from bytes; refuses other data, and files that must not be written."""
     if not isinstance(content, bytes):
         raise RefusedAnswerError(f"it is a {type(content).__name__}, and not bytes")
     archive = content[hashlib.sha256().digest_size :]
@@ -113,7 +113,7 @@ def files_in(folder: Path, prefix: str) -> dict[str, bytes]:
 
 
 def _check_names(names: Collection[str]) -> None:
-    """Refuse names that lead elsewhere, or that some system would not take as they are."""
+    """Refuse names that lead elsewhere, or that are not valid on every system."""
     for name in names:
         parts = name.split("/")
         if len(name) > _LONGEST_PATH or not 2 <= len(parts) <= _DEEPEST:
@@ -121,7 +121,7 @@ def _check_names(names: Collection[str]) -> None:
         for part in parts:
             if part in ("", ".", "..") or portable_name(part, 255) != part:
                 raise RefusedAnswerError(f"{name!a} would lie elsewhere")
-    # Some file systems do not tell upper from lower case.
+    # Some file systems ignore case.
     folded = {name.casefold() for name in names}
     if len(folded) < len(names):
         raise RefusedAnswerError("it lists a file twice")
@@ -131,15 +131,15 @@ def _check_names(names: Collection[str]) -> None:
         raise RefusedAnswerError("a file in it is a folder too")
 
 
-# --- What workers say they have done, held against what they were asked for.
+# --- Checks of the workers' answers against their orders.
 
-# Network folders show what others have written with a delay.
+# Network folders show files of other machines with a delay.
 SECONDS_TO_APPEAR = 10.0
 _SECONDS_BETWEEN_LOOKS = 0.25
 
 
 def check_in_place(planned: PlannedRun) -> None:
-    """Make sure that a run lies in its folder, as a worker says that shares it."""
+    """Check that a run is in its folder, as a worker that shares the folder has reported."""
     until = time.monotonic() + SECONDS_TO_APPEAR
     while not planned.is_finished:
         if time.monotonic() > until:
@@ -148,7 +148,7 @@ def check_in_place(planned: PlannedRun) -> None:
 
 
 def receive(planned: PlannedRun, root: Path, files: Mapping[str, bytes]) -> None:
-    """Put files ``run/...`` and ``tensorboard/...`` in place, if they are of this very run."""
+    """Put files ``run/...`` and ``tensorboard/...`` in place, if they belong to this run."""
     run, log = _part(files, "run/"), _part(files, "tensorboard/")
     if len(run) + len(log) != len(files) or (log and planned.spec.tensorboard_log is None):
         raise RefusedAnswerError("it holds files of no run")
@@ -163,7 +163,7 @@ def receive(planned: PlannedRun, root: Path, files: Mapping[str, bytes]) -> None
             shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)
             _write(planned.spec.tensorboard_log, log)
         put_run_in_place(planned, draft)
-    except ValueError as error:  # a name that cannot be written
+    except ValueError as error:  # an invalid file name
         raise RefusedAnswerError(str(error)) from error
     finally:
         remove_draft(draft)
@@ -174,7 +174,7 @@ def _part(files: Mapping[str, bytes], prefix: str) -> dict[str, bytes]:
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files for good, the record last of all."""
+    """Write files durably, the record last."""
     for name in sorted(files, key=lambda name: name == RECORD):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -185,7 +185,7 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _check(planned: PlannedRun, draft: Path, names: set[str]) -> None:
-    """Make sure that a draft holds this run to its end, and nothing but what the run left."""
+    """Check that a draft contains this finished run, and no other files."""
     there = replace(planned, path=draft)
     if not there.is_finished:
         raise RefusedAnswerError("it is another run than was asked for, or not at its end")

@@ -1,4 +1,4 @@
-"""Runs on a cluster, each caught by itself: what is lost on the way is tried again."""
+"""Does runs on a cluster, and retries each lost run separately."""
 
 from __future__ import annotations
 
@@ -40,54 +40,54 @@ from pipeline.signs_of_life import Heartbeat
 SECONDS_TO_GATHER = 60.0
 SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_REPLACEMENTS = 15.0
-# Answers that are looked at and put in place at once: so many are in memory.
+# Answers that are processed in parallel, and so are in memory together.
 N_RECEIVERS = 4
 
 
 MOST_TRIES = 3
-# Who did nothing wrong is sent again as often as that.
+# Retries of a run that was lost without fault.
 MOST_SENDS = 50
 
 
 @dataclass
 class SentRun:
-    """A run under way.
+    """A run that was sent to the scheduler.
 
-    Only a run that had begun may have to do with the end of its worker. One that merely waited
-    there, or whose worker left in good order, or whose scheduler went, is sent again without blame.
+    Only a run that has begun can have crashed its worker. A run that only waited on the worker, or
+    whose worker retired in good order, or whose scheduler was lost, is sent again without blame.
     """
 
     planned: PlannedRun
-    future: Future[RunFailure | None] = field(default_factory=Future)  # what its sender waits for
-    key: str = ""  # its name at the scheduler, another each time
-    task: Any = None  # what the scheduler promises
-    n_sent: int = 0  # how often it was sent
-    n_lost: int = 0  # how often the worker that had begun it was lost
-    n_refused: int = 0  # how often what came back was not the run, or none
-    worker: str | None = None  # where it has begun, as far as is known
-    reason: str = ""  # why it was last lost or refused
+    future: Future[RunFailure | None] = field(default_factory=Future)  # the sender waits for it
+    key: str = ""  # its name at the scheduler, new at each try
+    task: Any = None  # Dask's future
+    n_sent: int = 0  # number of sends
+    n_lost: int = 0  # number of workers lost after beginning it
+    n_refused: int = 0  # number of invalid answers
+    worker: str | None = None  # the worker that has begun it, if known
+    reason: str = ""  # of the last loss or refusal
 
     def begin(self, worker: str, has_left: bool) -> None:
-        """Note that a worker has begun; where another had before, that one was lost."""
+        """Record that a worker has begun the run; an earlier worker counts as lost."""
         self.lose(has_left)
         self.worker = worker
 
     def lose(self, has_left: bool) -> None:
-        """Note that the worker that had begun, if any, is gone; ``has_left`` if in good order."""
+        """Record the loss of the run's worker, if any; ``has_left``: it retired in good order."""
         if self.worker is not None and not has_left:
             self.n_lost += 1
             self.reason = f"the worker that did it was lost {self.n_lost} times ({self.worker})"
         self.worker = None
 
     def refuse(self, reason: str) -> None:
-        """Note that something else than the run came back."""
+        """Record an invalid answer."""
         self.n_refused += 1
         self.worker = None
         self.reason = f"{self.n_refused} times it did not come back as a run: {reason}"
 
     @property
     def is_given_up(self) -> bool:
-        """Whether it has been tried often enough."""
+        """Whether the retries are used up."""
         is_sent_too_often = self.n_sent >= MOST_SENDS
         if is_sent_too_often and not self.reason:
             self.reason = f"it was sent {self.n_sent} times and never came back"
@@ -103,7 +103,7 @@ def cluster_launcher(
     warm_ups: str = "[]",
     tell: Callable[[str], object] = str,
 ) -> Iterator[Launcher]:
-    """Do runs on a cluster, of which ``tell`` is told where the dashboard is, if there is one.
+    """Do runs on a cluster; ``tell`` receives the address of the dashboard, if there is one.
 
     Workers compile ``warm_ups`` once, see `experiments.run_in_child.warm_ups`.
 
@@ -127,7 +127,7 @@ def cluster_launcher(
 
 
 class ClusterLauncher:
-    """The driver's side of a cluster, of which there will be ``n_wanted`` workers at least."""
+    """The driver's side of a cluster with at least ``n_wanted`` workers."""
 
     connection: Connection
 
@@ -139,24 +139,24 @@ class ClusterLauncher:
         self._lock = threading.RLock()
         self._receivers = ThreadPoolExecutor(N_RECEIVERS)
         self._n_wanted = n_wanted
-        self._workers: Mapping[str, int] = {}  # with how many runs each does at once
+        self._workers: Mapping[str, int] = {}  # parallel runs by worker
         self._replaced = time.monotonic()
         self._end: UserError | None = None
 
     @property
     def n_workers(self) -> int:
-        """How many runs the cluster does at once."""
+        """The number of parallel runs on the cluster."""
         return max(sum(self._workers.values()), self._n_wanted)
 
     @property
     def words(self) -> str:
-        """How many workers there are, now."""
+        """The current number of workers, in words."""
         n, n_runs = len(self._workers), sum(self._workers.values())
         text = "1 worker" if n == 1 else f"{n:,} workers"
         return text if n == n_runs else f"{text} for {n_runs:,} runs at once"
 
     def prepare(self, plugin: Supervisors, client: Client) -> None:
-        """Make a scheduler's workers able to do runs, and listen to them."""
+        """Install the plugin on a scheduler's workers, and subscribe to their events."""
         for topic, handler in ((LEAVING, self._on_leaving), (self._topic, self._on_begun)):
             client.subscribe_topic(topic, handler)
         try:
@@ -172,7 +172,7 @@ class ClusterLauncher:
         return sent.future
 
     def look(self, replace_jobs: Replace) -> None:
-        """Count the workers, and see to it that there is a scheduler."""
+        """Count the workers, and check that the scheduler exists."""
         try:
             self._workers = self.connection.n_threads()
             if time.monotonic() > self._replaced + SECONDS_BETWEEN_REPLACEMENTS:
@@ -186,7 +186,7 @@ class ClusterLauncher:
             self._workers = {}
 
     def close(self) -> None:
-        """Leave the cluster; runs that are under way there end, and keep their states."""
+        """Leave the cluster; running runs end there, and keep their states."""
         self._end_all(UserError("the cluster was left"))
         self.connection.close()
         self._receivers.shutdown(cancel_futures=True)
@@ -199,19 +199,19 @@ class ClusterLauncher:
             _set_error(each.future, error)
 
     def _guarded(self, sent: SentRun, function: Callable[..., object], *args: Any) -> None:
-        """Let nothing that goes wrong leave a future waiting."""
+        """Pass every exception to the future, so that nothing waits for ever."""
         try:
             if self._end is not None:
                 raise self._end
             function(sent, *args)
-        except UserError as error:  # of the cluster as a whole
+        except UserError as error:  # about the whole cluster
             _set_error(sent.future, error)
             self._end_all(error)
         except Exception as error:  # noqa: BLE001  # whoever waits for it has to know
             _set_error(sent.future, error)
 
     def _send(self, sent: SentRun) -> None:
-        """Hand a run to the scheduler, if it has not been tried often enough."""
+        """Send a run to the scheduler, unless its retries are used up."""
         with self._lock:
             self._sent.pop(sent.key, None)
             if sent.is_given_up:
@@ -226,7 +226,7 @@ class ClusterLauncher:
         client = self.connection.client()
         try:
             sent.task = client.submit(do_order, order.packed(), key=sent.key, pure=False)
-        except (OSError, RuntimeError):  # the client has lost its scheduler since then
+        except (OSError, RuntimeError):  # the client has just lost its scheduler
             self.connection.lose(client)
             self._receivers.submit(self._guarded, sent, self._send)
             return
@@ -237,13 +237,13 @@ class ClusterLauncher:
             self._receivers.submit(self._guarded, sent, self._take, task)
 
     def _take(self, sent: SentRun, task: DaskFuture[Any]) -> None:
-        """See what has become of a run, and send it again where it has not come back."""
+        """Process the result of a run, and send the run again if there is none."""
         if sent.future.done() or sent.task is not task:
             return
         if task.status == "finished":
             try:
                 content = task.result(timeout=SECONDS_TO_GATHER)
-            except TimeoutError:  # its worker has died since, and it is done again
+            except TimeoutError:  # its worker has died, and the run is repeated
                 task.add_done_callback(partial(self._on_done, sent))
                 return
             except Exception:  # noqa: BLE001  # of whatever kind, from the scheduler: it is lost
@@ -266,7 +266,7 @@ class ClusterLauncher:
         self._send(sent)
 
     def _settle(self, sent: SentRun, reason: str, details: str = "") -> None:
-        """Tell whoever waits for a run that it is done, or how it failed."""
+        """Set the result of a run's future: done, or how it failed."""
         with self._lock:
             self._sent.pop(sent.key, None)
         failure = ended(sent.planned, self._probe.root, reason, details or f"{reason}\n")
@@ -276,7 +276,7 @@ class ClusterLauncher:
             sent.future.set_result(failure)
 
     def _on_begun(self, event: Any) -> None:
-        """Note who has begun a run; called by the client, and with anything."""
+        """Record which worker has begun a run; the client calls this with unchecked data."""
         match event:
             case [_, {"run": str(key), "at": str(worker)}]:
                 pass
@@ -308,10 +308,10 @@ def _set_error(future: Future[RunFailure | None], error: Exception) -> None:
 
 
 def _ending_of(sent: SentRun, content: object, root: Path) -> tuple[str, str] | None:
-    """Why a run failed, in one line and at length; both empty where it is done, and in its place.
+    """Why a run failed, in one line and at length; both empty if it is done and in its place.
 
-    Nothing is believed of ``content``, the answer of its worker. None where the run is to be sent
-    again; a worker that can do no run at all is a `UserError`.
+    ``content``, the worker's answer, is not trusted. Returns None if the run must be sent again;
+    raises UserError for a worker that cannot do any run.
     """
     try:
         answer = unpacked(content)

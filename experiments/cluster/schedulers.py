@@ -1,9 +1,9 @@
-"""What ``--cluster`` says, and the way to its scheduler: one that is there, one here, or a queue's.
+"""Reads ``--cluster``, and connects to a scheduler: an existing one, a local one, or a queue's.
 
-Dask's own messages are pickles, so whoever can talk to a scheduler can run code as its user, on the
-scheduler, on its workers and in the driver. Hence a scheduler is spoken to only by TLS with
-certificates on both sides, or on this machine alone. A connection that is lost is made again. Jobs
-are those of a queueing system, by dask-jobqueue.
+Dask's messages are pickles, so anyone who can connect to a scheduler can run code as its user, on
+the scheduler, on its workers and in the driver. So connections need TLS with certificates on both
+sides, or stay on this machine. A lost connection is made again. dask-jobqueue starts the jobs of a
+queueing system.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from pipeline.settings.yaml import read_yaml
 from pipeline.stopping import current
 from safe_files.files import UnsafeFileError, read_file
 
-# The classes of dask-jobqueue, by the names of their systems.
+# The classes of dask-jobqueue by system.
 QUEUES = {
     "htcondor": "HTCondorCluster",
     "lsf": "LSFCluster",
@@ -56,23 +56,23 @@ _FORMS = "ADDRESS:PORT, a scheduler's file, a YAML of dask-jobqueue, or local:N"
 
 @dataclass(frozen=True)
 class LocalWorkers:
-    """That many workers on this machine, for as long as the command takes."""
+    """A number of workers on this machine for the duration of the command."""
 
     n_workers: int
-    is_insecure: bool = False  # of no matter: nobody else can talk to them
+    is_insecure: bool = False  # irrelevant: no other user can connect
 
 
 @dataclass(frozen=True)
 class SchedulerAddress:
-    """A scheduler that is there, by its address or by the file that has it."""
+    """An existing scheduler, by its address or by a file with the address."""
 
-    text: str  # the address; empty where it stands in the file
-    file: Path | None = None  # the file; None where there is none
-    n_workers: int = 0  # to be waited for: whatever there is will do
-    is_insecure: bool = False  # whether the user has said that one open to the network will do
+    text: str  # the address; empty if it is in the file
+    file: Path | None = None  # the file, or None
+    n_workers: int = 0  # to wait for: any number is enough
+    is_insecure: bool = False  # whether the user accepts a scheduler that is open to the network
 
     def read(self) -> str:
-        """The address, as it is now: with ``tcp://`` or ``tls://``."""
+        """The current address, with ``tcp://`` or ``tls://``."""
         text = self.text if self.file is None else _address_in(self.file)
         return text if "://" in text else f"tcp://{text}"
 
@@ -82,18 +82,18 @@ class JobQueue:
     """Workers that a queueing system starts as jobs."""
 
     system: str  # its name in dask-jobqueue
-    settings: dict[str, Any]  # what dask-jobqueue is told of it
-    n_cores: int  # of each job, as many runs at once
-    file: Path  # where that stands
-    n_workers: int = 0  # for how many runs at once jobs are started
-    is_insecure: bool = False  # as of a `SchedulerAddress`
+    settings: dict[str, Any]  # arguments for dask-jobqueue
+    n_cores: int  # of each job: its parallel runs
+    file: Path  # the file with these settings
+    n_workers: int = 0  # parallel runs for which jobs are started
+    is_insecure: bool = False  # as in a `SchedulerAddress`
 
 
 Cluster = LocalWorkers | SchedulerAddress | JobQueue
 
 
 def read_cluster(text: str) -> Cluster:
-    """What ``--cluster`` means, or `UserError`."""
+    """Parse ``--cluster``, or raise `UserError`."""
     if text.startswith("local:"):
         number = text.removeprefix("local:")
         if number.isascii() and number.isdecimal() and 0 < int(number[:9]) <= MOST_LOCAL_WORKERS:
@@ -110,7 +110,7 @@ def read_cluster(text: str) -> Cluster:
 
 
 def check_address(address: str, has_certificates: bool, is_insecure: bool) -> None:
-    """Refuse a scheduler that is open to the network, or by TLS without its certificates."""
+    """Refuse a scheduler that is open to the network, or uses TLS without our certificates."""
     scheme = urlsplit(address).scheme
     if scheme not in ("tcp", "tls"):
         raise UserError(f"--cluster {address}: give an address that begins with tls:// or tcp://")
@@ -127,7 +127,7 @@ def check_address(address: str, has_certificates: bool, is_insecure: bool) -> No
 
 
 def is_loopback(address: str) -> bool:
-    """Whether an address can be reached from its own machine alone."""
+    """Whether an address can be reached only from its own machine."""
     host = _host(address)
     if host is None or host == "localhost":
         return host is not None
@@ -138,7 +138,7 @@ def is_loopback(address: str) -> bool:
 
 
 def _host(address: str) -> str | None:
-    """The host of an address; None where it is none, or lacks the port."""
+    """The host of an address; None if the address is invalid or lacks the port."""
     try:
         parts = urlsplit(address if "://" in address else f"tcp://{address}")
         return parts.hostname if parts.port else None
@@ -177,12 +177,12 @@ def _job_queue(path: Path) -> JobQueue:
 
 # --- Jobs of a queueing system.
 
-# Of the time that a job has, what its workers leave for going: they retire before it is over.
+# The time before a job's end at which its workers retire: a share, and a maximum.
 SHARE_FOR_LEAVING = 0.1
 MOST_FOR_LEAVING = 300.0  # seconds
 
-# How long a killed worker may take to be started again, before it is given up for another: Dask's
-# 15 seconds are soon over on a machine that is busy.
+# The time-out for the restart of a killed worker, before another replaces it: Dask's 15 seconds
+# are too short on a busy machine.
 SECONDS_TO_RESTART = 60.0
 _NEVER = 1e9  # seconds
 
@@ -190,20 +190,20 @@ _WALLTIME = re.compile(r"(?:(\d{1,4})-)?(\d{1,4}):(\d\d):(\d\d)")
 
 
 def has_certificates(security: Security) -> bool:
-    """Whether Dask's configuration names what TLS takes to prove oneself."""
+    """Whether Dask's configuration names the certificate and key for TLS."""
     tls = security.get_tls_config_for_role("client")
     return bool(tls["ca_file"] and tls["cert"])
 
 
 def opened_queue(queue: JobQueue) -> Any:
-    """Jobs whose scheduler is in this process; with certificates of its own, if none are given."""
+    """Start jobs with a scheduler in this process; makes certificates if none are given."""
     settings = {**queue.settings, **_retiring(queue)}
     words = settings.get("worker-extra-args") or []
     if not any("dashboard" in str(word) for word in words):
         closed = f"{ClosedWorker.__module__}.{ClosedWorker.__name__}"
         settings["worker-extra-args"] = [*words, "--no-dashboard", "--worker-class", closed]
     dask.config.set({f"jobqueue.{queue.system}": {**_defaults(queue.system), **settings}})
-    # Else it would end the job of the same name that `Jobs` has sent instead, while that waits.
+    # Otherwise Dask would cancel the waiting job of the same name that `Jobs` has sent instead.
     dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER})
     kind = getattr(_library(), QUEUES[queue.system])
     security = Security()
@@ -225,18 +225,18 @@ def opened_queue(queue: JobQueue) -> Any:
 
 
 class Jobs:
-    """As many jobs as are wanted, of which those that have ended are sent again.
+    """Keeps the wanted number of jobs, and replaces jobs that have ended.
 
-    Dask finds out that a job has ended only where one worker is all of it.
+    Dask itself notices the end of a job only if the job has a single worker.
     """
 
     def __init__(self, queue: Any, n_jobs: int) -> None:
         self._queue, self._n_jobs = queue, n_jobs
-        self._seen: dict[str, tuple[set[str], float]] = {}  # of a job: its workers, and when
+        self._seen: dict[str, tuple[set[str], float]] = {}  # by job: its workers, and the time
         queue.scale(jobs=n_jobs)
 
     def replace(self, left: Collection[str]) -> None:
-        """Send again those whose workers have gone; not those that left in good order."""
+        """Replace jobs whose workers are lost; not those that left in good order."""
         self._queue.loop.add_callback(self._replace, frozenset(left))
 
     def _replace(self, left: frozenset[str]) -> None:
@@ -252,9 +252,9 @@ class Jobs:
         self._queue.scale(jobs=self._n_jobs)
 
     def _workers_of_jobs(self) -> dict[str, set[str]]:
-        """The addresses of the workers that there are, by their job."""
+        """The addresses of existing workers by job."""
         workers = list(self._queue.scheduler.workers.values())
-        # One has the job's name, several have numbers behind it.
+        # A single worker has the job's name; several have the name and a number.
         return {
             job: {each.address for each in workers if f"{each.name}-".startswith(f"{job}-")}
             for job in self._queue.worker_spec
@@ -262,7 +262,7 @@ class Jobs:
 
 
 def _library() -> ModuleType:
-    """Dask-jobqueue; importing it takes Ctrl-C for itself, which is given back."""
+    """Import dask-jobqueue, and restore the Ctrl-C handler that the import replaces."""
     before = signal.getsignal(signal.SIGINT)
     try:
         return importlib.import_module("dask_jobqueue")
@@ -277,10 +277,10 @@ def _defaults(system: str) -> dict[str, Any]:
 
 
 def _retiring(queue: JobQueue) -> dict[str, Any]:
-    """What lets workers retire before their job is ended, where the file does not say it."""
+    """Options that make workers retire before their job ends, unless the file sets them."""
     words = queue.settings.get("worker-extra-args") or []
     walltime = queue.settings.get("walltime", _defaults(queue.system).get("walltime"))
-    if not isinstance(walltime, str | None):  # YAML takes 04:00:00 for a number in base 60
+    if not isinstance(walltime, str | None):  # YAML reads 04:00:00 as a number in base 60
         raise UserError(f"{queue.file}: {queue.system}: put walltime in quotes, as '04:00:00'")
     parts = _WALLTIME.fullmatch(walltime or "")
     if parts is None or any(str(word).startswith("--lifetime") for word in words):
@@ -294,20 +294,20 @@ def _retiring(queue: JobQueue) -> dict[str, Any]:
 
 # --- The connection to a scheduler.
 
-# How long a scheduler may be gone: to be started again takes a few seconds, a reboot a minute.
+# How long a scheduler may be unreachable: a restart takes a few seconds, a reboot a minute.
 SECONDS_WITHOUT_SCHEDULER = 120.0
 SECONDS_TO_CONNECT = 8.0
 _SECONDS_BETWEEN_LOOKS = 0.2
 
 
 class ClusterGoneError(UserError):
-    """There is no scheduler any more."""
+    """The scheduler is lost."""
 
 
 class Connection:
-    """A client of a scheduler, made by ``connect``, and another when it has lost it.
+    """Keeps a client of a scheduler, made by ``connect``, and makes a new one after a loss.
 
-    Each is handed to ``prepare``.
+    Each client is passed to ``prepare``.
     """
 
     def __init__(
@@ -323,20 +323,20 @@ class Connection:
         self._identity = ""
 
     def begin(self) -> None:
-        """Connect for the first time; `UserError` if there is no scheduler, or an open one."""
+        """Connect for the first time; `UserError` if the scheduler is missing or open to others."""
         try:
             self._client = self._connected()
         except OSError as error:
             raise UserError(f"--cluster: there is no scheduler: {one_line(error)}") from error
 
     def lose(self, client: Client) -> None:
-        """Take a client for lost: also one that has found another scheduler in its place."""
+        """Drop a lost client, also one that has connected to another scheduler instead."""
         with self._lock:
             if self._client is client and not self._closed.is_set():
                 self._is_lost = True
 
     def client(self) -> Client:
-        """A client that has its scheduler, which is waited for; else `ClusterGoneError`."""
+        """Wait for a connected client; `ClusterGoneError` after the time-out."""
         with self._lock:
             client = self._client
             if client is None or self._closed.is_set():
@@ -348,7 +348,7 @@ class Connection:
             return self._client
 
     def n_threads(self) -> Mapping[str, int]:
-        """How many runs each worker does at once, by address; a worker must not be open."""
+        """The parallel runs of each worker by address; refuses workers that are open to others."""
         client = self.client()
         if _identity(client)["id"] != self._identity:
             self.lose(client)
@@ -358,7 +358,7 @@ class Connection:
         return workers
 
     def close(self) -> None:
-        """Leave the scheduler; what is under way there ends."""
+        """Leave the scheduler; its running tasks end."""
         self._closed.set()
         with self._lock:
             if self._client is not None:
@@ -371,7 +371,7 @@ class Connection:
         while time.monotonic() < until and not self._closed.is_set():
             try:
                 return self._connected()
-            except (OSError, UserError) as error:  # its file may be missing, or half-written
+            except (OSError, UserError) as error:  # the file may be missing or half-written
                 reason = one_line(error)
             time.sleep(_SECONDS_BETWEEN_LOOKS)
         raise ClusterGoneError(
@@ -392,7 +392,7 @@ class Connection:
         return client
 
     def _check_open(self, addresses: Any) -> None:
-        """Refuse what listens to a network without TLS, whatever it was called here."""
+        """Refuse a scheduler that listens to a network without TLS, whatever its address here."""
         for address in addresses:
             if not (self._is_insecure or address.startswith("tls://") or is_loopback(address)):
                 raise UserError(
@@ -402,13 +402,13 @@ class Connection:
 
 
 def _identity(client: Client) -> dict[str, Any]:
-    """What a scheduler says of itself: where it listens among it."""
+    """A scheduler's description of itself, including its addresses."""
     found: dict[str, Any] = client.scheduler_info(n_workers=0)
     return found
 
 
 def _close(client: Client) -> None:
-    # Whatever goes wrong in leaving, there is nothing left to be done.
+    # Errors while leaving do not matter.
     with contextlib.suppress(Exception):
         client.close(timeout=2)
 
@@ -420,7 +420,7 @@ Replace = Callable[[Collection[str]], object]
 
 
 def checked_cluster(text: str, is_insecure: bool) -> Cluster:
-    """What ``--cluster`` means, before anything is begun; refused if it is open to others."""
+    """Parse and check ``--cluster`` before anything starts; refuses a cluster open to others."""
     cluster = replace(read_cluster(text), is_insecure=is_insecure)
     if isinstance(cluster, SchedulerAddress):
         check_address(cluster.read(), has_certificates(Security()), is_insecure)
@@ -429,10 +429,10 @@ def checked_cluster(text: str, is_insecure: bool) -> Cluster:
 
 @contextlib.contextmanager
 def opened(cluster: Cluster) -> Iterator[tuple[Connect, Replace]]:
-    """Have a scheduler while the ``with`` statement runs.
+    """Provide a scheduler during the ``with`` statement.
 
-    Yields what makes a client of it; and what is to be called now and then with the addresses of
-    workers that left in good order, so that workers and jobs that have ended are replaced.
+    Yields a function that makes a client, and a function to call periodically with the addresses
+    of workers that left in good order, which replaces ended workers and jobs.
     """
     _be_quiet()
     dask.config.set({"distributed.deploy.lost-worker-timeout": SECONDS_TO_RESTART})
@@ -450,7 +450,7 @@ def opened(cluster: Cluster) -> Iterator[tuple[Connect, Replace]]:
 
 
 def _be_quiet() -> None:
-    """Let the library log nothing: what matters, the launcher tells."""
+    """Silence the library's log: the launcher reports what matters."""
     for name in ("distributed", *logging.root.manager.loggerDict):
         if name.partition(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -468,11 +468,11 @@ def _client_of(cluster: SchedulerAddress) -> Client:
 
 @contextlib.contextmanager
 def _left_to_driver() -> Iterator[None]:
-    """Let what is started leave signals to this process, which reach all of a terminal at once."""
+    """Shield child processes from signals of the terminal, which this process handles."""
     if sys.platform == "win32":
         yield
         return
-    # It lets SIGINT through again after its own start, so that has to come first.
+    # The resource tracker unblocks SIGINT at its start, so it must start first.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
     try:
@@ -483,16 +483,16 @@ def _left_to_driver() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _local(n_workers: int) -> Iterator[SpecCluster]:
-    """Workers on this machine, and nobody but them and this process can talk to the scheduler.
+    """Start workers on this machine, with a scheduler that accepts only them and this process.
 
-    Loopback alone would not do: any user of the machine could, and have their code run by this one.
+    Loopback alone is not safe: any user of the machine could connect, and run code as this user.
     """
     security = Security.temporary()
     common = {"host": "127.0.0.1", "protocol": "tls://", "security": security, "dashboard": False}
     worker = {
         **common,
         "nthreads": 1,
-        "memory_limit": 0,  # a run's memory is its child's, and what --run-memory is about
+        "memory_limit": 0,  # the run is in a child, which --run-memory limits
         "silence_logs": logging.CRITICAL,
         "worker_class": ClosedWorker,
     }
@@ -508,7 +508,7 @@ def _local(n_workers: int) -> Iterator[SpecCluster]:
         cluster.scale(n_workers)
         yield cluster
     finally:
-        # Workers that are about to start make it fail; they end with this process.
+        # Starting workers make it fail; they end with this process.
         with contextlib.suppress(Exception):
             cluster.close()
-        SpecCluster._instances.discard(cluster)  # it would try again at the end
+        SpecCluster._instances.discard(cluster)  # it would retry at exit

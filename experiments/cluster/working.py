@@ -1,6 +1,6 @@
-"""What a driver tells a worker about a run, and what the worker does with it.
+"""Orders from a driver to a worker, and their execution by the worker.
 
-A worker is a supervisor whose child does the run.
+A worker is a supervisor whose child process does the run.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from experiments.run_limits import RunLimits
 from pipeline.digests import source_digest
 from pipeline.train_spec import TrainSpec
 
-# The topics of what workers tell drivers, besides answers: who has begun what, and who leaves.
+# The topics of workers' events, besides answers: the start of a run, and a worker's retirement.
 LEAVING = "yardstick-leaving"
 
-# As yaml.safe_dump and yaml.safe_load, by the library's faster half where that was built.
+# Like yaml.safe_dump and yaml.safe_load, with the faster C version if available.
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -46,12 +46,12 @@ class Probe:
 
     home: Path  # the folder where the driver was started
     root: Path  # the study's folder, as the driver knows it
-    name: str  # of the file
-    content: str  # its content
+    name: str  # the name of the file
+    content: str  # the content of the file
 
     @property
     def is_there(self) -> bool:
-        """Whether the file is, with its content."""
+        """Whether the file exists with its content."""
         try:
             with (self.home / self.root / self.name).open("rb") as file:
                 return file.read(len(self.content) + 1) == self.content.encode()
@@ -61,17 +61,17 @@ class Probe:
 
 @dataclass(frozen=True)
 class RunOrder:
-    """A run to do."""
+    """An order to do a run."""
 
     planned: PlannedRun  # the run
-    command: str  # the command that asked for it
-    limits: RunLimits  # what it may take
-    probe: Probe  # what tells whether the study's folder is shared
-    topic: str  # where to tell that it begins
+    command: str  # the command that requested it
+    limits: RunLimits  # its limits
+    probe: Probe  # the test for a shared folder
+    topic: str  # the topic of the event that it begins
     version: str  # the driver's `version`
 
     def packed(self) -> bytes:
-        """The order as YAML: plain data, whose numbers and keys stay what they are."""
+        """The order as YAML: plain data that keeps the types of numbers and keys."""
         planned, limits = self.planned, self.limits
         data = {
             "planned": {field.name: getattr(planned, field.name) for field in fields(PlannedRun)}
@@ -85,7 +85,7 @@ class RunOrder:
 
     @classmethod
     def unpacked(cls, content: bytes) -> Self:
-        """The order that `packed` has written."""
+        """Read an order that `packed` wrote."""
         loader = _Loader(content)
         data: dict[str, Any] = loader.get_single_data()
         loader.dispose()
@@ -100,7 +100,7 @@ class RunOrder:
         return cls(**{**data, **read})
 
     def apart(self) -> RunOrder:
-        """The same in folders that a relative path can reach, where none is shared."""
+        """The same order with relative paths, for a worker without the shared folder."""
         root, planned = self.probe.root, self.planned
         if not root.is_absolute() and ".." not in root.parts:
             return self
@@ -112,9 +112,9 @@ class RunOrder:
 
 @contextlib.contextmanager
 def probing(root: Path) -> Iterator[Probe]:
-    """Let a probe lie in a study's folder while the ``with`` statement runs.
+    """Keep a probe in a study's folder during the ``with`` statement.
 
-    One that is left, by a driver that was killed, is removed by the next.
+    The next driver removes a probe that a killed driver has left.
     """
     name = f".cluster-{secrets.token_hex(8)}.tmp"
     probe = Probe(Path.cwd(), root, name, secrets.token_hex(16))
@@ -129,7 +129,7 @@ def probing(root: Path) -> Iterator[Probe]:
 
 @cache
 def version() -> str:
-    """Of the sources that runs depend on, and of the libraries: workers of another do none."""
+    """The version of the sources and libraries of runs; a worker must have the driver's."""
     lines = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
     lines += [f"python {platform.python_version()}", source_digest("experiments")]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
@@ -137,54 +137,54 @@ def version() -> str:
 
 # --- The side of the worker.
 
-# The states of a task that its driver has given up, or that was lost with its scheduler.
+# The states of a task that its driver has cancelled, or that was lost with its scheduler.
 _UNWANTED = ("cancelled", "released", "forgotten")
 
 
 class _Closed:
-    """Opens no port for pages: these would answer every user of the machine, without TLS."""
+    """Mixin without an HTTP port, which would answer every user of the machine without TLS."""
 
     def start_http_server(self, *args: Any, **kwargs: Any) -> None:
-        """Dask has no setting that leaves this out."""
+        """Do nothing, because Dask has no setting for this."""
 
 
 class ClosedScheduler(_Closed, Scheduler):
-    """A scheduler that speaks TLS alone."""
+    """A scheduler that only accepts TLS."""
 
 
 class ClosedWorker(_Closed, Worker):
-    """A worker that speaks TLS alone."""
+    """A worker that only accepts TLS."""
 
 
 class Supervisors(WorkerPlugin):
-    """Makes workers able to do runs: the process that children are forked from starts at once."""
+    """Worker plugin that starts the fork server, so that workers can do runs."""
 
     name = "yardstick-supervisors"
-    idempotent = True  # of several drivers, the first is enough
+    idempotent = True  # with several drivers, the first is enough
 
     def __init__(self, warm_ups: str) -> None:
-        self.warm_ups = warm_ups  # what it compiles once, see `experiments.run_in_child.warm_ups`
+        self.warm_ups = warm_ups  # compiled once, see `experiments.run_in_child.warm_ups`
 
     def setup(self, worker: Worker) -> None:
-        """Get ready; what takes long goes on in the background."""
-        multiprocessing.current_process().daemon = False  # those of a nanny may have no children
+        """Start the fork server in the background."""
+        multiprocessing.current_process().daemon = False  # a nanny's process may have no children
         child_processes.start_server(self.warm_ups)
-        version()  # of what has been loaded, before it can change
+        version()  # caches the version of the loaded sources, before files change
 
     def teardown(self, worker: Worker) -> None:
-        """End what is under way: it leaves its state where it can be reached."""
+        """End running runs, which save their states."""
         worker.log_event(LEAVING, {"at": worker.address})
         child_processes.stop_all()
         child_processes.end_server()
 
 
 def answer_to(content: bytes) -> bytes:
-    """Do the run of an order, and say how it ended; see `experiments.cluster.do_order`."""
+    """Do the run of an order, and return how it ended; see `experiments.cluster.do_order`."""
     worker = get_worker()
     key = worker.get_current_task()
     order = RunOrder.unpacked(content)
     worker.log_event(order.topic, {"run": key, "at": worker.address})
-    if Supervisors.name not in worker.plugins:  # as after a scheduler was started again
+    if Supervisors.name not in worker.plugins:  # after a restart of the scheduler
         Supervisors("[]").setup(worker)
     if order.version != version():
         return packed(Answer(UNFIT, f"{worker.address} has other code or libraries than this"))
@@ -210,12 +210,12 @@ def _is_wanted(worker: Worker, key: Any) -> bool:
 
 def _do(order: RunOrder, home: Path) -> None:
     there = replace(order.planned, path=home / order.planned.path)
-    if not there.is_finished:  # else it was done before, and its worker died with the answer
+    if not there.is_finished:  # else an earlier worker finished it, but lost the answer
         do_supervised(order.planned, order.probe.root, order.command, order.limits, home)
 
 
 def _done_apart(order: RunOrder, folder: Path) -> Answer:
-    """Do a run in a folder of the worker's own, and take along what it left."""
+    """Do a run in a temporary folder of the worker, and add its files to the answer."""
     home = folder / order.topic
     home.mkdir(exist_ok=True)
     _do(order, home)

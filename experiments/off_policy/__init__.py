@@ -1,1 +1,1 @@
-"""Policies judged by pulls that another one made: ``compare.py --logged``."""
+"""Off-policy evaluation on the pulls of another policy: ``compare.py --logged``."""

@@ -1,11 +1,11 @@
-"""What a policy would have earned, estimated from pulls that another policy made.
+"""Estimates the value of a policy from pulls that another policy made.
 
-Each estimator returns a term for each logged pull. The mean of the terms is the estimate, and their
-spread over the square root of their number its standard error. Two policies on the same log are
-therefore compared by the differences of their terms, pull by pull: see `difference_in_value`.
+Each estimator returns a term for each logged pull. The estimate is the mean of the terms; its
+standard error is their standard deviation divided by the square root of their number. So two
+policies on one log are compared by differences of their terms: see `difference_in_value`.
 
-With a pull in context x of arm a, which the log chose with probability p and which gave r, a policy
-of probabilities pi(arm | x), and q(x, arm) a guess at the mean reward:
+For a pull in context x of arm a, which the log chose with probability p and which gave reward r, a
+policy with probabilities pi(arm | x), and an estimate q(x, arm) of the mean reward:
 
     importance weight        w = pi(a | x) / p
     inverse propensities     mean of w r
@@ -13,8 +13,8 @@ of probabilities pi(arm | x), and q(x, arm) a guess at the mean reward:
     direct method            mean of sum over arms of pi(arm | x) q(x, arm)
     doubly robust            the direct method's terms, plus w (r - q(x, a))
 
-The guesses q are linear in the rewards that they are fitted to, which tells how much each of those
-counts in what comes of a prediction. Each pull is predicted by a model fitted to other pulls.
+The estimates q are linear in the rewards to which they are fitted. This gives the influence of each
+reward on a prediction. A model predicts only pulls to which it was not fitted (cross-fitting).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mdp.transition_model import Bools, Floats, Ints
 from verdicts import Estimate, paired_difference
 
 N_FOLDS = 5
-# The weight of the prior of each coefficient, in pulls.
+# The weight of each coefficient's prior, in pulls.
 RIDGE = 1.0
 
 
@@ -43,7 +43,7 @@ class RewardModel(Protocol):
         ...
 
     def sensitivity(self, contexts: NDArray[Any], policy: Floats) -> Floats:
-        """By how much the predicted total reward of a policy rises with each reward fitted to.
+        """The derivative of a policy's predicted total reward by each reward in the fit.
 
         That is, the derivatives of the sum of ``policy * predict(contexts)``; ``policy`` has the
         probability of each arm in each of m contexts, shape (m, n_arms).
@@ -52,9 +52,9 @@ class RewardModel(Protocol):
 
 
 class ArmMeans:
-    """The mean reward of each arm in each context; the arm's overall mean where there is none.
+    """The mean reward of each arm in each context; without pulls, the arm's overall mean.
 
-    Saturated: nothing is assumed about the rewards. Contexts are whole numbers from 0, shape (n,).
+    A saturated model: it assumes nothing about rewards. Contexts are integers from 0, shape (n,).
     """
 
     def __init__(
@@ -88,8 +88,8 @@ class ArmMeans:
 class ArmRegressions:
     """A ridge regression of the rewards on the context for each arm.
 
-    Features are standardised, and rewards counted from their mean, which is what is predicted for
-    an arm without pulls. Contexts have the shape (n, d).
+    Features are standardised, and rewards are centred on their mean, which is the prediction for an
+    arm without pulls. Contexts have the shape (n, d).
 
     Source: Hoerl and Kennard (1970), "Ridge regression", Technometrics 12.
     """
@@ -113,7 +113,7 @@ class ArmRegressions:
         return np.asarray(self.level + self._standardised(contexts) @ self.coefficients.T)
 
     def sensitivity(self, contexts: Floats, policy: Floats) -> Floats:
-        """See `RewardModel`; of the regressions, the mean reward being taken as it is."""
+        """See `RewardModel`; treats the mean reward as fixed."""
         totals = policy.T @ self._standardised(contexts)
         solved = [linalg.cho_solve(*pair) for pair in zip(self._factors, totals, strict=True)]
         return np.asarray((self.inputs * np.stack(solved)[self.arms]).sum(axis=1))
@@ -125,19 +125,19 @@ class ArmRegressions:
 
 @dataclass(frozen=True, eq=False)
 class CrossFit:
-    """Models of the rewards, none of which predicts a pull that it was fitted to."""
+    """Models of the rewards; none predicts a pull to which it was fitted."""
 
     contexts: NDArray[Any]  # of the pulls, shape (n,) or (n, d)
     arms: Ints  # shape (n,)
     rewards: Floats  # shape (n,)
     fold: Ints  # the fold of each pull, shape (n,)
-    models: Sequence[RewardModel]  # for each fold the one fitted to all other folds
+    models: Sequence[RewardModel]  # for each fold, a model fitted to all other folds
     predicted: Floats  # mean reward of each arm before each pull, shape (n, n_arms)
 
     def reward_influence(self, policy: Floats) -> Floats:
-        """What each reward's deviation from its model adds to the predictions for the policy.
+        """The effect of each reward's deviation from its model on the policy's predictions.
 
-        On the scale of a single term: their mean is what they add together.
+        On the scale of a term: the mean of the results is their total effect.
         """
         added = np.zeros(len(self.arms))
         for fold, model in enumerate(self.models):
@@ -159,15 +159,15 @@ def cross_fit(
     n_folds: int = N_FOLDS,
     seed: int = 0,
 ) -> CrossFit:
-    """Fit models of the rewards: means for contexts that are numbered, else regressions.
+    """Fit models of the rewards: means for numbered contexts, else regressions.
 
     Args:
-        contexts: whole numbers from 0, shape (n,), or vectors, shape (n, d).
+        contexts: integers from 0, shape (n,), or vectors, shape (n, d).
         arms: shape (n,).
         rewards: shape (n,).
-        n_arms: number of arms, also of those that were not pulled.
-        n_folds: parts into which the pulls are divided at random.
-        seed: of the division.
+        n_arms: number of arms, including arms that were not pulled.
+        n_folds: number of random parts of the pulls.
+        seed: the seed of this partition.
 
     Raises:
         ValueError: if there are fewer than two pulls or folds.
@@ -195,10 +195,10 @@ def cross_fit(
 
 # --- The estimators.
 
-# By how many standard errors weights may miss their mean of 1 before the log is refused. Chance
-# does that only where next to none of what the policy does was logged.
+# By how many standard errors the mean weight may differ from 1 before the log is refused. Chance
+# causes this only if the log has almost none of the policy's actions.
 MOST_ERRORS = 5.0
-# By how much they may miss it besides: files round propensities.
+# An additional tolerance, because files round propensities.
 ROUNDED = 0.02
 _SUMS_TO_1 = 1e-6
 
@@ -211,25 +211,25 @@ class PolicyTerms:
     snips: Floats  # self-normalised
     direct: Floats  # the direct method
     doubly_robust: Floats  # doubly robust
-    effective: float  # how many pulls of the policy's own the log is worth
-    weights: Floats  # how much more often the policy makes each pull than the log did
-    errors: Floats  # by how much each reward was above what the model expected
+    effective: float  # the effective sample size, in pulls of the policy itself
+    weights: Floats  # probability of each pull under the policy, relative to the log
+    errors: Floats  # each reward minus the model's prediction
 
 
 def evaluate_policy(
     policy: Floats, arms: Ints, rewards: Floats, propensities: Floats, model: CrossFit
 ) -> PolicyTerms:
-    """Judge a policy by all four estimators.
+    """Evaluate a policy by all four estimators.
 
     Args:
-        policy: its probability of each arm before each pull, shape (n, n_arms).
+        policy: its probability of each arm at each pull, shape (n, n_arms).
         arms: the arms pulled, shape (n,).
-        rewards: what they gave, shape (n,).
-        propensities: the probability with which each was chosen, shape (n,).
-        model: of the rewards; see `experiments.off_policy.estimators.cross_fit`.
+        rewards: their rewards, shape (n,).
+        propensities: the log's probability of each pulled arm, shape (n,).
+        model: the reward model; see `experiments.off_policy.estimators.cross_fit`.
 
     Raises:
-        ValueError: if the arrays are not such, or the log cannot tell what the policy is worth.
+        ValueError: if the arrays are invalid, or the log cannot support an estimate.
     """
     weights = importance_weights(policy, arms, propensities)
     check_rewards(rewards, len(arms))
@@ -246,7 +246,7 @@ def evaluate_policy(
 
 
 def terms_as_logged(arms: Ints, rewards: Floats, model: CrossFit) -> PolicyTerms:
-    """The terms of the policy that made the log, which are the rewards themselves."""
+    """The terms of the log's own policy, which are the rewards themselves."""
     n, errors = len(rewards), _errors(arms, rewards, model.predicted)
     return PolicyTerms(rewards, rewards, rewards, rewards, float(n), np.ones(n), errors)
 
@@ -254,8 +254,8 @@ def terms_as_logged(arms: Ints, rewards: Floats, model: CrossFit) -> PolicyTerms
 def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
     """The mean of an estimator's terms with its t interval.
 
-    The interval holds where there are many terms and no few of them decide: look at the effective
-    sample size. What an estimator is biased by, it does not cover.
+    The interval is valid for many terms without dominating ones: check the effective sample size.
+    It does not cover the bias of an estimator.
     """
     return paired_difference(terms, np.zeros_like(terms), confidence)
 
@@ -263,17 +263,17 @@ def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
 def difference_in_value(
     first: PolicyTerms, second: PolicyTerms, n_comparisons: int = 1
 ) -> Estimate:
-    """How much more the first policy earns a pull, doubly robust, with a t interval.
+    """The difference of two policies' values per pull, doubly robust, with a t interval.
 
-    The spread of the terms has a floor: what it would be if rewards erred by the same everywhere.
-    Where few pulls tell of a choice, all of them may have given the same by chance, and the terms
-    then look sure of it.
+    The standard deviation of the terms has a lower bound: its value if rewards had the same noise
+    everywhere. If few pulls inform a choice, all may have had equal rewards by chance, and the
+    terms alone would look too certain.
 
     Args:
-        first: of the one policy.
-        second: of the other, on the same log.
-        n_comparisons: from among how many this one was picked; intervals of all of them hold
-            together with 95 %.
+        first: the terms of one policy.
+        second: the terms of the other, on the same log.
+        n_comparisons: the number of comparisons; the intervals of all of them hold
+            simultaneously with 95 %.
     """
     confidence = 1 - 0.05 / n_comparisons
     found = paired_difference(first.doubly_robust, second.doubly_robust, confidence)
@@ -285,10 +285,10 @@ def difference_in_value(
 
 
 def importance_weights(policy: Floats, arms: Ints, propensities: Floats) -> Floats:
-    """How much more often the policy makes each pull than the log did, shape (n,).
+    """The policy's probability of each pull divided by the log's, shape (n,).
 
     Raises:
-        ValueError: if the shapes do not fit, or something is no probability.
+        ValueError: if the shapes do not fit, or a value is not a probability.
     """
     n_pulls, n_arms = policy.shape
     if arms.shape != (n_pulls,) or propensities.shape != (n_pulls,):
@@ -305,21 +305,21 @@ def importance_weights(policy: Floats, arms: Ints, propensities: Floats) -> Floa
 
 
 def check_rewards(rewards: Floats, n_pulls: int) -> None:
-    """Refuse rewards that are not one finite number for each pull."""
+    """Refuse rewards that are not one finite number per pull."""
     if rewards.shape != (n_pulls,):
         raise ValueError(f"{n_pulls} pulls need as many rewards, not {rewards.shape}")
     _refuse(~np.isfinite(rewards), "reward", rewards)
 
 
 def check_support(policy: Floats, arms: Ints, weights: Floats) -> None:
-    """Refuse a log that does not show what the policy would do.
+    """Refuse a log that does not cover the policy's actions.
 
-    Weights are expected to be 1 if the propensities are right and the log could choose every arm
-    that the policy chooses, wherever it does. How far their mean is from 1 is measured in standard
-    errors, for a mean of 1: too few large weights would make their own variance too small.
+    The mean weight is 1 if the propensities are right and the log could choose every arm that the
+    policy chooses in each context. The deviation from 1 is measured in standard errors under a
+    mean of 1, because too few large weights would underestimate their own variance.
 
     Raises:
-        ValueError: naming the arm that was never logged, or what the weights are on average.
+        ValueError: names the arm that was never logged, or the mean weight.
     """
     share = policy.mean(axis=0)
     unlogged = np.setdiff1d(np.flatnonzero(share > 0), arms)
@@ -347,7 +347,7 @@ def check_support(policy: Floats, arms: Ints, weights: Floats) -> None:
 
 
 def ips(weights: Floats, rewards: Floats) -> Floats:
-    """Inverse propensity scoring: w r, whose mean is unbiased where propensities are right.
+    """Inverse propensity scoring: w r, with an unbiased mean if the propensities are right.
 
     Source: Horvitz and Thompson (1952), "A generalization of sampling without replacement from a
     finite universe", JASA 47; for policies Strehl, Langford, Li and Kakade (2010), "Learning from
@@ -357,10 +357,10 @@ def ips(weights: Floats, rewards: Floats) -> Floats:
 
 
 def snips(weights: Floats, rewards: Floats) -> Floats:
-    """Self-normalised inverse propensities: a weighted mean of the rewards, and so within them.
+    """Self-normalised inverse propensities: a weighted mean of rewards, so within their range.
 
     Consistent, with a bias of order 1/n. The terms are the ratio's linear approximation (delta
-    method): s + w (r - s) / mean(w), s being the estimate. Not all weights may be 0.
+    method): s + w (r - s) / mean(w), where s is the estimate. Not all weights may be 0.
 
     Source: Swaminathan and Joachims (2015), "The self-normalized estimator for counterfactual
     learning", NeurIPS.
@@ -371,11 +371,11 @@ def snips(weights: Floats, rewards: Floats) -> Floats:
 
 
 def direct_method(policy: Floats, model: CrossFit) -> Floats:
-    """The direct method: the rewards that a model predicts for what the policy does.
+    """The direct method: a model's predicted rewards of the policy's actions.
 
-    It needs no propensities, and is as biased as the model is; the interval covers none of that.
-    It does cover that the model was fitted to a sample: the terms contain what each reward adds
-    through the model, to first order (delta method). That has mean 0.
+    It needs no propensities. It has the bias of the model, which the interval does not cover. The
+    interval does cover that the model was fitted to a sample: the terms contain each reward's
+    first-order effect through the model (delta method), which has mean 0.
 
     Source: Dudik, Langford and Li (2011), "Doubly robust policy evaluation and learning", ICML;
     the variance as in Stefanski and Boos (2002), "The calculus of M-estimation", The American
@@ -388,10 +388,10 @@ def direct_method(policy: Floats, model: CrossFit) -> Floats:
 def doubly_robust(
     policy: Floats, weights: Floats, arms: Ints, rewards: Floats, predicted: Floats
 ) -> Floats:
-    """The direct method, corrected by inverse propensities where the log shows the model to err.
+    """The direct method, with the model's errors corrected by inverse propensities.
 
-    Unbiased if the propensities are right, whatever the model, as long as no pull is predicted by a
-    model that has seen it; and the closer the model, the smaller the variance.
+    Unbiased if the propensities are right, for any model that predicts only pulls outside its fit.
+    A better model gives a smaller variance.
 
     Source: Dudik, Langford and Li (2011); crossing folds as in Chernozhukov et al. (2018),
     "Double/debiased machine learning", The Econometrics Journal 21.
@@ -405,9 +405,9 @@ def _errors(arms: Ints, rewards: Floats, predicted: Floats) -> Floats:
 
 
 def effective_sample_size(weights: Floats) -> float:
-    """How many pulls of the policy's own would be worth as much: (sum of w)^2 / sum of w^2.
+    """The equivalent number of pulls by the policy itself: (sum of w)^2 / sum of w^2.
 
-    0 where every weight is. Source: Kish (1965), Survey Sampling, section 11.7.
+    0 if all weights are 0. Source: Kish (1965), Survey Sampling, section 11.7.
     """
     squares = float(weights @ weights)
     return float(weights.sum()) ** 2 / squares if squares else 0.0

@@ -1,4 +1,4 @@
-"""Trained agents judged on logged pulls: what ``compare.py --logged`` does before it prints."""
+"""Evaluates trained agents on logged pulls, for ``compare.py --logged``."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from pipeline.user_modules import UserModule
 
 @dataclass(frozen=True)
 class LoggedPolicy:
-    """A trained agent, to be judged on a log."""
+    """A trained agent for evaluation on a log."""
 
-    name: str  # its path, as it was given
-    agent: BaseAlgorithm  # as it was loaded
-    # The log that it was trained on, or None if it was not, or if that is not known.
+    name: str  # its path, as given
+    agent: BaseAlgorithm  # the loaded agent
+    # The log of its training; None if there was none, or it is unknown.
     log: Path | None
 
 
@@ -44,18 +44,18 @@ class Judged:
 
     name: str  # of the policy
     terms: PolicyTerms  # of its estimates
-    # Whether it is one of the policies asked about, and no alternative to them.
+    # Whether the user asked about this policy; otherwise it is an alternative.
     is_given: bool = False
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Policies judged on one log."""
+    """The comparison of policies on one log."""
 
     data: LoggedData  # the log
-    # The policies asked about; then each arm shown to everybody, and the log's own policy.
+    # The user's policies; then each arm as a constant policy, and the log's own policy.
     rows: tuple[Judged, ...]
-    notes: tuple[str, ...]  # what has to be known to read the figures
+    notes: tuple[str, ...]  # notes for reading the figures
 
 
 def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
@@ -64,10 +64,10 @@ def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
 
 
 def load_policy(found: PolicyFile, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
-    """Load an agent; ``modules`` are those that the user typed, which it may need.
+    """Load an agent; ``modules`` are the typed modules, which it may need.
 
     Raises:
-        UserError: if it cannot be loaded, or is none that sees a context as the log has it.
+        UserError: if it cannot be loaded, or does not observe the log's contexts.
     """
     agent = load_model(found.algo, found.model, modules=modules, device="cpu")
     if not isinstance(agent.action_space, spaces.Discrete):
@@ -76,10 +76,10 @@ def load_policy(found: PolicyFile, modules: Iterable[UserModule] = ()) -> Logged
 
 
 def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comparison:
-    """Judge policies, each arm shown to everybody, and the log's own policy.
+    """Evaluate policies, each arm as a constant policy, and the log's own policy.
 
     Raises:
-        UserError: if a policy does not fit the log, or the log cannot tell what it is worth.
+        UserError: if a policy does not fit the log, or the log cannot support an estimate.
     """
     model = reward_model(data, max([data.n_arms, *(n_arms(p.agent) for p in policies)]))
     notes = [note for policy in policies for note in _notes(data, policy)]
@@ -102,7 +102,7 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
 
 
 def reward_model(data: LoggedData, n_arms: int) -> CrossFit:
-    """Means of the rewards where contexts are Discrete, else regressions.
+    """Fit means of the rewards for Discrete contexts, else regressions.
 
     Raises:
         UserError: if there are too few pulls.
@@ -118,11 +118,11 @@ def reward_model(data: LoggedData, n_arms: int) -> CrossFit:
 
 
 def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
-    """The probability of each arm before each logged pull, shape (n, arms of the agent).
+    """The probability of each arm at each logged pull, shape (n, arms of the agent).
 
     Raises:
-        UserError: if the agent does not observe what the log has for context, or has to be told
-            more than that.
+        UserError: if the agent does not observe the log's contexts, or needs further
+            observations.
     """
     agent: Any = policy.agent
     try:
@@ -139,13 +139,13 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
 
 
 def n_arms(agent: BaseAlgorithm) -> int:
-    """The number of arms that an agent chooses from."""
+    """The number of arms of an agent."""
     assert isinstance(agent.action_space, spaces.Discrete)
     return int(agent.action_space.n)
 
 
 def _judge(data: LoggedData, name: str, policy: Floats, model: CrossFit) -> PolicyTerms:
-    """Judge a policy that may know of fewer arms than there are."""
+    """Evaluate a policy that may have fewer arms than the log."""
     padded = np.zeros(model.predicted.shape)
     padded[:, : policy.shape[1]] = policy
     assert data.propensities is not None
@@ -156,10 +156,10 @@ def _judge(data: LoggedData, name: str, policy: Floats, model: CrossFit) -> Poli
 
 
 def _notes(data: LoggedData, policy: LoggedPolicy) -> list[str]:
-    """What is to be said of an agent that was trained on a log.
+    """Notes on an agent that was trained on a log.
 
     Raises:
-        UserError: if that log numbered contexts of text otherwise.
+        UserError: if that log numbered text contexts differently.
     """
     if policy.log is None or not policy.log.is_file():
         return []

@@ -1,4 +1,4 @@
-"""Logs and the zips of policies, looked at before the libraries are imported, which takes long."""
+"""Checks logs and policies' zips before the slow import of the libraries."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from pipeline.models.find import run_of
 from pipeline.models.load import ModelFile, hand_written_algorithm, read_model
 from pipeline.user_modules import check_recorded
 
-# What changes an agent's observations, so that they are no longer the log's contexts.
+# Settings that change an agent's observations, so that they differ from the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
 
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """The zip of a trained agent, read and not yet loaded."""
+    """The zip of a trained agent, read but not loaded."""
 
-    name: str  # its path, as it was given
+    name: str  # its path, as given
     algo: str  # name of the agent
     model: ModelFile  # the zip
-    # The log that it was trained on, or None if it was not, or if that is not known.
+    # The log of its training; None if there was none, or it is unknown.
     log: Path | None
 
 
 def read_logged(path: str | Path) -> LoggedData:
-    """A log whose propensities are known.
+    """Read a log with propensities.
 
     Raises:
         UserError: if it cannot be read or lacks them.
@@ -47,10 +47,10 @@ def read_logged(path: str | Path) -> LoggedData:
 
 
 def find_policy(path: Path) -> PolicyFile:
-    """The agent of a run folder or in a zip.
+    """Find the agent of a run folder or in a zip.
 
     Raises:
-        UserError: if there is none, or none that sees a context as the log has it.
+        UserError: if there is none, or it does not observe the log's contexts.
     """
     zip_path = _final_model(path) if path.is_dir() else path
     run = run_of(zip_path)

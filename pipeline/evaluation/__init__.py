@@ -1,1 +1,1 @@
-"""What a policy is worth: sampled, exact, and cell by cell."""
+"""Evaluates policies: by sampled episodes, exactly, and for each cell of a map."""

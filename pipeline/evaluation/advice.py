@@ -1,8 +1,8 @@
-"""Says what an agent that has not learnt its task does instead, and what to try first.
+"""Describes what a failed agent does instead of its task, and proposes a first change.
 
-Where the agent values its start about as low as standing still for ever, the discount hides the
-goal: it has to be nearer to 1. Where it has tried its actions too seldom, it needs more steps.
-Neither is advised before exact planning has shown that it can help.
+If the agent values its start about as low as standing still for ever, the discount hides the goal:
+the discount has to be nearer to 1. If the agent has tried its actions too rarely, it needs more
+steps. Each advice requires that exact planning has shown that the change can help.
 """
 
 from __future__ import annotations
@@ -28,43 +28,43 @@ from pipeline.evaluation.yardstick import FAILED, NEARLY_ALL
 from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.train_spec import TrainSpec
 
-SOLVED = 0.5  # a score of planning from which on it may be recommended
+SOLVED = 0.5  # planning must reach this score for a recommendation
 NEAR_OPTIMUM = 0.01  # of the optimum
-# The value of the start, as a share of that of standing still.
+# The value of the start, divided by the value of standing still.
 NEAR_STANDING_STILL = 0.8
-# Steps of training for each state and action; more where the discount is to be nearer to 1.
+# Training steps for each pair of state and action; more if the discount is to come nearer to 1.
 FEW_STEPS, FEW_STEPS_FAR = 130, 400
 MANY_STEPS = 1000
-# Of the score that planning reaches.
+# As a share of the score that planning reaches.
 MATTERS = 0.05
-# Planning takes about a second where states times actions times outcomes are so many.
+# Planning with so many states x actions x outcomes takes about a second.
 MOST_OUTCOMES = 500_000
-# Where an episode is caught: where it spends nearly all of its last steps.
+# An episode is stuck in a few states if it spends nearly all of its last steps there.
 LAST_STEPS = 100
 MOST_STATES_NAMED = 3
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What to say of a run that failed."""
+    """Advice on a failed run."""
 
     instead: str  # what the greedy policy does instead of solving the task
-    try_first: str | None  # the change that is likely to help; None where no signal says so
+    try_first: str | None  # the change that is likely to help; None without evidence for one
 
 
 def advice(
     spec: TrainSpec, agent: BaseAlgorithm, evaluator: object, final: Evaluation, n_steps: int
 ) -> Advice | None:
-    """What a failed agent does instead, and what to try; None for others, or if not exact."""
+    """Advice on a failed agent; None for others, or if the evaluation is not exact."""
     if not isinstance(evaluator, ExactEvaluator) or isinstance(agent, RandomAgent):
         return None
     policy = evaluator.policy(agent, deterministic=True)
     if policy.ndim == 2 and np.issubdtype(policy.dtype, np.integer):
-        if len(policy) > 1:  # of a planner that knows the time limit
+        if len(policy) > 1:  # a planner that knows the time limit
             return None
         policy = policy[0]
     yardstick = evaluator.yardstick
-    # Where a constant action is optimal, the score of a near-optimal return may be 0.
+    # If a constant action is optimal, the score of a near-optimal return may be 0.
     near = yardstick.gap(final.mean_return) <= NEAR_OPTIMUM * abs(yardstick.optimum)
     failed = yardstick.score(final.mean_return) < FAILED and not near
     running = still_running(evaluator, policy, 1)
@@ -72,14 +72,14 @@ def advice(
         if running.sum() < NEARLY_ALL:
             return None
         best = evaluator.optimum[1].argmax(axis=1)
-        if still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # nobody can end an episode
+        if still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # no policy ends an episode
             return None
     instead = how_episodes_end(evaluator, policy)
     return Advice(instead, _try_first(spec, agent, evaluator, n_steps))
 
 
 def still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats:
-    """How often an episode acts in each state in its last steps before the limit, shape (S,)."""
+    """Expected visits to each state in the last steps before the limit, shape (S,)."""
     model, horizon = evaluator.model, evaluator.horizon
     visits = state_visitation(model, policy, horizon)
     if n_last < horizon:
@@ -92,7 +92,7 @@ def still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats
 
 
 def how_episodes_end(evaluator: ExactEvaluator, policy: Any) -> str:
-    """How the episodes of a policy end, and where they are caught if they do not."""
+    """Describe how the episodes of a policy end, or where they get stuck."""
     share = float(still_running(evaluator, policy, 1).sum())
     if share < 0.5:
         worth = policy_return(evaluator.model, policy, evaluator.horizon, success=evaluator.success)
@@ -153,7 +153,7 @@ def _try_first(
 
 
 def _shipped_steps(spec: TrainSpec) -> int:
-    """The steps that the shipped settings have for the environment; 0 where they have none."""
+    """The training steps in the shipped settings of the environment; 0 if there are none."""
     with suppress(UserError):
         steps = read_hyperparams(spec.algo, spec.env_id).get("n_timesteps")
         asked = {"n_timesteps": steps, "env_kwargs": dict(spec.hyperparams.env_kwargs)}
@@ -163,7 +163,7 @@ def _shipped_steps(spec: TrainSpec) -> int:
 
 
 def _trained_on(spec: TrainSpec, evaluator: ExactEvaluator) -> tuple[TransitionModel, Any] | None:
-    """The model of the training environment and what is observed in its states, or None."""
+    """The model of the training environment and the observations of its states, or None."""
     with closing(make_single_env(spec, training=True)) as env:
         model, observations = transition_model(env), observations_of_states(env)
     if model is None or observations is None or model.prob.size > MOST_OUTCOMES:
@@ -172,7 +172,7 @@ def _trained_on(spec: TrainSpec, evaluator: ExactEvaluator) -> tuple[TransitionM
 
 
 def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) -> float:
-    """The score of the best policy for a discount."""
+    """The score of the policy that is optimal under a discount."""
     plan = value_iteration(model, gamma)
     found = policy_return(evaluator.model, plan.policy, evaluator.horizon)
     return evaluator.yardstick.score(found.expected_return)
@@ -181,7 +181,7 @@ def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) ->
 def _share_of_standing_still(
     agent: BaseAlgorithm, model: TransitionModel, observations: Any, gamma: float
 ) -> float:
-    """The agent's value of its start, by that of standing still; 0 if that costs nothing."""
+    """The agent's value of its start, divided by that of standing still; 0 if that is free."""
     tables = getattr(agent.policy, "q_tables", None)
     stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
     stays &= (model.prob > 0) & model.reachable[:, None, None]

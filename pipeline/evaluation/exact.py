@@ -1,7 +1,7 @@
 """Computes the value of an agent's policy exactly, instead of sampling it.
 
-Where the transition model of the environment is known, the policy is asked for every state at once,
-and its return under the time limit follows by arithmetic, without evaluation noise.
+If the transition model of the environment is known, the evaluator queries the policy in all states
+at once, and computes its expected return under the time limit, without evaluation noise.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ from pipeline.train_spec import TrainSpec, is_plain
 
 # Limit for the array with the observations of all states.
 MOST_BYTES_OBSERVED = 1 << 30
-# Planning backwards from the time limit: steps times outcomes of all states and actions, of which a
-# second does some hundred million. Beyond the first number there may be a shorter way.
+# Planning backwards from the time limit: steps x outcomes of all states and actions; a second does
+# some hundred million. Beyond the first number, a shorter method is tried.
 FEW_BACKUPS = 200_000_000
 MOST_BACKUPS = 20_000_000_000
-# Planning to see what a discount costs: the outcomes of all states and actions, with which it takes
-# a tenth of a second, and the score below which that is worth a word.
+# Planning to measure the cost of a discount: the number of outcomes of all states and actions that
+# takes a tenth of a second, and the score below which there is a note.
 MOST_OUTCOMES_PLANNED = 250_000
 LOW_SCORE = 0.95
-# Evaluators of plain runs: where many share a process, the optimum is worked out once. Arrays of a
-# model with more states are not small any more.
+# Cached evaluators of plain runs: runs that share a process compute the optimum once. Models with
+# more states have large arrays, and are not cached.
 MOST_KEPT = 8
 MOST_STATES_KEPT = 20_000
 
@@ -67,16 +67,16 @@ MOST_STATES_KEPT = 20_000
 class ExactEvaluator:
     """Evaluates agents on an environment whose model is known."""
 
-    model: TransitionModel  #: dynamics of the environment that agents are evaluated on
+    model: TransitionModel  #: dynamics of the evaluation environment
     observations: NDArray[Any]  #: of each state, states along the first axis
     horizon: int  #: the time limit
     success: Bools | None  #: the outcomes that count as success, shape (S, A, K), or None
     yardstick: Yardstick  #: the best possible and the baseline's return
     layout: GridLayout | None = None  #: where the states lie on a map, for grid worlds
-    masks: Bools | None = None  #: what may be done, shape (S, A), for agents that are told
+    masks: Bools | None = None  #: action masks, shape (S, A), for agents that use them
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
-        """The exact worth of the agent's policy as it is."""
+        """Evaluate the agent's current policy exactly."""
         return self._worth(self.policy(agent, deterministic))
 
     @cached_property
@@ -96,16 +96,16 @@ class ExactEvaluator:
 
     @cached_property
     def values(self) -> OfLastPolicy[Floats]:
-        """From a policy to what each state is worth under it, shape (S,), see `state_values`."""
+        """The function from a policy to its state values, shape (S,); see `state_values`."""
         return OfLastPolicy(lambda policy: state_values(self.model, policy, self.horizon))
 
     @cached_property
     def optimum(self) -> tuple[Floats, Bools]:
-        """What each state is worth at best, shape (S,), and its optimal actions, shape (S, A)."""
+        """The optimal state values, shape (S,), and the optimal actions, shape (S, A)."""
         return optimal_choices(self.model, self.horizon)
 
     def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
-        """Probabilities of shape (S, A), or actions of shape (S,) or, with time, (horizon, S)."""
+        """The policy: probabilities (S, A), or actions (S,), or actions by step (horizon, S)."""
         if isinstance(agent, PlanningAgent):
             n_steps = 1 if agent.policy.is_stationary else self.horizon
             return agent.policy.actions_after(self.observations[None], np.arange(n_steps)[:, None])
@@ -114,12 +114,12 @@ class ExactEvaluator:
         return policy_matrix(agent, self.observations, deterministic, self.masks)
 
     def obstacle(self, agent: BaseAlgorithm, deterministic: bool = True) -> str:
-        """Why the policy cannot be computed, or is too expensive; empty if it can."""
+        """Why the policy cannot be computed, or only too slowly; empty if it can."""
         return obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
 
 
 def _observation_bytes(space: spaces.Space[Any]) -> int:
-    """Bytes of one observation; 0 where the space does not tell."""
+    """Bytes of one observation; 0 if the space does not say."""
     if isinstance(space, spaces.Dict):
         return sum(map(_observation_bytes, space.spaces.values()))
     if isinstance(space, spaces.Tuple):
@@ -130,7 +130,7 @@ def _observation_bytes(space: spaces.Space[Any]) -> int:
 
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
-    """The exact evaluator of a run, or None where episodes have to be sampled."""
+    """Make the exact evaluator of a run, or None if episodes have to be sampled."""
     if _is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
@@ -148,13 +148,13 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         masks = action_masks_of_states(env)
         success, layout = success_outcomes(env), grid_layout(env)
     if layout is not None and layout.n_states != model.n_states:
-        layout = None  # a grid world of somebody's own has states that are no cells
+        layout = None  # the states of a user's grid world are not cells
     yardstick = Yardstick(optimum, baseline=float(baseline_return(model, horizon)))
     return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks)
 
 
 def _optimum(model: TransitionModel, horizon: int) -> float | None:
-    """The highest return under the time limit; None if it takes too many operations."""
+    """The highest expected return under the time limit; None if planning takes too long."""
     n_backups = int(model.reachable.sum()) * model.n_actions * model.n_outcomes * horizon
     if n_backups > FEW_BACKUPS:
         found = optimum_far_from_limit(model, horizon)
@@ -164,7 +164,7 @@ def _optimum(model: TransitionModel, horizon: int) -> float | None:
 
 
 def model_refusal(spec: TrainSpec) -> str | None:
-    """Why the model that the environment brings is not believed, in one line; None if it is."""
+    """Why the environment's own model is rejected, in one line; None if it is accepted."""
     if _is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
@@ -173,10 +173,10 @@ def model_refusal(spec: TrainSpec) -> str | None:
 
 
 def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> str | None:
-    """What the discount that an agent learns under costs, in one line; None where that is little.
+    """A one-line note on what the agent's discount costs; None if the cost is small.
 
-    The best policy under the discount, planned exactly on the training environment, is judged as
-    agents are. No learner can be relied on to do better.
+    The best policy under the discount, planned exactly on the training environment, is evaluated
+    like an agent. A learner cannot be expected to do better.
     """
     with closing(make_single_env(spec, training=True)) as env:
         model = transition_model(env)
@@ -199,7 +199,7 @@ def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> st
 
 
 def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
-    """Whether a wrapper around the vectorised environment changes what the agent sees."""
+    """Whether a VecEnv wrapper changes the agent's observations."""
     special = spec.hyperparams
     return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)
 
@@ -208,10 +208,10 @@ _kept: OrderedDict[str, ExactEvaluator] = OrderedDict()
 
 
 def evaluator_of(spec: TrainSpec) -> ExactEvaluator | None:
-    """As `exact_evaluator`, cached for plain runs on the same environment."""
+    """Like `exact_evaluator`, cached for plain runs on the same environment."""
     if not is_plain(spec):
         return exact_evaluator(spec)
-    # Everything that determines the evaluation environment of a plain run.
+    # The key: everything that determines the evaluation environment of a plain run.
     masks = spec.hyperparams.algorithm.get("mask_actions", False)
     key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
     evaluator = _kept.pop(key, None) or exact_evaluator(spec)

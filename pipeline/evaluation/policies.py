@@ -1,4 +1,4 @@
-"""Asks agents for their policies in every state at once, and says which agents cannot be asked."""
+"""Queries agents' policies in all states at once, and says for which agents this fails."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from agents.tabular.policy import QTablePolicy
 from mdp.transition_model import Bools, Floats, Ints
 from pipeline.errors import UserError
 
-# The agents of these packages take any number of observations at once.
+# Agents of these packages accept any number of observations at once.
 KNOWN_LIBRARIES = ("agents", "stable_baselines3")
 
 
 def is_network(model: BaseAlgorithm) -> bool:
-    """Whether the agent's policy has weights."""
+    """Whether the agent's policy is a network."""
     policy = getattr(model, "policy", None)
     return isinstance(policy, th.nn.Module) and next(policy.parameters(), None) is not None
 
 
 def has_memory(agent: BaseAlgorithm) -> bool:
-    """Whether the agent's policy is recurrent, and acts by what it saw before as well."""
-    # Where sb3-contrib is not imported, no policy can be of its classes.
+    """Whether the agent's policy is recurrent, and depends on earlier observations too."""
+    # If sb3-contrib is not imported, no policy can be of its classes.
     module = sys.modules.get("sb3_contrib.common.recurrent.policies")
     return module is not None and isinstance(
         getattr(agent, "policy", None), module.RecurrentActorCriticPolicy
@@ -47,7 +47,7 @@ def has_memory(agent: BaseAlgorithm) -> bool:
 
 
 def takes_masks(model: Any) -> bool:
-    """Whether `predict` takes ``action_masks``, and the agent goes by them."""
+    """Whether `predict` takes ``action_masks``, and the agent uses them."""
     predict = getattr(model.predict, "__func__", model.predict)
     return "action_masks" in _parameters(predict) and bool(getattr(model, "mask_actions", True))
 
@@ -58,7 +58,7 @@ def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
 
 
 def player(model: BaseAlgorithm, env: VecEnv) -> Any:
-    """The agent for ``env``; one that takes action masks is wrapped to receive them."""
+    """The agent, wrapped to receive masks from ``env`` if it takes action masks."""
     if not takes_masks(model):
         return model
     try:
@@ -72,7 +72,7 @@ def player(model: BaseAlgorithm, env: VecEnv) -> Any:
 
 
 class MaskTold:
-    """An agent, and the environments that tell it what may be done."""
+    """Passes the action masks of environments to an agent."""
 
     def __init__(self, model: Any, env: VecEnv) -> None:
         self.model = model
@@ -89,14 +89,14 @@ Result = TypeVar("Result")
 
 
 class OfLastPolicy(Generic[Result]):
-    """A function of a policy that caches its last result: agents often act as the time before."""
+    """Caches the last result of a function of a policy, because policies often stay the same."""
 
     def __init__(self, work: Callable[[NDArray[Any]], Result]) -> None:
         self._work = work
         self._last: tuple[NDArray[Any], Result] | None = None
 
     def __call__(self, policy: NDArray[Any]) -> Result:
-        """The result for a policy in one of the forms of `mdp.evaluation`."""
+        """Return the result for a policy in one of the forms of `mdp.evaluation`."""
         last = self._last
         if last is not None and last[0].dtype == policy.dtype and np.array_equal(last[0], policy):
             return last[1]
@@ -105,13 +105,13 @@ class OfLastPolicy(Generic[Result]):
         return result
 
 
-# Numbers that a network is handed at once, and at all: beyond, asking for every state takes longer
-# than playing.
+# Largest input of a network at once, and in total: beyond it, querying all states takes longer than
+# playing episodes.
 MOST_AT_ONCE = 1 << 26
 MOST_NUMBERS = 400_000_000
-# A plan that changes with the step holds an action for each step and state.
+# A plan that changes with the step has an action for each step and state.
 MOST_PLANNED = 1 << 27
-# States times steps that probability may spread over, where actions are random.
+# States x steps over which probability may spread if actions are random.
 MOST_AT_RANDOM = 30_000_000
 
 
@@ -122,7 +122,7 @@ def obstacle(
     horizon: int,
     deterministic: bool = True,
 ) -> str:
-    """Why exact evaluation is impossible, or slower than playing; empty if it is neither."""
+    """Why exact evaluation is impossible, or slower than playing; empty if it is fine."""
     n_states = len(observations)
     if reason := _cannot_be_asked(agent, masks):
         return reason
@@ -139,7 +139,7 @@ def obstacle(
 
 
 def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
-    """Why `predict` cannot be asked for all states at once; strangers' are tried."""
+    """Why `predict` fails for all states at once; for the user's agents, tries it."""
     if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return ""
     try:
@@ -160,7 +160,7 @@ def policy_matrix(
     deterministic: bool = True,
     masks: Bools | None = None,
 ) -> Floats:
-    """The agent's policy as probabilities of shape (S, A); TypeError where they are not known.
+    """The agent's policy as probabilities of shape (S, A); TypeError if they are not known.
 
     ``observations`` has the states along its first axis, ``masks`` the shape (S, A).
     """
@@ -176,7 +176,7 @@ def policy_matrix(
     if isinstance(agent, TileAlgorithm):
         return agent.action_probabilities(observations)
     policy: Any = getattr(agent, "policy", None)
-    if hasattr(policy, "get_distribution"):  # of an actor with a softmax over its actions
+    if hasattr(policy, "get_distribution"):  # an actor with a softmax over actions
 
         def probabilities(part: NDArray[Any], **told: Any) -> NDArray[Any]:
             with th.no_grad():
@@ -185,7 +185,7 @@ def policy_matrix(
             return np.asarray(probs.cpu().numpy(), dtype=np.float64)
 
         return _in_parts(agent, observations, masks, probabilities)
-    # DQN, and QR-DQN, which may not be installed and is no subclass of it.
+    # DQN, and QR-DQN, which may not be installed and is not a subclass of DQN.
     homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
     if any(base.__module__.startswith(homes) for base in type(agent).__mro__):
         epsilon = float(vars(agent)["exploration_rate"])
@@ -200,11 +200,11 @@ def policy_matrix(
 def best_actions(
     agent: BaseAlgorithm, observations: NDArray[Any], masks: Bools | None = None
 ) -> Ints:
-    """What the agent does in each state, shape (S,)."""
+    """The agent's greedy action in each state, shape (S,)."""
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
 
-    # Reading a plain table is faster than `predict`, which takes most of an evaluation.
+    # Reading a plain table is faster than `predict`, which would take most of an evaluation.
     is_ours = type(agent).predict is TabularAlgorithm.predict and not takes_masks(agent)
     table: object = agent.policy if is_ours else None
     if isinstance(table, QTablePolicy) and type(table) is QTablePolicy:
@@ -222,7 +222,7 @@ def _in_parts(
     masks: Bools | None,
     asked: Callable[..., NDArray[Any]],
 ) -> NDArray[Any]:
-    """Call ``asked`` on batches of observations that are small enough for a network."""
+    """Call ``asked`` on batches of observations that a network can take."""
     n_states = len(observations)
     n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
@@ -246,18 +246,18 @@ def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
     return ""
 
 
-# --- values or probabilities of the actions at one observation ------------------------------------
+# --- values or probabilities of actions at one observation ----------------------------------------
 
 
 class ActionFigures(NamedTuple):
     """A number for each action."""
 
-    word: str  # what the numbers are: "value", "score" or "probability"
+    word: str  # the kind of numbers: "value", "score" or "probability"
     numbers: Floats  # shape (A,)
 
 
 def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | None:
-    """What an agent knows about its actions at the observation of one environment, or None."""
+    """The agent's figures for each action at the observation of one environment, or None."""
     policy: Any = agent.policy
     if not isinstance(agent.action_space, spaces.Discrete):
         return None
@@ -287,7 +287,7 @@ def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | N
 
 
 def believed_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
-    """What an agent believes actions or states to be worth: shape (S, A), or (S,); None if nothing.
+    """The agent's own values of actions (S, A) or states (S,); None if it has none.
 
     ``observations`` has the states along its first axis.
     """

@@ -1,8 +1,8 @@
-"""Evaluates agents by playing episodes, on the environment as it is and not on a training variant.
+"""Evaluates agents by episodes on the original environment, not on a training variant.
 
-How many steps evaluations may take follows from the steps of the training and never from the clock,
-so that the same seed gives the same files anywhere. Agents that were trained in compiled code are
-played in it too.
+The number of evaluation steps depends on the number of training steps and never on the clock, so
+that the same seed gives the same files on every machine. Agents that train in compiled code are
+evaluated in compiled code too.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from pipeline.evaluation.yardstick import Yardstick
 from pipeline.finite_numbers import FinitePlayer, check_numbers
 from pipeline.train_spec import TrainSpec
 
-# A mean so many standard errors above an upper bound means that something is wrong.
+# A mean so many standard errors above an upper bound is an error.
 BEYOND_CHANCE = 6.0
-# Fewer episodes may all have begun where returns are high.
+# Fewer episodes may all have begun in states of high return.
 FEWEST_TO_TELL = 10
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good an agent is: episodes that it has played, or their exact expectation."""
+    """The result of an evaluation: sampled episodes, or their exact expectation."""
 
-    # undiscounted return of each episode, shape (n_episodes,); the expected return, shape (1,),
-    # where that is exact
+    # undiscounted return of each episode, shape (n_episodes,);
+    # if exact, the expected return, of shape (1,)
     returns: Floats
     lengths: NDArray[np.floating[Any] | np.integer[Any]]  # number of steps, likewise
-    # whether each episode succeeded, or the probability of it, likewise; None where the environment
-    # does not say
+    # whether each episode succeeded, or the probability of success, likewise; None if the
+    # environment does not report it
     successes: NDArray[np.bool_ | np.floating[Any]] | None
-    # standard deviation of an episode's return, where it is exact; None where episodes were sampled
+    # exact standard deviation of an episode's return; None for sampled episodes
     exact_std: float | None = None
-    yardstick: Yardstick | None = None  # what to measure the return against, where it is known
+    yardstick: Yardstick | None = None  # the scale for the return, if known
 
     @property
     def is_exact(self) -> bool:
-        """Whether the figures are expectations, computed rather than sampled."""
+        """Whether the figures are exact expectations."""
         return self.exact_std is not None
 
     @cached_property
     def mean_return(self) -> float:
-        """Mean of the returns."""
+        """Mean return of an episode."""
         return float(self.returns.mean())
 
     @cached_property
@@ -71,14 +71,14 @@ class Evaluation:
 
     @cached_property
     def success_rate(self) -> float | None:
-        """Share of the episodes that succeed, if the environment says so."""
+        """Share of successful episodes, if the environment reports success."""
         return None if self.successes is None else float(self.successes.mean())
 
     @property
     def beats_optimum(self) -> bool:
-        """Whether the mean is above what no policy exceeds, by more than chance can explain.
+        """Whether the mean exceeds the upper bound of all policies by more than chance.
 
-        Then the environment is not the one that the bracket is of, or the bracket is wrong.
+        If so, the bracket is wrong, or belongs to another environment.
         """
         if self.yardstick is None or self.yardstick.at_least is None:
             return False
@@ -89,11 +89,11 @@ class Evaluation:
         return self.mean_return - BEYOND_CHANCE * error > self.yardstick.optimum + 1e-6
 
     def measured_by(self, yardstick: Yardstick | None) -> Evaluation:
-        """The same figures, with what to measure them against."""
+        """The same figures with another yardstick."""
         return replace(self, yardstick=yardstick)
 
     def joined(self, more: Evaluation) -> Evaluation:
-        """These episodes and further ones of the same agent, all of them sampled."""
+        """These sampled episodes together with further ones of the same agent."""
         both = None
         if self.successes is not None and more.successes is not None:
             both = np.concatenate([self.successes, more.successes])
@@ -120,14 +120,14 @@ class Evaluation:
 def evaluate(
     model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int | None, deterministic: bool = True
 ) -> Evaluation:
-    """Play ``n_episodes``, the same ones for the same seed; for None, those that come next."""
+    """Play ``n_episodes``, determined by the seed; with seed None, the environments go on."""
     successes: list[bool] = []
 
     def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:
         if local["done"] and "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
-    # Planners and others have no count of steps.
+    # Planners, for example, do not count steps.
     when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
     if seed is not None:
         env.seed(seed)
@@ -150,7 +150,7 @@ def evaluate(
 
 
 def takes_batches(model: BaseAlgorithm) -> bool:
-    """Whether an agent can be asked for the actions of several environments at once."""
+    """Whether an agent can act in several environments at once."""
     if type(model).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return True
     sample: Any = model.observation_space.sample()
@@ -166,13 +166,13 @@ def takes_batches(model: BaseAlgorithm) -> bool:
 
 
 def evaluation_seed(seed: int, purpose: int) -> int:
-    """A seed apart from training's; purpose 1 is during training, 2 at its end, 3 playing."""
+    """A seed distinct from training's; purpose 1: during training, 2: at its end, 3: playing."""
     stream = np.random.SeedSequence(seed, spawn_key=(purpose,))
     return int(stream.generate_state(1)[0] % 2**31)
 
 
 def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
-    """The bracket of the evaluation environment, or None where none holds for it."""
+    """The known bracket of the evaluation environment's optimum, or None."""
     if spec.hyperparams.vec_env_wrapper or not may_have_bracket(spec.env_id):
         return None
     with closing(make_single_env(spec)) as env:
@@ -183,24 +183,24 @@ def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
 
 
 class Shares(NamedTuple):
-    """Steps of evaluation for one of training."""
+    """Evaluation steps per training step."""
 
-    usual: float  # of any training
-    at_first: float  # of the steps of short trainings, until that comes to `STEPS_AT_FIRST`
+    usual: float  # for every training
+    at_first: float  # for short trainings, until the steps reach `STEPS_AT_FIRST`
 
 
-# Chosen by how long a step of evaluation takes beside one of training, so that all of them take a
-# fifth of its time or less. Figures: docs/benchmarks.md.
+# Chosen by the time of an evaluation step relative to a training step, so that evaluations take at
+# most a fifth of the training time. Figures: docs/benchmarks.md.
 NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
 TABLE = Shares(usual=1 / 100, at_first=1 / 5)
-# A2C learns once from each step, which takes no longer than to play one.
+# A2C learns once from each step, which takes no longer than playing it.
 LIGHT_NETWORK = Shares(usual=1 / 10, at_first=1 / 10)
-# Where training and evaluation are both compiled.
+# Training and evaluation are both compiled.
 COMPILED_NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
 COMPILED_TABLE = Shares(usual=1 / 10, at_first=1 / 2)
-# Compiled learning from environments in Python.
+# Learning is compiled, the environments are in Python.
 PYTHON_ENV = Shares(usual=1 / 32, at_first=1 / 6)
-# Compiled training whose evaluation cannot be compiled.
+# Training is compiled, evaluation cannot be.
 NETWORK_ALONE = Shares(usual=1 / 32, at_first=1 / 32)
 TABLE_ALONE = Shares(usual=1 / 2500, at_first=1 / 2500)
 STEPS_AT_FIRST = 10_000
@@ -209,7 +209,7 @@ STEPS_IN_ANY_CASE = 2_000
 
 
 def shares_of(model: BaseAlgorithm, *, plays_compiled: bool) -> Shares:
-    """How many steps of evaluation go with the training of an agent."""
+    """The evaluation steps per training step of an agent."""
     engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
     if engine.startswith("compiled but"):
         return PYTHON_ENV
@@ -222,15 +222,15 @@ def shares_of(model: BaseAlgorithm, *, plays_compiled: bool) -> Shares:
 
 
 def allowed_steps(n_trained: float, shares: Shares) -> float:
-    """Steps that all evaluations of a training of so many may take."""
+    """The number of steps that all evaluations of a training together may take."""
     at_first = min(shares.at_first * n_trained, STEPS_AT_FIRST)
     return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
 
-# The final evaluation has the rest, even if the others took more than their part.
+# The final evaluation gets the rest, even if the others exceeded their share.
 PART_DURING_TRAINING = 1 / 2
 
-# Episodes of an evaluation: the first number, and the next until the standard error is small.
+# Episodes of an evaluation: first this many, then more until the standard error is small.
 STAGES = (5, 10, 20)
 STAGES_AT_THE_END = (10, 25, 50, 100)
 LEAST_SURE = 10
@@ -240,23 +240,23 @@ PRECISION_AT_THE_END = 0.01
 
 
 class SampledEvaluator:
-    """Plays episodes: as many as are asked for, or as few as will do."""
+    """Evaluates by episodes: a given number, or as few as are precise enough."""
 
     def __init__(self, spec: TrainSpec, env: VecEnv) -> None:
         self.env = env
         self.yardstick = bracketed_yardstick(spec)
         self.seed = spec.seed
         self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
-        # Settings that say when or how long to evaluate are obeyed.
+        # Explicit settings of when or how long to evaluate take precedence.
         self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
         self.training_steps = spec.hyperparams.n_timesteps
         self.training_episodes = spec.hyperparams.n_episodes
-        self.n_steps = 0  # of all evaluations
+        self.n_steps = 0  # in all evaluations
         self._left = math.inf
         self._last_length: float | None = None
 
     def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
-        """Whether the training has come far enough for another evaluation."""
+        """Whether the training has done enough steps for another evaluation."""
         if self.is_limited:
             n_trained = model.num_timesteps - model._num_timesteps_at_start
             progress = n_trained / (self.training_steps or math.inf)
@@ -268,12 +268,12 @@ class SampledEvaluator:
         return STAGES[0] * self._usual_length(model) <= self._left
 
     def __call__(self, model: BaseAlgorithm) -> Evaluation:
-        """An evaluation during training."""
+        """Evaluate during training."""
         stages = STAGES if self.n_episodes is None else (self.n_episodes,)
         return self._evaluate(model, stages, PRECISION, self._left, evaluation_seed(self.seed, 1))
 
     def at_the_end(self, model: BaseAlgorithm) -> Evaluation:
-        """The final evaluation, by episodes of its own."""
+        """Evaluate at the end of training, on separate episodes."""
         n_trained = model.num_timesteps - model._num_timesteps_at_start
         allowed = self._allowed(model, n_trained)
         left = max(allowed - self.n_steps, allowed * (1 - PART_DURING_TRAINING))
@@ -292,7 +292,7 @@ class SampledEvaluator:
         most: float,
         seed: int,
     ) -> Evaluation:
-        """Play episodes, until the mean is sure enough or more of them would be too many steps."""
+        """Play episodes until the mean is precise enough, or the allowed steps are used up."""
         copy = self._compiled_copy(model)
 
         def play(n_episodes: int, seed: int | None) -> Evaluation:
@@ -305,7 +305,7 @@ class SampledEvaluator:
             n_more = n_episodes - len(found.returns)
             if is_sure(found, within) or found.lengths.sum() + n_more * found.mean_length > most:
                 break
-            # Without a new seed, the environments go on to other episodes.
+            # Without a new seed, the environments continue with other episodes.
             found = found.joined(play(n_more, None))
         self.n_steps += int(found.lengths.sum())
         self._last_length = found.mean_length
@@ -316,34 +316,34 @@ class SampledEvaluator:
         return allowed_steps(n_trained, shares_of(model, plays_compiled=is_compiled))
 
     def _usual_length(self, model: BaseAlgorithm) -> float:
-        """Steps of an episode: of those evaluated last, or else of training's last ones."""
+        """Mean steps of an episode in the last evaluation, or else in training's last episodes."""
         if self._last_length is not None:
             return self._last_length
         lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
         return float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
 
     def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
-        """The compiled environments, if the agent was trained in compiled code."""
+        """The compiled evaluation environments, if the agent trains in compiled code."""
         if getattr(model, "engine_in_use", "") != "compiled":
             return None
         return compiled_copy(self.env)
 
 
 def is_sure(evaluation: Evaluation, precision: float) -> bool:
-    """Whether the standard error is small beside the mean, of ten episodes or more."""
+    """Whether at least ten episodes have a small standard error relative to their mean."""
     n_episodes = len(evaluation.returns)
     error = float(np.std(evaluation.returns)) / math.sqrt(max(n_episodes - 1, 1))
     return n_episodes >= LEAST_SURE and error <= precision * abs(evaluation.mean_return)
 
 
 def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
-    """How many environments to play on at once: no more than there are episodes."""
+    """How many environments to play at once: at most one for each episode."""
     return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
 
 
 @dataclass(frozen=True)
 class CompiledCopy:
-    """Environments to evaluate on, and their compiled counterpart."""
+    """Evaluation environments and their compiled counterpart."""
 
     env: DummyVecEnv
     world: Any  # what `agents.compiled.loop` steps
@@ -351,7 +351,7 @@ class CompiledCopy:
 
 
 def compiled_copy(env: VecEnv) -> CompiledCopy | None:
-    """What can be evaluated on in compiled code: CartPole and MountainCar, plain or in Monitor."""
+    """The compiled copy of CartPole or MountainCar, plain or in Monitor; None for others."""
     from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
 
     from agents.compiled.worlds import NotCompilable, monitor_of
@@ -370,7 +370,7 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
 def evaluate_compiled(
     model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
 ) -> Evaluation:
-    """Play the episodes of `evaluate`; the library decides near ties of a network."""
+    """Like `evaluate`, in compiled code; the library decides near ties of a network."""
     from agents.compiled.greedy_play import play_episodes
     from agents.compiled.records import DECIMALS
     from agents.networks.network_worlds import NetworkEnvStates
@@ -379,7 +379,7 @@ def evaluate_compiled(
     env, n_envs = copy.env, copy.env.num_envs
     if seed is not None:
         env.seed(seed)
-    # The same shares as in `evaluate_policy`.
+    # The same numbers per environment as in `evaluate_policy`.
     wanted = (n_episodes + np.arange(n_envs)) // n_envs
     states = NetworkEnvStates(env, copy.world, copy.seen)
     acting = cast(Any, model).greedy_player(copy.seen)

@@ -1,8 +1,7 @@
-"""Exact values and actions of an agent in every state of a map, beside the optimal ones.
+"""Computes exact values and actions of an agent in every state of a map, and the optimal ones.
 
-A value means the same for tables and networks: the expected return, with the whole time limit
-ahead, of the agent's deterministic policy from that state on. What the agent itself believes the
-state to be worth does not enter.
+A value means the same for tables and networks: the expected return of the agent's deterministic
+policy from that state on, with the whole time limit left. The agent's own estimates are not used.
 """
 
 from __future__ import annotations
@@ -22,36 +21,36 @@ from mdp.transition_model import Bools, Floats, Ints
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.files import replacing
 
-# Beyond this, cells are too small to see and maps too large to keep.
+# On larger maps, cells are too small to see, and the data too large to store.
 MAX_STATES = 2500
-# More than a slider can tell apart.
+# More moments than a slider can resolve.
 MAX_MAPS = 400
 SECONDS_BETWEEN_WRITES = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class ValueMap:
-    """An agent's policy in every state of a grid world, beside the optimal ones."""
+    """An agent's policy in every state of a grid world, with the optimal one."""
 
     layout: GridLayout  #: where the states lie on the map
-    matters: Bools  #: where the agent may have to act, shape (S,); of other states nothing is said
+    matters: Bools  #: where the agent may have to act, shape (S,); other states are ignored
     initial: Floats  #: probabilities of the starting states, shape (S,)
     values: Floats  #: the expected return of the agent from each state on, shape (S,)
-    actions: Ints  #: what the agent does there at the first step, shape (S,)
-    visited: Bools  #: the states that it comes to from the start, shape (S,)
+    actions: Ints  #: the agent's action there at the first step, shape (S,)
+    visited: Bools  #: the states that the agent reaches from the start, shape (S,)
     optimal_values: Floats  #: the highest expected return from each state on, shape (S,)
-    optimal_actions: Bools  #: the actions that may begin it, shape (S, A)
+    optimal_actions: Bools  #: the optimal first actions, shape (S, A)
     optimal_visited: Bools  #: the states that optimal actions lead to, shape (S,)
 
     @property
     def differs(self) -> Bools:
-        """The states where the agent's action is not among the optimal ones, bool (S,)."""
+        """The states where the agent's action is not optimal, bool (S,)."""
         chosen = self.optimal_actions[np.arange(len(self.actions)), self.actions]
         return self.matters & ~chosen
 
 
 def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | None:
-    """The map of an agent; None but for grid worlds of up to 2500 states and one action in each."""
+    """The map of an agent with one action per state, on a grid of up to 2500 states; else None."""
     policy = best_actions_of(evaluator, agent) if _can_be_drawn(evaluator) else None
     if policy is None or evaluator.layout is None:
         return None
@@ -71,7 +70,7 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
 
 
 def map_refusal(evaluator: ExactEvaluator) -> str | None:
-    """Why there is no map of a grid world; None where there is one, or no grid world."""
+    """Why a grid world has no map; None if it has one, or is no grid world."""
     n_states = evaluator.model.n_states
     if evaluator.layout is None or n_states <= MAX_STATES:
         return None
@@ -83,7 +82,7 @@ def _can_be_drawn(evaluator: ExactEvaluator) -> bool:
 
 
 def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
-    """What the agent does at each step in each state, shape (1 or horizon, S); None if it draws."""
+    """Actions at each step and state, shape (1 or horizon, S); None if the policy is random."""
     policy = evaluator.policy(agent, deterministic=True)
     if np.issubdtype(policy.dtype, np.integer):
         return np.atleast_2d(policy).astype(np.int64)
@@ -91,10 +90,10 @@ def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | N
 
 
 class ValueMapRecorder:
-    """Keeps the maps of an agent over its training, in the file ``path``.
+    """Records the maps of an agent over its training in the file ``path``.
 
-    It holds `timesteps` (T,), `values` (T, S), `actions` (T, S), `optimal_values` (S,) and
-    `optimal_actions` (S, A), as in `ValueMap`. Of very many maps every second, fourth, ... is kept.
+    The file has `timesteps` (T,), `values` (T, S), `actions` (T, S), `optimal_values` (S,) and
+    `optimal_actions` (S, A), as in `ValueMap`. Of too many maps it keeps every 2nd, 4th, ... one.
     """
 
     def __init__(self, path: Path, evaluator: ExactEvaluator) -> None:
@@ -106,7 +105,7 @@ class ValueMapRecorder:
         self._last_write = time.monotonic()
 
     def record(self, agent: BaseAlgorithm, timesteps: int) -> None:
-        """Keep the map of the agent as it is after so many steps."""
+        """Record the map of the current agent after so many steps."""
         if len(self._maps) >= MAX_MAPS:
             self._maps = self._maps[1::2]
             self._stride *= 2
@@ -114,12 +113,12 @@ class ValueMapRecorder:
         if self._calls % self._stride:
             return
         self._append(agent, timesteps)
-        # Forcing a file onto the disk takes longer than an evaluation.
+        # Flushing a file to disk takes longer than an evaluation.
         if time.monotonic() - self._last_write > SECONDS_BETWEEN_WRITES:
             self._write()
 
     def finish(self, agent: BaseAlgorithm, timesteps: int) -> None:
-        """Keep the map of the agent as it is at the end, and write what is not written yet."""
+        """Record the map at the end of training, and write all maps that are not written yet."""
         if not self._maps or self._maps[-1][0] != timesteps:
             self._append(agent, timesteps)
         self._write()

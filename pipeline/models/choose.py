@@ -1,16 +1,16 @@
-"""Chooses the model to play or to train further, and makes the spec of its environments.
+"""Chooses the model to play or to continue training, and makes the spec of its environments.
 
-Agent, environment and settings come from the first of these that says them:
+Agent, environment and settings come from the first of these sources that has them:
 
 1. the request;
-2. for hand-written agents, the zip, which says what agent it holds;
-3. what the model's folder says, see `pipeline.models.find`;
-4. the entry of ``hyperparams/<algo>.yml``, apart from ``normalize``, where the folder says nothing.
+2. for hand-written agents, the zip, which names its agent;
+3. the model's folder, see `pipeline.models.find`;
+4. the entry of ``hyperparams/<algo>.yml`` without ``normalize``, if the folder has no settings.
 
-Statistics of VecNormalize are used wherever there are some that belong to the model. Further
-training begins a new run, in a folder of its own, with the hyperparameters of that run's entry. As
-in rl_zoo3, the agent's networks or tables, its statistics and its replay buffer go on. Other than
-there, the agent's steps are counted on, and schedules go by all steps, rather than begin anew.
+VecNormalize statistics of the model are always used, if they exist. Further training is a new run
+in a new folder, with the hyperparameters of the new run's entry. As in rl_zoo3, it keeps the
+agent's networks or tables, its statistics and its replay buffer. Unlike rl_zoo3, it continues the
+step count, and schedules depend on all steps instead of restarting.
 """
 
 from __future__ import annotations
@@ -59,52 +59,52 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """Which model is asked for."""
+    """A request for a model."""
 
-    path: Path | None = None  # a zip or a run folder, instead of looking for a run
-    # name of the agent; None for what the zip or its run folder says, or else ``"ppo"``
+    path: Path | None = None  # a zip or a run folder, instead of a search for a run
+    # name of the agent; None: as in the zip or its run folder, or else ``"ppo"``
     algo: str | None = None
-    # id of the environment; None for what the run folder says, or else ``"CartPole-v1"``
+    # id of the environment; None: as in the run folder, or else ``"CartPole-v1"``
     env_id: str | None = None
     log_folder: Path = Path("logs")  # the folder above all runs
     run_number: int = 0  # number of the run; 0 for the newest, -1 for one without a number
-    # the model at the end of training, the best, that of the last checkpoint, or that of the
-    # checkpoint after so many steps
+    # the model at the end of training, the best one, the last checkpoint, or the checkpoint after
+    # so many steps
     which: Which = "final"
-    # a file of VecNormalize's statistics, instead of those that lie with the model
+    # a file of VecNormalize statistics, instead of those beside the model
     statistics: Path | None = None
-    # arguments of the environment, to change those of the run
+    # arguments of the environment that replace those of the run
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    # modules of the user's, imported already; a run has no others imported
+    # the user's imported modules; a run cannot import others
     user_modules: tuple[UserModule, ...] = ()
     seed: int = 0  # of the episodes
     device: str = "auto"  # torch device of the networks
-    zipped_in: Path | None = None  # the pack that the folder was unpacked from
+    zipped_in: Path | None = None  # the pack from which the folder was unpacked
 
 
 @dataclass(frozen=True)
 class ChosenModel:
-    """A model and the run that it comes from; its files have been read, and are not read again."""
+    """A model and its run; all files are read once, before this is made."""
 
     file: ModelFile  # the zip
-    spec: TrainSpec  # how its environments are made
-    run: Run | None  # the run folder, or None for a zip that lies elsewhere
-    # VecNormalize's statistics that it is played with, or None
+    spec: TrainSpec  # the settings of its environments
+    run: Run | None  # the run folder, or None for a zip outside one
+    # VecNormalize statistics for playing, or None
     statistics: Statistics | None = None
 
     @property
     def path(self) -> Path:
-        """Where the zip lay."""
+        """The path of the zip."""
         return self.file.path
 
 
 def choose_model(request: ModelRequest) -> ChosenModel:
-    """The model that is asked for, ready to be played: `find_model`, then `with_statistics`."""
+    """The requested model, ready to play: `find_model`, then `with_statistics`."""
     return with_statistics(find_model(request), request.statistics)
 
 
 def find_model(request: ModelRequest) -> ChosenModel:
-    """Find the model that is asked for, without loading a library that takes long."""
+    """Find the requested model, without importing slow libraries."""
     if request.statistics is not None and not request.statistics.is_file():
         raise UserError(f"no such file of statistics: {request.statistics}")
     if request.path is None:
@@ -131,16 +131,16 @@ def find_model(request: ModelRequest) -> ChosenModel:
 
 
 def model_of_run(path: Path, spec: TrainSpec, run: Run) -> ChosenModel:
-    """A model of a run whose spec is known, ready to be played."""
+    """A model of a run with a known spec, ready to play."""
     return with_statistics(ChosenModel(read_model(path, run), spec, run))
 
 
 def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
-    """The run that is asked for, whose modules have been imported."""
+    """Find the requested run, and check that its modules are imported."""
     try:
         run = Run.find(request.log_folder, algo, env_id, request.run_number)
     except UserError:
-        # The better reason, where there is no such agent or environment.
+        # An unknown agent or environment is a better reason than a missing run.
         check_algorithm(algo)
         check_env_id(env_id)
         raise
@@ -151,23 +151,23 @@ def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
 
 
 def _check_modules(run: Run | None, zipped_in: Path | None = None) -> None:
-    """Make sure that what a run needs has been imported, whoever recorded it."""
+    """Check that the modules of a run are imported, whichever program recorded it."""
     if run is not None:
         packages = list(recorded_run(run).gym_packages)
         check_recorded({"gym_packages": packages, **run.recorded_spec()}, run.path, zipped_in)
 
 
 def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) -> TrainSpec:
-    """How the environments are made, by the order at the head of this module."""
+    """The spec of the environments, by the sources in this module's docstring."""
     raw = recorded.hyperparams
     if raw is None:
-        # Whether a model was trained on normalised observations is its own.
+        # Whether a model was trained on normalised observations depends on the model alone.
         entry: dict[str, Any] = {}
         with suppress(NoEntryError):
             entry = without_auto(read_hyperparams(algo, env_id))
         raw = {key: value for key, value in entry.items() if key != "normalize"}
     hyperparams = split(raw)
-    # Where episodes are judged, these win over all others.
+    # For evaluation, these override all others.
     env_kwargs = {**hyperparams.eval_env_kwargs, **request.env_kwargs}
     return TrainSpec(
         algo=algo,
@@ -182,7 +182,7 @@ def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) 
 
 
 def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenModel:
-    """The model with the statistics that it is played with, which are there and may be read."""
+    """The model with its statistics for playing, once read and checked."""
     path = named or statistics_of(chosen.path, chosen.run)
     normalize = chosen.spec.hyperparams.normalize
     if path is None:
@@ -198,7 +198,7 @@ def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenMod
 
 
 def agent_to_continue(path: Path) -> Path:
-    """The zip that a path means, once it and what goes with it were checked."""
+    """The zip at a path, after checks of it, its statistics and its replay buffer."""
     model = model_at(path)
     run = run_around(model)
     read_model(model, run)
@@ -209,14 +209,14 @@ def agent_to_continue(path: Path) -> Path:
 
 
 def model_to_continue(spec: TrainSpec) -> ModelFile | None:
-    """The zip of the agent to go on with, read once and for all; None for a new agent."""
+    """Read the zip of the agent to continue; None for a new agent."""
     if spec.trained_agent is None:
         return None
     return read_model(spec.trained_agent, run_around(spec.trained_agent))
 
 
 def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
-    """The statistics that go on with the agent; None where there are none, or none are wanted."""
+    """Read the statistics of the agent to continue; None if missing or not wanted."""
     if spec.trained_agent is None or spec.saved_hyperparams.get("normalize") is False:
         return None
     run = run_around(spec.trained_agent)
@@ -225,18 +225,18 @@ def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
 
 
 def continuing(spec: TrainSpec, statistics: Statistics) -> TrainSpec:
-    """The spec with environments that normalise as before, but for what its entry says of that."""
+    """The spec with the earlier normalisation, changed by the settings in its entry."""
     return normalising(spec, {**statistics.settings, **(spec.hyperparams.normalize or {})})
 
 
 def load_to_continue(spec: TrainSpec, file: ModelFile, env: VecEnv, **kwargs: Any) -> BaseAlgorithm:
-    """The agent as it was, with its replay buffer, on ``env`` and with these hyperparameters."""
+    """Load the agent with its replay buffer, on ``env`` and with these hyperparameters."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-    # The networks are those of the file: their shape cannot change.
+    # The networks come from the file, so their shape cannot change.
     kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
     if "n_steps" in kwargs and issubclass(agent_class(spec.algo), OffPolicyAlgorithm):
-        # The library chooses a kind of buffer by it, and would leave that of the file.
+        # The library chooses the buffer class by ``n_steps``, and would keep the file's class.
         kwargs = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **kwargs}
     model = load_model(spec.algo, file, env, spec.user_modules, device=spec.device, **kwargs)
     replay_buffer = replay_buffer_of(file.path)

@@ -1,19 +1,19 @@
-"""Finds the files that belong to a model, and reads what their folder says of the agent.
+"""Finds the files of a model, and reads the agent's settings in their folder.
 
-A folder is a run of ours, one of rl_zoo3, or a model hub's download:
+A folder is a run of this project, a run of rl_zoo3, or a download from a model hub:
 
-| who wrote it | what is read |
+| written by | files read |
 |---|---|
 | this project | ``run.json`` |
 | rl_zoo3 | ``<env>/args.yml`` (agent, environment, its arguments) and ``<env>/config.yml`` |
 | a model hub | the same two beside the zip |
 
-The first that is there counts, and what ``args.yml`` says of ``env_kwargs`` replaces those of
-``config.yml``, as in rl_zoo3, whose ``enjoy`` does not read ``eval_env_kwargs`` either. Nothing in
-these files is run, and no module is imported because they ask for it.
+The first existing source is used. ``env_kwargs`` in ``args.yml`` replace those in ``config.yml``,
+as in rl_zoo3, whose ``enjoy`` does not read ``eval_env_kwargs`` either. Reading runs no code from
+these files, and imports no module because a file names it.
 
-Statistics of VecNormalize and replay buffers lie beside the zip under the names that
-Stable-Baselines3's CheckpointCallback gives them, or where rl_zoo3 and model hubs have them.
+VecNormalize statistics and replay buffers lie beside the zip, with the names of
+Stable-Baselines3's CheckpointCallback, or at their places in rl_zoo3 and on model hubs.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _SETTINGS_FILES = ("args.yml", "config.yml")
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """What a folder says of the agent in it."""
+    """The settings of an agent, read from its folder."""
 
     algo: str | None = None  # name of the agent, or None
     env_id: str | None = None  # id of the environment, or None
-    # the entry of hyperparameters that it was trained with, or None
+    # the hyperparameters of its training, or None
     hyperparams: dict[str, Any] | None = None
-    # modules that were imported for the environments that they register
+    # modules that were imported because they register environments
     gym_packages: tuple[str, ...] = ()
 
 
 def run_of(path: Path) -> Run | None:
-    """The run folder that a model file lies in, or None if it lies elsewhere."""
-    # A link to a zip may lie in the run, or lead there.
+    """The run folder that contains a model file, or None."""
+    # A link to a zip may lie in the run, or point into it.
     folders = (path.parent.resolve(), path.resolve().parent)
     folder = next((one for one in folders if os.path.lexists(one / RECORD)), None)
     if folder is None:
@@ -58,13 +58,13 @@ def run_of(path: Path) -> Run | None:
     if not isinstance(env_name, str):
         return None
     if env_name != environment_name(env_name):
-        # Names of files are made of it.
+        # It becomes part of file names.
         raise UserError(f"{folder / RECORD} is damaged: env_name is {env_name!r}")
     return Run(folder, env_name)
 
 
 def run_around(model: Path) -> Run | None:
-    """The run folder of a zip, or None; ``env_name`` is empty where settings lie beside the zip."""
+    """The run folder of a zip, or None; ``env_name`` is empty if settings are beside the zip."""
     own = run_of(model)
     if own is not None:
         return own
@@ -78,7 +78,7 @@ def run_around(model: Path) -> Run | None:
 
 
 def run_in(folder: Path) -> Run:
-    """The run in a folder; where nothing says how it was trained, its ``env_name`` is empty."""
+    """The run in a folder; its ``env_name`` is empty if the folder has no settings."""
     run = run_around(folder / "any.zip")
     names = _settings_folders(folder)
     if run is None and len(names) > 1:
@@ -87,7 +87,7 @@ def run_in(folder: Path) -> Run:
 
 
 def recorded_run(run: Run | None) -> RecordedRun:
-    """What a run folder says, see the table above; of a folder that says nothing, nothing."""
+    """Read the settings in a run folder, by the table above; empty if it has none."""
     if run is None:
         return RecordedRun()
     spec = run.recorded_spec()
@@ -112,7 +112,7 @@ def recorded_run(run: Run | None) -> RecordedRun:
 
 @contextmanager
 def _telling_way_out() -> Iterator[None]:
-    """Say what to do about a file that is not as its run left it."""
+    """Add to the error about a changed file what the user can do."""
     try:
         yield
     except DamagedFileError as error:
@@ -120,14 +120,14 @@ def _telling_way_out() -> Iterator[None]:
 
 
 def check_digest(run: Run | None, path: Path) -> None:
-    """Make sure that a file of a run is as the run left it, where the run recorded that."""
+    """Check a file against the digest that its run recorded, if any."""
     if run is not None:
         with _telling_way_out():
             run.files.check(path)
 
 
 def read_recorded(run: Run | None, path: Path, limit: int) -> bytes:
-    """All of a file of at most so many bytes; that of a run has to be as the run left it."""
+    """Read a whole file of at most so many bytes; checks the digest of a run's file."""
     if run is None:
         return read_file(path, limit)
     with _telling_way_out():
@@ -139,7 +139,7 @@ def _has_settings(folder: Path) -> bool:
 
 
 def _settings_folders(folder: Path) -> list[str]:
-    """Names of the folders inside that hold a run's settings, which are its environments' names."""
+    """Names of subfolders with a run's settings, which are names of environments."""
     if not folder.is_dir():
         return []
     return sorted(path.name for path in folder.iterdir() if _has_settings(path))
@@ -158,7 +158,7 @@ REPLAY_BUFFER = "replay_buffer.pkl"
 
 
 def checkpoint_file(model: Path, kind: str) -> Path:
-    """Where "vecnormalize" or "replay_buffer" of a model lies: ``model_<kind>_<n>_steps.pkl``."""
+    """The path of a checkpoint's statistics or buffer: ``model_<kind>_<n>_steps.pkl``."""
     checkpoint = _CHECKPOINT.fullmatch(model.stem)
     if checkpoint is None:
         return model.with_name(f"{model.stem}_{kind}.pkl")
@@ -167,14 +167,14 @@ def checkpoint_file(model: Path, kind: str) -> Path:
 
 
 def statistics_of(model: Path, run: Run | None) -> Path | None:
-    """The statistics that belong to a model: the checkpoint's, its run's last, or a model hub's."""
+    """The statistics file of a model: the checkpoint's, its run's last, or a model hub's."""
     settings = [] if run is None else [run.vecnormalize_path]
     beside = [model.with_name(name) for name in ("vec_normalize.pkl", "vecnormalize.pkl")]
     return _first(checkpoint_file(model, "vecnormalize"), *settings, *beside)
 
 
 def replay_buffer_of(model: Path) -> Path | None:
-    """The replay buffer that belongs to a model: the checkpoint's, or else its run's last one."""
+    """The replay buffer file of a model: the checkpoint's, or else its run's last one."""
     return _first(checkpoint_file(model, "replay_buffer"), model.with_name(REPLAY_BUFFER))
 
 
@@ -184,12 +184,12 @@ def _first(*paths: Path) -> Path | None:
 
 Which = Literal["final", "best", "last checkpoint"] | int
 
-# Zips in a run folder or on a model hub that are not the agent at the end of training.
+# Zips in a run folder or on a model hub other than the final agent.
 _OTHER_ZIPS = ("best_model.zip", "train_eval_metrics.zip")
 
 
 def model_at(path: Path, which: Which = "final") -> Path:
-    """The zip that a path means."""
+    """Find the zip at a path."""
     with_suffix = path.with_name(f"{path.name}.zip") if path.name else path
     if path.is_dir() and (os.path.lexists(path / RECORD) or not with_suffix.is_file()):
         return model_of(run_in(path), which)
@@ -205,7 +205,7 @@ def model_at(path: Path, which: Which = "final") -> Path:
 
 
 def model_of(run: Run, which: Which = "final") -> Path:
-    """The zip of a run."""
+    """Find the zip of a run."""
     if not run.path.is_dir():
         raise UserError(f"{run.path} is no run folder")
     if isinstance(which, int):
@@ -231,7 +231,7 @@ def model_of(run: Run, which: Which = "final") -> Path:
 
 
 def _only_model(run: Run) -> Path:
-    """The one zip of a folder that does not name its environment."""
+    """The only zip of a folder that does not name its environment."""
     models = [
         path
         for path in sorted(run.path.glob("*.zip"))

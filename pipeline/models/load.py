@@ -1,8 +1,8 @@
-"""Loads and saves agents and their statistics; nothing in a file is run.
+"""Loads and saves agents and their statistics; runs no code from a file.
 
-What a zip says of its agent is plain JSON, and read without making an agent. What else it may hold
-are classes of the libraries and ours, and networks, optimizers and buffers of the user's: those of
-the modules that were typed on the command line, and of the agent's own module.
+The settings in a zip are plain JSON, and are read without making an agent. A zip may also name
+classes of the libraries and this project, and the user's networks, optimizers and buffers from
+modules on the command line or from the agent's own module.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 
-# Folders of `agents` in which no agent has a zip with a pickle: known before any is imported.
+# Folders of `agents` whose agents never pickle; known without importing them.
 _JSON_FAMILIES = {"tabular", "linear", "bandits", "mabwiser"}
 
 
 @dataclass(frozen=True)
 class ModelFile:
-    """A zip, read once: what is held against its digest, looked into and loaded are these bytes.
+    """A zip in memory: the same bytes are checked against the digest, inspected and loaded.
 
-    Whoever puts another file in its place meanwhile changes nothing.
+    Replacing the file on disk meanwhile has no effect.
     """
 
-    path: Path  # where it lay
-    content: bytes = field(repr=False)  # all of it
-    # the JSON in it; what is pickled in that stays text
+    path: Path  # the path of the zip
+    content: bytes = field(repr=False)  # the whole file
+    # its JSON; pickles in it stay text
     data: Mapping[str, Any] = field(repr=False)
 
     @property
     def digest(self) -> str:
-        """The SHA-256 of the content, as ``run.json`` has those of files."""
+        """The SHA-256 of the content, in the format of ``run.json``."""
         return hashlib.sha256(self.content).hexdigest()
 
     def stream(self) -> io.BytesIO:
-        """The content, for what reads files."""
+        """The content as a stream."""
         return io.BytesIO(self.content)
 
 
 def read_model(path: Path, run: Run | None = None) -> ModelFile:
-    """Read a zip, which is a whole one of an agent; no agent is made of it."""
+    """Read an agent's zip and check that it is complete, without making an agent."""
     from safe_files.archives import first_look
     from safe_files.files import MAX_ARCHIVE_BYTES
 
@@ -73,7 +73,7 @@ def read_model(path: Path, run: Run | None = None) -> ModelFile:
 
 
 def _shown_space(attributes: Any) -> str | None:
-    """A space in words, by its attributes; None where they say nothing plain."""
+    """A space in words, by its attributes; None if these are not plain data."""
     known = attributes if isinstance(attributes, dict) else {}
     if "n" in known:
         return f"{known['n']} kinds"
@@ -81,14 +81,14 @@ def _shown_space(attributes: Any) -> str | None:
 
 
 def hand_written_algorithm(model: ModelFile) -> str | None:
-    """The hand-written agent that a zip says it holds, or None; a hint for who is meant."""
+    """The hand-written agent that a zip names, or None."""
     end = f":{model.data.get('algorithm')}"
     named = (name for name, entry in ALGORITHMS.items() if entry.entry_point.endswith(end))
     return next(filter(_is_hand_written, named), None)
 
 
 def telling_masks(spec: TrainSpec, model: ModelFile) -> TrainSpec:
-    """The spec with action masks, if the agent in a zip has them and the spec says nothing."""
+    """The spec with action masks, if the agent in a zip has them and the spec does not decide."""
     algorithm, name = spec.hyperparams.algorithm, "mask_actions"
     if name in algorithm or model.data.get(name) is not True:
         return spec
@@ -98,7 +98,7 @@ def telling_masks(spec: TrainSpec, model: ModelFile) -> TrainSpec:
 
 
 def _is_hand_written(algo: str) -> bool:
-    """Whether zips of the agent hold JSON; where there is no class, none is loaded."""
+    """Whether zips of the agent contain JSON; True if its class cannot be imported."""
     if ALGORITHMS[algo].family in _JSON_FAMILIES:
         return True
     from agents.common.model_files import JsonAlgorithm
@@ -112,11 +112,11 @@ def _is_hand_written(algo: str) -> bool:
 def own_classes(
     algorithm: type[BaseAlgorithm], modules: Iterable[UserModule]
 ) -> Mapping[str, type]:
-    """Networks, optimizers and buffers of the user's, by their full names."""
+    """The user's networks, optimizers and buffers, by their full names."""
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
-    # No others: what a file names as a part of a network is called with what it says.
+    # No others, because a file may have parts of a network called with its arguments.
     kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = {module.name for module in modules} | {algorithm.__module__}
 
@@ -132,7 +132,7 @@ def own_classes(
     return {name: cls for name, cls in found.items() if lies_in(cls.__module__)}
 
 
-# What a class of the user's may stand for in a zip.
+# Settings in a zip that may be classes of the user.
 _CLASS_KEYS = ("policy_class", "policy_kwargs", "replay_buffer_class", "rollout_buffer_class")
 
 
@@ -156,7 +156,7 @@ def load_model(
     algorithm = agent_class(algo)
     try:
         with warnings.catch_warnings():
-            # Said of the buffer that the library itself chose when the agent was made.
+            # The warning is about a buffer that the library itself chose.
             warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
             agent = _loaded(algorithm, file, env, modules, kwargs)
         agent.__class__ = algorithm
@@ -182,7 +182,7 @@ def _loaded(
     modules: Iterable[UserModule],
     kwargs: Mapping[str, Any],
 ) -> BaseAlgorithm:
-    """An agent by its class's own `load`, where it has one, or else read as data."""
+    """Load an agent by its class's own `load`, if it has one, or else as data."""
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     from agents.common.model_files import JsonAlgorithm
@@ -191,7 +191,7 @@ def _loaded(
     if _is_load_of(JsonAlgorithm, algorithm):
         return algorithm.load(file.stream(), env=env, **kwargs)
     if not _is_load_of(BaseAlgorithm, algorithm):
-        # Code of the user's, which may do with paths alone.
+        # The user's code, which may accept only paths.
         return algorithm.load(file.path, env=env, **kwargs)
     return load_model(
         _loadable(algorithm), file.stream(), env, classes=own_classes(algorithm, modules), **kwargs
@@ -199,12 +199,12 @@ def _loaded(
 
 
 def _is_load_of(owner: type, algorithm: type[BaseAlgorithm]) -> bool:
-    """Whether the class loads as ``owner`` does."""
+    """Whether the class inherits `load` from ``owner``."""
     return getattr(algorithm.load, "__func__", None) is vars(owner)["load"].__func__
 
 
 def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
-    """The class, or a subclass that does without the arguments that `load` hands a constructor."""
+    """The class, or a subclass whose constructor accepts the arguments that `load` passes."""
     parameters = algorithm_parameters(algorithm)
     lacking = {"policy", "device", "_init_setup_model"} - parameters.keys()
     if not lacking:
@@ -212,7 +212,7 @@ def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
 
     def without_them(self: Any, **kwargs: Any) -> None:
         initialise: Any = algorithm.__init__
-        # What `_init_setup_model=False` is for: `load` sets up once it has restored the attributes.
+        # Replaces `_init_setup_model=False`: `load` sets up after restoring the attributes.
         vars(self)["_setup_model"] = lambda: None
         initialise(self, **{name: value for name, value in kwargs.items() if name not in lacking})
         del vars(self)["_setup_model"]
@@ -227,7 +227,7 @@ def load_to_play(
     device: str = "auto",
     modules: Iterable[UserModule] = (),
 ) -> BaseAlgorithm:
-    """As `load_model`, without buffers, noise and schedules; observations may have other bounds."""
+    """Like `load_model`, without buffers, noise and schedules; observation bounds may differ."""
     file = model if isinstance(model, ModelFile) else read_model(model)
     if _is_hand_written(algo):
         return load_model(algo, file, env, device=device)
@@ -257,7 +257,7 @@ def load_to_play(
 
 
 def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None) -> None:
-    """Give an agent the replay buffer in a file, where it is of a kind that has one."""
+    """Load a replay buffer from a file into an agent, if the agent has replay buffers."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     from agents.library import MaskedReplayBuffer
@@ -286,17 +286,17 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a VecNormalize has seen, and how it normalises by it."""
+    """The statistics and settings of a VecNormalize."""
 
-    path: Path  # where they were read
+    path: Path  # the file that was read
     settings: Mapping[str, Any]  # arguments of VecNormalize
-    # of each observation, or by key; None where observations are left alone
+    # of observations, or by key; None if observations are not normalised
     observations: RunningMeanStd | dict[str, RunningMeanStd] | None
     returns: RunningMeanStd  # of discounted returns, by which rewards are divided
 
 
 def read_statistics(path: Path, run: Run | None = None) -> Statistics:
-    """Read what VecNormalize saved, as data: nothing in the file is run."""
+    """Read the statistics that VecNormalize saved, as data: runs no code from the file."""
     from safe_files.buffers_and_statistics import read_normalization
     from safe_files.files import MAX_STATISTICS_BYTES
 
@@ -304,7 +304,7 @@ def read_statistics(path: Path, run: Run | None = None) -> Statistics:
         saved = read_normalization(read_recorded(run, path, MAX_STATISTICS_BYTES))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-    # NumPy's numbers become Python's, which a settings file can hold.
+    # NumPy's numbers become Python's, so that a settings file can store them.
     settings = {
         key: value.item() if hasattr(value, "item") else value
         for key, value in saved.settings.items()
@@ -315,7 +315,7 @@ def read_statistics(path: Path, run: Run | None = None) -> Statistics:
 
 
 def normalising(spec: TrainSpec, settings: Mapping[str, Any]) -> TrainSpec:
-    """The spec with environments under a VecNormalize that is made with ``settings``."""
+    """The spec with environments in a VecNormalize that is made with ``settings``."""
     return replace(
         spec,
         hyperparams=replace(spec.hyperparams, normalize=dict(settings)),
@@ -324,7 +324,7 @@ def normalising(spec: TrainSpec, settings: Mapping[str, Any]) -> TrainSpec:
 
 
 def take_over(env: VecEnv, statistics: Statistics) -> None:
-    """Let the VecNormalize in ``env`` go on from the statistics."""
+    """Copy the statistics into the VecNormalize of ``env``."""
     from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
     normalization = unwrap_vec_normalize(env)
@@ -346,7 +346,7 @@ def take_over(env: VecEnv, statistics: Statistics) -> None:
 
 
 def with_normalised_rewards(env: VecEnv) -> VecEnv:
-    """The environments with rewards as training normalised them, episodes' returns too."""
+    """The environments with normalised rewards, as in training, and returns of these."""
     from stable_baselines3.common.vec_env import VecMonitor, unwrap_vec_normalize
 
     normalization = unwrap_vec_normalize(env)
@@ -354,13 +354,13 @@ def with_normalised_rewards(env: VecEnv) -> VecEnv:
         raise UserError("--norm-reward: no statistics of VecNormalize belong to this model")
     normalization.norm_reward = True
     with warnings.catch_warnings():
-        # That the statistics of the Monitor inside are overwritten is what is wanted.
+        # Overwriting the statistics of the inner Monitor is intended.
         warnings.filterwarnings("ignore", "The environment is already wrapped with a `Monitor`")
         return VecMonitor(env)
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Write the agent to ``path``, whole or not at all."""
+    """Write the agent to ``path`` atomically."""
     from pipeline.finite_numbers import check_model
 
     check_model(model)
@@ -369,15 +369,15 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
 
 
 def save_normalization(model: BaseAlgorithm, path: Path) -> None:
-    """Write the running statistics of VecNormalize, where the agent trains under one."""
+    """Write the running statistics of VecNormalize, if the agent trains in one."""
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
         with replacing(path) as file:
-            pickle.dump(normalization, file)  # as its own `save`, which takes paths alone
+            pickle.dump(normalization, file)  # like its own `save`, which accepts only paths
 
 
 def save_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
-    """Write the replay buffer, where the agent has one."""
+    """Write the agent's replay buffer, if it has one."""
     if getattr(model, "replay_buffer", None) is not None:
         with replacing(path) as file:
             model.save_replay_buffer(file)  # type: ignore[attr-defined]

@@ -1,1 +1,1 @@
-"""Reads, checks and builds settings from files and command lines, and runs none of them."""
+"""Reads, checks and builds settings from files and command lines, without running code in them."""

@@ -1,10 +1,10 @@
-"""Builds what a file names: classes, wrappers, callbacks, schedules, arguments of agents.
+"""Builds objects that a settings file names: wrappers, callbacks, schedules, agents' arguments.
 
-A name in a file can choose among classes of a fixed kind from a fixed set of packages; it cannot
-make anything else be imported or called. A module is imported only if it is one of ours, if its
-name was typed, or if its file is in the record of a distribution that is installed: a folder
-``rl_zoo3`` of a stranger's is none, wherever it lies. All are looked up and checked before any is
-used, so that a mistake shows before a run begins.
+A name in a file can choose a class of a fixed kind from a fixed set of packages; it cannot import
+or call anything else. A module is imported only if it belongs to this project, if the user typed
+its name, or if its file is in the record of an installed distribution. A stranger's folder
+``rl_zoo3`` is in no such record. All names are looked up and checked before any is used, so that
+errors show before a run begins.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 
-# Arguments of wrappers for the number of stacked observations, whose memory is taken at once.
+# Wrapper arguments for the number of stacked observations, whose memory is allocated at once.
 _STACKS = frozenset({"n_stack", "stack_size"})
 _LONGEST_STACK = 10_000
 
 
 @dataclass(frozen=True)
 class _Component:
-    """A checked class and its checked arguments."""
+    """A checked class with checked arguments."""
 
     cls: type
     kwargs: dict[str, Any]
     where: str
 
     def build(self, *inner: Any) -> Any:
-        """Build the object; a wrapper around ``inner``."""
+        """Build the object; for a wrapper, around ``inner``."""
         from gymnasium.error import Error
 
         try:
@@ -92,7 +92,7 @@ def vec_wrapper_factory(
     where: str = "vec_env_wrapper",
     folder: Path | None = None,
 ) -> Callable[[VecEnv], VecEnv] | None:
-    """As `wrapper_factory`, for wrappers of a vectorised environment."""
+    """Like `wrapper_factory`, for wrappers of a vectorised environment."""
     from stable_baselines3.common.vec_env import VecEnvWrapper
 
     components = _components(spec, VecEnvWrapper, extra_packages, where, 1, folder)
@@ -114,7 +114,7 @@ def callbacks(
 def build_value(
     raw: Any, extra_packages: Sequence[str] = (), where: str = "hyperparameters"
 ) -> Any:
-    """Turn the names and schedules in nested values into classes and schedule objects."""
+    """Replace names and schedules in nested values by classes and schedule objects."""
     if isinstance(raw, dict):
         return {
             key: build_value(value, extra_packages, f"{where}: {key}") for key, value in raw.items()
@@ -162,7 +162,7 @@ def _components(
             is_variable = parameter.kind in {parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD}
             if parameter.default is parameter.empty and name not in kwargs and not is_variable:
                 raise UserError(f"{place}: argument {name!r} is missing")
-            kind = str(parameter.annotation).partition("[")[0]  # that admits functions alone
+            kind = str(parameter.annotation).partition("[")[0]  # accepts functions only
             if kwargs.get(name) is not None and "Callable" in kind and "|" not in kind:
                 raise UserError(f"{place}: {name} is a function, which settings cannot hold")
         components.append(_Component(cls, build_value(kwargs, extra_packages, place), place))
@@ -176,12 +176,12 @@ _LIBRARIES = ("stable_baselines3", "sb3_contrib", "gymnasium", "torch.nn", "torc
 # Of rl_zoo3 only two modules: importing the package changes Gymnasium's time limit.
 _PACKAGES = (*_LIBRARIES, "rl_zoo3.wrappers", "rl_zoo3.callbacks", "envs", "agents", "pipeline")
 
-# The short names that rl_zoo3's files use.
+# The short names in rl_zoo3's files.
 _MODULE_ALIASES = {"nn": "torch.nn", "th": "torch", "sb3": "stable_baselines3", "gym": "gymnasium"}
 _CLASS_ALIASES = {
     "RMSpropTFLike": "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
     "HerReplayBuffer": "stable_baselines3.her.her_replay_buffer.HerReplayBuffer",
-    # Where classes of ours were before: files that name them so are still read.
+    # Former names of this project's classes, which files may still use.
     "envs.wrappers.encodings.FlattenToDiscrete": "envs.wrappers.FlattenToDiscrete",
     "envs.wrappers.encodings.OneHotObservation": "envs.wrappers.OneHotObservation",
     "envs.wrappers.rewards.ScaleReward": "envs.wrappers.ScaleReward",
@@ -192,7 +192,7 @@ _CLASS_ALIASES = {
 def find_class(
     name: str, bases: tuple[type, ...], where: str, extra_packages: Sequence[str] = ()
 ) -> type:
-    """Import a subclass of ``bases``, such as ``nn.Tanh``, if its name is admitted."""
+    """Import a subclass of ``bases``, such as ``nn.Tanh``, if its name is allowed."""
     first, dot, rest = _CLASS_ALIASES.get(name, name).partition(".")
     module_name, _, class_name = f"{_MODULE_ALIASES.get(first, first)}{dot}{rest}".rpartition(".")
     parts = [*module_name.split("."), class_name]
@@ -215,7 +215,7 @@ def find_class(
 
 
 def _import(module_name: str, what: str, typed: Sequence[str]) -> ModuleType:
-    """Import a module, after each package around it was checked."""
+    """Import a module after checking each of its parent packages."""
     parts = module_name.split(".")
     try:
         for end in range(1, len(parts) + 1):
@@ -236,7 +236,7 @@ def _import(module_name: str, what: str, typed: Sequence[str]) -> ModuleType:
 
 
 def _is_installed(name: str) -> bool:
-    """Whether a module's file is in the record of the distribution of that name."""
+    """Whether a module's file is in the record of the installed distribution of that name."""
     try:
         spec = importlib.util.find_spec(name)
     except ValueError:  # `sys.modules` has something else under that name
@@ -254,7 +254,7 @@ def _is_installed(name: str) -> bool:
 
 @cache
 def _folders() -> tuple[Path, ...]:
-    """The folders of installed packages, without the current folder and PYTHONPATH."""
+    """The folders of installed packages, excluding the current folder and PYTHONPATH."""
     paths = sysconfig.get_paths()
     places = [paths["purelib"], paths["platlib"], *site.getsitepackages()]
     places += [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
@@ -268,7 +268,7 @@ def _folders() -> tuple[Path, ...]:
 
 @cache
 def _record(distribution: str, folder: Path) -> frozenset[str]:
-    """The files of a distribution that is installed in a folder, relative to it."""
+    """The files of a distribution in a folder of packages, relative to the folder."""
     found = importlib.metadata.distributions(name=distribution, path=[str(folder)])
     texts = [one.read_text("RECORD") or "" for one in found]
     return frozenset(line.rsplit(",", 2)[0] for text in texts for line in text.splitlines())
@@ -280,12 +280,12 @@ _NAME_OF_A_PLACE = re.compile(
 
 
 def names_a_place(argument: str) -> bool:
-    """Whether an argument of that name is a path to write to."""
+    """Whether an argument of that name is an output path."""
     return _NAME_OF_A_PLACE.search(argument) is not None
 
 
 def confined(value: Any, folder: Path | None, where: str, name: str = "") -> Any:
-    """Move paths among arguments into the folder; refuse those that lead out of it."""
+    """Make paths among the arguments relative to the folder; refuse paths that lead out of it."""
     if isinstance(value, dict):
         return {
             key: confined(item, folder, f"{where}: {key}", f"{name}_{key}")
@@ -295,7 +295,7 @@ def confined(value: Any, folder: Path | None, where: str, name: str = "") -> Any
         return type(value)(confined(item, folder, where, name) for item in value)
     if not (isinstance(value, str | Path) and names_a_place(name)):
         return value
-    path = PureWindowsPath(value)  # both slashes part folders, and a drive's letter leads out too
+    path = PureWindowsPath(value)  # accepts both slashes; a drive letter leads out too
     if "prefix" in name.lower():
         if path.name == str(value) != "..":
             return str(value)
@@ -303,7 +303,7 @@ def confined(value: Any, folder: Path | None, where: str, name: str = "") -> Any
         raise UserError(f"{where} {what}, unlike {shown(str(value))}")
     folder = Path(_scratch().name) if folder is None else folder
     leads_out = bool(path.anchor) or ".." in path.parts or "\0" in str(value)
-    # Links are followed first.
+    # After following links.
     if leads_out or not (folder / value).resolve().is_relative_to(folder.resolve()):
         raise UserError(f"{where} must lie inside the run folder, unlike {shown(str(value))}")
     return str(folder / value)
@@ -320,7 +320,7 @@ def build_algorithm_kwargs(
     where: str,
     extra_packages: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Check and build the arguments of an agent's constructor, ``policy_kwargs`` included."""
+    """Check and build the arguments of an agent's constructor, including ``policy_kwargs``."""
     from agents.common.model_files import JsonAlgorithm
     from agents.common.schedules import ExponentialSchedule, library_schedule
 
@@ -352,7 +352,7 @@ def needs_policy(algorithm: type[BaseAlgorithm], kwargs: Mapping[str, Any]) -> b
 
 
 def default_policy(algorithm: type[BaseAlgorithm], is_dict: bool) -> str:
-    """The policy of an agent if the settings name none."""
+    """The default policy of an agent."""
     prefix = "MultiInput" if is_dict else "Mlp"
     known = algorithm.policy_aliases
     fitting = (name for name in known if name.startswith(prefix))
@@ -366,7 +366,7 @@ def _policy_class(
     where: str,
     extra_packages: Sequence[str],
 ) -> type[BasePolicy] | None:
-    """The class of the policy; None where only the agent's constructor knows it."""
+    """The class of the policy; None if only the agent's constructor knows it."""
     from stable_baselines3.common.policies import BasePolicy
 
     if needs_policy(algorithm, kwargs):
@@ -387,7 +387,7 @@ def _build(
     where: str,
     extra_packages: Sequence[str],
 ) -> dict[str, Any]:
-    """Build each argument, and check classes against ``type[...]`` in the annotations."""
+    """Build each argument, and check classes against ``type[...]`` annotations."""
     built = {}
     for name, value in kwargs.items():
         built[name] = build_value(value, extra_packages, f"{where}: {name}")
@@ -404,7 +404,7 @@ def _build(
 
 
 def check_action_noise(hyperparams: Hyperparams, algorithm: type[BaseAlgorithm], algo: str) -> None:
-    """Make sure that the agent takes the noise that is asked for."""
+    """Check that the agent accepts action noise if the settings ask for it."""
     taken = constructor_parameters(algorithm)
     if hyperparams.noise_type is not None and "action_noise" not in taken:
         raise UserError(
@@ -413,7 +413,7 @@ def check_action_noise(hyperparams: Hyperparams, algorithm: type[BaseAlgorithm],
 
 
 def action_noise(hyperparams: Hyperparams, actions: spaces.Space[Any]) -> dict[str, Any]:
-    """The argument ``action_noise``, of actions scaled to [-1, 1]; empty for none."""
+    """The argument ``action_noise``, for actions scaled to [-1, 1]; empty without noise."""
     if hyperparams.noise_type is None:
         return {}
     import numpy as np

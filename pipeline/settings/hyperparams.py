@@ -1,8 +1,8 @@
-"""Reads and checks hyperparameters in rl_zoo3's format; nothing in a file is run.
+"""Reads and checks hyperparameters in rl_zoo3's format; runs no code in a file.
 
 One YAML file per algorithm maps environment ids to entries. An entry holds arguments of the
-algorithm's constructor, and the special keys that `Hyperparams` lists. Beside the entries, under
-``tuned_on``, a file may say which seeds they were tuned on.
+algorithm's constructor, and the special keys that `Hyperparams` lists. A file may also list, under
+``tuned_on``, the seeds on which its entries were tuned.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pipeline.errors import UserError, did_you_mean, shown
 from pipeline.settings.values import check_arguments, check_range, coerce, contains_name
 from pipeline.settings.yaml import read_yaml, settings_bytes
 
-# Constructor arguments that are set elsewhere, and how.
+# Constructor arguments that have another source, and its name.
 _SET_ELSEWHERE = {
     "action_noise": "noise_type and noise_std",
     "env": "--env",
@@ -54,7 +54,7 @@ _KEYWORDS: Mapping[str, Mapping[str, inspect.Parameter]] = {
 
 @dataclass(frozen=True)
 class ComponentSpec:
-    """A wrapper or callback that an entry asks for."""
+    """A wrapper or callback of an entry."""
 
     name: str  # the dotted name of its class
     kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of its constructor
@@ -64,32 +64,32 @@ class ComponentSpec:
 class Hyperparams:
     """One entry, the special keys apart from the algorithm's arguments."""
 
-    # environment steps to train for; None if counted in episodes or not said
+    # training steps; None if counted in episodes or not given
     n_timesteps: int | None = None
-    n_episodes: int | None = None  # episodes to train for; never set together with ``n_timesteps``
-    n_envs: int = 1  # environments to train on at once
-    # arguments of VecNormalize, the algorithm's ``gamma`` included; None for without
+    n_episodes: int | None = None  # training episodes; never set together with ``n_timesteps``
+    n_envs: int = 1  # parallel training environments
+    # arguments of VecNormalize, including the algorithm's ``gamma``; None without it
     normalize: dict[str, Any] | None = None
-    # wrappers of every environment, the innermost first
+    # wrappers of every environment, innermost first
     env_wrapper: tuple[ComponentSpec, ...] = ()
-    # wrappers of the training environments alone, around those
+    # further outer wrappers of the training environments
     train_env_wrapper: tuple[ComponentSpec, ...] = ()
     vec_env_wrapper: tuple[ComponentSpec, ...] = ()  # wrappers of the vectorised environment
     callback: tuple[ComponentSpec, ...] = ()  # callbacks of the training
     env_kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of every environment
-    # further arguments of the training environments alone
+    # further arguments of the training environments only
     train_env_kwargs: dict[str, Any] = field(default_factory=dict)
-    # further arguments of the evaluation environments alone
+    # further arguments of the evaluation environments only
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
-    frame_stack: int | None = None  # how many observations to stack, or None
+    frame_stack: int | None = None  # number of stacked observations, or None
     monitor_kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of Monitor
-    # action noise, for algorithms that take an ``action_noise``
+    # action noise, for algorithms with an argument ``action_noise``
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
-    # its standard deviation. Without a ``noise_type`` the key is an argument of the algorithm like
-    # any other.
+    # its standard deviation. Without ``noise_type``, the key is an ordinary argument of the
+    # algorithm.
     noise_std: float | None = None
-    flush_denormal: bool = False  # let the processor take numbers below 1e-38 for zero
-    # everything else: arguments of the algorithm's constructor, not checked yet
+    flush_denormal: bool = False  # the processor replaces numbers below 1e-38 by zero
+    # all other keys: arguments of the algorithm's constructor, not checked yet
     algorithm: dict[str, Any] = field(default_factory=dict)
 
 
@@ -100,8 +100,8 @@ _hints = cache(get_type_hints)  # evaluating them takes longer than reading an e
 
 
 def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperparams:
-    """Separate an entry's special keys, unless null, from the algorithm's arguments; check them."""
-    # Without a noise_type, noise_std is an argument of some agents.
+    """Separate an entry's special keys (unless null) from the algorithm's arguments; check them."""
+    # Without noise_type, noise_std is an argument of some agents.
     is_action_noise = entry.get("noise_type") is not None
     special_keys = [key for key in SPECIAL_KEYS if key != "noise_std" or is_action_noise]
     algorithm = {key: value for key, value in entry.items() if key not in special_keys}
@@ -125,7 +125,7 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
     if "noise_type" in special and "noise_std" not in special:
         raise UserError(f"{where}: noise_type needs noise_std, the standard deviation of the noise")
     if special.get("normalize") is not None and "gamma" in algorithm:
-        # As rl_zoo3 has it: rewards are normalised under the discount that the agent uses.
+        # As in rl_zoo3, rewards are normalised with the agent's discount.
         gamma = coerce(algorithm["gamma"], float, f"{where}: gamma")
         special["normalize"].setdefault("gamma", gamma)
     return Hyperparams(**special, algorithm=algorithm)
@@ -154,7 +154,7 @@ def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
 def check_algorithm_kwargs(
     kwargs: Mapping[str, Any], parameters: Mapping[str, inspect.Parameter], where: str
 ) -> dict[str, Any]:
-    """Check constructor arguments by name, type and range; see `coerce` for what is returned."""
+    """Check constructor arguments by name, type and range; returns values of `coerce`."""
     for name in kwargs:
         if name in _SET_ELSEWHERE and name in parameters:
             raise UserError(f"{where}: {name} is set by {_SET_ELSEWHERE[name]}, not here")
@@ -179,7 +179,7 @@ TUNED_ON = "tuned_on"
 
 
 class NoEntryError(UserError):
-    """A file of hyperparameters says nothing about the environment."""
+    """A file of hyperparameters has no entry for the environment."""
 
 
 def read_hyperparams(
@@ -188,12 +188,12 @@ def read_hyperparams(
     path: Path | str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Read the entry of an environment in ``hyperparams/<algo>.yml``, or in another file.
+    """Read the entry of an environment from ``hyperparams/<algo>.yml``, or from another file.
 
-    The entry ``atari`` stands in for Atari games without their own, ``default`` for all others. An
-    algorithm without a file here, such as one of the user's own, has an empty entry. Where
-    ``env_kwargs`` make the environment the one that another id stands for, that id's entry counts:
-    for CliffWalking-v1 with ``is_slippery: True`` that of CliffWalkingSlippery-v1.
+    Atari games without an entry use the entry ``atari``, all others ``default``. An algorithm
+    without a file, such as the user's own, has an empty entry. If ``env_kwargs`` make the
+    environment equal to another id, the entry of that id is used: for CliffWalking-v1 with
+    ``is_slippery: True``, the entry of CliffWalkingSlippery-v1.
     """
     if path is None and not _path(algo, None).is_file():
         return {}
@@ -215,7 +215,7 @@ def read_hyperparams(
 def seeds_tuned_on(
     algo: str, env_id: str, path: Path | str | None = None
 ) -> tuple[range, ...] | None:
-    """The seeds that the entry of an environment was tuned on; None where its file does not say."""
+    """The seeds on which an environment's entry was tuned; None if its file does not say."""
     if path is None and not _path(algo, None).is_file():
         return None
     entries, tuned_on = _read(_path(algo, path))
@@ -225,7 +225,7 @@ def seeds_tuned_on(
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, tuple[range, ...]] | None]:
-    """The entries of a file, and the seeds that it says they were tuned on."""
+    """Read the entries of a file, and the seeds of their tuning."""
     if path.suffix == ".py":
         raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
     entries = read_yaml(path)
@@ -238,7 +238,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, tuple[range, ...]] | No
 def _same_environment(
     entries: Mapping[str, Any], env_id: str, env_kwargs: Mapping[str, Any] | None
 ) -> str | None:
-    """The id of an entry that is registered as this environment with exactly these arguments."""
+    """The id of an entry that is registered as this environment with the same arguments."""
     if not env_kwargs:
         return None
     import gymnasium as gym
@@ -262,9 +262,9 @@ def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:
 
 
 def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
-    """Ids of the environments that an algorithm's file has an entry for, in its order."""
+    """Ids of the environments with an entry in an algorithm's file, in the file's order."""
     path = _path(algo, path)
-    # The keys alone, by their place in the line: parsing all files would slow listing them down.
+    # Finds keys by their position in the line, because parsing all files would be slow.
     text = settings_bytes(path).decode() if path.is_file() else ""
     return [name for name in _TOP_LEVEL_KEY.findall(text) if name not in (*_STAND_INS, TUNED_ON)]
 
@@ -274,14 +274,14 @@ def _path(algo: str, path: Path | str | None) -> Path:
 
 
 def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Change an entry; a new budget of training replaces the old one, whatever its unit."""
+    """Change an entry; a new training budget replaces the old one, also in another unit."""
     budgets = {"n_timesteps", "n_episodes"}
     gone = set() if budgets.isdisjoint(changes) else budgets
     return {**{key: value for key, value in entry.items() if key not in gone}, **changes}
 
 
 def _read_tuned_on(entries: Mapping[str, Any], where: str) -> dict[str, tuple[range, ...]]:
-    """The seeds that each entry was tuned on: ``{first: 0, count: 10}``, or a list of such."""
+    """Read the seeds of each entry's tuning: ``{first: 0, count: 10}``, or a list of such."""
     said = entries[TUNED_ON]
     if not isinstance(said, dict):
         raise UserError(f"{where} must map entries to seeds, not be {shown(said)}")

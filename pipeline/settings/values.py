@@ -1,9 +1,9 @@
-"""Reads values from files and command lines as literals, then as a constructor's types.
+"""Reads values from files and command lines as literals, and converts them to argument types.
 
-No text is ever run: it is parsed to a syntax tree, and the tree is rebuilt from a short list of
-node types. A dotted name stays a name: `pipeline.settings.components` decides what it may stand
-for. A whole number may be written 1e6, a number as a text, a tuple as a list, a class by its name,
-a schedule as ``lin_0.001``. What fits none of an argument's types is a mistake and said so.
+Text is never executed: it is parsed to a syntax tree, and values are rebuilt from a short list of
+node types. A dotted name stays a name; `pipeline.settings.components` decides what it may refer to.
+An integer may be written as 1e6, a number as a text, a tuple as a list, a class by its name, a
+schedule as ``lin_0.001``. A value that fits none of an argument's types is an error.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAX_CHARACTERS = 10_000
 
 @dataclass(frozen=True)
 class DottedName:
-    """The name of a class, such as ``nn.Tanh``, not looked up yet."""
+    """A class name such as ``nn.Tanh``, not looked up yet."""
 
     name: str
 
@@ -41,17 +41,17 @@ class DottedName:
 
 
 class _RefusedError(Exception):
-    """Arguments: what is wrong with a part of the syntax tree, and the part."""
+    """A refused part of a syntax tree; arguments: the reason, and the part."""
 
 
 def parse_literal(text: str, where: str = "") -> Any:
     """Read a literal: ``"[64, 64]"``, ``"{'a': 1}"``, ``"dict(net_arch=[64], act=nn.Tanh)"``."""
     text = text.strip()
     try:
-        # A deeper or longer expression is no hyperparameter, and could exhaust the parser.
+        # A deeper or longer expression is not a hyperparameter, and could exhaust the parser.
         if len(text) > _MAX_CHARACTERS:
             raise ValueError(f"longer than {_MAX_CHARACTERS} characters")
-        with warnings.catch_warnings(action="ignore"):  # an unknown escape such as "\d" stays
+        with warnings.catch_warnings(action="ignore"):  # keeps unknown escapes such as "\d"
             tree = ast.parse(text, mode="eval").body
         return _convert(tree)
     except SyntaxError as error:
@@ -70,7 +70,7 @@ def parse_literal(text: str, where: str = "") -> Any:
 
 
 def contains_name(value: object) -> bool:
-    """Whether a `DottedName` stands anywhere in nested lists, tuples and dictionaries."""
+    """Whether nested lists, tuples and dictionaries contain a `DottedName`."""
     if isinstance(value, dict):
         return any(map(contains_name, value.values()))
     if isinstance(value, list | tuple):
@@ -79,10 +79,10 @@ def contains_name(value: object) -> bool:
 
 
 def parse_assignments(assignments: Iterable[str], where: str = "") -> dict[str, Any]:
-    """Read what ``-params`` and ``--env-kwargs`` take: a list of ``key:value``.
+    """Read the values of ``-params`` and ``--env-kwargs``: a list of ``key:value``.
 
-    A value is a literal in Python's or YAML's spelling, or else text; text also where the names of
-    classes stand in it, since it goes into the run folder as it is.
+    A value is a literal in Python's or YAML's spelling, or else text. A value with class names
+    stays text, because it is written to the run folder unchanged.
     """
     prefix = f"{where}: " if where else ""
     result: dict[str, Any] = {}
@@ -186,20 +186,20 @@ _CLASS_NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)*")
 
 @dataclass(frozen=True)
 class ScheduleSpec:
-    """How a number changes over training, from ``start`` at first to ``end`` at the last step."""
+    """A schedule of a number, from ``start`` at the first step to ``end`` at the last."""
 
-    # whether it moves by a constant amount a step, or by a constant factor
+    # whether it changes by a constant amount per step, or by a constant factor
     kind: Literal["linear", "exponential"]
     start: float
     end: float
 
 
 class _MisfitError(Exception):
-    """A value that cannot be read as one of an argument's types; another may fit."""
+    """A value does not fit one of an argument's types; another type may fit."""
 
 
 def coerce(value: Any, annotation: Any, where: str) -> Any:
-    """Read a value by the first option of a type that fits; unknown types take it as it is."""
+    """Convert a value by the first fitting option of a type; unknown types keep it unchanged."""
     options = _options(annotation)
     for kind, _, read in _READERS:
         for option in options:
@@ -237,7 +237,7 @@ def _options(annotation: Any) -> tuple[Any, ...]:
 
 
 def _kind(option: Any) -> Any:
-    """The key of this type in `_READERS`, or None."""
+    """The key of a type in `_READERS`, or None."""
     origin = get_origin(option) or option
     if origin is collections.abc.Callable:
         return Callable if get_args(option) == ([float], float) else None
@@ -346,7 +346,7 @@ def _items(value: Any, where: str) -> Sequence[Any]:
     return items
 
 
-# In this order: a text is what remains when it is no number, schedule or dotted name.
+# In this order: a value is a text if it is no number, schedule or dotted name.
 _READERS: tuple[tuple[Any, str, Callable[[Any, Any, str], Any]], ...] = (
     (types.NoneType, "null", _read_as_it_is),
     (Literal, "one of several values", _read_choice),
@@ -374,7 +374,7 @@ _FINITE = sys.float_info.max
 _LARGEST_WHOLE = 2**63 - 1
 _STARRED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
-# Bounds, both included, of hyperparameters that mean the same in every algorithm.
+# Inclusive bounds of hyperparameters with the same meaning in every algorithm.
 RANGES: Mapping[str, tuple[float, float]] = {
     "n_timesteps": (1, _FINITE),
     "n_episodes": (1, _FINITE),
@@ -398,7 +398,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "n_epochs": (1, _FINITE),
     "learning_starts": (0, _FINITE),
     "train_freq": (1, _FINITE),
-    # -1 stands for one for every step of the environment, or for never.
+    # -1 means once per environment step, or never.
     "gradient_steps": (-1, _FINITE),
     "sde_sample_freq": (-1, _FINITE),
     "target_update_interval": (1, _FINITE),
@@ -411,17 +411,17 @@ RANGES: Mapping[str, tuple[float, float]] = {
 
 
 def constructor_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
-    """The arguments of a class's constructor, annotations as objects wherever they resolve."""
+    """The arguments of a class's constructor, with resolved annotations where possible."""
     try:
         return inspect.signature(cls, eval_str=True).parameters
     except (NameError, AttributeError, TypeError, SyntaxError):
-        # A name that only type checkers import; annotations that stay texts go unchecked.
+        # A name that only type checkers import; unresolved annotations are not checked.
         return inspect.signature(cls).parameters
 
 
-@cache  # a run asks six times, and signatures take long to read
+@cache  # a run calls it six times, and reading signatures is slow
 def algorithm_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
-    """A constructor's arguments, with those that ``**kwargs`` may hand on to base classes."""
+    """A constructor's arguments, including those that ``**kwargs`` may pass to base classes."""
     own = dict(constructor_parameters(cls))
     rest = next((p for p in own.values() if p.kind is p.VAR_KEYWORD), None)
     owners = [base for base in cls.__mro__[:-1] if "__init__" in vars(base)]
@@ -429,10 +429,10 @@ def algorithm_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
         named = {name: p for name, p in own.items() if p.kind not in _STARRED}
         own = {**algorithm_parameters(owners[1]), **named, rest.name: rest}
         if "env" in named and "policy" not in named:
-            own.pop("policy", None)  # which the constructor gives its base class itself
+            own.pop("policy", None)  # the constructor passes it itself
     for name, parameter in own.items():
         if set(get_args(parameter.annotation)) == {float, Callable}:
-            # sb3-contrib's TQC annotates a schedule as a function of no kind.
+            # sb3-contrib's TQC annotates a schedule as a bare function.
             own[name] = parameter.replace(annotation=float | Callable[[float], float])
         elif parameter.annotation is parameter.empty and type(parameter.default) in (int, float):
             kind = (
@@ -461,7 +461,7 @@ def check_arguments(
 
 
 def check_range(name: str, value: object, where: str) -> None:
-    """Refuse a number, or an end of a schedule, outside of `RANGES`, or that no array can hold."""
+    """Refuse a number, or an end of a schedule, outside `RANGES` or too large for an array."""
     if isinstance(value, ScheduleSpec):
         check_range(name, value.start, where)
         check_range(name, value.end, where)

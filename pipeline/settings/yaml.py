@@ -1,8 +1,7 @@
-"""YAML without surprises: plain data only, no key twice, and errors that say where.
+"""Reads strict YAML: plain data only, no repeated keys, and errors with a line number.
 
-Beside `yaml.safe_load`, three things differ: a repeated key is refused instead of winning silently,
-dates and other tags stay what they look like or are refused, and ``1e-4`` is a number, as YAML 1.2
-has it, not a text.
+It differs from `yaml.safe_load` in three ways: a repeated key is an error, dates and other tags
+stay text or are refused, and ``1e-4`` is a number, as in YAML 1.2, not a text.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from pipeline.errors import UserError, shown, visible
 from safe_files.files import UnsafeFileError, read_file
 
-# Far more than settings need, and read in well under a second.
+# Far more than settings need, but read in well under a second.
 _MAX_BYTES = 256 * 1024
 _MAX_DEPTH = 50
 _MAX_VALUES = 20_000
-_LONGEST_NUMBER = 100  # characters; the time that sexagesimal numbers take grows with the square
+_LONGEST_NUMBER = 100  # characters; reading sexagesimal numbers takes quadratic time
 
 _TAG = "tag:yaml.org,2002:"
 _PLAIN_TAGS = frozenset(
     _TAG + name for name in ("null", "bool", "int", "float", "str", "seq", "map")
 )
-# The tag with which rl_zoo3 writes the settings of a run.
+# The tag in the settings that rl_zoo3 writes.
 _ORDERED_DICT = _TAG + "python/object/apply:collections.OrderedDict"
 
 
@@ -46,7 +45,7 @@ def _too_much(mark: yaml.Mark) -> ConstructorError:
 
 
 class StrictLoader(yaml.SafeLoader):
-    """Refuses repeated keys, every tag but those of plain data, and what is too large."""
+    """Refuses repeated keys, tags other than plain data, and documents that are too large."""
 
     admitted_tags = _PLAIN_TAGS
     admits_control_characters = False
@@ -58,9 +57,9 @@ class StrictLoader(yaml.SafeLoader):
 
     def __init__(self, content: str | bytes) -> None:
         super().__init__(content)
-        self._n_values = 0  # so far, what is shared counted at each of its places
-        self._open: list[int] = []  # values before each of the nodes that are being read
-        self._sizes: dict[int, tuple[int, int]] = {}  # values and levels of each node, by its id
+        self._n_values = 0  # so far; shared values count at each of their places
+        self._open: list[int] = []  # number of values before each open node
+        self._sizes: dict[int, tuple[int, int]] = {}  # values and depth of each node, by its id
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         untyped: Any = self
@@ -80,7 +79,7 @@ class StrictLoader(yaml.SafeLoader):
             self._sizes[id(node)] = self._n_values - before, levels
         elif id(node) in self._sizes:
             self._n_values += self._sizes[id(node)][0]
-        else:  # it holds its own alias
+        else:  # it contains its own alias
             raise _too_much(mark)
         around = self._open[-1] if self._open else self._n_values
         level = len(self._open) + self._sizes[id(node)][1]
@@ -106,7 +105,7 @@ class StrictLoader(yaml.SafeLoader):
         if node.tag not in self.admitted_tags:
             problem = f"{node.tag.replace(_TAG, '!!')} is not allowed here"
         elif not self.admits_control_characters and visible(text) != text:
-            # YAML refuses plain ones; escaped ones would reach tables, pictures and file names.
+            # YAML refuses raw ones; escaped ones would reach tables, pictures and file names.
             problem = f"{shown(text)} holds control characters"
         elif is_number and len(node.value) > _LONGEST_NUMBER:
             problem = f"{shown(node.value)} is too long for a number"
@@ -124,7 +123,7 @@ StrictLoader.add_implicit_resolver(
 
 
 class SavedSettingsLoader(StrictLoader):
-    """Admits rl_zoo3's tag for an OrderedDict, and control characters in names of folders."""
+    """Accepts rl_zoo3's tag for an OrderedDict, and control characters in folder names."""
 
     admitted_tags = _PLAIN_TAGS | {_ORDERED_DICT}
     admits_control_characters = True
@@ -150,7 +149,7 @@ def parse_yaml(content: str | bytes, where: str, loader: type[StrictLoader] = St
     if len(content) > _MAX_BYTES:
         raise UserError(f"{where}: is larger than {_MAX_BYTES:,} bytes")
     try:
-        loader_class: Any = loader  # mypy takes no class for hashable
+        loader_class: Any = loader  # for mypy, classes are not hashable
         return deepcopy(_load(content, loader_class))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -162,18 +161,18 @@ def parse_yaml(content: str | bytes, where: str, loader: type[StrictLoader] = St
         raise UserError(f"{where}: is nested too deeply, or too large") from error
 
 
-@lru_cache(maxsize=32)  # a study asks for the same entries again and again
+@lru_cache(maxsize=32)  # a study reads the same entries repeatedly
 def _load(content: str | bytes, loader_class: Any) -> Any:
     return yaml.load(content, loader_class)  # noqa: S506  # a subclass of SafeLoader
 
 
 def read_yaml(path: Path) -> Any:
-    """Read the one YAML document in a file."""
+    """Read the only YAML document in a file."""
     return parse_yaml(settings_bytes(path), str(path))
 
 
 def read_saved_settings(path: Path) -> dict[str, Any]:
-    """Read the settings that a run folder keeps, ours or rl_zoo3's."""
+    """Read the settings in a run folder of this project or rl_zoo3."""
     value = parse_yaml(settings_bytes(path), str(path), SavedSettingsLoader)
     if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
         raise UserError(f"{path}: must map names to values")
@@ -181,7 +180,7 @@ def read_saved_settings(path: Path) -> dict[str, Any]:
 
 
 def settings_bytes(path: Path) -> bytes:
-    """All of a file of settings."""
+    """Read a whole settings file."""
     try:
         return read_file(path, _MAX_BYTES)
     except UnsafeFileError as error:
@@ -192,7 +191,7 @@ def settings_bytes(path: Path) -> bytes:
 
 
 def key_lines(path: Path) -> dict[tuple[str | int, ...], int]:
-    """The lines, from 1, of the values in a file that was read, by the keys that lead to them."""
+    """The line numbers, from 1, of the values in a file, by their key paths."""
     node = yaml.compose(settings_bytes(path), StrictLoader)
     return {} if node is None else dict(_node_lines(node, ()))
 
@@ -205,7 +204,7 @@ def _node_lines(
         for key, value in node.value:
             inner = (*keys, str(key.value))
             yield from _node_lines(value, inner)
-            # Where the key stands, and not where its value begins.
+            # The line of the key, not of its value.
             yield inner, key.start_mark.line + 1
     elif isinstance(node, SequenceNode):
         for index, value in enumerate(node.value):
