@@ -23,17 +23,20 @@ if TYPE_CHECKING:
         state_visitation,
     )
     from mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
+    from mdp.hardness import Hardness, hardness_of
     from mdp.large_maps import optimum_far_from_limit
     from mdp.planning import Plan, policy_iteration, value_iteration
 
 __all__ = [
     "FiniteHorizonPlan",
+    "Hardness",
     "Plan",
     "PolicyReturn",
     "TransitionModel",
     "baseline_policies",
     "baseline_return",
     "finite_horizon_optimum",
+    "hardness_of",
     "optimal_choices",
     "optimum_far_from_limit",
     "policy_iteration",
@@ -46,6 +49,8 @@ __all__ = [
 _HOMES = {
     "FiniteHorizonPlan": "mdp.finite_horizon",
     "finite_horizon_optimum": "mdp.finite_horizon",
+    "Hardness": "mdp.hardness",
+    "hardness_of": "mdp.hardness",
     "Plan": "mdp.planning",
     "policy_iteration": "mdp.planning",
     "value_iteration": "mdp.planning",

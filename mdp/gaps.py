@@ -219,7 +219,7 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
 
 
 @called
-def _action_value(
+def action_value(
     prob: Floats,
     next_state: AnyInts,
     terminated: Bools,
@@ -289,7 +289,7 @@ def _losses(
             if repaired[state]:
                 chosen, highest = 0, -np.inf
                 for action in range(n_actions):
-                    value = _action_value(
+                    value = action_value(
                         prob, next_state, terminated, mean_reward, state, action, own
                     )
                     if value > highest:
@@ -298,7 +298,7 @@ def _losses(
                 weights[chosen] = 1.0
             visits[state] += here[state]
             for action in range(n_actions):
-                value = _action_value(
+                value = action_value(
                     prob, next_state, terminated, mean_reward, state, action, later
                 )
                 values[state, action] += here[state] * value
@@ -334,7 +334,7 @@ def _policy_rows(
             for action in range(n_actions):
                 if taken[state, action] == 0 and not repaired[state]:
                     continue
-                value = _action_value(
+                value = action_value(
                     prob, next_state, terminated, mean_reward, state, action, later
                 )
                 highest = max(highest, value)

@@ -248,7 +248,7 @@ def finite_part(model: TransitionModel, mask: Bools | None = None) -> FinitePart
         step_cost = 0.0
         rest_actions = _rest_actions(model, endless)
     resting = np.any(rest_actions, axis=1)
-    states, allowed = _surely_ending(model, allowed, resting)
+    states, allowed = surely_ending(model, allowed, resting)
     lost = np.flatnonzero((model.initial > 0) & ~states)
     if lost.size:
         raise ValueError(
@@ -258,7 +258,7 @@ def finite_part(model: TransitionModel, mask: Bools | None = None) -> FinitePart
     return FinitePart(states, allowed, resting, rest_actions, step_cost)
 
 
-def _surely_ending(model: TransitionModel, allowed: Bools, resting: Bools) -> tuple[Bools, Bools]:
+def surely_ending(model: TransitionModel, allowed: Bools, resting: Bools) -> tuple[Bools, Bools]:
     """The states from which some policy ends the episode, or comes to rest, with probability one.
 
     What has no way there is left out, and then what might lead to it, until nothing changes.

@@ -45,6 +45,24 @@ def test_every_environment_is_pictured(fill_pages):
     assert drawn == set(fill_pages.pictured_environments())
 
 
+def test_the_table_of_hardness_has_each_environment_with_a_model(fill_pages):
+    page = (DOCS / "environments.md").read_text()
+    listed = {
+        kind: " ".join(
+            arguments for _, other, arguments in fill_pages.LINE.findall(page) if other == kind
+        )
+        for kind in ("optima", "hardness")
+    }
+    own = {item.partition("=")[2] for item in listed["optima"].split()}
+    without = {"GaussianBandit-v0", "LinearBandit-v0"}
+    assert own - without < set(listed["hardness"].split())
+    assert not without & set(listed["hardness"].split())
+    heads, _, row = fill_pages.filled('[x](x.py "hardness: DeepSea-v0")', DOCS).splitlines()
+    worth = "55 of 101 | 9 | 22.2 % | 0.001 | 0.9945 | 0 | 1 | 10 | 10,240 | 10,240"
+    assert row == f"| `DeepSea-v0` | {worth} |"
+    assert heads.count("|") == row.count("|")
+
+
 def test_a_line_is_filled_and_others_stay(fill_pages):
     with pytest.raises(ValueError, match=r"mdp/graph\.py defines no nothing"):
         fill_pages.filled('[x](../mdp/graph.py "code: nothing")', DOCS)

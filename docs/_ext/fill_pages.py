@@ -6,9 +6,10 @@ A page says what stands there by a link with a title, which a code host shows as
 
 The kinds: ``code``, with names that the linked file defines; ``environment``, with an id and
 arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, likewise, for
-a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``agents`` and
-``agents-by-spaces``, with nothing, for tables of agents; ``trainings``, for what commands reach;
-``reference``, with a module and perhaps names in it, for their docstrings below a heading;
+a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``hardness``,
+likewise, for a table of how hard they are; ``agents`` and ``agents-by-spaces``, with nothing, for
+tables of agents; ``trainings``, for what commands reach; ``reference``, with a module and perhaps
+names in it, for their docstrings below a heading;
 ``timings``, for the linked file of what `benchmarks/timing.py` has measured.
 """
 
@@ -30,6 +31,7 @@ from environment_facts import (  # noqa: E402
     docstring_block,
     environment_block,
     facts_block,
+    hardness_block,
     optima_block,
     variants_block,
 )
@@ -50,6 +52,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "docstring": docstring_block,
     "environment": environment_block,
     "facts": facts_block,
+    "hardness": hardness_block,
     "optima": optima_block,
     "reference": reference_block,
     "timings": timings_block,

@@ -6,6 +6,7 @@ import inspect
 import re
 from dataclasses import dataclass
 from functools import lru_cache
+from math import inf
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +16,14 @@ from gymnasium.envs.registration import load_env_creator
 import envs  # noqa: F401  # registers the environments
 from agents.registry import ALGORITHMS
 from envs.known_models import success_outcomes, time_limit, transition_model
-from mdp import TransitionModel, baseline_policies, finite_horizon_optimum, policy_return
+from mdp import (
+    Hardness,
+    TransitionModel,
+    baseline_policies,
+    finite_horizon_optimum,
+    hardness_of,
+    policy_return,
+)
 from mdp.evaluation import PolicyReturn
 from pipeline.settings.hyperparams import entry_names
 from pipeline.settings.values import parse_assignments
@@ -82,6 +90,49 @@ def variants_block(*words: str) -> str:
         assert found is not None, f"{env_id} has no model"
         lines.append(f"| `{env_id}` | `{' '.join(arguments)}` | {number(found.optimum)} |")
     return "\n".join(lines) + "\n"
+
+
+def hardness_block(*ids: str) -> str:
+    """A row for each environment: how hard it is, by its model under its time limit."""
+    heads = [
+        *("id", "states", "diameter", "pairs", "smallest gap", "mean gap", "variance"),
+        *("look-ahead", "effective horizon", "random actions to a reward", "to the goal"),
+    ]
+    lines = [f"| {' | '.join(heads)} |", f"|---|{'---:|' * (len(heads) - 1)}"]
+    lines += [f"| `{env_id}` | {' | '.join(hardness_cells(env_id))} |" for env_id in ids]
+    return "\n".join(lines) + "\n"
+
+
+def hardness_cells(env_id: str) -> list[str]:
+    """The numbers of `mdp.Hardness` as the table has them: "-" for None, "never" for infinite."""
+
+    def cell(value: float | None) -> str:
+        return "-" if value is None else "never" if value == inf else number(value)
+
+    found = hardness(env_id)
+    assert found is not None, f"{env_id} has no model"
+    unreached = found.states - found.reachable_states
+    bound = found.effective_horizon
+    return [
+        f"{found.reachable_states:,}" + (f" of {found.states:,}" if unreached else ""),
+        cell(found.diameter),
+        "-" if found.connected is None else f"{100 * found.connected:.3g} %",
+        cell(found.smallest_gap),
+        cell(found.mean_gap),
+        cell(found.return_variance),
+        cell(found.lookahead),
+        "-" if bound is None else f"{bound:.1f}".removesuffix(".0"),
+        cell(found.random_steps_to_reward),
+        cell(found.random_steps_to_goal),
+    ]
+
+
+@lru_cache
+def hardness(env_id: str) -> Hardness | None:
+    """How hard an environment is under its time limit; None where no model is known."""
+    env = made(env_id)
+    model, limit = transition_model(env), time_limit(env) or LIMIT
+    return None if model is None else hardness_of(model, limit, success_outcomes(env))
 
 
 def picture(env_id: str) -> str:
