@@ -19,6 +19,7 @@ PACKAGES = [
     "envs",
     "agents",
     "pipeline",
+    "diagnosis",
     "experiments",
     "tuning",
     "report",

@@ -1,0 +1,1 @@
+"""Why an agent is not optimal, and whether an algorithm is right."""
