@@ -1,7 +1,7 @@
 """How often `audit` names a planted fault, and how often it accuses what is right.
 
     python benchmarks/audit_faults.py                     # planted faults, five seeds
-    python benchmarks/audit_faults.py --only 'q_*' --seeds 1
+    python benchmarks/audit_faults.py --only 'tables.q_*' --seeds 1
     python benchmarks/audit_faults.py FOLDER              # files with tables of your own
     python benchmarks/audit_faults.py --right --seeds 3   # shipped agents instead
     python benchmarks/audit_faults.py --publish           # writes docs/measured/audit-faults.md
@@ -166,7 +166,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", nargs="?", type=Path, default=PLANTED)
     parser.add_argument("--right", action="store_true", help="audit the shipped agents instead")
-    parser.add_argument("--only", default="*", metavar="PATTERN")
+    parser.add_argument("--only", nargs="+", default=["*"], metavar="PATTERN")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -182,7 +182,8 @@ def main() -> None:
     cases = list(shipped()) if args.right else list(planted(args.folder))
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for case in cases:
-            if (case.name, seed) in done or not fnmatch(case.name, args.only):
+            is_wanted = any(fnmatch(case.name, pattern) for pattern in args.only)
+            if (case.name, seed) in done or not is_wanted:
                 continue
             row = measure(case, seed, 3)
             rows.append(row)
@@ -192,7 +193,7 @@ def main() -> None:
     text = report(rows)
     print(text)
     if args.publish:
-        head = "git rev-parse --short HEAD".split()
+        head = ["git", "rev-parse", "--short", "HEAD"]
         version = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True).stdout
         MEASURED.write_text(f"{text}\nMeasured with version {version.strip()}.\n", encoding="utf-8")
 

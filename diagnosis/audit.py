@@ -121,27 +121,21 @@ def _title(probe: Probe) -> str:
     return TITLES[probe]
 
 
-TITLES: dict[Probe, str] = {
-    probe: title
-    for probe, title in zip(
-        PROBES,
-        (
-            "the end of an episode",
-            "the discount",
-            "an episode that is cut off",
-            "the next action",
-            "the importance ratio",
-            "the target network",
-            "the age of what is learnt from",
-            "observations that change in place",
-            "targets of several steps",
-            "traces",
-            "what it does when evaluated",
-            "the entropy term",
-            "the schedule of the learning rate",
-            "seeds",
-            "saving and loading",
-        ),
-        strict=True,
-    )
-}
+_NAMES = (
+    "the end of an episode",
+    "the discount",
+    "an episode that is cut off",
+    "the next action",
+    "the importance ratio",
+    "the target network",
+    "the age of what is learnt from",
+    "observations that change in place",
+    "targets of several steps",
+    "traces",
+    "what it does when evaluated",
+    "the entropy term",
+    "the schedule of the learning rate",
+    "seeds",
+    "saving and loading",
+)
+TITLES: dict[Probe, str] = dict(zip(PROBES, _NAMES, strict=True))

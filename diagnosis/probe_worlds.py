@@ -104,7 +104,8 @@ class ProbeEnv(gym.Env[Any, Any]):
         """What is seen in a state: a number, or a vector of its own."""
         if self.is_discrete:
             return state
-        return np.eye(self.n_observations, dtype=np.float32)[state]
+        vector: NDArray[np.float32] = np.eye(self.n_observations, dtype=np.float32)[state]
+        return vector
 
     def _observe(self, state: int) -> Any:
         if self.is_discrete or not self.world.in_place:

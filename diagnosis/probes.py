@@ -205,7 +205,7 @@ class Lab:
             steps *= 2
             values = trained.state_values()
             assert values is not None
-            if np.abs(values - before).max() <= 0.06 * max(1.0, np.abs(values).max()):
+            if np.abs(values - before).max() <= 0.05 * max(1.0, np.abs(values).max()):
                 return values
             before = values
         return None
@@ -328,7 +328,7 @@ def probe_next_action(lab: Lab) -> Iterator[Finding]:
 
 
 def probe_ratio(lab: Lab) -> Iterator[Finding]:
-    """Off-policy returns are weighed; the policy moves no further than PPO's clipped ratio lets it."""
+    """Off-policy returns are weighed; PPO's clipped ratio bounds how far one rollout moves it."""
     name, subject = "the importance ratio", lab.subject
     if subject.uses_ratio:
         whole = lab.settled(World(((0, 0), (1, 0))))
@@ -351,9 +351,7 @@ def probe_ratio(lab: Lab) -> Iterator[Finding]:
         f"clipped at 1.2, and to {moved[1]:.2f} where at 1.5"
     )
     low, high = moved
-    if high < 0.15:
-        yield Finding(name, "fault", text, "importance-ratio", "to 0.6, and to 0.75")
-    elif high > 0.5 and (high > 0.92 or low > 0.75):
+    if high < 0.15 or (high > 0.5 and (high > 0.92 or low > 0.75)):
         yield Finding(name, "fault", text, "importance-ratio", "to 0.6, and to 0.75")
     elif 0.5 < low < high:
         yield Finding(name, "ok", text)
@@ -414,7 +412,11 @@ def probe_copies(lab: Lab) -> Iterator[Finding]:
     elif subject.spaces[0] == "discrete":
         return
     in_place = World(CHAIN.pays, in_place=True)
-    copied, shared = numbered.settled(CHAIN), lab.settled(in_place)
+    copied = numbered.settled(CHAIN)
+    if not _is_right(CHAIN, copied):
+        yield Finding(name, "skipped", "values are wrong with copies already")
+        return
+    shared = lab.settled(in_place)
     text = f"values are {_told(copied)} with copies, and {_told(shared)} without"
     if np.abs(copied - shared).max() > 0.25:
         yield Finding(name, "fault", text, "shared-buffer", "the same")
@@ -430,6 +432,10 @@ def probe_copies(lab: Lab) -> Iterator[Finding]:
         yield Finding(name, "ok", f"{text}observation, and not this agent")
     else:
         yield Finding(name, "ok", text)
+
+
+def _is_right(world: World, values: Floats) -> bool:
+    return bool(np.abs(values - world.values(GAMMA)).max() < 0.25)
 
 
 def _told(values: Floats) -> str:
@@ -450,7 +456,11 @@ def probe_target_network(lab: Lab) -> Iterator[Finding]:
     name, subject = "the target network", lab.subject
     if not has_target(subject):
         return
+    # The library's SAC counts the interval anew in each training: with one gradient step it is
+    # always due.
     settings = {"target_update_interval": 10**9, "tau": 1e-9}
+    if subject.target != "maximises":
+        settings = {"tau": 1e-9}
     for setting in filter(subject.accepts, settings):
         change = {setting: settings[setting]}
         less, more = lab.settled(CHAIN, **change), lab.settled(END_PAYS_MORE, **change)
@@ -474,7 +484,11 @@ def probe_n_steps(lab: Lab) -> Iterator[Finding]:
         return  # it may mean the length of a rollout
     if subject.is_on_policy and "A2C" not in {kind.__name__ for kind in subject_mro(subject)}:
         return
-    one, several = lab.settled(STAIRS, n_steps=1), lab.settled(STAIRS, n_steps=3)
+    one = lab.settled(STAIRS, n_steps=1)
+    if not _is_right(STAIRS, one):
+        yield Finding(name, "skipped", "values are wrong with one step already")
+        return
+    several = lab.settled(STAIRS, n_steps=3)
     text = f"values are {_told(one)} with one step, and {_told(several)} with 3"
     if np.abs(one - several).max() > 0.2:
         right = " and ".join(f"{value:.2f}" for value in STAIRS.values(GAMMA))
@@ -544,9 +558,7 @@ def watkins_table(world: World, record: Record, decay: float, *, is_cut: bool) -
     table, traces = np.zeros((2, world.n_states, N_ACTIONS))
     steps = zip(record.states, record.actions, record.rewards, strict=True)
     for state, action, reward in steps:
-        if state == 0:
-            traces[:] = 0
-        elif is_cut and table[state, action] < table[state].max():
+        if state == 0 or (is_cut and table[state, action] < table[state].max()):
             traces[:] = 0
         else:
             traces *= GAMMA * decay
@@ -694,7 +706,7 @@ def _moves(lab: Lab, schedule: Any) -> tuple[float, float] | None:
 
     reader = Reader()
     reader.readings = []
-    trained.train(2 * subject.steps, reader)
+    trained.train(max(2 * subject.steps, 24 * every), reader)
     if len(reader.readings) < 16:
         return None
     moves = np.abs(np.diff(np.array(reader.readings), axis=0)).mean(axis=(1, 2))
@@ -805,10 +817,10 @@ def _lost(trained: TrainedModel, model: Any, loaded: Any) -> dict[str, str]:
     lost, before = {}, trained.values()
     trained.model = loaded
     after = trained.values()
-    is_same = before is None or (after is not None and np.allclose(before, after))
+    is_same = before is None or (after is not None and bool(np.allclose(before, after)))
     if not (is_same and _same(model.policy.state_dict(), loaded.policy.state_dict())):
-        text = f"values {np.round(before, 2).tolist() if before is not None else ''} are "
-        lost["zip-forgets-tables"] = f"{text}{np.round(after, 2).tolist()} after loading"
+        told = [[] if each is None else np.round(each, 2).tolist() for each in (before, after)]
+        lost["zip-forgets-tables"] = f"values {told[0]} are {told[1]} after loading"
     there, now = _optimizers(model), _optimizers(loaded)
     for place, optimizer in there.items():
         if place not in now or not _same(optimizer.state_dict(), now[place].state_dict()):
@@ -817,12 +829,12 @@ def _lost(trained: TrainedModel, model: Any, loaded: Any) -> dict[str, str]:
     for key in ("lr_schedule", "exploration_schedule", "clip_range"):
         schedules = getattr(model, key, None), getattr(loaded, key, None)
         if callable(schedules[0]):
-            told = [
+            first, second = (
                 [float(each(p)) if callable(each) else each for p in (1.0, 0.5)]
                 for each in schedules
-            ]
-            if told[0] != told[1]:
-                lost["zip-forgets-schedules"] = f"{key} goes {told[0]}, after loading {told[1]}"
+            )
+            if first != second:
+                lost["zip-forgets-schedules"] = f"{key} goes {first}, after loading {second}"
     for key in ("num_timesteps", "_current_progress_remaining", "exploration_rate"):
         pair = getattr(model, key, None), getattr(loaded, key, None)
         if pair[0] != pair[1]:

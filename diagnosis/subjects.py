@@ -1,19 +1,18 @@
-"""What is audited: how classes in Stable-Baselines3's style, and single files, are trained and asked."""
+"""What is audited: classes in Stable-Baselines3's style, and functions that train."""
 
 from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from gymnasium import spaces
 
 from agents.registry import ALGORITHMS, AlgorithmEntry, load_algorithm
 from diagnosis.probe_worlds import (
-    N_ACTIONS,
     Actions,
     Observations,
     ProbeEnv,
@@ -95,6 +94,8 @@ class Subject(ABC):
     """An algorithm under audit.
 
     Attributes:
+        typed: settings that were asked for.
+        base: settings under which tiny worlds are learnt, unless others are asked for.
         steps: environment steps after which values are read first.
         target: what its targets are made of; None where that is not known.
         uses_ratio: whether it weighs by importance, towards a greedy policy.
@@ -103,6 +104,7 @@ class Subject(ABC):
         spaces: kinds of observations and actions.
     """
 
+    typed: Mapping[str, Any]
     steps = 2000
     target: Target | None = None
     uses_ratio = False
@@ -231,7 +233,7 @@ class ClassSubject(Subject):
 _OFF_POLICY: Mapping[str, Any] = {
     "learning_rate": 3e-3,
     "buffer_size": 2000,
-    "learning_starts": 100,
+    "learning_starts": 50,
     "batch_size": 64,
     "train_freq": 2,
     "gradient_steps": 1,
@@ -268,30 +270,30 @@ _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
     "Reinforce": ("states", 1000, {"baseline": "value"}),
     "QRDQN": (
         "maximises",
-        500,
+        250,
         {**_OFF_POLICY, "policy_kwargs": {"net_arch": [32], "n_quantiles": 10}},
     ),
-    "DQN": ("maximises", 500, _OFF_POLICY),
-    "DeepQLearning": ("maximises", 500, {**_OFF_POLICY, "learning_rate": 1e-3}),
+    "DQN": ("maximises", 250, _OFF_POLICY),
+    "DeepQLearning": ("maximises", 250, {**_OFF_POLICY, "learning_rate": 1e-3}),
     "TQC": (
         None,
-        500,
+        250,
         {**_ACTOR, "top_quantiles_to_drop_per_net": 0, "policy_kwargs": {"net_arch": [32]}},
     ),
-    "CrossQ": (None, 500, _ACTOR),
-    "SAC": (None, 500, _ACTOR),
-    "TD3": (None, 500, _ACTOR),
+    "CrossQ": (None, 250, _ACTOR),
+    "SAC": (None, 250, _ACTOR),
+    "TD3": (None, 250, _ACTOR),
     "A2C": ("states", 400, {**_ON_POLICY, "n_steps": 1, "learning_rate": 1e-2}),
     "RecurrentPPO": (
         "states",
-        512,
+        256,
         {
             **_ON_POLICY,
             "policy_kwargs": {"net_arch": {"pi": [32], "vf": [32]}, "lstm_hidden_size": 16},
         },
     ),
-    "TRPO": ("states", 512, {**_ON_POLICY, "n_critic_updates": 10}),
-    "OnPolicyAlgorithm": ("states", 512, _ON_POLICY),
+    "TRPO": ("states", 256, {**_ON_POLICY, "n_critic_updates": 10}),
+    "OnPolicyAlgorithm": ("states", 256, _ON_POLICY),
     "ARS": (None, 2000, {"n_delta": 4, "learning_rate": 0.05, "delta_std": 0.1}),
 }
 
@@ -314,13 +316,11 @@ class TrainedModel(Trained):
         self.subject = subject
         wanted = {**subject.base, "gamma": GAMMA, "seed": seed, "device": "cpu"}
         wanted = {**wanted, **subject.typed, **changes}
-        settings = {
-            name: value
-            for key, value in wanted.items()
-            if (name := subject.named(key)) is not None or key in subject.typed
-        }
+        named = {subject.named(key): value for key, value in wanted.items()}
+        settings = {name: value for name, value in named.items() if name is not None}
         self.env = make_env(world, record, *subject.spaces)
-        self.model = subject.cls(env=self.env, **settings)
+        # Copies: the library writes into policy_kwargs.
+        self.model = subject.cls(env=self.env, **deepcopy(settings))
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self._has_begun = False
 
@@ -373,7 +373,8 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     with th.no_grad():
         tensor, _ = policy.obs_to_tensor(batch)
         found = _network_values(model, policy, tensor)
-    return None if found is None else found.double().numpy()
+    values: Floats | None = None if found is None else found.double().numpy()
+    return values
 
 
 def _network_values(model: Any, policy: Any, tensor: Any) -> Any:

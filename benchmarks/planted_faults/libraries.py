@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.utils import explained_variance
-from torch.nn import functional as F
+from torch.nn.functional import mse_loss, smooth_l1_loss
 
 from agents.tabular.one_step import QLearning
 from agents.tabular.traces import SARSALambda
@@ -25,11 +25,15 @@ class WrittenOutDQN(DQN):
 
     def next_values(self, batch: Any) -> th.Tensor:
         """Of the best next actions, shape (n, 1)."""
-        return self.q_net_target(batch.next_observations).max(dim=1, keepdim=True)[0]
+        values: th.Tensor = self.q_net_target(batch.next_observations)
+        return values.amax(dim=1, keepdim=True)
 
     def targets(self, batch: Any) -> th.Tensor:
         """What values are moved towards, shape (n, 1)."""
-        return batch.rewards + (1 - batch.dones) * self.gamma * self.next_values(batch)
+        targets: th.Tensor = batch.rewards + (1 - batch.dones) * self.gamma * self.next_values(
+            batch
+        )
+        return targets
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Gradient steps on batches of the memory."""
@@ -41,9 +45,9 @@ class WrittenOutDQN(DQN):
             with th.no_grad():
                 targets = self.targets(batch)
             values = self.q_net(batch.observations).gather(1, batch.actions.long())
-            loss = F.smooth_l1_loss(values, targets)
+            loss = smooth_l1_loss(values, targets)
             self.policy.optimizer.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             self.policy.optimizer.step()
         self._n_updates += gradient_steps
 
@@ -53,7 +57,8 @@ class DQNBootstraps(WrittenOutDQN):
 
     def targets(self, batch: Any) -> th.Tensor:
         """Without the mask."""
-        return batch.rewards + self.gamma * self.next_values(batch)
+        targets: th.Tensor = batch.rewards + self.gamma * self.next_values(batch)
+        return targets
 
 
 class DQNGammaTwice(WrittenOutDQN):
@@ -69,7 +74,7 @@ class DQNFollows(WrittenOutDQN):
 
     def next_values(self, batch: Any) -> th.Tensor:
         """Of next actions as exploring chooses them."""
-        values = self.q_net_target(batch.next_observations)
+        values: th.Tensor = self.q_net_target(batch.next_observations)
         return values.gather(1, th.randint(0, values.shape[1], (len(values), 1)))
 
 
@@ -132,7 +137,7 @@ class DQNSharesArrays(DQN):
     def _store_transition(
         self, buffer: Any, action: Any, new_obs: Any, reward: Any, dones: Any, infos: Any
     ) -> None:
-        self._last_obs[:] = new_obs
+        self._last_obs[:] = new_obs  # type: ignore[index]
         super()._store_transition(buffer, action, new_obs, reward, dones, infos)
 
 
@@ -200,11 +205,12 @@ class WrittenOutPPO(PPO):
                 ratio = th.exp(self.ratio_sign * (log_prob - batch.old_log_prob))
                 clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
                 policy_loss = -th.min(advantages * ratio, advantages * clipped).mean()
-                value_loss = F.mse_loss(batch.returns, values.flatten())
+                value_loss = mse_loss(batch.returns, values.flatten())
+                assert entropy is not None
                 entropy_loss = -self.entropy_sign * entropy.mean()
                 loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
                 self.policy.optimizer.zero_grad()
-                loss.backward()
+                loss.backward()  # type: ignore[no-untyped-call]
                 th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
                 self.policy.optimizer.step()
         self._n_updates += self.n_epochs

@@ -24,13 +24,14 @@ class Agent:
 
     def act(self, obs: Any) -> int:
         """The best action, or sometimes another one."""
-        if random.random() < self.epsilon:
-            return random.randrange(self.table.shape[1])
+        if random.random() < self.epsilon:  # noqa: S311 (as people write it)
+            return random.randrange(self.table.shape[1])  # noqa: S311
         return int(self.table[number(obs)].argmax())
 
     def values(self, obs: Any) -> Table:
         """The values of both actions."""
-        return self.table[number(obs)]
+        values: Table = self.table[number(obs)]
+        return values
 
 
 def number(obs: Any) -> int:
@@ -113,7 +114,8 @@ def from_memory(
     """Q-learning on a table from a memory of steps, whose observations are vectors."""
     env, rng = make_env(), np.random.default_rng(seed)
     n_states = env.observation_space.shape[0]
-    q, memory, place = np.zeros((n_states, env.action_space.n)), [], 0
+    q, place = np.zeros((n_states, env.action_space.n)), 0
+    memory: list[tuple[Any, int, float, Any, bool]] = []
     obs, _ = env.reset(seed=seed)
     for _ in range(steps):
         kept = obs if fault == "shared-buffer" else obs.copy()
@@ -269,8 +271,7 @@ sarsa_lambda_fades_slowly = partial(with_traces, target="next", fault="lambda-al
 sarsa_lambda_goes_on = partial(with_traces, target="next", fault="kept-across-episodes")
 actor_critic_flees = partial(preferences, fault="advantage-sign")
 
-RIGHT = ("q_right", "sarsa_right", "expected_sarsa_right", "memory_right", "n_step_right")
-RIGHT += ("q_lambda_right", "sarsa_lambda_right", "actor_critic_right")
+RIGHT = [name for name in list(globals()) if name.endswith("_right")]
 FAULTS = {
     "q_bootstraps": "bootstraps-at-terminal",
     "q_done_is_end": "no-bootstrap-at-truncation",
