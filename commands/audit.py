@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from diagnosis.subjects import Subject
 
 # As in `diagnosis.subjects`, which takes long to import.
-KINDS = tuple(
-    "q_learning off_policy_monte_carlo sarsa expected_sarsa actor_critic policy_gradient".split()
+KINDS = (
+    *("q_learning", "off_policy_monte_carlo", "sarsa", "expected_sarsa"),
+    *("actor_critic", "policy_gradient"),
 )
 
 WORDS = {"ok": "ok", "fault": "FAULT", "unsaid": "nothing can be said", "skipped": "skipped"}

@@ -30,9 +30,9 @@ class WrittenOutDQN(DQN):
 
     def targets(self, batch: Any) -> th.Tensor:
         """What values are moved towards, shape (n, 1)."""
-        targets: th.Tensor = batch.rewards + (1 - batch.dones) * self.gamma * self.next_values(
-            batch
-        )
+        discounts = self.gamma if batch.discounts is None else batch.discounts
+        values = (1 - batch.dones) * discounts * self.next_values(batch)
+        targets: th.Tensor = batch.rewards + values
         return targets
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
@@ -57,7 +57,8 @@ class DQNBootstraps(WrittenOutDQN):
 
     def targets(self, batch: Any) -> th.Tensor:
         """Without the mask."""
-        targets: th.Tensor = batch.rewards + self.gamma * self.next_values(batch)
+        discounts = self.gamma if batch.discounts is None else batch.discounts
+        targets: th.Tensor = batch.rewards + discounts * self.next_values(batch)
         return targets
 
 

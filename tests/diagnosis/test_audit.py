@@ -261,13 +261,19 @@ def test_a_script_of_ones_own(type_audit, tmp_path):
     assert found["faults"][0]["source"].startswith("Pardo et al. (2018)")
 
 
-def test_a_class_of_ones_own(type_audit, tmp_path):
-    text = "from agents.tabular.one_step import SARSA as Mine\n"
+def test_a_class_of_ones_own(type_audit, tmp_path, monkeypatch):
+    text = "from stable_baselines3 import DQN\n\n\nclass Mine(DQN):\n    pass\n"
     (tmp_path / "my_audited_agents.py").write_text(text)
-    flags = ("--gym-packages", "my_audited_agents.py", "--engine", "interpreted")
+    monkeypatch.setattr(audit, "__defaults__", ((probes.probe_ends, probes.probe_discount),))
+    flags = ("--gym-packages", "my_audited_agents.py", "-params", "batch_size:32")
     code, out, err = type_audit("--algo", "my_audited_agents:Mine", *flags)
     assert (code, err) == (0, "")
-    assert out.endswith("right, as far as these probes see\n")
+    assert out == (
+        "audit of my_audited_agents:Mine\n"
+        "  the end of an episode               ok\n"
+        "  the discount                        ok\n"
+        "right, as far as these probes see\n"
+    )
 
 
 @pytest.mark.parametrize(
