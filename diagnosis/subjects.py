@@ -241,7 +241,7 @@ _OFF_POLICY: Mapping[str, Any] = {
     "policy_kwargs": {"net_arch": [32]},
 }
 _ACTOR = {key: value for key, value in _OFF_POLICY.items() if key != "target_update_interval"}
-_ACTOR |= {"tau": 0.05, "ent_coef": 1e-3}
+_ACTOR |= {"tau": 0.2, "ent_coef": 1e-3}
 _ON_POLICY: Mapping[str, Any] = {
     "learning_rate": 5e-3,
     "n_steps": 64,
@@ -394,14 +394,10 @@ def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
             sequence = policy.predict_values(tensor[: last + 1], (start, start.clone()), begins)
             values.append(sequence[-1])
         return th.stack(values)
-    if hasattr(policy, "critic"):
-        columns = []
-        for action in (-0.5, 0.5):
-            actions = th.full((len(tensor), 1), action)
-            critics = policy.critic(tensor, actions)
-            critics = th.stack(critics) if isinstance(critics, tuple) else critics.transpose(0, 1)
-            columns.append(critics.reshape(len(critics), len(tensor), -1).mean(dim=(0, 2)))
-        return th.stack(columns, dim=1)
+    if hasattr(policy, "critic"):  # of what the actor does: the rest of the line is not learnt
+        critics = policy.critic(tensor, policy._predict(tensor, deterministic=True))
+        critics = th.stack(critics) if isinstance(critics, tuple) else critics.transpose(0, 1)
+        return critics.reshape(len(critics), len(tensor), -1).mean(dim=(0, 2))[:, None]
     return policy.predict_values(tensor) if hasattr(policy, "value_net") else None
 
 
