@@ -731,10 +731,10 @@ def _probe_exploration(lab: Lab) -> Iterator[Finding]:
     if isinstance(subject, ClassSubject) and subject.typed.get("engine") == "compiled":
         yield Finding(name, "skipped", "compiled training does not tell what was done")
         return
-    trained = lab.begin(World(((1, 0),), noise=1e-9), **changes)
-    best, done = trained.act(0), np.array(trained.record.actions)
-    quarter = max(len(done) // 4, 1)
-    early, late = float((done[:quarter] != best).mean()), float((done[-quarter:] != best).mean())
+    trained = lab.begin(World(((1, 0),), noise=1e-9), 2 * subject.steps, **changes)
+    is_other = np.array(trained.record.actions) != trained.act(0)
+    n = len(is_other)  # not the first steps, in which nothing is known yet
+    early, late = float(is_other[n // 8 : n // 4].mean()), float(is_other[-n // 4 :].mean())
     text = (
         f"what is not best is done in {early:.1%} of the first steps, and in {late:.1%} of the last"
     )
