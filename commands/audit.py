@@ -152,7 +152,7 @@ def finding_lines(finding: Finding) -> Sequence[str]:
 
 def verdict_lines(verdict: Verdict) -> Sequence[str]:
     """The verdict, in a few lines."""
-    from diagnosis.probes import FAULTS
+    from diagnosis.faults import FAULTS
 
     unsaid = [finding.probe for finding in verdict.findings if finding.state == "unsaid"]
     if not verdict.faults:

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from diagnosis.faults import FAULTS
 from diagnosis.probes import (
-    FAULTS,
     NEEDS_VALUES,
     PROBES,
     Finding,

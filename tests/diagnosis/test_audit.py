@@ -13,7 +13,8 @@ from commands.cli import run_command
 from diagnosis import probes, subjects
 from diagnosis.audit import TITLES, Verdict, audit
 from diagnosis.probe_worlds import Record, World, make_env
-from diagnosis.probes import FAULTS, Finding, watkins_table
+from diagnosis.faults import FAULTS
+from diagnosis.probes import Finding, watkins_table
 from diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
 
 PLANTED = Path(__file__).resolve().parents[2] / "benchmarks" / "planted_faults"
