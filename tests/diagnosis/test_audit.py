@@ -12,8 +12,8 @@ from commands.audit import KINDS, main
 from commands.cli import run_command
 from diagnosis import probes, subjects
 from diagnosis.audit import TITLES, Verdict, audit
-from diagnosis.probe_worlds import Record, World, make_env
 from diagnosis.faults import FAULTS
+from diagnosis.probe_worlds import Record, World, make_env
 from diagnosis.probes import Finding, watkins_table
 from diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
 
