@@ -122,10 +122,17 @@ def report(rows: list[dict[str, Any]]) -> str:
         said[row["fault"]][answer] += 1
         times[row["fault"]].append(row["seconds"])
     named = sum(counter[fault] for fault, counter in said.items())
+    files = [
+        f"{stem}: {len({row['name'] for row in own})} agents, {len({row['seed'] for row in own})} "
+        f"seeds, {sum(row['said'][:1] == [row['fault']] for row in own)} of {len(own)} audits"
+        for stem in sorted({row["name"].partition(".")[0] for row in faulty})
+        if (own := [row for row in faulty if row["name"].startswith(f"{stem}.")])
+    ]
     lines = [
         (
             f"Of {len(faulty)} audits of {len({row['name'] for row in faulty})} agents with a "
-            f"planted fault, {named} named it rightly ({named / max(len(faulty), 1):.0%})."
+            f"planted fault, {named} named it rightly ({named / max(len(faulty), 1):.0%}): "
+            f"{'; '.join(files)}."
         ),
         "",
         "| planted | named so | other answers | processor time |",
@@ -201,7 +208,8 @@ def main() -> None:
 def _read(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return list({(row["name"], row["seed"]): row for row in rows}.values())
 
 
 if __name__ == "__main__":

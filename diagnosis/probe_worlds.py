@@ -151,7 +151,8 @@ class ModelledProbeEnv(ProbeEnv):
     @property
     def initial_state_distrib(self) -> Floats:
         """All episodes begin in state 0."""
-        return np.eye(self.n_observations)[0]
+        start: Floats = np.eye(self.n_observations)[0]
+        return start
 
     @property
     def P(self) -> dict[int, dict[int, list[tuple[float, int, float, bool]]]]:  # noqa: N802 (Gymnasium's name)

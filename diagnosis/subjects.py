@@ -280,7 +280,7 @@ _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
         250,
         {**_ACTOR, "top_quantiles_to_drop_per_net": 0, "policy_kwargs": {"net_arch": [32]}},
     ),
-    "CrossQ": (None, 250, _ACTOR),
+    "CrossQ": (None, 1000, _ACTOR),
     "SAC": (None, 250, _ACTOR),
     "TD3": (None, 250, _ACTOR),
     "A2C": ("states", 400, {**_ON_POLICY, "n_steps": 1, "learning_rate": 1e-2}),
@@ -354,7 +354,8 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     batch = np.stack(observations)
     for holder in (policy, model):
         if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
-            return np.asarray(table, dtype=np.float64)[batch]
+            found: Floats = np.asarray(table, dtype=np.float64)[batch]
+            return found
     if hasattr(policy, "state_weights"):  # tiles
         if len(policy.state_weights):
             from agents.linear.tiles import tiles_of_all, vectors_of
@@ -372,8 +373,8 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     policy.set_training_mode(False)
     with th.no_grad():
         tensor, _ = policy.obs_to_tensor(batch)
-        found = _network_values(model, policy, tensor)
-    values: Floats | None = None if found is None else found.double().numpy()
+        told = _network_values(model, policy, tensor)
+    values: Floats | None = None if told is None else told.double().numpy()
     return values
 
 
