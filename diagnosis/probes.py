@@ -558,7 +558,10 @@ def probe_schedules(lab: Lab) -> Iterator[Finding]:
     from stable_baselines3.common.utils import LinearSchedule
 
     rate = {**subject.base, **subject.typed}.get("learning_rate", 0.1)
-    if subject.accepts("learning_rate") and isinstance(rate, float) and not subject.uses_ratio:
+    if subject.accepts("value_step_size"):
+        text = "values have a step size of their own, which has no schedule"
+        yield Finding("the schedule of the learning rate", "skipped", text)
+    elif subject.accepts("learning_rate") and isinstance(rate, float) and not subject.uses_ratio:
         name = "the schedule of the learning rate"
         rate /= 10 if subject.is_on_policy else 1  # or each rollout is learnt by heart
         falling = _moves(lab, LinearSchedule(rate, rate / 20, 1.0))
