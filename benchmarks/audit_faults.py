@@ -202,7 +202,10 @@ def main() -> None:
     if args.publish:
         head = ["git", "rev-parse", "--short", "HEAD"]
         version = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-        MEASURED.write_text(f"{text}\nMeasured with version {version.strip()}.\n", encoding="utf-8")
+        MEASURED.write_text(
+            f"{text}\nThe last of them was measured with version {version.strip()}.\n",
+            encoding="utf-8",
+        )
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
