@@ -45,6 +45,7 @@ COMMANDS = {
     "explain": "say where an agent loses what it stays behind the optimum",
     "compare": "compare agents over seeds, and write a page",
     "tune": "search for an agent's settings, and test them on other seeds",
+    "audit": "say whether an algorithm is right, or which fault it has",
     "pack": "make a finished run, or a study, a zip for others, with a card",
     "inspect": "say what a model file holds, and run nothing of it",
 }

@@ -31,8 +31,8 @@ from safe_files.files import NO_LIMIT, read_file
 # If this project is installed, libraries are beside it.
 _PROJECT = Path(__file__).resolve().parents[1]
 _OWN = (
-    "safe_files machine_code mdp verdicts envs agents pipeline experiments tuning report commands "
-    "train enjoy compare tune"
+    "safe_files machine_code mdp verdicts envs agents pipeline diagnosis experiments tuning report "
+    "commands train enjoy compare tune audit"
 )
 
 

@@ -26,6 +26,7 @@ PACKAGES = (
     "envs",
     "agents",
     "pipeline",
+    "diagnosis",
     "experiments",
     "tuning",
     "report",

@@ -1,0 +1,302 @@
+"""Hand-written tables in single files, as people write them, each right or with one fault.
+
+``FAULTS`` says which function has which fault; none of those in ``RIGHT`` has any.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Table = NDArray[np.float64]
+
+
+class Agent:
+    """A table, and how it acts."""
+
+    def __init__(self, table: Table, epsilon: float = 0.0) -> None:
+        self.table, self.epsilon = table, epsilon
+
+    def act(self, obs: Any) -> int:
+        """The best action, or sometimes another one."""
+        if random.random() < self.epsilon:  # noqa: S311 (as people write it)
+            return random.randrange(self.table.shape[1])  # noqa: S311
+        return int(self.table[number(obs)].argmax())
+
+    def values(self, obs: Any) -> Table:
+        """The values of both actions."""
+        values: Table = self.table[number(obs)]
+        return values
+
+
+def number(obs: Any) -> int:
+    """The state, of its number or of a vector with a one."""
+    return int(np.argmax(obs)) if np.ndim(obs) else int(obs)
+
+
+def one_step(
+    make_env: Callable[[], Any],
+    seed: int,
+    gamma: float,
+    steps: int,
+    exploration_initial_eps: float = 1.0,
+    exploration_final_eps: float = 0.1,
+    *,
+    target: str = "max",
+    fault: str = "",
+) -> Agent:
+    """Q-learning, SARSA or Expected SARSA from single steps."""
+    env, rng = make_env(), np.random.default_rng(seed)
+    if fault == "not-reproducible":
+        rng = np.random.default_rng()
+    q = np.zeros((env.observation_space.n, env.action_space.n))
+    obs, _ = env.reset(seed=seed)
+    epsilon = exploration_initial_eps
+
+    def explores() -> bool:
+        if fault == "global-generator":
+            return bool(np.random.random() < epsilon)  # noqa: NPY002 (the fault)
+        return bool(rng.random() < epsilon)
+
+    def choose(state: int) -> int:
+        if explores():
+            return int(rng.integers(len(q[state])))
+        return int(q[state].argmax())
+
+    action = choose(obs)
+    for step in range(steps):
+        share = step / steps
+        if fault == "schedule-backwards":
+            share = 1 - share
+        if fault == "schedule-constant":
+            share = 0.0
+        epsilon = exploration_initial_eps + share * (
+            exploration_final_eps - exploration_initial_eps
+        )
+        following, reward, terminated, truncated, _ = env.step(action)
+        done = terminated or truncated
+        shown = following
+        if done:
+            following, _ = env.reset()
+        if fault == "reset-observation":
+            shown = following
+        next_action = choose(shown)
+        if target == "max":
+            value = q[shown].max()
+        elif target == "expected":
+            value = epsilon * q[shown].mean() + (1 - epsilon) * q[shown].max()
+        else:
+            value = q[shown, next_action]
+        ended = done if fault == "no-bootstrap-at-truncation" else terminated
+        if fault == "bootstraps-at-terminal":
+            ended = False
+        discount = {"discount-twice": gamma**2, "discount-missing": 1.0}.get(fault, gamma)
+        goal = reward + (0.0 if ended else discount * value)
+        q[obs, action] += 0.1 * (goal - q[obs, action])
+        obs, action = following, choose(following) if done or target == "max" else next_action
+    return Agent(q, 0.05 if fault == "explores-in-evaluation" else 0.0)
+
+
+def from_memory(
+    make_env: Callable[[], Any],
+    seed: int,
+    gamma: float,
+    steps: int,
+    buffer_size: int = 500,
+    *,
+    fault: str = "",
+) -> Agent:
+    """Q-learning on a table from a memory of steps, whose observations are vectors."""
+    env, rng = make_env(), np.random.default_rng(seed)
+    n_states = env.observation_space.shape[0]
+    q, place = np.zeros((n_states, env.action_space.n)), 0
+    memory: list[tuple[Any, int, float, Any, bool]] = []
+    obs, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        kept = obs if fault == "shared-buffer" else obs.copy()
+        action = int(rng.integers(q.shape[1]))
+        following, reward, terminated, truncated, _ = env.step(action)
+        next_kept = following if fault == "shared-buffer" else following.copy()
+        item = (kept, action, reward, next_kept, terminated)
+        if len(memory) < buffer_size:
+            memory.append(item)
+        elif fault != "stale-buffer":
+            memory[place] = item
+            place = (place + 1) % buffer_size
+        obs = env.reset()[0] if terminated or truncated else following
+        for i in rng.integers(len(memory), size=4):
+            then, done, paid, after, ended = memory[i]
+            goal = paid + (0.0 if ended else gamma * q[number(after)].max())
+            q[number(then), done] += 0.1 * (goal - q[number(then), done])
+    return Agent(q)
+
+
+def several_steps(
+    make_env: Callable[[], Any],
+    seed: int,
+    gamma: float,
+    steps: int,
+    n_steps: int = 3,
+    *,
+    fault: str = "",
+) -> Agent:
+    """n-step SARSA."""
+    env, rng = make_env(), np.random.default_rng(seed)
+    q = np.zeros((env.observation_space.n, env.action_space.n))
+    obs, _ = env.reset(seed=seed)
+    action, window = int(rng.integers(q.shape[1])), []
+    for _ in range(steps):
+        following, reward, terminated, truncated, _ = env.step(action)
+        window.append((obs, action, reward))
+        next_action = int(rng.integers(q.shape[1]))
+        done = terminated or truncated
+        ahead = 0.0 if terminated else q[following, next_action]
+        while window and (done or len(window) >= n_steps):
+            n = len(window)
+            powers = [0 if fault == "rewards" else k for k in range(n)]
+            total = sum(gamma**k * paid for k, (_, _, paid) in zip(powers, window, strict=True))
+            last = {"power-less": max(n - 1, 1), "power-one": 1}.get(fault, n)
+            then, did, _ = window.pop(0)
+            q[then, did] += 0.1 * (total + gamma**last * ahead - q[then, did])
+        obs, action = following, next_action
+        if done:
+            obs, _ = env.reset()
+            window = []
+    return Agent(q)
+
+
+def with_traces(
+    make_env: Callable[[], Any],
+    seed: int,
+    gamma: float,
+    steps: int,
+    lam: float = 0.9,
+    learning_rate: float = 0.1,
+    exploration_initial_eps: float = 1.0,
+    *,
+    target: str = "max",
+    fault: str = "",
+) -> Agent:
+    """SARSA(lambda) or Watkins's Q(lambda), with replacing traces."""
+    env, rng = make_env(), np.random.default_rng(seed)
+    q = np.zeros((env.observation_space.n, env.action_space.n))
+    traces = np.zeros_like(q)
+
+    def choose(state: int) -> int:
+        if rng.random() < exploration_initial_eps:
+            return int(rng.integers(len(q[state])))
+        return int(q[state].argmax())
+
+    obs, _ = env.reset(seed=seed)
+    action = choose(obs)
+    for _ in range(steps):
+        following, reward, terminated, truncated, _ = env.step(action)
+        next_action = choose(following)
+        is_greedy = q[following, next_action] == q[following].max()
+        value = q[following].max() if target == "max" else q[following, next_action]
+        error = reward + (0.0 if terminated else gamma * value) - q[obs, action]
+        traces[obs, action] = 1.0
+        q += learning_rate * error * traces
+        traces *= {"lambda-alone": lam, "gamma-alone": gamma}.get(fault, gamma * lam)
+        if target == "max" and not is_greedy and fault != "never-cut":
+            traces[:] = 0.0
+        obs, action = following, next_action
+        if terminated or truncated:
+            obs, _ = env.reset()
+            action = choose(obs)
+            if fault != "kept-across-episodes":
+                traces[:] = 0.0
+    return Agent(q)
+
+
+def preferences(
+    make_env: Callable[[], Any], seed: int, gamma: float, steps: int, *, fault: str = ""
+) -> Any:
+    """One-step actor-critic on tables, with a softmax of preferences."""
+    env, rng = make_env(), np.random.default_rng(seed)
+    likes = np.zeros((env.observation_space.n, env.action_space.n))
+    v = np.zeros(len(likes))
+    obs, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        chances = np.exp(likes[obs] - likes[obs].max())
+        chances /= chances.sum()
+        action = int(rng.choice(len(chances), p=chances))
+        following, reward, terminated, truncated, _ = env.step(action)
+        error = reward + (0.0 if terminated else gamma * v[following]) - v[obs]
+        v[obs] += 0.1 * error
+        slope = -chances
+        slope[action] += 1.0
+        likes[obs] += (-0.1 if fault == "advantage-sign" else 0.1) * error * slope
+        obs = env.reset()[0] if terminated or truncated else following
+
+    class ActorCritic(Agent):
+        def values(self, obs: Any) -> Table:
+            return v[[number(obs)]]
+
+    return ActorCritic(likes)
+
+
+q_right = partial(one_step, target="max")
+sarsa_right = partial(one_step, target="next")
+expected_sarsa_right = partial(one_step, target="expected")
+memory_right = partial(from_memory)
+n_step_right = partial(several_steps)
+q_lambda_right = partial(with_traces, target="max")
+sarsa_lambda_right = partial(with_traces, target="next")
+actor_critic_right = partial(preferences)
+
+q_bootstraps = partial(one_step, fault="bootstraps-at-terminal")
+q_done_is_end = partial(one_step, fault="no-bootstrap-at-truncation")
+q_gamma_squared = partial(one_step, fault="discount-twice")
+sarsa_without_gamma = partial(one_step, target="next", fault="discount-missing")
+q_sees_reset = partial(one_step, fault="reset-observation")
+q_that_follows = partial(one_step, target="next")
+sarsa_that_maximises = partial(one_step, target="max")
+q_explores = partial(one_step, fault="explores-in-evaluation")
+q_global = partial(one_step, fault="global-generator")
+sarsa_unseeded = partial(one_step, target="next", fault="not-reproducible")
+q_epsilon_grows = partial(one_step, fault="schedule-backwards")
+q_epsilon_stays = partial(one_step, fault="schedule-constant")
+memory_of_references = partial(from_memory, fault="shared-buffer")
+memory_never_renewed = partial(from_memory, fault="stale-buffer")
+n_step_rewards_whole = partial(several_steps, fault="rewards")
+n_step_power_one = partial(several_steps, fault="power-one")
+q_lambda_never_cut = partial(with_traces, fault="never-cut")
+sarsa_lambda_fades_slowly = partial(with_traces, target="next", fault="lambda-alone")
+sarsa_lambda_goes_on = partial(with_traces, target="next", fault="kept-across-episodes")
+actor_critic_flees = partial(preferences, fault="advantage-sign")
+
+RIGHT = [name for name in list(globals()) if name.endswith("_right")]
+FAULTS = {
+    "q_bootstraps": "bootstraps-at-terminal",
+    "q_done_is_end": "no-bootstrap-at-truncation",
+    "q_gamma_squared": "discount-twice",
+    "sarsa_without_gamma": "discount-missing",
+    "q_sees_reset": "reset-observation",
+    "q_that_follows": "follows-instead-of-maximises",
+    "sarsa_that_maximises": "maximises-instead-of-follows",
+    "q_explores": "explores-in-evaluation",
+    "q_global": "global-generator",
+    "sarsa_unseeded": "not-reproducible",
+    "q_epsilon_grows": "schedule-backwards",
+    "q_epsilon_stays": "schedule-constant",
+    "memory_of_references": "shared-buffer",
+    "memory_never_renewed": "stale-buffer",
+    "n_step_rewards_whole": "n-step-return",
+    "n_step_power_one": "n-step-return",
+    "q_lambda_never_cut": "traces",
+    "sarsa_lambda_fades_slowly": "traces",
+    "sarsa_lambda_goes_on": "traces",
+    "actor_critic_flees": "advantage-sign",
+}
+KINDS = dict.fromkeys(("q_right", "memory_right", "q_lambda_right"), "q_learning")
+KINDS |= {name: "q_learning" for name in FAULTS if name.startswith(("q_", "memory"))}
+KINDS |= {name: "sarsa" for name in FAULTS if name.startswith(("sarsa", "n_step"))}
+KINDS |= dict.fromkeys(("sarsa_right", "n_step_right", "sarsa_lambda_right"), "sarsa")
+KINDS |= {"expected_sarsa_right": "expected_sarsa"}
+KINDS |= dict.fromkeys(("actor_critic_right", "actor_critic_flees"), "actor_critic")

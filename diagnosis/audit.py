@@ -1,0 +1,141 @@
+"""Runs the probes on an algorithm, over seeds, and comes to a verdict."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from diagnosis.faults import FAULTS
+from diagnosis.probes import (
+    NEEDS_VALUES,
+    PROBES,
+    Finding,
+    Lab,
+    NotSettled,
+    Probe,
+    probe_discount,
+    probe_ends,
+)
+from diagnosis.subjects import Subject
+from pipeline.errors import UserError, one_line
+
+# Where one of these is found, what is said of several steps follows from it.
+_OF_ONE_STEP = frozenset(list(FAULTS)[: list(FAULTS).index("importance-ratio")])
+_OF_SEVERAL = frozenset({"n-step-return", "traces"})
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What an audit has come to."""
+
+    subject: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def faults(self) -> list[Finding]:
+        """Faults, the one that explains most first; none that follow from another."""
+        found = [finding for finding in self.findings if finding.state == "fault"]
+        if _OF_ONE_STEP & {finding.fault for finding in found}:
+            found = [finding for finding in found if finding.fault not in _OF_SEVERAL]
+        found.sort(key=lambda finding: list(FAULTS).index(finding.fault))
+        return found
+
+    @property
+    def is_right(self) -> bool:
+        """Whether its targets were looked at, and nothing was found."""
+        states = {f.probe: f.state for f in self.findings}
+        decided = [states.get(_title(probe)) for probe in (probe_ends, probe_discount)]
+        return not self.faults and decided == ["ok", "ok"]
+
+    @property
+    def exit_code(self) -> int:
+        """0 right, 1 a fault, 2 nothing can be said."""
+        return 1 if self.faults else 0 if self.is_right else 2
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values: what was found, and each fault's sentence and source."""
+        words = ("right", "fault", "nothing can be said")
+        faults = []
+        for finding in self.faults:
+            fault = FAULTS[finding.fault]
+            entry = {"fault": finding.fault, "sentence": fault.sentence, "source": fault.source}
+            faults.append({**entry, "measured": finding.text, "right": finding.right})
+        return {
+            "algorithm": self.subject,
+            "verdict": words[self.exit_code],
+            "fault": faults[0]["fault"] if faults else None,
+            "faults": faults,
+            "probes": [asdict(finding) for finding in self.findings],
+        }
+
+
+def audit(
+    subject: Subject, seeds: Sequence[int], probes: Sequence[Probe] = PROBES
+) -> Iterator[Finding]:
+    """What each probe finds, one after the other.
+
+    A probe that finds nothing wrong with the first seed is done. Otherwise the other seeds are
+    asked as well, and what most of them say counts.
+    """
+    labs = [Lab(subject, seed) for seed in seeds]
+    if not subject.has_values:
+        probes = [probe for probe in probes if probe not in NEEDS_VALUES]
+        yield Finding("its values", "skipped", "it tells none, so that its targets are not seen")
+    for probe in probes:
+        found: list[list[Finding]] = []
+        for lab in labs:
+            found.append(_findings(probe, lab))
+            if all(finding.state in ("ok", "skipped") for finding in found[0]):
+                break
+        yield from _most_agreed(found)
+
+
+def _findings(probe: Probe, lab: Lab) -> list[Finding]:
+    """What a probe finds with one seed; that nothing can be said where it cannot be done."""
+    name = _title(probe)
+    try:
+        return list(probe(lab))
+    except NotSettled as error:
+        return [Finding(name, "unsaid", str(error))]
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001 (whatever a stranger's code does)
+        text = f"{type(error).__name__}: {one_line(error)}"
+        return [Finding(name, "unsaid", f"it cannot train here: {text}")]
+
+
+def _most_agreed(found: list[list[Finding]]) -> list[Finding]:
+    """What most seeds agree on, in the words of the first of them."""
+    signs = [tuple((each.probe, each.state, each.fault) for each in findings) for findings in found]
+    (sign, n), *_ = Counter(signs).most_common()
+    if 2 * n > len(signs):
+        return found[signs.index(sign)]
+    name = found[0][0].probe
+    told = {each.fault or each.state for findings in found for each in findings}
+    return [Finding(name, "unsaid", f"seeds disagree: {', '.join(sorted(told))}")]
+
+
+def _title(probe: Probe) -> str:
+    return TITLES[probe]
+
+
+_NAMES = (
+    "the end of an episode",
+    "the discount",
+    "an episode that is cut off",
+    "the next action",
+    "the importance ratio",
+    "the target network",
+    "the age of what is learnt from",
+    "observations that change in place",
+    "targets of several steps",
+    "traces",
+    "what it does when evaluated",
+    "the entropy term",
+    "the schedule of the learning rate",
+    "seeds",
+    "saving and loading",
+)
+TITLES: dict[Probe, str] = dict(zip(PROBES, _NAMES, strict=True))

@@ -1,0 +1,116 @@
+"""The faults that an audit can name, and where it is written how it should be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+BOOK = "Sutton and Barto (2nd edition)"
+
+
+class Fault(NamedTuple):
+    """A way in which an algorithm is wrong."""
+
+    sentence: str
+    source: str  # where it is written how it should be
+
+
+# The most telling first: what explains others comes before them.
+FAULTS: Mapping[str, Fault] = {
+    "shared-buffer": Fault(
+        "What is stored is an array that changes later, not a copy of it.",
+        "Mnih et al. (2015), algorithm 1: the transition is stored as it was",
+    ),
+    "bootstraps-at-terminal": Fault(
+        "The target goes on with the value of what the end of an episode shows.",
+        f"{BOOK}, section 6.1: V(terminal) = 0",
+    ),
+    "reset-observation": Fault(
+        "Where an episode is cut off, the first observation of the next one is taken to follow.",
+        "Pardo et al. (2018), Time limits in reinforcement learning, section 3",
+    ),
+    "no-bootstrap-at-truncation": Fault(
+        "An episode that is cut off is taken to have ended, and nothing to follow.",
+        "Pardo et al. (2018), Time limits in reinforcement learning, section 3",
+    ),
+    "target-never-copied": Fault(
+        "The target network stays as it began: what is learnt does not travel back.",
+        "Mnih et al. (2015), algorithm 1: every C steps reset Q^ = Q",
+    ),
+    "discount-twice": Fault(
+        "The discount is applied twice: what comes next counts gamma squared.",
+        f"{BOOK}, section 3.3, equation 3.9",
+    ),
+    "discount-missing": Fault(
+        "What comes next is not discounted.", f"{BOOK}, section 3.3, equation 3.9"
+    ),
+    "importance-ratio": Fault(
+        "What was done is weighed by a wrong ratio of the two policies' probabilities.",
+        f"{BOOK}, section 5.5; Schulman et al. (2017), equations 6 and 7, for PPO",
+    ),
+    "follows-instead-of-maximises": Fault(
+        "The target takes the action that is done next, where it should take the best one.",
+        f"{BOOK}, section 6.5, equation 6.8",
+    ),
+    "maximises-instead-of-follows": Fault(
+        "The target takes the best next action, where it should follow what is done.",
+        f"{BOOK}, section 6.4, equation 6.7",
+    ),
+    "stale-buffer": Fault(
+        "It goes on learning from old steps that should have been replaced.",
+        "Mnih et al. (2015), algorithm 1: memory of capacity N; for rollouts Schulman et al. "
+        "(2017), algorithm 1",
+    ),
+    "n-step-return": Fault(
+        "A target of several steps is not the discounted sum of its rewards and what follows.",
+        f"{BOOK}, section 7.1, equation 7.1",
+    ),
+    "traces": Fault(
+        "Credit does not fade by gamma times lambda with each step back, or is not cut off.",
+        f"{BOOK}, section 12.2, equation 12.5, and 12.10; Schulman et al. (2016), equation 16, for "
+        "the advantages of rollouts",
+    ),
+    "advantage-sign": Fault(
+        "The policy moves away from what was better than expected.",
+        f"{BOOK}, section 13.5, equation 13.14",
+    ),
+    "entropy-sign": Fault(
+        "The entropy term makes the policy surer, where it should make it less sure.",
+        "Mnih et al. (2016), section 4; Haarnoja et al. (2018), equation 1",
+    ),
+    "target-always-copied": Fault(
+        "The target network follows at once, whatever its settings say.",
+        "Mnih et al. (2015), algorithm 1; Lillicrap et al. (2016), algorithm 1",
+    ),
+    "schedule-backwards": Fault(
+        "A schedule runs from its end to its beginning.",
+        f"{BOOK}, section 2.5; Stable-Baselines3: progress_remaining goes from 1 to 0",
+    ),
+    "schedule-constant": Fault(
+        "A schedule has no effect: the number stays the same.",
+        f"{BOOK}, section 2.5; Stable-Baselines3: progress_remaining goes from 1 to 0",
+    ),
+    "explores-in-evaluation": Fault(
+        "It still explores where it is asked for its best action.",
+        "Machado et al. (2018), section 4; Stable-Baselines3: predict(deterministic=True)",
+    ),
+    "not-reproducible": Fault(
+        "The same seed gives different results.",
+        "Stable-Baselines3: BaseAlgorithm.set_random_seed; Henderson et al. (2018)",
+    ),
+    "global-generator": Fault(
+        "It draws from global generators that its seed does not set.",
+        "Stable-Baselines3: BaseAlgorithm.set_random_seed; NumPy enhancement proposal 19",
+    ),
+    "zip-forgets-tables": Fault(
+        "What was learnt is not in the saved file.", "Stable-Baselines3: BaseAlgorithm.save"
+    ),
+    "zip-forgets-optimizer": Fault(
+        "The optimizer's state is not in the saved file: training goes on differently.",
+        "Stable-Baselines3: BaseAlgorithm._get_torch_save_params",
+    ),
+    "zip-forgets-schedules": Fault(
+        "Schedules, or how far they were, are not in the saved file.",
+        "Stable-Baselines3: BaseAlgorithm.save",
+    ),
+}

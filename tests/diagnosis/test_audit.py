@@ -1,0 +1,308 @@
+"""`audit`: planted faults are named, what is right passes, and mistakes end in one line."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from commands.audit import KINDS, main
+from commands.cli import run_command
+from diagnosis import probes, subjects
+from diagnosis.audit import TITLES, Verdict, audit
+from diagnosis.faults import FAULTS
+from diagnosis.probe_worlds import Record, World, make_env
+from diagnosis.probes import Finding, watkins_table
+from diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
+
+PLANTED = Path(__file__).resolve().parents[2] / "benchmarks" / "planted_faults"
+
+
+def planted(name):
+    spec = importlib.util.spec_from_file_location(f"planted_{name}", PLANTED / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+TABLES, LIBRARIES = planted("tables"), planted("libraries")
+
+
+def verdict_on(subject, *probed):
+    findings = audit(subject, range(3), probed or probes.PROBES)
+    return Verdict(subject.name, tuple(findings))
+
+
+# --- what is found --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in TABLES.FAULTS if not name.startswith("memory")])
+def test_faults_of_tables_are_named(name):
+    subject = ScriptSubject(name, getattr(TABLES, name), {}, TABLES.KINDS.get(name))
+    verdict = verdict_on(subject)
+    assert [finding.fault for finding in verdict.faults][:1] == [TABLES.FAULTS[name]]
+    assert verdict.exit_code == 1
+
+
+@pytest.mark.parametrize("name", [name for name in TABLES.RIGHT if not name.startswith("memory")])
+def test_right_tables_pass(name):
+    subject = ScriptSubject(name, getattr(TABLES, name), {}, TABLES.KINDS.get(name))
+    verdict = verdict_on(subject)
+    assert (verdict.faults, verdict.exit_code) == ([], 0)
+    assert {finding.state for finding in verdict.findings} <= {"ok", "skipped"}
+
+
+@pytest.mark.parametrize(
+    ("name", "probe"),
+    [
+        ("memory_never_renewed", probes.probe_age),
+        ("memory_of_references", probes.probe_copies),
+    ],
+)
+def test_faults_of_memories_are_named(name, probe):
+    subject = ScriptSubject(name, getattr(TABLES, name), {}, "q_learning")
+    subject.steps = 1000
+    assert [f.fault for f in verdict_on(subject, probe).faults] == [TABLES.FAULTS[name]]
+    right = ScriptSubject("memory_right", TABLES.memory_right, {}, "q_learning")
+    right.steps = 1000
+    assert verdict_on(right, probe).faults == []
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "probe"),
+    [
+        ("DQNWithoutOptimizer", "dqn", probes.probe_files),
+        ("PPORatio", "ppo", probes.probe_ratio),
+        ("PPOTraces", "ppo", probes.probe_traces),
+        ("PPOEntropy", "ppo", probes.probe_entropy),
+        ("ForgetfulPPO", "ppo", probes.probe_files),
+    ],
+)
+def test_faults_of_classes_are_named(name, right, probe, monkeypatch):
+    monkeypatch.setattr(probes, "MOST_DOUBLINGS", 1)
+    accused = ClassSubject(name, getattr(LIBRARIES, name), {})
+    assert {f.fault for f in audit(accused, [0], [probe]) if f.fault} == {LIBRARIES.FAULTS[name]}
+    passed = ClassSubject(right, class_named(right), {})
+    assert {f.state for f in audit(passed, [0], [probe])} == {"ok"}
+
+
+def test_observations_changed_in_place_are_the_librarys_affair():
+    """DummyVecEnv keeps no copy of an episode's last observation: no fault of any agent."""
+    subject = ClassSubject("dqn", class_named("dqn"), {})
+    subject.steps = 300
+    finding = list(audit(subject, [0], [probes.probe_copies]))
+    assert [each.state for each in finding] == ["ok"]
+    assert "DummyVecEnv" in finding[0].text
+
+
+# --- when nothing is said -------------------------------------------------------------------------
+
+
+def restless(make_env, seed, gamma, steps):
+    """Values that never come to rest."""
+    agent = TABLES.q_right(make_env, seed, gamma, steps)
+    agent.values = lambda obs: np.full(2, float(steps))
+    return agent
+
+
+def test_no_verdict_without_rest():
+    verdict = verdict_on(ScriptSubject("restless", restless, {}), probes.probe_ends)
+    assert [(f.state, f.fault) for f in verdict.findings] == [("unsaid", "")]
+    assert "did not settle" in verdict.findings[0].text
+    assert verdict.exit_code == 2
+
+
+def test_values_that_no_fault_explains_are_told_and_not_named():
+    def shifted(make_env, seed, gamma, steps):
+        agent = TABLES.q_right(make_env, seed, gamma, steps)
+        table = agent.table + 3.0
+        agent.values = lambda obs: table[TABLES.number(obs)]
+        return agent
+
+    verdict = verdict_on(ScriptSubject("shifted", shifted, {}, "q_learning"), probes.probe_ends)
+    assert verdict.exit_code == 2
+    assert "4.00 and not 1: no fault known here explains it" in verdict.findings[0].text
+
+
+def test_what_it_claims_to_be_has_to_be_known():
+    verdict = verdict_on(ScriptSubject("?", TABLES.q_right, {}), probes.probe_next_action)
+    assert [f.state for f in verdict.findings] == ["skipped"]
+    assert "--kind" in verdict.findings[0].text
+
+
+def test_seeds_that_disagree_decide_nothing():
+    def moody(lab):
+        state = ("fault", "ok", "unsaid")[lab.seed]
+        yield Finding("a probe", state, "", "traces" if state == "fault" else "")
+
+    TITLES[moody] = "a probe"
+    try:
+        found = list(audit(ScriptSubject("moody", TABLES.q_right, {}), range(3), [moody]))
+        assert [(f.state, f.text) for f in found] == [
+            ("unsaid", "seeds disagree: ok, traces, unsaid")
+        ]
+    finally:
+        del TITLES[moody]
+
+
+# --- worlds and tables by hand --------------------------------------------------------------------
+
+
+def test_values_of_worlds():
+    assert World(((0, 0), (1, 1))).values(0.8).tolist() == [0.8, 1.0]
+    assert World(((0, 0), (1, -4)), quits=0.5).values(0.8).tolist() == [0.4, 1.0]
+    loop = World(((5, 5), (1, 1)), ends=False, cut=4)
+    np.testing.assert_allclose(loop.values(0.8), [9, 5])
+
+
+@pytest.mark.parametrize("observations", ["discrete", "box"])
+def test_worlds_are_gymnasium_environments(observations):
+    from gymnasium.utils.env_checker import check_env
+
+    world, record = World(((0, 0), (1, -1)), cut=3), Record(2)
+    env = make_env(world, record, observations, "discrete")
+    check_env(env.unwrapped, skip_render_check=True)
+    record.states.clear()
+    record.actions.clear()
+    env.reset(seed=0)
+    assert [env.step(0)[1:4], env.step(1)[1:4]] == [(0, False, False), (-1, True, False)]
+    assert record.counts().tolist() == [[1, 0], [0, 1]]
+
+
+def test_what_is_shown_in_place_is_one_array():
+    for in_place in (False, True):
+        env = make_env(World(((0, 0),), in_place=in_place), Record(1), "box", "discrete")
+        first, _ = env.reset()
+        assert (env.step(0)[0] is first) is in_place
+
+
+def test_a_table_of_watkins_by_hand():
+    """Two episodes; in the second, exploring in the middle state cuts what led there."""
+    world = World(((0, 0), (1, -1), (1, 1)))
+    record = Record(3, [0, 1, 2, 0, 1, 2], [0, 0, 0, 0, 1, 0], [0, 1, 1, 0, -1, 1])
+    first = [0.5 * 0.4 * 1 + 0.5 * 0.16 * 1, 0.5 + 0.5 * 0.4, 0.5]
+    cut = watkins_table(world, record, 0.5, is_cut=True)
+    whole = watkins_table(world, record, 0.5, is_cut=False)
+    start = first[0] + 0.5 * (GAMMA * first[1] - first[0])
+    np.testing.assert_allclose(cut[:, 0], [start, first[1], 0.75])
+    error = -1 + GAMMA * first[2]
+    moved = start + 0.5 * (0.4 * error + 0.16 * 0.5)
+    np.testing.assert_allclose(whole[:, 0], [moved, first[1], 0.75])
+
+
+def test_every_fault_has_a_sentence_and_a_source():
+    assert len(FAULTS) == 24
+    for fault in FAULTS.values():
+        assert fault.sentence.endswith(".")
+        assert fault.source
+    assert set(TABLES.FAULTS.values()) | set(LIBRARIES.FAULTS.values()) == set(FAULTS)
+    assert tuple(subjects.KINDS) == KINDS
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def type_audit(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["audit.py", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            run_command(main)
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+SCRIPT = '''
+import numpy as np
+
+
+def train(make_env, seed, gamma, steps):
+    """Q-learning in which an episode that is cut off counts as ended."""
+    rng, env = np.random.default_rng(seed), make_env()
+    q = np.zeros((env.observation_space.n, 2))
+    obs, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        action = int(rng.integers(2)) if rng.random() < 0.5 else int(q[obs].argmax())
+        following, reward, terminated, truncated, _ = env.step(action)
+        done = terminated or truncated
+        q[obs, action] += 0.1 * (reward + gamma * q[following].max() * (not done) - q[obs, action])
+        obs = env.reset()[0] if done else following
+
+    class Agent:
+        def act(self, obs):
+            return int(q[obs].argmax())
+
+        def values(self, obs):
+            return q[obs]
+
+    return Agent()
+
+
+number = 3
+'''
+
+
+def test_a_script_of_ones_own(type_audit, tmp_path):
+    (tmp_path / "my_audited_script.py").write_text(SCRIPT)
+    words = ("--script", "my_audited_script:train", "--kind", "q_learning", "--json", "out.json")
+    code, out, err = type_audit(*words)
+    assert (code, err) == (1, "")
+    assert "an episode that is cut off          FAULT\n" in out
+    assert "\nfault: no-bootstrap-at-truncation. An episode that is cut off is taken to " in out
+    assert "right would be: 5 in both" in " ".join(out.split())
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert (found["verdict"], found["fault"]) == ("fault", "no-bootstrap-at-truncation")
+    assert found["faults"][0]["source"].startswith("Pardo et al. (2018)")
+
+
+def test_a_class_of_ones_own(type_audit, tmp_path, monkeypatch):
+    text = "from stable_baselines3 import DQN\n\n\nclass Mine(DQN):\n    pass\n"
+    (tmp_path / "my_audited_agents.py").write_text(text)
+    monkeypatch.setattr(audit, "__defaults__", ((probes.probe_ends, probes.probe_discount),))
+    flags = ("--gym-packages", "my_audited_agents.py", "-params", "batch_size:32")
+    code, out, err = type_audit("--algo", "my_audited_agents:Mine", *flags)
+    assert (code, err) == (0, "")
+    assert out.endswith(
+        "audit of my_audited_agents:Mine\n"
+        "  the end of an episode               ok\n"
+        "  the discount                        ok\n"
+        "right, as far as these probes see\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("", "one of the arguments --algo --script is required"),
+        ("--algo qlerning", "did you mean 'qlearning'?"),
+        ("--algo ucb", "--algo ucb: it is for bandits"),
+        ("--algo optimal", "--algo optimal: it does not learn"),
+        ("--algo qlearning -params gama:0.5", "unknown hyperparameter 'gama'"),
+        ("--algo qlearning --json .", "--json: . is no place for a file"),
+        ("--algo my_refused:number", "number is no subclass of Stable-Baselines3's BaseAlgorithm"),
+        ("--algo my_refused:none", "my_refused has no none"),
+        ("--script train", "--script takes module:function, not 'train'"),
+        ("--script my_refused:number", "there is no function my_refused:number"),
+        ("--script my_refused:bare", "must take make_env, seed, gamma, steps"),
+        ("--script my_refused:train -params alpha:1", "unknown argument of my_refused:train"),
+        ("--script my_refused:broken", "cannot train on a tiny world: ZeroDivisionError"),
+        ("--script my_refused:empty", "must return something with act(obs)"),
+        ("--script my_refused:train --engine auto", "--engine: a script has none"),
+    ],
+)
+def test_mistakes_end_in_one_line(type_audit, tmp_path, words, told):
+    broken = "\n\ndef broken(make_env, seed, gamma, steps):\n    1 / 0\n"
+    broken += "\n\ndef empty(make_env, seed, gamma, steps):\n    return None\n"
+    name = tmp_path.name  # another one each time: modules stay imported
+    (tmp_path / f"{name}.py").write_text(f"{SCRIPT}\n\ndef bare():\n    pass\n{broken}")
+    code, out, err = type_audit(*words.replace("my_refused", name).split())
+    assert (code, out) == (2, "")
+    assert told.replace("my_refused", name) in err
+    assert len(err.splitlines()) == 1
