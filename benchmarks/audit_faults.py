@@ -29,6 +29,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pipeline.errors import UserError
+
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
@@ -88,13 +90,18 @@ def shipped() -> Iterator[Case]:
 def measure(case: Case, seed: int, n_seeds: int) -> dict[str, Any]:
     """One audit: what it said, and how long it took."""
     from diagnosis.audit import Verdict, audit
+    from diagnosis.probes import Finding
     from diagnosis.subjects import ClassSubject, ScriptSubject, Subject, class_named
 
     started = time.process_time()
     agent = class_named(case.agent) if isinstance(case.agent, str) else case.agent
     kind = ClassSubject if isinstance(agent, type) else ScriptSubject
-    subject: Subject = kind(case.name, agent, dict(case.params), case.kind)
-    verdict = Verdict(case.name, tuple(audit(subject, range(seed, seed + n_seeds))))
+    try:
+        subject: Subject = kind(case.name, agent, dict(case.params), case.kind)
+        findings = tuple(audit(subject, range(seed, seed + n_seeds)))
+    except UserError as error:
+        findings = (Finding("begin", "unsaid", str(error)),)
+    verdict = Verdict(case.name, findings)
     return {
         "name": case.name,
         "seed": seed,

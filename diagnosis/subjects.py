@@ -348,6 +348,17 @@ class TrainedModel(Trained):
         return values_of(self.model, [np.asarray(self.observation(s)) for s in states])
 
 
+def _takes_one_argument(function: Any) -> bool:
+    """Whether a stranger's method can be called with an observation alone."""
+    if not callable(function):
+        return False
+    try:
+        inspect.signature(function).bind(None)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 def values_of(model: Any, observations: list[Any]) -> Floats | None:
     """A model's values at observations, shape (n, 2) or (n, 1); None where it has none."""
     policy = model.policy
@@ -366,7 +377,7 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
         return None if hasattr(model, "initial_preferences") else np.asarray(policy.sums(batch))
     import torch as th
 
-    if hasattr(model, "values"):
+    if _takes_one_argument(getattr(model, "values", None)):
         return np.stack([np.atleast_1d(model.values(obs)) for obs in observations]).astype(float)
     if not hasattr(policy, "obs_to_tensor"):
         return None
