@@ -510,12 +510,14 @@ def probe_choice(lab: Lab) -> Iterator[Finding]:
         f"it does action 1 in {chosen[0]:.1%} of 400 where 0 pays, in {chosen[1]:.1%} where 1 does"
     )
     right = "0 % and 100 %"
-    if chosen[0] > 0.6 and chosen[1] < 0.4:
+    if chosen[0] > 0.6 and chosen[1] < 0.4:  # the reverse of what pays
         if lab.subject.target == "states" or lab.subject.target is None:
             yield Finding(name, "fault", text, "advantage-sign", right)
         else:
             yield Finding(name, "unsaid", f"{text}: no fault known here explains it")
-    elif chosen[0] < 0.4 and chosen[1] > 0.6 and chosen != [0, 1]:
+    elif all(0 < share < 1 for share in chosen) or (
+        chosen[0] < 0.4 and chosen[1] > 0.6 and chosen != [0, 1]
+    ):
         yield Finding(name, "fault", text, "explores-in-evaluation", right)
     elif chosen == [0, 1]:
         yield Finding(name, "ok", text)

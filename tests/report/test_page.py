@@ -37,8 +37,8 @@ HOSTILE = "</script><script>document.title='taken'</script>"
 # Attributes that make a browser fetch something.
 LOADING = {"src", "srcset", "data", "poster", "action", "formaction", "background", "ping"}
 SECTION_NAMES = [
-    *("verdict", "overview", "ranking", "curves", "comparison", "overall", "policies", "films"),
-    "settings",
+    *("verdict", "overview", "ranking", "curves", "comparison", "overall"),
+    *("why", "policies", "films", "settings"),
 ]
 
 
