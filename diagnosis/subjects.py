@@ -393,10 +393,11 @@ def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
     """Values of networks, a tensor of shape (n, 2) or (n, 1); None where there are none."""
     import torch as th
 
-    if hasattr(model, "q_net"):
-        return model.q_net(tensor)
-    if hasattr(model, "quantile_net"):
-        return model.quantile_net(tensor).mean(dim=1)
+    for holder in (model, policy):
+        if hasattr(holder, "q_net"):
+            return holder.q_net(tensor)
+        if hasattr(holder, "quantile_net"):
+            return holder.quantile_net(tensor).mean(dim=1)
     if hasattr(policy, "lstm_critic"):  # each state after those that lead to it
         values, shape = [], (policy.lstm_critic or policy.lstm_actor)
         for last in range(len(tensor)):
