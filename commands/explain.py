@@ -26,6 +26,7 @@ EPILOG = """\
 examples:
   python explain.py --env FrozenLake-v1 --algo qlearning
   python explain.py logs/dqn/Taxi-v4_1 --json why.json
+  python explain.py logs/my_study --algo dqn --env Taxi-v4     # the median run of a study's pair
   python explain.py logs/sarsa/CliffWalking-v1_1 --against logs/qlearning/CliffWalking-v1_1
 """
 
@@ -103,7 +104,7 @@ def _asked(console: Console, wanted: ModelRequest, stack: ExitStack) -> Asked:
     """Find and load an agent, and work out the optimum of its environment."""
     from pipeline.signs_of_life import doing
 
-    chosen = found_model(console, wanted, stack)
+    chosen = found_model(console, _median_run(wanted), stack)
     with doing(console, "working out the optimum"):
         from pipeline.evaluation.exact import exact_evaluator, model_refusal
 
@@ -113,6 +114,28 @@ def _asked(console: Console, wanted: ModelRequest, stack: ExitStack) -> Asked:
             reason = model_refusal(spec) or f"the model of {spec.env_id} is not known"
             raise UserError(f"{reason}, so the gap to the optimum cannot be split")
     return Asked(chosen, evaluator, _loaded(chosen, stack))
+
+
+def _median_run(wanted: ModelRequest) -> ModelRequest:
+    """The request with a study's folder replaced by its run of median return, or the one below."""
+    if wanted.path is None or not (table := wanted.path / "summary.csv").is_file():
+        return wanted
+    import pandas as pd
+
+    rows = pd.read_csv(table, dtype={"agent": str, "environment": str})
+    for column, flag, name in (
+        ("agent", "--algo", wanted.algo),
+        ("environment", "--env", wanted.env_id),
+    ):
+        names = [str(each) for each in rows[column].unique()]
+        chosen = names[0] if name is None and len(names) == 1 else name
+        if chosen not in names:
+            raise UserError(f"{wanted.path} is a study: choose one by {flag}: {', '.join(names)}")
+        rows = rows[rows[column] == chosen]
+    rows = rows.sort_values("final", kind="stable")
+    place = Path(str(rows["path"].iloc[(len(rows) - 1) // 2]))  # the study may have been moved
+    run = wanted.path.joinpath("runs", *place.parts[-2:])
+    return replace(wanted, path=run, algo=None, env_id=None)
 
 
 def _loaded(chosen: ChosenModel, stack: ExitStack) -> BaseAlgorithm:

@@ -387,22 +387,23 @@ class _Found:
         return self._best_of(np.where(allowed, plan.action_values, -np.inf))
 
     def proposal(self, parts: tuple[Part, ...]) -> str | None:
-        """The change to its settings that the parts suggest, as ``--test`` takes it, or None."""
-        gap, changes, own_gap = self.split.gap, [], self.own_gap()
+        """The change to one setting that the largest part suggests, as ``--test`` takes it."""
+        gap, own_gap = self.split.gap, self.own_gap()
         lost = {part.name: part.loss / gap for part in parts}
-        # What costs it little in its own objective it has little reason to learn.
-        is_small = own_gap is not None and own_gap < SMALL * gap
-        if self.task is not None and (is_small or lost.get("objective", 0.0) >= LARGE):
+        suggested: dict[str, float] = {}
+        if self.task is not None:
             nearer = 1 - 0.5 / self.horizon  # what `gamma: auto` stands for
             values = policy_iteration(self.task.model, nearer).action_values
             if nearer > self.task.discount and self._best_of(values) > self.split.value:
-                changes.append("gamma:auto")
-        if lost.get("exploring", 0.0) >= LARGE:
-            changes.append("exploration_final_eps:0")
-        if sum(lost.get(name, 0.0) for name in UNFINISHED) >= LARGE:
-            steps = f"{MORE_TRAINING * self.agent.num_timesteps:.2g}"
-            changes.append(f"n_timesteps:{float(steps):.0f}")
-        return " ".join(changes) or None
+                # What costs it little in its own objective it has little reason to learn.
+                is_small = own_gap is not None and own_gap < SMALL * gap
+                suggested["gamma:auto"] = 1.0 if is_small else lost.get("objective", 0.0)
+        suggested["exploration_final_eps:0"] = lost.get("exploring", 0.0)
+        steps = f"{MORE_TRAINING * self.agent.num_timesteps:.2g}"
+        unfinished = sum(lost.get(name, 0.0) for name in UNFINISHED)
+        suggested[f"n_timesteps:{float(steps):.0f}"] = unfinished
+        change = max(suggested, key=lambda one: suggested[one])
+        return change if suggested[change] >= LARGE else None
 
     # --- in its own objective ---------------------------------------------------------------------
 

@@ -181,9 +181,10 @@ def _on_typical_runs(environment: EnvironmentAnalysis) -> Iterable[str]:
         if pair.typical in ("undecided", pair.verdict) or pair.certain:
             continue
         seen = pair.swapped() if pair.typical == "worse" else pair
-        figures = f"{number(medians[seen.first])} and {number(medians[seen.second])}"
+        one, two = number(medians[seen.first]), number(medians[seen.second])
+        figures, within = f"{one} and {two}", "" if one == two else " within the margin"
         said = {"better": f"{seen.first} is better than {seen.second}"}.get(
-            seen.typical, f"{seen.first} and {seen.second} are equal"
+            seen.typical, f"{seen.first} and {seen.second} are equal{within}"
         )
         failed = failed_runs(environment, [seen.first, seen.second])
         yield f"In the typical run, {said} (medians {figures}{f'; {failed}' if failed else ''})."

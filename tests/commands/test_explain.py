@@ -1,9 +1,13 @@
 """``explain.py`` as a user types it: runs, zips, changes that are tried, files, refusals."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from report.documents import write_tables
 
 TRAIN = ("train.py", "--algo", "qlearning", "--env", "FrozenLake-v1", "-n", 3000, "--eval-freq", -1)
 
@@ -77,3 +81,19 @@ def test_what_cannot_be_explained_is_refused_in_one_line(type_command, run, word
     code, _, err = type_command("explain.py", *words)
     assert (code, err.count("\n")) == (2, 1)
     assert line in err
+
+
+def test_of_a_study_the_median_run_of_a_pair_is_explained(type_command, report_study, tmp_path):
+    folder = tmp_path / "moved"
+    shutil.copytree(report_study.root, folder)
+    write_tables(replace(report_study.analysis.results, root=folder))
+    pair = ("--algo", "Q-learning & co", "--env", "FrozenLake-v1")
+    code, out, _ = type_command("explain.py", folder, *pair, "--json", "why.json")
+    table = report_study.analysis.results.summary
+    rows = table[(table["agent"] == pair[1]) & (table["environment"] == pair[3])]
+    assert code == 0
+    assert str(folder) in out.splitlines()[0]
+    assert json.loads(Path("why.json").read_text())["return"] == pytest.approx(rows["final"].min())
+    code, _, err = type_command("explain.py", folder, *pair[:2])
+    assert (code, err.count("\n")) == (2, 1)
+    assert "choose one by --env: FrozenLake-v1, Warehouse-v0" in err
