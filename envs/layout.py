@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+from gymnasium.envs.toy_text.taxi import TaxiEnv
 
 from envs.grid import MOVES, GridWorld, Tile
 from envs.textbook.windy_gridworld import WindyGridworldEnv
@@ -140,5 +141,7 @@ def action_names(env: gym.Env[Any, Any]) -> tuple[str, ...]:
     given = getattr(env.unwrapped, "action_names", None)
     if isinstance(given, tuple | list):
         return tuple(map(str, given))
+    if isinstance(env.unwrapped, TaxiEnv):
+        return ("south", "north", "east", "west", "pick up", "drop off")
     layout = grid_layout(env)
     return () if layout is None else tuple(_NAMES.get(move, str(move)) for move in layout.moves)

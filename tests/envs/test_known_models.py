@@ -268,8 +268,9 @@ def test_layers_and_other_layouts():
     diagonal = ((-1, -1), (-1, 1), (1, -1), (1, 1), (0, 0))
     assert field.moves == (UP, DOWN, LEFT, RIGHT, *diagonal)
     # Actions are called as the environment says, or by their moves.
-    for env_id, names in (("FrozenLake-v1", ("left", "down", "right", "up")), ("Taxi-v4", ())):
+    for env_id, names in (("FrozenLake-v1", ("left", "down", "right", "up")), ("CartPole-v1", ())):
         assert action_names(gym.make(env_id)) == names
+    assert action_names(gym.make("Taxi-v4"))[1:5:3] == ("north", "pick up")
     assert action_names(gym.make("WindyGridworld-v0", moves="king"))[3:5] == ("right", "up left")
     assert action_names(gym.make("JacksCarRental-v0"))[4:7] == ("move -1", "move +0", "move +1")
     for env_id in ("Taxi-v4", "CartPole-v1", "BernoulliBandit-v0"):
