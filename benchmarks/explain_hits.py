@@ -87,7 +87,8 @@ def judged(words: str, found: dict[str, Any]) -> list[str]:
 def where(words: str, found: dict[str, Any]) -> list[str]:
     """A row of the other table: the run, its gap and parts, the worst state and the repairs."""
     gap, own = found["gap"], found["gap_in_own_objective"]
-    parts = [f"{part['name']} {part['loss'] / gap:.0%}" for part in found["parts"]]
+    told = [(part["name"], f"{part['loss'] / gap:.0%}") for part in found["parts"]]
+    parts = [f"{name} {share}" for name, share in told if share != "0%"]
     worst = found["states"][0]
     regained = [(one["return"] - found["return"]) / gap for one in found["repairs"]]
     return [
