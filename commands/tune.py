@@ -441,6 +441,8 @@ def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> Non
     """Print what the re-test shows: a table, and what follows from it."""
     from rich.table import Table
 
+    from tuning.retesting import unproven_mark
+
     held_out = opened.tuning.held_out
     console.print()
     title = f"re-test on the seeds {held_out.start} to {held_out.stop - 1}"
@@ -463,6 +465,8 @@ def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> Non
     if outcome.optimism is not None:
         optimism = "optimism of the search, its best there less the same on other seeds"
         say(console, f"{optimism}: {round(outcome.optimism, 9):+.4g}")
+    if mark := unproven_mark(opened.tuning):
+        say(console, f"scores are{mark}")
     if outcome.winner is None:
         say(console, f"no winner: {outcome.reason}; they stay as they are")
 
