@@ -102,18 +102,18 @@ def _spec(args: argparse.Namespace) -> TrainSpec:
     check_algorithm(args.algo)
     check_env_id(args.env)
     changes = parse_assignments(args.hyperparams, "-params")
-    if args.env_kwargs:
-        changes["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
-    entry = read_hyperparams(args.algo, args.env, args.conf_file, changes.get("env_kwargs"))
+    typed = parse_assignments(args.env_kwargs, "--env-kwargs")
+    entry = read_hyperparams(args.algo, args.env, args.conf_file, typed)
+    if typed:
+        changes["env_kwargs"] = {**(entry.get("env_kwargs") or {}), **typed}
     if args.train_env_kwargs or args.wrapper:
         changes["train_env_kwargs"] = parse_assignments(args.train_env_kwargs, "--train-env-kwargs")
         changes["train_env_wrapper"] = [
             {name: parse_assignments(given, "--wrapper")} for name, *given in args.wrapper
         ]
-    raw, origins = training_follows(override(entry, changes), changes)
-    names = {"gym_packages": tuple(module.name for module in modules), "user_modules": modules}
-    raw = with_maps_read(args.env, raw)
-    spec = resolved_spec(raw, origins=origins, algo=args.algo, env_id=args.env, seed=0, **names)
+    raw, _ = training_follows(override(entry, changes), {**changes, "env_kwargs": typed})
+    raw, packages = with_maps_read(args.env, raw), tuple(module.name for module in modules)
+    spec = resolved_spec(raw, algo=args.algo, env_id=args.env, seed=0, gym_packages=packages)
     for key in ("normalize", "vec_env_wrapper"):
         if getattr(spec.hyperparams, key):
             raise UserError(f"{key}: what it makes of rewards has no model that could be compared")

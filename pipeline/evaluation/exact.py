@@ -59,8 +59,8 @@ MOST_BYTES_OBSERVED = 1 << 30
 # some hundred million. Beyond the first number, a shorter method is tried.
 FEW_BACKUPS = 200_000_000
 MOST_BACKUPS = 20_000_000_000
-# Outcomes of all states and actions, times steps, up to which further returns are computed: it takes
-# a millisecond on a small model, and two seconds at most.
+# Outcomes of all states and actions, times steps, up to which further returns are computed. It
+# takes a millisecond on a small model, and about two seconds at most.
 MOST_OUTCOMES_OF_OTHERS = 600_000_000
 # Planning to measure the cost of a discount: the number of outcomes of all states and actions that
 # takes a tenth of a second, and the score below which there is a note.
@@ -112,8 +112,9 @@ class ExactEvaluator:
             if optimum is None:
                 optimum = finite_horizon_optimum(self.model, self.horizon, discount).start_value
                 self._optima[discount] = optimum
-            figures = {"discount": float(discount), "discounted_return": worth}
-            found = replace(found, **figures, discounted_optimum=optimum)
+            found = replace(
+                found, discount=discount, discounted_return=worth, discounted_optimum=optimum
+            )
         return found
 
     @cached_property
