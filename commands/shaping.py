@@ -15,15 +15,13 @@ from pipeline.failures import exits_as_mistakes
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     import gymnasium as gym
 
-    from mdp.shaping import DiscountedEffect, Effect
-    from mdp.transition_model import Bools, TransitionModel
+    from mdp.shaping import Effect
+    from mdp.transition_model import TransitionModel
     from pipeline.train_spec import TrainSpec
-
-Ends = tuple[float, float]  # the highest and the lowest return of several optimal policies
 
 # States that are named of those in which other actions are best.
 MOST_STATES = 3
@@ -151,6 +149,90 @@ def _model(spec: TrainSpec, env: gym.Env[Any, Any]) -> TransitionModel:
 # --- what is found --------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Compared:
+    """The optimal policies of two rewards, compared."""
+
+    env: gym.Env[Any, Any]  # in which policies are judged
+    model: TransitionModel
+    horizon: int
+    effects: dict[float, Effect]  # by discount, the last one without and under the time limit
+
+    def lines(self) -> Iterator[str]:
+        """What there is to say."""
+        optimum = self.effects[1.0].optimum
+        for discount, found in self.effects.items():
+            of = f"{int(found.differs.sum()):,} of {int(self.model.reachable.sum()):,} states"
+            differ = f"NOT the same policies are optimal: the best actions differ in {of}"
+            told = "the same policies are optimal" if found.is_same else differ
+            where = (
+                f"discount {discount:g}" if discount < 1 else f"no discount, {self.horizon:,} steps"
+            )
+            yield f"{where}: {told}"
+            met = [place for place in self.places(found) if place["met"] > 0]
+            for place in met[:MOST_STATES]:
+                told = f"{place['met']:.1%} of episodes part here, worth {place['gain']:.4g}"
+                if place["optimal"] != place["shaped"]:
+                    sets = (" or ".join(place[name]) for name in ("optimal", "shaped"))
+                    told = "best is {}, with the changes {}; {}".format(*sets, told)
+                yield f"  {place['state']}: {told}"
+            if not found.is_same and not met:
+                yield "  optimal policies do not come to these states"
+            yield f"  {_cost(found, optimum)}"
+        for discount, found in self.effects.items():
+            if discount < 1:
+                yield _potential(found)
+
+    def places(self, found: Effect) -> list[dict[str, Any]]:
+        """The states with other best actions, those first where most return is lost."""
+        import numpy as np
+
+        from envs.layout import action_names, grid_layout, state_name
+        from mdp.gaps import first_differences
+
+        states = np.flatnonzero(found.differs)
+        if not len(states):
+            return []
+        policies = found.policy, found.worst_policy
+        split = first_differences(self.model, *policies, self.horizon)
+        layout, names = grid_layout(self.env), action_names(self.env)
+        if layout is not None and layout.n_states != self.model.n_states:
+            layout = None
+        named = [names[a] if a < len(names) else f"action {a}" for a in range(self.model.n_actions)]
+        return [
+            {
+                "state": state_name(self.env, layout, int(state)),
+                "optimal": [named[action] for action in np.flatnonzero(found.optimal[state])],
+                "shaped": [named[action] for action in np.flatnonzero(found.shaped[state])],
+                "met": float(split.met[state]),
+                "gain": float(split.gains[state]),
+            }
+            for state in states[np.lexsort((-split.met[states], -split.gains[states]))]
+        ]
+
+    def as_data(self) -> dict[str, Any]:
+        """The same as JSON."""
+        objectives = [
+            {
+                "discount": discount,
+                "time_limit": None if discount < 1 else self.horizon,
+                "same": found.is_same,
+                "n_states": int(self.model.reachable.sum()),
+                "n_differing": int(found.differs.sum()),
+                "optimum": found.optimum,
+                "returns": found.returns,
+                "cost": [found.optimum - each for each in found.returns],
+                "judged": found.judged,
+                "judged_before": found.judged_before,
+                "factor": found.factor,
+                "potential": None if found.potential is None else found.potential.tolist(),
+                "states": self.places(found),
+            }
+            for discount, found in self.effects.items()
+        ]
+        return {"optimum": self.effects[1.0].optimum, "objectives": objectives}
+
+
 def _compared(spec: TrainSpec, env: gym.Env[Any, Any], discount: float) -> Compared:
     """Plan in both models."""
     from envs.known_models import time_limit
@@ -161,132 +243,33 @@ def _compared(spec: TrainSpec, env: gym.Env[Any, Any], discount: float) -> Compa
         shaped = _model(spec, training)
     original, horizon = _model(spec, env), time_limit(env)
     assert horizon is not None  # evaluations always have one
+    effects = {}
     try:
-        under_limit = effect_under_limit(original, shaped, horizon)
-        discounted = None
         if discount < 1:
-            discounted = discounted_effect(original, shaped, discount, horizon)
+            effects[discount] = discounted_effect(original, shaped, discount, horizon)
+        effects[1.0] = effect_under_limit(original, shaped, horizon)
     except ValueError as error:
         raise UserError(f"{spec.env_id}: {error}") from error
-    return Compared(env, original, horizon, discount, discounted, under_limit)
+    return Compared(env, original, horizon, effects)
 
 
-@dataclass(frozen=True)
-class Compared:
-    """The optimal policies of two rewards, compared."""
+def _cost(found: Effect, optimum: float) -> str:
+    """What optimal policies return as evaluations judge them, with and without the changes."""
+    near = ROUNDING * max(1.0, abs(optimum))
 
-    env: gym.Env[Any, Any]  # in which policies are judged
-    model: TransitionModel
-    horizon: int
-    discount: float
-    discounted: DiscountedEffect | None  # None where the agent does not discount
-    under_limit: Effect
+    def span(best: float, worst: float, form: str = ".6g") -> str:
+        ends = sorted((best, worst))
+        return " to ".join(f"{end:{form}}" for end in ends[: 1 + (ends[1] - ends[0] > near)])
 
-    def lines(self) -> Iterator[str]:
-        """What there is to say."""
-        limited, found = self.under_limit, self.discounted
-        if found is not None:
-            before = found.judged_before
-            yield from self._said(f"discount {self.discount:g}", found, found.judged, before)
-        before = limited.optimum, limited.optimum
-        where = f"no discount, {self.horizon:,} steps"
-        yield from self._said(where, limited, (limited.best, limited.worst), before)
-        if found is not None:
-            yield _potential(found)
-
-    def _said(self, where: str, found: Effect, returns: Ends, before: Ends) -> Iterator[str]:
-        """Whether the sets are the same, where policies part, and what that costs."""
-        of = f"{int(found.differs.sum()):,} of {int(self.model.reachable.sum()):,} states"
-        differ = f"NOT the same policies are optimal: the best actions differ in {of}"
-        yield f"{where}: {'the same policies are optimal' if found.is_same else differ}"
-        met = [place for place in self._places(found) if place["met"] > 0]
-        for place in met[:MOST_STATES]:
-            told = f"{place['met']:.1%} of episodes part here, worth {place['gain']:.4g}"
-            if place["optimal"] != place["shaped"]:
-                sets = (" or ".join(place[name]) for name in ("optimal", "shaped"))
-                told = "best is {}, with the changes {}; {}".format(*sets, told)
-            yield f"  {place['state']}: {told}"
-        if not found.is_same and not met:
-            yield "  optimal policies do not come to these states"
-        yield f"  {self._cost(returns, before)}"
-
-    def _cost(self, returns: Ends, before: Ends) -> str:
-        """What optimal policies return as evaluations judge them, with and without the changes."""
-        optimum = self.under_limit.optimum
-        least, most = (one - other for one, other in zip(before, returns, strict=True))
-        cost = "nothing"
-        if not (_equal(least, 0, optimum) and _equal(most, 0, optimum)):
-            cost = f"{least:.4g}" if _equal(least, most, optimum) else f"{least:.4g} to {most:.4g}"
-        told = f"with the changes optimal policies return {_range(returns, optimum)}"
-        if not _equal(before[1], optimum, optimum):
-            told += f", without {_range(before, optimum)}"
-        return f"{told}; the optimum is {optimum:.6g}: the changes cost {cost}"
-
-    def _places(self, found: Effect) -> list[dict[str, Any]]:
-        """The states with other best actions, those first where most return is lost."""
-        import numpy as np
-
-        from envs.layout import action_names, grid_layout, state_name
-        from mdp.gaps import first_differences
-
-        met = gains = np.zeros(self.model.n_states)
-        if not found.is_same:
-            policies = found.policy, found.worst_policy
-            split = first_differences(self.model, *policies, self.horizon)
-            met, gains = split.met, split.gains
-        layout, names = grid_layout(self.env), action_names(self.env)
-        if layout is not None and layout.n_states != self.model.n_states:
-            layout = None
-        states = np.flatnonzero(found.differs)
-        return [
-            {
-                "state": state_name(self.env, layout, int(state)),
-                "optimal": _named(found.optimal[state], names),
-                "shaped": _named(found.shaped[state], names),
-                "met": float(met[state]),
-                "gain": float(gains[state]),
-            }
-            for state in states[np.lexsort((-met[states], -gains[states]))]
-        ]
-
-    def as_data(self) -> dict[str, Any]:
-        """The same as JSON."""
-        objectives = [{"discount": 1.0, "time_limit": self.horizon, **self._data(self.under_limit)}]
-        if (found := self.discounted) is not None:
-            data = {"discount": self.discount, "time_limit": None, **self._data(found)}
-            for name, ends in (("judged", found.judged), ("judged_before", found.judged_before)):
-                data[name] = {"best": ends[0], "worst": ends[1]}
-            potential = None if found.potential is None else found.potential.tolist()
-            objectives.insert(0, {**data, "factor": found.factor, "potential": potential})
-        return {"optimum": self.under_limit.optimum, "objectives": objectives}
-
-    def _data(self, found: Effect) -> dict[str, Any]:
-        figures = {name: getattr(found, name) for name in ("optimum", "best", "worst")}
-        return {
-            "same": found.is_same,
-            "n_states": int(self.model.reachable.sum()),
-            "n_differing": int(found.differs.sum()),
-            **figures,
-            "cost": [found.optimum - found.best, found.optimum - found.worst],
-            "states": self._places(found),
-        }
+    lost = [one - other for one, other in zip(found.judged_before, found.judged, strict=True)]
+    cost = "nothing" if max(map(abs, lost)) <= near else span(lost[0], lost[1], ".4g")
+    told = f"with the changes optimal policies return {span(*found.judged)}"
+    if optimum - found.judged_before[1] > near:
+        told += f", without {span(*found.judged_before)}"
+    return f"{told}; the optimum is {optimum:.6g}: the changes cost {cost}"
 
 
-def _named(actions: Bools, names: Sequence[str]) -> list[str]:
-    places = actions.nonzero()[0].tolist()
-    return [names[place] if place < len(names) else f"action {place}" for place in places]
-
-
-def _equal(one: float, other: float, scale: float) -> bool:
-    return abs(one - other) <= ROUNDING * max(1.0, abs(scale))
-
-
-def _range(ends: Ends, scale: float) -> str:
-    best, worst = ends
-    return f"{best:.6g}" if _equal(best, worst, scale) else f"{worst:.6g} to {best:.6g}"
-
-
-def _potential(found: DiscountedEffect) -> str:
+def _potential(found: Effect) -> str:
     """Whether the rewards were changed by a potential."""
     if found.factor is None or found.potential is None:
         return "the changed rewards are not the original ones plus the difference of a potential"

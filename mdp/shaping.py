@@ -25,6 +25,8 @@ EQUAL, EQUAL_NEAR_ZERO = 1e-9, 1e-12
 MOST_OUTCOMES = 2_000_000
 MOST_BACKED_UP = 50_000_000
 
+Ends = tuple[float, float]  # the highest and the lowest return of several policies
+
 
 @dataclass(frozen=True, eq=False)
 class Effect:
@@ -38,22 +40,30 @@ class Effect:
             limit with all steps left.
         shaped: the same in the shaped rewards.
         optimum: the highest expected return in the original rewards.
-        best: the highest one of the policies that are optimal in the shaped rewards.
-        worst: the lowest one of these.
+        returns: those of the policies that are optimal in the shaped rewards.
+        judged: the same without a discount and under the time limit.
+        judged_before: the same of the policies that are optimal in the original rewards. What they
+            lack of the optimum under the limit is due to the discount.
         policy: a policy that is optimal in the original rewards, actions of shape (horizon, S). It
             does what ``worst_policy`` does wherever that is optimal.
         worst_policy: of the policies that are optimal in the shaped rewards, the one with the
             lowest original return under the time limit, of the same shape.
+        factor: c, if the shaped rewards are c > 0 times the original ones plus the difference of a
+            potential, in the mean over outcomes; None otherwise, and without a discount.
+        potential: that potential, shape (S,), or None.
     """
 
     differs: Bools
     optimal: Bools
     shaped: Bools
     optimum: float
-    best: float
-    worst: float
+    returns: Ends
+    judged: Ends
+    judged_before: Ends
     policy: Ints
     worst_policy: Ints
+    factor: float | None = None
+    potential: Floats | None = None
 
     @property
     def is_same(self) -> bool:
@@ -61,48 +71,9 @@ class Effect:
         return not self.differs.any()
 
 
-@dataclass(frozen=True, eq=False)
-class DiscountedEffect(Effect):
-    """The effect on policies that are optimal with a discount and without a time limit.
-
-    Attributes:
-        judged: the highest and the lowest undiscounted return under the time limit, in the original
-            rewards, of the policies that are optimal in the shaped rewards.
-        judged_before: the same of those that are optimal in the original rewards: what differs from
-            the optimum under the limit here is due to the discount.
-        factor: c, if the shaped rewards are c > 0 times the original ones plus the difference of a
-            potential, in the mean over outcomes; else None.
-        potential: that potential, shape (S,), or None.
-    """
-
-    judged: tuple[float, float]
-    judged_before: tuple[float, float]
-    factor: float | None
-    potential: Floats | None
-
-
-def check_alike(original: TransitionModel, shaped: TransitionModel, horizon: int) -> None:
-    """Check that both models have the same states and actions, and are not too large.
-
-    Raises:
-        ValueError: if not.
-    """
-    sizes = [(model.n_states, model.n_actions) for model in (original, shaped)]
-    if sizes[0] != sizes[1]:
-        raise ValueError(
-            f"{sizes[1][0]:,} states and {sizes[1][1]} actions cannot be compared with "
-            f"{sizes[0][0]:,} states and {sizes[0][1]} actions"
-        )
-    size = max(original.prob.size, shaped.prob.size)
-    if size > MOST_OUTCOMES or size * horizon > MOST_BACKED_UP:
-        raise ValueError(
-            f"{original.n_states:,} states under a limit of {horizon:,} steps are too many to plan"
-        )
-
-
 def discounted_effect(
     original: TransitionModel, shaped: TransitionModel, discount: float, horizon: int
-) -> DiscountedEffect:
+) -> Effect:
     """Compare the policies that are optimal with a discount and without a time limit.
 
     Args:
@@ -113,40 +84,37 @@ def discounted_effect(
         horizon: the time limit under which returns are judged.
 
     Raises:
-        ValueError: for a discount out of range, or as `check_alike`.
+        ValueError: for an argument out of range, for models with different states or actions, and
+            for models that are too large.
     """
     if not 0 <= discount < 1:
         raise ValueError(f"discount is {discount}, it must be at least 0 and below 1")
-    check_alike(original, shaped, horizon)
+    _check(original, shaped, horizon)
     everywhere = original.reachable / original.reachable.sum()
     plan = policy_iteration(original, discount)
     shaped_plan = policy_iteration(replace(shaped, initial=everywhere), discount)
     optimal = _best(plan.action_values)
     theirs = _best(shaped_plan.action_values) | ~shaped.reachable[:, None]
     bad = replace(original, reward=-original.reward)
-    judged, before = (
-        (
-            finite_horizon_optimum(original, horizon, mask=mask).start_value,
-            0.0 - finite_horizon_optimum(bad, horizon, mask=mask).start_value,
-        )
-        for mask in (theirs, optimal)
-    )
+
+    def judged(mask: Bools) -> Ends:
+        best, worst = (finite_horizon_optimum(m, horizon, mask=mask) for m in (original, bad))
+        return best.start_value, 0.0 - worst.start_value
+
     worst_policy = finite_horizon_optimum(bad, horizon, mask=theirs).policy.astype(np.int64)
     is_optimal = optimal[np.arange(original.n_states), worst_policy]
-    factor, potential = _potential(original, shaped, plan, shaped_plan)
-    return DiscountedEffect(
-        differs=original.reachable & (optimal != theirs).any(axis=1),
-        optimal=optimal,
-        shaped=theirs,
-        optimum=plan.start_value,
-        best=policy_iteration(original, discount, theirs).start_value,
-        worst=0.0 - policy_iteration(bad, discount, theirs).start_value,
-        policy=np.where(is_optimal, worst_policy, plan.policy),
-        worst_policy=worst_policy,
-        judged=judged,
-        judged_before=before,
-        factor=factor,
-        potential=potential,
+    best, worst = (policy_iteration(m, discount, theirs).start_value for m in (original, bad))
+    return Effect(
+        original.reachable & (optimal != theirs).any(axis=1),
+        optimal,
+        theirs,
+        plan.start_value,
+        (best, 0.0 - worst),
+        judged(theirs),
+        judged(optimal),
+        np.where(is_optimal, worst_policy, plan.policy),
+        worst_policy,
+        *_potential(original, shaped, plan, shaped_plan),
     )
 
 
@@ -155,19 +123,9 @@ def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horiz
 
     What is optimal depends on the steps that are left, so that the sets are compared at each step,
     in the states that an optimal policy may come to by then: two sets of optimal policies are equal
-    if they are equal there.
-
-    Args:
-        original: the decision process in which policies are judged.
-        shaped: the one in which they are optimal, as in `discounted_effect`.
-        horizon: the time limit of both.
-
-    Raises:
-        ValueError: for a horizon below 1, or as `check_alike`.
+    if they are equal there. Arguments and errors are those of `discounted_effect`.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}, it must be at least 1")
-    check_alike(original, shaped, horizon)
+    _check(original, shaped, horizon)
     values = [np.zeros(original.n_states)] * 4
     rows: list[tuple[Bools, Bools, Ints, Ints]] = []
     for _ in range(horizon):
@@ -176,18 +134,13 @@ def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horiz
             for model, later in zip((original, shaped, original, original), values, strict=True)
         ]
         optimal, theirs = _best(found[0]), _best(found[1]) | ~shaped.reachable[:, None]
-        worst_values = np.where(theirs, found[3], np.inf)
-        worst_action = worst_values.argmin(axis=1)
-        is_optimal = np.take_along_axis(optimal, worst_action[:, None], axis=1)[:, 0]
-        action = np.where(is_optimal, worst_action, found[0].argmax(axis=1))
-        rows.append((optimal, theirs, action, worst_action))
-        best_values = np.where(theirs, found[2], -np.inf).max(axis=1)
-        earlier = [
-            found[0].max(axis=1),
-            found[1].max(axis=1),
-            best_values,
-            worst_values.min(axis=1),
-        ]
+        best, worst = np.where(theirs, found[2], -np.inf), np.where(theirs, found[3], np.inf)
+        action = worst.argmin(axis=1)
+        is_optimal = np.take_along_axis(optimal, action[:, None], axis=1)[:, 0]
+        rows.append(
+            (optimal, theirs, np.where(is_optimal, action, found[0].argmax(axis=1)), action)
+        )
+        earlier = [*(each.max(axis=1) for each in (found[0], found[1], best)), worst.min(axis=1)]
         if all(map(np.array_equal, earlier, values)):
             break
         values = earlier
@@ -196,16 +149,23 @@ def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horiz
     for optimal, theirs, _, _ in in_time:
         differs |= here & (optimal != theirs).any(axis=1)
         here = _following(original, here, optimal)
+    optimum, _, best_return, worst_return = (float(original.initial @ each) for each in values)
+    ends, policies = (best_return, worst_return), zip(*in_time, strict=True)
+    _, _, policy, worst_policy = (np.array(each) for each in policies)
     return Effect(
-        differs=differs,
-        optimal=in_time[0][0],
-        shaped=in_time[0][1],
-        optimum=float(original.initial @ values[0]),
-        best=float(original.initial @ values[2]),
-        worst=float(original.initial @ values[3]),
-        policy=np.array([row[2] for row in in_time]),
-        worst_policy=np.array([row[3] for row in in_time]),
+        differs, *in_time[0][:2], optimum, ends, ends, (optimum, optimum), policy, worst_policy
     )
+
+
+def _check(original: TransitionModel, shaped: TransitionModel, horizon: int) -> None:
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, it must be at least 1")
+    told = [f"{m.n_states:,} states and {m.n_actions} actions" for m in (shaped, original)]
+    if told[0] != told[1]:
+        raise ValueError(f"{told[0]} cannot be compared with {told[1]}")
+    size = max(original.prob.size, shaped.prob.size)
+    if size > MOST_OUTCOMES or size * horizon > MOST_BACKED_UP:
+        raise ValueError(f"{told[0]} under a limit of {horizon:,} steps are too many to plan")
 
 
 def _action_values(model: TransitionModel, later: Floats) -> Floats:
@@ -238,11 +198,10 @@ def _potential(
     potential is the factor times the original's optimal values, minus those of the shaped rewards.
     The factor is found by least squares.
     """
-    names = ("prob", "next_state", "terminated")
-    states = original.reachable
+    states, moves = original.reachable, ("prob", "next_state", "terminated")
     if original.prob.shape != shaped.prob.shape or not all(
         np.array_equal(getattr(original, name)[states], getattr(shaped, name)[states])
-        for name in names
+        for name in moves
     ):
         return None, None
     ours, theirs = (

@@ -46,13 +46,13 @@ def crossing(stop=1.0):
 def test_a_bonus_for_stopping_by_hand(bonus, same, discounted, judged, factor):
     found = discounted_effect(crossing(), crossing(1.0 + bonus), 0.5, 10)
     assert (found.is_same, found.optimum) == (same, 1.5)
-    assert ((found.best, found.worst), found.judged) == (discounted, judged)
+    assert (found.returns, found.judged) == (discounted, judged)
     assert found.judged_before == (3.0, 3.0)
     assert found.differs.tolist() == [not same, False]
     assert found.factor == factor
     # Without a discount, to go on earns 3, and no such bonus changes that.
     later = effect_under_limit(crossing(), crossing(1.0 + bonus), 10)
-    assert (later.is_same, later.optimum, later.best, later.worst) == (True, 3.0, 3.0, 3.0)
+    assert (later.is_same, later.optimum, later.returns) == (True, 3.0, (3.0, 3.0))
 
 
 def test_a_bonus_that_can_be_collected_again_and_again_changes_the_optimum():
@@ -63,7 +63,7 @@ def test_a_bonus_that_can_be_collected_again_and_again_changes_the_optimum():
     looping = replace(original, reward=original.reward + bonus)
     found = discounted_effect(original, looping, 0.9, 6)
     assert found.optimum == pytest.approx(-0.1 + 0.9)
-    assert found.best == pytest.approx(-0.1 / (1 - 0.9))  # to and fro for ever
+    assert found.returns[0] == pytest.approx(-0.1 / (1 - 0.9))  # to and fro for ever
     assert found.judged == pytest.approx((-0.6, -0.6))
     assert found.optimal.tolist() == [[False, True], [False, True]]
     assert found.shaped.tolist() == [[False, True], [True, False]]
@@ -71,7 +71,7 @@ def test_a_bonus_that_can_be_collected_again_and_again_changes_the_optimum():
     assert gains == pytest.approx([0, 0.9 + 0.6])
     limited = effect_under_limit(original, looping, 6)
     # Five rewards for coming nearer, and not the sixth but the goal.
-    assert (limited.best, limited.worst) == pytest.approx((-0.5 + 1, -0.5 + 1))
+    assert limited.returns == pytest.approx((-0.5 + 1, -0.5 + 1))
     assert not limited.is_same
 
 
@@ -93,8 +93,7 @@ def test_a_potential_costs_nothing_and_is_found(data, model, discount, factor):
     found = discounted_effect(model, shaped_by(model, potential, discount, factor), discount, 5)
     assert found.is_same
     assert (found.optimal == found.shaped).all()
-    assert found.best == pytest.approx(found.optimum, abs=1e-9)
-    assert found.worst == pytest.approx(found.optimum, abs=1e-9)
+    assert found.returns == pytest.approx((found.optimum,) * 2, abs=1e-9)
     assert found.judged == pytest.approx(found.judged_before, abs=1e-9)
     assert found.factor is not None
     rest = shaped_by(model, found.potential, discount, found.factor).expected_reward
@@ -114,7 +113,7 @@ def test_a_potential_costs_nothing_without_a_discount_if_episodes_end_in_time(da
     shaped = shaped_by(onward, potential, 1.0, factor)
     found = effect_under_limit(onward, shaped, model.n_states)
     assert found.is_same
-    assert (found.best, found.worst) == pytest.approx((found.optimum,) * 2, abs=1e-9)
+    assert found.returns == pytest.approx((found.optimum,) * 2, abs=1e-9)
 
 
 def test_a_potential_that_is_not_0_where_time_runs_out_changes_what_is_optimal():
@@ -122,7 +121,7 @@ def test_a_potential_that_is_not_0_where_time_runs_out_changes_what_is_optimal()
     original = chain(rewards, ends, [[0, 1], [1, 1]])
     found = effect_under_limit(original, shaped_by(original, np.array([0.0, 1.0]), 1.0), 3)
     assert found.differs.tolist() == [True, False]
-    assert (found.optimum, found.best, found.worst) == (0.0, 0.0, 0.0)
+    assert (found.optimum, found.returns) == (0.0, (0.0, 0.0))
 
 
 @given(st.data(), models(states=3, actions=2), st.sampled_from(DISCOUNTS))
@@ -147,8 +146,8 @@ def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount)
     returns = np.array([policy_return(model, p, None, discount).expected_return for p in policies])
     ours, theirs = are_optimal(model.reward), are_optimal(shaped.reward)
     assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
-    assert found.best == pytest.approx(returns[theirs].max(), abs=1e-9)
-    assert found.worst == pytest.approx(returns[theirs].min(), abs=1e-9)
+    ends = returns[theirs].max(), returns[theirs].min()
+    assert found.returns == pytest.approx(ends, abs=1e-9)
     assert found.is_same == (ours == theirs).all()
 
 
@@ -168,10 +167,10 @@ def test_best_and_worst_under_a_limit_are_those_of_all_optimal_policies(data, mo
     )
     ours, theirs = returns >= returns.max() - 1e-9, others >= others.max() - 1e-9
     assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
-    assert found.best == pytest.approx(returns[theirs].max(), abs=1e-9)
-    assert found.worst == pytest.approx(returns[theirs].min(), abs=1e-9)
+    ends = returns[theirs].max(), returns[theirs].min()
+    assert found.returns == pytest.approx(ends, abs=1e-9)
     assert found.is_same == (ours == theirs).all()
-    for policy, value in ((found.policy, found.optimum), (found.worst_policy, found.worst)):
+    for policy, value in ((found.policy, found.optimum), (found.worst_policy, ends[1])):
         assert policy_return(model, policy, horizon).expected_return == pytest.approx(
             value, abs=1e-9
         )
@@ -182,7 +181,7 @@ def test_where_training_never_comes_every_action_may_be_taken():
     found = discounted_effect(
         crossing(), replace(crossing(), initial=np.array([0.0, 1.0])), 0.5, 10
     )
-    assert (found.differs.tolist(), found.worst) == ([True, False], 1.0)
+    assert (found.differs.tolist(), found.returns) == ([True, False], (1.5, 1.0))
 
 
 def test_rewards_times_a_negative_number_are_no_potential():
