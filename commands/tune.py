@@ -393,6 +393,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
 def print_opened(context: RunContext, opened: OpenTuning) -> None:
     """Say what there is to do, and on which engines."""
     from pipeline.train_spec import NETWORKS
+    from tuning.retesting import unproven_mark
     from tuning.suggesting import planned_run, shipped_run
 
     tell = partial(say, context.console)
@@ -402,6 +403,8 @@ def print_opened(context: RunContext, opened: OpenTuning) -> None:
         f"{opened.queue.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them "
         f"there already; {suggestions.n_free} settings to choose; {context.words}, in {opened.root}"
     )
+    if mark := unproven_mark(tuning):
+        tell(f"scores are{mark}")
     for name in suggestions.space.widened:
         tell(f"{name}: the search space is widened to hold the shipped value")
     if tuning.agent.algo not in NETWORKS:
@@ -441,8 +444,6 @@ def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> Non
     """Print what the re-test shows: a table, and what follows from it."""
     from rich.table import Table
 
-    from tuning.retesting import unproven_mark
-
     held_out = opened.tuning.held_out
     console.print()
     title = f"re-test on the seeds {held_out.start} to {held_out.stop - 1}"
@@ -465,8 +466,6 @@ def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> Non
     if outcome.optimism is not None:
         optimism = "optimism of the search, its best there less the same on other seeds"
         say(console, f"{optimism}: {round(outcome.optimism, 9):+.4g}")
-    if mark := unproven_mark(opened.tuning):
-        say(console, f"scores are{mark}")
     if outcome.winner is None:
         say(console, f"no winner: {outcome.reason}; they stay as they are")
 
