@@ -177,7 +177,7 @@ class Compared:
                     told = "best is {}, with the changes {}; {}".format(*sets, told)
                 yield f"  {place['state']}: {told}"
             if not found.is_same and not met:
-                yield "  optimal policies do not come to these states"
+                yield "  nothing is lost wherever policies come that are optimal with the changes"
             yield f"  {_cost(found, optimum)}"
         for discount, found in self.effects.items():
             if discount < 1:
