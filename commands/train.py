@@ -476,7 +476,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
     from rich.table import Table
 
-    from commands.terminal import describe, episodes, print_rows, say
+    from commands.terminal import describe, describe_others, episodes, print_rows, say
     from pipeline.runs import FINISHED
 
     taken = outcome.taken.cpu_seconds
@@ -490,6 +490,8 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
         rows.append(("regret", describe_pulls(outcome.pulls)))
     if outcome.final is not None:
         rows.append(("final", describe(outcome.final)))
+        if outcome.final.others is not None and (others := describe_others(outcome.final.others)):
+            rows.append(("beside", others))
     if outcome.best_return is not None:
         over = f" over {episodes(outcome.best_episodes)}" if outcome.best_episodes else ""
         best = f"return {outcome.best_return:.2f}{over}, first at step {outcome.best_timesteps:,}"

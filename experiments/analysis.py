@@ -367,6 +367,13 @@ class AgentAnalysis:
     changes: tuple[str, ...] = ()
     #: When it reached the threshold for good; likewise.
     steps_to_stay: ThresholdSummary | None = None
+    #: Exact returns of the policy that it acts by in training, and what that is; None if unknown.
+    stochastic: Estimate | None = None
+    acts_by: str = ""
+    #: Exact returns of the final policy under the agent's discount, and the highest one under it.
+    discounted: Estimate | None = None
+    discount: float | None = None
+    discounted_optimum: float | None = None
 
     @property
     def marked(self) -> str:
@@ -402,6 +409,7 @@ class EnvironmentAnalysis:
     look: Standing = field(default_factory=Standing)  #: the look at these runs
     #: The lower end of the optimum's bracket; None without a bracket.
     optimum_at_least: float | None = None
+    optimum_is_proven: bool = True  #: whether the upper end of that bracket is proven
     #: The optima by agent, if agents play environments with different optima; else empty.
     optima: Mapping[str, float] = field(default_factory=dict)
     advice: tuple[str, ...] = ()  #: sentences on runs that failed, see `experiments.analysis`
@@ -494,6 +502,7 @@ def _analyse_environment(
         seeds=evidence.seeds,
         look=look,
         optimum_at_least=evidence.optimum_at_least,
+        optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # None is none
         optima=_differing_optima(table),
         ends=evidence.ends,
         is_score=evidence.is_score,
@@ -618,7 +627,18 @@ def _analyse_agent(
             if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
         ),
         changes=_recorded_changes(results, agent, environment),
+        stochastic=mean("stochastic_return") if table["stochastic_return"].notna().any() else None,
+        acts_by=_only(table["acts_by"]),
+        discounted=mean("discounted_return") if table["discounted_return"].notna().any() else None,
+        discount=_first(table, "discount"),
+        discounted_optimum=_first(table, "discounted_optimum"),
     )
+
+
+def _only(texts: pd.Series) -> str:
+    """The text that is the same in all runs; empty if it differs."""
+    found = texts.dropna().unique()
+    return str(found[0]) if len(found) == 1 else ""
 
 
 def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:

@@ -53,6 +53,8 @@ _FINAL_FIGURES = (
     "gap",
     "score",
 )
+# Missing in runs of earlier versions, and where figures are sampled.
+_OTHER_RETURNS = ("stochastic_return", "discount", "discounted_return", "discounted_optimum")
 # The last ones only if the optimum is bracketed.
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
 _MAPS = {
@@ -149,7 +151,7 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
         raise DamagedFileError(run.info_path, f"is damaged: it lacks {missing[0]}")
     given = {name: info[name] for name in (*required, *_OPTIONAL) if name in info}
     given.pop("final", None)
-    figures = {name: final[name] for name in _FINAL_FIGURES if name in final}
+    figures = {name: final[name] for name in (*_FINAL_FIGURES, *_OTHER_RETURNS) if name in final}
     for name, value in (given | figures).items():
         if not (value is None or _is_figure(value)):
             raise DamagedFileError(run.info_path, f"is damaged: {name} is no figure")
@@ -163,6 +165,7 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
 
 def _check_texts(run: Run, info: Mapping[str, Any]) -> None:
     texts = [info.get("engine") or "", info.get("model_refused") or ""]
+    texts.append((info.get("final") or {}).get("acts_by") or "")
     for name in ("versions", "machine"):
         named = info.get(name, {})
         texts += named.values() if isinstance(named, dict) else [None]
@@ -320,9 +323,15 @@ RUN_COLUMNS = (
     "exact",  # whether these are exact expectations, not means of episodes
     "optimum",
     "optimum_at_least",  # lower end of a bracket; ``optimum`` is then the upper end
+    "optimum_is_proven",  # whether that upper end is proven
     "baseline",
     "gap",  # optimum minus final
     "score",  # final return, scaled: 0 is the best random or constant policy, 1 the optimum
+    "acts_by",  # what the agent acts by in training: "epsilon 0.01", "its own distribution"
+    "stochastic_return",  # exact, of the policy that it acts by in training
+    "discount",  # the agent's
+    "discounted_return",  # exact, of the final policy under that discount
+    "discounted_optimum",  # the highest one under it
     "best",  # highest return of an evaluation during training
     "best_timesteps",
     "area",  # mean return over the learning curve
@@ -343,7 +352,10 @@ RUN_COLUMNS = (
 )
 
 # Columns with the same name in ``run.json``.
-_FIGURES = ("success_rate", "exact", "optimum", "optimum_at_least", "baseline", "gap", "score")
+_FIGURES = (
+    *("success_rate", "exact", "optimum", "optimum_at_least", "optimum_is_proven", "baseline"),
+    *("gap", "score", "acts_by", *_OTHER_RETURNS),
+)
 
 
 def read_results(

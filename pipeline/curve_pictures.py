@@ -122,7 +122,8 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
 
 def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
     least = yardstick.at_least
-    lines = [("optimum" if least is None else "optimum, at most", yardstick.optimum, "-")]
+    most = "optimum, at most" if yardstick.is_proven else "optimum, at most (not proven)"
+    lines = [("optimum" if least is None else most, yardstick.optimum, "-")]
     if least is not None:
         lines.append(("optimum, at least", least, "--"))
     lines.append(("best random or constant policy", yardstick.baseline, ":"))

@@ -16,6 +16,7 @@ from pipeline import loading_libraries
 from pipeline.callbacks import PullSummary, summarise_pulls
 from pipeline.curve_pictures import draw_learning_curve, draw_pulls
 from pipeline.errors import UserError, one_line
+from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import value_map
 from pipeline.failures import LibraryError, blame_settings, exits_as_mistakes
@@ -213,7 +214,7 @@ def _judge(training: Training, state: str) -> Evaluation | None:
         return None
     evaluation.take_statistics()
     with evaluation.timed():
-        if isinstance(evaluation.evaluator, SampledEvaluator):
+        if isinstance(evaluation.evaluator, SampledEvaluator | ExactEvaluator):
             return evaluation.evaluator.at_the_end(model)
         return evaluation.evaluator(model)
 

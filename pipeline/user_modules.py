@@ -32,7 +32,7 @@ from safe_files.files import NO_LIMIT, read_file
 _PROJECT = Path(__file__).resolve().parents[1]
 _OWN = (
     "safe_files machine_code mdp verdicts envs agents pipeline diagnosis experiments tuning report "
-    "commands train enjoy compare tune audit"
+    "commands train enjoy explain shaping compare tune audit"
 )
 
 

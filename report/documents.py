@@ -18,7 +18,7 @@ from experiments.results import StudyResults
 from experiments.study import METRIC_WORDS, StudySpec
 from pipeline.errors import visible
 from pipeline.files import replacing, write_text
-from report.conclusions import conclusion, none_has_learnt, on_changes
+from report.conclusions import conclusion, none_has_learnt, on_changes, unproven_sentences
 from report.words import (
     enumeration,
     interval,
@@ -209,6 +209,7 @@ def _legend(analysis: StudyAnalysis) -> str:
         names = [one.environment for one in environments if one.optimum_at_least is not None]
         if names:
             what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
+            what = " ".join([what, *unproven_sentences(environments)])
     else:
         what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
     text = (

@@ -18,6 +18,7 @@ from typing import Any, cast
 import yaml
 from optuna.trial import FrozenTrial, TrialState
 
+from envs.brackets import upper_is_proven
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.study import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.digests import DamagedFileError
@@ -299,6 +300,12 @@ def _figure(value: float | None) -> str:
     return "nothing" if value is None else f"{value:.4g}"
 
 
+def unproven_mark(tuning: TuningSpec) -> str:
+    """What is said of scores that go by an upper end without a proof; empty for others."""
+    is_proven = tuning.figure != "score" or upper_is_proven(tuning.environment.env_id)
+    return "" if is_proven else " by a bracket whose upper end is not proven"
+
+
 def _held_out(tuning: TuningSpec, each: Retested) -> str:
     """The held-out figure with an interval, in words."""
     found, text = each.interval, _figure(each.held_out)
@@ -309,6 +316,7 @@ def _held_out(tuning: TuningSpec, each: Retested) -> str:
     # Quartiles and times to a threshold have no intervals.
     statistic = "interquartile mean" if tuning.objective == "iqm" else "mean"
     of_what = f"{statistic} of {tuning.figure if tuning.figure in METRICS else 'score'}"
+    of_what += unproven_mark(tuning)
     return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs{failed})"
 
 
@@ -323,6 +331,7 @@ def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> di
         "command": command,
         "asked": place.study.user_attrs.get(ASKED),
         "figure": tuning.figure,
+        **({"figure_mark": mark} if (mark := unproven_mark(tuning)) else {}),
         "objective": tuning.objective,
         "lower_is_better": tuning.is_cost,
         "n_trials": place.queue.n_trials,

@@ -88,6 +88,7 @@ def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
                 "label": environment.environment,
                 "optimum": environment.optimum,
                 "optimum_at_least": environment.optimum_at_least,
+                "optimum_is_proven": environment.optimum_is_proven,
                 "baseline": environment.baseline,
                 "agents": [agent.agent for agent in environment.agents],
             }

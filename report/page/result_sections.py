@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,10 +21,11 @@ from report.conclusions import (
     overall_sentences,
     pairs_both_ways,
     places_without_a_run,
+    unproven_sentences,
 )
 from report.documents import MARKUPS, verdicts_as
 from report.page.frame import Report, Section, setting
-from report.ranking import COLUMNS, Row, filled
+from report.ranking import COLUMNS, OTHER_RETURNS, Column, Row, filled
 from report.series import (
     AgentRuns,
     Curve,
@@ -167,10 +168,20 @@ def ranking(report: Report) -> Section | None:
 
 
 def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Any]:
-    """Headings, and by agent the cells below them."""
+    """The ranking, the table below it, and what there is to say of training."""
     rows = [Row(agent, environment) for agent in environment.agents]
-    columns = filled([column for column in COLUMNS if column.page], rows)
-    threshold = number(environment.threshold)
+    has_others = any(agent.stochastic or agent.discounted for agent in environment.agents)
+    return {
+        **_table(study, [column for column in COLUMNS if column.page], rows),
+        "others": _table(study, OTHER_RETURNS, rows) if has_others else None,
+        "changes": on_changes([environment]),
+    }
+
+
+def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
+    """Headings, and by agent the cells below them."""
+    shown = filled(columns, rows)
+    threshold = number(rows[0].environment.threshold) if rows else ""
     return {
         "headings": [
             {
@@ -178,12 +189,11 @@ def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, An
                 "help": column.help.format(threshold=threshold),
                 "order": column.order(study),
             }
-            for column, _ in columns
+            for column, _ in shown
         ],
         "rows": [
-            (row.agent, [cells[place] for _, cells in columns]) for place, row in enumerate(rows)
+            (row.agent, [cells[place] for _, cells in shown]) for place, row in enumerate(rows)
         ],
-        "changes": on_changes([environment]),
     }
 
 
@@ -264,7 +274,12 @@ def overall(report: Report) -> Section | None:
         {agent.agent: agent.score.mean for agent in one.agents if agent.score is not None}
         for one in report.analysis.environments
     ]
-    context = {"agents": agents, "scores": scores, "probabilities": overall.improvement}
+    context = {
+        "agents": agents,
+        "scores": scores,
+        "probabilities": overall.improvement,
+        "unproven": unproven_sentences(report.analysis.environments),
+    }
     data = {
         "agents": agents,
         "means": [{"agent": agent, **vars(overall.scores[agent].mean)} for agent in agents],

@@ -15,6 +15,7 @@ from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
 
 from experiments.results import Curve, RunResults
+from experiments.study import EnvironmentSpec
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
 from tuning import searching
@@ -28,6 +29,7 @@ from tuning.retesting import (
     entry_text,
     optimism,
     retest_study,
+    unproven_mark,
     write_winner,
 )
 from tuning.searching import UnjudgedError, outcome_of
@@ -413,6 +415,21 @@ def retested(number, held_out, verdict="undecided", in_search=0.9, n_runs=20, n_
     interval = Estimate(held_out or 0.0, 0.5, 0.9, 20)
     n_runs = 0 if held_out is None else n_runs
     return Retested(label, number, in_search, held_out, interval, verdict, n_runs, n_failed)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "figure", "is_marked"),
+    [
+        ("Acrobot-v1", "score", True),
+        ("Acrobot-v1", "final", False),
+        ("CartPole-v1", "score", False),
+    ],
+)
+def test_scores_by_an_upper_end_without_a_proof_are_marked(toy, env_id, figure, is_marked):
+    tuning = toy.tuning(figure=figure)
+    study = replace(tuning.study, environments=(EnvironmentSpec(env_id, env_id),))
+    mark = unproven_mark(replace(tuning, study=study))
+    assert ("not proven" in mark) is is_marked
 
 
 def test_seeds_of_the_search_and_of_the_re_test_are_apart(toy):
