@@ -385,6 +385,7 @@ def main() -> int:
     if missing:
         raise SystemExit(f"{', '.join(missing)} missing: apt-get install slurm-wlm munge")
     folder = Path(tempfile.mkdtemp(prefix="slurm-campaign-"))
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends the daemons
     is_whole = campaign(folder, args)
     if is_whole:
         shutil.rmtree(folder, ignore_errors=True)

@@ -13,15 +13,14 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from importlib.metadata import Distribution, PackageNotFoundError, distribution
-from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.digests import digest_of
 from pipeline.user_modules import UserModule, files_of, is_ours, named_in
 
 if TYPE_CHECKING:
+    from importlib.metadata import Distribution
+
     from pipeline.train_spec import TrainSpec
 
 DISTRIBUTIONS = "distributions"  # fields of ``run.json``
@@ -57,6 +56,8 @@ def _normal(name: str) -> str:
 
 
 def _installed(name: str) -> Distribution | None:
+    from importlib.metadata import PackageNotFoundError, distribution
+
     try:
         return distribution(name)
     except PackageNotFoundError:
@@ -88,23 +89,14 @@ def _distributions_with(top: str) -> tuple[str, ...]:
     """The distributions with a module of that name."""
     if top in sys.stdlib_module_names or _normal(top) in distributions() or is_ours(top):
         return ()
-    if _installed(top) is not None:
-        return (_normal(top),)
-    return _by_module().get(top, ()) if _is_found(top) else ()
-
-
-def _is_found(top: str) -> bool:
-    try:
-        return find_spec(top) is not None
-    except (ImportError, ValueError):
-        return False
+    return (top,) if _installed(top) is not None else _by_module().get(top, ())
 
 
 @cache
 def _by_module() -> Mapping[str, tuple[str, ...]]:
     from importlib.metadata import packages_distributions  # which takes 0.2 s
 
-    return {k: tuple(sorted(set(map(_normal, v)))) for k, v in packages_distributions().items()}
+    return {top: tuple(names) for top, names in packages_distributions().items()}
 
 
 def digests_of_module(module: UserModule) -> dict[str, str]:
@@ -124,27 +116,16 @@ def recorded_code(modules: Iterable[UserModule]) -> dict[str, Any]:
 
 def files_in_settings(spec: TrainSpec) -> list[str]:
     """The texts in a run's hyperparameters that are paths of files, such as the log of a bandit."""
-    texts = sorted(set(_texts(spec.saved_hyperparams)))
-    return [t for t in texts if (os.sep in t or Path(t).suffix) and _is_file(t)]
-
-
-def _is_file(text: str) -> bool:
-    try:
-        return Path(text).is_file()
-    except (OSError, ValueError):
-        return False
+    texts = {text for text in _texts(spec.saved_hyperparams) if os.sep in text or "." in text}
+    return sorted(text for text in texts if os.path.isfile(text))  # noqa: PTH113  # never raises
 
 
 def _texts(value: Any) -> Iterator[str]:
-    match value:
-        case str():
-            yield value
-        case Mapping():
-            for item in value.values():
-                yield from _texts(item)
-        case list() | tuple():
-            for item in value:
-                yield from _texts(item)
+    if isinstance(value, Mapping | list | tuple):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(item)
+    elif isinstance(value, str):
+        yield value
 
 
 def digest_of_lines(versions: Mapping[str, str]) -> str:

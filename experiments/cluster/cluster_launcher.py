@@ -351,7 +351,8 @@ class ClusterLauncher:
             if isinstance(error, KilledWorker):
                 sent.lose(sent.worker in self._left)
             else:
-                self._look_at(self.connection.n_threads())
+                with contextlib.suppress(Exception):  # the scheduler may be lost just now
+                    self._look_at(self.connection.n_threads())
                 if sent.n_aside == self._n_aside:  # otherwise that worker may have failed it
                     sent.refuse(one_line(error))
         else:

@@ -19,6 +19,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -214,7 +215,7 @@ def has_certificates(security: Security) -> bool:
 @contextlib.contextmanager
 def opened_queue(queue: JobQueue, root: Path) -> Iterator[Any]:
     """Start jobs with a scheduler in this process; makes certificates if none are given."""
-    settings = {**_defaults(queue.system), **queue.settings, **_retiring(queue)}
+    settings = {**_defaults(queue.system), **queue.settings, **retiring(queue)}
     words = settings["worker-extra-args"] or []
     if not any("dashboard" in str(word) for word in words):
         closed = f"{ClosedWorker.__module__}.{ClosedWorker.__name__}"
@@ -246,8 +247,13 @@ def opened_queue(queue: JobQueue, root: Path) -> Iterator[Any]:
                 )
         except (ValueError, TypeError, OSError, RuntimeError) as error:
             raise UserError(f"{queue.file}: {one_line(error)}") from error
-        with opened:
-            yield opened
+        try:
+            with opened:
+                yield opened
+        finally:
+            for name in ("ca_file", "cert", "key"):  # dask-jobqueue's files, which it never closes
+                with contextlib.suppress(AttributeError):
+                    getattr(opened, f"_job_{name}").close()
 
 
 @contextlib.contextmanager
@@ -273,20 +279,25 @@ def _folder_for_keys(typed: str) -> Iterator[str]:
 class Jobs:
     """Keeps the wanted number of jobs, and replaces jobs that have ended.
 
-    Dask itself notices the end of a job only if the job has a single worker.
+    Dask itself notices the end of a job only if the job has a single worker. If ``listed`` returns
+    the numbers of existing jobs, jobs that ended before they had workers are replaced too.
     """
 
-    def __init__(self, queue: Any, n_jobs: int) -> None:
-        self._queue, self._n_jobs = queue, n_jobs
+    def __init__(
+        self, queue: Any, n_jobs: int, listed: Callable[[], Collection[str] | None] = lambda: None
+    ) -> None:
+        self._queue, self._n_jobs, self._listed = queue, n_jobs, listed
         self._seen: dict[str, tuple[set[str], float]] = {}  # by job: its workers, and the time
+        self._unlisted: set[str] = set()  # jobs that the system did not list at the last look
         queue.scale(jobs=n_jobs)
 
     def replace(self, left: Collection[str]) -> None:
         """Replace jobs whose workers are lost; not those that left in good order."""
-        self._queue.loop.add_callback(self._replace, frozenset(left))
+        self._queue.loop.add_callback(self._replace, frozenset(left), self._listed())
 
-    def _replace(self, left: frozenset[str]) -> None:
+    def _replace(self, left: frozenset[str], listed: Collection[str] | None) -> None:
         jobs, now = self._queue.workers, time.monotonic()
+        before, self._unlisted = self._unlisted, set()
         for name, there in self._workers_of_jobs().items():
             if there:
                 self._seen[name] = (there, now)
@@ -294,8 +305,16 @@ class Jobs:
                 workers, last = self._seen[name]
                 if workers <= left or now > last + SECONDS_TO_RESTART:
                     del self._seen[name]
-                    self._queue._futures.add(asyncio.ensure_future(jobs.pop(name).close()))
+                    self._close(name)
+            elif listed is not None and name in jobs and str(jobs[name].job_id) not in listed:
+                if name in before:
+                    self._close(name)
+                else:  # it may have been sent after the list was made
+                    self._unlisted.add(name)
         self._queue.scale(jobs=self._n_jobs)
+
+    def _close(self, name: str) -> None:
+        self._queue._futures.add(asyncio.ensure_future(self._queue.workers.pop(name).close()))
 
     def _workers_of_jobs(self) -> dict[str, set[str]]:
         """The addresses of existing workers by job."""
@@ -305,6 +324,16 @@ class Jobs:
             job: {each.address for each in workers if f"{each.name}-".startswith(f"{job}-")}
             for job in self._queue.worker_spec
         }
+
+
+def listed_by_slurm() -> list[str] | None:
+    """The numbers of this user's waiting and running jobs; None without an answer."""
+    words = ["squeue", "--noheader", "--me", "--format=%A"]
+    try:
+        done = subprocess.run(words, capture_output=True, timeout=30, check=True)  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.decode().split()
 
 
 def _library() -> ModuleType:
@@ -322,7 +351,7 @@ def _defaults(system: str) -> dict[str, Any]:
     return found
 
 
-def _retiring(queue: JobQueue) -> dict[str, Any]:
+def retiring(queue: JobQueue) -> dict[str, Any]:
     """Options that make workers retire before their job ends, unless the file sets them."""
     words = queue.settings.get("worker-extra-args") or []
     settings = {**_defaults(queue.system), **queue.settings}
@@ -499,7 +528,7 @@ def opened(cluster: Cluster, root: Path) -> Iterator[tuple[Connect, Replace]]:
     else:
         n_jobs = math.ceil(cluster.n_workers / cluster.n_cores)
         with opened_queue(cluster, root) as queue:
-            jobs = Jobs(queue, n_jobs)
+            jobs = Jobs(queue, n_jobs, *([listed_by_slurm] if cluster.system == "slurm" else []))
             yield lambda: Client(queue, set_as_default=False), jobs.replace
 
 

@@ -114,7 +114,7 @@ class SentCode:
     def of(cls, spec: TrainSpec) -> Self:
         """The code of a run."""
         more, modules = _of_modules(spec.user_modules)
-        files = {text: _digest(Path(text)) for text in files_in_settings(spec)}
+        files = {text: _first_digest(Path(text).absolute()) for text in files_in_settings(spec)}
         return cls(digest_of_lines(versions(*more)), more, modules, files)
 
     def as_data(self) -> dict[str, Any]:
@@ -150,6 +150,12 @@ def _of_modules(
 ) -> tuple[tuple[str, ...], tuple[SentModule, ...]]:
     """The user's modules as they are at the first call: later changes do not enter a study."""
     return imported_distributions(modules), tuple(map(SentModule.of, modules))
+
+
+@cache
+def _first_digest(path: Path) -> str:
+    """The digest of a file at the first call, likewise."""
+    return digest_of(path)
 
 
 def _digest(path: Path) -> str:

@@ -59,8 +59,8 @@ def write_module(folder, name, reward):
     (folder / f"{helper}.py").write_text(f"REWARD = {reward:.1f}\n")
 
 
-def runs_of(root, modules=(), env_id="FrozenLake-v1"):
-    environments = (EnvironmentSpec("e", env_id, {"n_timesteps": 50}),)
+def runs_of(root, modules=(), env_id="FrozenLake-v1", **env_kwargs):
+    environments = (EnvironmentSpec("e", env_id, {"n_timesteps": 50, "env_kwargs": env_kwargs}),)
     names = {"gym_packages": tuple(m.name for m in modules), "user_modules": tuple(modules)}
     agents = (AgentSpec("mine", "qlearning", tuned=False),)
     return plan(StudySpec("s", "S", agents, environments, 2, **names), root)
@@ -223,6 +223,40 @@ def test_the_last_fit_worker_is_replaced_by_another(tmp_path, scheduler):
         assert not any(future.done() for future in futures)
         with worker(scheduler, tmp_path / "w2"):
             assert [future.result(timeout=60) for future in futures] == [None, None]
+
+
+# --- A worker that is asked to end, as by a queue before it kills a job, leaves in good order.
+
+LEAVING = """
+import multiprocessing, os, pathlib, signal, time
+import gymnasium as gym
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+
+class Leaving(FrozenLakeEnv):
+    def __init__(self, marks, **kwargs):
+        super().__init__(**kwargs)
+        self.marks = pathlib.Path(marks)
+
+    def reset(self, **kwargs):
+        parent, n_marks = multiprocessing.parent_process(), len(list(self.marks.iterdir()))
+        if parent is not None and n_marks < 3:
+            (self.marks / str(n_marks)).touch()
+            os.kill(parent.pid, signal.SIGTERM)
+            time.sleep(60)
+        return super().reset(**kwargs)
+
+gym.register("Leaving-v0", Leaving, max_episode_steps=20)
+"""
+
+
+def test_workers_that_are_asked_to_end_are_no_loss_however_many(tmp_path, scheduler):
+    (tmp_path / "leaving_lake.py").write_text(LEAVING)
+    (tmp_path / "marks").mkdir()
+    modules = import_typed([str(tmp_path / "leaving_lake.py")])
+    runs = runs_of(tmp_path / "study", modules, "Leaving-v0", marks=str(tmp_path / "marks"))
+    with worker(scheduler, tmp_path / "w"):
+        assert len(done(scheduler, tmp_path / "study", runs[:1])[0]) == 1
+    assert len(list((tmp_path / "marks").iterdir())) == 3
 
 
 # --- What is compared.
