@@ -257,9 +257,10 @@ class Study:
         return sum(1 for _ in self.folder.glob(f"slurm/{self.name}/runs/*/*/run.json"))
 
     @property
-    def has_begun(self) -> bool:
-        """Whether a run is under way."""
-        return any(self.folder.glob(f"slurm/{self.name}/.drafts/*/run.json"))
+    def drafts(self) -> set[str]:
+        """The runs that are under way, or were; by the processes that do them."""
+        places = self.folder.glob(f"slurm/{self.name}/.drafts/*/run.json")
+        return {path.parent.name for path in places}
 
     def suffer(self, fault: str) -> str:
         """Do what a fault says; returns what came of it."""
@@ -302,14 +303,14 @@ def disturbed(study: Study, faults: Sequence[tuple[int, str]]) -> None:
 
 def cancelled(study: Study, n_times: int) -> None:
     """Let one long run end whose job is cancelled so many times."""
-    n_left, seen, until = n_times, set[str](), time.monotonic() + MOST_SECONDS
+    n_left, begun, until = n_times, set[str](), time.monotonic() + MOST_SECONDS
     while study.process.poll() is None and time.monotonic() < until:
         time.sleep(0.5)
-        jobs = [job for job in study.cluster.jobs() if job not in seen]
-        if n_left and jobs and study.has_begun:
+        if n_left and study.drafts - begun:
             time.sleep(5)  # it learns for a while
-            seen.update(jobs)
+            begun |= study.drafts
             n_left -= 1
+            jobs = study.cluster.jobs()
             for job in jobs:
                 study.cluster.said("scancel", job)
             print(f"  long run: jobs {', '.join(jobs)} cancelled", flush=True)
