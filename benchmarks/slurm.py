@@ -283,8 +283,8 @@ class Study:
                 _kill(pid)
             return f"of job {job}"
         if fault == "preempt":
-            words = ["-p", "urgent", "-N", "1", "--exclusive", "-o", "/dev/null", "--wrap"]
-            return cluster.said("sbatch", *words, "sleep 3").strip()
+            urgent = ["-p", "urgent", "-N", "1", "--exclusive", "--no-requeue", "-o", "/dev/null"]
+            return cluster.said("sbatch", *urgent, "--wrap", "sleep 3").strip()
         words = ("scontrol", "requeue", job) if fault == "requeue" else ("scancel", job)
         return f"job {job} {cluster.said(*words).strip()}"
 

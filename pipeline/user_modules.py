@@ -82,9 +82,9 @@ class _TypedFolder(MetaPathFinder):
 def _search(folder: str, typed: str) -> None:
     """Search a folder for a typed top-level module, and for modules that its code names."""
     for finder in sys.meta_path:
-        is_last = isinstance(finder, _TypedFolder) and not finder.is_first
-        if is_last and finder.folder == folder:
-            finder.names.add(typed)
+        ours = finder if isinstance(finder, _TypedFolder) else None
+        if ours and ours.folder == folder and not ours.is_first:
+            ours.names.add(typed)
             return
     sys.meta_path.append(_TypedFolder(folder, [typed]))
 
