@@ -15,6 +15,7 @@ import os
 import re
 import shlex
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -248,6 +249,7 @@ def _refused(typed: str, reason: str) -> UserError:
 COPIES = "modules"  # the folder in a run for copies of modules
 SENT = "yardstick-modules"  # the folder on a worker for modules that a driver has sent
 MAX_COPY_BYTES = 1_000_000  # of a module, with its imports from beside it
+_parsing = threading.Lock()  # in several threads at once, Python 3.11 raises SystemError
 _OF_LIBRARIES = ("site-packages", "dist-packages")  # folders of installed distributions
 _FOLDERS_ABOVE = 3  # parent folders of a run's pack to search for a study's modules
 
@@ -310,7 +312,8 @@ def _folder_of(module: UserModule) -> Path | None:
 def named_in(path: Path) -> Iterator[str]:
     """The modules that a file imports, or names in texts such as ``"module:Class"``."""
     try:
-        tree = ast.parse(path.read_bytes())
+        with _parsing:
+            tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError, RecursionError):
         return
     for node in ast.walk(tree):
