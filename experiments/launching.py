@@ -156,8 +156,11 @@ def _do_planned_run(planned: PlannedRun, root: Path, command: str, home: Path) -
     # A slow import that a supervisor does not need.
     from experiments.run_in_child import do_run
 
-    if home.parts:
+    if home.parts:  # on a worker, which has compared the modules with the driver's
+        from pipeline.user_modules import import_checked
+
         os.chdir(home)
+        import_checked(planned.spec.user_modules)
     hold(root)
     do_run(planned, draft_path(root, planned), command)
 

@@ -25,6 +25,7 @@ from experiments.study import StudySpec
 from mdp.transition_model import Floats
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.errors import one_line
+from pipeline.loaded_code import DISTRIBUTIONS
 from pipeline.runs import Run
 from pipeline.signs_of_life import Tell, tell_nobody
 from safe_files.archives import read_members
@@ -166,7 +167,7 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
 def _check_texts(run: Run, info: Mapping[str, Any]) -> None:
     texts = [info.get("engine") or "", info.get("model_refused") or ""]
     texts.append((info.get("final") or {}).get("acts_by") or "")
-    for name in ("versions", "machine"):
+    for name in ("versions", "machine", DISTRIBUTIONS):
         named = info.get(name, {})
         texts += named.values() if isinstance(named, dict) else [None]
     if not all(isinstance(text, str) for text in texts):
@@ -616,7 +617,7 @@ def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
     """Versions that differ between the ``run.json`` of runs, in a line; empty if none differ."""
     counts: dict[str, Counter[str]] = {}
     for info in infos:
-        for package, version in info.get("versions", {}).items():
+        for package, version in {**info.get(DISTRIBUTIONS, {}), **info.get("versions", {})}.items():
             counts.setdefault(package, Counter())[version] += info.get("n_runs", 1)
     mixed = [
         f"{package} {', '.join(_counted(*item) for item in sorted(found.items()))}"

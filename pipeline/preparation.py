@@ -45,6 +45,7 @@ from pipeline.evaluation.sampled import SampledEvaluator, n_environments, takes_
 from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal
 from pipeline.failures import exits_as_mistakes
 from pipeline.files import naming
+from pipeline.loaded_code import recorded_code
 from pipeline.models.choose import (
     continuing,
     load_to_continue,
@@ -260,6 +261,7 @@ def _record_beginning(
         spec=spec.as_data(),
         versions=recorded_versions(),
         machine=recorded_machine(),
+        **recorded_code(spec.user_modules),
         **({} if trained is None else {TRAINED_AGENT: trained.digest}),
         **({} if training.refusal is None else {"model_refused": training.refusal}),
     )
