@@ -83,6 +83,8 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         with closing(sqlite3.connect(path, isolation_level=None)) as database:
             database.execute("PRAGMA trusted_schema = OFF")
             yield database
+    except UserError:
+        raise
     except sqlite3.OperationalError as error:  # locked, or no room on the disk
         raise UserError(f"{path} cannot be used: {one_line(error)}") from error
     except (sqlite3.Error, ValueError, TypeError, KeyError, struct.error, zlib.error) as error:
@@ -102,13 +104,14 @@ def _checked_seeds(path: Path) -> set[int]:
         origins = dict(database.execute("SELECT id, content FROM origins"))
         seeds = set()
         for seed, origin, *content, checksum in database.execute("SELECT * FROM runs"):
-            if checksum != _checksum(seed, origins[origin], content):
+            if checksum != checksum_of(seed, origins[origin], content):
                 raise ValueError(f"seed {seed} is not as it was written")
             seeds.add(seed)
         return seeds
 
 
-def _checksum(seed: int, origin: str, content: Sequence[Any]) -> int:
+def checksum_of(seed: int, origin: str, content: Sequence[Any]) -> int:
+    """The checksum of a row, whose origin is given as its text."""
     return zlib.crc32(repr((seed, origin, tuple(content))).encode())
 
 
@@ -131,7 +134,8 @@ def packed(columns: Sequence[Floats]) -> bytes:
 def _as_whole(column: Floats) -> tuple[int, NDArray[Any]]:
     """The scale with which numbers are whole, from 1, and their steps; 0 if there is none."""
     for code, scale in enumerate(_SCALES, start=1):
-        scaled = np.rint(column * scale)
+        with np.errstate(over="ignore"):
+            scaled = np.rint(column * scale)
         if np.abs(scaled).max(initial=0.0) < 2**53:  # False for NaN
             whole = scaled.astype(np.int64)
             if (whole / scale).tobytes() == column.tobytes():
@@ -181,19 +185,15 @@ def _without_times(content: Sequence[Any]) -> list[Any]:
     return [*figures, *(column.tobytes() for name, column in columns if name not in TIMES)]
 
 
-def _can_fold(planned: PlannedRun) -> bool:
-    """Whether all in the folder is the run's own, and neither a batch nor the pulls of a bandit."""
-    digests = planned.run.files.digests
-    if planned.is_batch or digests is None or PULLS_FILE in digests:
-        return False
+def _is_single(planned: PlannedRun) -> bool:
+    """Whether a run is neither a batch, nor on a bandit, whose figures need all pulls."""
+    return not planned.is_batch and PULLS_FILE not in (planned.run.files.digests or {})
+
+
+def _is_our_own(planned: PlannedRun) -> bool:
+    """Whether all files in the folder are the run's."""
     names = {path.relative_to(planned.path).as_posix() for path in files_below(planned.path)}
-    return names <= {*digests, RECORD, LOCK}
-
-
-def _figures(content: bytes, kind: str) -> dict[str, Floats]:
-    """A curve of a row."""
-    first = KINDS.index(kind) * len(POINTS)
-    return dict(zip(POINTS, unpacked(content)[first:], strict=False))
+    return names <= {*(planned.run.files.digests or {}), RECORD, LOCK}
 
 
 @dataclass(frozen=True)
@@ -208,14 +208,16 @@ class StoredRuns:
         place = bisect_left(self.seeds, seed)
         return place < len(self.seeds) and self.seeds[place] == seed
 
-    def _rows(
-        self, columns: str, first: int | None = None, last: int | None = None
-    ) -> Iterator[Any]:
-        """Columns of the runs from one seed to another, by rising seed."""
-        ends = self.seeds[0] if first is None else first, self.seeds[-1] if last is None else last
+    def _rows(self, columns: str, seeds: Sequence[int] | None = None) -> Iterator[Any]:
+        """Columns of the runs from the first of these seeds to the last, by rising seed.
+
+        If the last one is that of the curves, they are unpacked.
+        """
+        seeds = seeds or self.seeds
+        query = f"SELECT {columns} FROM runs WHERE seed BETWEEN ? AND ? ORDER BY seed"  # noqa: S608
         with _opened(store_path(self.first)) as database:
-            query = f"SELECT {columns} FROM runs WHERE seed BETWEEN ? AND ? ORDER BY seed"  # noqa: S608
-            yield from database.execute(query, ends)
+            for row in database.execute(query, (seeds[0], seeds[-1])):
+                yield (*row[:-1], unpacked(row[-1])) if columns.endswith("curves") else row
 
     def column(self, name: str, study: StudySpec) -> list[Any]:
         """A column of the summary, see `RUN_COLUMNS`."""
@@ -238,25 +240,29 @@ class StoredRuns:
     def _speed_column(self, name: str, study: StudySpec) -> list[Any]:
         if not self._speed:  # all at once: most of the time goes into unpacking the curves
             self._speed.update({column: [] for column in _SPEED})
-            for *final, content in self._rows(", ".join((*_YARDSTICK, "curves"))):
+            for *final, columns in self._rows(", ".join((*_YARDSTICK, "curves"))):
                 known = {k: v for k, v in zip(_YARDSTICK, final, strict=True) if v is not None}
-                curve = _figures(content, "evaluation")
+                curve = dict(zip(POINTS, columns, strict=False))  # of evaluations
                 found = speed_figures(study, self.first.spec.env_id, known, curve)
                 for column in _SPEED:
                     self._speed[column].append(found[column])
         return self._speed.pop(name)
 
-    def curves(
-        self, kind: str, first: int | None = None, last: int | None = None
-    ) -> Iterator[Curve]:
-        """The learning curves of the runs from one seed to another."""
+    def curves(self, seeds: Sequence[int] | None = None) -> Iterator[list[Curve]]:
+        """The curves of evaluations and training of each run, with these seeds or all."""
         labels = {"agent": self.first.agent, "environment": self.first.environment}
-        for seed, content in self._rows("seed, curves", first, last):
-            yield Curve({**labels, "seed": seed, "kind": kind}, _figures(content, kind))
+        for seed, unpacked_curves in self._rows("seed, curves", seeds):
+            columns = iter(unpacked_curves)
+            yield [
+                Curve(
+                    {**labels, "seed": seed, "kind": kind}, dict(zip(POINTS, columns, strict=False))
+                )
+                for kind in KINDS
+            ]
 
     def content(self, seed: int) -> list[Any]:
         """The row of a run, without seed, origin and checksum."""
-        return list(next(self._rows("*", seed, seed))[2:-1])
+        return list(next(self._rows("*", [seed]))[2:-1])
 
     def infos(self) -> list[dict[str, Any]]:
         """What ``run.json`` says of settings and versions, once for all runs that are alike.
@@ -325,7 +331,13 @@ class FigureStore:
         """Store a finished run soon, and then remove its folder; returns whether it will be."""
         with suppress(DamagedFileError, OSError):  # damage is reported when all runs are read
             planned = planned.read()
-            if self.folds and found is not None and _can_fold(planned):
+            stays = planned.seed == self.first_seed
+            if (
+                self.folds
+                and found is not None
+                and _is_single(planned)
+                and (stays or _is_our_own(planned))
+            ):
                 self._waiting.append((planned, *_content_of(planned, found)))
                 now = time.monotonic()
                 if (
@@ -422,7 +434,7 @@ def _write(
         database.execute("INSERT OR IGNORE INTO origins (content) VALUES (?)", (origin,))
         key = "SELECT id FROM origins WHERE content = ?"
         (number,) = database.execute(key, (origin,)).fetchone()
-        row = [planned.seed, number, *content, _checksum(planned.seed, origin, content)]
+        row = [planned.seed, number, *content, checksum_of(planned.seed, origin, content)]
         database.execute(_insertion(), row)
         if planned.seed == first_seed:
             database.execute("INSERT OR IGNORE INTO kept VALUES (?)", (planned.seed,))

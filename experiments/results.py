@@ -338,13 +338,9 @@ class StudyResults:
         size = max(RUNS_IN_A_PIECE // max(len(self.stored), 1), 1)
         for start in range(0, self.study.n_seeds if self.stored else 0, size):
             seeds = self.study.seeds[start : start + size]
-            found = [
-                curve
-                for runs in self.stored.values()
-                for kind in ("evaluation", "training")
-                for curve in runs.curves(kind, seeds[0], seeds[-1])
-            ]
-            yield from sorted(found, key=lambda curve: curve.labels["seed"])
+            found = [run for runs in self.stored.values() for run in runs.curves(seeds)]
+            for run in sorted(found, key=lambda run: run[0].labels["seed"]):
+                yield from run
 
     def infos(self) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
         """By labels, what the runs recorded of settings and versions; of stored runs once."""
@@ -653,7 +649,8 @@ def stored_curves(
 ) -> list[Mapping[str, Floats]]:
     """The learning curves of stored runs, as `curves_by_agent` has those of the others."""
     runs = results.stored.get((agent, environment))
-    return [] if runs is None else [curve.figures for curve in runs.curves(kind)]
+    which = int(kind == "training")
+    return [] if runs is None else [run[which].figures for run in runs.curves()]
 
 
 def mean_curve(

@@ -141,7 +141,7 @@ def curve_band(
     for there in np.unique(known, axis=1).T:
         if there.any():
             places = (known == there[:, None]).all(axis=0)
-            columns = table[there][:, places]
+            columns = table if known.all() else table[there][:, places]
             band[:, places] = _resampled_means(columns, seed, confidence, n_resamples)
     return Band(*band)
 

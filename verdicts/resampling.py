@@ -25,7 +25,8 @@ N_RESAMPLES = 10_000
 # Those over many seeds lie further in, and need fewer.
 ENOUGH_RESAMPLES = 1_000
 _MOST_DRAWS = 2_000_000
-_MOST_AT_ONCE = 4_000_000  # draws that are in memory
+_MOST_AT_ONCE = 4_000_000  # draws that are in memory; more are drawn in pieces
+_PIECE = 1_000_000
 
 
 def as_columns(scores: ArrayLike) -> Floats:
@@ -207,10 +208,10 @@ def drawn_in_pieces(
     sizes: tuple[int, ...], n_resamples: int, seed: int
 ) -> Iterator[tuple[Counts, ...]]:
     """Resamples of strata, as many at once as memory has room for; nobody changes them."""
-    at_once = max(_MOST_AT_ONCE // sum(sizes), 1)
-    if n_resamples <= at_once:
+    if n_resamples * sum(sizes) <= _MOST_AT_ONCE:
         yield _drawn(sizes, n_resamples, seed)
         return
+    at_once = max(_PIECE // sum(sizes), 1)
     generators = [np.random.default_rng([seed, place]) for place in range(len(sizes))]
     for start in range(0, n_resamples, at_once):
         n = min(at_once, n_resamples - start)
