@@ -231,8 +231,8 @@ def _prepare(
 
         apart = context.not_stored(planned)
         if not replaces:
-            stored = {} if context.store is None else context.store.differences(planned)
-            others = [(len(runs.seeds), there) for runs, there in stored.values()]
+            stored = [] if context.store is None else context.store.differences(planned)
+            others = [(n, there) for _, n, there in stored]
             check_settings_kept(apart, context.root, others)
         if any(run.is_to_do for run in apart):
             context.get_ready(apart)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from commands.terminal import say
 from pipeline.errors import UserError, unknown
+from pipeline.files import put_in_place
 from pipeline.signs_of_life import doing
 
 if TYPE_CHECKING:
@@ -29,7 +32,7 @@ def keep_few(
 
     if not results.stored:
         return results, [], True
-    kept = runs_to_keep(results)
+    kept = [run for run in runs_to_keep(results) if not _otherwise(run).exists()]
     failures, is_same = _do_again(context, results.study, kept)
     there = tuple(run for run in kept if run.is_finished)
     return replace(results, kept=there), failures, is_same
@@ -64,13 +67,20 @@ def _do_again(
     failures = execute(missing, context.root, context.launchers, lambda *_: None)
     for run in missing:
         if run.is_finished and not context.store.is_again(study, run):
-            is_same, place = False, move_aside(run.path)
+            is_same, place = False, _otherwise(run)
+            shutil.rmtree(place, ignore_errors=True)
+            put_in_place(run.path, place)
             who = f"{run.agent} on {run.environment}, seed {run.seed}"
             words = "came out otherwise than the first time, as with other versions or processors"
             say(context.console, f"{who}: {words}; see {place}")
         elif run.is_finished:
             context.store.keep(run)
     return failures, is_same
+
+
+def _otherwise(run: PlannedRun) -> Path:
+    """Where the folder of a run is that came out otherwise than the first time."""
+    return run.path.with_name(f"{run.path.name}.otherwise")
 
 
 def make_again(context: RunContext, study: StudySpec, runs: Sequence[PlannedRun]) -> int:

@@ -655,11 +655,11 @@ def runs_to_keep(results: StudyResults) -> list[PlannedRun]:
             for several, _ in _failed_runs(results, environment.label)
             for run in several[:1]
         }
-    for (agent, environment), rows in table.groupby(["agent", "environment"], sort=False):
+    for labels, rows in table.groupby(["agent", "environment"], sort=False):
         for column in (study.metric, "final"):
             order = rows[["seed", column]].dropna().sort_values(column, kind="stable")["seed"]
             places = {0, (len(order) - 1) // 2, len(order) - 1} if len(order) else ()
-            kept |= {(str(agent), str(environment), int(order.iloc[place])) for place in places}
+            kept |= {(*map(str, labels), int(order.iloc[place])) for place in places}  # type: ignore[misc]
     return [run for key, run in runs.items() if key in kept]
 
 

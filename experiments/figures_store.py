@@ -17,7 +17,7 @@ import struct
 import time
 import zlib
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -36,7 +36,7 @@ from experiments.results import (
     speed_figures,
     tensors,
 )
-from experiments.run_folders import move_aside, move_to, new_folder
+from experiments.run_folders import Differences, move_aside, move_to, new_folder
 from experiments.study import StudySpec
 from mdp.transition_model import Floats
 from pipeline.digests import LOCK, RECORD, DamagedFileError
@@ -393,23 +393,24 @@ class FigureStore:
 
     def differences(
         self, planned: Sequence[PlannedRun]
-    ) -> Mapping[tuple[str, str], tuple[StoredRuns, dict[str, tuple[Any, Any]]]]:
-        """By labels, stored runs with other settings, and these."""
-        found = {}
-        for labels, runs in self.runs(planned).items():
-            there = differences(runs.infos()[0]["spec"], runs.first.spec)
-            there.pop("seed", None)
-            if there:
-                found[labels] = runs, there
+    ) -> list[tuple[PlannedRun, int, Differences]]:
+        """One run of each file with other settings, the number of runs there, and these."""
+        found = []
+        for run in {run.labels: run for run in planned}.values():
+            if not run.is_batch and (seeds := self._seeds_of(run)):
+                (info, *_) = StoredRuns(run, sorted(seeds)).infos()
+                there = differences(info["spec"], run.spec)
+                there.pop("seed", None)
+                found += [(run, len(seeds), there)] if there else []
         return found
 
     def move_others_aside(self, planned: Sequence[PlannedRun], root: Path) -> None:
         """Move files of runs with other settings to ``replaced/<number>``."""
         others = self.differences(planned)
         place = new_folder(root) if others else root
-        for labels, (runs, _) in others.items():
-            move_to(place, store_path(runs.first), root)
-            self._seeds[labels] = set()
+        for run, *_ in others:
+            move_to(place, store_path(run), root)
+            self._seeds[run.labels] = set()
 
     def move_damaged_aside(self, planned: Sequence[PlannedRun]) -> list[Path]:
         """Rename damaged files; returns their new paths."""
@@ -419,6 +420,8 @@ class FigureStore:
                 self._seeds_of(run)
             except DamagedFileError:
                 moved.append(move_aside(store_path(run)))
+                # It would be applied to the next file of this name.
+                store_path(run).with_suffix(f"{SUFFIX}-journal").unlink(missing_ok=True)
         return moved
 
 

@@ -201,7 +201,7 @@ def _spacings(n: int) -> Floats:
     if n > MOST_SPACINGS:  # sums of gaps are gamma variates, divided by the sum of all
         sizes = np.diff(_starts(n), append=n)
         gaps = np.random.default_rng(0).gamma([1, *sizes], size=(N_SPACINGS, len(sizes) + 1))
-        return (gaps[:, 1:] / gaps.sum(axis=1, keepdims=True)).T.copy()
+        return np.asarray((gaps[:, 1:] / gaps.sum(axis=1, keepdims=True)).T.copy())
     uniform = np.sort(np.random.default_rng(0).random((N_SPACINGS, n)), axis=1)
     return np.diff(np.hstack([uniform, np.ones((N_SPACINGS, 1))]), axis=1).T.copy()
 

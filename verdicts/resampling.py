@@ -198,9 +198,10 @@ def _estimates(
         for statistic, means in found.items():
             means.append(_trimmed_means(values[order], weights, _CUTS[statistic](n)))
     estimates = []
-    for means in map(np.concatenate, found.values()):
-        low, high = percentile_interval(means[1:], tail)
-        estimates.append(Estimate(float(means[0]), float(low), float(high), n, n_missing))
+    for pieces in found.values():
+        first, *resampled = np.concatenate(pieces)
+        low, high = percentile_interval(np.array(resampled), tail)
+        estimates.append(Estimate(float(first), float(low), float(high), n, n_missing))
     return estimates
 
 

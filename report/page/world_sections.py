@@ -127,8 +127,8 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
         rows = table[here & (table["agent"] == agent.agent)].sort_values("final", kind="stable")
         of_agent = runs.get((agent.agent, environment.environment), {})
         if len(rows) and of_agent:
-            run = of_agent.get(int(rows["seed"].iloc[(len(rows) - 1) // 2]))
-            found += [] if run is None else [run]
+            median = int(rows["seed"].iloc[(len(rows) - 1) // 2])
+            found += [of_agent[median]] if median in of_agent else []
     return found
 
 
