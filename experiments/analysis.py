@@ -18,7 +18,12 @@ from agents import ALGORITHMS
 from experiments.child_processes import do_aside
 from experiments.looks import Standing
 from experiments.plan import PlannedRun
-from experiments.results import RESAMPLING_SEED, StudyResults, values_over_seeds
+from experiments.results import (
+    RESAMPLING_SEED,
+    StudyResults,
+    stored_curves,
+    values_over_seeds,
+)
 from experiments.study import COSTS, StudySpec
 from mdp.transition_model import Floats
 from pipeline.environments import training_changes, trains_on_variant
@@ -109,6 +114,11 @@ def speeds(
     spans = [
         np.diff(rows["step"].to_numpy(dtype=np.float64), prepend=0.0).max()
         for _, rows in curves[chosen & curves["agent"].isin(agents)].groupby(["agent", "seed"])
+    ]
+    spans += [
+        np.diff(rows["step"], prepend=0.0).max(initial=0.0)
+        for agent in agents
+        for rows in stored_curves(results, environment, agent, "evaluation")
     ]
     spacing = max(spans, default=0.0)
     if not spacing > 0:
@@ -643,9 +653,34 @@ def _only(texts: pd.Series) -> str:
 
 def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:
     """The recorded changes of the agent's first run, because all seeds share the settings."""
-    of_agent = (r for r in results.finished if r.labels == (agent, environment))
-    run = next(of_agent, None)
-    return () if run is None else training_changes(TrainSpec.of_data(run.run.read_info()["spec"]))
+    run = next((r for r in results.finished if r.labels == (agent, environment)), None)
+    if run is None:
+        return ()
+    info = results.stored[run.labels].infos()[0] if results.is_stored(run) else run.run.read_info()
+    return training_changes(TrainSpec.of_data(info["spec"]))
+
+
+def runs_to_keep(results: StudyResults) -> list[PlannedRun]:
+    """The stored runs whose agents are kept: the best, median and worst, and what the page loads.
+
+    The page plays the first run, splits the gap of the median final return, and asks the first
+    failed run for advice.
+    """
+    study, table = results.study, results.summary
+    runs = {(*run.labels, run.seed): run for run in results.finished if results.is_stored(run)}
+    kept = {(*labels, study.first_seed) for labels in results.stored}
+    for environment in study.environments:
+        kept |= {
+            (*run.labels, run.seed)
+            for several, _ in _failed_runs(results, environment.label)
+            for run in several[:1]
+        }
+    for labels, rows in table.groupby(["agent", "environment"], sort=False):
+        for column in (study.metric, "final"):
+            order = rows[["seed", column]].dropna().sort_values(column, kind="stable")["seed"]
+            places = {0, (len(order) - 1) // 2, len(order) - 1} if len(order) else ()
+            kept |= {(*map(str, labels), int(order.iloc[place])) for place in places}  # type: ignore[misc]
+    return [run for key, run in runs.items() if key in kept]
 
 
 # --- Advice on failed runs, once for each agent.

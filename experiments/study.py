@@ -28,6 +28,8 @@ from pipeline.user_modules import UserModule
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
 
+Keep = Literal["all", "figures"]
+
 METRIC_WORDS: dict[str, str] = {
     "final": "return of the final policy",
     "best": "return of the best policy during training",
@@ -167,6 +169,8 @@ class StudySpec:
     run_memory: int | None = None  #: bytes of memory that each run may take; None for no limit
     source: Path | None = None  #: its file, or None
     first_seed: int = 0  #: the first seed; the others follow it
+    #: ``"figures"`` to keep figures and curves of runs in files, and few of their folders.
+    keep: Keep | None = None
 
     @property
     def seeds(self) -> range:
@@ -206,6 +210,7 @@ _STUDY_VALUES: dict[str, Any] = {
     "shared_randomness": bool,
     "threshold": float,
     "episodes_table": int,
+    "keep": Keep,
 }
 # Limits of each run, in the format of the command line.
 _LIMITS: dict[str, Callable[[str], float]] = {

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.looks import Looks, read_looks
-from experiments.plan import PlannedRun, tuning_seeds
+from experiments.plan import tuning_seeds
 from experiments.results import StudyResults, mixed_versions
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from mdp.transition_model import Floats
@@ -206,7 +206,7 @@ def curves(report: Report) -> Section | None:
     Bandits have theirs by pull, in a section of their own.
     """
     curves = [one.curves for one in report.series.environments]
-    if report.analysis.results.curves.empty or not any(curves):
+    if not (report.analysis.results.has_curves and any(curves)):
         return None
     by_step = [{} if item is None else item["evaluation"].by_axis["step"] for item in curves]
     context = {
@@ -307,15 +307,15 @@ ABSENT = "-"
 def settings(report: Report) -> Section | None:
     """Settings by environment, and what holds for the whole study."""
     results, environments = report.analysis.results, report.analysis.environments
-    done = [(run, run.run.read_info()) for run in results.finished]
-    infos = [info for _, info in done]
+    done = list(results.infos())
+    infos = [info for *_, info in done]
     looks = read_looks(results.root)
     context = {
         "command": report.command,
         "seeds": seed_sentence(results.study.seeds, tuning_seeds(results.study)),
         "absent": ABSENT,
         "tables": [
-            _settings_table([(r, info) for r, info in done if r.environment == e.environment])
+            _settings_table([(agent, info) for agent, on, info in done if on == e.environment])
             for e in environments
         ],
         "versions": recorded("versions", infos),
@@ -327,11 +327,11 @@ def settings(report: Report) -> Section | None:
     return Section("settings", "Settings", context, by_environment=True)
 
 
-def _settings_table(runs: list[tuple[PlannedRun, Mapping[str, Any]]]) -> dict[str, Any]:
+def _settings_table(runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
     """The agents, and by setting its value for each of them and whether these differ."""
     columns: dict[str, dict[str, str]] = {}
-    for agent in dict.fromkeys(run.agent for run, _ in runs):
-        columns[agent] = _column([info for run, info in runs if run.agent == agent])
+    for agent in dict.fromkeys(agent for agent, _ in runs):
+        columns[agent] = _column([info for one, info in runs if one == agent])
     rows = {}
     for name in dict.fromkeys(name for column in columns.values() for name in column):
         values = [column.get(name, ABSENT) for column in columns.values()]
@@ -367,9 +367,9 @@ def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
     """
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
     damaged = {one.planned.path: one.reason for one in results.left_out}
-    there = {run.path for run in results.finished}
+    there = {(*run.labels, run.seed) for run in results.finished}
     for run in results.planned:
-        if run.path in there:
+        if (*run.labels, run.seed) in there:
             continue
         details = results.failures.get(run.path, "").strip()
         reason = damaged.get(run.path) or (details.splitlines()[-1] if details else "not done yet")

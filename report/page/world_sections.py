@@ -119,7 +119,7 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
     table = analysis.results.summary
     here = (table["environment"] == environment.environment) & table["exact"].astype(bool)
     runs: dict[tuple[str, str], dict[int, PlannedRun]] = {}
-    for run in analysis.results.finished:
+    for run in analysis.results.in_folders:
         if not run.is_batch:
             runs.setdefault(run.labels, {})[run.seed] = run
     found = []
@@ -127,7 +127,8 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
         rows = table[here & (table["agent"] == agent.agent)].sort_values("final", kind="stable")
         of_agent = runs.get((agent.agent, environment.environment), {})
         if len(rows) and of_agent:
-            found.append(of_agent[int(rows["seed"].iloc[(len(rows) - 1) // 2])])
+            median = int(rows["seed"].iloc[(len(rows) - 1) // 2])
+            found += [of_agent[median]] if median in of_agent else []
     return found
 
 
@@ -158,7 +159,7 @@ def _policy_data(
     order = [agent.agent for agent in environment.agents]
     runs = [
         run
-        for run in analysis.results.finished
+        for run in analysis.results.in_folders
         if run.environment == environment.environment and run.run.value_maps_path.exists()
     ]
     if not runs:
