@@ -232,6 +232,7 @@ def _looked(looks: Looks, design: Design, evidence: Evidence) -> tuple[Looks, St
         evidence.certain,
         ends=evidence.ends,
         paired=evidence.paired,
+        against=evidence.against,
     )
     seeds = {name: max(n, design.seeds.get(name, 0)) for name, n in growth.seeds.items()}
     more = tuple(

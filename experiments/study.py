@@ -167,6 +167,8 @@ class StudySpec:
     run_memory: int | None = None  #: bytes of memory that each run may take; None for no limit
     source: Path | None = None  #: its file, or None
     first_seed: int = 0  #: the first seed; the others follow it
+    #: Label of the only agent whose mean the others are compared with; empty for all pairs.
+    against: str = ""
 
     @property
     def seeds(self) -> range:
