@@ -53,8 +53,8 @@ class Candidate:
     number: int  # number of its trial
     entry: Mapping[str, Any]  # its hyperparameters
     value: float  # its value in the search
-    figures: tuple[float, ...]  # those of its seeds there
-    steps: float | None  # mean steps to the threshold, if it has the optimum on all seeds
+    figures: tuple[float, ...] = ()  # those of its seeds there
+    steps: float | None = None  # mean steps to the threshold, if it has the optimum on all seeds
 
     @property
     def label(self) -> str:
