@@ -16,6 +16,7 @@ from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
 
 from experiments.analysis import analyse
+from experiments.growing import remember, settled_looks, take_planned_looks
 from experiments.plan import plan
 from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, Curve, RunResults, StudyResults
 from pipeline.errors import UserError
@@ -31,6 +32,7 @@ from tuning.retesting import (
     chosen_for_retest,
     concluded,
     entry_text,
+    is_settled,
     optimism,
     retest_study,
     write_winner,
@@ -574,24 +576,30 @@ ENTRY = {
 }
 
 
-def re_tested(toy, root, monkeypatch, runs, **changes):
-    """The outcome of a re-test whose runs ended so, by settings; those of the search are shipped.
+def runs_of_retest(toy, root, runs, **changes):
+    """A re-test whose runs ended so, by settings: its tuning, candidates, results and figures.
 
-    A run is its score, or the score and the searched figure.
+    A run is its score, or the score and the searched figure; None if it is missing.
     """
     tuning = toy.tuning(retest_seeds=len(runs["shipped"]), **changes)
     labels = [label for label in runs if label != "shipped"]
     found = [Candidate(int(label[-1]), ENTRY, 0.5, (0.5,)) for label in labels]
     study = retest_study(tuning, root, found)
     planned = plan(study, root)
-    ends = {(r.agent, r.seed): np.broadcast_to(runs[r.agent][r.seed - 1000], 2) for r in planned}
+    ended = {(r.agent, r.seed): runs[r.agent][r.seed - 1000] for r in planned}
+    ends = {key: np.broadcast_to(end, 2) for key, end in ended.items() if end is not None}
     rows = [
         {"agent": agent, "environment": "FrozenLake-v1", "env_id": "FrozenLake-v1", "seed": seed}
         | {"final": score, "score": score, "optimum": 1.0, "baseline": 0.0, "exact": True}
         for (agent, seed), (score, _) in ends.items()
     ]
     tables = pd.DataFrame(rows, columns=RUN_COLUMNS), pd.DataFrame(columns=CURVE_COLUMNS)
-    results = StudyResults(study, root, *tables, tuple(planned))
+    return tuning, found, StudyResults(study, root, *tables, tuple(planned)), ends
+
+
+def re_tested(toy, root, monkeypatch, runs, **changes):
+    """The outcome of such a re-test."""
+    tuning, found, results, ends = runs_of_retest(toy, root, runs, **changes)
     monkeypatch.setattr(
         retesting,
         "outcome_of",
@@ -632,6 +640,37 @@ def test_who_is_better_on_average_wins(toy, tmp_path, monkeypatch, shipped, foun
     if verdict == "better, as seen":
         share = compare_means(found, shipped, level_of_look(0.05, 1) * 0.75 / 3).most_outside
         assert f"{100 * share:.2g}" == "0.87"
+
+
+BETTER, HIGHEST, OLD, NEAR = (
+    [0.5] * 20,
+    [0.0, 1.0] * 9 + [1.0] * 2,
+    [0.3, 0.4] * 10,
+    [0.3, 0.45] * 10,
+)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "settled"),
+    [
+        (BETTER, NEAR, True),  # the other may be undecided
+        (BETTER, HIGHEST, False),  # but not if it is ahead
+        (BETTER, [None, *HIGHEST[1:]], True),  # unless it cannot win
+        (OLD, NEAR, False),
+        ([None, *BETTER[1:]], NEAR, False),
+    ],
+)
+def test_a_re_test_has_grown_enough_when_its_best_setting_is_decided(
+    toy, tmp_path, first, second, settled
+):
+    runs = {"shipped": OLD, "trial 1": first, "trial 2": second}
+    _, _, results, _ = runs_of_retest(toy, tmp_path, runs)
+    remember(tmp_path, {}, settled_looks(results.study, tmp_path, 45))
+    (step,) = take_planned_looks(results)
+    verdicts = [step.growth.judged["shipped", name].mean.verdict for name in list(runs)[1:]]
+    assert verdicts == ["undecided" if first == OLD else "worse", "undecided"]
+    assert step.asked == [("shipped", "trial 1"), ("shipped", "trial 2")]
+    assert is_settled(results, [step]) == settled
 
 
 def test_settings_whose_intervals_are_apart_are_told_apart(toy, tmp_path, monkeypatch):
