@@ -64,7 +64,7 @@ def run(words: Sequence[object], begun: Path = ROOT, budget: float = float("inf"
             if not begun.exists():
                 loading = taken
             if taken - loading > budget:
-                child.send_signal(signal.SIGINT)
+                child.send_signal(signal.SIGTERM)
                 budget = float("inf")
             time.sleep(0.2)
     return taken - loading
