@@ -8,7 +8,7 @@ import importlib.util
 import signal
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -285,8 +285,7 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
 
     How many seeds there are at each look is settled before the first.
     """
-    from experiments.growing import counts_of, grown, remember, settled_looks, take_planned_looks
-    from experiments.launching import EarlyResults
+    from experiments.growing import counts_of, grown, remember, settled_looks
     from experiments.looks import read_looks
     from experiments.plan import plan
     from report.words import seeds
@@ -299,28 +298,10 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
         repair(context.console, now, planned, context.store)
     _prepare(now, planned, context)
     remember(context.root, read_looks(context.root), looks)  # before the first run is done
-    failures: list[RunFailure] = []
-    said: set[tuple[str, int]] = set()
-    with context.held():  # from one look to the next
-        while True:
-            given_up = {failure.planned.path for failure in failures}
-            early = EarlyResults(now)
-            failures += do_missing(context, planned, early, given_up)
-            results = read(context, now, planned, early)
-            steps = take_planned_looks(results)
-            for step in steps:
-                if (step.environment, step.growth.n_looks) not in said:
-                    said.add((step.environment, step.growth.n_looks))
-                    say(context.console, _on_look(step))
-            if all(step.growth.is_done for step in steps):
-                break
-            counts = counts_of(study, read_looks(context.root))
-            now = grown(study, counts)
-            planned = plan(now, context.root, counts)
-        code = conclude(
-            context, results, failures, {step.environment: step.standing for step in steps}
-        )
+    results, steps, failures = look_by_look(context, study, counts)
+    code = conclude(context, results, failures, {each.environment: each.standing for each in steps})
     # How many runs it took, beside a design that gives every agent all seeds.
+    counts = counts_of(study, read_looks(context.root))
     most = max((step.design.sizes[-1] for step in steps), default=0)
     undecided = [
         f"{first} and {second} on {step.environment}"
@@ -333,17 +314,53 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
     return code
 
 
-def _on_look(step: Step) -> str:
+def look_by_look(
+    context: RunContext,
+    study: StudySpec,
+    counts: Mapping[tuple[str, str], int],
+    is_enough: Callable[[StudyResults, Sequence[Step]], bool] = lambda results, steps: False,
+) -> tuple[StudyResults, list[Step], list[RunFailure]]:
+    """Do the runs of one planned look after another, until nobody lacks seeds or it is enough.
+
+    ``counts`` are the seeds of the first of these looks, by agent and environment.
+    """
+    from experiments.growing import grown, take_planned_looks
+    from experiments.launching import EarlyResults
+    from experiments.plan import plan
+
+    failures: list[RunFailure] = []
+    said: set[tuple[str, int]] = set()
+    with context.held():  # from one look to the next
+        while True:
+            now = grown(study, counts)
+            planned = plan(now, context.root, counts)
+            given_up = {failure.planned.path for failure in failures}
+            early = EarlyResults(now)
+            failures += do_missing(context, planned, early, given_up)
+            results = read(context, now, planned, early)
+            steps = take_planned_looks(results)
+            is_over = all(step.growth.is_done for step in steps) or is_enough(results, steps)
+            for step in steps:
+                if (step.environment, step.growth.n_looks) not in said:
+                    said.add((step.environment, step.growth.n_looks))
+                    say(context.console, _on_look(step, is_over=is_over))
+            if is_over:
+                return results, steps, failures
+            seeds = {(name, s.environment): n for s in steps for name, n in s.growth.seeds.items()}
+            counts = {**counts, **seeds}
+
+
+def _on_look(step: Step, *, is_over: bool) -> str:
     """What a look has decided, and who gets more seeds."""
     from report.words import enumeration, seeds
 
     growth, sizes = step.growth, step.design.sizes
     text = f"{step.environment}, look {growth.n_looks} of {len(sizes)}: "
-    n, n_undecided = len(growth.judged), len(step.undecided)
+    n, n_undecided = len(step.asked), len(step.undecided)
     if not n_undecided:
         return f"{text}all pairs are decided"
     text += f"{n_undecided} of {n} pairs {'is' if n_undecided == 1 else 'are'} undecided"
-    if growth.is_done:
+    if is_over or growth.is_done:
         return text
     size = sizes[growth.n_looks]
     names = [name for name, wanted in growth.seeds.items() if wanted == size]

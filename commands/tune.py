@@ -35,6 +35,7 @@ from commands.compare import (
     conclude,
     do_missing,
     give_way,
+    look_by_look,
     read,
     run_context,
     typed_settings,
@@ -143,6 +144,10 @@ def build_parser() -> argparse.ArgumentParser:
     add("--retest-seeds", type=SEEDS, default=20, metavar="N", help="how many other seeds (20)")
     first = "the first of these seeds (1000)"
     add("--first-retest-seed", type=FIRST_SEED, default=1000, metavar="N", help=first)
+    decided = "add seeds, at looks fixed beforehand, until the best setting is decided to be better"
+    add("--until-decided", action="store_true", help=decided)
+    most = "the most other seeds for that (50)"
+    add("--max-retest-seeds", type=SEEDS, metavar="N", help=most)
 
     group = parser.add_argument_group("runs")
     add_shared(group, "--n-timesteps", "--n-episodes")
@@ -288,6 +293,8 @@ def _retest(context: RunContext, opened: OpenTuning) -> int:
         words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id]
         how = f"{called_as('train')} {shlex.join([*words, '--conf-file', str(path)])}"
         tell(f"winner: {winner.label}, in {path}: {how}")
+        assert outcome.winner is not None
+        tell(f"  {outcome.winner.said}")
         entry, shipped = winner.entry, opened.suggestions.shipped
         for key in {**shipped, **entry}:
             if entry.get(key) != shipped.get(key):
@@ -301,21 +308,33 @@ def _retested(
 ) -> tuple[int, Outcome]:
     """The exit code, and what the re-test shows."""
     from experiments.analysis import analyse
-    from experiments.growing import take_looks
+    from experiments.growing import first_counts, remember, settled_looks, take_looks
     from experiments.launching import EarlyResults
+    from experiments.looks import read_looks
     from experiments.plan import plan
-    from tuning.retesting import concluded, retest_study
+    from tuning.retesting import concluded, is_settled, retest_study
 
-    study = retest_study(opened.tuning, opened.root, candidates)
+    tuning = opened.tuning
+    study = retest_study(tuning, opened.root, candidates)
     planned = plan(study, context.root)
-    context.get_ready(planned)
-    early = EarlyResults(study)
-    failures = do_missing(context, planned, early)
-    results = read(context, study, planned, early)
-    code = conclude(context, results, failures)
+    looks = None
+    if tuning.until_decided:
+        settled = settled_looks(study, context.root, tuning.max_retest_seeds)
+        remember(context.root, read_looks(context.root), settled)  # before the first run is done
+        context.get_ready(planned)
+        # From the first look on, so that what is done already may be found to be enough.
+        counts = first_counts(study, settled)
+        results, steps, failures = look_by_look(context, study, counts, is_settled)
+        looks = {step.environment: step.standing for step in steps}
+    else:
+        context.get_ready(planned)
+        early = EarlyResults(study)
+        failures = do_missing(context, planned, early)
+        results = read(context, study, planned, early)
+    code = conclude(context, results, failures, looks)
     with doing(context.console, "judging the winner") as activity:
-        analysis = analyse(results, activity.at, take_looks(results))
-        return code, concluded(opened.tuning, ranked, candidates, analysis)
+        analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
+        return code, concluded(tuning, ranked, candidates, analysis)
 
 
 def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None) -> None:
@@ -405,6 +424,11 @@ def print_opened(context: RunContext, opened: OpenTuning) -> None:
     )
     if mark := unproven_mark(tuning):
         tell(f"scores are{mark}")
+    if suggestions.fits_batches:
+        tell(
+            "batch_size: where it does not divide n_steps times n_envs, as the library recommends, "
+            "the nearest number that does is tried"
+        )
     for name in suggestions.space.widened:
         tell(f"{name}: the search space is widened to hold the shipped value")
     if tuning.agent.algo not in NETWORKS:
@@ -438,13 +462,20 @@ def print_search(console: Console, opened: OpenTuning) -> None:
         f"{len(trials)} trials: {counts}; {n_runs} of {len(trials) * len(tuning.seeds)} runs, "
         f"{duration(seconds)} of processor time",
     )
+    if (n := opened.n_at_optimum) > 1:
+        text = f"{n} settings have the optimum on all seeds, so that their scores cannot tell them "
+        text += "apart: they are ranked by steps to the threshold"
+        if opened.is_saturated and not opened.queue.is_done():
+            text += "; the search ends here, since more trials cannot score more (--metric steps "
+            text += "searches for the fastest)"
+        say(console, text)
 
 
 def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> None:
     """Print what the re-test shows: a table, and what follows from it."""
     from rich.table import Table
 
-    held_out = opened.tuning.held_out
+    held_out = outcome.held_out
     console.print()
     title = f"re-test on the seeds {held_out.start} to {held_out.stop - 1}"
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")

@@ -154,6 +154,7 @@ class Evidence:
     is_score: bool  #: whether these ends define the score
     paired: bool  #: whether runs of one seed share their randomness
     n_environments: int  #: of the study, which share its error rate
+    against: str = ""  #: the only agent whose mean the others are compared with
 
     def share(self, level: float) -> float:
         """This environment's share of a look's error rate."""
@@ -201,6 +202,7 @@ def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
         is_score=is_score,
         paired=study.shared_randomness,
         n_environments=len(study.environments),
+        against=study.against,
     )
 
 
@@ -555,21 +557,24 @@ def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[Pai
     """All pairs, judged at this look, or at the look of a design that decided them."""
     scores = {name: evidence.scores[name] for name in names}
     margin, certain = evidence.margin, evidence.certain
-    ends, paired = evidence.ends, evidence.paired
+    ends, paired, against = evidence.ends, evidence.paired, evidence.against
     if look.design is None:
         level = evidence.share(look.level)
         judged = {
             pair: (judgement, len(scores[pair[0]]))
             for pair, judgement in judge_pairs(
-                scores, margin, level, certain, ends=ends, paired=paired
+                scores, margin, level, certain, ends=ends, paired=paired, against=against
             ).items()
         }
     else:
         given = {name: evidence.given[name] for name in names}
         level = evidence.share(look.design.level)
-        growth = grow(given, look.design.sizes, margin, level, certain, ends=ends, paired=paired)
+        sizes = look.design.sizes
+        growth = grow(
+            given, sizes, margin, level, certain, ends=ends, paired=paired, against=against
+        )
         judged = {
-            pair: (judgement, look.design.sizes[growth.looks[pair] - 1])
+            pair: (judgement, sizes[growth.looks[pair] - 1])
             for pair, judgement in growth.judged.items()
         }
     levels = (evidence.share(look.level), evidence.share(look.next_level))
@@ -581,7 +586,8 @@ def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[Pai
         ends,
         seed=RESAMPLING_SEED,
         paired=paired,
-        ranks=look.design is None and len(scores) > 2,
+        ranks=look.design is None and len(scores) > 2 and not against,
+        against=against,
         certain=certain,
     )
 

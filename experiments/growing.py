@@ -109,11 +109,12 @@ class Step:
     design: Design  # the planned looks, and each agent's current or next number of seeds
     growth: Growth  # the decisions so far
     standing: Standing  # the last look's place among all looks
+    asked: list[tuple[str, str]]  # the pairs to decide
 
     @property
     def undecided(self) -> list[tuple[str, str]]:
         """The undecided pairs."""
-        return [pair for pair, each in self.growth.judged.items() if not each.is_decided]
+        return [pair for pair in self.asked if not self.growth.judged[pair].is_decided]
 
 
 def settled_looks(study: StudySpec, root: Path, most: int | None) -> LookLog:
@@ -155,7 +156,13 @@ def counts_of(study: StudySpec, log: LookLog) -> Counts:
     }
 
 
-def grown(study: StudySpec, counts: Counts) -> StudySpec:
+def first_counts(study: StudySpec, log: LookLog) -> Counts:
+    """The numbers of seeds at the first planned look."""
+    designs = {label: looks.design for label, looks in log.items() if looks.design is not None}
+    return {(a.label, e): design.sizes[0] for e, design in designs.items() for a in study.agents}
+
+
+def grown(study: StudySpec, counts: Mapping[tuple[str, str], int]) -> StudySpec:
     """The study with the largest number of seeds of any agent."""
     return replace(study, n_seeds=max(counts.values()))
 
@@ -232,6 +239,7 @@ def _looked(looks: Looks, design: Design, evidence: Evidence) -> tuple[Looks, St
         evidence.certain,
         ends=evidence.ends,
         paired=evidence.paired,
+        against=evidence.against,
     )
     seeds = {name: max(n, design.seeds.get(name, 0)) for name, n in growth.seeds.items()}
     more = tuple(
@@ -248,6 +256,7 @@ def _looked(looks: Looks, design: Design, evidence: Evidence) -> tuple[Looks, St
     looks = Looks((*looks.taken, *more), design)
     number = max((k for k, each in enumerate(looks.taken, start=1) if each.planned), default=1)
     later = looks.next_level if growth.is_done else design.share
-    return looks, Step(
-        evidence.environment, design, growth, Standing(number, design.share, later, design)
-    )
+    standing = Standing(number, design.share, later, design)
+    only = evidence.against
+    asked = [pair for pair in growth.judged if not only or only in pair]
+    return looks, Step(evidence.environment, design, growth, standing, asked)

@@ -171,6 +171,8 @@ class StudySpec:
     first_seed: int = 0  #: the first seed; the others follow it
     #: ``"figures"`` to keep figures and curves of runs in files, and few of their folders.
     keep: Keep | None = None
+    #: Label of the only agent whose mean the others are compared with; empty for all pairs.
+    against: str = ""
 
     @property
     def seeds(self) -> range:

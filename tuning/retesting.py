@@ -15,20 +15,31 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import yaml
 from optuna.trial import FrozenTrial, TrialState
 
 from envs.brackets import upper_is_proven
-from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis, evidence_on
+from experiments.growing import Step
+from experiments.results import RESAMPLING_SEED, StudyResults
 from experiments.study import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.digests import DamagedFileError
 from pipeline.files import plain, write_json, write_text
 from pipeline.settings.hyperparams import TUNED_ON, seeds_tuned_on
 from tuning.searching import OpenTuning, UnjudgedError, outcome_of
 from tuning.suggesting import name_of
-from tuning.trial_storage import ASKED, FAILURE, SETTINGS, figures_of, seconds_of
-from tuning.tuning_spec import SHIPPED, TuningSpec, judged
-from verdicts import Estimate
+from tuning.trial_storage import (
+    ASKED,
+    AT_OPTIMUM,
+    FAILURE,
+    SETTINGS,
+    figures_of,
+    seconds_of,
+)
+from tuning.tuning_spec import SHIPPED, Floats, TuningSpec, judged, judged_rows
+from verdicts import FEWEST_SEEDS, Estimate, level_of_claim
+from verdicts.resampling import N_RESAMPLES, interval_tail, percentile_interval
 
 FOLDER, WINNER, RECORD = "retest", "winner.yml", "tuning.json"
 
@@ -43,6 +54,8 @@ class Candidate:
     number: int  # number of its trial
     entry: Mapping[str, Any]  # its hyperparameters
     value: float  # its value in the search
+    figures: tuple[float, ...] = ()  # those of its seeds there
+    steps: float | None = None  # mean steps to the threshold, if it has the optimum on all seeds
 
     @property
     def label(self) -> str:
@@ -53,15 +66,25 @@ class Candidate:
 def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candidate]:
     """The settings of complete trials, best first; equal ones in order of their trials.
 
-    A setting of several trials appears once.
+    Settings with the optimum on all seeds are equal, but for their steps to the threshold. A
+    setting of several trials appears once.
     """
     found: dict[str, Candidate] = {}
     for trial in trials:
-        entry = trial.user_attrs.get(SETTINGS)
+        said, entry = trial.user_attrs, trial.user_attrs.get(SETTINGS)
         value = trial.value if trial.state == TrialState.COMPLETE else None
         if value is not None and isinstance(entry, Mapping):
-            found.setdefault(name_of(entry), Candidate(trial.number, entry, value))
-    return sorted(found.values(), key=lambda each: each.value, reverse=not is_cost)
+            figures = tuple(figures_of(said).values())
+            steps = [*figures_of(said, AT_OPTIMUM).values()]
+            mean = sum(steps) / len(steps) if steps and len(steps) == len(figures) else None
+            found.setdefault(name_of(entry), Candidate(trial.number, entry, value, figures, mean))
+
+    def order(each: Candidate) -> tuple[float, float]:
+        if each.steps is not None:
+            return -1.0, each.steps
+        return (1 if is_cost else -1) * each.value, 0.0
+
+    return sorted(found.values(), key=order)
 
 
 def chosen_for_retest(ranked: Sequence[Candidate], k: int) -> list[Candidate]:
@@ -84,13 +107,34 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
         name=FOLDER,
         title=f"{tuning.agent.algo} on {tuning.environment.env_id}: "
         f"the best settings of a search, on other seeds",
-        description=f"Settings that a search found on the seeds {seeds}, "
-        "beside those that it began with, on seeds that it has not seen.",
+        description=f"Settings that a search found on the seeds {seeds}, beside those that it "
+        "began with, on seeds that it has not seen. Each is compared with these alone.",
         agents=tuple(agents),
         first_seed=tuning.first_retest_seed,
         n_seeds=tuning.retest_seeds,
         metric=cast(Metric, metric),
+        against=SHIPPED,
     )
+
+
+def is_settled(results: StudyResults, steps: Sequence[Step]) -> bool:
+    """Whether the best setting of a growing re-test is decided to be better than the initial one.
+
+    Settings that are decided not to be better, and those with missing runs, do not count.
+    """
+    for step in steps:
+        evidence = evidence_on(results, step.environment)
+        runs = {} if evidence is None else evidence.given
+        is_better = {
+            name: each.mean.verdict == "worse"  # the initial setting is
+            for (first, name), each in step.growth.judged.items()
+            if first == SHIPPED and each.mean.verdict in ("worse", "undecided")
+        }
+        there = [name for name in is_better if np.isfinite(runs[name]).all()]
+        best = max(there, key=lambda name: float(runs[name].mean()), default=None)
+        if best is None or not is_better[best]:
+            return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -101,12 +145,14 @@ class Retested:
     number: int  # number of its trial; 0 for the initial settings
     in_search: float | None  # its value in the search, if its trial is complete
     held_out: float | None  # its value on held-out seeds; None without runs
-    interval: Estimate  # of the mean of the held-out scores, or of the chosen objective
-    verdict: str  # compared with the initial settings; empty for these
+    interval: Estimate  # of that value
+    verdict: str  # compared with the initial settings by that value; empty for these
     n_runs: int  # number of runs
     # Number of failed runs, which got less than half as far as the best typical run; None if
     # that is not defined.
     n_failed: int | None
+    n_missing: int = 0  # number of runs that are missing
+    said: str = ""  # the verdict in words, with its condition
 
 
 @dataclass(frozen=True)
@@ -122,6 +168,7 @@ class Outcome:
     # it was not re-tested.
     optimism: float | None
     reason: str  # why there is no winner; empty if there is one
+    held_out: range  # the held-out seeds; a growing re-test may have fewer of some settings
 
 
 def concluded(
@@ -131,15 +178,27 @@ def concluded(
     analysis: StudyAnalysis,
 ) -> Outcome:
     """The result of the re-test of ``candidates``; ``ranked`` are all complete settings."""
-    in_search = {each.number: each.value for each in ranked}
+    # In the verdicts of a study, a score below 0 counts as 0. So it does here.
+    is_score = tuning.figure == "score" and all(each.is_score for each in analysis.environments)
+    least = 0.0 if is_score and tuning.is_judged_by_study else -math.inf
+    in_search = {each.number: _value(tuning, each.figures, least) for each in ranked}
     numbers = {SHIPPED: 0} | {each.label: each.number for each in candidates}
+    figures = {label: np.maximum(_figures(tuning, label, analysis), least) for label in numbers}
     retested = [
-        _retested(tuning, label, number, in_search.get(number), analysis)
+        _retested(tuning, label, number, in_search.get(number), figures, analysis)
         for label, number in numbers.items()
     ]
     winner, reason = _winner(tuning, retested)
     best = [each for each in retested if ranked and each.number == ranked[0].number]
-    return Outcome(tuple(retested), winner, optimism(tuning, best[0]) if best else None, reason)
+    fooled_by = optimism(tuning, best[0]) if best else None
+    n_seeds = max(each.n_runs + each.n_missing for each in retested)
+    held_out = range(tuning.first_retest_seed, tuning.first_retest_seed + n_seeds)
+    return Outcome(tuple(retested), winner, fooled_by, reason, held_out)
+
+
+def _value(tuning: TuningSpec, figures: Sequence[float] | Floats, least: float) -> float:
+    values = np.maximum(np.asarray(figures, np.float64), least)
+    return judged(values, tuning.objective, is_cost=tuning.is_cost)
 
 
 def optimism(tuning: TuningSpec, best: Retested) -> float | None:
@@ -150,49 +209,116 @@ def optimism(tuning: TuningSpec, best: Retested) -> float | None:
     return -apart if tuning.is_cost else apart
 
 
-def _retested(
-    tuning: TuningSpec,
-    label: str,
-    number: int,
-    in_search: float | None,
-    analysis: StudyAnalysis,
-) -> Retested:
+def _figures(tuning: TuningSpec, label: str, analysis: StudyAnalysis) -> Floats:
     figures = []
     for run in analysis.results.planned:
         # The study reports missing runs and their reasons.
         with contextlib.suppress(UnjudgedError, DamagedFileError):
             if run.agent == label:
                 figures.append(outcome_of(tuning, run).figure)
+    return np.array(figures)
+
+
+def _retested(
+    tuning: TuningSpec,
+    label: str,
+    number: int,
+    in_search: float | None,
+    figures: Mapping[str, Floats],
+    analysis: StudyAnalysis,
+) -> Retested:
     environment = next(iter(analysis.environments), None)
     agents = () if environment is None else environment.agents
     agent = next((agent for agent in agents if agent.agent == label), None)
     failures = None if environment is None else environment.failures.get(label)
+    own = figures[label]
+    verdict, said = "", ""
+    if number and environment is not None:
+        compare = _by_study if tuning.is_judged_by_study else _by_resampling
+        verdict, said = compare(tuning, label, figures, environment)
     return Retested(
         label=label,
         number=number,
         in_search=in_search,
-        held_out=judged(figures, tuning.objective, is_cost=tuning.is_cost) if figures else None,
-        interval=_interval(tuning, agent),
-        verdict="" if number == 0 else _verdict(environment, label),
+        held_out=judged(own, tuning.objective, is_cost=tuning.is_cost) if len(own) else None,
+        interval=_interval(tuning, own, agent),
+        verdict=verdict,
         n_runs=0 if agent is None else agent.n_runs,
         n_failed=None if failures is None else failures.n_failed,
+        n_missing=0 if agent is None else agent.n_missing,
+        said=said,
     )
 
 
-def _interval(tuning: TuningSpec, agent: AgentAnalysis | None) -> Estimate:
-    if agent is None:
+def _interval(tuning: TuningSpec, figures: Floats, agent: AgentAnalysis | None) -> Estimate:
+    if agent is None or not len(figures):
         return Estimate(math.nan, math.nan, math.nan, 0)
-    of_score = tuning.figure in ("score", "steps", "seconds")
-    summary = (agent.score if of_score else None) or agent.metric
-    return summary.iqm if tuning.objective == "iqm" else summary.mean
+    if tuning.is_judged_by_study:
+        return ((agent.score if tuning.figure == "score" else None) or agent.metric).mean
+    tail = interval_tail([figures], 0.95)
+    low, high = percentile_interval(_resampled(tuning, figures, 0), tail)
+    value = judged(figures, tuning.objective, is_cost=tuning.is_cost)
+    return Estimate(value, float(low), float(high), len(figures))
 
 
-def _verdict(environment: EnvironmentAnalysis | None, label: str) -> str:
-    for pair in () if environment is None else environment.pairs:
-        for seen in (pair, pair.swapped()):
-            if (seen.first, seen.second) == (label, SHIPPED):
-                return f"{seen.verdict}{', as seen' if seen.is_conditional else ''}"
-    return "undecided"
+AS_SEEN = ", as seen"
+
+
+def _by_study(
+    _: TuningSpec, label: str, __: Mapping[str, Floats], environment: EnvironmentAnalysis
+) -> tuple[str, str]:
+    """The verdict of the re-test's study on the mean of its metric, and the same in words."""
+    pairs = [seen for pair in environment.pairs for seen in (pair, pair.swapped())]
+    pair = next((p for p in pairs if (p.first, p.second) == (label, SHIPPED)), None)
+    if pair is None or pair.verdict == "undecided":
+        return "undecided", ""
+    than = "to" if pair.verdict == "equivalent" else "than"
+    said = f"{pair.verdict} on average {than} the shipped settings"
+    if not pair.is_conditional:
+        return pair.verdict, said
+    most, condition = pair.mean.most_outside, "further runs are like those that were seen"
+    if most > 0:
+        condition = f"fewer than {100 * most:.2g} % of further runs lie outside of those seen"
+    return f"{pair.verdict}{AS_SEEN}", f"{said}, as long as {condition}"
+
+
+def _by_resampling(
+    tuning: TuningSpec,
+    label: str,
+    figures: Mapping[str, Floats],
+    environment: EnvironmentAnalysis,
+) -> tuple[str, str]:
+    """The same for other statistics and figures: whether an interval of the difference has 0.
+
+    The interval is a percentile bootstrap's, widened for few seeds. The settings of the re-test
+    share its error rate equally. What was not seen cannot be resampled, so there is a condition.
+    """
+    own, shipped = figures[label], figures[SHIPPED]
+    if min(len(own), len(shipped)) < FEWEST_SEEDS:
+        return "undecided", ""
+    level = level_of_claim(environment.look.level, "means") / (len(figures) - 1)
+    apart = _resampled(tuning, own, 1) - _resampled(tuning, shipped, 2)
+    ends = percentile_interval(apart, interval_tail([own, shipped], 1 - level))
+    low, high = sorted((-1 if tuning.is_cost else 1) * float(end) for end in ends)
+    if low <= 0 <= high:
+        return "undecided", ""
+    verdict = "better" if low > 0 else "worse"
+    of_what = f"{statistic_of(tuning)} of {tuning.figure}"
+    condition = "as long as further runs are like those that were seen"
+    return f"{verdict}{AS_SEEN}", f"{verdict} than the shipped settings by {of_what}, {condition}"
+
+
+def _resampled(tuning: TuningSpec, figures: Floats, stream: int) -> Floats:
+    """The value of a setting in each resample of its runs."""
+    n, rng = len(figures), np.random.default_rng([RESAMPLING_SEED, stream])
+    drawn = figures[rng.integers(n, size=(N_RESAMPLES, n))]
+    return judged_rows(drawn, tuning.objective, is_cost=tuning.is_cost)
+
+
+def statistic_of(tuning: TuningSpec) -> str:
+    """The searched statistic in words."""
+    lower = "upper quartile" if tuning.is_cost else "lower quartile"
+    return {"mean": "mean", "iqm": "interquartile mean", "lower": lower}[tuning.objective]
 
 
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
@@ -202,7 +328,8 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     runs are the luckier ones.
     """
     shipped, *others = retested
-    there = [each for each in others if each.n_runs >= tuning.retest_seeds]
+    enough = tuning.retest_seeds
+    there = [each for each in others if each.n_runs >= enough and not each.n_missing]
     if not there:
         return None, "none has run on all other seeds"
     sign = -1 if tuning.is_cost else 1
@@ -278,19 +405,18 @@ def _provenance(
     """Lines on the origin of the winner's settings."""
     winner, shipped = outcome.winner, outcome.retested[0]
     assert winner is not None
-    seeds, held_out = tuning.study.seeds, tuning.held_out
+    seeds, held_out = tuning.study.seeds, outcome.held_out
     others = len(outcome.retested) - 1
     chosen = f", the best of {others} that were run again" if others > 1 else ""
-    lower = "upper quartile" if tuning.is_cost else "lower quartile"
-    statistic = {"mean": "mean", "iqm": "interquartile mean", "lower": lower}[tuning.objective]
     is_one_engine = tuning.searched(entry) == dict(entry)
     engines = f" The search ran with engine: auto, the re-test in {LIBRARY_LOOP}."
     text = (
         f"Tuned by tune.py on {time.strftime('%Y-%m-%d')}: trial {winner.number} of {n_trials} "
-        f"({tuning.sampler}), {statistic} of {tuning.figure} over the seeds {seeds.start} to "
-        f"{seeds.stop - 1}: {_figure(winner.in_search)}. On the seeds {held_out.start} to "
-        f"{held_out.stop - 1}, which the search has not seen{chosen}: {_held_out(tuning, winner)}; "
-        f"the settings before, there: {_held_out(tuning, shipped)}. Verdict: {winner.verdict}."
+        f"({tuning.sampler}), {statistic_of(tuning)} of {tuning.figure}"
+        f"{unproven_mark(tuning)} over the seeds {seeds.start} to {seeds.stop - 1}: "
+        f"{_figure(winner.in_search)}. On the seeds {held_out.start} to {held_out.stop - 1}, which "
+        f"the search has not seen{chosen}: {_held_out(winner)}; "
+        f"the settings before, there: {_held_out(shipped)}. Verdict: {winner.said}."
         f"{'' if is_one_engine else engines}"
     )
     return textwrap.wrap(text, LONGEST_LINE - len("# "))
@@ -306,18 +432,14 @@ def unproven_mark(tuning: TuningSpec) -> str:
     return "" if is_proven else " by a bracket whose upper end is not proven"
 
 
-def _held_out(tuning: TuningSpec, each: Retested) -> str:
+def _held_out(each: Retested) -> str:
     """The held-out figure with an interval, in words."""
     found, text = each.interval, _figure(each.held_out)
     if math.isnan(found.low):
         return text
     ends = f"{found.low:.4g} to {found.high:.4g}"
     failed = f", {each.n_failed} of them failed" if each.n_failed else ""
-    # Quartiles and times to a threshold have no intervals.
-    statistic = "interquartile mean" if tuning.objective == "iqm" else "mean"
-    of_what = f"{statistic} of {tuning.figure if tuning.figure in METRICS else 'score'}"
-    of_what += unproven_mark(tuning)
-    return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs{failed})"
+    return f"{text} (95 % interval: {ends}, {each.n_runs} runs{failed})"
 
 
 # The record.
@@ -335,8 +457,9 @@ def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> di
         "objective": tuning.objective,
         "lower_is_better": tuning.is_cost,
         "n_trials": place.queue.n_trials,
+        "n_at_optimum": place.n_at_optimum,
         "seeds": list(tuning.seeds),
-        "held_out_seeds": list(tuning.held_out),
+        "held_out_seeds": list(outcome.held_out if outcome else tuning.held_out),
         "search_engine": tuning.searched(place.suggestions.shipped).get("engine"),
         "engine": place.suggestions.shipped.get("engine"),
         "widened": list(place.suggestions.space.widened),
@@ -365,6 +488,7 @@ def _trial(trial: FrozenTrial) -> dict[str, Any]:
         "params": dict(trial.params),
         "settings": said.get(SETTINGS),
         "figures": {str(seed): figure for seed, figure in figures_of(said).items()},
+        "at_optimum": {str(seed): steps for seed, steps in figures_of(said, AT_OPTIMUM).items()},
         "seconds": seconds_of(said),
         "failure": said.get(FAILURE),
         "began": began and began.isoformat(),

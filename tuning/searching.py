@@ -29,8 +29,16 @@ from pipeline.locks import FolderGoneError, is_gone
 from safe_files.files import take_up
 from tuning.pruning import is_hopeless
 from tuning.search_spaces import read_search_space, steps_aside
-from tuning.suggesting import Suggestions, check_entry, make_sampler, planned_run, shipped_run
+from tuning.suggesting import (
+    Suggestions,
+    check_entry,
+    make_sampler,
+    name_of,
+    planned_run,
+    shipped_run,
+)
 from tuning.trial_storage import (
+    AT_OPTIMUM,
     FAILURE,
     FIGURES,
     JUDGED_BY,
@@ -43,7 +51,7 @@ from tuning.trial_storage import (
     seconds_of,
     turn,
 )
-from tuning.tuning_spec import AUTO, TuningSpec, judged
+from tuning.tuning_spec import AUTO, COST_OF_THRESHOLD, TuningSpec, judged
 from verdicts import steps_to_threshold
 
 SECONDS_BETWEEN_LOOKS = 1.0
@@ -53,6 +61,10 @@ _ROOM_FOR_A_RUN = 1 << 18  # bytes of a small run
 # Penalty for never reaching the threshold: twice the budget (PAR-2). If only the steps done
 # counted, giving up early would look cheap.
 WHOLE_RUNS = 2
+# Scores from here on are the optimum, but for rounding.
+OPTIMAL_SCORE = 1 - 1e-6
+# With so many settings at the optimum on all seeds, or as many as are re-tested, a search ends.
+ENOUGH_AT_OPTIMUM = 10
 
 
 @dataclass(frozen=True)
@@ -87,6 +99,24 @@ class OpenTuning:
             n_seeds=len(self.tuning.seeds),
             ceiling=1.0 if is_score else -math.inf,
         )
+
+    @property
+    def n_at_optimum(self) -> int:
+        """Number of settings that have the optimal score on all seeds of the search."""
+        said = [trial.user_attrs for trial in self.queue.trials()]
+        return len(
+            {
+                name_of(each[SETTINGS])
+                for each in said
+                if len(figures_of(each, AT_OPTIMUM)) == len(self.tuning.seeds)
+                and isinstance(each.get(SETTINGS), Mapping)
+            }
+        )
+
+    @property
+    def is_saturated(self) -> bool:
+        """Whether so many settings have the optimum that more trials cannot tell the best."""
+        return self.n_at_optimum >= max(ENOUGH_AT_OPTIMUM, self.tuning.retest)
 
 
 def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:
@@ -146,6 +176,7 @@ class RunOutcome:
     figure: float  # the figure for the search
     seconds: float  # its processor time
     name: str  # name of the figure: as requested, or the final return if no score is known
+    steps: float | None = None  # steps to the threshold, if the score is optimal
 
 
 def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
@@ -160,19 +191,22 @@ def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
     row, name = results.rows[0], tuning.figure
     if name == "score" and row.get(name) is None:  # no known optimum
         name = "final"
-    is_cost = name in ("steps", "seconds")
-    figure = _cost(tuning, row, results.curves[0]) if is_cost else row.get(name)
+    is_cost = name in COST_OF_THRESHOLD
+    figure = _cost(tuning, name, row, results.curves[0]) if is_cost else row.get(name)
     if figure is None or not math.isfinite(figure):
         raise UnjudgedError(f"it has no figure for {name}")
-    return RunOutcome(float(figure), float(row.get("cpu_seconds") or row["seconds"]), name)
+    steps = None
+    if name == "score" and figure >= OPTIMAL_SCORE and row.get("threshold") is not None:
+        steps = _cost(tuning, "steps", row, results.curves[0])
+    return RunOutcome(float(figure), float(row.get("cpu_seconds") or row["seconds"]), name, steps)
 
 
-def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> float:
+def _cost(tuning: TuningSpec, name: str, row: Mapping[str, Any], evaluations: Curve) -> float:
     """Steps or seconds until the learning curve reaches the threshold.
 
     Source: for PAR-k, Hutter et al. (2009), "ParamILS", JAIR 36.
     """
-    threshold, name = row.get("threshold"), tuning.figure
+    threshold = row.get("threshold")
     if threshold is None:
         raise UserError(
             f"--metric {name}: no threshold is known on "
@@ -207,6 +241,7 @@ class TrialUnderWay:
     seeds: list[int]  # seeds that have not begun, in order
     figures: dict[int, float]  # figures of finished seeds
     seconds: float  # time of finished seeds
+    steps: dict[int, float]  # by finished seed with the optimum, the steps to the threshold
     n_running: int = 0  # number of running seeds
     is_over: bool = False  # whether further results are ignored
 
@@ -244,7 +279,14 @@ class Search:
         return time.monotonic() > self.deadline
 
     def _is_at_end(self) -> bool:
-        return not self._runs and (self._is_late or (not self._trials and self.queue.is_done()))
+        if self._runs or self._is_late:
+            return not self._runs
+        return not self._trials and (self.queue.is_done() or self._is_saturated_by_all())
+
+    def _is_saturated_by_all(self) -> bool:
+        """Whether the search is saturated, and no driver has a trial under way."""
+        is_running = any(trial.state == TrialState.RUNNING for trial in self.queue.trials())
+        return not is_running and self.place.is_saturated
 
     def _hand_out(self) -> None:
         """Submit runs to all free workers, as long as there are any."""
@@ -263,12 +305,16 @@ class Search:
         return min(open_ones, key=lambda each: each.n_running, default=None)
 
     def _new_trial(self) -> TrialUnderWay | None:
-        while (trial := self.queue.claim(self.place.suggestions.params)) is not None:
+        while not self.place.is_saturated:
+            trial = self.queue.claim(self.place.suggestions.params)
+            if trial is None:
+                return None
             entry = self.place.suggestions.entry(trial)
             trial.set_user_attr(SETTINGS, plain(entry))
             known, seconds = figures_of(trial.user_attrs), seconds_of(trial.user_attrs)
             seeds = [seed for seed in self.tuning.seeds if seed not in known]
-            new = TrialUnderWay(trial, entry, seeds, known, seconds)
+            steps = figures_of(trial.user_attrs, AT_OPTIMUM)
+            new = TrialUnderWay(trial, entry, seeds, known, seconds, steps)
             self._trials.append(new)
             if known:  # its driver may have died after the last seed
                 self._judge(new)
@@ -333,6 +379,10 @@ class Search:
             if step not in there:  # a killed driver may have reported it
                 each.trial.report(self._value(each), step)
             each.trial.set_user_attr(SECONDS, each.seconds)
+            if outcome.steps is not None:
+                each.steps[planned.seed] = outcome.steps
+                steps = {str(seed): steps for seed, steps in each.steps.items()}
+                each.trial.set_user_attr(AT_OPTIMUM, steps)
             # Last, because it marks the seed as done.
             figures = {str(seed): figure for seed, figure in each.figures.items()}
             each.trial.set_user_attr(FIGURES, figures)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import random
 import warnings
 import zlib
@@ -32,6 +33,8 @@ from experiments.plan import PlannedRun, check_settings, plan
 from experiments.study import AgentSpec, layered
 from pipeline.errors import UserError
 from pipeline.files import json_text
+from pipeline.models.load import agent_class
+from pipeline.settings.values import algorithm_parameters
 from tuning.search_spaces import SearchSpace
 from tuning.tuning_spec import TuningSpec
 
@@ -119,6 +122,7 @@ class Suggestions:
         self.space = space.including(self.shipped)
         self.first = self.space.params_of(self.shipped)  # the parameters of the first trial
         self._fixed = self._settled()
+        self.fits_batches = self._fits_batches()
 
     def _settled(self) -> dict[str, Any]:
         """The parameters of settings that the user has fixed."""
@@ -126,6 +130,18 @@ class Suggestions:
         dimensions = [each for each in self.space.entries.values() if given.issuperset(each.keys)]
         names = [name for each in dimensions for name in each.distributions]
         return {name: self.first[name] for name in names if name in self.first}
+
+    def _fits_batches(self) -> bool:
+        """Whether trials draw batches, or buffers, of an agent that splits its buffer into them."""
+        from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+        algorithm = agent_class(self.tuning.agent.algo)
+        keys = {"batch_size", "n_steps", "n_envs"} & set(self.space.keys)
+        return (
+            issubclass(algorithm, OnPolicyAlgorithm)
+            and "batch_size" in algorithm_parameters(algorithm)
+            and bool(keys - set(self.tuning.agent.settings))
+        )
 
     @property
     def n_free(self) -> int:
@@ -187,7 +203,28 @@ class Suggestions:
     def merged(self, suggested: Mapping[str, Any]) -> dict[str, Any]:
         """The shipped hyperparameters with suggested settings and the user's fixed settings."""
         entry = self.space.merged(self.shipped, suggested)
-        return layered(entry, self.tuning.agent.settings)
+        entry = layered(entry, self.tuning.agent.settings)
+        return self._with_fitting_batch(entry) if self.fits_batches else entry
+
+    def _with_fitting_batch(self, entry: dict[str, Any]) -> dict[str, Any]:
+        """The entry with batches that divide the buffer of steps, as the library recommends.
+
+        If the user has fixed the batch size, the number of steps is changed instead. The sampler
+        keeps the parameters that it drew.
+        """
+        parameters = algorithm_parameters(agent_class(self.tuning.agent.algo))
+        found = {key: entry.get(key, parameters[key].default) for key in ("n_steps", "batch_size")}
+        n_steps, batch_size, n_envs = *found.values(), entry.get("n_envs", 1)
+        if batch_size is None:
+            return entry
+        if "batch_size" not in self.tuning.agent.settings:
+            divisors = [k for k in range(2, n_steps * n_envs + 1) if n_steps * n_envs % k == 0]
+            nearest = min(divisors, key=lambda k: abs(k - batch_size), default=batch_size)
+            return entry if nearest == batch_size else {**entry, "batch_size": nearest}
+        unit = batch_size // math.gcd(batch_size, n_envs)
+        nearest = max(round(n_steps / unit), 1) * unit
+        is_fixed = nearest == n_steps or "n_steps" in self.tuning.agent.settings
+        return entry if is_fixed else {**entry, "n_steps": nearest}
 
 
 # The runs of a trial: one for each seed; trials with equal settings share folders.

@@ -45,6 +45,8 @@ _ANY_PORT = 13000  # of Optuna's proxy
 ASKED, JUDGED_BY = "asked", "judged by"
 # Attributes of a trial, besides Optuna's own data.
 DRIVER, FAILURE, FIGURES = "driver", "failure", "figures"
+# By seed with the optimum, the steps to the threshold.
+AT_OPTIMUM = "at optimum"
 SETTINGS, SECONDS = "settings", "seconds"
 
 SECONDS_BETWEEN_SIGNS = 15.0
@@ -340,9 +342,9 @@ def turn(root: Path) -> Iterator[None]:
         yield
 
 
-def figures_of(said: Mapping[str, Any]) -> dict[int, float]:
+def figures_of(said: Mapping[str, Any], key: str = FIGURES) -> dict[int, float]:
     """The figures of a trial's seeds; empty if the attribute is invalid."""
-    given = said.get(FIGURES)
+    given = said.get(key)
     if not isinstance(given, Mapping):
         return {}
     return {

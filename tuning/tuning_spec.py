@@ -11,27 +11,31 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents import ALGORITHMS
 from experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError, one_line, shown
 from pipeline.files import plain
 
+Floats = NDArray[np.float64]
 Sampler = Literal["tpe", "gp", "random", "grid"]
 Objective = Literal["mean", "iqm", "lower"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
 # The figure of a run: a metric of compare.py, the score, or the cost to reach the threshold.
-FIGURES = ("score", *METRICS, "steps", "seconds")
-CHEAPER_IS_BETTER = (*COSTS, "steps", "seconds")
+COST_OF_THRESHOLD = ("steps", "seconds")
+FIGURES = ("score", *METRICS, *COST_OF_THRESHOLD)
+CHEAPER_IS_BETTER = (*COSTS, *COST_OF_THRESHOLD)
 
 AUTO = "auto"
 SHIPPED = "shipped"
 LOWER = 0.25
 
 # Fields that may change when a tuning is continued; any other change makes another tuning.
-_MAY_CHANGE = ("study", "n_trials", "retest", "retest_seeds", "first_retest_seed")
+_OF_RETEST = ("retest", "retest_seeds", "first_retest_seed", "until_decided", "max_retest_seeds")
+_MAY_CHANGE = ("study", "n_trials", *_OF_RETEST)
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ class TuningSpec:
     retest: int = 3  #: number of best settings in the re-test on held-out seeds
     retest_seeds: int = 20  #: number of held-out seeds
     first_retest_seed: int = 1000  #: the first held-out seed
+    until_decided: bool = False  #: whether the re-test grows until its winner is decided
+    max_retest_seeds: int | None = None  #: the most held-out seeds then; None for 50
 
     @property
     def agent(self) -> AgentSpec:
@@ -68,6 +74,11 @@ class TuningSpec:
     def is_cost(self) -> bool:
         """Whether a lower figure is better."""
         return self.figure in CHEAPER_IS_BETTER
+
+    @property
+    def is_judged_by_study(self) -> bool:
+        """Whether the verdicts of a study are about the figure and statistic of the search."""
+        return self.objective == "mean" and self.figure not in COST_OF_THRESHOLD
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -90,13 +101,36 @@ class TuningSpec:
         return {**({"engine": "auto"} if "auto" in engines[1:] else {}), **entry}
 
     def check(self) -> None:
-        """Check that search and re-test share no seeds."""
-        shared = sorted(set(self.seeds) & set(self.held_out))
+        """Check that search and re-test share no seeds, and that a re-test can grow."""
+        held_out = self.held_out
+        if self.until_decided:
+            held_out = range(held_out.start, held_out.start + self._check_growing())
+        elif self.max_retest_seeds is not None:
+            raise UserError("--max-retest-seeds belongs to --until-decided: give both")
+        shared = sorted(set(self.seeds) & set(held_out))
         if self.retest and shared:
             raise UserError(
                 f"seed {shared[0]} is one of the search and of the re-test: what is chosen by its "
                 "seeds is judged on others; see --first-seed and --first-retest-seed"
             )
+
+    def _check_growing(self) -> int:
+        """Check that the re-test can grow until decided; returns the most seeds."""
+        from experiments.growing import MOST_SEEDS
+
+        if not self.retest:
+            raise UserError("--until-decided is about the re-test: leave out --retest 0")
+        if not self.is_judged_by_study:
+            raise UserError(
+                "--until-decided decides means of scores, returns or regrets: leave it out, or "
+                f"--objective {self.objective} --metric {self.figure}"
+            )
+        most = self.max_retest_seeds or max(MOST_SEEDS, self.retest_seeds)
+        if most < self.retest_seeds:
+            raise UserError(
+                f"--max-retest-seeds is {most}, the re-test begins with {self.retest_seeds} seeds"
+            )
+        return most
 
     def identity(self, shipped: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
         """The identity of this tuning as JSON."""
@@ -120,7 +154,7 @@ class TuningSpec:
         return data
 
 
-def judged(figures: Sequence[float], objective: Objective, *, is_cost: bool) -> float:
+def judged(figures: Sequence[float] | Floats, objective: Objective, *, is_cost: bool) -> float:
     """The value of a setting by its runs.
 
     Args:
@@ -129,13 +163,16 @@ def judged(figures: Sequence[float], objective: Objective, *, is_cost: bool) -> 
             side of the worst runs.
         is_cost: whether a lower figure is better; ``lower`` is then the upper quartile.
     """
-    values = np.sort(np.asarray(figures, dtype=np.float64))
-    if objective == "mean":
-        return float(values.mean())
-    if objective == "iqm":
-        cut = len(values) // 4
-        return float(values[cut : len(values) - cut].mean())
-    return float(np.quantile(values, 1 - LOWER if is_cost else LOWER))
+    return float(judged_rows(np.asarray(figures, np.float64), objective, is_cost=is_cost))
+
+
+def judged_rows(figures: Floats, objective: Objective, *, is_cost: bool) -> Floats:
+    """The values of many sets of runs, shape (..., n_runs); see `judged`."""
+    values = np.sort(figures, axis=-1)
+    if objective == "lower":
+        return np.asarray(np.quantile(values, 1 - LOWER if is_cost else LOWER, axis=-1))
+    cut = values.shape[-1] // 4 if objective == "iqm" else 0
+    return np.asarray(values[..., cut : values.shape[-1] - cut].mean(axis=-1))
 
 
 # The type of ``--storage``, and one-line messages for its failures: Optuna itself is loaded later.

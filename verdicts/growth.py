@@ -63,6 +63,7 @@ def grow(
     *,
     ends: Ends | None = None,
     paired: bool = False,
+    against: str = "",
 ) -> Growth:
     """Look at a study as often as was settled and its seeds allow, and say who needs more.
 
@@ -79,6 +80,7 @@ def grow(
         certain: the agents that do not depend on chance; see ``judge_pairs``.
         ends: of the scores; see ``judge_pairs``.
         paired: whether the agents' runs of one seed share their randomness.
+        against: the only agent that the others are compared with; see ``judge_pairs``.
 
     Source: Holm's procedure with p-values over looks, each multiplied by the number of looks; see
     Maurer and Bretz (2013), "Multiple testing in group sequential trials using graphical
@@ -89,13 +91,15 @@ def grow(
     looks: dict[tuple[str, str], int] = {}
     seeds = dict.fromkeys(scores, sizes[0])
     for look, size in enumerate(sizes, start=1):
-        growing = _undecided_agents(scores, judged, seeds) if judged else set(scores)
+        growing = _undecided_agents(scores, judged, seeds, against) if judged else set(scores)
         seeds |= dict.fromkeys(growing, size)
         if not growing or any(len(scores[name]) < size for name in growing):
             break
         decided = {pair: each for pair, each in judged.items() if each.is_decided}
         shown = {name: np.asarray(values)[: seeds[name]] for name, values in scores.items()}
-        judged = judge_pairs(shown, margin, share, certain, decided, ends=ends, paired=paired)
+        judged = judge_pairs(
+            shown, margin, share, certain, decided, ends=ends, paired=paired, against=against
+        )
         looks |= {pair: look for pair in judged if pair not in decided}
     is_done = all(len(values) >= seeds[name] for name, values in scores.items())
     return Growth(judged, looks, seeds, max(looks.values(), default=0), share, is_done)
@@ -105,12 +109,15 @@ def _undecided_agents(
     scores: Mapping[str, Floats],
     judged: Mapping[tuple[str, str], Judgement],
     seeds: Mapping[str, int],
+    against: str,
 ) -> set[str]:
     """The agents in undecided pairs, but for those whose runs all but fail."""
     there = {name: np.isfinite(values[: seeds[name]]).sum() for name, values in scores.items()}
     return {
         name
         for pair, judgement in judged.items()
-        if not judgement.is_decided and min(there[each] for each in pair) >= FEWEST_SEEDS
+        if (not against or against in pair)
+        and not judgement.is_decided
+        and min(there[each] for each in pair) >= FEWEST_SEEDS
         for name in pair
     }

@@ -100,6 +100,7 @@ def judge_pairs(
     *,
     ends: Ends | None = None,
     paired: bool = False,
+    against: str = "",
 ) -> dict[tuple[str, str], Judgement]:
     """Judge every two agents, in the order of the mapping.
 
@@ -118,6 +119,8 @@ def judge_pairs(
             spent on who is best, see ``rank_by_mean``.
         ends: of the scores; where they are not known, see ``Ends.beyond``.
         paired: whether the agents' runs of one seed share their randomness.
+        against: the only agent whose mean the others are compared with. Other pairs are not tested:
+            they are undecided, unless two tested pairs imply a verdict. Empty for all pairs.
     """
     earlier = dict(decided or {})
     ends = ends or Ends.beyond(scores)
@@ -125,13 +128,17 @@ def judge_pairs(
     known = {(a, b) for a, b in pairs if a in certain and b in certain} - earlier.keys()
     tested = [pair for pair in pairs if pair not in known and pair not in earlier]
     for_means = level_of_claim(level, "means")
-    ranks = decided is None and len(scores) > 2
+    ranks = decided is None and len(scores) > 2 and not against
     if ranks:
         for_means /= 2  # the other half is for who is best
-    share = for_means / max(len(pairs) - len(known), 1)
+    compared = {pair for pair in pairs if not against or against in pair}
+    share = for_means / max(len(compared - known), 1)
     runs = {pair: _runs(scores, pair, paired=paired) for pair in tested}
     means = {}
     for pair, (x, y) in runs.items():
+        if pair not in compared:
+            means[pair] = MeanVerdict("undecided")
+            continue
         means[pair] = judge_means(
             ends.shares(x),
             ends.shares(y),
@@ -469,6 +476,7 @@ def describe_pairs(
     seed: int,
     paired: bool = False,
     ranks: bool = False,
+    against: str = "",
     certain: Collection[str] = (),
     confidence: float = 0.95,
     n_resamples: int = N_RESAMPLES,
@@ -484,11 +492,13 @@ def describe_pairs(
         seed: of the resampling.
         paired: whether the agents' runs of one seed share their randomness.
         ranks: whether half of what is for means was spent on who is best.
+        against: the only agent that the others were compared with; empty for all pairs.
         certain: the agents that do not depend on chance.
         confidence: of the probabilities of improvement.
         n_resamples: how many resamples their intervals come from.
     """
-    n_pairs = max(1, sum(not each.certain for each, _ in judged.values()))
+    compared = {pair for pair in judged if not against or against in pair}
+    n_pairs = max(1, sum(not judged[pair][0].certain for pair in compared))
     for_best = level_of_claim(levels[0], "means") / 2 if ranks else 0.0
     level = (for_best or level_of_claim(levels[0], "means")) / n_pairs
     comparisons = []
@@ -500,7 +510,7 @@ def describe_pairs(
         )
         x, y = _runs(dict(zip((one, two), both, strict=True)), (one, two), paired=paired)
         needed = None
-        if not judgement.is_decided and min(len(x), len(y)) > 1:
+        if (one, two) in compared and not judgement.is_decided and min(len(x), len(y)) > 1:
             needed = seeds_needed(
                 ends.shares(x),
                 ends.shares(y),
@@ -516,7 +526,8 @@ def describe_pairs(
                 mean=_mean_difference(
                     (ends.shares(x), ends.shares(y)),
                     (one in certain, two in certain),
-                    (level, for_best),
+                    # Without a test, an interval has every difference.
+                    (level if (one, two) in compared else 0.0, for_best),
                     margin / (ends.high - ends.low),
                     judgement,
                     paired=paired,

@@ -58,7 +58,13 @@ class Trials:
         """Those that have all their seeds, the best first, and then the others."""
         whole = [trial for trial in self.judged if kind(trial) == COMPLETE]
         whole.sort(key=lambda trial: trial["value"], reverse=not self.is_cost)
+        whole.sort(key=self._steps_at_optimum)
         return whole + [trial for trial in self.ended if trial not in whole]
+
+    def _steps_at_optimum(self, trial: Mapping[str, Any]) -> float:
+        steps = [*trial.get("at_optimum", {}).values()]
+        is_optimal = bool(steps) and len(steps) == len(trial["figures"])
+        return sum(steps) / len(steps) if is_optimal else math.inf
 
     def distributions(self) -> dict[str, BaseDistribution]:
         """What each parameter was drawn from."""
@@ -111,8 +117,8 @@ def importances(trials: Trials) -> dict[str, float]:
 
 # The numbers behind the figures.
 
-# Trials so far from the best that the others could not be told apart are drawn at the edge.
-_SHOWN = 0.8
+# The share of trials below the axis of values: what decides lies between the others and the best.
+_BELOW = 0.25
 # Lines of as many strengths as ranks are told apart by.
 _GROUPS = 5
 _ABSENT = object()
@@ -155,16 +161,25 @@ def _text(trial: Mapping[str, Any]) -> str:
 
 
 def _edge(trials: Trials) -> float | None:
-    """Where the axis of values ends on the side of the worst; None where all are shown."""
-    values = np.array([v for t in trials.ended if (v := _value(t)) is not None])
-    if not values.size:
-        return None
+    """Where the axis of values ends on the side of the worst; None where all are shown.
+
+    It holds the best three quarters of the trials that were judged on all seeds, or else of all
+    trials, and the shipped settings, if these need no more room than they have.
+    """
     sign = -1.0 if trials.is_cost else 1.0
-    goods = np.sort(sign * values)
-    worst, best = float(goods[0]), float(goods[-1])
-    least = float(goods[math.ceil((1 - _SHOWN) * (goods.size - 1))])
-    edge = least - 0.15 * (best - least)
-    return sign * edge if edge - worst > best - edge else None
+    values = [
+        (kind(t), t["number"], sign * v) for t in trials.ended if (v := _value(t)) is not None
+    ]
+    goods = np.array([value for *_, value in values])
+    whole = np.array([value for name, _, value in values if name == COMPLETE])
+    shipped = next((value for _, number, value in values if number == 0), -math.inf)
+    for some in (whole, goods):
+        if some.size and (room := some.max() - np.quantile(some, _BELOW)) > 0:
+            best = float(some.max())
+            room = max(room, best - shipped) if best - shipped <= 2 * room else room
+            edge = best - 1.15 * float(room)
+            return sign * edge if edge > goods.min() else None
+    return None
 
 
 def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:

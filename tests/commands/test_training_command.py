@@ -11,6 +11,8 @@ import pytest
 import yaml
 
 import train
+from experiments import launching
+from pipeline.errors import UserError
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
@@ -67,6 +69,71 @@ def search(own_folder, type_study):
     """Do a search in this process, inside a folder of its own."""
     (own_folder / "space.yml").write_text(SPACE)
     return lambda *words: type_study(*SEARCH, *words, program="tune.py")
+
+
+UNTIL_DECIDED = ["--until-decided", "--max-retest-seeds", "12"]
+# Without a look ahead nothing is learnt but the last step.
+BLIND = "FrozenLake-v1: {n_episodes: 600, learning_rate: 0.1, gamma: 0.0}"
+NEAR = "FrozenLake-v1: {n_episodes: 600, learning_rate: 0.1, gamma: 0.9}"
+NEARBY = "default: {learning_rate: {low: 0.09, high: 0.11}}"
+EASY = ["--env-kwargs", "is_slippery:False", "--conf-file", "blind.yml", "--retest", "2"]
+
+
+def test_a_saturated_search_ends_and_its_re_test_grows_until_decided(search, own_folder):
+    (own_folder / "blind.yml").write_text(BLIND)
+    words = [*EASY, *UNTIL_DECIDED, "--trials", "40", "--retest-seeds", "8", "--n-episodes", "600"]
+    code, out, err = search(*words)
+    assert (code, err) == (0, "")
+    assert "settings have the optimum on all seeds" in out
+    assert "the search ends here" in out
+    assert "FrozenLake-v1, look 1 of 2: all pairs are decided" in out
+    assert "better on average than the shipped settings" in out
+    record = json.loads((FOLDER / "tuning.json").read_text())
+    assert record["n_at_optimum"] == 10
+    best = [each for each in record["trials"] if len(each["at_optimum"]) == 2]
+    best.sort(key=lambda each: sum(each["at_optimum"].values()))
+    labels = [each["label"] for each in record["retest"]["settings"]]
+    assert labels == ["shipped", *(f"trial {each['number']}" for each in best[:2])]
+    assert (record["retest"]["winner"], record["held_out_seeds"]) == (
+        labels[1],
+        [*range(1000, 1008)],
+    )
+    code, again, _ = search(*words)
+    assert (code, out.splitlines()[-8:-1]) == (0, again.splitlines()[-8:-1])
+    assert "24 runs, 24 of them there already" in again
+    code, _, err = search(*words, "--max-retest-seeds", "20")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "the looks were fixed before the first of them and cannot change" in err
+
+
+def test_a_growing_re_test_that_is_stopped_between_goes_on(search, own_folder, monkeypatch):
+    (own_folder / "near.yml").write_text(NEAR)
+    (own_folder / "nearby.yml").write_text(NEARBY)
+    words = [*UNTIL_DECIDED, "--trials", "3", "--retest-seeds", "8", "--n-episodes", "600"]
+    words += ["--conf-file", "near.yml", "--search-space", "nearby.yml"]
+
+    def retested(name, code=0):
+        found = search(*words, "--name", name)
+        assert found[0] == code
+        return json.loads((FOLDER.parent / name / "tuning.json").read_text()) if not code else None
+
+    whole, do_runs, calls = retested("whole"), launching.execute, []
+
+    def stopped(runs, *args):
+        calls.append(len(runs))
+        if len(calls) == 2:
+            do_runs(runs[:1], *args)
+            raise UserError("the power is gone")
+        return do_runs(runs, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(launching, "execute", stopped)
+        retested("parts", 2)
+    assert len(calls) == 2
+    assert whole["held_out_seeds"] == [*range(1000, 1012)]
+    parts = retested("parts")
+    assert parts["retest"] == whole["retest"]
+    assert parts["retest"]["settings"][1]["verdict"] == "undecided"
 
 
 def finished_runs():

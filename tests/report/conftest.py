@@ -52,7 +52,8 @@ def tuning_record(tuning_trial):
     retested = {"held_out": 0.5, "verdict": "", "in_search": 0.6, "number": 0}
     retested |= {"n_runs": 4, "n_failed": 1}
     retested["interval"] = {"point": 0.5, "low": 0.4, "high": 0.6, "n": 4, "n_missing": 0}
-    winner = {**retested, "label": "trial 2", "number": 2, "held_out": 0.7, "verdict": "better"}
+    winner = {**retested, "label": "trial 2", "number": 2, "held_out": 0.7}
+    winner |= {"verdict": "better, as seen", "said": "better <on average>, as long as it holds"}
     space = {
         name: json.dumps({"name": f"{kind}Distribution", "attributes": attributes})
         for name, (kind, attributes) in SEARCH_SPACE.items()
@@ -66,6 +67,7 @@ def tuning_record(tuning_trial):
         "objective": "mean",
         "lower_is_better": False,
         "n_trials": 10,
+        "n_at_optimum": 0,
         "seeds": [1, 0],
         "held_out_seeds": [1000, 1001],
         "widened": ["rate"],

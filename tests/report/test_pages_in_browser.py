@@ -299,7 +299,7 @@ def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tuning_record,
     browser.plots(3)
     assert len(browser.all(".js-plotly-plot")) == 3
     browser.fits(390)
-    told = "Triangles at the edge lie beyond it. Failed: trial 4."
+    told = "a triangle at its edge is a trial beyond it. Failed: trial 4."
     assert told in browser.find("#history").text
     browser.asks_nobody(path)
 

@@ -36,6 +36,49 @@ def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
     assert [trial["number"] for trial in trials.best_first] == [0, 3, 2, 1, 4, 6]
 
 
+@pytest.mark.parametrize(
+    ("values", "pruned", "edge"),
+    [
+        # Three quarters of 0.9, 0.96, 0.98, 1.0 reach from 0.945 to 1; 15 % of that is room.
+        ([0.2, 0.9, 0.96, 0.98, 1.0], {}, 0.9 - 0.015),
+        # The shipped settings are shown, where they double the axis at most.
+        ([0.85, 0.9, 0.95, 0.98, 1.0], {5: 0.0}, 0.85 - 0.0225),
+        ([0.81, 0.9, 0.95, 0.98, 1.0], {5: 0.0}, 0.81 - 0.0285),
+        ([0.79, 0.9, 0.95, 0.98, 1.0], {5: 0.0}, 0.9 - 0.015),
+        # Trials that were ended early lie beyond, and have no say.
+        ([0.9, 0.95, 1.0], {3: 0.0, 4: 0.5}, 0.9 - 0.015),
+        # Where all others are alike, those tell.
+        ([1.0, 1.0, 1.0], {3: 0.0, 4: 0.5}, 0.5 - 0.075),
+        # All fit in.
+        ([0.9, 0.92, 0.98, 1.0], {}, None),
+        ([1.0, 1.0], {}, None),
+        ([], {}, None),
+    ],
+)
+@pytest.mark.parametrize("is_cost", [False, True])
+def test_the_axis_shows_where_the_best_are_told_apart(
+    tuning_record, tuning_trial, values, pruned, edge, is_cost
+):
+    sign = -1 if is_cost else 1
+    trials = [tuning_trial(n, sign * v, {"1": 0.0, "0": 0.0}) for n, v in enumerate(values)]
+    trials += [tuning_trial(n, sign * v, {"1": 0.0}, "pruned") for n, v in pruned.items()]
+    shown = history(Trials({**tuning_record, "trials": trials, "lower_is_better": is_cost}))
+    assert shown["edge"] == (None if edge is None else pytest.approx(sign * edge))
+
+
+def test_settings_with_the_optimum_are_ranked_by_their_steps(tuning_record, tuning_trial, tmp_path):
+    both = {"1": 1.0, "0": 1.0}
+    trials = [tuning_trial(n, 1.0, both) for n in range(4)]
+    for number, steps in ((1, (30, 50)), (3, (20, 40)), (2, (1,))):
+        trials[number]["at_optimum"] = dict(zip(("1", "0"), steps, strict=False))
+    record = {**tuning_record, "trials": trials, "n_at_optimum": 2}
+    assert [trial["number"] for trial in Trials(record).best_first] == [3, 1, 0, 2]
+    write_tuning_page(record, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "2 settings have the optimum on all seeds of the search" in text
+    assert "threshold, and more trials were not needed." in text
+
+
 def test_lines_run_through_the_parameters_between_their_ends(tuning_record):
     shown = parallel(Trials(tuning_record), {"steps": 1.0})
     assert [axis["name"] for axis in shown["axes"]] == ["steps", "rate", "kind"]
@@ -103,7 +146,8 @@ def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
     assert sections == ["verdict", "history", "parallel", "importances", "cost", "trials"]
     for part in (
         "Trial 2 is the best on seeds that the search has not seen: 0.7",
-        "and 1 of its 4 runs failed. Its settings are in",
+        "It is better &lt;on average&gt;, as long as it holds; 1 of its 4 runs failed. Its",
+        '<span class="chip better">better, as seen</span>',
         "looked better in the search than on other seeds, by 0.1",
         'href="retest/report.html"',
         ">rate 0.1, kind null, steps 3<",

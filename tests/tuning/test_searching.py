@@ -10,33 +10,40 @@ from dataclasses import replace
 
 import numpy as np
 import optuna
+import pandas as pd
 import pytest
 from optuna.storages import InMemoryStorage
 from optuna.trial import TrialState
 
-from experiments.results import Curve, RunResults
+from experiments.analysis import analyse
+from experiments.growing import remember, settled_looks, take_planned_looks
+from experiments.plan import plan
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, Curve, RunResults, StudyResults
 from experiments.study import EnvironmentSpec
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
-from tuning import searching
+from tuning import retesting, searching
 from tuning.pruning import PRUNERS, is_hopeless
 from tuning.retesting import (
+    Candidate,
     Outcome,
     Retested,
     _winner,
     best_trials,
     chosen_for_retest,
+    concluded,
     entry_text,
+    is_settled,
     optimism,
     retest_study,
     unproven_mark,
     write_winner,
 )
-from tuning.searching import UnjudgedError, outcome_of
+from tuning.searching import RunOutcome, UnjudgedError, outcome_of
 from tuning.suggesting import make_sampler
 from tuning.trial_storage import FAILURE, FIGURES, SETTINGS
 from tuning.tuning_spec import SAMPLERS, judged
-from verdicts import Estimate
+from verdicts import Ends, Estimate, compare_means, judge_pairs, level_of_look
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -131,6 +138,57 @@ def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path
     assert ended
     assert all(len(trial.user_attrs[FIGURES]) < 5 for trial in ended)
     assert len(launcher.done) == sum(len(t.user_attrs[FIGURES]) for t in place.queue.trials())
+
+
+def at_once(entry, seed):
+    """The optimum, but for a setting that did not learn on one seed."""
+    return 0.0 if entry["gamma"] < 0.7 and seed == 2 else 1.0
+
+
+def steps(entry, seed):
+    return 1000 * entry["learning_rate"] + seed
+
+
+@pytest.mark.parametrize(("retest", "n"), [(3, 10), (12, 12)])
+def test_a_saturated_search_ends_and_ranks_by_steps_to_the_threshold(toy, tmp_path, retest, n):
+    tuning = toy.tuning(n_trials=40, sampler="random", retest=retest)
+    place = toy.opened(tuning, tmp_path)
+    toy.search(place, toy.Launcher(), at_once, steps=steps)
+    ended = [trial for trial in place.queue.trials() if trial.state.is_finished()]
+    optimal = [t for t in ended if t.user_attrs[SETTINGS]["gamma"] >= 0.7]
+    assert (place.n_at_optimum, len(optimal), optimal[-1] == ended[-1]) == (n, n, True)
+    assert toy.states(place)[len(ended) :] == ["WAITING"] * (40 - len(ended))
+    ranked = best_trials(place.queue.trials(), is_cost=False)
+    rates = [each.entry["learning_rate"] for each in ranked]
+    assert rates[:n] == sorted(rates[:n])
+    assert [each.steps for each in ranked[:n]] == pytest.approx([1000 * r + 1 for r in rates[:n]])
+    assert [each.steps for each in ranked[n:]] == [None] * (len(ended) - n)
+    assert not toy.search(toy.opened(tuning, tmp_path), toy.Launcher(), at_once, steps=steps).done
+
+
+def test_other_drivers_trials_are_waited_for_where_a_search_is_saturated(
+    toy, tmp_path, monkeypatch
+):
+    tuning, waits = toy.tuning(n_trials=12, sampler="random"), []
+    other = toy.opened(tuning, tmp_path)
+    other.queue.add_places()
+    theirs = other.queue.claim(lambda _: {})
+
+    def ends_meanwhile(_):
+        waits.append(toy.states(other).count("RUNNING"))
+        other.queue.give_back(theirs)
+
+    place = toy.opened(tuning, tmp_path)
+    monkeypatch.setattr(searching.time, "sleep", ends_meanwhile)
+    toy.search(place, toy.Launcher(), lambda *_: 1.0, steps=steps)
+    assert waits == [1]
+    assert toy.states(place) == ["WAITING"] + ["COMPLETE"] * 10 + ["WAITING"]
+
+
+def test_returns_of_1_are_no_optimum(toy, tmp_path):
+    place = toy.opened(toy.tuning(n_trials=14, sampler="random"), tmp_path)
+    toy.search(place, toy.Launcher(), lambda *_: 1.0, judged_by="final")
+    assert (place.n_at_optimum, toy.states(place)) == (0, ["COMPLETE"] * 14)
 
 
 def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
@@ -302,6 +360,20 @@ def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value):
     assert (found.figure, found.seconds) == (value, 2.0)
 
 
+@pytest.mark.parametrize(
+    ("figure", "row", "steps"),
+    [
+        ("score", {"score": 1.0}, 20.0),
+        ("score", {"score": 1 - 1e-8, "threshold": 0.9}, 60.0),
+        ("score", {"score": 0.9999}, None),
+        ("score", {"score": 1.0, "threshold": None}, None),
+        ("final", {"final": 1.0}, None),
+    ],
+)
+def test_only_an_optimal_score_has_steps(toy, monkeypatch, figure, row, steps):
+    assert outcome(toy, monkeypatch, figure, **row).steps == steps
+
+
 @pytest.mark.parametrize("regret", [None, np.nan, np.inf])
 def test_a_run_without_the_figure_says_nothing(toy, monkeypatch, regret):
     with pytest.raises(UnjudgedError, match="no figure for regret"):
@@ -432,6 +504,25 @@ def test_scores_by_an_upper_end_without_a_proof_are_marked(toy, env_id, figure, 
     assert ("not proven" in mark) is is_marked
 
 
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"max_retest_seeds": 30}, "--max-retest-seeds belongs to --until-decided"),
+        ({"until_decided": True, "retest": 0}, "leave out --retest 0"),
+        ({"until_decided": True, "max_retest_seeds": 9}, "is 9, the re-test begins with 20"),
+        ({"until_decided": True, "objective": "iqm"}, "decides means of scores, returns"),
+        ({"until_decided": True, "figure": "steps"}, "or --objective mean --metric steps"),
+        # It may grow into the seeds of the search.
+        ({"until_decided": True, "first_seed": 1049}, "seed 1049 is one of the search and of"),
+    ],
+)
+def test_what_a_growing_re_test_cannot_be(toy, changes, complaint):
+    first = changes.pop("first_seed", 0)
+    tuning = toy.tuning(**changes)
+    with pytest.raises(UserError, match=complaint):
+        replace(tuning, study=replace(tuning.study, first_seed=first)).check()
+
+
 def test_seeds_of_the_search_and_of_the_re_test_are_apart(toy):
     toy.tuning(first_retest_seed=3).check()
     toy.tuning(first_retest_seed=2, retest=0).check()
@@ -502,6 +593,145 @@ ENTRY = {
 }
 
 
+def runs_of_retest(toy, root, runs, **changes):
+    """A re-test whose runs ended so, by settings: its tuning, candidates, results and figures.
+
+    A run is its score, or the score and the searched figure; None if it is missing.
+    """
+    tuning = toy.tuning(retest_seeds=len(runs["shipped"]), **changes)
+    labels = [label for label in runs if label != "shipped"]
+    found = [Candidate(int(label[-1]), ENTRY, 0.5, (0.5,)) for label in labels]
+    study = retest_study(tuning, root, found)
+    planned = plan(study, root)
+    ended = {(r.agent, r.seed): runs[r.agent][r.seed - 1000] for r in planned}
+    ends = {key: np.broadcast_to(end, 2) for key, end in ended.items() if end is not None}
+    rows = [
+        {"agent": agent, "environment": "FrozenLake-v1", "env_id": "FrozenLake-v1", "seed": seed}
+        | {"final": score, "score": score, "optimum": 1.0, "baseline": 0.0, "exact": True}
+        for (agent, seed), (score, _) in ends.items()
+    ]
+    tables = pd.DataFrame(rows, columns=RUN_COLUMNS), pd.DataFrame(columns=CURVE_COLUMNS)
+    return tuning, found, StudyResults(study, root, *tables, tuple(planned)), ends
+
+
+def re_tested(toy, root, monkeypatch, runs, **changes):
+    """The outcome of such a re-test."""
+    tuning, found, results, ends = runs_of_retest(toy, root, runs, **changes)
+    monkeypatch.setattr(
+        retesting,
+        "outcome_of",
+        lambda _, run: RunOutcome(float(ends[run.agent, run.seed][1]), 1.0, "score"),
+    )
+    return concluded(tuning, found, found, analyse(results))
+
+
+HALF = [0.0, 1.0] * 10
+# Their means are 0.36, and three quarters of them lie below.
+SKEWED = [0.2] * 16 + [1.0] * 4
+AHEAD = "better on average than the shipped settings"
+AS_LONG_AS = "as long as fewer than 0.87 % of further runs lie outside of those seen"
+
+
+@pytest.mark.parametrize(
+    ("shipped", "found", "verdict", "said"),
+    [
+        (HALF, [1.0] * 20, "better", AHEAD),
+        # Not sure for all that may happen: it wins, with the condition.
+        ([0.95, 1.0] * 10, [1.0] * 20, "better, as seen", f"{AHEAD}, {AS_LONG_AS}"),
+        ([1.0] * 20, HALF, "worse", None),
+        (HALF, HALF, "undecided", None),
+        # Closer than the margin of 0.02.
+        ([0.99, 1.0] * 10, [1.0] * 20, "equivalent, as seen", None),
+        # Below 0 counts as 0, in figures as in verdicts.
+        ([-3.0] * 20, [-1.0] * 20, "equivalent, as seen", None),
+    ],
+)
+def test_who_is_better_on_average_wins(toy, tmp_path, monkeypatch, shipped, found, verdict, said):
+    runs = {"shipped": shipped, "trial 1": found, "trial 2": shipped, "trial 3": found}
+    outcome = re_tested(toy, tmp_path, monkeypatch, runs)
+    assert [each.verdict for each in outcome.retested[1::2]] == [verdict] * 2
+    assert (outcome.winner and outcome.winner.said) == said
+    for each in outcome.retested:
+        low, high = each.interval.low, each.interval.high
+        assert low <= each.held_out <= high
+    if verdict == "better, as seen":
+        share = compare_means(found, shipped, level_of_look(0.05, 1) * 0.75 / 3).most_outside
+        assert f"{100 * share:.2g}" == "0.87"
+
+
+BETTER, HIGHEST, OLD, NEAR = (
+    [0.5] * 20,
+    [0.0, 1.0] * 9 + [1.0] * 2,
+    [0.3, 0.4] * 10,
+    [0.3, 0.45] * 10,
+)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "settled"),
+    [
+        (BETTER, NEAR, True),  # the other may be undecided
+        (BETTER, HIGHEST, False),  # but not if it is ahead
+        (BETTER, [None, *HIGHEST[1:]], True),  # unless it cannot win
+        (OLD, NEAR, False),
+        ([None, *BETTER[1:]], NEAR, False),
+    ],
+)
+def test_a_re_test_has_grown_enough_when_its_best_setting_is_decided(
+    toy, tmp_path, first, second, settled
+):
+    runs = {"shipped": OLD, "trial 1": first, "trial 2": second}
+    _, _, results, _ = runs_of_retest(toy, tmp_path, runs)
+    remember(tmp_path, {}, settled_looks(results.study, tmp_path, 45))
+    (step,) = take_planned_looks(results)
+    verdicts = [step.growth.judged["shipped", name].mean.verdict for name in list(runs)[1:]]
+    assert verdicts == ["undecided" if first == OLD else "worse", "undecided"]
+    assert step.asked == [("shipped", "trial 1"), ("shipped", "trial 2")]
+    assert is_settled(results, [step]) == settled
+
+
+def test_settings_whose_intervals_are_apart_are_told_apart(toy, tmp_path, monkeypatch):
+    """Where all pairs were compared, and who is best, this was undecided."""
+    low = [0.08, 0.09, 0.09, 0.09, 0.1, 0.1, *[0.11] * 4, *[0.12] * 6, 0.13, 0.13, 0.14, 0.15]
+    high = HALF
+    runs = {"shipped": low, "trial 1": high, "trial 2": high, "trial 3": low}
+    scores = {label: np.array(values) for label, values in runs.items()}
+    pairs = judge_pairs(scores, 0.02, level_of_look(0.05, 1), ends=Ends(0, 1))
+    assert not pairs["shipped", "trial 1"].is_decided
+    outcome = re_tested(toy, tmp_path, monkeypatch, runs)
+    shipped, found, *_ = outcome.retested
+    assert shipped.interval.high < found.interval.low
+    assert (outcome.winner, found.verdict) == (found, "better")
+
+
+@pytest.mark.parametrize(
+    ("changes", "shipped", "found", "verdict"),
+    [
+        # By their means they are alike; by the figure that was searched they are not.
+        ({"objective": "lower"}, SKEWED, [0.36] * 20, "better, as seen"),
+        ({"objective": "lower"}, [0.36] * 20, SKEWED, "worse, as seen"),
+        ({"objective": "iqm"}, [0.2] * 18 + [1.0] * 2, [0.28] * 20, "better, as seen"),
+        ({"objective": "mean"}, SKEWED, [0.36] * 20, "undecided"),
+        ({"objective": "iqm"}, HALF, HALF, "undecided"),
+        # Both reach the optimum, one of them sooner.
+        ({"figure": "steps"}, [(1.0, 900.0 + k) for k in range(20)], [(1.0, 500.0)] * 20,
+         "better, as seen"),
+        ({"figure": "steps", "objective": "lower"}, [(1.0, 5.0)] * 20,
+         [(1.0, 4.0)] * 6 + [(1.0, 9.0)] * 14, "worse, as seen"),
+        ({"figure": "seconds"}, [(1.0, 5.0)] * 4, [(1.0, 1.0)] * 4, "undecided"),  # too few
+    ],
+)  # fmt: skip
+def test_the_verdict_is_about_what_was_searched_for(
+    toy, tmp_path, monkeypatch, changes, shipped, found, verdict
+):
+    runs = {"shipped": shipped, "trial 1": found, "trial 2": shipped}
+    outcome = re_tested(toy, tmp_path, monkeypatch, runs, **changes)
+    assert [each.verdict for each in outcome.retested] == ["", verdict, "undecided"]
+    assert bool(outcome.winner) == verdict.startswith("better")
+    for each in outcome.retested:
+        assert each.interval.low <= each.held_out <= each.interval.high
+
+
 def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_path):
     """The search's own, and those that the settings it began with were tuned on: 0 to 9."""
     path = tmp_path / "entry.yml"
@@ -513,11 +743,11 @@ def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_pat
 
 
 def test_the_file_of_the_winner_says_where_it_comes_from(toy, tmp_path):
-    winner = retested(4, 0.85, "better", n_failed=3)
-    outcome = Outcome((retested(0, 0.7, ""), winner), winner, 0.05, "")
+    winner = replace(retested(4, 0.85, "better", n_failed=3), said="better on average")
+    outcome = Outcome((retested(0, 0.7, ""), winner), winner, 0.05, "", range(1000, 1020))
     path = write_winner(toy.tuning(), tmp_path, outcome, ENTRY, 10)
     said = " ".join(line[2:] for line in path.read_text().splitlines() if line.startswith("# "))
     assert "trial 4 of 10 (tpe), mean of score over the seeds 0 to 2: 0.9." in said
     assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (95 % interval" in said
     assert "0.5 to 0.9, 20 runs, 3 of them failed); the settings before, there: 0.7" in said
-    assert said.endswith("Verdict: better.")
+    assert said.endswith("Verdict: better on average.")

@@ -15,6 +15,7 @@ from verdicts import (
     apart_p_value,
     compare_means,
     compare_pairs,
+    describe_pairs,
     equivalent_p_value,
     fewest_seeds,
     holm,
@@ -585,6 +586,34 @@ def test_the_best_is_told_from_each_other_without_a_price_for_their_number():
     judged = judge_pairs(dict(zip("abcd", [best, *others], strict=True)), 0.02, 0.05, ends=UNIT)
     assert {judged["a", other].mean.verdict for other in "bcd"} == {"better"}
     assert not any(judged["a", other].mean.is_conditional for other in "bcd")
+
+
+def test_against_one_agent_the_others_are_not_tested():
+    old, far, low = (normal_scores(20, mean) for mean in (0.5, 0.7, 0.3))
+    scores = {"old": old, "far": far, "further": far + 0.1, "low": low}
+    judged = judge_pairs(scores, 0.0, 0.05, ends=UNIT, against="old")
+    said = {pair: each.mean.verdict for pair, each in judged.items()}
+    assert [said["old", name] for name in ("far", "further", "low")] == ["worse"] * 2 + ["better"]
+    assert said["far", "further"] == "undecided"  # though they are as far apart as old and far
+    assert said["far", "low"] == said["further", "low"] == "better"  # follows
+    # Each of three pairs has a third, where each of six would have a twelfth beside a ranking.
+    ahead = normal_scores(20, 0.555)
+    close = {"old": old, "a": ahead, "b": ahead, "c": old}
+    assert judge_pairs(close, 0.0, 0.05, ends=UNIT)["old", "a"].mean.verdict == "undecided"
+    few = judge_pairs(close, 0.0, 0.05, ends=UNIT, against="old")
+    assert few["old", "a"].mean == MeanVerdict("worse", is_conditional=True)
+    assert few["old", "a"].mean == judge_means(old, close["a"], 0.05 * 0.75 / 3)
+    described = describe_pairs(
+        {pair: (each, 20) for pair, each in judged.items()},
+        scores,
+        0.0,
+        (0.05, 0.05),
+        UNIT,
+        seed=0,
+        against="old",
+    )
+    untested = next(pair for pair in described if (pair.first, pair.second) == ("far", "further"))
+    assert (untested.mean.low, untested.mean.high, untested.seeds_needed) == (-1, 1, None)
 
 
 def test_who_is_best_may_have_a_condition_too():

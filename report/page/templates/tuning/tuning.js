@@ -31,7 +31,8 @@ report.section("history", (root, data) => {
     },
   });
   const words = [];
-  if (Object.values(values).flat().some(isBeyond)) words.push("Triangles at the edge lie beyond it.");
+  const beyond = Object.values(values).flat().filter(isBeyond).length;
+  if (beyond) words.push(`The axis shows where the best are told apart: ${beyond === 1 ? "a triangle at its edge is a trial" : `triangles at its edge are ${beyond} trials`} beyond it.`);
   if (failed.length) words.push(`Failed: ${failed.map((number) => `trial ${number}`).join(", ")}.`);
   root.querySelector(".detail").textContent = words.join(" ");
   report.figure(root.querySelector(".plot"), () => {
@@ -40,7 +41,7 @@ report.section("history", (root, data) => {
     const lines = shipped === null ? [] : [{
       type: "line", xref: "paper", x0: 0, x1: 1, y0: shown(shipped), y1: shown(shipped),
       line: { color: muted, width: 1.4, dash: "dot" },
-      label: { text: `shipped ${report.number(shipped)}`, textposition: "end", xanchor: "right", yanchor: isCost ? "top" : "bottom", font: { size: 11, color: muted } },
+      label: { text: `shipped ${report.number(shipped)}${isBeyond(shipped) ? ", beyond the edge" : ""}`, textposition: "end", xanchor: "right", yanchor: isCost ? "top" : "bottom", font: { size: 11, color: muted } },
     }];
     return {
       traces: [
