@@ -1,5 +1,6 @@
 report.section("diagnosis", (root, meanings, place) => {
   const select = root.querySelector("select");
+  const scale = () => root.querySelector('input[name="compared-scale"]:checked').value;
   const column = () => (place() ?? {})[select.value] ?? {};
   let redraw = () => {};
   const { isShown } = report.legend(root.querySelector(".legend"), () => redraw());
@@ -18,11 +19,11 @@ report.section("diagnosis", (root, meanings, place) => {
       .flatMap(([label, curve]) => report.band(label, curve, (value) => value)),
     layout: {
       hovermode: "x unified",
-      uirevision: [report.environment, select.value].join(),
+      uirevision: [report.environment, select.value, scale()].join(),
       xaxis: { title: { text: "environment steps" }, hoverformat: ",.4~r", exponentformat: "SI", rangemode: "tozero" },
-      yaxis: { title: { text: meanings[select.value] } },
+      yaxis: { title: { text: meanings[select.value] }, type: scale(), exponentformat: "power" },
     },
   });
   redraw = report.figure(root.querySelector(".plot"), build, () => place() !== null);
-  select.addEventListener("change", redraw);
+  root.querySelectorAll("select, input").forEach((input) => input.addEventListener("change", redraw));
 });
