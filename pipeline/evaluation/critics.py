@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -76,6 +76,7 @@ class KnownWorld:
     observations: NDArray[Any]  # of each state, states along the first axis
     horizon: int  # the time limit, which says how often states are visited
     masks: Bools | None  # action masks, shape (S, A), for agents that use them
+    is_limited: bool = True  # whether the limit is that of training; otherwise of evaluations
 
     @cached_property
     def visits(self) -> OfLastPolicy[Floats]:
@@ -131,7 +132,8 @@ def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
             observations, masks = observations_of_states(env), action_masks_of_states(env)
     if model is None or observations is None:
         return f"the exact model of {spec.env_id} is not known"
-    if horizon is None:  # visits are those of evaluations
+    is_limited = horizon is not None
+    if horizon is None:
         with closing(make_single_env(spec)) as env:
             horizon = time_limit(env)
         assert horizon is not None
@@ -141,7 +143,8 @@ def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
         return reason
     if own_values(agent, observations) is None:
         return f"{spec.algo} has no values"
-    world = KnownWorld(model, observations, horizon, masks if takes_masks(agent) else None)
+    masks = masks if takes_masks(agent) else None
+    world = KnownWorld(model, observations, horizon, masks, is_limited)
     # Compiled functions are loaded before the training begins.
     first = np.eye(model.n_actions)[np.zeros(model.n_states, np.int64)]
     world.values(first, 0.5)
@@ -256,7 +259,8 @@ class CriticRecorder(BlockCallback):
         world, agent = self.world, self.model
         if self.explores:
             found = policy_matrix(agent, world.observations, deterministic=False, masks=world.masks)
-            return found / found.sum(axis=1, keepdims=True)  # networks work in float32
+            # Networks work in float32.
+            return np.asarray(found / found.sum(axis=1, keepdims=True))
         actions = best_actions(agent, world.observations, world.masks)
         return np.eye(world.model.n_actions)[actions]
 
@@ -274,17 +278,17 @@ class CriticRecorder(BlockCallback):
         if believed.ndim == 2:
             values = (policy * believed).sum(axis=1)
             n_allowed = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
-            weights = {"": 1.0 * allowed, "_visited": visits[:, None] * allowed / n_allowed}
+            alike, by_visits = allowed.astype(np.float64), visits[:, None] * allowed / n_allowed
+            weights: dict[str, Floats] = {"": alike, "_visited": np.asarray(by_visits)}
             errors = believed - exact.action_values
             own_advantages = believed - values[:, None]
             for end, weight in weights.items():
                 found[f"q_error{end}"] = root_mean_square(errors, weight)
-                found[f"advantage_error{end}"] = root_mean_square(
-                    own_advantages - exact.advantages, weight
-                )
+                of_advantages = root_mean_square(own_advantages - exact.advantages, weight)
+                found[f"advantage_error{end}"] = of_advantages
             if not self.explores:
                 found["overestimation"] = weighted_mean(values - exact.values, visits)
-        found["v_error"] = root_mean_square(values - exact.values, 1.0 * reachable)
+        found["v_error"] = root_mean_square(values - exact.values, reachable.astype(np.float64))
         found["v_error_visited"] = root_mean_square(values - exact.values, visits)
         if self.explores:
             logs = np.log(np.where(policy > 0, policy, 1.0))
@@ -334,24 +338,23 @@ class RolloutRecorder(CriticRecorder):
 
     def rollout_figures(self, seed: int) -> dict[str, float]:
         """What comes of comparing the advantages of the rollout, and its policy gradient."""
-        world, agent, buffer = self.world, self.model, self.model.rollout_buffer  # type: ignore[attr-defined]
+        world, agent = self.world, cast(Any, self.model)
+        buffer = agent.rollout_buffer
         n_steps, n_envs = buffer.rewards.shape
         states = world.states_of(buffer.observations, n_steps * n_envs)
         actions = buffer.actions.reshape(-1).astype(np.int64)
         estimates = buffer.advantages.reshape(-1).astype(np.float64)
         policy, critic = self.policy(), own_values(agent, world.observations)
-        exact = world.values(policy, float(agent.gamma))  # type: ignore[attr-defined]
+        exact = world.values(policy, float(agent.gamma))
         times = np.arange(n_steps)[:, None]
         begun = np.maximum.accumulate(np.where(buffer.episode_starts > 0, times, 0))
-        n_left = np.minimum(n_steps - times, world.horizon - (times - begun)).reshape(-1)
+        n_left = np.broadcast_to(n_steps - times, begun.shape)
+        if world.is_limited:
+            n_left = np.minimum(n_left, world.horizon - (times - begun))
         assert critic is not None
+        steps = states, actions, n_left.reshape(-1)
         expected, shared = expected_estimates(
-            world.model,
-            policy,
-            critic,
-            agent.gamma,
-            agent.gae_lambda,
-            (states, actions, n_left),  # type: ignore[attr-defined]
+            world.model, policy, critic, agent.gamma, agent.gae_lambda, steps
         )
         ones = np.ones(len(states))
         found = {
@@ -421,7 +424,9 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
     parameters = [p for p in policy.parameters() if p.requires_grad]
     found = []
     for weight in th.as_tensor(weights, dtype=logs.dtype, device=logs.device):
-        slopes = th.autograd.grad(logs, parameters, weight, retain_graph=True, allow_unused=True)
+        slopes: Any = th.autograd.grad(
+            logs, parameters, weight, retain_graph=True, allow_unused=True
+        )
         found.append(th.cat([slope.reshape(-1) for slope in slopes if slope is not None]))
     return np.asarray(th.stack(found).double().cpu().numpy())
 
@@ -431,7 +436,7 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
 # Comparisons may take this share of a training, by the figures below, which are rather high for
 # comparisons and rather low for trainings. They go by no clock: the same seed gives the same file.
 SHARE = 0.1
-SECONDS_IN_ANY_CASE = 8e-3
+SECONDS_IN_ANY_CASE = 5e-3
 SECONDS_OF_NETWORKS = 2e-2  # likewise
 
 
@@ -449,12 +454,15 @@ def seconds_of_comparison(world: KnownWorld, model: BaseAlgorithm, *, explores: 
     """What a comparison takes at most."""
     per_state = world.model.n_actions * world.model.n_outcomes
     n_states = int(world.model.reachable.sum())
-    visits = 5e-9 * world.horizon * n_states * per_state
-    seconds = 4e-4 + 2e-7 * world.model.prob.size + (visits if explores else visits / 3)
+    visits = 7e-9 * world.horizon * n_states * per_state
+    seconds = (7e-4 + visits) if explores else (4e-4 + visits / 3)
+    seconds += 2e-7 * world.model.prob.size
     if n_states <= LARGEST_DENSE:
         seconds += 1e-10 * n_states**3
     else:
         seconds += (3e-5 if explores else 3e-6) * n_states
+    if model.gamma == 1:  # type: ignore[attr-defined]
+        seconds *= 2  # first it looks where episodes surely end
     if is_network(model):
         seconds += 1e-3 + 5e-6 * world.model.n_states
     if isinstance(model, OnPolicyAlgorithm):

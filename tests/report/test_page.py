@@ -379,7 +379,16 @@ def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_st
     agents = [AgentSpec(name, name) for name in ("qlearning", "sarsa", "random")]
     places = [EnvironmentSpec("lake", "FrozenLake-v1"), EnvironmentSpec("pole", "CartPole-v1")]
     places = [replace(place, settings={"n_timesteps": 400}) for place in places]
-    study = StudySpec("small", "", (*agents,), (*places,), n_seeds=2, eval_freq=100, eval_episodes=1, diagnose=True)
+    study = StudySpec(
+        "small",
+        "",
+        (*agents,),
+        (*places,),
+        n_seeds=2,
+        eval_freq=100,
+        eval_episodes=1,
+        diagnose=True,
+    )
     results = do_study(study, tmp_path / "runs")
     planned = results.planned
     page = written(analyse(results))
