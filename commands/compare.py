@@ -133,6 +133,8 @@ def build_parser() -> argparse.ArgumentParser:
     add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
     add_shared(group, "--log-folder", default="logs/studies", help="folder of all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
+    compared = "compare values, advantages and gradients with the exact ones at each evaluation"
+    add("--diagnose", action="store_true", default=None, help=compared)
     watched = "train the first run of each agent again, and link pages that play how it learns"
     add("--watch-learning", action="store_true", dest="learning_pages", help=watched)
     add(

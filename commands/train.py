@@ -122,6 +122,8 @@ def build_parser() -> argparse.ArgumentParser:
     levels = "0 silent, 1 progress and summary (default), 2 the library's tables as well"
     add("--verbose", type=VERBOSITY, default=1, help=levels)
     add("-P", "--progress", action="store_true", help="a progress bar even without a terminal")
+    compared = "compare values, advantages and gradients with the exact ones at each evaluation"
+    add("--diagnose", action="store_true", help=compared)
     add(
         "--watch-learning",
         type=filled,

@@ -23,6 +23,7 @@ from experiments.bandits import STATISTICS_FILE, PullStatistics, read_pulls, run
 from experiments.plan import PlannedRun
 from experiments.study import StudySpec
 from mdp.transition_model import Floats
+from pipeline.curve_pictures import MEANINGS, read_diagnosis
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.errors import one_line
 from pipeline.loaded_code import DISTRIBUTIONS
@@ -194,6 +195,21 @@ def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
         raise DamagedFileError(path, "is damaged: it has actions that there are not")
     _check_finite(path, arrays["timesteps"], arrays["values"], arrays["optimal_values"])
     return arrays
+
+
+def read_compared(run: Run) -> dict[str, Floats]:
+    """Read what `pipeline.evaluation.critics` wrote of a run, by column."""
+    path = run.diagnosis_path
+    try:
+        found = read_diagnosis(run.files.read(path))
+        known = {name: found[name] for name in ("timesteps", *MEANINGS) if name in found}
+        if not len(known["timesteps"]) or not np.isfinite(known["timesteps"]).all():
+            raise ValueError("no steps")
+    except (ValueError, KeyError) as error:
+        if isinstance(error, DamagedFileError):
+            raise
+        raise DamagedFileError(path, "is damaged: it is no table of numbers by step") from error
+    return known
 
 
 # --- Learning curves.
@@ -510,6 +526,8 @@ def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
         files.check(path)
         if files.digests is None:
             read_value_maps(run)
+    if files.matching(run.diagnosis_path.name):
+        read_compared(run)
     if planned.seed == study.first_seed:
         files.check(run.model_path)
         if not run.model_path.exists():

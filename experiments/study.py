@@ -161,6 +161,8 @@ class StudySpec:
     user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
     tensorboard: bool = False  #: whether each run writes a TensorBoard log
     render_every: int = 0  #: episodes between two films; 0 for no films
+    #: Whether values and gradients are compared with exact ones at evaluations.
+    diagnose: bool = False
     #: Whether the page links to pages that play the first training of each agent.
     learning_pages: bool = False
     #: The file formats of figures: "png", "svg", "pdf".
@@ -213,6 +215,7 @@ _STUDY_VALUES: dict[str, Any] = {
     "threshold": float,
     "episodes_table": int,
     "keep": Keep,
+    "diagnose": bool,
 }
 # Limits of each run, in the format of the command line.
 _LIMITS: dict[str, Callable[[str], float]] = {
@@ -367,6 +370,7 @@ def write_study(root: Path, study: StudySpec) -> None:
         for environment in study.environments
     }
     data["agents"] = agents
+    data["diagnose"] = study.diagnose or None
     known = {key: value for key, value in data.items() if value not in (None, "")}
     text = yaml.safe_dump(plain(known), sort_keys=False, allow_unicode=True)
     write_text(root / "study.yml", text)

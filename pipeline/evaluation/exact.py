@@ -174,7 +174,7 @@ def _observation_bytes(space: spaces.Space[Any]) -> int:
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     """Make the exact evaluator of a run, or None if episodes have to be sampled."""
-    if _is_wrapped_as_vector(spec):
+    if is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
         model, horizon = transition_model(env), time_limit(env)
@@ -208,7 +208,7 @@ def _optimum(model: TransitionModel, horizon: int) -> float | None:
 
 def model_refusal(spec: TrainSpec) -> str | None:
     """Why the environment's own model is rejected, in one line; None if it is accepted."""
-    if _is_wrapped_as_vector(spec):
+    if is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
         check = model_check(env)
@@ -241,7 +241,7 @@ def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> st
     return f"{said}; {other:g}: {better:.2f} (gamma: auto)" if better > reached + 0.01 else said
 
 
-def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
+def is_wrapped_as_vector(spec: TrainSpec) -> bool:
     """Whether a VecEnv wrapper changes the agent's observations."""
     special = spec.hyperparams
     return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)

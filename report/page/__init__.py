@@ -35,6 +35,7 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     result_sections.comparison,
     result_sections.overall,
     world_sections.why,
+    world_sections.diagnosis,
     world_sections.policies,
     world_sections.played_episodes,
     result_sections.watching,
