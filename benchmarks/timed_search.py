@@ -26,7 +26,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import psutil
+import numpy as np
+import psutil  # type: ignore[import-untyped]
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -118,7 +119,8 @@ def with_optuna(args: argparse.Namespace, number: int, folder: Path) -> tuple[Pa
         value = 0.0
         for half in range(2):
             model.learn(args.n_timesteps // 2, reset_num_timesteps=half == 0)
-            value = float(evaluate_policy(model, gym.make(args.env), 20, warn=False)[0])
+            found = evaluate_policy(model, gym.make(args.env), 20, warn=False)[0]
+            value = float(np.mean(found))
             trial.report(value, half)
             if half == 0 and trial.should_prune():
                 raise optuna.TrialPruned

@@ -122,6 +122,14 @@ def build_parser() -> argparse.ArgumentParser:
     again = "make the folders of these runs again, of which figures were kept"
     add("--make-again", nargs="+", default=[], metavar="AGENT:SEED", help=again)
 
+    _add_output_flags(parser)
+    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
+    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
+    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
+    return parser
+
+
+def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("judgement and output")
     add = group.add_argument
     add("--metric", help="what verdicts are about: final, best, area, regret, ...")
@@ -145,11 +153,6 @@ def build_parser() -> argparse.ArgumentParser:
         help="formats of the figures: png, svg, pdf (default: png svg)",
     )
     add("--no-report", action="store_true", help="only tables: no figures and no page")
-
-    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
-    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
-    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
-    return parser
 
 
 # --- what is done ---------------------------------------------------------------------------------
