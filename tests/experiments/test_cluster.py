@@ -743,7 +743,9 @@ def test_a_cluster_does_what_this_machine_does_whatever_dies(tmp_path, monkeypat
         assert failures.keys() == {("poison", 0), ("poison", 1)}
         assert failures["poison", 0].reason == "its process died 2 times (SIGKILL)"
         assert failures["poison", 0].log.read_text()
-        # Beside the copies of the module.
+        # Beside the module's copies and digests.
+        digests = [found[name].pop("module_digests") for name in found if "run.json" in name]
+        assert all(digest.keys() == {"deadly_lake.py"} for digest in digests)
         assert {name: found.get(name) for name in here} == here
         assert len({name for name in found if "once_" in name and "run.json" in name}) == 2
         # Where no folder is shared, as on a machine of its own, files come back.
