@@ -75,8 +75,9 @@ def repeat_rows(path: Path, n_seeds: int) -> None:
 def row(folder: Path, n_runs: int, n_really: int) -> list[str]:
     """Do or make a study of so many runs, and measure it."""
     study = folder / NAME
-    done = f"{min(n_runs, n_really):,}"
-    while_training = measured(folder, min(n_runs, n_really))
+    driving = None
+    if n_runs <= n_really or not study.exists():
+        driving = measured(folder, min(n_runs, n_really))
     if n_runs > n_really:
         for path in study.glob(f"runs/*/*{SUFFIX}"):
             repeat_rows(path, n_runs // len(AGENTS))
@@ -85,13 +86,31 @@ def row(folder: Path, n_runs: int, n_really: int) -> list[str]:
     n_inodes = sum(1 for _ in (study / "runs").rglob("*"))
     return [
         f"{n_runs:,}",
-        done,
+        f"{min(n_runs, n_really):,}",
         f"{sum(files) / n_runs:.0f}",
         f"{n_inodes:,}",
-        f"{while_training['MB']:.0f}",
+        "-" if driving is None else f"{driving['MB']:.0f}",
         f"{page['MB']:.0f}",
         f"{page['processor']:.0f}",
         f"{page['seconds']:.0f}",
+    ]
+
+
+def extrapolated(first: list[str], second: list[str]) -> list[str]:
+    """The row of a million runs, on the line through two others."""
+    (n, *one), (m, *other) = (
+        [float(row[k].replace(",", "")) for k in (0, 5, 6)] for row in (first, second)
+    )
+    memory, processor = (y + (y - x) / (m - n) * (1e6 - m) for x, y in zip(one, other, strict=True))
+    return [
+        "1,000,000",
+        "extrapolated",
+        second[2],
+        "-",
+        "-",
+        f"{memory:.0f}",
+        f"{processor:.0f}",
+        "-",
     ]
 
 
@@ -102,12 +121,14 @@ def table(rows: list[list[str]]) -> str:
         "really done",
         "bytes of the files per run",
         "files and folders, all runs together",
-        "MB of the driver while runs are done",
-        "MB of the driver, to the page",
+        "MB of the driver that does them",
+        "MB of the driver to the page",
         "processor seconds to the page",
         "seconds to the page",
     ]
     lines = [headings, ["---:"] * len(headings), *rows]
+    if len(rows) > 1:
+        lines.append(extrapolated(*rows[-2:]))
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 

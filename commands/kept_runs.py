@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from commands.terminal import say
 from pipeline.errors import UserError, unknown
@@ -16,16 +17,29 @@ from pipeline.signs_of_life import doing
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from commands.compare import RunContext
     from experiments.figures_store import FigureStore
-    from experiments.launching import RunFailure
+    from experiments.launching import Launcher, RunFailure
     from experiments.plan import PlannedRun
     from experiments.results import LeftOut, StudyResults
     from experiments.study import StudySpec
 
 
+class Context(Protocol):
+    """What is needed here of `commands.compare.RunContext`."""
+
+    root: Path
+    console: Console
+    store: FigureStore | None
+
+    def get_ready(self, planned: Sequence[PlannedRun]) -> None:
+        """Start what runs are forked from."""
+
+    def launchers(self) -> AbstractContextManager[Launcher]:
+        """Open the place where runs are done."""
+
+
 def keep_few(
-    context: RunContext, results: StudyResults
+    context: Context, results: StudyResults
 ) -> tuple[StudyResults, list[RunFailure], bool]:
     """Have folders of few stored runs; also which failed, and whether all others are the same."""
     from experiments.analysis import runs_to_keep
@@ -39,7 +53,7 @@ def keep_few(
 
 
 def _do_again(
-    context: RunContext, study: StudySpec, runs: Sequence[PlannedRun]
+    context: Context, study: StudySpec, runs: Sequence[PlannedRun]
 ) -> tuple[list[RunFailure], bool]:
     """Make folders of stored runs again where they are missing or damaged.
 
@@ -83,7 +97,7 @@ def _otherwise(run: PlannedRun) -> Path:
     return run.path.with_name(f"{run.path.name}.otherwise")
 
 
-def make_again(context: RunContext, study: StudySpec, runs: Sequence[PlannedRun]) -> int:
+def make_again(context: Context, study: StudySpec, runs: Sequence[PlannedRun]) -> int:
     """Make the folders of stored runs again, the same to the bit; the exit code."""
     assert context.store is not None
     for run in runs:

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -40,9 +40,6 @@ from verdicts import (
     steps_to_stay,
     steps_to_threshold,
 )
-
-if TYPE_CHECKING:
-    from experiments.figures_store import StoredRuns
 
 # --- The files of one run.
 
@@ -312,6 +309,21 @@ class RunResults:
     curves: list[Curve] = field(default_factory=list)  #: its learning curves
 
 
+class RunsInFile(Protocol):
+    """The runs of an agent on an environment that are in a file instead of folders."""
+
+    def __contains__(self, seed: int) -> bool: ...
+
+    def column(self, name: str, study: StudySpec) -> list[Any]:
+        """A column of the summary, see `RUN_COLUMNS`."""
+
+    def curves(self, seeds: Sequence[int] | None = None) -> Iterator[list[Curve]]:
+        """The curves of evaluations and training of each run, with these seeds or all."""
+
+    def infos(self) -> list[dict[str, Any]]:
+        """What ``run.json`` says of settings and versions, once for all runs that are alike."""
+
+
 @dataclass(frozen=True)
 class StudyResults:
     """A study and its runs."""
@@ -329,7 +341,7 @@ class StudyResults:
     #: The details of runs that have just failed, by folder.
     failures: Mapping[Path, str] = field(default_factory=dict)
     #: The runs in files instead of folders, by labels; their curves are not in ``curves``.
-    stored: Mapping[tuple[str, str], StoredRuns] = field(default_factory=dict)
+    stored: Mapping[tuple[str, str], RunsInFile] = field(default_factory=dict)
     kept: tuple[PlannedRun, ...] = ()  #: the stored runs that have folders too, to load agents from
 
     @property
@@ -429,7 +441,7 @@ def read_results(
     root: Path,
     tell: Tell = tell_nobody,
     read: Callable[[PlannedRun], RunResults | None] | None = None,
-    stored: Mapping[tuple[str, str], StoredRuns] | None = None,
+    stored: Mapping[tuple[str, str], RunsInFile] | None = None,
 ) -> StudyResults:
     """Read all finished runs, except runs with damaged files.
 
@@ -483,7 +495,7 @@ def _summary(
     study: StudySpec,
     n_rows: int,
     rows: Mapping[int, dict[str, Any]],
-    stored: Mapping[tuple[str, str], tuple[list[int], StoredRuns]],
+    stored: Mapping[tuple[str, str], tuple[list[int], RunsInFile]],
 ) -> pd.DataFrame:
     """The summary of runs in folders, by number of row, and of stored runs with their numbers."""
     if not stored:
