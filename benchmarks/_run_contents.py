@@ -16,7 +16,7 @@ import torch as th
 
 TIMES = ("seconds", "cpu_seconds")
 # Digests of files with times in them, the settings with the folder's name, and who did it.
-NOT_COMPARED = (*TIMES, "began", "ended", "files", "spec", "process", "command", "packed")
+NOT_COMPARED = (*TIMES, "began", "date", "ended", "files", "spec", "process", "command", "packed")
 
 
 def contents(logs: Path) -> dict[str, Any]:

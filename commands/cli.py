@@ -43,6 +43,7 @@ COMMANDS = {
     "train": "train an agent on an environment",
     "enjoy": "watch a trained agent",
     "explain": "say where an agent loses what it stays behind the optimum",
+    "shaping": "say what other rewards in training cost, and whether they change the optimum",
     "compare": "compare agents over seeds, and write a page",
     "tune": "search for an agent's settings, and test them on other seeds",
     "audit": "say whether an algorithm is right, or which fault it has",

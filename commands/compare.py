@@ -31,6 +31,7 @@ from commands.cli import (
     number_at_least_zero,
     whole_number,
 )
+from commands.kept_runs import keep_few, make_again, named_runs, repair, whose
 from commands.terminal import LiveProgress, say, table_console
 from pipeline import loading_libraries
 from pipeline.errors import UserError, unknown
@@ -44,11 +45,12 @@ if TYPE_CHECKING:
 
     from experiments.analysis import StudyAnalysis
     from experiments.cluster.schedulers import Cluster
+    from experiments.figures_store import FigureStore
     from experiments.growing import Step
     from experiments.launching import EarlyResults, Launcher, RunFailure
     from experiments.looks import Standing
     from experiments.plan import PlannedRun
-    from experiments.results import LeftOut, StudyResults
+    from experiments.results import StudyResults
     from experiments.run_limits import RunLimits
     from experiments.study import StudySpec
     from pipeline.signs_of_life import Activity
@@ -110,11 +112,24 @@ def build_parser() -> argparse.ArgumentParser:
 
     group = parser.add_argument_group("runs")
     add_shared(group, "--jobs", "--cluster", "--insecure-cluster", "--run-timeout", "--run-memory")
+    add = group.add_argument
     repaired = "do damaged runs again; the old folders are kept"
-    group.add_argument("--repair", action="store_true", help=repaired)
+    add("--repair", action="store_true", help=repaired)
     replaced = "do finished runs with other settings again; the old folders are kept"
-    group.add_argument("--replace", action="store_true", help=replaced)
+    add("--replace", action="store_true", help=replaced)
+    kept = "keep all run folders, or figures and few folders: the best, median and worst (all)"
+    add("--keep", choices=("all", "figures"), help=kept)
+    again = "make the folders of these runs again, of which figures were kept"
+    add("--make-again", nargs="+", default=[], metavar="AGENT:SEED", help=again)
 
+    _add_output_flags(parser)
+    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
+    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
+    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
+    return parser
+
+
+def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("judgement and output")
     add = group.add_argument
     add("--metric", help="what verdicts are about: final, best, area, regret, ...")
@@ -126,6 +141,8 @@ def build_parser() -> argparse.ArgumentParser:
     add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
     add_shared(group, "--log-folder", default="logs/studies", help="folder of all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
+    compared = "compare values, advantages and gradients with the exact ones at each evaluation"
+    add("--diagnose", action="store_true", default=None, help=compared)
     watched = "train the first run of each agent again, and link pages that play how it learns"
     add("--watch-learning", action="store_true", dest="learning_pages", help=watched)
     add(
@@ -136,11 +153,6 @@ def build_parser() -> argparse.ArgumentParser:
         help="formats of the figures: png, svg, pdf (default: png svg)",
     )
     add("--no-report", action="store_true", help="only tables: no figures and no page")
-
-    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
-    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
-    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
-    return parser
 
 
 # --- what is done ---------------------------------------------------------------------------------
@@ -159,6 +171,7 @@ def _compare(args: argparse.Namespace) -> int:
     """Do a study, as the only one that does."""
     study = study_spec(args)
     from experiments.child_processes import end_server
+    from experiments.figures_store import FigureStore
     from experiments.looks import read_looks
     from experiments.plan import plan
     from experiments.run_limits import RunLimits
@@ -171,15 +184,19 @@ def _compare(args: argparse.Namespace) -> int:
     console = table_console()
     limits = RunLimits(study.run_timeout, study.run_memory)
     context = run_context(args, root, command_line(), limits, console)
+    context.store = FigureStore(folds=study.keep == "figures", first_seed=study.first_seed)
     planned = plan(study, root)
+    to_make_again = named_runs(planned, args.make_again)
     console.print(study.title, style="bold", highlight=False)
     with folder_lock(root, give_way, partial(say, console)), told_if_gone(root):
         try:
+            if to_make_again:
+                return make_again(context, study, to_make_again)
             if args.until_decided:
                 return _grow_study(args, study, context)
             read_looks(root)  # so that it is known how often the study was looked at
             if args.repair:
-                repair(console, study, planned)
+                repair(console, study, planned, context.store)
             _prepare(study, planned, context, args.replace)
             return run_study(context, study, planned)
         except KeyboardInterrupt:
@@ -217,14 +234,17 @@ def _prepare(
         from experiments.plan import check_settings
         from experiments.run_folders import check_settings_kept
 
+        apart = context.not_stored(planned)
         if not replaces:
-            check_settings_kept(planned, context.root)
-        if any(run.is_to_do for run in planned):
-            context.get_ready(planned)
+            stored = [] if context.store is None else context.store.differences(planned)
+            others = [(n, there) for _, n, there in stored]
+            check_settings_kept(apart, context.root, others)
+        if any(run.is_to_do for run in apart):
+            context.get_ready(apart)
         activity.now("loading the libraries")
         first = [run for run in planned if run.seed == study.first_seed]
         do_aside(check_settings, study, first)
-        line, context.expected = _engines(planned)
+        line, context.expected = _engines(apart)
     if line:
         say(context.console, f"engines: {line}")
 
@@ -280,7 +300,7 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
     now = grown(study, counts)
     planned = plan(now, context.root, counts)
     if args.repair:
-        repair(context.console, now, planned)
+        repair(context.console, now, planned, context.store)
     _prepare(now, planned, context)
     remember(context.root, read_looks(context.root), looks)  # before the first run is done
     results, steps, failures = look_by_look(context, study, counts)
@@ -365,28 +385,46 @@ def do_missing(
     from experiments.launching import execute
     from experiments.run_folders import move_replaced_aside
 
-    console, root = context.console, context.root
-    moved, place = move_replaced_aside(planned, root)
+    console, root, store = context.console, context.root, context.store
+    if store is not None:
+        store.move_others_aside(planned, root)
+    apart = context.not_stored(planned)
+    moved, place = move_replaced_aside(apart, root)
     if place is not None:
         runs = "1 run that is" if len(moved) == 1 else f"{len(moved)} runs that are"
         say(console, f"{runs} done again: what was there is in {place} now")
-    missing = [run for run in planned if run.is_to_do and run.path not in given_up]
-    done = [run for run in planned if run.is_finished]
+    missing = [run for run in apart if run.is_to_do and run.path not in given_up]
+    there = {id(run) for run in apart}
+    done = [run for run in planned if id(run) not in there or run.is_finished]
     console.print(
         f"{len(planned)} runs, {len(done)} of them there already; {context.words}, in {root}",
         highlight=False,
     )
+    if store is not None and store.folds:
+        store.tidy(planned)
+        for run in done:
+            if id(run) in there:
+                store.add(run, early.read(run))
     begun = [*done, *missing]
     with StudyProgress(console, begun, done, context.expected) as progress:
         for run in done:
-            progress.note_refusal(run)
+            if id(run) in there:
+                progress.note_refusal(run)
 
         def note(planned: PlannedRun, failure: RunFailure | None) -> None:
             progress.note(planned, failure)
             if failure is None:
-                early.read(planned)
+                found = early.read(planned)
+                if store is not None and store.add(planned, found):
+                    early.forget(planned)
 
-        return execute(missing, root, progress.watching(context.launchers), note, early.get_ready)
+        try:
+            return execute(
+                missing, root, progress.watching(context.launchers), note, early.get_ready
+            )
+        finally:
+            if store is not None:
+                store.commit()
 
 
 def read(
@@ -396,7 +434,8 @@ def read(
     with doing(context.console, "reading the results") as activity:
         from experiments.results import read_results
 
-        return read_results(study, planned, context.root, activity.at, early.of)
+        stored = None if context.store is None else context.store.runs(planned)
+        return read_results(study, planned, context.root, activity.at, early.of, stored)
 
 
 def conclude(
@@ -412,11 +451,13 @@ def conclude(
     from experiments.results import mixed_versions
 
     tell = partial(say, context.console)
+    results, more, is_same = keep_few(context, results)
+    failures = [*failures, *more]
     results = replace(results, failures={one.planned.path: one.details for one in failures})
     try:
         if len(results.summary):
             _judge(context, results, looks)
-            note = mixed_versions(run.run.read_info() for run in results.finished)
+            note = mixed_versions(info for *_, info in results.infos())
             if note:
                 tell(note)
     finally:
@@ -426,7 +467,7 @@ def conclude(
             who = f"{run.agent} on {run.environment}, seed {run.seed}"
             tell(f"failed: {who}: {failure.reason}; {details}")
         for damaged in results.left_out:
-            tell(f"left out: {_whose(damaged)}")
+            tell(f"left out: {whose(damaged)}")
         if results.left_out:
             n_runs = sum(damaged.planned.n_runs for damaged in results.left_out)
             runs = "1 run is" if n_runs == 1 else f"{n_runs} runs are"
@@ -438,25 +479,7 @@ def conclude(
     if n_missing > len(failures) + len(results.left_out):
         which = f"{n_missing} of {len(results.planned)} runs are missing"
         tell(f"{which}; the same command continues")
-    return 1 if n_missing else 0
-
-
-def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) -> None:
-    """Move the folders of damaged runs aside, and say so."""
-    with doing(console, "looking for damaged runs") as activity:
-        from experiments.run_folders import move_damaged_aside
-
-        moved = move_damaged_aside(study, planned, activity.at)
-    for damaged, place in moved:
-        say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
-
-
-def _whose(damaged: LeftOut) -> str:
-    run = damaged.planned
-    seeds = (
-        f"seeds {run.seed} to {run.seed + run.n_runs - 1}" if run.n_runs > 1 else f"seed {run.seed}"
-    )
-    return f"{run.agent} on {run.environment}, {seeds}: {damaged.reason}"
+    return 1 if n_missing or more or not is_same else 0
 
 
 def _judge(
@@ -544,6 +567,7 @@ class RunContext:
     # Seconds of a run by agent and environment, where something is known of them.
     expected: Mapping[tuple[str, str], float] = field(default_factory=dict)
     _warm_ups: str = "[]"  # what the cluster's workers compile once
+    store: FigureStore | None = None  # the runs that are in files instead of folders
     _held: ExitStack | None = None
     _launcher: Launcher | None = None  # what is held
 
@@ -552,6 +576,10 @@ class RunContext:
         """Where runs are done, in words."""
         here = f"{self.n_workers} at once"
         return here if self.cluster is None else f"on the cluster {self.address}"
+
+    def not_stored(self, planned: Sequence[PlannedRun]) -> list[PlannedRun]:
+        """Those of these runs that are not in files instead of folders."""
+        return [run for run in planned if self.store is None or not self.store.holds(run)]
 
     def get_ready(self, planned: Sequence[PlannedRun]) -> None:
         """Start what runs are forked from here; what they compile is compiled once.
@@ -646,6 +674,8 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     for flag, is_given in (("quick", args.is_quick), ("replace", args.replace)):
         if args.until_decided and is_given:
             raise UserError(f"--until-decided and --{flag} do not go together: give one of them")
+    if args.make_again and args.until_decided:
+        raise UserError("--until-decided and --make-again do not go together: give one of them")
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
     if args.metric is not None and args.metric not in METRICS:
@@ -664,6 +694,11 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     changes = {**named, "n_seeds": args.seeds, "gym_packages": names, "user_modules": modules}
     changes = {key: value for key, value in changes.items() if value is not None}
     study = replace(_with_settings(study, args), **changes)
+    if study.keep == "figures" and (study.episodes_table or study.tensorboard):
+        what = "--episodes-table" if study.episodes_table else "--tensorboard"
+        raise UserError(
+            f"{what} needs more of each run than --keep figures keeps: give one of them"
+        )
     return study.quickened() if args.is_quick else study
 
 
@@ -799,8 +834,8 @@ class StudyProgress(LiveProgress):
         from experiments.launching import TimeLeft
 
         super().__init__(console)
-        there = {run.path for run in done}
-        self.left = TimeLeft([run for run in runs if run.path not in there], expected or {})
+        there = {id(run) for run in done}
+        self.left = TimeLeft([run for run in runs if id(run) not in there], expected or {})
         self.total = Counter(run.labels for run in runs)
         self.done = Counter(run.labels for run in done)
         self.failed: Counter[tuple[str, str]] = Counter()

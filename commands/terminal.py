@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from agents.networks.engine_setting import EnginePlan
     from experiments.launching import Launcher, Launchers
-    from pipeline.evaluation.sampled import Evaluation
+    from pipeline.evaluation.sampled import Evaluation, OtherReturns
     from pipeline.evaluation.yardstick import Yardstick
     from pipeline.preparation import EngineOutlook
 
@@ -197,6 +197,17 @@ def describe(evaluation: Evaluation) -> str:
     return f"{text}, {measured}" if measured else text
 
 
+def describe_others(others: OtherReturns) -> str:
+    """The exact returns beside that of the greedy policy in a few words; empty for none."""
+    told = []
+    if others.stochastic_return is not None and others.acts_by != "the same policy":
+        told.append(f"return {others.stochastic_return:.2f} with {others.acts_by}, as in training")
+    if others.discounted_return is not None and others.discount != 1:
+        figures = f"{others.discounted_return:.4g}, optimum {others.discounted_optimum:.4g}"
+        told.append(f"discounted by {others.discount:g}: {figures}")
+    return f"{'; '.join(told)} (exact)" if told else ""
+
+
 def describe_measured(evaluation: Evaluation) -> str:
     """How the return stands to the optimum; empty where that is neither known nor bracketed."""
     yardstick, value = evaluation.yardstick, evaluation.mean_return
@@ -206,7 +217,7 @@ def describe_measured(evaluation: Evaluation) -> str:
     if yardstick.at_least is not None:
         optimum = f"optimum between {yardstick.at_least:.2f} and {yardstick.optimum:.2f}"
         most = _score(yardstick.lower_end, value)
-        score += f" to {most} (bracketed)" if not score.endswith(most) else " (bracketed)"
+        score += f" {yardstick.mark}" if score.endswith(most) else f" to {most} {yardstick.mark}"
     if not yardstick.has_scale:
         score = f"{yardstick.gap(value):.3g} below the optimum"
     text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"
@@ -215,6 +226,7 @@ def describe_measured(evaluation: Evaluation) -> str:
             ". THIS IS MORE THAN ANY POLICY CAN REACH: the environment is not the one that the "
             "bracket is of, or the bracket is wrong"
         )
+        text += "" if yardstick.is_proven else ", whose upper end is not proven"
     return text
 
 

@@ -122,6 +122,8 @@ def build_parser() -> argparse.ArgumentParser:
     levels = "0 silent, 1 progress and summary (default), 2 the library's tables as well"
     add("--verbose", type=VERBOSITY, default=1, help=levels)
     add("-P", "--progress", action="store_true", help="a progress bar even without a terminal")
+    compared = "compare values, advantages and gradients with the exact ones at each evaluation"
+    add("--diagnose", action="store_true", help=compared)
     add(
         "--watch-learning",
         type=filled,
@@ -476,7 +478,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
     from rich.table import Table
 
-    from commands.terminal import describe, episodes, print_rows, say
+    from commands.terminal import describe, describe_others, episodes, print_rows, say
     from pipeline.runs import FINISHED
 
     taken = outcome.taken.cpu_seconds
@@ -490,6 +492,8 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
         rows.append(("regret", describe_pulls(outcome.pulls)))
     if outcome.final is not None:
         rows.append(("final", describe(outcome.final)))
+        if outcome.final.others is not None and (others := describe_others(outcome.final.others)):
+            rows.append(("beside", others))
     if outcome.best_return is not None:
         over = f" over {episodes(outcome.best_episodes)}" if outcome.best_episodes else ""
         best = f"return {outcome.best_return:.2f}{over}, first at step {outcome.best_timesteps:,}"

@@ -412,6 +412,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
 def print_opened(context: RunContext, opened: OpenTuning) -> None:
     """Say what there is to do, and on which engines."""
     from pipeline.train_spec import NETWORKS
+    from tuning.retesting import unproven_mark
     from tuning.suggesting import planned_run, shipped_run
 
     tell = partial(say, context.console)
@@ -421,6 +422,8 @@ def print_opened(context: RunContext, opened: OpenTuning) -> None:
         f"{opened.queue.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them "
         f"there already; {suggestions.n_free} settings to choose; {context.words}, in {opened.root}"
     )
+    if mark := unproven_mark(tuning):
+        tell(f"scores are{mark}")
     if suggestions.fits_batches:
         tell(
             "batch_size: where it does not divide n_steps times n_envs, as the library recommends, "

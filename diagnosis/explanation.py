@@ -25,14 +25,13 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.toy_text.taxi import TaxiEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from envs.known_models import transition_model
-from envs.layout import action_names
+from envs.layout import action_names, state_name
 from mdp import (
     TransitionModel,
     finite_horizon_optimum,
@@ -250,21 +249,12 @@ class _Words:
     """Names of states and actions."""
 
     def __init__(self, env: gym.Env[Any, Any], evaluator: ExactEvaluator) -> None:
-        self._base, self._layout = env.unwrapped, evaluator.layout
+        self._env, self._layout = env, evaluator.layout
         self._actions = action_names(env)
 
     def place(self, state: int) -> str:
         """The name of a state."""
-        if (layout := self._layout) is not None:
-            name = layout.place_name(state % layout.n_cells)
-            collected = layout.collected_in(state // layout.n_cells)
-            return f"{name}, {len(collected)} collected" if collected else name
-        if isinstance(self._base, TaxiEnv):
-            row, column, passenger, target = self._base.decode(state)
-            where = "on board" if passenger == 4 else f"at {'RGYB'[passenger]}"
-            place = f"row {row + 1}, column {column + 1}"
-            return f"{place}, passenger {where}, to {'RGYB'[target]}"
-        return f"state {state}"
+        return state_name(self._env, self._layout, state)
 
     def action(self, action: int) -> str:
         """The name of an action."""

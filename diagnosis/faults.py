@@ -18,7 +18,7 @@ class Fault(NamedTuple):
 # The most telling first: what explains others comes before them.
 FAULTS: Mapping[str, Fault] = {
     "shared-buffer": Fault(
-        "What is stored is an array that changes later, not a copy of it.",
+        "What is stored changes later: it is no copy, or another agent writes into it too.",
         "Mnih et al. (2015), algorithm 1: the transition is stored as it was",
     ),
     "bootstraps-at-terminal": Fault(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import random
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field
@@ -650,18 +651,22 @@ def _probe_exploration(lab: Lab) -> Iterator[Finding]:
 
 def probe_seeds(lab: Lab) -> Iterator[Finding]:
     """The same seed, the same training, whatever state the global generators are in."""
-    name, results = "seeds", []
+    name, results, agents = "seeds", [], []
     steps = 130 if lab.subject.is_on_policy else 300
     for state in (1, 1, 2):
         _set_global_generators(state)
         half = {"exploration_initial_eps": 0.5, "exploration_final_eps": 0.5}
         trained = lab.begin(SAFE_FORK, steps, **half)
+        agents.append(trained)
         values = trained.values()
         acted = [trained.act(state) for state in range(SAFE_FORK.n_states)]
         found = acted if values is None else [*values.ravel(), *acted]
         results.append((tuple(trained.record.actions), tuple(found)))
     first, again, other = results
-    if first != again:
+    if first != again and (both := _held_by_both(*agents[:2])):
+        text = f"two agents have the same {both}, and two trainings with the same seed differ"
+        yield Finding(name, "fault", text, "shared-buffer", "one for each")
+    elif first != again:
         text = "two trainings with the same seed differ, in the same state of the global generators"
         yield Finding(name, "fault", text, "not-reproducible", "none")
     elif first != other:
@@ -669,6 +674,21 @@ def probe_seeds(lab: Lab) -> Iterator[Finding]:
         yield Finding(name, "fault", f"{text}generators do", "global-generator", "none")
     else:
         yield Finding(name, "ok", "three trainings with the same seed are the same")
+
+
+def _held_by_both(one: Trained, other: Trained) -> str:
+    """The name of what two models hold that can be written into; empty where there is nothing."""
+    import torch as th
+    from stable_baselines3.common.buffers import BaseBuffer
+
+    kinds = (BaseBuffer, np.ndarray, th.Tensor, th.nn.Module, list, dict, deque)
+    held = [vars(getattr(each, "model", None) or each) for each in (one, other)]
+    names = [
+        name
+        for name, value in held[0].items()
+        if isinstance(value, kinds) and value is held[1].get(name)
+    ]
+    return names[0] if names else ""
 
 
 def _set_global_generators(state: int) -> None:

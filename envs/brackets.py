@@ -31,6 +31,7 @@ class OptimumBracket:
     lower: float  # what a policy was seen to reach
     upper: float  # what no policy exceeds
     baseline: float  # the mean return of the best random or constant policy
+    upper_is_proven: bool = True  # whether there is a proof that none exceeds it
 
 
 def optimum_bracket(env: gym.Env[Any, Any]) -> OptimumBracket | None:
@@ -40,13 +41,21 @@ def optimum_bracket(env: gym.Env[Any, Any]) -> OptimumBracket | None:
     found = entry.get(time_limit(env))
     if found is None or not _is_plain(env) or constants_of(base) != found["constants"]:
         return None
-    return OptimumBracket(found["lower"], found["upper"], found["baseline"]["mean"])
+    baseline, is_proven = found["baseline"]["mean"], found["upper_is_proven"]
+    return OptimumBracket(found["lower"], found["upper"], baseline, is_proven)
 
 
 def may_have_bracket(env_id: str) -> bool:
     """Whether an environment is of a class that has brackets, without making it."""
     registered = gym.registry.get(env_id.rpartition(":")[2])
     return registered is not None and registered.entry_point in known_entries()
+
+
+def upper_is_proven(env_id: str) -> bool:
+    """Whether no bracket of the environment's class has an upper end without a proof."""
+    registered = gym.registry.get(env_id.rpartition(":")[2])
+    entries = {} if registered is None else known_entries().get(str(registered.entry_point), {})
+    return all(entry["upper_is_proven"] for entry in entries.values())
 
 
 @cache

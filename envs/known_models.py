@@ -104,6 +104,12 @@ def model_check(env: Env) -> ModelCheck | None:
     return _judged(base)[1] if all(map(_folds, wrappers)) else None
 
 
+def unknown_wrapper(env: Env) -> str | None:
+    """The innermost wrapper that hides the model, by its class; None where none does."""
+    wrappers = (type(wrapper) for wrapper in _layers(env)[1] if not _folds(wrapper))
+    return next((f"{kind.__module__}.{kind.__qualname__}" for kind in wrappers), None)
+
+
 def time_limit(env: Env) -> int | None:
     """The number of steps after which an episode is cut off, None where there is no limit."""
     _, wrappers = _layers(env)

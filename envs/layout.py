@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+from gymnasium.envs.toy_text.taxi import TaxiEnv
 
 from envs.grid import MOVES, GridWorld, Tile
 from envs.textbook.windy_gridworld import WindyGridworldEnv
@@ -140,5 +141,22 @@ def action_names(env: gym.Env[Any, Any]) -> tuple[str, ...]:
     given = getattr(env.unwrapped, "action_names", None)
     if isinstance(given, tuple | list):
         return tuple(map(str, given))
+    if isinstance(env.unwrapped, TaxiEnv):
+        return ("south", "north", "east", "west", "pick up", "drop off")
     layout = grid_layout(env)
     return () if layout is None else tuple(_NAMES.get(move, str(move)) for move in layout.moves)
+
+
+def state_name(env: gym.Env[Any, Any], layout: GridLayout | None, state: int) -> str:
+    """What a state of `envs.known_models.transition_model` is called: a place, where it is one."""
+    base = env.unwrapped
+    if layout is not None:
+        name = layout.place_name(state % layout.n_cells)
+        collected = layout.collected_in(state // layout.n_cells)
+        return f"{name}, {len(collected)} collected" if collected else name
+    if isinstance(base, TaxiEnv):
+        row, column, passenger, target = base.decode(state)
+        where = "on board" if passenger == 4 else f"at {'RGYB'[passenger]}"
+        place = f"row {row + 1}, column {column + 1}"
+        return f"{place}, passenger {where}, to {'RGYB'[target]}"
+    return f"state {state}"

@@ -18,7 +18,12 @@ from agents import ALGORITHMS
 from experiments.child_processes import do_aside
 from experiments.looks import Standing
 from experiments.plan import PlannedRun
-from experiments.results import RESAMPLING_SEED, StudyResults, values_over_seeds
+from experiments.results import (
+    RESAMPLING_SEED,
+    StudyResults,
+    stored_curves,
+    values_over_seeds,
+)
 from experiments.study import COSTS, StudySpec
 from mdp.transition_model import Floats
 from pipeline.environments import training_changes, trains_on_variant
@@ -109,6 +114,11 @@ def speeds(
     spans = [
         np.diff(rows["step"].to_numpy(dtype=np.float64), prepend=0.0).max()
         for _, rows in curves[chosen & curves["agent"].isin(agents)].groupby(["agent", "seed"])
+    ]
+    spans += [
+        np.diff(rows["step"], prepend=0.0).max(initial=0.0)
+        for agent in agents
+        for rows in stored_curves(results, environment, agent, "evaluation")
     ]
     spacing = max(spans, default=0.0)
     if not spacing > 0:
@@ -369,6 +379,13 @@ class AgentAnalysis:
     changes: tuple[str, ...] = ()
     #: When it reached the threshold for good; likewise.
     steps_to_stay: ThresholdSummary | None = None
+    #: Exact returns of the policy that it acts by in training, and what that is; None if unknown.
+    stochastic: Estimate | None = None
+    acts_by: str = ""
+    #: Exact returns of the final policy under the agent's discount, and the highest one under it.
+    discounted: Estimate | None = None
+    discount: float | None = None
+    discounted_optimum: float | None = None
 
     @property
     def marked(self) -> str:
@@ -404,6 +421,7 @@ class EnvironmentAnalysis:
     look: Standing = field(default_factory=Standing)  #: the look at these runs
     #: The lower end of the optimum's bracket; None without a bracket.
     optimum_at_least: float | None = None
+    optimum_is_proven: bool = True  #: whether the upper end of that bracket is proven
     #: The optima by agent, if agents play environments with different optima; else empty.
     optima: Mapping[str, float] = field(default_factory=dict)
     advice: tuple[str, ...] = ()  #: sentences on runs that failed, see `experiments.analysis`
@@ -496,6 +514,7 @@ def _analyse_environment(
         seeds=evidence.seeds,
         look=look,
         optimum_at_least=evidence.optimum_at_least,
+        optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # None is none
         optima=_differing_optima(table),
         ends=evidence.ends,
         is_score=evidence.is_score,
@@ -624,14 +643,50 @@ def _analyse_agent(
             if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
         ),
         changes=_recorded_changes(results, agent, environment),
+        stochastic=mean("stochastic_return") if table["stochastic_return"].notna().any() else None,
+        acts_by=_only(table["acts_by"]),
+        discounted=mean("discounted_return") if table["discounted_return"].notna().any() else None,
+        discount=_first(table, "discount"),
+        discounted_optimum=_first(table, "discounted_optimum"),
     )
+
+
+def _only(texts: pd.Series) -> str:
+    """The text that is the same in all runs; empty if it differs."""
+    found = texts.dropna().unique()
+    return str(found[0]) if len(found) == 1 else ""
 
 
 def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:
     """The recorded changes of the agent's first run, because all seeds share the settings."""
-    of_agent = (r for r in results.finished if r.labels == (agent, environment))
-    run = next(of_agent, None)
-    return () if run is None else training_changes(TrainSpec.of_data(run.run.read_info()["spec"]))
+    run = next((r for r in results.finished if r.labels == (agent, environment)), None)
+    if run is None:
+        return ()
+    info = results.stored[run.labels].infos()[0] if results.is_stored(run) else run.run.read_info()
+    return training_changes(TrainSpec.of_data(info["spec"]))
+
+
+def runs_to_keep(results: StudyResults) -> list[PlannedRun]:
+    """The stored runs whose agents are kept: the best, median and worst, and what the page loads.
+
+    The page plays the first run, splits the gap of the median final return, and asks the first
+    failed run for advice.
+    """
+    study, table = results.study, results.summary
+    runs = {(*run.labels, run.seed): run for run in results.finished if results.is_stored(run)}
+    kept = {(*labels, study.first_seed) for labels in results.stored}
+    for environment in study.environments:
+        kept |= {
+            (*run.labels, run.seed)
+            for several, _ in _failed_runs(results, environment.label)
+            for run in several[:1]
+        }
+    for labels, rows in table.groupby(["agent", "environment"], sort=False):
+        for column in (study.metric, "final"):
+            order = rows[["seed", column]].dropna().sort_values(column, kind="stable")["seed"]
+            places = {0, (len(order) - 1) // 2, len(order) - 1} if len(order) else ()
+            kept |= {(*map(str, labels), int(order.iloc[place])) for place in places}  # type: ignore[misc]
+    return [run for key, run in runs.items() if key in kept]
 
 
 # --- Advice on failed runs, once for each agent.

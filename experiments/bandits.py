@@ -21,6 +21,7 @@ from mdp.transition_model import AnyInts, Floats, Ints
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.environments import make_single_env
 from pipeline.files import replacing
+from pipeline.loaded_code import recorded_code
 from pipeline.runs import (
     FINISHED,
     PULLS_FILE,
@@ -322,6 +323,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
         n_timesteps=len(result.arms[0]),
         versions=recorded_versions(),
         machine=recorded_machine(),
+        **recorded_code(spec.user_modules),
         engine=engine,
         **(WorkTime.now() - started - time_compiling()).as_data(),
     )

@@ -167,6 +167,12 @@ def end_server() -> None:
         _send(server_pid(), signal.SIGKILL)
 
 
+def serve_anew() -> None:
+    """Replace the fork server by one that has imported no module of the user."""
+    os.environ[WARM_UPS] = "[]"
+    end_server()  # the next child starts another
+
+
 def _send(pid: int | None, number: int) -> None:
     """Send a signal to a process, if it still exists."""
     if sys.platform != "win32" and pid is not None:

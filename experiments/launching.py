@@ -156,8 +156,11 @@ def _do_planned_run(planned: PlannedRun, root: Path, command: str, home: Path) -
     # A slow import that a supervisor does not need.
     from experiments.run_in_child import do_run
 
-    if home.parts:
+    if home.parts:  # on a worker, which has compared the modules with the driver's
+        from pipeline.user_modules import import_checked
+
         os.chdir(home)
+        import_checked(planned.spec.user_modules)
     hold(root)
     do_run(planned, draft_path(root, planned), command)
 
@@ -384,7 +387,7 @@ class EarlyResults:
         with loading_libraries():
             import experiments.results  # noqa: F401
 
-    def read(self, planned: PlannedRun) -> None:
+    def read(self, planned: PlannedRun) -> RunResults | None:
         """Read a run that has just ended; damage is reported later."""
         from experiments.results import read_run
 
@@ -392,6 +395,12 @@ class EarlyResults:
             found = read_run(self.study, planned)
             if found is not None:
                 self._found[planned.path] = found
+            return found
+        return None
+
+    def forget(self, planned: PlannedRun) -> None:
+        """Drop what was read of a run, because it is stored."""
+        self._found.pop(planned.path, None)
 
     def of(self, planned: PlannedRun) -> RunResults | None:
         """Like `read_run`, but returns a result that was read before."""

@@ -113,13 +113,7 @@ class PlannedRun:
         info = _info(self.run)
         if info.get("state") != FINISHED:
             return {}
-        there = _by_name(_identity(_recorded(info)))
-        now = _by_name(_identity(self.spec.as_data()))
-        return {
-            name: (there.get(name), now.get(name))
-            for name in {**there, **now}
-            if there.get(name) != now.get(name)
-        }
+        return differences(_recorded(info), self.spec)
 
     @property
     def is_to_do(self) -> bool:
@@ -168,6 +162,17 @@ def _info(run: Run) -> dict[str, Any]:
 def _identity(spec: Mapping[str, Any]) -> Any:
     kept = {key: value for key, value in spec.items() if key not in _MAY_DIFFER}
     return plain(kept)
+
+
+def differences(recorded: Mapping[str, Any], spec: TrainSpec) -> dict[str, tuple[Any, Any]]:
+    """By name, the settings of a recorded spec and those of another one, where they differ."""
+    there = _by_name(_identity(completed(recorded)))
+    now = _by_name(_identity(spec.as_data()))
+    return {
+        name: (there.get(name), now.get(name))
+        for name in {**there, **now}
+        if there.get(name) != now.get(name)
+    }
 
 
 def _recorded(info: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -23,8 +23,10 @@ from experiments.bandits import STATISTICS_FILE, PullStatistics, read_pulls, run
 from experiments.plan import PlannedRun
 from experiments.study import StudySpec
 from mdp.transition_model import Floats
+from pipeline.curve_pictures import MEANINGS, read_diagnosis
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.errors import one_line
+from pipeline.loaded_code import DISTRIBUTIONS
 from pipeline.runs import Run
 from pipeline.signs_of_life import Tell, tell_nobody
 from safe_files.archives import read_members
@@ -38,6 +40,9 @@ from verdicts import (
     steps_to_stay,
     steps_to_threshold,
 )
+
+if TYPE_CHECKING:
+    from experiments.figures_store import StoredRuns
 
 # --- The files of one run.
 
@@ -53,6 +58,8 @@ _FINAL_FIGURES = (
     "gap",
     "score",
 )
+# Missing in runs of earlier versions, and where figures are sampled.
+_OTHER_RETURNS = ("stochastic_return", "discount", "discounted_return", "discounted_optimum")
 # The last ones only if the optimum is bracketed.
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
 _MAPS = {
@@ -149,7 +156,7 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
         raise DamagedFileError(run.info_path, f"is damaged: it lacks {missing[0]}")
     given = {name: info[name] for name in (*required, *_OPTIONAL) if name in info}
     given.pop("final", None)
-    figures = {name: final[name] for name in _FINAL_FIGURES if name in final}
+    figures = {name: final[name] for name in (*_FINAL_FIGURES, *_OTHER_RETURNS) if name in final}
     for name, value in (given | figures).items():
         if not (value is None or _is_figure(value)):
             raise DamagedFileError(run.info_path, f"is damaged: {name} is no figure")
@@ -163,7 +170,8 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
 
 def _check_texts(run: Run, info: Mapping[str, Any]) -> None:
     texts = [info.get("engine") or "", info.get("model_refused") or ""]
-    for name in ("versions", "machine"):
+    texts.append((info.get("final") or {}).get("acts_by") or "")
+    for name in ("versions", "machine", DISTRIBUTIONS):
         named = info.get(name, {})
         texts += named.values() if isinstance(named, dict) else [None]
     if not all(isinstance(text, str) for text in texts):
@@ -187,6 +195,21 @@ def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
         raise DamagedFileError(path, "is damaged: it has actions that there are not")
     _check_finite(path, arrays["timesteps"], arrays["values"], arrays["optimal_values"])
     return arrays
+
+
+def read_compared(run: Run) -> dict[str, Floats]:
+    """Read what `pipeline.evaluation.critics` wrote of a run, by column."""
+    path = run.diagnosis_path
+    try:
+        found = read_diagnosis(run.files.read(path))
+        known = {name: found[name] for name in ("timesteps", *MEANINGS) if name in found}
+        if not len(known["timesteps"]) or not np.isfinite(known["timesteps"]).all():
+            raise ValueError("no steps")
+    except (ValueError, KeyError) as error:
+        if isinstance(error, DamagedFileError):
+            raise
+        raise DamagedFileError(path, "is damaged: it is no table of numbers by step") from error
+    return known
 
 
 # --- Learning curves.
@@ -270,6 +293,7 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
 # --- The results of runs.
 
 LAST_EPISODES = 100
+RUNS_IN_A_PIECE = 1000  # whose curves are in memory at once when tables are written
 
 
 @dataclass(frozen=True)
@@ -304,6 +328,50 @@ class StudyResults:
     finished: tuple[PlannedRun, ...] = ()  #: the runs in the results
     #: The details of runs that have just failed, by folder.
     failures: Mapping[Path, str] = field(default_factory=dict)
+    #: The runs in files instead of folders, by labels; their curves are not in ``curves``.
+    stored: Mapping[tuple[str, str], StoredRuns] = field(default_factory=dict)
+    kept: tuple[PlannedRun, ...] = ()  #: the stored runs that have folders too, to load agents from
+
+    @property
+    def in_folders(self) -> tuple[PlannedRun, ...]:
+        """The runs in the results that have folders."""
+        if not self.stored:
+            return self.finished
+        kept = {(*run.labels, run.seed) for run in self.kept}
+        return tuple(
+            run
+            for run in self.finished
+            if not self.is_stored(run) or (*run.labels, run.seed) in kept
+        )
+
+    def is_stored(self, run: PlannedRun) -> bool:
+        """Whether a finished run is in a file instead of a folder."""
+        return run.labels in self.stored and run.seed in self.stored[run.labels]
+
+    @property
+    def has_curves(self) -> bool:
+        """Whether there are learning curves."""
+        return bool(self.stored) or not self.curves.empty
+
+    def stored_curves(self) -> Iterator[Curve]:
+        """The learning curves of stored runs, in the order of the plan."""
+        size = max(RUNS_IN_A_PIECE // max(len(self.stored), 1), 1)
+        for start in range(0, self.study.n_seeds if self.stored else 0, size):
+            seeds = self.study.seeds[start : start + size]
+            found = [run for runs in self.stored.values() for run in runs.curves(seeds)]
+            for run in sorted(found, key=lambda run: run[0].labels["seed"]):
+                yield from run
+
+    def infos(self) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+        """By labels, what the runs recorded of settings and versions; of stored runs once."""
+        told: set[tuple[str, str]] = set()
+        for run in self.finished:
+            if not self.is_stored(run):
+                yield *run.labels, run.run.read_info()
+            elif run.labels not in told:
+                told.add(run.labels)
+                for info in self.stored[run.labels].infos():
+                    yield *run.labels, info
 
 
 # Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.
@@ -320,9 +388,15 @@ RUN_COLUMNS = (
     "exact",  # whether these are exact expectations, not means of episodes
     "optimum",
     "optimum_at_least",  # lower end of a bracket; ``optimum`` is then the upper end
+    "optimum_is_proven",  # whether that upper end is proven
     "baseline",
     "gap",  # optimum minus final
     "score",  # final return, scaled: 0 is the best random or constant policy, 1 the optimum
+    "acts_by",  # what the agent acts by in training: "epsilon 0.01", "its own distribution"
+    "stochastic_return",  # exact, of the policy that it acts by in training
+    "discount",  # the agent's
+    "discounted_return",  # exact, of the final policy under that discount
+    "discounted_optimum",  # the highest one under it
     "best",  # highest return of an evaluation during training
     "best_timesteps",
     "area",  # mean return over the learning curve
@@ -343,7 +417,10 @@ RUN_COLUMNS = (
 )
 
 # Columns with the same name in ``run.json``.
-_FIGURES = ("success_rate", "exact", "optimum", "optimum_at_least", "baseline", "gap", "score")
+_FIGURES = (
+    *("success_rate", "exact", "optimum", "optimum_at_least", "optimum_is_proven", "baseline"),
+    *("gap", "score", "acts_by", *_OTHER_RETURNS),
+)
 
 
 def read_results(
@@ -352,6 +429,7 @@ def read_results(
     root: Path,
     tell: Tell = tell_nobody,
     read: Callable[[PlannedRun], RunResults | None] | None = None,
+    stored: Mapping[tuple[str, str], StoredRuns] | None = None,
 ) -> StudyResults:
     """Read all finished runs, except runs with damaged files.
 
@@ -361,30 +439,65 @@ def read_results(
         root: the study's folder.
         tell: receives the progress.
         read: a function that reads a run, for example from a cache; by default `read_run`.
+        stored: the runs that are in files instead of folders, by labels.
     """
-    rows, curves, done, left_out = [], [], [], []
+    stored = stored or {}
+    rows: dict[int, dict[str, Any]] = {}
+    curves, done, left_out, n_rows = [], [], [], 0
+    places: dict[tuple[str, str], list[int]] = {labels: [] for labels in stored}
     for place, run in enumerate(planned, start=1):
         tell(f"run {place:,} of {len(planned):,}")
+        if run.labels in stored and run.seed in stored[run.labels]:
+            places[run.labels].append(n_rows)
+            done.append(run)
+            n_rows += 1
+            continue
         try:
             found = read_run(study, run) if read is None else read(run)
         except DamagedFileError as error:
             left_out.append(LeftOut(run, str(error)))
             continue
         if found is not None:
-            rows += found.rows
+            rows |= enumerate(found.rows, start=n_rows)
+            n_rows += len(found.rows)
             curves += found.curves
             done.append(run)
+    apart = [run for run in done if run.labels not in stored or run.seed not in stored[run.labels]]
     return StudyResults(
         study,
         root,
-        pd.DataFrame(rows, columns=list(RUN_COLUMNS)),
+        _summary(
+            study, n_rows, rows, {labels: (places[labels], stored[labels]) for labels in stored}
+        ),
         joined(curves),
         tuple(planned),
-        read_pulls(done),
+        read_pulls(apart),
         tuple(left_out),
-        sum(run.n_runs for run in done if run.run.files.digests is None),
+        sum(run.n_runs for run in apart if run.run.files.digests is None),
         tuple(done),
+        stored=stored,
     )
+
+
+def _summary(
+    study: StudySpec,
+    n_rows: int,
+    rows: Mapping[int, dict[str, Any]],
+    stored: Mapping[tuple[str, str], tuple[list[int], StoredRuns]],
+) -> pd.DataFrame:
+    """The summary of runs in folders, by number of row, and of stored runs with their numbers."""
+    if not stored:
+        return pd.DataFrame([*rows.values()], columns=list(RUN_COLUMNS))
+    table = {}
+    for name in RUN_COLUMNS:  # one after the other, because of the memory
+        column: list[Any] = [None] * n_rows
+        for number, row in rows.items():
+            column[number] = row.get(name)
+        for numbers, runs in stored.values():
+            for number, value in zip(numbers, runs.column(name, study), strict=True):
+                column[number] = value
+        table[name] = pd.Series(column)
+    return pd.DataFrame(table)
 
 
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
@@ -413,6 +526,8 @@ def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
         files.check(path)
         if files.digests is None:
             read_value_maps(run)
+    if files.matching(run.diagnosis_path.name):
+        read_compared(run)
     if planned.seed == study.first_seed:
         files.check(run.model_path)
         if not run.model_path.exists():
@@ -473,12 +588,7 @@ def _summary_row(
         planned.run, ("final", "best_mean_return", "best_timesteps", "n_timesteps", "seconds")
     )
     final = info["final"]
-    threshold = threshold_of(study, planned.spec.env_id, final)
     steps, values = evaluations.figures["step"], evaluations.figures["value"]
-    reached = stayed = float("nan")
-    if threshold is not None and len(steps):
-        reached = steps_to_threshold(steps, values, threshold)
-        stayed = steps_to_stay(steps, values, threshold)
     return {
         **_named(planned),
         "seed": planned.seed,
@@ -492,11 +602,7 @@ def _summary_row(
         "training": _mean(episodes.returns),
         "last_episodes": _mean(episodes.returns[-LAST_EPISODES:]),
         "regret": run_regret(planned),
-        "threshold": threshold,
-        "steps_to_threshold": reached,
-        "steps_to_stay": stayed,
-        "episodes_to_threshold": _episodes_by(episodes, reached),
-        "episodes_to_stay": _episodes_by(episodes, stayed),
+        **speed_figures(study, planned.spec.env_id, final, evaluations.figures),
         "n_timesteps": info["n_timesteps"],
         "n_episodes": len(episodes.returns),
         "seconds": info["seconds"],
@@ -516,9 +622,28 @@ def _named(planned: PlannedRun) -> dict[str, Any]:
     }
 
 
-def _episodes_by(episodes: Episodes, step: float) -> float:
-    reached = np.searchsorted(episodes.steps, step, side="right")
-    return float(reached) if np.isfinite(step) else step
+def speed_figures(
+    study: StudySpec, env_id: str, final: dict[str, Any], evaluations: Mapping[str, Floats]
+) -> dict[str, float | None]:
+    """The columns of the summary on the threshold, from the curve of a run's evaluations."""
+    threshold = threshold_of(study, env_id, final)
+    steps, values = evaluations["step"], evaluations["value"]
+    reached = stayed = float("nan")
+    if threshold is not None and len(steps):
+        reached = steps_to_threshold(steps, values, threshold)
+        stayed = steps_to_stay(steps, values, threshold)
+
+    def episodes_by(step: float) -> float:
+        there = np.isfinite(step)
+        return float(evaluations["episode"][np.searchsorted(steps, step)]) if there else step
+
+    return {
+        "threshold": threshold,
+        "steps_to_threshold": reached,
+        "steps_to_stay": stayed,
+        "episodes_to_threshold": episodes_by(reached),
+        "episodes_to_stay": episodes_by(stayed),
+    }
 
 
 # --- Agents over their seeds.
@@ -550,7 +675,18 @@ def curves_by_agent(
     return found
 
 
-def mean_curve(curves: Sequence[pd.DataFrame], by: str) -> tuple[Floats, Band] | None:
+def stored_curves(
+    results: StudyResults, environment: str, agent: str, kind: str
+) -> list[Mapping[str, Floats]]:
+    """The learning curves of stored runs, as `curves_by_agent` has those of the others."""
+    runs = results.stored.get((agent, environment))
+    which = int(kind == "training")
+    return [] if runs is None else [run[which].figures for run in runs.curves()]
+
+
+def mean_curve(
+    curves: Sequence[Mapping[str, Any] | pd.DataFrame], by: str
+) -> tuple[Floats, Band] | None:
     """The mean learning curve of an agent over its seeds.
 
     Args:
@@ -562,7 +698,7 @@ def mean_curve(curves: Sequence[pd.DataFrame], by: str) -> tuple[Floats, Band] |
         ended before the first point of another one.
     """
     runs = [
-        (rows[by].to_numpy(dtype=np.float64), rows["value"].to_numpy(dtype=np.float64))
+        (np.asarray(rows[by], dtype=np.float64), np.asarray(rows["value"], dtype=np.float64))
         for rows in curves
     ]
     if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
@@ -577,7 +713,7 @@ def mean_curve(curves: Sequence[pd.DataFrame], by: str) -> tuple[Floats, Band] |
 
 def difference(run: Run, other: Run) -> str:
     """The difference of two finished runs in words; empty if they are equal to the last bit."""
-    if _tensors(run) != _tensors(other):
+    if tensors(run) != tensors(other):
         return "the agent"
     one, another = read_episodes(run), read_episodes(other)
     if not (_same(one.steps, another.steps) and _same(one.returns, another.returns)):
@@ -591,7 +727,7 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
     return one.tobytes() == other.tobytes()
 
 
-def _tensors(run: Run) -> dict[str, bytes]:
+def tensors(run: Run) -> dict[str, bytes]:
     """Read the tensors in the zip of the final agent."""
     try:
         members = read_members(run.files.read(run.model_path))
@@ -604,7 +740,7 @@ def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
     """Versions that differ between the ``run.json`` of runs, in a line; empty if none differ."""
     counts: dict[str, Counter[str]] = {}
     for info in infos:
-        for package, version in info.get("versions", {}).items():
+        for package, version in {**info.get(DISTRIBUTIONS, {}), **info.get("versions", {})}.items():
             counts.setdefault(package, Counter())[version] += info.get("n_runs", 1)
     mixed = [
         f"{package} {', '.join(_counted(*item) for item in sorted(found.items()))}"

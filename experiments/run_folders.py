@@ -16,7 +16,7 @@ import re
 import shutil
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from experiments.plan import PlannedRun
 from experiments.study import StudySpec
@@ -172,25 +172,33 @@ def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
 REPLACED_FOLDER = "replaced"
 _MOST_NAMED = 3
 
+Differences = dict[str, tuple[Any, Any]]  # by name, a setting there and the requested one
+
 
 def in_the_way(planned: Sequence[PlannedRun]) -> list[PlannedRun]:
     """The planned runs whose folder has another or an unfinished run; ignores damaged ones."""
     return [run for run in planned if run.path.exists() and run.is_to_do]
 
 
-def check_settings_kept(planned: Sequence[PlannedRun], root: Path) -> None:
-    """Refuse to repeat runs that finished with other settings, and name the ways out."""
-    others = [(run, run.differences) for run in in_the_way(planned)]
-    others = [(run, differences) for run, differences in others if differences]
+def check_settings_kept(
+    planned: Sequence[PlannedRun], root: Path, stored: Sequence[tuple[int, Differences]] = ()
+) -> None:
+    """Refuse to repeat runs that finished with other settings, and name the ways out.
+
+    ``stored`` are numbers of runs that are in files with other settings, and these.
+    """
+    found = [(1, run.differences) for run in in_the_way(planned)]
+    others = [each for each in (*found, *stored) if each[1]]
     if not others:
         return
+    n_others = sum(n for n, _ in others)
     named: dict[str, str] = {}
     for _, differences in others:
         for key, (there, now) in differences.items():
             named.setdefault(key, f"{key}: {shown(there)} there, {shown(now)} now")
     words = "; ".join(list(named.values())[:_MOST_NAMED])
     words += f"; and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-    runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
+    runs = "1 finished run has" if n_others == 1 else f"{n_others} finished runs have"
     raise UserError(
         f"{root}: {runs} other settings ({words}): --name NAME makes another study of it, "
         f"--replace does them again and moves the old ones to {REPLACED_FOLDER}/"
@@ -207,7 +215,7 @@ def move_replaced_aside(
     moved = [run for run in in_the_way(planned) if _is_kept_aside(run.path)]
     if not moved:
         return [], None
-    place = _new_folder(root)
+    place = new_folder(root)
     for run in moved:
         _move(run, root, place)
     return moved, place
@@ -218,7 +226,7 @@ def make_room(planned: PlannedRun, root: Path) -> None:
     with contextlib.suppress(DamagedFileError):
         planned.check_record()
         if planned.path.exists() and not planned.is_finished and _is_kept_aside(planned.path):
-            _move(planned, root, _new_folder(root))
+            _move(planned, root, new_folder(root))
 
 
 def put_run_in_place(planned: PlannedRun, draft: Path) -> None:
@@ -246,12 +254,18 @@ def _is_kept_aside(folder: Path) -> bool:
 
 
 def _move(run: PlannedRun, root: Path, place: Path) -> None:
-    target = place / run.path.relative_to(root / "runs")
+    move_to(place, run.path, root)
+
+
+def move_to(place: Path, path: Path, root: Path) -> None:
+    """Move a run folder, or a file of runs, to ``place``, below the same folders."""
+    target = place / path.relative_to(root / "runs")
     target.parent.mkdir(parents=True, exist_ok=True)
-    put_in_place(run.path, target)
+    put_in_place(path, target)
 
 
-def _new_folder(root: Path) -> Path:
+def new_folder(root: Path) -> Path:
+    """Make the next free folder ``replaced/<number>``."""
     for number in itertools.count(1):
         place = root / REPLACED_FOLDER / str(number)
         with contextlib.suppress(FileExistsError):

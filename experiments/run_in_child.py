@@ -29,9 +29,10 @@ from experiments.run_folders import (
 from machine_code.sources import kept_packages
 from pipeline.errors import UserError
 from pipeline.failures import is_of_the_machine
+from pipeline.loaded_code import recorded_code
 from pipeline.locks import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.models.load import agent_class
-from pipeline.runs import Run, remove_states
+from pipeline.runs import Run, recorded_versions, remove_states
 from pipeline.settings.hyperparams import split
 from pipeline.signs_of_life import Heartbeat
 from pipeline.train_spec import TrainSpec
@@ -60,7 +61,8 @@ def _do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
     """Finish a run in its draft.
 
     If another process has left the draft, the run resumes from its state, provided that the state
-    is complete and saved with the same settings and sources; otherwise the run starts again.
+    is complete and saved with the same settings, sources and versions; otherwise the run starts
+    again.
     """
     run = Run(draft, planned.run.env_name)
     keeping = _to_go_on_with(planned, run)
@@ -85,6 +87,10 @@ def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:
     """The state that another process has left, or None."""
     anew = StateKeeping(was_cut_off=run.path.is_dir())
     if planned.is_batch or not holds_state(run.path) or not planned.is_of(run):
+        return anew
+    code = {"versions": recorded_versions(), **recorded_code(planned.spec.user_modules)}
+    info = run.read_info()
+    if {name: info.get(name) for name in code} != code:
         return anew
     try:
         keeping = go_on(run, StateKeeping(), str)  # nobody reads messages here

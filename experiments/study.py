@@ -28,6 +28,8 @@ from pipeline.user_modules import UserModule
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
 
+Keep = Literal["all", "figures"]
+
 METRIC_WORDS: dict[str, str] = {
     "final": "return of the final policy",
     "best": "return of the best policy during training",
@@ -159,6 +161,8 @@ class StudySpec:
     user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
     tensorboard: bool = False  #: whether each run writes a TensorBoard log
     render_every: int = 0  #: episodes between two films; 0 for no films
+    #: Whether values and gradients are compared with exact ones at evaluations.
+    diagnose: bool = False
     #: Whether the page links to pages that play the first training of each agent.
     learning_pages: bool = False
     #: The file formats of figures: "png", "svg", "pdf".
@@ -167,6 +171,8 @@ class StudySpec:
     run_memory: int | None = None  #: bytes of memory that each run may take; None for no limit
     source: Path | None = None  #: its file, or None
     first_seed: int = 0  #: the first seed; the others follow it
+    #: ``"figures"`` to keep figures and curves of runs in files, and few of their folders.
+    keep: Keep | None = None
     #: Label of the only agent whose mean the others are compared with; empty for all pairs.
     against: str = ""
 
@@ -208,6 +214,8 @@ _STUDY_VALUES: dict[str, Any] = {
     "shared_randomness": bool,
     "threshold": float,
     "episodes_table": int,
+    "keep": Keep,
+    "diagnose": bool,
 }
 # Limits of each run, in the format of the command line.
 _LIMITS: dict[str, Callable[[str], float]] = {
@@ -362,6 +370,7 @@ def write_study(root: Path, study: StudySpec) -> None:
         for environment in study.environments
     }
     data["agents"] = agents
+    data["diagnose"] = study.diagnose or None
     known = {key: value for key, value in data.items() if value not in (None, "")}
     text = yaml.safe_dump(plain(known), sort_keys=False, allow_unicode=True)
     write_text(root / "study.yml", text)

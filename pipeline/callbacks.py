@@ -24,6 +24,7 @@ from agents.bandits.runs import PullLog
 from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from machine_code import WorkTime
 from pipeline.errors import UserError
+from pipeline.evaluation.critics import CriticRecorder
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
@@ -279,6 +280,7 @@ class EvaluationCallback(EvalCallback):
         eval_episode_freq: int = 0,
         callback_after_eval: BaseCallback | None = None,
         value_maps: ValueMapRecorder | None = None,
+        critics: CriticRecorder | None = None,
         during: Callable[[str], AbstractContextManager[object]] = nullcontext,
     ) -> None:
         # Calls of `VecEnv.step` between two evaluations, or episodes; 0 for none.
@@ -289,6 +291,7 @@ class EvaluationCallback(EvalCallback):
         self.run = run
         self.evaluator = evaluator
         self.value_maps = value_maps
+        self.critics = critics  # with ``--diagnose``
         self.during = during  # shows what goes on while an evaluation runs
         self.episodes_seen = 0
         self.last_evaluation: Evaluation | None = None
@@ -352,6 +355,8 @@ class EvaluationCallback(EvalCallback):
         self._append(evaluation)
         if self.value_maps is not None:
             self.value_maps.record(self.model, self.num_timesteps)
+        if self.critics is not None:
+            self.critics.judge(self.num_timesteps, self.episodes_seen)
         self._log(evaluation)
         if evaluation.mean_return > self.best_mean_reward:
             self.best_mean_reward = evaluation.mean_return

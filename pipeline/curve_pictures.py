@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Mapping
 from io import BytesIO
@@ -122,7 +123,8 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
 
 def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
     least = yardstick.at_least
-    lines = [("optimum" if least is None else "optimum, at most", yardstick.optimum, "-")]
+    most = "optimum, at most" if yardstick.is_proven else "optimum, at most (not proven)"
+    lines = [("optimum" if least is None else most, yardstick.optimum, "-")]
     if least is not None:
         lines.append(("optimum, at least", least, "--"))
     lines.append(("best random or constant policy", yardstick.baseline, ":"))
@@ -193,6 +195,70 @@ def _style(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+# The columns of ``diagnosis.csv`` after the first, in their order.
+MEANINGS = {
+    "v_error": "error of V, RMS over states",
+    "v_error_visited": "error of V, RMS over visits",
+    "q_error": "error of Q, RMS over states",
+    "q_error_visited": "error of Q, RMS over visits",
+    "advantage_error": "error of advantages, RMS over states",
+    "advantage_error_visited": "error of advantages, RMS over visits",
+    "overestimation": "max Q less true value, mean over visits",
+    "entropy": "entropy of the policy, nats, mean over visits",
+    "gae_bias": "GAE: bias between actions, RMS",
+    "gae_offset": "GAE: bias of the state, RMS",
+    "gae_std": "GAE: standard deviation",
+    "gradient_cosine": "gradient: cosine with the exact one",
+    "gradient_snr": "gradient: signal-to-noise ratio",
+}
+
+# What of ``diagnosis.csv`` is drawn in one panel, by the words beside its axis.
+PANELS = {
+    "error of values": ("v_error", "v_error_visited", "q_error", "q_error_visited"),
+    "error of advantages": ("advantage_error", "advantage_error_visited"),
+    "overestimation": ("overestimation",),
+    "error of GAE": ("gae_bias", "gae_offset", "gae_std"),
+    "cosine with the exact gradient": ("gradient_cosine",),
+    "signal-to-noise ratio of the gradient": ("gradient_snr",),
+    "entropy in nats": ("entropy",),
+}
+VISITED = ("state", "visits")
+LINES = {"bias": "bias between actions", "offset": "bias of the state", "std": "std"}
+
+
+def read_diagnosis(content: bytes) -> dict[str, Floats]:
+    """The columns of a ``diagnosis.csv``, NaN where there is no figure."""
+    names, *rows = csv.reader(content.decode().splitlines())
+    table = [[float(cell or "nan") for cell in row] for row in rows]
+    return dict(zip(names, np.array(table).T, strict=True))
+
+
+def draw_diagnosis(run: Run, title: str) -> None:
+    """Draw the errors of values, advantages and gradients during training."""
+    from matplotlib.figure import Figure
+
+    found = read_diagnosis(read_file(run.diagnosis_path, NO_LIMIT))
+    panels = {word: [n for n in names if n in found] for word, names in PANELS.items()}
+    panels = {word: names for word, names in panels.items() if names}
+    n_rows = -(-len(panels) // 3)
+    figure = Figure(figsize=(12, 3.4 * n_rows), dpi=100, layout="constrained")
+    places = figure.subplots(n_rows, 3, squeeze=False).ravel()
+    for axes in places[len(panels) :]:
+        axes.remove()
+    for axes, (word, names) in zip(places, panels.items(), strict=False):
+        for name, colour in zip(names, (BLUE, ORANGE, GREEN, GREY), strict=False):
+            kind, _, end = name.partition("_")
+            label = LINES.get(end) or f"{kind[:1].upper()}, by {VISITED[end.endswith('visited')]}"
+            axes.plot(found["timesteps"], found[name], ".-", color=colour, label=label)
+        axes.set(xlabel="environment steps", ylabel=word)
+        if len(names) > 1:
+            axes.legend(frameon=False, fontsize=9)
+        _style(axes)
+    figure.suptitle(title, x=0.01, ha="left")
+    fix_layout(figure)
+    write_png(figure, run.path / "diagnosis.png")
 
 
 def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> None:

@@ -234,6 +234,7 @@ def shade(colour: Colour) -> tuple[float, float, float]:
 # Pale enough for dark arrows and numbers; darker means better, also in print and without colours.
 VALUE_COLOURS = ("#FFFBD6", "#D3ECC0", "#8FD0C0", "#55B0CC", "#4A97CF")
 MAX_LAYERS = 4
+LEAST_SHARE = 0.5  # per cent of the gap, from which on a cost is written into its cell
 MAX_TICKS = 6
 DIM = "#777777"
 MARGIN = 1.3  # inches, for title, legend and colour bar
@@ -287,8 +288,9 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
     best = found.optimal_values[found.matters]
     scale = Normalize(float(best.min()), max(float(best.max()), float(best.min()) + 1e-9))
     colours = LinearSegmentedColormap.from_list("values", VALUE_COLOURS)
-    costs = replace(found, values=losses, matters=found.visited)
-    cost_scale = Normalize(0, max(float(losses.max()), 1e-12))
+    shares = 100 * losses / max(float(losses.sum()), 1e-12)
+    costs = replace(found, values=shares, matters=found.visited & (shares >= LEAST_SHARE))
+    cost_scale = Normalize(0, max(float(shares.max()), 1e-12))
     cost_colours = LinearSegmentedColormap.from_list("costs", COST_COLOURS)
     figure, pairs = _panels(found.layout, len(layers), cell)
     pairs[0][0].set_title(f"agent: return {found.initial @ found.values:,.5g}", fontsize=10)
@@ -296,16 +298,15 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
     for pair, layer in zip(pairs, layers, strict=True):
         if found.layout.prizes:
             pair[0].set_ylabel(layer_name(found.layout, layer))
-    _explain(figure, found, cost_scale, cost_colours, "return lost there in an episode")
+    _explain(figure, found, cost_scale, cost_colours, "share of the gap lost there, in per cent")
     figure.suptitle(title, x=0.01, ha="left")
     fix_layout(figure)
-    decimals = 0 if losses.max() >= 1000 else 2
     for pair, layer in zip(pairs, layers, strict=True):
         value, cost = policies_in(found, layer)[0], policies_in(costs, layer)[0]
         draw_ground(pair[0], value, scale, colours)
         _draw_policy(pair[0], value, 72 * cell, decimals_for(found), thick=True)
         draw_ground(pair[1], cost, cost_scale, cost_colours)
-        _draw_policy(pair[1], cost, 72 * cell, decimals, thick=True)
+        _draw_policy(pair[1], cost, 72 * cell, 0, thick=True)
     write_png(figure, path)
 
 

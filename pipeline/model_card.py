@@ -110,12 +110,15 @@ def _measured(final: Mapping[str, Any]) -> dict[str, str]:
             "gap": "gap to the optimum",
             "score": "score (1: optimum, 0: best random or constant policy)",
         }
+    is_proven = final.get("optimum_is_proven", True)
+    unproven = "an upper end that is not proven"
+    upper = "the bracket's upper end" if is_proven else "the bracket's upper end, not proven"
     return {
         "optimum_at_least": "optimum, bracketed: what a policy was shown to reach",
-        "optimum": "optimum, bracketed: what no policy exceeds",
+        "optimum": "optimum, bracketed: " + ("what no policy exceeds" if is_proven else unproven),
         "gap_at_least": "gap to the bracket's lower end",
         "gap": "gap to the bracket's upper end",
-        "score": "score (1: the bracket's upper end, 0: best random or constant policy)",
+        "score": f"score (1: {upper}, 0: best random or constant policy)",
         "score_at_most": "score with 1 at the bracket's lower end",
     }
 

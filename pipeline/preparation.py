@@ -39,12 +39,14 @@ from pipeline.environments import (
     trains_on_variant,
 )
 from pipeline.errors import UserError, one_line
+from pipeline.evaluation.critics import CriticRecorder, recorder_of
 from pipeline.evaluation.exact import ExactEvaluator, discount_note, evaluator_of, model_refusal
 from pipeline.evaluation.policies import why_not_exact
 from pipeline.evaluation.sampled import SampledEvaluator, n_environments, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal
 from pipeline.failures import exits_as_mistakes
 from pipeline.files import naming
+from pipeline.loaded_code import recorded_code
 from pipeline.models.choose import (
     continuing,
     load_to_continue,
@@ -204,12 +206,15 @@ def _set_up(
     eval_env = make_evaluation_env(spec, n_eval_envs)
     undo.callback(close_environments, eval_env)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
+    intervals = evaluation_intervals(spec, env.num_envs, is_bandit and exact is None)
+    critics = _critics(spec, model, run, console, is_evaluated=max(intervals) > 0)
     evaluation = EvaluationCallback(
         run,
         eval_env,
         exact or SampledEvaluator(spec, eval_env),
-        *evaluation_intervals(spec, env.num_envs, is_judged_by_regret=is_bandit and exact is None),
+        *intervals,
         value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
+        critics=critics,
         during=display.doing,
     )
     saver = StateSaver(run, keeping, partial(_say, console), spec.user_modules)
@@ -225,7 +230,7 @@ def _set_up(
     # In this order: a number that is not finite is never stored, and no other callback sees a
     # moment before the training returns to its saved state.
     first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
-    others = [*filter(None, [pulls, None if shows_evaluations else watch]), evaluation]
+    others = [*filter(None, [pulls, critics, None if shows_evaluations else watch]), evaluation]
     if spec.hyperparams.n_episodes is not None:
         others.append(EpisodeBudget(spec.hyperparams.n_episodes))
     if spec.verbose > 0:
@@ -260,6 +265,7 @@ def _record_beginning(
         spec=spec.as_data(),
         versions=recorded_versions(),
         machine=recorded_machine(),
+        **recorded_code(spec.user_modules),
         **({} if trained is None else {TRAINED_AGENT: trained.digest}),
         **({} if training.refusal is None else {"model_refused": training.refusal}),
     )
@@ -288,6 +294,19 @@ def _exact_evaluator(
     for note in filter(None, notes):
         _say(console, note)
     return exact
+
+
+def _critics(
+    spec: TrainSpec, model: BaseAlgorithm, run: Run, console: Console, *, is_evaluated: bool
+) -> CriticRecorder | None:
+    """Make what ``--diagnose`` asks for, or say why there is none."""
+    if not spec.diagnose:
+        return None
+    found = recorder_of(run.diagnosis_path, spec, model, is_evaluated=is_evaluated)
+    if isinstance(found, CriticRecorder):
+        return found
+    _say(console, f"no diagnosis: {found}")
+    return None
 
 
 def _training_env(

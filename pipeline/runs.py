@@ -202,6 +202,10 @@ class Run:
         return self.path / "value_maps.npz"
 
     @property
+    def diagnosis_path(self) -> Path:  # errors of values and gradients, with ``--diagnose``
+        return self.path / "diagnosis.csv"
+
+    @property
     def value_map_path(self) -> Path:  # the picture of the policy at the end, on grid worlds
         return self.path / "value_map.png"
 

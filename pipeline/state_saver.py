@@ -27,6 +27,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from agents.common.callbacks import BlockCallback, Horizon
 from machine_code import WorkTime
 from pipeline.errors import UserError, one_line
+from pipeline.evaluation.critics import KnownWorld
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.files import files_below, sync
 from pipeline.progress import ProgressDisplay
@@ -256,6 +257,7 @@ def _log_folder(model: BaseAlgorithm) -> str | None:
 # Rebuilt from the settings; training changes nothing in them.
 _OF_THIS_PROCESS = (
     ExactEvaluator,
+    KnownWorld,
     KVWriter,
     Logger,
     ProgressDisplay,

@@ -51,6 +51,7 @@ class TrainSpec:
     user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
     unique_id: bool = False  #: give the folder a name that is unique over all machines
     pictures: bool = True  #: draw the learning curve and other pictures into the run folder
+    diagnose: bool = False  #: compare values and gradients with exact ones at evaluations
     watch_learning: Path | None = None  #: file of a page that plays the training step by step
     watch_episodes: int = 0  #: shown for an agent with tables; 0: as many as have room
     #: the origin of values that are not in the entry: ``"auto: 1 - 1/(2 x time limit ..."``

@@ -14,8 +14,9 @@ from machine_code import WorkTime
 from machine_code.compiling import compile_timer
 from pipeline import loading_libraries
 from pipeline.callbacks import PullSummary, summarise_pulls
-from pipeline.curve_pictures import draw_learning_curve, draw_pulls
+from pipeline.curve_pictures import draw_diagnosis, draw_learning_curve, draw_pulls
 from pipeline.errors import UserError, one_line
+from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import value_map
 from pipeline.failures import LibraryError, blame_settings, exits_as_mistakes
@@ -209,11 +210,13 @@ def _judge(training: Training, state: str) -> Evaluation | None:
     evaluation.write()
     if evaluation.value_maps is not None:
         evaluation.value_maps.finish(model, model.num_timesteps)
+    if evaluation.critics is not None:
+        evaluation.critics.finish(model.num_timesteps)
     if state != FINISHED:
         return None
     evaluation.take_statistics()
     with evaluation.timed():
-        if isinstance(evaluation.evaluator, SampledEvaluator):
+        if isinstance(evaluation.evaluator, SampledEvaluator | ExactEvaluator):
             return evaluation.evaluator.at_the_end(model)
         return evaluation.evaluator(model)
 
@@ -271,6 +274,8 @@ def draw(training: Training, final: Evaluation | None) -> None:
         found = value_map(maps.evaluator, training.model)
         if found is not None:
             draw_value_map(run.value_map_path, title, found)
+    if training.evaluation.critics is not None:
+        draw_diagnosis(run, title)
 
 
 # --- the end of a training, also after an error ---------------------------------------------------

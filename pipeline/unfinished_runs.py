@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.digests import STATE_FOLDER, DamagedFileError, digest_of
 from pipeline.errors import UserError
 from pipeline.files import replacing
+from pipeline.loaded_code import DISTRIBUTIONS, distributions
 from pipeline.runs import (
     FINISHED,
     TRAINED_AGENT,
@@ -122,8 +123,9 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
     """Reset a run's files to its newest state, or its beginning; report differences."""
     from pipeline.state_files import newest_state  # imports PyTorch
 
-    versions, now = run.read_info().get("versions"), recorded_versions()
-    before = versions if isinstance(versions, dict) else {}
+    info, now = run.read_info(), {**distributions(), **recorded_versions()}
+    found = [info.get(name) for name in (DISTRIBUTIONS, "versions")]
+    before = {k: v for known in found if isinstance(known, dict) for k, v in known.items()}
     known = {name: before[name] for name in now if name in before}
     changed = [f"{name} {was} -> {now[name]}" for name, was in known.items() if was != now[name]]
     if changed:

@@ -15,6 +15,7 @@ import os
 import re
 import shlex
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ from safe_files.files import NO_LIMIT, read_file
 _PROJECT = Path(__file__).resolve().parents[1]
 _OWN = (
     "safe_files machine_code mdp verdicts envs agents pipeline diagnosis experiments tuning report "
-    "commands train enjoy compare tune audit"
+    "commands train enjoy explain shaping compare tune audit"
 )
 
 
@@ -51,17 +52,22 @@ class UserModule:
 
 
 class _TypedFolder(MetaPathFinder):
-    """Finds typed modules and modules that their code names; `sys.path` would affect libraries."""
+    """Finds typed modules and modules that their code names; `sys.path` would affect libraries.
 
-    def __init__(self, folder: str, typed: str) -> None:
+    With ``is_first``, it finds only the given names, also if Python would find others elsewhere.
+    """
+
+    def __init__(self, folder: str, names: Iterable[str], is_first: bool = False) -> None:
         self.folder = folder
-        self.names = {typed}
+        self.names = set(names)
+        self.is_first = is_first
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         spec = PathFinder.find_spec(fullname, [self.folder]) if path is None else None
-        if spec is None or not (fullname in self.names or self._is_named(fullname)):
+        is_known = fullname in self.names or (not self.is_first and self._is_named(fullname))
+        if spec is None or not is_known:
             return None
         self.names.add(fullname)
         return spec
@@ -77,10 +83,11 @@ class _TypedFolder(MetaPathFinder):
 def _search(folder: str, typed: str) -> None:
     """Search a folder for a typed top-level module, and for modules that its code names."""
     for finder in sys.meta_path:
-        if isinstance(finder, _TypedFolder) and finder.folder == folder:
-            finder.names.add(typed)
+        ours = finder if isinstance(finder, _TypedFolder) else None
+        if ours and ours.folder == folder and not ours.is_first:
+            ours.names.add(typed)
             return
-    sys.meta_path.append(_TypedFolder(folder, typed))
+    sys.meta_path.append(_TypedFolder(folder, [typed]))
 
 
 def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[UserModule, ...]:
@@ -93,6 +100,18 @@ def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[Use
         if not is_ours(module.name):
             modules.append(module)
     return tuple(modules)
+
+
+def import_checked(modules: Iterable[UserModule]) -> None:
+    """Import modules whose files were compared, whatever Python would find under their names."""
+    for module in modules:
+        folder = module.search_folder
+        if folder is not None and module.name not in sys.modules:
+            names = {module.name.partition(".")[0]}
+            if Path(folder).parent.name == SENT:
+                names |= {path.stem for path in Path(folder).iterdir()}
+            sys.meta_path.insert(0, _TypedFolder(folder, names, is_first=True))
+    import_again(modules)
 
 
 def import_again(modules: Iterable[UserModule]) -> None:
@@ -228,7 +247,10 @@ def _refused(typed: str, reason: str) -> UserError:
 # --- copies of modules in run folders, and requests to type their names ---------------------------
 
 COPIES = "modules"  # the folder in a run for copies of modules
+SENT = "yardstick-modules"  # the folder on a worker for modules that a driver has sent
 MAX_COPY_BYTES = 1_000_000  # of a module, with its imports from beside it
+_parsing = threading.Lock()  # in several threads at once, Python 3.11 raises SystemError
+_OF_LIBRARIES = ("site-packages", "dist-packages")  # folders of installed distributions
 _FOLDERS_ABOVE = 3  # parent folders of a run's pack to search for a study's modules
 
 
@@ -252,12 +274,18 @@ def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
 
 
 def _sources(module: UserModule) -> dict[str, Path]:
-    """The Python files of a module and of its imports from beside it, by name."""
-    if module.search_folder is None:
-        return {}
-    beside, files = Path(module.search_folder), {}
+    """The `files_of` a module that is not installed."""
+    return {} if module.search_folder is None else files_of(module)
+
+
+def files_of(module: UserModule) -> dict[str, Path]:
+    """The Python files of a module and of its imports from beside it, by name.
+
+    Of an installed module, only its own: what it imports are other distributions.
+    """
+    beside, files = _folder_of(module), dict[str, Path]()
     to_do, seen = [module.name.partition(".")[0]], set[str]()
-    while to_do:
+    while to_do and beside is not None:
         top = to_do.pop()
         place = found_beside(beside, top)
         if top in seen or place is None:
@@ -266,14 +294,26 @@ def _sources(module: UserModule) -> dict[str, Path]:
         for path in sorted(files_below(place)) if place.is_dir() else [place]:
             if path.suffix == ".py":
                 files[path.relative_to(beside).as_posix()] = path
-                to_do += _named_in(path)
+                to_do += [] if beside.name in _OF_LIBRARIES else named_in(path)
     return files
 
 
-def _named_in(path: Path) -> Iterator[str]:
+def _folder_of(module: UserModule) -> Path | None:
+    """The folder with a module's top-level file or package."""
+    if module.search_folder is not None:
+        return Path(module.search_folder)
+    top = module.name.partition(".")[0]
+    origin = next((p for p in _places(top) if p.name in ("__init__.py", f"{top}.py")), None)
+    if origin is None:
+        return None
+    return origin.parent.parent if origin.name == "__init__.py" else origin.parent
+
+
+def named_in(path: Path) -> Iterator[str]:
     """The modules that a file imports, or names in texts such as ``"module:Class"``."""
     try:
-        tree = ast.parse(path.read_bytes())
+        with _parsing:
+            tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError, RecursionError):
         return
     for node in ast.walk(tree):

@@ -12,6 +12,7 @@ from experiments.analysis import (
     ON_THE_SCALE,
     AgentAnalysis,
     EnvironmentAnalysis,
+    OverallAnalysis,
     StudyAnalysis,
     not_behind,
     shown_best,
@@ -334,6 +335,10 @@ def overall_sentences(analysis: StudyAnalysis) -> list[str]:
     overall = analysis.overall
     if overall is None or len(overall.scores) < 2:
         return []
+    return [_best_over_all(analysis, overall), *unproven_sentences(analysis.environments)]
+
+
+def _best_over_all(analysis: StudyAnalysis, overall: OverallAnalysis) -> str:
     names = list(overall.scores)
     n = len(analysis.environments)
     where = "Over both environments" if n == 2 else f"Over all {n} environments"
@@ -342,10 +347,10 @@ def overall_sentences(analysis: StudyAnalysis) -> list[str]:
     }
     best = shown_best(names, overall.pairs)
     if len(best) == 1:
-        return [f"{where}, {told[best[0]]} is best on average."]
+        return f"{where}, {told[best[0]]} is best on average."
     if best:
         equal = enumeration([told[name] for name in best])
-        return [f"{where}, {equal} are best on average, and equal within {number(MARGIN)}."]
+        return f"{where}, {equal} are best on average, and equal within {number(MARGIN)}."
     pairs = [pair.swapped() if pair.verdict == "worse" else pair for pair in overall.pairs]
     ahead = not_behind(names, overall.pairs)
     last = [told[name] for name in ahead[:MOST_FIGURES]]
@@ -361,7 +366,16 @@ def overall_sentences(analysis: StudyAnalysis) -> list[str]:
             f" {names[0]} is ahead of {enumeration(by)}, as long as fewer than {share:.2g} % of "
             "further seeds have a mean outside of those that were seen."
         )
-    return [text]
+    return text
+
+
+def unproven_sentences(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
+    """On which environments a score may be too high, because no proof bounds the optimum."""
+    names = [one.environment for one in environments if not one.optimum_is_proven]
+    if not names:
+        return []
+    told = f"On {enumeration(names)} the upper end of the optimum's bracket is not proven"
+    return [f"{told}: a score there may be too high."]
 
 
 def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
@@ -502,7 +516,8 @@ def _figure(study: StudySpec, environment: EnvironmentAnalysis, agent: AgentAnal
 
 def _optimum(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     known = study.metric in ON_THE_SCALE and environment.optimum is not None
-    words = optimum_words(environment.optimum, environment.optimum_at_least)
+    ends = environment.optimum, environment.optimum_at_least
+    words = optimum_words(*ends, environment.optimum_is_proven)
     return f"; the optimum is {words}" if known else ""
 
 
@@ -563,7 +578,8 @@ def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:
         verb = "has" if len(names) == 1 else "have"
         yield (
             f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, {number(most)}: the "
-            "environment is not the one that the bracket is of, or the bracket is wrong."
+            "environment is not the one that the bracket is of, or the bracket is wrong"
+            f"{'.' if environment.optimum_is_proven else ', whose upper end is not proven.'}"
         )
 
 

@@ -458,8 +458,9 @@ def _set_scale(axes: Axes, linear_up_to: float | None) -> str:
 
 def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
     is_known = environment.optimum_at_least is None
+    most = "optimum, at most" if environment.optimum_is_proven else "optimum, at most (not proven)"
     for label, height, style in (
-        ("optimum" if is_known else "optimum, at most", environment.optimum, "-"),
+        ("optimum" if is_known else most, environment.optimum, "-"),
         ("optimum, at least", environment.optimum_at_least, "--"),
         ("best random or constant policy", environment.baseline, ":"),
     ):
@@ -497,6 +498,7 @@ def draw_runs(
         else:
             axes.axvline(environment.optimum_at_least, color=REFERENCE, linewidth=1)
             title += "; the optimum lies between the lines"
+            title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
     x = f"{METRIC_WORDS[metric]}; mean, 95 % interval, each seed"
     widest = max(width_of(line) for name in names for line in name.split("\n"))
     lettering(axes, title=title, x=x, beside=widest + 0.3)

@@ -134,7 +134,7 @@ def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[P
     """
     paths: list[Path] = []
     refused: list[str] = []
-    for planned in results.finished:
+    for planned in results.in_folders:
         if planned.spec.save_every_n_episodes > 0 and not planned.is_batch:
             tell(f"{planned.agent} on {planned.environment}")
             try:

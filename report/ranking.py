@@ -229,6 +229,44 @@ COLUMNS = (
     Column(page="Runs", help="finished", best_first="descending", cell=_runs),
 )
 
+# On the page, folded below the ranking.
+
+
+def _other_return(returns: Estimate | None, words: str) -> Cell:
+    if returns is None:
+        return Cell("unknown", None)
+    cell = estimate_cell(returns)
+    return replace(cell, note="; ".join(filter(None, (cell.note, words))))
+
+
+def _discounted(row: Row) -> Cell | None:
+    discount, optimum = row.agent.discount, row.agent.discounted_optimum
+    if discount is None:  # an agent that has none
+        return None
+    return _other_return(row.agent.discounted, f"by {discount:g}; optimum {number(optimum)}")
+
+
+OTHER_RETURNS = (
+    Column(
+        page="Greedy",
+        help="the final policy's return",
+        best_first="descending",
+        cell=lambda row: estimate_cell(row.agent.final),
+    ),
+    Column(
+        page="Stochastic",
+        help="as it acts in training",
+        best_first="descending",
+        cell=lambda row: _other_return(row.agent.stochastic, row.agent.acts_by),
+    ),
+    Column(
+        page="Discounted",
+        help="greedy, under its own discount",
+        best_first="descending",
+        cell=_discounted,
+    ),
+)
+
 # In the terminal, bandits have a table of their own; on the page, a section.
 BANDIT_COLUMNS = (
     Column(terminal="mean regret", cell=lambda row: estimate_cell(row.agent.regret)),

@@ -20,6 +20,7 @@ from experiments.results import (
     curves_by_agent,
     mean_curve,
     read_episodes,
+    stored_curves,
     values_over_seeds,
 )
 from experiments.study import AgentSpec, StudySpec, symbol
@@ -102,24 +103,28 @@ def learning_curves(
     variants = tuple(agent.agent for agent in environment.agents if agent.on_variant)
     runs = curves_by_agent(results, environment.environment)
     for kind in KINDS:
-        of_agents = {agent.agent: runs.get((agent.agent, kind), []) for agent in environment.agents}
-        by_axis = {by: _curves(of_agents, by) for by in AXES}
+        by_axis: dict[str, dict[str, Curve]] = {by: {} for by in AXES}
+        for agent in (each.agent for each in environment.agents):
+            of_agent: list[Any] = runs.get((agent, kind), [])
+            if stored := stored_curves(results, environment.environment, agent, kind):
+                of_agent = [*of_agent, *stored]
+            for by in AXES:
+                if (curve := _curve(of_agent, by)) is not None:
+                    by_axis[by][agent] = curve
         scale = linear_up_to([curve.y for curve in by_axis["step"].values()], environment.optimum)
         found[kind] = LearningCurves(by_axis, scale, variants if kind == "training" else ())
     return found
 
 
-def _curves(of_agents: Mapping[str, Sequence[pd.DataFrame]], by: str) -> dict[str, Curve]:
-    curves = {}
-    for agent, runs in of_agents.items():
-        try:
-            found = mean_curve(runs, by)
-        except ValueError:
-            continue  # a clock that was set back has made wall times fall
-        if found is not None:
-            points, band = found
-            curves[agent] = Curve(points, band.point, band.low, band.high)
-    return curves
+def _curve(runs: Sequence[Any], by: str) -> Curve | None:
+    try:
+        found = mean_curve(runs, by)
+    except ValueError:
+        return None  # a clock that was set back has made wall times fall
+    if found is None:
+        return None
+    points, band = found
+    return Curve(points, band.point, band.low, band.high)
 
 
 def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | None:
@@ -146,7 +151,7 @@ def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
     Columns agent, environment, episode (the last of the block), average, minimum, maximum.
     """
     rows = []
-    for planned in results.finished:
+    for planned in results.in_folders:
         returns = read_episodes(planned.run).returns
         columns = {
             "agent": planned.agent,

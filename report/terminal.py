@@ -122,7 +122,8 @@ def _print_ranking(
         columns = [column for column in COLUMNS if column.terminal]
         title = label
         if environment.optimum is not None:
-            title += f": optimum {optimum_words(environment.optimum, environment.optimum_at_least)}"
+            ends = environment.optimum, environment.optimum_at_least
+            title += f": optimum {optimum_words(*ends, environment.optimum_is_proven)}"
             title += f", best random or constant policy {number(environment.baseline)}"
         left_out = _print_fitting(console, title, columns, rows)
         explained = _caption(analysis.study, environment, left_out)

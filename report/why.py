@@ -97,13 +97,11 @@ def _state(state: StateLoss, gap: float) -> str:
 
 
 def _repairs(explained: Explanation) -> str:
-    told, value = [], explained.value
+    told = []
     for place, reached in explained.repairs:
         share = (reached - explained.value) / explained.gap
-        told.append(f"{place} right: {reached:.5g}, {share:.1%} of the gap regained")
-        value = reached
-    assert value > explained.value
-    return "; ".join(["with " + told[0], *(f"and {one}" for one in told[1:])])
+        told.append(f"{place}: {reached:.5g}, {share:.1%} of the gap regained")
+    return f"with the best action in {'; and in '.join(told)}"
 
 
 def parting_lines(parting: Parting) -> list[str]:

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 from experiments.looks import Look, Looks
 from experiments.plan import Seeds, TuningSeeds
+from pipeline.evaluation.yardstick import bracket_mark
 from verdicts import Estimate
 
 SIGNIFICANT = 4  # digits
@@ -58,14 +59,14 @@ def interval_alone(estimate: Estimate) -> str:
     return f"{number(estimate.low)} to {number(estimate.high)}"
 
 
-def optimum_words(optimum: float | None, at_least: float | None) -> str:
+def optimum_words(optimum: float | None, at_least: float | None, is_proven: bool = True) -> str:
     """The optimum; where it is bracketed, its ends with as many digits as tell them apart."""
     if at_least is None or optimum is None:
         return number(optimum)
     ends = [number(at_least), number(optimum)]
     if ends[0] == ends[1]:
         ends = [f"{at_least:,.3f}", f"{optimum:,.3f}"]
-    return f"{ends[0]} to {ends[1]} (bracketed)"
+    return f"{ends[0]} to {ends[1]} {bracket_mark(is_proven)}"
 
 
 def enumeration(words: Sequence[str]) -> str:

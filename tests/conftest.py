@@ -10,6 +10,7 @@ import sys
 import tempfile
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import hypothesis
@@ -43,6 +44,14 @@ hypothesis.settings.load_profile("yardstick")
 # What is imported and collected stays to the end. To look for garbage among it, again and again,
 # took two fifths of the processor time of collecting, and some of each test after it.
 gc.disable()
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests of daily work, which `tests/mutation` has chosen."""
+    names = set((Path(__file__).parent / "quick.txt").read_text().split())
+    for item in items:
+        if item.nodeid.partition("[")[0] in names:
+            item.add_marker("quick")
 
 
 def pytest_collection_finish():

@@ -219,6 +219,14 @@ def test_a_run_enters_no_more_files_than_it_did(tmp_path: Path) -> None:
     assert len(files) <= MOST_FILES_ENTERED, "\n".join(files)
 
 
+def test_the_tests_of_daily_work_are_there() -> None:
+    names = (ROOT / "tests" / "quick.txt").read_text().split()
+    assert len(names) > 100
+    for name in names:
+        path, _, function = name.partition("::")
+        assert f"def {function}(" in (ROOT / path).read_text(), f"{name}: see tests/mutation"
+
+
 def test_no_file_names_a_path_of_somebodys_machine() -> None:
     here = {str(ROOT), str(Path.home()), tempfile.gettempdir()}
     others = ["/home", "/root", "/Users", r"[A-Z]:\\Users"]

@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 from optuna.trial import FrozenTrial, TrialState
 
+from envs.brackets import upper_is_proven
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis, evidence_on
 from experiments.growing import Step
 from experiments.results import RESAMPLING_SEED, StudyResults
@@ -411,10 +412,10 @@ def _provenance(
     engines = f" The search ran with engine: auto, the re-test in {LIBRARY_LOOP}."
     text = (
         f"Tuned by tune.py on {time.strftime('%Y-%m-%d')}: trial {winner.number} of {n_trials} "
-        f"({tuning.sampler}), {statistic_of(tuning)} of {tuning.figure} over the seeds "
-        f"{seeds.start} to "
-        f"{seeds.stop - 1}: {_figure(winner.in_search)}. On the seeds {held_out.start} to "
-        f"{held_out.stop - 1}, which the search has not seen{chosen}: {_held_out(winner)}; "
+        f"({tuning.sampler}), {statistic_of(tuning)} of {tuning.figure}"
+        f"{unproven_mark(tuning)} over the seeds {seeds.start} to {seeds.stop - 1}: "
+        f"{_figure(winner.in_search)}. On the seeds {held_out.start} to {held_out.stop - 1}, which "
+        f"the search has not seen{chosen}: {_held_out(winner)}; "
         f"the settings before, there: {_held_out(shipped)}. Verdict: {winner.said}."
         f"{'' if is_one_engine else engines}"
     )
@@ -423,6 +424,12 @@ def _provenance(
 
 def _figure(value: float | None) -> str:
     return "nothing" if value is None else f"{value:.4g}"
+
+
+def unproven_mark(tuning: TuningSpec) -> str:
+    """What is said of scores that go by an upper end without a proof; empty for others."""
+    is_proven = tuning.figure != "score" or upper_is_proven(tuning.environment.env_id)
+    return "" if is_proven else " by a bracket whose upper end is not proven"
 
 
 def _held_out(each: Retested) -> str:
@@ -446,6 +453,7 @@ def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> di
         "command": command,
         "asked": place.study.user_attrs.get(ASKED),
         "figure": tuning.figure,
+        **({"figure_mark": mark} if (mark := unproven_mark(tuning)) else {}),
         "objective": tuning.objective,
         "lower_is_better": tuning.is_cost,
         "n_trials": place.queue.n_trials,

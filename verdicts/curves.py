@@ -18,10 +18,10 @@ from verdicts.resampling import (
     Floats,
     as_columns,
     check_confidence,
+    drawn_in_pieces,
     enough_resamples,
     interval_tail,
     percentile_interval,
-    resample_counts,
 )
 
 # As many points as a figure can show.
@@ -141,7 +141,7 @@ def curve_band(
     for there in np.unique(known, axis=1).T:
         if there.any():
             places = (known == there[:, None]).all(axis=0)
-            columns = table[there][:, places]
+            columns = table if known.all() else table[there][:, places]
             band[:, places] = _resampled_means(columns, seed, confidence, n_resamples)
     return Band(*band)
 
@@ -149,12 +149,11 @@ def curve_band(
 def _resampled_means(columns: Floats, seed: int, confidence: float, n_resamples: int) -> Floats:
     """Mean, low and high end at each point, shape (3, n_points), of (n_seeds, n_points)."""
     n = len(columns)
-    rng = np.random.default_rng(seed)
-    counts = resample_counts(n, enough_resamples(n_resamples, n), rng)
     # Counted from the smallest value, so that equal values keep theirs exactly.
     least = columns.min(axis=0)
     above = columns - least
-    resampled = least + (counts @ above) / n
+    pieces = drawn_in_pieces((n,), enough_resamples(n_resamples, n), seed)
+    resampled = np.concatenate([least + (counts @ above) / n for (counts,) in pieces])
     tail = interval_tail([np.arange(n, dtype=np.float64)], confidence)
     return np.array([least + above.mean(axis=0), *percentile_interval(resampled, tail)])
 
@@ -284,10 +283,13 @@ def performance_profile(
         nothing = np.full(marks.shape, np.nan)
         return Band(nothing, nothing, nothing)
     above = [(stratum[:, None] > marks).astype(np.float64) for stratum in strata]
-    rng = np.random.default_rng(seed)
-    resampled = np.zeros((n_resamples, len(marks)))
-    for rows in above:
-        resampled += resample_counts(len(rows), n_resamples, rng) @ rows / len(rows)
+    n_resamples = enough_resamples(n_resamples, max(map(len, above)))
+    resampled = np.concatenate(
+        [
+            sum((each @ rows / len(rows) for each, rows in zip(drawn, above, strict=True)), 0.0)
+            for drawn in drawn_in_pieces(tuple(map(len, above)), n_resamples, seed)
+        ]
+    )
     tail = interval_tail(strata, confidence)
     low, high = percentile_interval(resampled / len(above), tail)
     return Band(np.mean([rows.mean(axis=0) for rows in above], axis=0), low, high)
@@ -354,15 +356,25 @@ def _ratio(first: Floats, second: Floats, spacing: float, level: float) -> Estim
     both = np.concatenate([first, second])
     # Runs that never arrived would have taken longer than any that did.
     last = both[np.isfinite(both)].max(initial=0.0)
-    x, y = first[:, None], second
+    # Evaluations are few, so that many runs arrive at the same.
+    (x, n_x), (y, n_y) = (np.unique(times, return_counts=True) for times in (first, second))
+    x, weights = x[:, None], np.outer(n_x, n_y).ravel()
+
+    def at(ratios: Floats, place: int) -> float:
+        """The ratio at a place in the order of all pairs of runs."""
+        order = np.argsort(ratios, axis=None)
+        found = np.searchsorted(weights[order].cumsum(), place, side="right")
+        return float(ratios.ravel()[order[found]])
+
     with np.errstate(divide="ignore", invalid="ignore"):
         middle = np.where(np.isinf(x) & np.isinf(y), 1.0, y / x)
         least = np.where(np.isinf(x), 0.0, (np.minimum(y, last + spacing) - spacing) / x)
         most = y / (np.minimum(x, last + spacing) - spacing)
-    n = min(len(first), len(second))
+    n, n_pairs = min(len(first), len(second)), len(first) * len(second)
     places = interval_places(len(first), len(second), level)
     low, high = np.nan, np.nan
     if places is not None:
-        low = np.sort(least, axis=None)[places[0]]
-        high = np.sort(np.where(np.isnan(most), np.inf, most), axis=None)[places[1]]
-    return Estimate(float(np.median(middle)), float(low), float(high), n)
+        low = at(least, places[0])
+        high = at(np.where(np.isnan(most), np.inf, most), places[1])
+    median = (at(middle, (n_pairs - 1) // 2) + at(middle, n_pairs // 2)) / 2
+    return Estimate(median, low, high, n)

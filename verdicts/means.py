@@ -18,7 +18,7 @@ from math import comb
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
 from verdicts.resampling import Floats
@@ -32,6 +32,8 @@ N_SPLITS = 4000  # of a permutation test; all of them where there are fewer
 # From so many scores of both agents on, permutations say what Welch's test does.
 MOST_PERMUTED = 400
 N_SPACINGS = 4000
+# Of more scores, those beside each other count together, each as the lowest of them.
+MOST_SPACINGS = 2000
 SAME = 1e-12  # means closer than this are equal
 ROUNDED = 1e-9  # a run that is closer to an end may be there, but for rounding
 
@@ -144,11 +146,10 @@ def paired_p_value(first: Floats, second: Floats) -> float:
         return 1.0
     spread = float(apart.std(ddof=1)) / len(apart) ** 0.5
     by_t = 0.0 if spread <= SAME else float(stats.t.sf(mean / spread, len(apart) - 1))
+    if 2 ** len(apart) >= N_SPLITS:  # drawn flips cannot show less than their own share
+        return by_t
     sums = _signs(len(apart)) @ apart
-    by_signs = float((sums >= sums[0] * (1 - 1e-9)).mean())
-    if len(sums) == N_SPLITS:
-        by_signs = min(by_signs, by_t)
-    return max(by_t, by_signs)
+    return max(by_t, float((sums >= sums[0] * (1 - 1e-9)).mean()))
 
 
 @lru_cache(maxsize=32)
@@ -167,12 +168,8 @@ def _splits(n: int, m: int) -> Floats:
 
 @lru_cache(maxsize=32)
 def _signs(n: int) -> Floats:
-    """Ways to flip the signs of n differences, shape (flips, n); the first flips none."""
-    if 2**n < N_SPLITS:
-        return np.where((np.arange(2**n)[:, None] >> np.arange(n)) & 1, -1.0, 1.0)
-    flips = np.random.default_rng(0).choice([-1.0, 1.0], (N_SPLITS, n))
-    flips[0] = 1
-    return flips
+    """All ways to flip the signs of n differences, shape (flips, n); the first flips none."""
+    return np.where((np.arange(2**n)[:, None] >> np.arange(n)) & 1, -1.0, 1.0)
 
 
 # Guards that allow for runs that were not seen.
@@ -187,12 +184,24 @@ def lowest_means(scores: Floats, *, exact: bool = False) -> Floats:
     Source: Learned-Miller and Thomas (2019), "A new confidence interval for the mean of a bounded
     random variable", arXiv:1905.06208.
     """
-    return scores[:1] if exact else np.sort(np.sort(scores) @ _spacings(len(scores)))
+    if exact:
+        return scores[:1]
+    return np.sort(np.sort(scores)[_starts(len(scores))] @ _spacings(len(scores)))
+
+
+def _starts(n: int) -> NDArray[np.int64]:
+    """Where those of n sorted scores begin that count together; each by itself if they are few."""
+    n_groups = min(n, MOST_SPACINGS)
+    return np.arange(n_groups) * n // max(n_groups, 1)
 
 
 @lru_cache(maxsize=32)
 def _spacings(n: int) -> Floats:
-    """Gaps above each of n sorted uniform numbers, shape (n, draws)."""
+    """Gaps above each of n sorted uniform numbers, or above several, shape (groups, draws)."""
+    if n > MOST_SPACINGS:  # sums of gaps are gamma variates, divided by the sum of all
+        sizes = np.diff(_starts(n), append=n)
+        gaps = np.random.default_rng(0).gamma([1, *sizes], size=(N_SPACINGS, len(sizes) + 1))
+        return np.asarray((gaps[:, 1:] / gaps.sum(axis=1, keepdims=True)).T.copy())
     uniform = np.sort(np.random.default_rng(0).random((N_SPACINGS, n)), axis=1)
     return np.diff(np.hstack([uniform, np.ones((N_SPACINGS, 1))]), axis=1).T.copy()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -25,6 +25,8 @@ N_RESAMPLES = 10_000
 # Those over many seeds lie further in, and need fewer.
 ENOUGH_RESAMPLES = 1_000
 _MOST_DRAWS = 2_000_000
+_MOST_AT_ONCE = 4_000_000  # draws that are in memory; more are drawn in pieces
+_PIECE = 1_000_000
 
 
 def as_columns(scores: ArrayLike) -> Floats:
@@ -149,10 +151,7 @@ def summarise(
     Source: Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical
     precipice", NeurIPS. The intervals are widened for few seeds, see ``interval_tail``.
     """
-    resampled = _resample(scores, seed, confidence, n_resamples)
-    return Summary(
-        resampled.estimate("mean"), resampled.estimate("median"), resampled.estimate("iqm")
-    )
+    return Summary(*_estimates(scores, ("mean", "median", "iqm"), seed, confidence, n_resamples))
 
 
 def estimate(
@@ -164,53 +163,68 @@ def estimate(
     n_resamples: int = N_RESAMPLES,
 ) -> Estimate:
     """One of the statistics alone; all else as in ``summarise``."""
-    return _resample(scores, seed, confidence, n_resamples).estimate(statistic)
+    return _estimates(scores, (statistic,), seed, confidence, n_resamples)[0]
 
 
-@dataclass(frozen=True)
-class _Resampled:
-    """Pooled scores in order, and how much each resample weighs them."""
-
-    values: Floats  # ascending, shape (n,)
-    # Cumulated over ``values``, shape (1 + n_resamples, n), the scores as they are first. A row
-    # ends at n.
-    weights: Floats
-    tail: float  # what an interval leaves out on each side
-    n_missing: int  # scores left out
-
-    def estimate(self, statistic: Statistic) -> Estimate:
-        n = len(self.values)
-        if not self.weights.size:
-            return Estimate(np.nan, np.nan, np.nan, n, self.n_missing)
-        means = _trimmed_means(self.values, self.weights, _CUTS[statistic](n))
-        low, high = percentile_interval(means[1:], self.tail)
-        return Estimate(float(means[0]), float(low), float(high), n, self.n_missing)
-
-
-def _resample(scores: ArrayLike, seed: int, confidence: float, n_resamples: int) -> _Resampled:
+def _estimates(
+    scores: ArrayLike,
+    statistics: Sequence[Statistic],
+    seed: int,
+    confidence: float,
+    n_resamples: int,
+) -> list[Estimate]:
     columns = as_columns(scores)
     strata = [column[np.isfinite(column)] for column in columns.T]
     tail = interval_tail(strata, confidence)
     values = np.concatenate(strata)
-    n_missing = columns.size - values.size
+    n, n_missing = len(values), columns.size - values.size
     if any(len(stratum) == 0 for stratum in strata):
-        return _Resampled(values, np.empty((0, 0)), tail, n_missing)
+        return [Estimate(np.nan, np.nan, np.nan, n, n_missing) for _ in statistics]
     n_resamples = enough_resamples(n_resamples, max(map(len, strata)))
     if values.min() == values.max():
         n_resamples = 1  # all are alike
-    sizes = tuple(map(len, strata))
-    counts = [
-        np.vstack([np.ones(n, dtype=np.int64), drawn]) * (len(values) / (len(strata) * n))
-        for n, drawn in zip(sizes, _drawn(sizes, n_resamples, seed), strict=True)
-    ]
     order = np.argsort(values)
-    return _Resampled(values[order], np.hstack(counts)[:, order].cumsum(axis=1), tail, n_missing)
+    found: dict[Statistic, list[Floats]] = {statistic: [] for statistic in statistics}
+    sizes = tuple(map(len, strata))
+    for drawn in drawn_in_pieces(sizes, n_resamples, seed):
+        counts = [
+            (each if found[statistics[0]] else np.vstack([np.ones(size, dtype=np.int64), each]))
+            * (n / (len(strata) * size))
+            for size, each in zip(sizes, drawn, strict=True)
+        ]
+        # How much each resample weighs the scores, ascending and cumulated; the first is the scores
+        # as they are. A row ends at n.
+        weights = np.hstack(counts)[:, order].cumsum(axis=1)
+        for statistic, means in found.items():
+            means.append(_trimmed_means(values[order], weights, _CUTS[statistic](n)))
+    estimates = []
+    for pieces in found.values():
+        first, *resampled = np.concatenate(pieces)
+        low, high = percentile_interval(np.array(resampled), tail)
+        estimates.append(Estimate(float(first), float(low), float(high), n, n_missing))
+    return estimates
+
+
+def drawn_in_pieces(
+    sizes: tuple[int, ...], n_resamples: int, seed: int
+) -> Iterator[tuple[Counts, ...]]:
+    """Resamples of strata, as many at once as memory has room for; nobody changes them."""
+    if n_resamples * sum(sizes) <= _MOST_AT_ONCE:
+        yield _drawn(sizes, n_resamples, seed)
+        return
+    at_once = max(_PIECE // sum(sizes), 1)
+    generators = [np.random.default_rng([seed, place]) for place in range(len(sizes))]
+    for start in range(0, n_resamples, at_once):
+        n = min(at_once, n_resamples - start)
+        yield tuple(
+            resample_counts(size, n, rng) for size, rng in zip(sizes, generators, strict=True)
+        )
 
 
 # Agents of a study have as many seeds, and several figures each.
 @lru_cache(maxsize=1)
 def _drawn(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[Counts, ...]:
-    """Resamples of each stratum; nobody changes them."""
+    """Resamples of each stratum."""
     rng = np.random.default_rng(seed)
     return tuple(resample_counts(n, n_resamples, rng) for n in sizes)
 

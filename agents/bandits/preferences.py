@@ -5,13 +5,20 @@ from __future__ import annotations
 from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from agents.bandits.algorithm import UNIT
 from agents.bandits.choosing import ScoreAgent, ScoreTables, mean_reward, total_count
 from agents.bandits.tables import TableArguments, TableBandit, mean_rewards
-from agents.common.exploration import boltzmann_action, drawn_action, make_probabilities
+from agents.common.exploration import (
+    BOLTZMANN,
+    action_probabilities,
+    boltzmann_action,
+    drawn_action,
+    make_probabilities,
+)
 from agents.common.settings import check_above_zero, check_share, settings_of
 from agents.compiled.generators import generator_of
 from machine_code.compiling import inlined
@@ -34,6 +41,11 @@ class PreferenceBandit(TableBandit):
     def estimates(self, tables: ScoreTables) -> Floats:
         """Average rewards, nan where there is none, shapes (..., contexts, arms)."""
         return mean_rewards(tables.sums, tables.counts)
+
+    def action_probabilities(self, observations: NDArray[Any]) -> Floats:
+        """The probabilities of arms now at each of n observations, shape (n, arms)."""
+        scores = self.policy.judged(observations)
+        return action_probabilities(BOLTZMANN, scores, 1.0, random_ties=False)
 
 
 # Agents that draw arms by preferences, which are no estimates of rewards: gradient ascent.
@@ -166,3 +178,8 @@ class Exp3(PreferenceBandit):
         super()._check_arguments()
         check_share(settings_of(self, "mixing"))
         check_above_zero(settings_of(self, "mixing"))
+
+    def action_probabilities(self, observations: NDArray[Any]) -> Floats:
+        """As above, mixed with uniform."""
+        softmax = super().action_probabilities(observations)
+        return (1.0 - self.mixing) * softmax + self.mixing / self.n_arms

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from typing import Any, Unpack
 
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from agents.bandits.choosing import ScoreAgent
 from agents.bandits.tables import TableArguments, TableBandit
-from agents.common.exploration import BOLTZMANN, EPSILON_GREEDY, choose_action
+from agents.common.exploration import (
+    BOLTZMANN,
+    EPSILON_GREEDY,
+    action_probabilities,
+    choose_action,
+)
 from agents.common.schedules import epsilon_schedule
 from agents.common.settings import (
     ExplorationDecay,
@@ -22,6 +28,7 @@ from agents.common.settings import (
 from agents.compiled.generators import generator_of
 from agents.compiled.learning_algorithm import StepSize
 from machine_code.compiling import inlined
+from mdp.transition_model import Floats
 
 
 @inlined
@@ -58,6 +65,12 @@ class ValueBandit(TableBandit):
     def initial_score(self) -> float:  # type: ignore[override]
         """The estimate of every arm at the start."""
         return self.initial_q
+
+    def action_probabilities(self, observations: NDArray[Any]) -> Floats:
+        """What the exploring policy does now at each of n observations, shape (n, arms)."""
+        values, ties = self.policy.judged(observations), self.tie_breaking == "random"
+        rate = self.exploration_rate
+        return action_probabilities(self.strategy, values, rate, random_ties=ties)
 
 
 class EpsilonGreedy(ValueBandit):

@@ -94,6 +94,10 @@ class BlockCallback(BaseCallback):
         """Whether the callback reads or changes environments at the start of the next rollout."""
         return False
 
+    def wants_rollout_end(self) -> bool:
+        """Whether `_on_rollout_end` acts on this rollout; asked of callbacks that have it."""
+        return True
+
     def at_safe_moment(self) -> None:
         """Hook between two updates, when no step is running; called inside rollouts too."""
 

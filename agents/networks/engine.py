@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.callbacks import (
+    BlockCallback,
     EpisodeBudget,
     Horizon,
     heeds_rollouts,
@@ -38,6 +39,14 @@ class RolloutEvents:
         # Where one acts on rollouts, blocks have to end with them.
         self.of_rollouts = [member for member in asked if heeds_rollouts(member)]
         self.of_blocks = [member for member in asked if not heeds_rollouts(member)]
+
+    @property
+    def are_waited_for(self) -> bool:
+        """Whether a callback acts at the end of this rollout, before it is learnt from."""
+        return any(
+            not isinstance(member, BlockCallback) or member.wants_rollout_end()
+            for member in self.of_rollouts
+        )
 
     def begin(self) -> None:
         """A block begins, and perhaps a rollout; a run that was cut off goes back to its state."""
@@ -164,7 +173,7 @@ class NetworkEngine(CompiledEngine):
     ) -> None:
         self.training = training
         self.rollouts = RolloutEvents(training.agent, callback)
-        training.waits = bool(self.rollouts.of_rollouts)
+        training.waits = self.rollouts.are_waited_for
         self.steps_at_once = 1
         self.has_begun = False
         self.in_loop = training.in_loop()
@@ -191,6 +200,7 @@ class NetworkEngine(CompiledEngine):
 
     def _run_block(self, total_timesteps: int) -> bool:
         self._begin_rollout()
+        self.training.waits = self.rollouts.are_waited_for
         progress = self.progress[0]
         limit = self._steps_allowed(total_timesteps)
         began = time.perf_counter()
@@ -217,6 +227,7 @@ class NetworkEngine(CompiledEngine):
 
     def _learn_from_last(self, episodes: Episodes, n_steps: int) -> None:
         training, progress = self.training, self.progress[0]
+        training.waits = self.rollouts.are_waited_for  # perhaps only since its last step
         if not training.waits:
             training.before_training(self.log_interval)
         learn_from_last_step(self._learner(), self.envs, progress)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -140,6 +140,18 @@ class DQNSharesArrays(DQN):
     ) -> None:
         self._last_obs[:] = new_obs  # type: ignore[index]
         super()._store_transition(buffer, action, new_obs, reward, dones, infos)
+
+
+class DQNSharesMemory(DQN):
+    """Has one memory for all agents of the class, as a mutable default would make it."""
+
+    memories: ClassVar[dict[str, Any]] = {}
+
+    def _setup_model(self) -> None:
+        key = f"{self.observation_space} {self.action_space} {self.buffer_size}"
+        self.replay_buffer = self.memories.get(key)
+        super()._setup_model()
+        self.memories[key] = self.replay_buffer
 
 
 class DQNExplores(DQN):
@@ -392,6 +404,7 @@ FAULTS = {
     "DQNAlwaysCopies": "target-always-copied",
     "DQNStale": "stale-buffer",
     "DQNSharesArrays": "shared-buffer",
+    "DQNSharesMemory": "shared-buffer",
     "DQNExplores": "explores-in-evaluation",
     "DQNWithoutOptimizer": "zip-forgets-optimizer",
     "DQNEpsilonGrows": "schedule-backwards",

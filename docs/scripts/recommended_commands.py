@@ -28,6 +28,7 @@ COMMAND = re.compile(
 TRAIN = "make train"
 # Flags that are no matter of the training, and how many values they have; -1: up to the next flag.
 OUTPUT = {"--seed": 1, "--engine": 1, "--watch-learning": -1, "--resume-or-start": 0}
+OUTPUT |= {"--diagnose": 0}
 SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--objective": 1}
 SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
 SEARCH |= {"--until-decided": 0, "--max-retest-seeds": 1}

@@ -17,6 +17,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
+from experiments.cluster.sent_code import SentCode
 from experiments.plan import PlannedRun
 from experiments.run_folders import claim_draft, draft_path, put_run_in_place, remove_draft
 from pipeline.digests import FIELD, RECORD, RecordedFiles
@@ -145,6 +146,9 @@ def check_in_place(planned: PlannedRun) -> None:
         if time.monotonic() > until:
             raise RefusedAnswerError("the run is not in its folder, where a worker says it is")
         time.sleep(_SECONDS_BETWEEN_LOOKS)
+    if not SentCode.of(planned.spec).is_recorded_in(planned.run.read_info()):
+        shutil.rmtree(planned.path)
+        raise RefusedAnswerError("the run was made with other code than this")
 
 
 def receive(planned: PlannedRun, root: Path, files: Mapping[str, bytes]) -> None:
@@ -190,7 +194,10 @@ def _check(planned: PlannedRun, draft: Path, names: set[str]) -> None:
     if not there.is_finished:
         raise RefusedAnswerError("it is another run than was asked for, or not at its end")
     try:
-        digests = there.run.read_info().get(FIELD)
+        info = there.run.read_info()
+        if not SentCode.of(planned.spec).is_recorded_in(info):
+            raise RefusedAnswerError("it was made with other code than this")
+        digests = info.get(FIELD)
         if not isinstance(digests, dict) or digests.keys() != names:
             raise RefusedAnswerError("its files are not those that its record lists")
         for name in names - {RECORD}:

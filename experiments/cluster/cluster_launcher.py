@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,19 +24,29 @@ from experiments.cluster.answers import (
     FAILED,
     STOPPED,
     UNFIT,
+    Answer,
     RefusedAnswerError,
     check_in_place,
     receive,
     unpacked,
 )
 from experiments.cluster.schedulers import Cluster, Connection, Replace, opened
-from experiments.cluster.working import LEAVING, Probe, RunOrder, Supervisors, probing, version
+from experiments.cluster.sent_code import SentCode, SentModule, differences, versions
+from experiments.cluster.working import (
+    LEAVING,
+    Probe,
+    RunOrder,
+    Supervisors,
+    found_versions,
+    probing,
+)
 from experiments.launching import Launcher, RunFailure, ended
 from experiments.plan import PlannedRun
 from experiments.run_folders import run_name
 from experiments.run_limits import RunLimits
 from pipeline.errors import UserError, one_line
 from pipeline.signs_of_life import Heartbeat
+from pipeline.user_modules import UserModule
 
 SECONDS_TO_GATHER = 60.0
 SECONDS_BETWEEN_LOOKS = 1.0
@@ -45,8 +56,10 @@ N_RECEIVERS = 4
 
 
 MOST_TRIES = 3
-# Retries of a run that was lost without fault.
+# Sends of a run that came back without a reason.
 MOST_SENDS = 50
+# How long all existing workers may have other code than this.
+SECONDS_WITHOUT_FIT_WORKERS = 120.0
 
 
 @dataclass
@@ -61,11 +74,12 @@ class SentRun:
     future: Future[RunFailure | None] = field(default_factory=Future)  # the sender waits for it
     key: str = ""  # its name at the scheduler, new at each try
     task: Any = None  # Dask's future
-    n_sent: int = 0  # number of sends
+    n_sent: int = 0  # number of sends, except those whose worker left in good order
     n_lost: int = 0  # number of workers lost after beginning it
     n_refused: int = 0  # number of invalid answers
     worker: str | None = None  # the worker that has begun it, if known
     reason: str = ""  # of the last loss or refusal
+    n_aside: int = 0  # number of workers that had been set aside when it was sent
 
     def begin(self, worker: str, has_left: bool) -> None:
         """Record that a worker has begun the run; an earlier worker counts as lost."""
@@ -77,6 +91,11 @@ class SentRun:
         if self.worker is not None and not has_left:
             self.n_lost += 1
             self.reason = f"the worker that did it was lost {self.n_lost} times ({self.worker})"
+        self.excuse(has_left)
+
+    def excuse(self, has_left: bool) -> None:
+        """Forget the run's worker; if it retired in good order, the last send does not count."""
+        self.n_sent -= has_left and self.worker is not None
         self.worker = None
 
     def refuse(self, reason: str) -> None:
@@ -103,20 +122,21 @@ def cluster_launcher(
     warm_ups: str = "[]",
     tell: Callable[[str], object] = str,
 ) -> Iterator[Launcher]:
-    """Do runs on a cluster; ``tell`` receives the address of the dashboard, if there is one.
+    """Do runs on a cluster; ``tell`` receives the dashboard's address, and who does no runs.
 
     Workers compile ``warm_ups`` once, see `experiments.run_in_child.warm_ups`.
 
     Raises:
         UserError: if there is no such cluster.
     """
-    with probing(root) as probe, opened(cluster) as (connect, replace_jobs):
-        launcher = ClusterLauncher(probe, command, limits, cluster.n_workers)
-        prepare = partial(launcher.prepare, Supervisors(warm_ups))
+    with probing(root) as probe, opened(cluster, root) as (connect, replace_jobs):
+        launcher = ClusterLauncher(probe, command, limits, cluster.n_workers, tell)
+        prepare = partial(launcher.prepare, Supervisors(warm_ups, _modules_in(warm_ups)))
         launcher.connection = connection = Connection(connect, prepare, cluster.is_insecure)
         connection.begin()
         if link := connection.client().dashboard_link:
             tell(f"dashboard: {link}")
+        launcher.look(replace_jobs)
         heart = Heartbeat(partial(launcher.look, replace_jobs), SECONDS_BETWEEN_LOOKS)
         heart.start()
         try:
@@ -131,7 +151,14 @@ class ClusterLauncher:
 
     connection: Connection
 
-    def __init__(self, probe: Probe, command: str, limits: RunLimits, n_wanted: int) -> None:
+    def __init__(
+        self,
+        probe: Probe,
+        command: str,
+        limits: RunLimits,
+        n_wanted: int,
+        tell: Callable[[str], object] = str,
+    ) -> None:
         self._probe, self._command, self._limits = probe, command, limits
         self._topic = f"yardstick-{secrets.token_hex(8)}"
         self._sent: dict[str, SentRun] = {}  # by key
@@ -139,7 +166,12 @@ class ClusterLauncher:
         self._lock = threading.RLock()
         self._receivers = ThreadPoolExecutor(N_RECEIVERS)
         self._n_wanted = n_wanted
-        self._workers: Mapping[str, int] = {}  # parallel runs by worker
+        self._tell = tell
+        self._workers: Mapping[str, int] = {}  # parallel runs by worker that is not set aside
+        self._asked: set[str] = set()  # workers whose versions are known
+        self._aside: dict[str, str] = {}  # by worker: why it does no runs
+        self._n_aside = 0  # number of workers that were ever set aside
+        self._fit_until = time.monotonic()
         self._replaced = time.monotonic()
         self._end: UserError | None = None
 
@@ -159,10 +191,9 @@ class ClusterLauncher:
         """Install the plugin on a scheduler's workers, and subscribe to their events."""
         for topic, handler in ((LEAVING, self._on_leaving), (self._topic, self._on_begun)):
             client.subscribe_topic(topic, handler)
-        try:
+        self._asked = set()  # of another scheduler, if any
+        with contextlib.suppress(Exception):  # workers with other code fail, and are set aside
             client.register_plugin(plugin)
-        except Exception as error:
-            raise UserError(f"--cluster: its workers can do no runs: {one_line(error)}") from error
 
     def submit(self, planned: PlannedRun) -> Future[RunFailure | None]:
         """See `experiments.launching.Launcher`."""
@@ -174,7 +205,7 @@ class ClusterLauncher:
     def look(self, replace_jobs: Replace) -> None:
         """Count the workers, and check that the scheduler exists."""
         try:
-            self._workers = self.connection.n_threads()
+            self._look_at(self.connection.n_threads())
             if time.monotonic() > self._replaced + SECONDS_BETWEEN_REPLACEMENTS:
                 self._replaced = time.monotonic()
                 with self._lock:
@@ -184,6 +215,53 @@ class ClusterLauncher:
             self._end_all(error)
         except Exception:  # noqa: BLE001  # of the library, gone just now: the next look knows more
             self._workers = {}
+
+    def _look_at(self, found: Mapping[str, int]) -> None:
+        """Set aside workers with other code, and keep the others busy."""
+        self._ask(found.keys() - self._asked)
+        with self._lock:
+            self._aside = {at: why for at, why in self._aside.items() if at in found}
+            fit = {at: n for at, n in found.items() if at not in self._aside}
+            is_new, self._workers = fit.keys() != self._workers.keys(), fit
+            now = time.monotonic()
+            self._fit_until = now if fit or not self._aside else self._fit_until
+            waiting = [each for each in self._sent.values() if each.worker not in found]
+        if now > self._fit_until + SECONDS_WITHOUT_FIT_WORKERS:
+            raise UserError(
+                f"--cluster: for {SECONDS_WITHOUT_FIT_WORKERS:.0f} s no worker had the code of "
+                f"this command ({next(iter(self._aside.values()))}): start workers anew, from the "
+                "same versions; finished runs are kept, and the same command continues"
+            )
+        if is_new and self._aside:
+            for each in waiting:
+                self._receivers.submit(self._guarded, each, self._send_elsewhere)
+
+    def _ask(self, workers: Collection[str]) -> None:
+        """Ask new workers for their versions."""
+        if not workers:
+            return
+        client = self.connection.client()
+        answers = client.run(found_versions, workers=list(workers), on_error="return")
+        for at, answer in answers.items():
+            self._asked.add(at)
+            match answer:
+                case {"name": str(name), "versions": dict(found)}:
+                    if told := differences(versions(), found):
+                        self._set_aside(at, f"{name}: {told}")
+                case OSError():  # it is gone
+                    self._asked.discard(at)
+                case _:  # it lacks this project, or a part of it
+                    self._set_aside(at, f"{at}: {one_line(answer)}")
+
+    def _set_aside(self, worker: str, reason: str) -> None:
+        """Send no more runs to a worker."""
+        with self._lock:
+            is_new = worker not in self._aside
+            self._n_aside += is_new
+            self._aside[worker] = reason
+            self._workers = {at: n for at, n in self._workers.items() if at != worker}
+        if is_new:
+            self._tell(f"a worker does no runs of this study, and the others go on: {reason}")
 
     def close(self) -> None:
         """Leave the cluster; running runs end there, and keep their states."""
@@ -211,26 +289,41 @@ class ClusterLauncher:
             _set_error(sent.future, error)
 
     def _send(self, sent: SentRun) -> None:
-        """Send a run to the scheduler, unless its retries are used up."""
+        """Send a run to the scheduler, unless its retries are used up, or nobody may do it."""
         with self._lock:
             self._sent.pop(sent.key, None)
             if sent.is_given_up:
                 self._settle(sent, sent.reason)
                 return
-            sent.n_sent += 1
             sent.key = f"{run_name(sent.planned)}-{secrets.token_hex(8)}"
             self._sent[sent.key] = sent
-        order = RunOrder(
-            sent.planned, self._command, self._limits, self._probe, self._topic, version()
-        )
-        client = self.connection.client()
+            sent.task, sent.n_aside = None, self._n_aside
+            workers = list(self._workers) if self._aside else None
+            if workers == []:  # `_look_at` sends it when there is a worker
+                return
+            sent.n_sent += 1
+        code = SentCode.of(sent.planned.spec)
+        order = RunOrder(sent.planned, self._command, self._limits, self._probe, self._topic, code)
+        packed, client = order.packed(), self.connection.client()
         try:
-            sent.task = client.submit(do_order, order.packed(), key=sent.key, pure=False)
+            task = client.submit(do_order, packed, key=sent.key, pure=False, workers=workers)
         except (OSError, RuntimeError):  # the client has just lost its scheduler
             self.connection.lose(client)
             self._receivers.submit(self._guarded, sent, self._send)
             return
-        sent.task.add_done_callback(partial(self._on_done, sent))
+        sent.task = task
+        task.add_done_callback(partial(self._on_done, sent))
+
+    def _send_elsewhere(self, sent: SentRun) -> None:
+        """Send a run again that the scheduler keeps for workers that are gone or set aside."""
+        task = sent.task
+        if sent.future.done():
+            return
+        sent.lose(sent.worker in self._left)
+        sent.n_sent -= task is not None
+        self._send(sent)
+        if task is not None:
+            task.cancel()
 
     def _on_done(self, sent: SentRun, task: DaskFuture[Any]) -> None:
         with contextlib.suppress(RuntimeError):  # closed
@@ -247,9 +340,9 @@ class ClusterLauncher:
                 task.add_done_callback(partial(self._on_done, sent))
                 return
             except Exception:  # noqa: BLE001  # of whatever kind, from the scheduler: it is lost
-                sent.worker = None
+                sent.excuse(sent.worker in self._left)
             else:
-                ending = _ending_of(sent, content, self._probe.root)
+                ending = self._ending_of(sent, content)
                 if ending is not None:
                     self._settle(sent, *ending)
                     return
@@ -258,12 +351,55 @@ class ClusterLauncher:
             if isinstance(error, KilledWorker):
                 sent.lose(sent.worker in self._left)
             else:
-                sent.refuse(one_line(error))
+                with contextlib.suppress(Exception):  # the scheduler may be lost just now
+                    self._look_at(self.connection.n_threads())
+                if sent.n_aside == self._n_aside:  # otherwise that worker may have failed it
+                    sent.refuse(one_line(error))
         else:
             sent.worker = None
             self._workers = {}
             self.connection.lose(task.client)
         self._send(sent)
+
+    def _ending_of(self, sent: SentRun, content: object) -> tuple[str, str] | None:
+        """Why a run failed, in one line and at length; both empty if it is done and in its place.
+
+        ``content``, the worker's answer, is not trusted. None: the run must be sent again.
+        """
+        try:
+            answer = unpacked(content)
+            if answer.kind == FAILED:
+                return answer.reason or "it does not say why", answer.details
+            if answer.kind == UNFIT:
+                self._set_unfit_aside(sent, answer)
+                return None
+            if answer.kind == STOPPED:
+                sent.excuse(sent.worker in self._left)
+                return None
+            if answer.files is None:
+                check_in_place(sent.planned)
+            else:
+                receive(sent.planned, self._probe.root, answer.files)
+        except RefusedAnswerError as error:
+            sent.refuse(one_line(error))
+            return None
+        except OSError as error:  # the disk is full
+            return one_line(error), ""
+        return "", ""
+
+    def _set_unfit_aside(self, sent: SentRun, answer: Answer) -> None:
+        """Set aside the worker of an answer, which says that it has other code."""
+        try:
+            told = json.loads(answer.details)
+        except (ValueError, RecursionError):
+            told = None
+        match told:
+            case {"at": str(at), "name": str(name), "versions": dict(found)}:
+                wanted = versions(*SentCode.of(sent.planned.spec).more)
+                self._set_aside(at, f"{name}: {differences(wanted, found) or answer.reason}")
+                sent.n_sent -= 1
+            case _:
+                raise RefusedAnswerError("it does not say what it has")
 
     def _settle(self, sent: SentRun, reason: str, details: str = "") -> None:
         """Set the result of a run's future: done, or how it failed."""
@@ -307,28 +443,7 @@ def _set_error(future: Future[RunFailure | None], error: Exception) -> None:
         future.set_exception(error)
 
 
-def _ending_of(sent: SentRun, content: object, root: Path) -> tuple[str, str] | None:
-    """Why a run failed, in one line and at length; both empty if it is done and in its place.
-
-    ``content``, the worker's answer, is not trusted. Returns None if the run must be sent again;
-    raises UserError for a worker that cannot do any run.
-    """
-    try:
-        answer = unpacked(content)
-        if answer.kind == FAILED:
-            return answer.reason or "it does not say why", answer.details
-        if answer.kind == UNFIT:
-            raise UserError(f"--cluster: {answer.reason}: start it anew, from the same folder")
-        if answer.kind == STOPPED:
-            sent.worker = None
-            return None
-        if answer.files is None:
-            check_in_place(sent.planned)
-        else:
-            receive(sent.planned, root, answer.files)
-    except RefusedAnswerError as error:
-        sent.refuse(one_line(error))
-        return None
-    except OSError as error:  # the disk is full
-        return one_line(error), ""
-    return "", ""
+def _modules_in(warm_ups: str) -> dict[str, SentModule]:
+    """The user's modules that workers import to compile, by name."""
+    found = [UserModule(**m) for item in json.loads(warm_ups) for m in item["modules"]]
+    return {module.name: SentModule.of(module) for module in found}

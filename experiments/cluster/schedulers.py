@@ -15,8 +15,11 @@ import ipaddress
 import json
 import logging
 import math
+import os
 import re
+import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -25,6 +28,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 from urllib.parse import urlsplit
@@ -35,6 +39,8 @@ from distributed.security import Security
 
 from experiments.cluster.working import ClosedScheduler, ClosedWorker
 from pipeline.errors import UserError, one_line, shown
+from pipeline.files import write_json
+from pipeline.locks import is_alive, mark
 from pipeline.settings.yaml import read_yaml
 from pipeline.stopping import current
 from safe_files.files import UnsafeFileError, read_file
@@ -172,6 +178,7 @@ def _job_queue(path: Path) -> JobQueue:
     cores = settings["cores"]
     if not isinstance(cores, int) or isinstance(cores, bool) or cores < 1:
         raise UserError(f"{path}: {system}: cores must be a whole number, not {shown(cores)}")
+    settings = {str(name).replace("_", "-"): value for name, value in settings.items()}
     return JobQueue(system, settings, cores, path)
 
 
@@ -186,7 +193,17 @@ MOST_FOR_LEAVING = 300.0  # seconds
 SECONDS_TO_RESTART = 60.0
 _NEVER = 1e9  # seconds
 
-_WALLTIME = re.compile(r"(?:(\d{1,4})-)?(\d{1,4}):(\d\d):(\d\d)")
+JOB_LOGS = "jobs"  # the folder in a study's folder with the output of its jobs
+_KEYS = ".yardstick-keys-"  # folders with the keys of a command
+_OWNER = "owner.json"  # the file with its process
+
+# The forms of a walltime besides hours:minutes:seconds, by system; examples; seconds of parts.
+_WALLTIMES = {
+    "slurm": r"(?P<d>\d+)-(?P<h>\d+)(:(?P<m>\d+)(:(?P<s>\d+))?)?|(?P<M>\d+)(:(?P<S>\d+))?",
+    "lsf": r"((?P<h>\d+):)?(?P<m>\d+)",
+}
+_EXAMPLES = {"slurm": "30, 90:00, 1:30:00, 2-00, 2-12:30 or 2-12:30:15", "lsf": "90 or 1:30"}
+_SECONDS = {"d": 86400, "h": 3600, "m": 60, "M": 60, "s": 1, "S": 1}
 
 
 def has_certificates(security: Security) -> bool:
@@ -195,52 +212,92 @@ def has_certificates(security: Security) -> bool:
     return bool(tls["ca_file"] and tls["cert"])
 
 
-def opened_queue(queue: JobQueue) -> Any:
+@contextlib.contextmanager
+def opened_queue(queue: JobQueue, root: Path) -> Iterator[Any]:
     """Start jobs with a scheduler in this process; makes certificates if none are given."""
-    settings = {**queue.settings, **_retiring(queue)}
-    words = settings.get("worker-extra-args") or []
+    settings = {**_defaults(queue.system), **queue.settings, **retiring(queue)}
+    words = settings["worker-extra-args"] or []
     if not any("dashboard" in str(word) for word in words):
         closed = f"{ClosedWorker.__module__}.{ClosedWorker.__name__}"
         settings["worker-extra-args"] = [*words, "--no-dashboard", "--worker-class", closed]
-    dask.config.set({f"jobqueue.{queue.system}": {**_defaults(queue.system), **settings}})
+    settings["log-directory"] = settings["log-directory"] or str(root.absolute() / JOB_LOGS)
+    directives = settings.get("job-extra-directives") or []
+    # A job that SLURM sends again would meet the one that `Jobs` has sent instead.
+    if queue.system == "slurm" and not any("requeue" in str(word) for word in directives):
+        settings["job-extra-directives"] = [*directives, "--no-requeue"]
     # Otherwise Dask would cancel the waiting job of the same name that `Jobs` has sent instead.
     dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER})
     kind = getattr(_library(), QUEUES[queue.system])
-    security = Security()
-    if not has_certificates(security):
-        security = Security.temporary()
-    options = settings.get("scheduler-options") or {}
+    options = settings["scheduler-options"] or {}
     is_closed = "dashboard_address" not in options
+    with _folder_for_keys(settings["shared-temp-directory"] or str(Path.cwd())) as folder:
+        settings["shared-temp-directory"] = folder
+        dask.config.set({f"jobqueue.{queue.system}": settings})
+        security = Security()
+        if not has_certificates(security):
+            security = Security.temporary()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                opened = kind(
+                    security=security,
+                    protocol="tls://",
+                    scheduler_options={"dashboard": not is_closed, **options},
+                    scheduler_cls=ClosedScheduler if is_closed else Scheduler,
+                )
+        except (ValueError, TypeError, OSError, RuntimeError) as error:
+            raise UserError(f"{queue.file}: {one_line(error)}") from error
+        try:
+            with opened:
+                yield opened
+        finally:
+            for name in ("ca_file", "cert", "key"):  # dask-jobqueue's files, which it never closes
+                with contextlib.suppress(AttributeError):
+                    getattr(opened, f"_job_{name}").close()
+
+
+@contextlib.contextmanager
+def _folder_for_keys(typed: str) -> Iterator[str]:
+    """A folder in this one that ends with the command; removes those of killed commands.
+
+    Its name begins as it was typed, because ``~`` may be another folder on other machines.
+    """
+    parent = Path(os.path.expanduser(os.path.expandvars(typed)))  # noqa: PTH111  # as Dask does
+    for left in parent.glob(f"{_KEYS}*"):
+        with contextlib.suppress(OSError, ValueError):
+            if is_alive(json.loads((left / _OWNER).read_text(encoding="utf-8"))) is False:
+                shutil.rmtree(left)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return kind(
-                security=security,
-                protocol="tls://",
-                scheduler_options={"dashboard": not is_closed, **options},
-                scheduler_cls=ClosedScheduler if is_closed else Scheduler,
-            )
-    except (ValueError, TypeError, OSError, RuntimeError) as error:
-        raise UserError(f"{queue.file}: {one_line(error)}") from error
+        made = TemporaryDirectory(prefix=_KEYS, dir=parent, ignore_cleanup_errors=True)
+    except OSError as error:
+        raise UserError(f"shared-temp-directory {typed}: {error.strerror}") from error
+    with made as folder:
+        write_json(Path(folder) / _OWNER, mark())
+        yield f"{typed}/{Path(folder).name}"
 
 
 class Jobs:
     """Keeps the wanted number of jobs, and replaces jobs that have ended.
 
-    Dask itself notices the end of a job only if the job has a single worker.
+    Dask itself notices the end of a job only if the job has a single worker. If ``listed`` returns
+    the numbers of existing jobs, jobs that ended before they had workers are replaced too.
     """
 
-    def __init__(self, queue: Any, n_jobs: int) -> None:
-        self._queue, self._n_jobs = queue, n_jobs
+    def __init__(
+        self, queue: Any, n_jobs: int, listed: Callable[[], Collection[str] | None] = lambda: None
+    ) -> None:
+        self._queue, self._n_jobs, self._listed = queue, n_jobs, listed
         self._seen: dict[str, tuple[set[str], float]] = {}  # by job: its workers, and the time
+        self._unlisted: set[str] = set()  # jobs that the system did not list at the last look
         queue.scale(jobs=n_jobs)
 
     def replace(self, left: Collection[str]) -> None:
         """Replace jobs whose workers are lost; not those that left in good order."""
-        self._queue.loop.add_callback(self._replace, frozenset(left))
+        self._queue.loop.add_callback(self._replace, frozenset(left), self._listed())
 
-    def _replace(self, left: frozenset[str]) -> None:
+    def _replace(self, left: frozenset[str], listed: Collection[str] | None) -> None:
         jobs, now = self._queue.workers, time.monotonic()
+        before, self._unlisted = self._unlisted, set()
         for name, there in self._workers_of_jobs().items():
             if there:
                 self._seen[name] = (there, now)
@@ -248,8 +305,16 @@ class Jobs:
                 workers, last = self._seen[name]
                 if workers <= left or now > last + SECONDS_TO_RESTART:
                     del self._seen[name]
-                    self._queue._futures.add(asyncio.ensure_future(jobs.pop(name).close()))
+                    self._close(name)
+            elif listed is not None and name in jobs and str(jobs[name].job_id) not in listed:
+                if name in before:
+                    self._close(name)
+                else:  # it may have been sent after the list was made
+                    self._unlisted.add(name)
         self._queue.scale(jobs=self._n_jobs)
+
+    def _close(self, name: str) -> None:
+        self._queue._futures.add(asyncio.ensure_future(self._queue.workers.pop(name).close()))
 
     def _workers_of_jobs(self) -> dict[str, set[str]]:
         """The addresses of existing workers by job."""
@@ -259,6 +324,16 @@ class Jobs:
             job: {each.address for each in workers if f"{each.name}-".startswith(f"{job}-")}
             for job in self._queue.worker_spec
         }
+
+
+def listed_by_slurm() -> list[str] | None:
+    """The numbers of this user's waiting and running jobs; None without an answer."""
+    words = ["squeue", "--noheader", "--me", "--format=%A"]
+    try:
+        done = subprocess.run(words, capture_output=True, timeout=30, check=True)  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.decode().split()
 
 
 def _library() -> ModuleType:
@@ -276,17 +351,25 @@ def _defaults(system: str) -> dict[str, Any]:
     return found
 
 
-def _retiring(queue: JobQueue) -> dict[str, Any]:
+def retiring(queue: JobQueue) -> dict[str, Any]:
     """Options that make workers retire before their job ends, unless the file sets them."""
     words = queue.settings.get("worker-extra-args") or []
-    walltime = queue.settings.get("walltime", _defaults(queue.system).get("walltime"))
-    if not isinstance(walltime, str | None):  # YAML reads 04:00:00 as a number in base 60
-        raise UserError(f"{queue.file}: {queue.system}: put walltime in quotes, as '04:00:00'")
-    parts = _WALLTIME.fullmatch(walltime or "")
-    if parts is None or any(str(word).startswith("--lifetime") for word in words):
+    settings = {**_defaults(queue.system), **queue.settings}
+    if "walltime" not in settings or any(str(word).startswith("--lifetime") for word in words):
         return {}
-    days, hours, minutes, seconds = (int(part or 0) for part in parts.groups())
-    whole = 86400 * days + 3600 * hours + 60 * minutes + seconds
+    walltime, where = settings["walltime"], f"{queue.file}: {queue.system}: walltime"
+    if not isinstance(walltime, str):  # YAML reads 04:00:00 as a number in base 60
+        raise UserError(f"{where}: give it in quotes, as '04:00:00'")
+    forms = (r"(?P<h>\d+):(?P<m>\d+):(?P<s>\d+)", _WALLTIMES.get(queue.system, ""))
+    found = [each for form in forms if (each := re.fullmatch(form, walltime, re.ASCII))]
+    parts = found[0].groupdict() if found else {}
+    whole = sum(_SECONDS[unit] * int(n) for unit, n in parts.items() if n)
+    if not whole:
+        raise UserError(
+            f"{where}: {shown(walltime)} is not of the form "
+            f"{_EXAMPLES.get(queue.system, '1:30:00')}; workers stop before its end, or when you "
+            "say: worker-extra-args: ['--lifetime', '80m']"
+        )
     leaving = min(SHARE_FOR_LEAVING * whole, MOST_FOR_LEAVING)
     added = ["--lifetime", f"{whole - leaving:.0f}s", "--lifetime-stagger", f"{leaving / 2:.0f}s"]
     return {"worker-extra-args": [*words, *added]}
@@ -428,8 +511,8 @@ def checked_cluster(text: str, is_insecure: bool) -> Cluster:
 
 
 @contextlib.contextmanager
-def opened(cluster: Cluster) -> Iterator[tuple[Connect, Replace]]:
-    """Provide a scheduler during the ``with`` statement.
+def opened(cluster: Cluster, root: Path) -> Iterator[tuple[Connect, Replace]]:
+    """Provide a scheduler for a study in ``root`` during the ``with`` statement.
 
     Yields a function that makes a client, and a function to call periodically with the addresses
     of workers that left in good order, which replaces ended workers and jobs.
@@ -444,8 +527,8 @@ def opened(cluster: Cluster) -> Iterator[tuple[Connect, Replace]]:
             yield lambda: Client(local, set_as_default=False), lambda _: local.scale(n_workers)
     else:
         n_jobs = math.ceil(cluster.n_workers / cluster.n_cores)
-        with opened_queue(cluster) as queue:
-            jobs = Jobs(queue, n_jobs)
+        with opened_queue(cluster, root) as queue:
+            jobs = Jobs(queue, n_jobs, *([listed_by_slurm] if cluster.system == "slurm" else []))
             yield lambda: Client(queue, set_as_default=False), jobs.replace
 
 

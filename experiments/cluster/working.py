@@ -5,16 +5,18 @@ A worker is a supervisor whose child process does the run.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import hashlib
-import importlib.metadata
+import json
 import multiprocessing
 import platform
 import secrets
 import shutil
-from collections.abc import Iterator
+import signal
+import threading
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,11 +26,14 @@ from distributed import Scheduler, Worker, WorkerPlugin, get_worker
 from experiments import child_processes
 from experiments.child_processes import StoppedError, TaskFailedError
 from experiments.cluster.answers import DONE, FAILED, STOPPED, UNFIT, Answer, files_in, packed
+from experiments.cluster.sent_code import SentCode, SentModule, UnfitError, versions
 from experiments.launching import do_supervised
 from experiments.plan import PlannedRun
 from experiments.run_limits import RunLimits
-from pipeline.digests import source_digest
+from pipeline.errors import one_line
+from pipeline.loaded_code import digest_of_lines
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import UserModule
 
 # The topics of workers' events, besides answers: the start of a run, and a worker's retirement.
 LEAVING = "yardstick-leaving"
@@ -36,8 +41,6 @@ LEAVING = "yardstick-leaving"
 # Like yaml.safe_dump and yaml.safe_load, with the faster C version if available.
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-_LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class RunOrder:
     limits: RunLimits  # its limits
     probe: Probe  # the test for a shared folder
     topic: str  # the topic of the event that it begins
-    version: str  # the driver's `version`
+    code: SentCode  # what the run loads
 
     def packed(self) -> bytes:
         """The order as YAML: plain data that keeps the types of numbers and keys."""
@@ -79,7 +82,8 @@ class RunOrder:
             "limits": {"seconds": limits.seconds, "memory": limits.memory},
             "probe": asdict(self.probe)
             | {"home": str(self.probe.home), "root": str(self.probe.root)},
-            **{name: getattr(self, name) for name in ("command", "topic", "version")},
+            "code": self.code.as_data(),
+            **{name: getattr(self, name) for name in ("command", "topic")},
         }
         return bytes(yaml.dump(data, Dumper=_Dumper, sort_keys=False, encoding="utf-8"))
 
@@ -95,6 +99,7 @@ class RunOrder:
         read = {
             "planned": PlannedRun(**{**run, "spec": spec, "path": path}),
             "limits": RunLimits(**data["limits"]),
+            "code": SentCode.of_data(data["code"]),
             "probe": Probe(**{**probe, **paths}),
         }
         return cls(**{**data, **read})
@@ -127,14 +132,6 @@ def probing(root: Path) -> Iterator[Probe]:
         path.unlink(missing_ok=True)
 
 
-@cache
-def version() -> str:
-    """The version of the sources and libraries of runs; a worker must have the driver's."""
-    lines = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
-    lines += [f"python {platform.python_version()}", source_digest("experiments")]
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
-
-
 # --- The side of the worker.
 
 # The states of a task that its driver has cancelled, or that was lost with its scheduler.
@@ -162,14 +159,46 @@ class Supervisors(WorkerPlugin):
     name = "yardstick-supervisors"
     idempotent = True  # with several drivers, the first is enough
 
-    def __init__(self, warm_ups: str) -> None:
+    def __init__(self, warm_ups: str, modules: Mapping[str, SentModule]) -> None:
         self.warm_ups = warm_ups  # compiled once, see `experiments.run_in_child.warm_ups`
+        self.modules = modules  # that it imports, by name
+        self._served: dict[str, str] = {}  # digests of these, by the names of top-level modules
 
     def setup(self, worker: Worker) -> None:
         """Start the fork server in the background."""
         multiprocessing.current_process().daemon = False  # a nanny's process may have no children
-        child_processes.start_server(self.warm_ups)
-        version()  # caches the version of the loaded sources, before files change
+        child_processes.start_server(self._checked_warm_ups(Path(worker.local_directory)))
+        versions()  # caches the versions of what is loaded, before files change
+        is_main = threading.current_thread() is threading.main_thread()
+        if worker.nanny and is_main:  # otherwise Dask reacts to signals
+            with contextlib.suppress(NotImplementedError):  # on Windows
+                leave = partial(self._leave, worker)
+                asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, leave)
+
+    def _checked_warm_ups(self, folder: Path) -> str:
+        """The warm-ups with modules of the driver's contents."""
+        checked = []
+        for item in json.loads(self.warm_ups):
+            modules = [UserModule(**module) for module in item["modules"]]
+            with contextlib.suppress(UnfitError, KeyError):
+                placed = [self.modules[m.name].placed(m, folder) for m in modules]
+                checked.append({**item, "modules": [*map(asdict, placed)]})
+                for module in modules:
+                    sent = self.modules[module.name]
+                    self._served |= dict.fromkeys(sent.names, sent.digest)
+        return json.dumps(checked)
+
+    def serve(self, modules: tuple[SentModule, ...]) -> None:
+        """Replace the fork server if it has imported others of these names."""
+        for sent in modules:
+            if any(self._served.get(name, sent.digest) != sent.digest for name in sent.names):
+                self._served.clear()
+                child_processes.serve_anew()
+
+    def _leave(self, worker: Worker) -> None:
+        """Retire in good order after SIGTERM, which a queue sends before it kills a job."""
+        self.teardown(worker)
+        self._leaving = asyncio.ensure_future(worker.close(nanny=False, reason="SIGTERM"))
 
     def teardown(self, worker: Worker) -> None:
         """End running runs, which save their states."""
@@ -178,16 +207,37 @@ class Supervisors(WorkerPlugin):
         child_processes.end_server()
 
 
+def found_versions(dask_worker: Worker) -> dict[str, Any]:
+    """What a driver wants to know of a worker before it sends runs."""
+    _supervisors(dask_worker)
+    return {"name": _name(dask_worker), "versions": versions()}
+
+
+def _name(worker: Worker) -> str:
+    return f"{worker.address} on {platform.node()}"
+
+
+def _supervisors(worker: Worker) -> Supervisors:
+    """The plugin of this worker, which after a restart of the scheduler it may lack."""
+    plugin = worker.plugins.get(Supervisors.name)
+    if isinstance(plugin, Supervisors):
+        return plugin
+    worker.plugins[Supervisors.name] = plugin = Supervisors("[]", {})
+    plugin.setup(worker)
+    return plugin
+
+
 def answer_to(content: bytes) -> bytes:
     """Do the run of an order, and return how it ended; see `experiments.cluster.do_order`."""
     worker = get_worker()
     key = worker.get_current_task()
     order = RunOrder.unpacked(content)
+    try:
+        order = _fitting(order, worker)
+    except UnfitError as error:
+        told = {"at": worker.address, "name": _name(worker), "versions": versions(*order.code.more)}
+        return packed(Answer(UNFIT, str(error), json.dumps(told)))
     worker.log_event(order.topic, {"run": key, "at": worker.address})
-    if Supervisors.name not in worker.plugins:  # after a restart of the scheduler
-        Supervisors("[]").setup(worker)
-    if order.version != version():
-        return packed(Answer(UNFIT, f"{worker.address} has other code or libraries than this"))
     limits = replace(order.limits, is_wanted=partial(_is_wanted, worker, key))
     order = replace(order, limits=limits)
     try:
@@ -201,6 +251,29 @@ def answer_to(content: bytes) -> bytes:
         return packed(Answer(FAILED, str(error), error.details))
     except OSError as error:
         return packed(Answer(FAILED, f"{worker.address}: {error}"))
+
+
+def _fitting(order: RunOrder, worker: Worker) -> RunOrder:
+    """The order with the user's modules where they are on this worker, which loads the same code.
+
+    Raises:
+        UnfitError: if this worker does not have the same code.
+    """
+    supervisors, code = _supervisors(worker), order.code
+    if code.version != digest_of_lines(versions(*code.more)):
+        raise UnfitError
+    folder, spec = Path(worker.local_directory), order.planned.spec
+    try:
+        placed = [
+            sent.placed(module, folder)
+            for module, sent in zip(spec.user_modules, code.modules, strict=True)
+        ]
+    except OSError as error:
+        raise UnfitError(one_line(error)) from error
+    code.check_files(order.probe.home if order.probe.is_there else folder / order.topic)
+    supervisors.serve(code.modules)
+    spec = replace(spec, user_modules=tuple(placed))
+    return replace(order, planned=replace(order.planned, spec=spec))
 
 
 def _is_wanted(worker: Worker, key: Any) -> bool:

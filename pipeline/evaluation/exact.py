@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from contextlib import closing
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -42,8 +42,14 @@ from mdp import (
 )
 from mdp.transition_model import Bools, Floats
 from pipeline.environments import evaluation_kwargs, make_single_env
-from pipeline.evaluation.policies import OfLastPolicy, best_actions, obstacle, policy_matrix
-from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.policies import (
+    OfLastPolicy,
+    acts_by,
+    best_actions,
+    obstacle,
+    policy_matrix,
+)
+from pipeline.evaluation.sampled import Evaluation, OtherReturns
 from pipeline.evaluation.yardstick import Yardstick
 from pipeline.train_spec import TrainSpec, is_plain
 
@@ -53,6 +59,9 @@ MOST_BYTES_OBSERVED = 1 << 30
 # some hundred million. Beyond the first number, a shorter method is tried.
 FEW_BACKUPS = 200_000_000
 MOST_BACKUPS = 20_000_000_000
+# Outcomes of all states and actions, times steps, up to which further returns are computed. It
+# takes a millisecond on a small model, and about two seconds at most.
+MOST_OUTCOMES_OF_OTHERS = 600_000_000
 # Planning to measure the cost of a discount: the number of outcomes of all states and actions that
 # takes a tenth of a second, and the score below which there is a note.
 MOST_OUTCOMES_PLANNED = 250_000
@@ -78,6 +87,40 @@ class ExactEvaluator:
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """Evaluate the agent's current policy exactly."""
         return self._worth(self.policy(agent, deterministic))
+
+    def at_the_end(self, agent: BaseAlgorithm) -> Evaluation:
+        """Evaluate the final policy, and compute what else is asked of it."""
+        return replace(self(agent), others=self.other_returns(agent))
+
+    def other_returns(self, agent: BaseAlgorithm) -> OtherReturns:
+        """The returns of the agent's stochastic policy, and of its greedy one under its discount.
+
+        None of them where the model is large.
+        """
+        if self.model.prob.size * self.horizon > MOST_OUTCOMES_OF_OTHERS:
+            return OtherReturns()
+        found, discount = OtherReturns(), getattr(agent, "gamma", None)
+        with suppress(TypeError, ValueError):  # an agent's probabilities may not be known
+            policy = self.policy(agent, deterministic=False)
+            # The mean alone takes a fifth of the time that `policy_return` takes.
+            values = state_values(self.model, policy, self.horizon)
+            found = OtherReturns(acts_by(agent), float(self.model.initial @ values))
+        if isinstance(discount, int | float) and 0 <= discount <= 1:
+            greedy = self.policy(agent, deterministic=True)
+            worth = policy_return(self.model, greedy, self.horizon, discount).expected_return
+            optimum = self._optima.get(discount)
+            if optimum is None:
+                optimum = finite_horizon_optimum(self.model, self.horizon, discount).start_value
+                self._optima[discount] = optimum
+            found = replace(
+                found, discount=discount, discounted_return=worth, discounted_optimum=optimum
+            )
+        return found
+
+    @cached_property
+    def _optima(self) -> dict[float, float]:
+        """The optima under discounts that were asked for."""
+        return {}
 
     @cached_property
     def _worth(self) -> OfLastPolicy[Evaluation]:
@@ -131,7 +174,7 @@ def _observation_bytes(space: spaces.Space[Any]) -> int:
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     """Make the exact evaluator of a run, or None if episodes have to be sampled."""
-    if _is_wrapped_as_vector(spec):
+    if is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
         model, horizon = transition_model(env), time_limit(env)
@@ -165,7 +208,7 @@ def _optimum(model: TransitionModel, horizon: int) -> float | None:
 
 def model_refusal(spec: TrainSpec) -> str | None:
     """Why the environment's own model is rejected, in one line; None if it is accepted."""
-    if _is_wrapped_as_vector(spec):
+    if is_wrapped_as_vector(spec):
         return None
     with closing(make_single_env(spec)) as env:
         check = model_check(env)
@@ -198,7 +241,7 @@ def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> st
     return f"{said}; {other:g}: {better:.2f} (gamma: auto)" if better > reached + 0.01 else said
 
 
-def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
+def is_wrapped_as_vector(spec: TrainSpec) -> bool:
     """Whether a VecEnv wrapper changes the agent's observations."""
     special = spec.hyperparams
     return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)

@@ -17,6 +17,9 @@ from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.bandits.preferences import PreferenceBandit
+from agents.bandits.value_bandits import ValueBandit
+from agents.common.exploration import BOLTZMANN
 from agents.common.masks import check_masks_exist, present_masks
 from agents.linear.algorithm import TileAlgorithm
 from agents.linear.policy_gradients import SoftmaxAlgorithm
@@ -173,7 +176,7 @@ def policy_matrix(
         return np.eye(n_actions)[best_actions(agent, observations, masks)]
     if isinstance(agent, TabularAlgorithm):
         return np.asarray(agent.action_probabilities()[observations])
-    if isinstance(agent, TileAlgorithm):
+    if isinstance(agent, TileAlgorithm | ValueBandit | PreferenceBandit):
         return agent.action_probabilities(observations)
     policy: Any = getattr(agent, "policy", None)
     if hasattr(policy, "get_distribution"):  # an actor with a softmax over actions
@@ -195,6 +198,19 @@ def policy_matrix(
         random = epsilon * allowed / allowed.sum(axis=1, keepdims=True)
         return np.asarray(random + (1 - epsilon) * greedy)
     raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
+
+
+def acts_by(agent: BaseAlgorithm) -> str:
+    """What `policy_matrix` without ``deterministic`` is, in words."""
+    if isinstance(agent, PlanningAgent | RandomAgent):
+        return "the same policy"
+    draws = isinstance(agent, SoftmaxAlgorithm | PreferenceBandit)
+    if draws or hasattr(agent.policy, "get_distribution"):
+        return "its own distribution"
+    is_softmax = getattr(agent, "strategy", None) == BOLTZMANN
+    return (
+        f"{'temperature' if is_softmax else 'epsilon'} {getattr(agent, 'exploration_rate', 0.0):g}"
+    )
 
 
 def best_actions(

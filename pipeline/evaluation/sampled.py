@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, cast
 
@@ -35,6 +35,17 @@ FEWEST_TO_TELL = 10
 
 
 @dataclass(frozen=True)
+class OtherReturns:
+    """Exact returns of the final agent beside that of its greedy policy; None where not known."""
+
+    acts_by: str | None = None  # what it acts by in training, in words: "epsilon 0.01"
+    stochastic_return: float | None = None  # of the policy that it acts by in training
+    discount: float | None = None  # the agent's
+    discounted_return: float | None = None  # of the greedy policy, under that discount
+    discounted_optimum: float | None = None  # the highest one under it, and under the time limit
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """The result of an evaluation: sampled episodes, or their exact expectation."""
 
@@ -48,6 +59,7 @@ class Evaluation:
     # exact standard deviation of an episode's return; None for sampled episodes
     exact_std: float | None = None
     yardstick: Yardstick | None = None  # the scale for the return, if known
+    others: OtherReturns | None = None  # further returns; None for sampled episodes
 
     @property
     def is_exact(self) -> bool:
@@ -112,6 +124,8 @@ class Evaluation:
         }
         if self.yardstick is not None:
             figures |= self.yardstick.figures(self.mean_return)
+        if self.others is not None:
+            figures |= asdict(self.others)
         if self.beats_optimum:
             figures["beats_optimum"] = True
         return figures
@@ -179,7 +193,7 @@ def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
         found = optimum_bracket(env)
     if found is None:
         return None
-    return Yardstick(found.upper, found.baseline, at_least=found.lower)
+    return Yardstick(found.upper, found.baseline, found.lower, found.upper_is_proven)
 
 
 class Shares(NamedTuple):

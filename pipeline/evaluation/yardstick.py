@@ -14,6 +14,11 @@ ROUNDING = 1e-12
 LEAST_WAY = 0.01
 
 
+def bracket_mark(is_proven: bool) -> str:
+    """What is said behind the figures of a bracketed optimum."""
+    return "(bracketed)" if is_proven else "(bracketed; the upper end is not proven)"
+
+
 @dataclass(frozen=True)
 class Yardstick:
     """The baseline and the optimum of an environment."""
@@ -25,6 +30,7 @@ class Yardstick:
     # if the optimum is not known, a return that some policy has reached: the two bracket the
     # optimum. None if the optimum is known.
     at_least: float | None = None
+    is_proven: bool = True  # whether the upper end of the bracket, or the optimum, is proven
 
     def gap(self, expected_return: float) -> float:
         """The distance of a return from the optimum, or from the upper end of its bracket."""
@@ -51,12 +57,18 @@ class Yardstick:
         """This yardstick with the lower end of the bracket as optimum."""
         return self if self.at_least is None else Yardstick(self.at_least, self.baseline)
 
+    @property
+    def mark(self) -> str:
+        """What is said behind the figures of a bracket; empty without one."""
+        return "" if self.at_least is None else bracket_mark(self.is_proven)
+
     def figures(self, expected_return: float) -> dict[str, float]:
         """Score and gap of a return as JSON; with a bracket, for both of its ends."""
         found = {"optimum": self.optimum, "baseline": self.baseline}
         found |= {"gap": self.gap(expected_return), "score": self.score(expected_return)}
         if self.at_least is not None:
             found["optimum_at_least"] = self.at_least
+            found["optimum_is_proven"] = self.is_proven
             found["gap_at_least"] = self.lower_end.gap(expected_return)
             found["score_at_most"] = self.lower_end.score(expected_return)
         return found

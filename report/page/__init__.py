@@ -35,6 +35,7 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     result_sections.comparison,
     result_sections.overall,
     world_sections.why,
+    world_sections.diagnosis,
     world_sections.policies,
     world_sections.played_episodes,
     result_sections.watching,
@@ -88,6 +89,7 @@ def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
                 "label": environment.environment,
                 "optimum": environment.optimum,
                 "optimum_at_least": environment.optimum_at_least,
+                "optimum_is_proven": environment.optimum_is_proven,
                 "baseline": environment.baseline,
                 "agents": [agent.agent for agent in environment.agents],
             }

@@ -189,7 +189,7 @@ class Section:
 def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
     """By environment, the first finished run of each agent; a batch leaves no agent."""
     first: dict[tuple[str, str], PlannedRun] = {}
-    for run in analysis.results.finished:
+    for run in analysis.results.in_folders:
         if not run.is_batch:
             first.setdefault((run.agent, run.environment), run)
     ranked = (

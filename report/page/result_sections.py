@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.looks import Looks, read_looks
-from experiments.plan import PlannedRun, tuning_seeds
+from experiments.plan import tuning_seeds
 from experiments.results import StudyResults, mixed_versions
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from mdp.transition_model import Floats
@@ -21,10 +21,11 @@ from report.conclusions import (
     overall_sentences,
     pairs_both_ways,
     places_without_a_run,
+    unproven_sentences,
 )
 from report.documents import MARKUPS, verdicts_as
 from report.page.frame import Report, Section, setting
-from report.ranking import COLUMNS, Row, filled
+from report.ranking import COLUMNS, OTHER_RETURNS, Column, Row, filled
 from report.series import (
     AgentRuns,
     Curve,
@@ -167,10 +168,20 @@ def ranking(report: Report) -> Section | None:
 
 
 def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Any]:
-    """Headings, and by agent the cells below them."""
+    """The ranking, the table below it, and what there is to say of training."""
     rows = [Row(agent, environment) for agent in environment.agents]
-    columns = filled([column for column in COLUMNS if column.page], rows)
-    threshold = number(environment.threshold)
+    has_others = any(agent.stochastic or agent.discounted for agent in environment.agents)
+    return {
+        **_table(study, [column for column in COLUMNS if column.page], rows),
+        "others": _table(study, OTHER_RETURNS, rows) if has_others else None,
+        "changes": on_changes([environment]),
+    }
+
+
+def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
+    """Headings, and by agent the cells below them."""
+    shown = filled(columns, rows)
+    threshold = number(rows[0].environment.threshold) if rows else ""
     return {
         "headings": [
             {
@@ -178,12 +189,11 @@ def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, An
                 "help": column.help.format(threshold=threshold),
                 "order": column.order(study),
             }
-            for column, _ in columns
+            for column, _ in shown
         ],
         "rows": [
-            (row.agent, [cells[place] for _, cells in columns]) for place, row in enumerate(rows)
+            (row.agent, [cells[place] for _, cells in shown]) for place, row in enumerate(rows)
         ],
-        "changes": on_changes([environment]),
     }
 
 
@@ -196,7 +206,7 @@ def curves(report: Report) -> Section | None:
     Bandits have theirs by pull, in a section of their own.
     """
     curves = [one.curves for one in report.series.environments]
-    if report.analysis.results.curves.empty or not any(curves):
+    if not (report.analysis.results.has_curves and any(curves)):
         return None
     by_step = [{} if item is None else item["evaluation"].by_axis["step"] for item in curves]
     context = {
@@ -264,7 +274,12 @@ def overall(report: Report) -> Section | None:
         {agent.agent: agent.score.mean for agent in one.agents if agent.score is not None}
         for one in report.analysis.environments
     ]
-    context = {"agents": agents, "scores": scores, "probabilities": overall.improvement}
+    context = {
+        "agents": agents,
+        "scores": scores,
+        "probabilities": overall.improvement,
+        "unproven": unproven_sentences(report.analysis.environments),
+    }
     data = {
         "agents": agents,
         "means": [{"agent": agent, **vars(overall.scores[agent].mean)} for agent in agents],
@@ -292,15 +307,15 @@ ABSENT = "-"
 def settings(report: Report) -> Section | None:
     """Settings by environment, and what holds for the whole study."""
     results, environments = report.analysis.results, report.analysis.environments
-    done = [(run, run.run.read_info()) for run in results.finished]
-    infos = [info for _, info in done]
+    done = list(results.infos())
+    infos = [info for *_, info in done]
     looks = read_looks(results.root)
     context = {
         "command": report.command,
         "seeds": seed_sentence(results.study.seeds, tuning_seeds(results.study)),
         "absent": ABSENT,
         "tables": [
-            _settings_table([(r, info) for r, info in done if r.environment == e.environment])
+            _settings_table([(agent, info) for agent, on, info in done if on == e.environment])
             for e in environments
         ],
         "versions": recorded("versions", infos),
@@ -312,11 +327,11 @@ def settings(report: Report) -> Section | None:
     return Section("settings", "Settings", context, by_environment=True)
 
 
-def _settings_table(runs: list[tuple[PlannedRun, Mapping[str, Any]]]) -> dict[str, Any]:
+def _settings_table(runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
     """The agents, and by setting its value for each of them and whether these differ."""
     columns: dict[str, dict[str, str]] = {}
-    for agent in dict.fromkeys(run.agent for run, _ in runs):
-        columns[agent] = _column([info for run, info in runs if run.agent == agent])
+    for agent in dict.fromkeys(agent for agent, _ in runs):
+        columns[agent] = _column([info for one, info in runs if one == agent])
     rows = {}
     for name in dict.fromkeys(name for column in columns.values() for name in column):
         values = [column.get(name, ABSENT) for column in columns.values()]
@@ -352,9 +367,9 @@ def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
     """
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
     damaged = {one.planned.path: one.reason for one in results.left_out}
-    there = {run.path for run in results.finished}
+    there = {(*run.labels, run.seed) for run in results.finished}
     for run in results.planned:
-        if run.path in there:
+        if (*run.labels, run.seed) in there:
             continue
         details = results.failures.get(run.path, "").strip()
         reason = damaged.get(run.path) or (details.splitlines()[-1] if details else "not done yet")

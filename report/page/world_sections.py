@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -17,11 +18,12 @@ from envs.layout import GridLayout, grid_layout
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.child_processes import do_aside
 from experiments.plan import PlannedRun
-from experiments.results import read_value_maps
+from experiments.results import mean_curve, read_compared, read_value_maps
+from pipeline.curve_pictures import MEANINGS
 from pipeline.environments import make_single_env
 from report.films import MAX_BYTES, films_of, has_film
 from report.page.frame import Report, Section, data_uri, first_runs, layout_data
-from report.series import SPREAD, Pulls, PullSeries, mean_regret, regret_of_runs
+from report.series import SPREAD, Curve, Pulls, PullSeries, mean_regret, regret_of_runs
 from report.why import whys_of
 from report.words import number
 from safe_files.files import NO_LIMIT, read_file
@@ -119,7 +121,7 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
     table = analysis.results.summary
     here = (table["environment"] == environment.environment) & table["exact"].astype(bool)
     runs: dict[tuple[str, str], dict[int, PlannedRun]] = {}
-    for run in analysis.results.finished:
+    for run in analysis.results.in_folders:
         if not run.is_batch:
             runs.setdefault(run.labels, {})[run.seed] = run
     found = []
@@ -127,8 +129,51 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
         rows = table[here & (table["agent"] == agent.agent)].sort_values("final", kind="stable")
         of_agent = runs.get((agent.agent, environment.environment), {})
         if len(rows) and of_agent:
-            found.append(of_agent[int(rows["seed"].iloc[(len(rows) - 1) // 2])])
+            median = int(rows["seed"].iloc[(len(rows) - 1) // 2])
+            found += [of_agent[median]] if median in of_agent else []
     return found
+
+
+# How far values, advantages and gradients lie from the exact ones, of runs with `diagnose`.
+
+
+def diagnosis(report: Report) -> Section | None:
+    """A curve for each figure of `diagnosis.csv`; None where no run has one."""
+    analysis = report.analysis
+    data = [_compared(analysis, environment) for environment in analysis.environments]
+    if not any(data):
+        return None
+    context = {"is_there": [bool(item) for item in data]}
+    places = [item or None for item in data]
+    return Section(
+        "diagnosis", "Critics and gradients", context, MEANINGS, places, by_environment=True
+    )
+
+
+def _compared(
+    analysis: StudyAnalysis, environment: EnvironmentAnalysis
+) -> dict[str, dict[str, Curve]]:
+    """By column of the files and by agent, the mean over seeds with its interval."""
+    found: dict[str, dict[str, list[pd.DataFrame]]] = {name: {} for name in MEANINGS}
+    for planned in analysis.results.finished:
+        if planned.environment != environment.environment or planned.is_batch:
+            continue
+        if not planned.run.diagnosis_path.exists():
+            continue
+        columns = read_compared(planned.run)
+        for name in columns.keys() & found.keys():
+            rows = pd.DataFrame({"step": columns["timesteps"], "value": columns[name]}).dropna()
+            if len(rows):
+                found[name].setdefault(planned.agent, []).append(rows)
+    curves: dict[str, dict[str, Curve]] = {}
+    for name, of_agents in found.items():
+        for agent in (one.agent for one in environment.agents):
+            mean = mean_curve(of_agents.get(agent, []), "step")
+            if mean is not None:
+                points, band = mean
+                curve = Curve(points, band.point, band.low, band.high)
+                curves.setdefault(name, {})[agent] = curve
+    return curves
 
 
 # What agents do on each cell of a grid world, over their training, beside the optimum.
@@ -158,7 +203,7 @@ def _policy_data(
     order = [agent.agent for agent in environment.agents]
     runs = [
         run
-        for run in analysis.results.finished
+        for run in analysis.results.in_folders
         if run.environment == environment.environment and run.run.value_maps_path.exists()
     ]
     if not runs:

@@ -8,6 +8,7 @@ import pytest
 import compare
 import enjoy
 import explain
+import shaping
 import train
 import tune
 from commands import main, share
@@ -18,6 +19,7 @@ MAINS = {
     "train.py": train.main,
     "enjoy.py": enjoy.main,
     "explain.py": explain.main,
+    "shaping.py": shaping.main,
     "compare.py": compare.main,
 }
 COMMANDS = {name: partial(run_command, main) for name, main in MAINS.items()}

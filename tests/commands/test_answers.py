@@ -166,7 +166,7 @@ NO_RUN = (
     "no run of dqn on CartPole-v1 in logs: "
     "train one with: yardstick train --algo dqn --env CartPole-v1 -f logs\n"
 )
-KNOWN = "train, enjoy, explain, compare, tune, audit, pack, inspect"
+KNOWN = "train, enjoy, explain, shaping, compare, tune, audit, pack, inspect"
 
 
 @pytest.mark.parametrize(

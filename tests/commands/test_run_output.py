@@ -17,7 +17,15 @@ from agents.networks import engine_setting
 from agents.networks.engine_setting import TOO_SHORT, EnginePlan, Work
 from commands import compare, terminal, tune
 from commands.compare import StudyProgress
-from commands.terminal import TextConsole, about, describe, search_line, study_line, training_line
+from commands.terminal import (
+    TextConsole,
+    about,
+    describe,
+    describe_others,
+    search_line,
+    study_line,
+    training_line,
+)
 from commands.train import (
     print_header,
     print_outcome,
@@ -29,7 +37,7 @@ from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from machine_code import WorkTime
 from pipeline import signs_of_life
-from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.sampled import Evaluation, OtherReturns
 from pipeline.evaluation.yardstick import Yardstick
 from pipeline.model_card import card
 from pipeline.preparation import EngineOutlook
@@ -114,6 +122,29 @@ def test_a_run_in_words():
         "files        logs/qlearning/Lake-v1_3",
         "watch        python enjoy.py --algo qlearning --env Lake-v1 -f 'else where'",
     ]
+
+
+def test_exact_returns_beside_that_of_the_greedy_policy_in_words():
+    both = OtherReturns("epsilon 0.1", 61.25, 0.9, 30.5, 40.0)
+    learnt = "return 61.25 with epsilon 0.1, as in training"
+    discounted = "discounted by 0.9: 30.5, optimum 40"
+    assert describe_others(both) == f"{learnt}; {discounted} (exact)"
+    assert describe_others(replace(both, discount=1.0)) == f"{learnt} (exact)"
+    assert describe_others(replace(both, acts_by="the same policy")) == f"{discounted} (exact)"
+    assert describe_others(OtherReturns()) == ""
+    outcome = outcome_of(final=replace(EXACT, others=both))
+    assert f"beside   {learnt}; {discounted} (exact)" in printed(outcome, spec_of())
+
+
+def test_a_card_marks_an_upper_end_without_a_proof():
+    proven = Yardstick(-38.0, -498.0, -60.0)
+    spec = {"algo": "qlearning", "env_id": "Acrobot-v1", "seed": 0, "hyperparams": {}}
+    record = {"spec": spec, "n_timesteps": 9, "versions": {}, "env_name": "Acrobot-v1"}
+    for yardstick, words in ((proven, ""), (replace(proven, is_proven=False), ", not proven")):
+        final = replace(SAMPLED, yardstick=yardstick).summary()
+        text = card({**record, "final": final}, [])
+        assert f"| score (1: the bracket's upper end{words}, 0: best" in text
+        assert ("an upper end that is not proven" in text) is bool(words)
 
 
 HEADERS = [

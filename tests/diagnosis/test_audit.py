@@ -79,6 +79,7 @@ def test_faults_of_memories_are_named(name, probe):
         ("PPOTraces", "ppo", probes.probe_traces),
         ("PPOEntropy", "ppo", probes.probe_entropy),
         ("ForgetfulPPO", "ppo", probes.probe_files),
+        ("DQNSharesMemory", "dqn", probes.probe_seeds),
     ],
 )
 def test_faults_of_classes_are_named(name, right, probe, monkeypatch):

@@ -130,7 +130,8 @@ def test_the_columns_of_the_files_that_others_read():
     """Once written down here: whoever reads the files reads them by these names."""
     assert " ".join(RUN_COLUMNS) == (
         "agent algo environment env_id seed final final_std final_length success_rate exact "
-        "optimum optimum_at_least baseline gap score best best_timesteps area training "
+        "optimum optimum_at_least optimum_is_proven baseline gap score acts_by stochastic_return "
+        "discount discounted_return discounted_optimum best best_timesteps area training "
         "last_episodes regret threshold steps_to_threshold steps_to_stay episodes_to_threshold "
         "episodes_to_stay n_timesteps n_episodes seconds cpu_seconds engine path"
     )
@@ -291,6 +292,11 @@ def test_what_is_within_reach_goes_by_the_lower_end_of_a_bracket(tmp_path):
     assert environment.agents[1].score.mean.point == pytest.approx(380 / 500)
     text = said(analyse(results))
     assert "the optimum is 420 to 520 (bracketed)" in text
+    assert environment.optimum_is_proven
+    results.summary["optimum_is_proven"] = False  # as on Acrobot
+    told = said(analyse(results))
+    assert "the optimum is 420 to 520 (bracketed; the upper end is not proven)" in told
+    assert "or the bracket is wrong, whose upper end is not proven." in told
     assert "sarsa has MORE THAN ANY POLICY CAN REACH, 520: the environment is not" in text
     assert "SAME ENVIRONMENT" not in text
     results.summary.loc[results.summary["agent"] == "sarsa", "optimum"] = 700.0

@@ -100,7 +100,7 @@ VOLATILE = (
 # How far a long training has come is told by the clock.
 PROGRESS = re.compile(r"^\d+%( |$)|^\d+ of \d+ runs in|, TIME$|compiling|left by the clock")
 BOXES = re.compile(r"[\u2500-\u257f]+")
-NOT_RECORDED = ("cpu_seconds", "files", "machine", "seconds", "versions")
+NOT_RECORDED = ("cpu_seconds", "distributions", "files", "machine", "seconds", "versions")
 
 
 class Done(NamedTuple):

@@ -28,6 +28,7 @@ from pathlib import Path
 
 import pytest
 from drawing import Mutant, drawn
+from quick import chosen, weights
 
 NOT_COPIED = shutil.ignore_patterns(".*", "logs", "runs", "build", "__pycache__")
 LIBRARIES = "torch._dynamo scipy.stats pandas matplotlib.pyplot gymnasium stable_baselines3 numba"
@@ -204,15 +205,32 @@ class Copy:
         return sorted(self.costs, key=rank), not covering
 
 
+def choose_quick(root: Path, seconds: float) -> None:
+    """Watch all tests, and write the names of those of daily work to ``tests/quick.txt``."""
+    costs, entered = defaultdict(float), defaultdict(set)
+    for folder in sorted({file.parent.name for file in root.glob("tests/*/test_*.py")}):
+        copy = Copy(root, folder)
+        for test, cost in copy.costs.items():
+            costs[test.partition("[")[0]] += cost
+        for place, tests in copy.entering.items():
+            for test in tests:
+                entered[test.partition("[")[0]].add(place)
+        print(f"{folder}: {len(copy.costs)} tests", flush=True)
+    names = chosen(costs, entered, weights(root), seconds)
+    (root / "tests" / "quick.txt").write_text("\n".join(sorted(names)) + "\n")
+    print(f"{len(names)} test functions, {sum(costs[name] for name in names):.0f} s")
+
+
 def main() -> None:
     """Draw errors, or take those drawn before; judge each, and count."""
     root = Path(__file__).resolve().parents[2]
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("packages", nargs="+", help="packages of the project, such as mdp")
+    parser.add_argument("packages", nargs="*", help="packages of the project, such as mdp")
     parser.add_argument("-n", type=int, default=25, help="how many errors in each (25)")
     parser.add_argument("--seed", type=int, default=0, help="which errors (0)")
     parser.add_argument("--record", type=Path, help="write the errors and their fates to a file")
     parser.add_argument("--replay", type=Path, help="make the errors of such a file again")
+    parser.add_argument("--choose-quick", type=float, metavar="S", help="tests of so many seconds")
     parser.add_argument("--root", type=Path, default=root, help="another checkout than this one")
     args = parser.parse_args()
     root, entries = args.root.resolve(), []
@@ -221,6 +239,8 @@ def main() -> None:
     for name in LIBRARIES.split() if (root / "constraints.txt").exists() else ():
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
+    if args.choose_quick:
+        choose_quick(root, args.choose_quick)
     for package in args.packages:
         copy = Copy(root, package)
         for test in copy.broken:

@@ -15,7 +15,7 @@ from pipeline.evaluation import policies
 from pipeline.evaluation.advice import advice
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.policies import action_figures, policy_matrix
-from pipeline.evaluation.sampled import evaluate
+from pipeline.evaluation.sampled import OtherReturns, evaluate
 from pipeline.evaluation.yardstick import Yardstick
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
@@ -28,6 +28,8 @@ HOT |= {"env_wrapper": "envs.wrappers.OneHotObservation"}
 SLIPPERY = {"env_kwargs": {"slip": 0.1, "max_episode_steps": 60, "shelf_reward": -3}}
 DEEP = {"random_start": True, "slip": 0.2, "max_episode_steps": 50}
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
+PROBS = {"probabilities": [0.2, 0.5, 0.9], "pulls": 100}
+BANDIT = {"env_kwargs": PROBS}
 AGENTS = {
     "qlearning": (5000, {"learning_rate": 0.5, "exploration_final_eps": 0.3}),
     "ppo": (256, {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2}),
@@ -117,6 +119,101 @@ def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
         expected, _ = agent.predict(states, deterministic=True)
         assert (policies.best_actions(agent, states) == expected).all()
     assert (policies.best_actions(Contrary(env="FrozenLake-v1"), states) == 3).all()
+
+
+# --- returns beside that of the greedy policy ----------------------------------------------------
+
+
+def lake_walker(**arguments):
+    """Q-learning whose table goes the shortest way over the lake that is not slippery, 6 steps."""
+    evaluator = exact_evaluator(spec_of(LAKE, DRY))
+    agent = load_algorithm("qlearning")(env=LAKE, gamma=0.9, **arguments)
+    best = value_iteration(evaluator.model, 0.9).policy
+    agent.policy.q_tables[:] = th.eye(4, dtype=th.float64)[best]
+    return evaluator, agent, np.eye(4)[best]
+
+
+DRY = {"env_kwargs": {"is_slippery": False}}
+
+
+def test_the_discounted_return_and_its_optimum_by_hand():
+    evaluator, agent, _ = lake_walker()
+    found = evaluator.other_returns(agent)
+    assert found.discount == 0.9
+    assert found.discounted_return == pytest.approx(0.9**5)
+    assert found.discounted_optimum == pytest.approx(0.9**5)
+    agent.policy.q_tables[:] = 0  # it goes left for ever
+    again = evaluator.other_returns(agent)
+    assert (again.discounted_return, again.discounted_optimum) == (0, found.discounted_optimum)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words", "chances"),
+    [
+        ({"exploration_final_eps": 0.2}, "epsilon 0.2", [0.05, 0.85]),
+        (
+            {"exploration": "boltzmann", "temperature": 0.5},
+            "temperature 0.5",
+            [1 / (3 + math.e**2), math.e**2 / (3 + math.e**2)],
+        ),
+    ],
+)
+def test_the_stochastic_return_is_that_of_the_exploring_policy_at_its_last_rate(
+    arguments, words, chances
+):
+    evaluator, agent, greedy = lake_walker(**arguments)
+    agent._current_progress_remaining = 0.0  # as after training
+    found = evaluator.other_returns(agent)
+    matrix = np.where(greedy == 1, chances[1], chances[0])
+    wanted = policy_return(evaluator.model, matrix, evaluator.horizon).expected_return
+    assert found.acts_by == words
+    assert found.stochastic_return == pytest.approx(wanted, abs=1e-12)
+    assert 0 < wanted < evaluator(agent).mean_return == 1
+
+
+@pytest.mark.parametrize("name", ["ppo", "dqn"])
+def test_stochastic_returns_of_networks_are_what_their_own_actions_come_to(name):
+    spec = spec_of(LAKE)
+    evaluator, agent = exact_evaluator(spec), briefly_trained(name, spec)
+    found = evaluator.other_returns(agent)
+    played = evaluate(agent, make_evaluation_env(spec, 10), 400, seed=1, deterministic=False)
+    error = WITHIN_999 * math.sqrt(found.stochastic_return * (1 - found.stochastic_return) / 400)
+    assert abs(played.mean_return - found.stochastic_return) <= error
+    assert found.acts_by == {"ppo": "its own distribution", "dqn": "epsilon 0.2"}[name]
+    assert found.discount == 0.99
+
+
+def test_bandits_draw_their_arms_by_their_own_rule():
+    scores = np.array([0.0, 0.5, 0.0])
+    softmax = np.exp(scores) / np.exp(scores).sum()
+    evaluator = exact_evaluator(spec_for("epsilon_greedy", "BernoulliBandit-v0", BANDIT))
+    for name, arguments, words, chances in (
+        ("epsilon_greedy", {"exploration_initial_eps": 0.3}, "epsilon 0.3", [0.1, 0.8, 0.1]),
+        ("boltzmann", {"temperature": 1.0}, "temperature 1", softmax),
+        ("gradient_bandit", {}, "its own distribution", softmax),
+        ("exp3", {"mixing": 0.3}, "its own distribution", 0.7 * softmax + 0.1),
+    ):
+        agent = agent_of(name, make_vec_env("BernoulliBandit-v0", env_kwargs=PROBS), **arguments)
+        agent.policy.scores[:] = th.from_numpy(scores)
+        found = evaluator.other_returns(agent)
+        assert found.acts_by == words
+        assert found.stochastic_return == pytest.approx(
+            100 * np.dot(chances, PROBS["probabilities"])
+        )
+        drawn = agent.predict(np.zeros(4000, dtype=np.int64), deterministic=False)[0]
+        error = WITHIN_999 * np.sqrt(np.multiply(chances, 1 - np.array(chances)) / 4000)
+        assert (np.abs(np.bincount(drawn, minlength=3) / 4000 - chances) <= error).all()
+
+
+def test_what_is_not_known_exactly_is_left_out(monkeypatch):
+    evaluator, agent, _ = lake_walker(exploration="gaussian_noise")
+    assert evaluator.other_returns(agent).stochastic_return is None
+    agent = load_algorithm("random")("RandomPolicy", LAKE)
+    found = evaluator.other_returns(agent)
+    assert (found.acts_by, found.discounted_return) == ("the same policy", None)
+    assert found.stochastic_return == pytest.approx(evaluator(agent).mean_return)
+    monkeypatch.setattr("pipeline.evaluation.exact.MOST_OUTCOMES_OF_OTHERS", 6399)
+    assert evaluator.other_returns(agent) == OtherReturns()
 
 
 # --- the yardstick -------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -307,6 +308,16 @@ def test_the_upper_end_measures_and_the_lower_stands_beside_it():
     known = episodes(80.0, yardstick=Yardstick(100.0, 60.0)).summary()
     assert known["score"] == 0.5
     assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
+
+
+def test_an_upper_end_without_a_proof_is_marked_wherever_its_score_is_told():
+    guessed = episodes(*[260.0] * 10, yardstick=replace(POLE, is_proven=False))
+    assert guessed.summary()["optimum_is_proven"] is False
+    assert describe(guessed).endswith("(bracketed; the upper end is not proven)")
+    too_good = episodes(*[501.0] * 10, yardstick=replace(POLE, is_proven=False))
+    assert describe(too_good).endswith("or the bracket is wrong, whose upper end is not proven")
+    spec = spec_of("random", "Acrobot-v1")
+    assert bracketed_yardstick(spec) == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
 
 
 @pytest.mark.parametrize(

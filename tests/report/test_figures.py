@@ -351,6 +351,8 @@ VARIANT = "trained on a variant of the environment"
     ("changes", "on_variant", "names", "title"),
     [
         (BRACKET, (), "optimum, at most, optimum, at least, best random or constant policy", ""),
+        ({**BRACKET, "optimum_is_proven": False}, (),
+         "optimum, at most (not proven), optimum, at least, best random or constant policy", ""),
         ({"optimum": None, "baseline": None}, (), "", ""),
         ({}, ("second",), f"optimum, best random or constant policy, {VARIANT}",
          " (second: on a variant of the environment)"),

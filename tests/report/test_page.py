@@ -14,7 +14,9 @@ import pytest
 from plotly.offline import get_plotlyjs
 
 from experiments.analysis import analyse
+from experiments.results import read_compared
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.digests import DamagedFileError
 from report.conclusions import conclusion
 from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
@@ -368,3 +370,39 @@ def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
     }
     captions = " ".join(text for _, text in page.all("figcaption"))
     assert "by a (down) and e (across)" in captions
+
+
+# --- critics and gradients ------------------------------------------------------------------------
+
+
+def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_study, written):
+    agents = [AgentSpec(name, name) for name in ("qlearning", "sarsa", "random")]
+    places = [EnvironmentSpec("lake", "FrozenLake-v1"), EnvironmentSpec("pole", "CartPole-v1")]
+    places = [replace(place, settings={"n_timesteps": 400}) for place in places]
+    study = StudySpec(
+        "small",
+        "",
+        (*agents,),
+        (*places,),
+        n_seeds=2,
+        eval_freq=100,
+        eval_episodes=1,
+        diagnose=True,
+    )
+    results = do_study(study, tmp_path / "runs")
+    planned = results.planned
+    page = written(analyse(results))
+    assert "diagnosis" in page.sections
+    (lake, pole) = page.data("data-diagnosis-0"), page.data("data-diagnosis-1")
+    assert pole is None
+    assert lake["v_error"].keys() == {"qlearning", "sarsa"}
+    assert lake["overestimation"].keys() == {"qlearning"}
+    rows = [read_compared(one.run)["v_error"] for one in planned if one.labels == ("sarsa", "lake")]
+    curve = lake["v_error"]["sarsa"]
+    assert curve["x"][-1] == 400
+    assert curve["y"][-1] == pytest.approx(np.mean([row[-1] for row in rows]), rel=1e-4)
+    assert page.data("data-diagnosis").keys() >= lake.keys()
+    damaged = planned[0].run.diagnosis_path
+    damaged.write_text("timesteps,v_error\n100,high\n")
+    with pytest.raises(DamagedFileError, match=r"diagnosis\.csv is not as the run left it"):
+        read_compared(planned[0].run)

@@ -59,6 +59,7 @@ NAN, INF = math.nan, math.inf
         (optimum_words, [79.0, None], "79"),
         (optimum_words, [-134.442, -140.856], "-140.9 to -134.4 (bracketed)"),
         (optimum_words, [99.94951, 99.94921], "99.949 to 99.950 (bracketed)"),
+        (optimum_words, [-38, -60, False], "-60 to -38 (bracketed; the upper end is not proven)"),
         (duration, [0.1249], "0.12 s"),
         (duration, [0.0071], "0.0071 s"),
         (duration, [44.6], "45 s"),

@@ -85,6 +85,15 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
     }
 
 
+def test_an_upper_end_without_a_proof_has_a_footnote():
+    guessed = of_lake(optimum_at_least=95.0, optimum_is_proven=False)
+    _, legend = table_as("md", headline(guessed)).split("\n\n")
+    assert (
+        "On lake the optimum is bracketed: 1 is the upper end. On lake the upper end of the "
+        "optimum's bracket is not proven: a score there may be too high. ±:"
+    ) in legend
+
+
 def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():
     study = made_up.study(NAMES)
     seen = {"first": "open", "same": "open", "open": "open", "low": "behind"}
@@ -369,10 +378,15 @@ def test_blocks_of_episodes_agents_side_by_side_where_there_is_room(width):
 
 def ranked(agents, metric="final", **changes):
     """Headings of the page's table and its rows, of agents on an environment."""
+    table = table_of(agents, metric, **changes)
+    return table["headings"], table["rows"]
+
+
+def table_of(agents, metric="final", **changes):
     place = made_up.environment(agents, **changes)
     found = made_up.analysis([place], [agent.agent for agent in agents], metric=metric)
     (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
-    return table["headings"], table["rows"]
+    return table
 
 
 RANKING = """
@@ -410,6 +424,24 @@ def test_figures_of_each_agent_the_best_first():
     # The lowest regret is the best.
     orders = [heading["order"] for heading in ranked(agents, metric="regret")[0]]
     assert orders == ["ascending"] * 3 + ["descending", *[row[2] for row in expected[4:]]]
+
+
+def test_the_stochastic_policy_and_the_discounted_return_have_a_table_below():
+    known = {"stochastic": made_up.estimate(70.0), "acts_by": "epsilon 0.1"}
+    known |= {"discounted": made_up.estimate(50.0), "discount": 0.9, "discounted_optimum": 60.0}
+    agents = [
+        made_up.agent("learner", 80.0, **known),
+        made_up.agent("strange", 40.0, **{**known, "stochastic": None, "acts_by": ""}),
+        made_up.agent("random", 1.0, stochastic=made_up.estimate(1.0), acts_by="the same policy"),
+    ]
+    others = table_of(agents)["others"]
+    assert [each["title"] for each in others["headings"]] == ["Greedy", "Stochastic", "Discounted"]
+    assert [[f"{cell.text} {cell.note}" for cell in cells] for _, cells in others["rows"]] == [
+        ["83 82.9 to 83.2", "70 69.9 to 70.2; epsilon 0.1", "50 49.9 to 50.2; by 0.9; optimum 60"],
+        ["43 42.9 to 43.2", "unknown ", "50 49.9 to 50.2; by 0.9; optimum 60"],
+        ["4 3.9 to 4.2", "1 0.9 to 1.2; the same policy", "- "],
+    ]
+    assert table_of([made_up.agent("sampled", 1.0)])["others"] is None
 
 
 def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():

@@ -19,6 +19,7 @@ from experiments.analysis import analyse
 from experiments.growing import remember, settled_looks, take_planned_looks
 from experiments.plan import plan
 from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, Curve, RunResults, StudyResults
+from experiments.study import EnvironmentSpec
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
 from tuning import retesting, searching
@@ -35,6 +36,7 @@ from tuning.retesting import (
     is_settled,
     optimism,
     retest_study,
+    unproven_mark,
     write_winner,
 )
 from tuning.searching import RunOutcome, UnjudgedError, outcome_of
@@ -485,6 +487,21 @@ def retested(number, held_out, verdict="undecided", in_search=0.9, n_runs=20, n_
     interval = Estimate(held_out or 0.0, 0.5, 0.9, 20)
     n_runs = 0 if held_out is None else n_runs
     return Retested(label, number, in_search, held_out, interval, verdict, n_runs, n_failed)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "figure", "is_marked"),
+    [
+        ("Acrobot-v1", "score", True),
+        ("Acrobot-v1", "final", False),
+        ("CartPole-v1", "score", False),
+    ],
+)
+def test_scores_by_an_upper_end_without_a_proof_are_marked(toy, env_id, figure, is_marked):
+    tuning = toy.tuning(figure=figure)
+    study = replace(tuning.study, environments=(EnvironmentSpec(env_id, env_id),))
+    mark = unproven_mark(replace(tuning, study=study))
+    assert ("not proven" in mark) is is_marked
 
 
 @pytest.mark.parametrize(

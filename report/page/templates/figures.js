@@ -139,8 +139,10 @@
     return traces;
   };
 
-  const optimumName = ({ optimum, optimum_at_least: least }) =>
-    least === null ? `optimum ${report.number(optimum)}` : `optimum between ${report.number(least)} and ${report.number(optimum)}`;
+  const optimumName = ({ optimum, optimum_at_least: least, optimum_is_proven: isProven }) =>
+    least === null
+      ? `optimum ${report.number(optimum)}`
+      : `optimum between ${report.number(least)} and ${report.number(optimum)}${isProven ? "" : " (not proven)"}`;
 
   // The optimum and the best random or constant policy as lines: across, or upright where the middle of the
   // horizontal axis is given, so that their names fall inside the figure and on no other name.

@@ -1,0 +1,306 @@
+"""Workers with other code than the driver: they do as the driver would, or do no runs at all.
+
+Workers are processes of their own, with another search path or another folder than the driver.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+from distributed import LocalCluster
+
+import compare
+from experiments.cluster import cluster_launcher
+from experiments.cluster.schedulers import SchedulerAddress
+from experiments.cluster.sent_code import SentCode, UnfitError, differences, versions
+from experiments.launching import execute
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
+from pipeline.loaded_code import distributions, files_in_settings, recorded_code
+from pipeline.settings.hyperparams import split
+from pipeline.user_modules import UserModule, import_typed
+
+ROOT = Path(compare.__file__).parent
+# Five steps: the return is five times the reward, which a module beside it says.
+MODULE = """
+import gymnasium as gym
+from {helper} import REWARD
+
+class Five(gym.Env):
+    observation_space = gym.spaces.Discrete(1)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {{}}
+
+    def step(self, action):
+        return 0, REWARD, False, False, {{}}
+
+if "{name}-v0" not in gym.registry:
+    gym.register("{name}-v0", Five, max_episode_steps=5)
+"""
+
+
+def write_module(folder, name, reward):
+    folder.mkdir(parents=True, exist_ok=True)
+    helper = f"{name}_reward"
+    (folder / f"{name}.py").write_text(MODULE.format(helper=helper, name=name))
+    (folder / f"{helper}.py").write_text(f"REWARD = {reward:.1f}\n")
+
+
+def runs_of(root, modules=(), env_id="FrozenLake-v1", **env_kwargs):
+    environments = (EnvironmentSpec("e", env_id, {"n_timesteps": 50, "env_kwargs": env_kwargs}),)
+    names = {"gym_packages": tuple(m.name for m in modules), "user_modules": tuple(modules)}
+    agents = (AgentSpec("mine", "qlearning", tuned=False),)
+    return plan(StudySpec("s", "S", agents, environments, 2, **names), root)
+
+
+@pytest.fixture
+def scheduler():
+    with LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=50) as cluster:
+        yield cluster
+
+
+@contextlib.contextmanager
+def worker(scheduler, folder, *paths, cwd=None):
+    """A worker that searches modules in these folders first; ends with the ``with`` statement."""
+    folder.mkdir()
+    words = f"-m distributed.cli.dask_worker {scheduler.scheduler_address} --nworkers 1"
+    words += f" --nthreads 1 --no-dashboard --local-directory {folder}"
+    n_before = len(scheduler.scheduler.workers)
+    process = subprocess.Popen(
+        [sys.executable, *words.split()],
+        cwd=cwd or folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*paths, ROOT)))},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        until = time.monotonic() + 60
+        while len(scheduler.scheduler.workers) == n_before and time.monotonic() < until:
+            time.sleep(0.05)
+        yield process
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def done(scheduler, root, runs, warm_ups="[]"):
+    """The mean returns of the runs, and what was said."""
+    said = []
+    root.mkdir(exist_ok=True)
+    there = SchedulerAddress(scheduler.scheduler_address)
+    launchers = partial(
+        cluster_launcher.cluster_launcher, there, root, "c", warm_ups=warm_ups, tell=said.append
+    )
+    assert execute(runs, root, launchers, lambda *_: None) == []
+    return [run.run.read_info()["final"]["mean_return"] for run in runs], [
+        line for line in said if "no runs" in line
+    ]
+
+
+def stale_distribution(folder, name, number):
+    """A folder in which a distribution has another version."""
+    place = folder / f"{name}-{number}.dist-info"
+    place.mkdir(parents=True)
+    (place / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {number}\n")
+    return folder
+
+
+def test_other_contents_at_the_modules_place_are_not_used(tmp_path, scheduler):
+    mine = tmp_path / "mine"
+    write_module(mine, "five_sent", 1)
+    modules = import_typed([str(mine / "five_sent.py")])
+    runs = runs_of(tmp_path / "study", modules, "five_sent-v0")
+    wanted = recorded_code(modules)
+    SentCode.of(runs[0].spec)  # as at the beginning of a study
+    write_module(mine, "five_sent", 7)  # then somebody changes them
+    write_module(tmp_path / "path", "five_sent", 7)
+    with worker(scheduler, tmp_path / "w", tmp_path / "path"):
+        assert done(scheduler, tmp_path / "study", runs) == ([5.0, 5.0], [])
+    for run in runs:
+        info = run.run.read_info()
+        assert {name: info[name] for name in wanted} == wanted
+        assert sorted(info["module_digests"]) == ["five_sent.py", "five_sent_reward.py"]
+        assert "REWARD = 1.0" in (run.path / "modules" / "five_sent_reward.py").read_text()
+
+
+def test_a_worker_that_has_imported_other_contents_for_an_earlier_study(
+    tmp_path, scheduler, monkeypatch
+):
+    modules = {}
+    for name, reward in (("old", 7), ("new", 1)):  # each as a driver of its own
+        write_module(tmp_path / name, "five_anew", reward)
+        monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
+        for imported in ("five_anew", "five_anew_reward"):
+            monkeypatch.delitem(sys.modules, imported, raising=False)
+        modules[name] = import_typed([str(tmp_path / name / "five_anew.py")])
+        runs = runs_of(tmp_path / name / "study", modules[name], "five_anew-v0")
+        assert SentCode.of(runs[0].spec).modules[0].digests
+        monkeypatch.undo()
+    raw = runs[0].spec.saved_hyperparams
+    item = {"algo": "qlearning", "env_id": "five_anew-v0", "hyperparams": raw}
+    warm_ups = json.dumps([{**item, "modules": [asdict(modules["old"][0])]}])
+    with worker(scheduler, tmp_path / "w"):
+        for name, reward in (("old", 7.0), ("new", 1.0), ("old", 7.0)):
+            root = tmp_path / name / str(reward)
+            runs = runs_of(root, modules[name], "five_anew-v0")
+            assert done(scheduler, root, runs, warm_ups) == ([5 * reward] * 2, [])
+            warm_ups = "[]"
+            shutil.rmtree(root)
+
+
+def test_a_worker_of_another_version_is_set_aside_and_the_others_go_on(tmp_path, scheduler):
+    path = stale_distribution(tmp_path / "path", "scipy", "1.16.0")
+    with worker(scheduler, tmp_path / "w1", path), worker(scheduler, tmp_path / "w2"):
+        _, said = done(scheduler, tmp_path / "study", runs_of(tmp_path / "study"))
+    assert len(said) == 1
+    assert f"scipy 1.16.0 instead of {version('scipy')}" in said[0]
+    assert f" on {os.uname().nodename}: scipy" in said[0]
+
+
+def test_a_worker_without_this_project_is_set_aside(tmp_path, scheduler):
+    (tmp_path / "other" / "experiments").mkdir(parents=True)
+    (tmp_path / "other" / "experiments" / "__init__.py").touch()
+    (tmp_path / "other" / "experiments" / "cluster.py").touch()
+    stale = worker(scheduler, tmp_path / "w1", tmp_path / "other", cwd=tmp_path / "other")
+    with stale, worker(scheduler, tmp_path / "w2"):
+        _, said = done(scheduler, tmp_path / "study", runs_of(tmp_path / "study"))
+    assert len(said) == 1
+    assert "experiments.cluster" in said[0]
+
+
+def test_an_installed_module_of_other_contents_is_not_used(tmp_path, scheduler, monkeypatch):
+    for name, reward in (("mine", 1), ("theirs", 7)):
+        write_module(tmp_path / name, "five_found", reward)
+    monkeypatch.syspath_prepend(tmp_path / "mine")
+    modules = import_typed(["five_found"])
+    assert modules == (UserModule("five_found", "five_found"),)
+    runs = runs_of(tmp_path / "study", modules, "five_found-v0")
+    with (
+        worker(scheduler, tmp_path / "w1", tmp_path / "theirs"),
+        worker(scheduler, tmp_path / "w2", tmp_path / "mine"),
+    ):
+        found, said = done(scheduler, tmp_path / "study", runs)
+    assert found == [5.0, 5.0]
+    assert len(said) <= 1  # it may have had no order
+    assert all("the module five_found has other contents" in line for line in said)
+
+
+def test_a_study_ends_when_nobody_is_left(tmp_path, scheduler, monkeypatch):
+    monkeypatch.setattr(cluster_launcher, "SECONDS_WITHOUT_FIT_WORKERS", 2.0)  # two minutes
+    path = stale_distribution(tmp_path / "path", "sb3_contrib", "2.8.0")
+    with (
+        worker(scheduler, tmp_path / "w", path),
+        pytest.raises(UserError, match=r"for 2 s no worker .*sb3-contrib 2.8.0 instead of"),
+    ):
+        done(scheduler, tmp_path / "study", runs_of(tmp_path / "study"))
+
+
+def test_the_last_fit_worker_is_replaced_by_another(tmp_path, scheduler):
+    """While a worker is set aside, runs are sent to named workers, and again if these are gone."""
+    path = stale_distribution(tmp_path / "path", "scipy", "1.16.0")
+    runs, root = runs_of(tmp_path / "study"), tmp_path / "study"
+    root.mkdir()
+    there = SchedulerAddress(scheduler.scheduler_address)
+    with (
+        worker(scheduler, tmp_path / "w1", path),
+        cluster_launcher.cluster_launcher(there, root, "c") as launcher,
+    ):
+        futures = [launcher.submit(run) for run in runs]
+        time.sleep(1)
+        assert not any(future.done() for future in futures)
+        with worker(scheduler, tmp_path / "w2"):
+            assert [future.result(timeout=60) for future in futures] == [None, None]
+
+
+# --- A worker that is asked to end, as by a queue before it kills a job, leaves in good order.
+
+LEAVING = """
+import multiprocessing, os, pathlib, signal, time
+import gymnasium as gym
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+
+class Leaving(FrozenLakeEnv):
+    def __init__(self, marks, **kwargs):
+        super().__init__(**kwargs)
+        self.marks = pathlib.Path(marks)
+
+    def reset(self, **kwargs):
+        parent, n_marks = multiprocessing.parent_process(), len(list(self.marks.iterdir()))
+        if parent is not None and n_marks < 3:
+            (self.marks / str(n_marks)).touch()
+            os.kill(parent.pid, signal.SIGTERM)
+            time.sleep(60)
+        return super().reset(**kwargs)
+
+gym.register("Leaving-v0", Leaving, max_episode_steps=20)
+"""
+
+
+def test_workers_that_are_asked_to_end_are_no_loss_however_many(tmp_path, scheduler):
+    (tmp_path / "leaving_lake.py").write_text(LEAVING)
+    (tmp_path / "marks").mkdir()
+    modules = import_typed([str(tmp_path / "leaving_lake.py")])
+    runs = runs_of(tmp_path / "study", modules, "Leaving-v0", marks=str(tmp_path / "marks"))
+    with worker(scheduler, tmp_path / "w"):
+        assert len(done(scheduler, tmp_path / "study", runs[:1])[0]) == 1
+    assert len(list((tmp_path / "marks").iterdir())) == 3
+
+
+# --- What is compared.
+
+
+def test_what_runs_load_is_named_with_what_it_requires():
+    found = distributions()
+    needed = ("rl-yardstick", "numpy", "scipy", "torch", "gymnasium", "sb3-contrib", "llvmlite")
+    for name in (*needed, "cloudpickle", "farama-notifications", "mpmath", "pygame-ce"):
+        assert found[name] == version(name)
+    assert found.keys().isdisjoint({"pytest", "sphinx", "optuna", "distributed", "ruff"})
+
+
+def test_what_the_users_modules_import_is_loaded_too(tmp_path):
+    (tmp_path / "imports_more.py").write_text("import yaml, os, hypothesis\nfrom bs4 import x\n")
+    module = UserModule("m", "imports_more", str(tmp_path / "imports_more.py"))
+    named = recorded_code([module])["distributions"]
+    assert named.keys() - distributions().keys() >= {"hypothesis", "beautifulsoup4", "soupsieve"}
+    assert recorded_code([]) == {"distributions": distributions()}
+
+
+def test_differences_are_told_by_name():
+    mine = versions()
+    assert differences(mine, mine) == ""
+    theirs = {**mine, "scipy": "1.16", "other": "1"}
+    del theirs["numpy"]
+    assert differences(mine, theirs) == (
+        f"numpy is missing instead of {mine['numpy']}, other 1 instead of none, "
+        f"scipy 1.16 instead of {mine['scipy']}"
+    )
+
+
+def test_files_in_settings_are_compared(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / "log.csv"
+    log.write_text("1")
+    spec = runs_of(tmp_path)[0].spec
+    raw = {**spec.saved_hyperparams, "env_kwargs": {"a": [str(log)], "b": {"c": "log.csv"}}}
+    spec = replace(spec, hyperparams=split(raw), saved_hyperparams=raw)
+    assert files_in_settings(spec) == [str(log), "log.csv"]
+    code = SentCode.of(spec)
+    code.check_files(tmp_path)
+    with pytest.raises(UnfitError, match="cannot be read"):
+        code.check_files(tmp_path / "elsewhere")
+    log.write_text("23")
+    with pytest.raises(UnfitError, match="other contents"):
+        code.check_files(tmp_path)

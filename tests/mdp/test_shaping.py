@@ -1,0 +1,206 @@
+"""What other rewards make of the optimal policies: by hand, by brute force, and potentials."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mdp import TransitionModel, policy_return
+from mdp.gaps import first_differences
+from mdp.shaping import discounted_effect, effect_under_limit
+from tests.mdp.test_random_models import models
+
+DISCOUNTS = [0.3, 0.9]
+
+
+def chain(rewards, ends, following):
+    """A model with one outcome for each state and action, which begins in state 0."""
+    following = np.array(following)[..., None]
+    return TransitionModel(
+        prob=np.ones(following.shape),
+        next_state=following,
+        reward=np.array(rewards, np.float64)[..., None],
+        terminated=np.array(ends, np.bool_)[..., None],
+        initial=np.eye(len(following))[0],
+    )
+
+
+def crossing(stop=1.0):
+    """In state 0: stop for a reward, or go on to state 1 for nothing, where the end earns 3."""
+    return chain([[stop, 0.0], [3.0, 3.0]], [[True, False], [True, True]], [[0, 1], [1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("bonus", "same", "discounted", "judged", "factor"),
+    [
+        # To go on is worth 0.5 * 3; to stop is worse by 0.25 instead of 0.5: half as much.
+        (0.25, True, (1.5, 1.5), (3.0, 3.0), 0.5),
+        (0.5, False, (1.5, 1.0), (3.0, 1.0), None),  # a tie: either may be done
+        (1.0, False, (1.0, 1.0), (1.0, 1.0), None),
+    ],
+)
+def test_a_bonus_for_stopping_by_hand(bonus, same, discounted, judged, factor):
+    found = discounted_effect(crossing(), crossing(1.0 + bonus), 0.5, 10)
+    assert (found.is_same, found.optimum) == (same, 1.5)
+    assert (found.returns, found.judged) == (discounted, judged)
+    assert found.judged_before == (3.0, 3.0)
+    assert found.differs.tolist() == [not same, False]
+    assert found.factor == factor
+    # Without a discount, to go on earns 3, and no such bonus changes that.
+    later = effect_under_limit(crossing(), crossing(1.0 + bonus), 10)
+    assert (later.is_same, later.optimum, later.returns) == (True, 3.0, (3.0, 3.0))
+
+
+def test_a_bonus_that_can_be_collected_again_and_again_changes_the_optimum():
+    # The bicycle of Randlov and Alstrom (1998): a reward for coming nearer, none taken back.
+    rewards, ends = [[0.0, -0.1], [-0.1, 1.0]], [[False, False], [False, True]]
+    original = chain(rewards, ends, [[0, 1], [0, 1]])
+    bonus = np.array([[0.0, 0.5], [0.0, 0.0]])[..., None]
+    looping = replace(original, reward=original.reward + bonus)
+    found = discounted_effect(original, looping, 0.9, 6)
+    assert found.optimum == pytest.approx(-0.1 + 0.9)
+    assert found.returns[0] == pytest.approx(-0.1 / (1 - 0.9))  # to and fro for ever
+    assert found.judged == pytest.approx((-0.6, -0.6))
+    assert found.optimal.tolist() == [[False, True], [False, True]]
+    assert found.shaped.tolist() == [[False, True], [True, False]]
+    gains = first_differences(original, found.policy, found.worst_policy, 6).gains
+    assert gains == pytest.approx([0, 0.9 + 0.6])
+    limited = effect_under_limit(original, looping, 6)
+    # Five rewards for coming nearer, and not the sixth but the goal.
+    assert limited.returns == pytest.approx((-0.5 + 1, -0.5 + 1))
+    assert not limited.is_same
+
+
+def shaped_by(model, potential, discount, factor=1.0):
+    """The model with rewards times a factor, plus the difference of a potential."""
+    after = np.where(model.terminated, 0.0, potential[model.next_state])
+    return replace(
+        model, reward=factor * model.reward + discount * after - potential[:, None, None]
+    )
+
+
+def potentials(model):
+    return hnp.arrays(np.int64, model.n_states, elements=st.integers(-9, 9))
+
+
+@given(st.data(), models(), st.sampled_from(DISCOUNTS), st.sampled_from([0.01, 1.0, 7.0]))
+def test_a_potential_costs_nothing_and_is_found(data, model, discount, factor):
+    potential = data.draw(potentials(model)).astype(np.float64)
+    found = discounted_effect(model, shaped_by(model, potential, discount, factor), discount, 5)
+    assert found.is_same
+    assert (found.optimal == found.shaped).all()
+    assert found.returns == pytest.approx((found.optimum,) * 2, abs=1e-9)
+    assert found.judged == pytest.approx(found.judged_before, abs=1e-9)
+    assert found.factor is not None
+    rest = shaped_by(model, found.potential, discount, found.factor).expected_reward
+    wanted = shaped_by(model, potential, discount, factor).expected_reward
+    assert rest[model.reachable] == pytest.approx(wanted[model.reachable], abs=1e-7)
+
+
+@given(st.data(), models(), st.sampled_from([0.5, 1.0, 3.0]))
+def test_a_potential_costs_nothing_without_a_discount_if_episodes_end_in_time(data, model, factor):
+    places, last = np.arange(model.n_states)[:, None, None], model.n_states - 1
+    onward = replace(
+        model,
+        next_state=np.clip(model.next_state, np.minimum(places + 1, last), last),
+        terminated=model.terminated | (places == last),
+    )
+    potential = data.draw(potentials(model)).astype(np.float64)
+    shaped = shaped_by(onward, potential, 1.0, factor)
+    found = effect_under_limit(onward, shaped, model.n_states)
+    assert found.is_same
+    assert found.returns == pytest.approx((found.optimum,) * 2, abs=1e-9)
+
+
+def test_a_potential_that_is_not_0_where_time_runs_out_changes_what_is_optimal():
+    rewards, ends = np.zeros((2, 2)), np.zeros((2, 2))
+    original = chain(rewards, ends, [[0, 1], [1, 1]])
+    found = effect_under_limit(original, shaped_by(original, np.array([0.0, 1.0]), 1.0), 3)
+    assert found.differs.tolist() == [True, False]
+    assert (found.optimum, found.returns) == (0.0, (0.0, 0.0))
+
+
+@given(st.data(), models(states=3, actions=2), st.sampled_from(DISCOUNTS))
+def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount):
+    rewards = hnp.arrays(np.int64, model.prob.shape, elements=st.integers(-3, 3))
+    shaped = replace(model, reward=data.draw(rewards))
+    found = discounted_effect(model, shaped, discount, 4)
+    policies = [*map(np.array, itertools.product(range(model.n_actions), repeat=model.n_states))]
+    starts = [replace(model, initial=row) for row in np.eye(model.n_states)[model.reachable]]
+
+    def are_optimal(reward):
+        """By policy, whether no other is better from any state."""
+        values = [
+            [
+                policy_return(replace(m, reward=reward), p, None, discount).expected_return
+                for m in starts
+            ]
+            for p in policies
+        ]
+        return (np.array(values) >= np.max(values, axis=0) - 1e-9).all(axis=1)
+
+    returns = np.array([policy_return(model, p, None, discount).expected_return for p in policies])
+    ours, theirs = are_optimal(model.reward), are_optimal(shaped.reward)
+    assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
+    ends = returns[theirs].max(), returns[theirs].min()
+    assert found.returns == pytest.approx(ends, abs=1e-9)
+    assert found.is_same == (ours == theirs).all()
+
+
+@given(st.data(), models(states=2, actions=2), st.integers(1, 3))
+def test_best_and_worst_under_a_limit_are_those_of_all_optimal_policies(data, model, horizon):
+    rewards = hnp.arrays(np.int64, model.prob.shape, elements=st.integers(-3, 3))
+    shaped = replace(model, reward=data.draw(rewards))
+    found = effect_under_limit(model, shaped, horizon)
+    size = horizon, model.n_states
+    policies = [
+        np.reshape(actions, size)
+        for actions in itertools.product(range(model.n_actions), repeat=np.prod(size))
+    ]
+    returns, others = (
+        np.array([policy_return(each, p, horizon).expected_return for p in policies])
+        for each in (model, shaped)
+    )
+    ours, theirs = returns >= returns.max() - 1e-9, others >= others.max() - 1e-9
+    assert found.optimum == pytest.approx(returns.max(), abs=1e-9)
+    ends = returns[theirs].max(), returns[theirs].min()
+    assert found.returns == pytest.approx(ends, abs=1e-9)
+    assert found.is_same == (ours == theirs).all()
+    for policy, value in ((found.policy, found.optimum), (found.worst_policy, ends[1])):
+        assert policy_return(model, policy, horizon).expected_return == pytest.approx(
+            value, abs=1e-9
+        )
+
+
+def test_where_training_never_comes_every_action_may_be_taken():
+    # Training begins in state 1, so nothing is learnt about state 0.
+    found = discounted_effect(
+        crossing(), replace(crossing(), initial=np.array([0.0, 1.0])), 0.5, 10
+    )
+    assert (found.differs.tolist(), found.returns) == ([True, False], (1.5, 1.0))
+
+
+def test_rewards_times_a_negative_number_are_no_potential():
+    opposite = replace(crossing(), reward=-crossing().reward)
+    assert discounted_effect(crossing(), opposite, 0.5, 10).factor is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (lambda: discounted_effect(crossing(), crossing(), 1.0, 10), "discount is 1.0"),
+        (lambda: effect_under_limit(crossing(), crossing(), 0), "horizon is 0"),
+        (
+            lambda: effect_under_limit(crossing(), chain([[0.0, 0.0]], [[1, 1]], [[0, 0]]), 3),
+            "1 states and 2 actions cannot be compared with 2 states",
+        ),
+        (lambda: discounted_effect(crossing(), crossing(), 0.5, 10**9), "too many to plan"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(kind, message):
+    with pytest.raises(ValueError, match=message):
+        kind()

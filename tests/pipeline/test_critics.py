@@ -1,0 +1,440 @@
+"""What `--diagnose` compares, by hand, by finite differences and by many rollouts; and no more."""
+
+import csv
+import io
+from dataclasses import replace
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from rich.console import Console
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from mdp import TransitionModel, policy_return, state_visitation
+from pipeline.environments import make_training_env
+from pipeline.evaluation import critics
+from pipeline.evaluation.critics import (
+    CriticRecorder,
+    KnownWorld,
+    RolloutRecorder,
+    known_world,
+    minibatches,
+    recorder_of,
+)
+from pipeline.evaluation.policies import policy_matrix
+from pipeline.preparation import prepare
+from pipeline.training import carry_out, close
+from tests.envs.corridors import Corridor
+from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, spec_of
+from tests.pipeline.test_resuming import EAGER, carried_out, content, cut_off, gone_on
+from tests.pipeline.test_resuming import spec_of as resumable
+
+PPO = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2, "gae_lambda": 0.8}
+LIBRARY = {**PPO, "engine": "library"}
+COMPILED = {**PPO, "engine": "compiled"}
+
+
+def rows_of(run):
+    with run.diagnosis_path.open() as file:
+        return [{k: float(v or "nan") for k, v in row.items()} for row in csv.DictReader(file)]
+
+
+# --- values of a table ----------------------------------------------------------------------------
+
+
+def chain_world():
+    """0 goes on to 1 for a reward of 1, 1 to the end for 2; action 1 stays, for nothing."""
+    following = np.array([[[1], [0]], [[1], [1]]])
+    reward = np.array([[[1.0], [0.0]], [[2.0], [0.0]]])
+    ends = np.array([[[False], [False]], [[True], [False]]])
+    model = TransitionModel(np.ones((2, 2, 1)), following, reward, ends, np.array([1.0, 0.0]))
+    return KnownWorld(model, np.arange(2), horizon=4, masks=None)
+
+
+class TwoStates(gym.Env):
+    observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+
+
+def compared(algo, table, *, explores, **arguments):
+    agent = agent_of(algo, DummyVecEnv([TwoStates]), gamma=0.5, **arguments)
+    agent.policy.q_tables[:] = th.tensor(table, dtype=th.float64)
+    recorder = CriticRecorder(None, chain_world(), spec_of(algo), explores=explores)
+    recorder.model = agent
+    return recorder.figures()
+
+
+def test_errors_of_a_greedy_table_worked_out_by_hand():
+    # Greedy it goes on twice: V = (2, 2), Q = ((2, 1), (2, 1)), and is half of its steps in each.
+    found = compared("qlearning", [[3.0, 1.0], [2.0, 2.0]], explores=False)
+    # Errors of Q: 1, 0, 0, 1; own advantages (0, -2), (0, 0), exact ones (0, -1) twice.
+    assert found == pytest.approx(
+        {
+            "v_error": np.sqrt(1 / 2),
+            "v_error_visited": np.sqrt(1 / 2),
+            "q_error": np.sqrt(2 / 4),
+            "q_error_visited": np.sqrt(2 / 4),
+            "advantage_error": np.sqrt((1 + 1) / 4),
+            "advantage_error_visited": np.sqrt((1 + 1) / 4),
+            "overestimation": 0.5,
+        }
+    )
+
+
+def test_visits_weigh_what_the_policy_meets_and_states_count_alike():
+    # It stays in 0 for ever, which is worth nothing, and believes that this is worth 4.
+    found = compared("qlearning", [[3.0, 4.0], [2.0, 1.0]], explores=False)
+    assert found["overestimation"] == found["v_error_visited"] == pytest.approx(4.0)
+    assert found["v_error"] == pytest.approx(np.sqrt((4**2 + 0) / 2))
+    # Q(0) = (1 + 1/2 2, 0).
+    assert found["q_error_visited"] == pytest.approx(np.sqrt((1 + 16) / 2))
+    assert found["q_error"] == pytest.approx(np.sqrt((1 + 16 + 0 + 0) / 4))
+
+
+def test_sarsa_is_compared_with_the_policy_that_explores():
+    # Random: V = (10/9, 4/3), Q = ((5/3, 5/9), (2, 2/3)), see the tests of advantages.
+    right = [[5 / 3, 5 / 9], [2.0, 2 / 3]]
+    found = compared("sarsa", right, explores=True, exploration_initial_eps=1.0)
+    errors = {name: value for name, value in found.items() if name != "entropy"}
+    assert errors == pytest.approx(dict.fromkeys(errors, 0.0), abs=1e-12)
+    assert "overestimation" not in errors
+    assert found["entropy"] == pytest.approx(np.log(2))
+    assert compared("qlearning", right, explores=False)["overestimation"] < -0.1
+
+
+def test_which_policy_an_agent_s_values_are_of():
+    follows = {"sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo"}
+    follows |= {"n_step_tree_backup", "semi_gradient_sarsa", "actor_critic", "ppo", "a2c"}
+    maximises = {"qlearning", "double_qlearning", "q_lambda", "dyna_q", "dqn", "double_dqn"}
+    maximises |= {"off_policy_monte_carlo", "prioritized_sweeping", "semi_gradient_q"}
+    for algo in follows | maximises:
+        spec = spec_of(algo, LAKE)
+        agent = agent_of(algo, make_training_env(spec, None))
+        recorder = recorder_of(None, spec, agent, is_evaluated=True)
+        assert recorder.explores == (algo in follows), algo
+        recorder.model = agent
+        assert np.isfinite(recorder.figures()["v_error"]), algo
+
+
+# --- advantages and gradients of rollouts ---------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def corridor_registered():
+    gym.register("tests/Windy-v0", Corridor, max_episode_steps=50)
+    yield "tests/Windy-v0"
+    del gym.registry["tests/Windy-v0"]
+
+
+def on_corridor(env_id, algo="ppo", limit=50, **settings):
+    spec = spec_of(algo, env_id, {"n_envs": 4, "env_kwargs": {"max_episode_steps": limit}})
+    env = make_training_env(spec, None)
+    settings = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 256, "gamma": 0.9, **settings}
+    agent = agent_of(algo, env, device="cpu", **settings)
+    world = known_world(spec, agent)
+    recorder = RolloutRecorder(None, world, spec, explores=True)
+    recorder.model = agent
+    return agent, world, recorder
+
+
+def collect(agent, n_rollouts=1):
+    """Rollouts of an agent that never learns: its policy stays."""
+    from stable_baselines3.common.callbacks import CallbackList
+
+    _, callback = agent._setup_learn(10**9, CallbackList([]))
+    for _ in range(n_rollouts):
+        agent.collect_rollouts(agent.env, callback, agent.rollout_buffer, agent.n_steps)
+        yield agent.rollout_buffer
+
+
+@pytest.mark.parametrize("trace", [0.0, 0.7, 1.0])
+def test_means_of_many_rollouts_are_what_estimates_are_said_to_expect(corridor_registered, trace):
+    """By state and action: within 4.5 standard errors, some 10 pairs being compared."""
+    agent, _, recorder = on_corridor(corridor_registered, gae_lambda=trace, engine="library")
+    noted, told = [], critics.expected_estimates
+
+    def noting(*args):
+        noted.append((args[-1], told(*args)))
+        return noted[-1][1]
+
+    errors, places, stds = [], [], []
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(critics, "expected_estimates", noting)
+        for buffer in collect(agent, 30):
+            stds.append(recorder.rollout_figures(0)["gae_std"])
+            (states, actions, _), (expected, _) = noted[-1]
+            errors.append(buffer.advantages.reshape(-1) - expected)
+            places.append(2 * states + actions)
+    errors, places = np.concatenate(errors), np.concatenate(places)
+    assert len(np.unique(places)) >= 7
+    assert np.sqrt((errors**2).mean()) == pytest.approx(np.sqrt(np.mean(np.square(stds))))
+    for place in np.unique(places):
+        of_pair = errors[places == place]
+        # Estimates of one episode depend on each other: counted as if a tenth were independent.
+        error = of_pair.std() / np.sqrt(max(len(of_pair) / 10, 1))
+        assert abs(of_pair.mean()) <= 4.5 * error + 1e-6, place
+
+
+def test_bias_vanishes_at_lambda_1_and_variance_grows(corridor_registered):
+    found = {}
+    for trace in (0.0, 1.0):
+        settings = {"gae_lambda": trace, "engine": "library", "n_steps": 2048, "limit": 1000}
+        agent, _, recorder = on_corridor(corridor_registered, **settings)
+        next(collect(agent))
+        found[trace] = recorder.rollout_figures(0)
+    # Estimates that the end of the rollout cuts off keep some of it.
+    assert found[1.0]["gae_bias"] < 0.1 * found[0.0]["gae_bias"]
+    assert found[1.0]["gae_std"] > 2 * found[0.0]["gae_std"]
+
+
+def test_the_exact_gradient_is_that_of_finite_differences():
+    """Of the return, where neither discount nor time limit makes a difference."""
+    chain = chain_world()
+    reward = chain.model.reward - np.array([0.0, 1.0])[:, None]  # to stay costs 1
+    world = replace(chain, model=replace(chain.model, reward=reward), horizon=400)
+    settings = {"policy_kwargs": {"net_arch": [3]}, "gamma": 1.0, "n_steps": 8, "batch_size": 8}
+    agent = agent_of("ppo", DummyVecEnv([TwoStates]), device="cpu", **settings)
+    agent.policy.double()
+    actor = agent.policy.mlp_extractor.forward_actor
+    agent.policy.mlp_extractor.forward_actor = lambda features: actor(features.double())
+    policy = policy_matrix(agent, world.observations, deterministic=False)
+    visits = state_visitation(world.model, policy, 400)
+    advantages = world.values(policy, 1.0).advantages
+    weights = (visits[:, None] * policy * advantages)[None]
+    (found,) = critics._gradients(agent.policy, world, np.arange(2), weights)
+
+    def value():
+        now = policy_matrix(agent, world.observations, deterministic=False)
+        return policy_return(world.model, now, 400).expected_return
+
+    slopes = []
+    with th.no_grad():
+        for name, parameter in agent.policy.named_parameters():
+            if name.startswith(("mlp_extractor.value_net", "value_net")):
+                continue
+            flat = parameter.view(-1)
+            for i in range(len(flat)):
+                flat[i] += 1e-5
+                up = value()
+                flat[i] -= 2e-5
+                slopes.append((up - value()) / 2e-5)
+                flat[i] += 1e-5
+    assert np.linalg.norm(slopes) > 0.1
+    assert found == pytest.approx(slopes, abs=1e-6)
+
+
+def test_the_gradient_of_a_minibatch_is_the_one_that_the_library_descends(corridor_registered):
+    """At ratio 1 and without other terms, but for the scale of normalised advantages."""
+    agent, world, _ = on_corridor(corridor_registered, batch_size=1024, engine="library")
+    buffer = next(collect(agent))
+    estimates = buffer.advantages.reshape(-1).astype(np.float64)
+    ((steps, centred),) = minibatches(agent, estimates, 0)
+    assert sorted(steps) == list(range(1024))
+    assert centred.mean() == pytest.approx(0.0, abs=1e-9)
+    states = world.states_of(buffer.observations, 1024)
+    weights = np.zeros((1, 5, 2))
+    np.add.at(
+        weights[0], (states[steps], buffer.actions.reshape(-1).astype(int)[steps]), centred / 1024
+    )
+    (ours,) = critics._gradients(agent.policy, world, np.arange(5), weights)
+    (batch,) = list(buffer.get(1024))
+    _, log_prob, _ = agent.policy.evaluate_actions(batch.observations, batch.actions.flatten())
+    advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)
+    ratio = th.exp(log_prob - batch.old_log_prob)
+    gain = th.min(advantages * ratio, advantages * th.clamp(ratio, 0.8, 1.2)).mean()
+    slopes = th.autograd.grad(gain, list(agent.policy.parameters()), allow_unused=True)
+    theirs = th.cat([slope.reshape(-1) for slope in slopes if slope is not None])
+    theirs = theirs.double().numpy() * float(estimates.std(ddof=1))
+    assert np.linalg.norm(theirs) > 1e-3
+    assert ours == pytest.approx(theirs, abs=1e-5)
+
+
+def test_more_steps_give_a_better_gradient(corridor_registered):
+    """Thirty times the steps: the noise falls about thirtyfold, the signal stays."""
+    found = []
+    for n_steps in (16, 480):
+        agent, _, recorder = on_corridor(
+            corridor_registered, "a2c", n_steps=n_steps, gae_lambda=1.0, engine="library"
+        )
+        figures = [recorder.rollout_figures(0) for _ in collect(agent, 20)]
+        found.append(
+            {
+                k: np.mean([1 / f[k] if k == "gradient_snr" else f[k] for f in figures])
+                for k in ("gradient_cosine", "gradient_snr")
+            }
+        )
+    few, many = found
+    assert many["gradient_cosine"] > max(few["gradient_cosine"], 0.8)
+    assert 8 < few["gradient_snr"] / many["gradient_snr"] < 120
+
+
+# --- a training -----------------------------------------------------------------------------------
+
+
+def prepared(spec, console=None):
+    return prepare(spec, console or Console(quiet=True), {}, "train.py")
+
+
+CASES = [
+    ("qlearning", LAKE, {"engine": "compiled"}, "overestimation"),
+    ("sarsa", LAKE, {"engine": "interpreted"}, "q_error"),
+    ("dqn", LAKE, {**EAGER, "engine": "library"}, "overestimation"),
+    ("dqn", LAKE, {**EAGER, "engine": "compiled"}, "overestimation"),
+    ("actor_critic", LAKE, {}, "v_error"),
+    ("ppo", LAKE, LIBRARY, "gradient_cosine"),
+    ("ppo", LAKE, COMPILED, "gradient_cosine"),
+    ("a2c", LAKE, {"n_envs": 2, "n_steps": 7, "engine": "compiled"}, "gae_bias"),
+    ("ppo_mask", WAREHOUSE, PPO, "gradient_snr"),
+    ("trpo", LAKE, {"n_steps": 64, "n_envs": 2, "batch_size": 32}, "gae_std"),
+]
+
+
+@pytest.mark.parametrize(("algo", "env_id", "settings", "column"), CASES)
+def test_the_agent_is_the_same_to_the_last_bit(tmp_path, algo, env_id, settings, column):
+    spec = resumable(tmp_path / "plain", env_id, algo, 600, settings, eval_freq=100)
+    plain = carried_out(spec)
+    with_it = carried_out(replace(spec, log_folder=tmp_path / "compared", diagnose=True))
+    for path in sorted(plain.run.path.rglob("*.zip")):
+        again = with_it.run.path / path.relative_to(plain.run.path)
+        assert content(path) == content(again), path.name
+    rows = rows_of(with_it.run)
+    assert len(rows) >= 6
+    assert np.isfinite([row[column] for row in rows[:5]]).all()
+    assert not plain.run.diagnosis_path.exists()
+
+
+@pytest.mark.parametrize(("algo", "env_id", "settings", "column"), CASES)
+def test_a_run_that_was_cut_off_has_the_same_figures(
+    tmp_path, monkeypatch, algo, env_id, settings, column
+):
+    for name, eval_freq in (("each", 70), ("some", None)):
+        monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 2e-3)
+        monkeypatch.setattr(critics, "SECONDS_OF_NETWORKS", 5e-2)
+        spec = resumable(
+            tmp_path / name / "whole",
+            env_id,
+            algo,
+            600,
+            settings,
+            diagnose=True,
+            eval_freq=eval_freq,
+        )
+        whole = carried_out(spec)
+        run = cut_off(replace(spec, log_folder=tmp_path / name / "parts"), monkeypatch)
+        gone_on(run)
+        assert run.diagnosis_path.read_bytes() == whole.run.diagnosis_path.read_bytes()
+        assert column in rows_of(run)[0]
+
+
+def test_both_engines_say_the_same_of_the_same_agent(corridor_registered):
+    """Of one policy and one rollout, which the compiled engine collects."""
+    agent, world, recorder = on_corridor(corridor_registered, engine="compiled", batch_size=64)
+    seen = {}
+
+    def look(self):
+        seen["compiled"] = self.rollout_figures(0)
+        buffer = self.model.rollout_buffer
+        copy = SimpleNamespace(
+            **{
+                k: np.array(getattr(buffer, k))
+                for k in (
+                    "rewards",
+                    "observations",
+                    "actions",
+                    "advantages",
+                    "episode_starts",
+                    "values",
+                )
+            }
+        )
+        seen["rollout"] = copy
+        self.asked_at = None
+
+    recorder.asked_at = 1
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(RolloutRecorder, "_on_rollout_end", look)
+        other = on_corridor(corridor_registered, engine="library", batch_size=64)[0]
+        other.policy.load_state_dict(agent.policy.state_dict())
+        agent.learn(1024, callback=recorder)
+    # The library works out advantages of the same rollout anew, with the same networks.
+    theirs = RolloutRecorder(None, world, spec_of("ppo", corridor_registered), explores=True)
+    theirs.model = other
+    rollout, buffer = seen["rollout"], other.rollout_buffer
+    for name in ("rewards", "observations", "actions", "episode_starts"):
+        getattr(buffer, name)[:] = getattr(rollout, name)
+    tensor, _ = other.policy.obs_to_tensor(rollout.observations.reshape(-1))
+    with th.no_grad():
+        buffer.values[:] = other.policy.predict_values(tensor).numpy().reshape(buffer.values.shape)
+    assert buffer.values == pytest.approx(rollout.values, abs=1e-5)
+    buffer.advantages[:] = rollout.advantages
+    assert theirs.rollout_figures(0) == pytest.approx(seen["compiled"], rel=1e-4)
+
+
+def said(spec):
+    file = io.StringIO()
+    training = prepared(replace(spec, verbose=1), Console(file=file, width=1000))
+    return training, file.getvalue()
+
+
+HOT = {"env_wrapper": "envs.wrappers.OneHotObservation"}
+NO_DIAGNOSIS = [
+    ("ppo", CART, {}, {}, "the exact model of CartPole-v1 is not known"),
+    ("random", LAKE, {}, {}, "random has no"),
+    ("value_iteration", LAKE, {}, {}, "a planner's values are exact already"),
+    ("reinforce", LAKE, {}, {}, "reinforce has no values"),
+    ("sac", "Pendulum-v1", {}, {}, "the exact model of Pendulum-v1 is not known"),
+    ("ppo", LAKE, {**HOT, "normalize": True}, {}, "a VecEnv wrapper changes what the agent sees"),
+    ("ppo_lstm", LAKE, {}, {}, "it acts by what it remembers"),
+    ("qlearning", LAKE, {}, {"eval_freq": -1}, "there are no evaluations during this training"),
+    ("epsilon_greedy", "BernoulliBandit-v0", {}, {}, "epsilon_greedy has no discount"),
+]
+
+
+@pytest.mark.parametrize(("algo", "env_id", "settings", "fields", "reason"), NO_DIAGNOSIS)
+def test_where_it_cannot_be_done_a_line_says_so(tmp_path, algo, env_id, settings, fields, reason):
+    spec = spec_of(
+        algo, env_id, settings, n_timesteps=50, log_folder=tmp_path, diagnose=True, **fields
+    )
+    training, text = said(spec)
+    (line,) = [line for line in text.splitlines() if line.startswith("no diagnosis")]
+    assert line.startswith(f"no diagnosis: {reason}")
+    assert training.evaluation.critics is None
+    close(training)
+
+
+def test_comparisons_are_thinned_out_evenly_and_by_no_clock(tmp_path, monkeypatch):
+    monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 0.0)
+    monkeypatch.setattr(critics, "SHARE", 1.0)
+    monkeypatch.setattr(critics, "seconds_per_step", lambda _: 1e-3)
+    monkeypatch.setattr(critics, "seconds_of_comparison", lambda *_, **__: 0.39)
+    spec = resumable(tmp_path, LAKE, "qlearning", 2000, {}, diagnose=True)
+    steps = [row["timesteps"] for row in rows_of(carried_out(spec).run)]
+    assert steps == [400, 800, 1200, 1600, 2000]  # of 20 evaluations
+    budget = {"n_episodes": 40, "n_timesteps": None}
+    of_episodes = resumable(tmp_path, LAKE, "qlearning", 2000, budget, diagnose=True)
+    rows = rows_of(carried_out(of_episodes).run)
+    assert 1 <= len(rows) <= 3
+    each = resumable(tmp_path, LAKE, "qlearning", 2000, {}, diagnose=True, eval_freq=50)
+    assert len(rows_of(carried_out(each).run)) == 40
+
+
+def test_figures_reach_the_library_s_log(tmp_path):
+    spec = resumable(tmp_path, LAKE, "ppo", 600, COMPILED, diagnose=True, eval_freq=100)
+    training = prepared(spec)
+    logged = []
+    record = training.model.logger.record
+    training.model.logger.record = lambda name, *a, **k: (
+        logged.append(name),
+        record(name, *a, **k),
+    )
+    carry_out(training)
+    assert {"diagnosis/v_error", "diagnosis/gradient_snr"} <= set(logged)
+
+
+def test_a_picture_shows_what_was_compared(tmp_path):
+    spec = resumable(
+        tmp_path, LAKE, "ppo", 300, LIBRARY, diagnose=True, eval_freq=100, pictures=True
+    )
+    training = carried_out(spec)
+    assert (training.run.path / "diagnosis.png").stat().st_size > 5000
