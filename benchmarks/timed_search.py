@@ -9,8 +9,8 @@ by the mean score. tune.py has its re-test within the budget: its search ends af
 proposes its best trial. Its search is that of many tutorials, with rl_zoo3's ranges: one seed a
 trial, TPE, and a median pruner that sees an evaluation of 20 episodes half-way.
 
-The processor time that each search really took stands in the table: a trial that has begun ends.
-What libraries take to load does not count.
+The processor time is that of training and evaluation alone, and not of loading the libraries. What
+each search really took stands in the table: a trial that has begun ends.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil  # type: ignore[import-untyped]
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -36,39 +35,23 @@ FIRST_UNSEEN = 2000
 ENVIRON = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
 
 
-def processor_seconds(process: psutil.Process) -> float:
-    """What a process and all its children have taken."""
-    total = 0.0
-    for each in (process, *process.children(recursive=True)):
-        try:
-            total += sum(each.cpu_times()[:4])  # its own, and that of children that have ended
-        except psutil.Error:
-            continue
-    return total
+def processor_seconds(root: Path) -> float:
+    """What the runs in a folder have taken that have ended."""
+    files = root.glob("runs/*/*/run.json")
+    return sum(json.loads(path.read_text()).get("cpu_seconds") or 0.0 for path in files)
 
 
-def run(words: Sequence[object], begun: Path = ROOT, budget: float = float("inf")) -> float:
-    """Run a command of the project until it ends or has taken its budget; the processor seconds.
-
-    What it takes until ``begun`` is there does not count.
-    """
+def run(words: Sequence[object], root: Path = ROOT, budget: float = float("inf")) -> None:
+    """Run a command of the project until it ends, or the runs in a folder have taken a budget."""
     command = [sys.executable, *map(str, words)]
     with subprocess.Popen(
         command, cwd=ROOT, env=ENVIRON, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as child:
-        process, taken, loading = psutil.Process(child.pid), 0.0, 0.0
         while child.poll() is None:
-            try:
-                taken = max(taken, processor_seconds(process))
-            except psutil.Error:
-                break
-            if not begun.exists():
-                loading = taken
-            if taken - loading > budget:
+            if processor_seconds(root) > budget:
                 child.send_signal(signal.SIGTERM)
                 budget = float("inf")
             time.sleep(0.2)
-    return taken - loading
 
 
 def tuned(args: argparse.Namespace, number: int, folder: Path) -> tuple[Path | None, float, int]:
@@ -79,8 +62,9 @@ def tuned(args: argparse.Namespace, number: int, folder: Path) -> tuple[Path | N
     words += ["--seeds-per-trial", 3, "--n-startup-trials", 5, "--retest", 2, "--retest-seeds", 8]
     words += ["-j", 1, "--no-report", "-f", folder, "--name", f"tune-{number}"]
     root = folder / f"tune-{number}"
-    taken = run(words, root / "runs", SEARCH_SHARE * args.seconds)
-    taken += run([*words, "--timeout", "1s"], root / "retest" / "runs")
+    run(words, root, SEARCH_SHARE * args.seconds)
+    run([*words, "--timeout", "1s"])
+    taken = processor_seconds(root) + processor_seconds(root / "retest")
     record = json.loads((folder / f"tune-{number}" / "tuning.json").read_text())
     n_trials = sum(trial["state"] in ("complete", "pruned") for trial in record["trials"])
     winner = folder / f"tune-{number}" / "winner.yml"
@@ -98,7 +82,6 @@ def with_optuna(args: argparse.Namespace, number: int, folder: Path) -> tuple[Pa
 
     torch.set_num_threads(1)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    started = time.process_time()
 
     def objective(trial: optuna.Trial) -> float:
         settings = {
@@ -119,25 +102,23 @@ def with_optuna(args: argparse.Namespace, number: int, folder: Path) -> tuple[Pa
         value = 0.0
         for half in range(2):
             model.learn(args.n_timesteps // 2, reset_num_timesteps=half == 0)
-            found = evaluate_policy(model, gym.make(args.env), 20, warn=False)[0]
-            value = float(np.mean(found))
+            value = float(np.mean(evaluate_policy(model, gym.make(args.env), 20, warn=False)[0]))
             trial.report(value, half)
             if half == 0 and trial.should_prune():
                 raise optuna.TrialPruned
         return value
 
-    def stop(study: optuna.Study, _: optuna.trial.FrozenTrial) -> None:
-        if time.process_time() - started > args.seconds:
-            study.stop()
-
     sampler = optuna.samplers.TPESampler(seed=number, multivariate=True, n_startup_trials=5)
     pruner = optuna.pruners.MedianPruner(n_startup_trials=5)
     study = optuna.create_study(direction="maximize", sampler=sampler, pruner=pruner)
-    study.optimize(objective, callbacks=[stop])
+    started = time.process_time()
+    while time.process_time() - started < args.seconds:
+        study.optimize(objective, n_trials=1)
     path = folder / f"optuna-{number}.yml"
     entry = {"policy": "MlpPolicy", **study.best_trial.user_attrs["settings"]}
+    taken = time.process_time() - started
     path.write_text(yaml.safe_dump({args.env: {"n_timesteps": args.n_timesteps, **entry}}))
-    return path, time.process_time() - started, len(study.trials)
+    return path, taken, len(study.trials)
 
 
 def score(args: argparse.Namespace, name: str, file: Path | None, folder: Path) -> float:

@@ -103,15 +103,9 @@ class OpenTuning:
     @property
     def n_at_optimum(self) -> int:
         """Number of settings that have the optimal score on all seeds of the search."""
-        said = [trial.user_attrs for trial in self.queue.trials()]
-        return len(
-            {
-                name_of(each[SETTINGS])
-                for each in said
-                if len(figures_of(each, AT_OPTIMUM)) == len(self.tuning.seeds)
-                and isinstance(each.get(SETTINGS), Mapping)
-            }
-        )
+        n_seeds, said = len(self.tuning.seeds), [t.user_attrs for t in self.queue.trials()]
+        optimal = [each for each in said if len(figures_of(each, AT_OPTIMUM)) == n_seeds]
+        return len({name_of(each[SETTINGS]) for each in optimal})
 
     @property
     def is_saturated(self) -> bool:

@@ -126,10 +126,8 @@ class TuningSpec:
                 f"--objective {self.objective} --metric {self.figure}"
             )
         most = self.max_retest_seeds or max(MOST_SEEDS, self.retest_seeds)
-        if most < self.retest_seeds:
-            raise UserError(
-                f"--max-retest-seeds is {most}, the re-test begins with {self.retest_seeds} seeds"
-            )
+        if most < (least := self.retest_seeds):
+            raise UserError(f"--max-retest-seeds is {most}, the re-test begins with {least} seeds")
         return most
 
     def identity(self, shipped: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:

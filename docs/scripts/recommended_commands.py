@@ -31,6 +31,7 @@ OUTPUT = {"--seed": 1, "--engine": 1, "--watch-learning": -1, "--resume-or-start
 OUTPUT |= {"--diagnose": 0}
 SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--objective": 1}
 SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
+SEARCH |= {"--until-decided": 0, "--max-retest-seeds": 1}
 STUDY = {"--env": -1, "--algos": -1, "--seeds": 1, "--first-seed": 1}
 STUDY |= {"--episodes-table": 1, "--render-every": 1, "--metric": 1, "--figures": -1}
 LINE = re.compile(r"^(python (?:train|compare)\.py [^#\n]*?)(?: +#[^\n]*)?$", re.MULTILINE)
