@@ -438,3 +438,12 @@ def test_a_picture_shows_what_was_compared(tmp_path):
     )
     training = carried_out(spec)
     assert (training.run.path / "diagnosis.png").stat().st_size > 5000
+
+
+def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():
+    spec = spec_of("ppo", "ShortCorridor-v0")
+    agent = agent_of("ppo", make_training_env(spec, None), device="cpu")
+    recorder = recorder_of(None, spec, agent, is_evaluated=True)
+    assert type(recorder) is CriticRecorder
+    recorder.model = agent
+    assert set(recorder.figures()) == {"v_error", "v_error_visited", "entropy"}
