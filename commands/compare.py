@@ -32,6 +32,7 @@ from commands.cli import (
     whole_number,
 )
 from commands.kept_runs import keep_few, make_again, named_runs, repair, whose
+from commands.logged import compare_on_log
 from commands.terminal import LiveProgress, say, table_console
 from pipeline import loading_libraries
 from pipeline.errors import UserError, unknown
@@ -163,7 +164,7 @@ def main() -> int:
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
         if args.logged or args.policy:
-            return _compare_on_log(args)
+            return compare_on_log(args)
         return _compare(args)
 
 
@@ -782,40 +783,6 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
 
 
 # --- policies on logged pulls ---------------------------------------------------------------------
-
-
-def _compare_on_log(args: argparse.Namespace) -> int:
-    """Judge the policies of ``--policy`` on the log of ``--logged``; the exit code."""
-    from pipeline.user_modules import import_typed
-
-    if not (args.logged and args.policy):
-        raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
-    if args.study or args.env or args.algos:
-        raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
-    modules = import_typed(args.gym_packages)
-    console = table_console(highlight=False)
-    n = len(args.policy)
-    say(console, f"{n} {'policy' if n == 1 else 'policies'} on {args.logged}")
-    with doing(console, "reading the log") as activity:
-        from experiments.off_policy.policy_files import find_policy, read_logged
-
-        data = read_logged(args.logged)
-        found = [find_policy(Path(path)) for path in args.policy]
-        names = [policy.name for policy in found]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise UserError(f"--policy names {twice} twice")
-        activity.now("loading the libraries")
-        from experiments.off_policy.logged_policies import compare_policies, load_policy
-
-        activity.now("loading the policies")
-        policies = [load_policy(policy, modules) for policy in found]
-        activity.now("judging the policies")
-        compared = compare_policies(data, policies)
-    from report.terminal import print_comparison
-
-    print_comparison(console, compared)
-    return 0
 
 
 # --- what a person watching sees: one table that moves, or a line now and then --------------------
