@@ -207,6 +207,14 @@ def describe_measured(evaluation: Evaluation) -> str:
         optimum = f"optimum between {yardstick.at_least:.2f} and {yardstick.optimum:.2f}"
         most = _score(yardstick.lower_end, value)
         score += f" to {most} (bracketed)" if not score.endswith(most) else " (bracketed)"
+    if (hidden := yardstick.hidden) is not None:
+        optimum += " with memory (" if hidden.with_memory else " without memory ("
+        if not hidden.with_memory:
+            least, most = hidden.memory_optimum
+            optimum += (
+                f"{most:.2f} with, " if least == most else f"{least:.2f} to {most:.2f} with, "
+            )
+        optimum += f"{hidden.full_optimum:.2f} by the state)"
     if not yardstick.has_scale:
         score = f"{yardstick.gap(value):.3g} below the optimum"
     text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"

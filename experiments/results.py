@@ -25,6 +25,7 @@ from experiments.study import StudySpec
 from mdp.transition_model import Floats
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.errors import one_line
+from pipeline.evaluation.yardstick import with_memory
 from pipeline.runs import Run
 from pipeline.signs_of_life import Tell, tell_nobody
 from safe_files.archives import read_members
@@ -55,6 +56,9 @@ _FINAL_FIGURES = (
 )
 # The last ones only if the optimum is bracketed.
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
+# Only if observations hide the state.
+_HIDDEN = ("full_optimum", "memory_optimum_at_least", "memory_optimum")
+_SCALES = ("observation", "memory")
 _MAPS = {
     "timesteps": "n",
     "values": "n states",
@@ -157,6 +161,13 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
     is_whole = known in ((), _YARDSTICK[:2], _YARDSTICK)
     if not is_whole or not all(_is_figure(final[name]) for name in known):
         raise DamagedFileError(run.info_path, "is damaged: it lacks the optimum's figures")
+    hidden = [name for name in _HIDDEN if name in final]
+    if hidden and (
+        not all(_is_figure(final.get(name)) for name in _HIDDEN)
+        or final.get("measured_by") not in _SCALES
+        or not known
+    ):
+        raise DamagedFileError(run.info_path, "is damaged: it lacks figures on what is observed")
     _check_texts(run, info)
     return {**info, "final": final}
 
@@ -321,6 +332,8 @@ RUN_COLUMNS = (
     "optimum",
     "optimum_at_least",  # lower end of a bracket; ``optimum`` is then the upper end
     "baseline",
+    "full_optimum",  # of agents that see the state, where observations hide it
+    "measured_by",  # then: "observation" or "memory", what the agents go by that ``optimum`` is of
     "gap",  # optimum minus final
     "score",  # final return, scaled: 0 is the best random or constant policy, 1 the optimum
     "best",  # highest return of an evaluation during training
@@ -343,7 +356,11 @@ RUN_COLUMNS = (
 )
 
 # Columns with the same name in ``run.json``.
-_FIGURES = ("success_rate", "exact", "optimum", "optimum_at_least", "baseline", "gap", "score")
+_FIGURES = (
+    *("success_rate", "exact", "optimum", "optimum_at_least", "baseline", "gap", "score"),
+    *("full_optimum", "measured_by"),
+)
+_ONLY_IF_HIDDEN = frozenset({"full_optimum", "measured_by"})
 
 
 def read_results(
@@ -377,7 +394,7 @@ def read_results(
     return StudyResults(
         study,
         root,
-        pd.DataFrame(rows, columns=list(RUN_COLUMNS)),
+        pd.DataFrame(rows, columns=_columns(rows)),
         joined(curves),
         tuple(planned),
         read_pulls(done),
@@ -385,6 +402,11 @@ def read_results(
         sum(run.n_runs for run in done if run.run.files.digests is None),
         tuple(done),
     )
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    is_hidden = any(row.get("full_optimum") is not None for row in rows)
+    return [name for name in RUN_COLUMNS if is_hidden or name not in _ONLY_IF_HIDDEN]
 
 
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
@@ -472,7 +494,7 @@ def _summary_row(
     info = read_outcome(
         planned.run, ("final", "best_mean_return", "best_timesteps", "n_timesteps", "seconds")
     )
-    final = info["final"]
+    final = with_memory(info["final"]) if planned.on_memory_scale else info["final"]
     threshold = threshold_of(study, planned.spec.env_id, final)
     steps, values = evaluations.figures["step"], evaluations.figures["value"]
     reached = stayed = float("nan")
