@@ -210,10 +210,8 @@ def describe_measured(evaluation: Evaluation) -> str:
     if (hidden := yardstick.hidden) is not None:
         optimum += " with memory (" if hidden.with_memory else " without memory ("
         if not hidden.with_memory:
-            least, most = hidden.memory_optimum
-            optimum += (
-                f"{most:.2f} with, " if least == most else f"{least:.2f} to {most:.2f} with, "
-            )
+            lower, upper = hidden.memory_optimum
+            optimum += f"{lower:.2f} to " * (lower < upper) + f"{upper:.2f} with, "
         optimum += f"{hidden.full_optimum:.2f} by the state)"
     if not yardstick.has_scale:
         score = f"{yardstick.gap(value):.3g} below the optimum"

@@ -509,7 +509,9 @@ def _analyse_environment(
 
 
 def _measured_by(table: pd.DataFrame) -> str | None:
-    found = table["measured_by"].dropna() if "measured_by" in table else ()
+    if "measured_by" not in table:
+        return None
+    found = table["measured_by"].dropna()
     return str(found.iloc[0]) if len(found) else None
 
 

@@ -222,7 +222,8 @@ def _improved(hidden: HiddenModel, plans: Floats, points: Floats) -> Floats:
     chosen = ahead[action[..., None], group[..., None], best].sum(axis=1)  # (A, n, C)
     chosen += hidden.reward[:, None]
     first = np.einsum("anc,nc->na", chosen, points).argmax(axis=1)
-    return np.unique(chosen[first, np.arange(len(points))], axis=0)
+    plans: Floats = np.unique(chosen[first, np.arange(len(points))], axis=0)
+    return plans
 
 
 def _points(hidden: HiddenModel, bound: Floats, horizon: int) -> Floats:
@@ -239,7 +240,7 @@ def _points(hidden: HiddenModel, bound: Floats, horizon: int) -> Floats:
             belief = joint[group] / chances[group]
             found[np.round(belief, DIGITS).tobytes()] = belief
             joint = np.einsum("c,cgd->gd", belief, hidden.arrive[(bound @ belief).argmax()])
-    beliefs = np.array(list(found.values()))
+    beliefs: Floats = np.array(list(found.values()))
     return beliefs[np.linspace(0, len(beliefs) - 1, min(len(beliefs), MOST_POINTS)).astype(int)]
 
 

@@ -34,6 +34,7 @@ MOST_FIRM = 256  # policies without chance that are all tried
 STEEP = 6.0
 # Relative to the return: bounds that close are taken to meet.
 PROVED = 1e-6
+ROUNDING = 1e-12  # of probabilities
 
 
 class BestMemoryless(NamedTuple):
@@ -147,15 +148,16 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
     model = found.model
     enough = found.value + PROVED * max(1.0, abs(found.value))
     arrays = model.prob, model.next_state, model.terminated, model.expected_reward
-    states, shape = np.flatnonzero(model.reachable), found.policy.shape
+    states: Ints = np.flatnonzero(model.reachable)
+    shape, groups = found.policy.shape, found.groups
     order = count()  # so that arrays are never compared
     heap: list[tuple[float, int, Floats, Floats]] = []
     n_slopes = 2 * len(seen) * shape[1]
 
     def add(low: Floats, high: Floats, most: float) -> None:
         nonlocal work
-        box = states, found.groups, low, high, horizon
-        most = min(most, float(model.initial @ _return_in_box(*arrays, *box)))
+        values = _return_in_box(*arrays, states, groups, low, high, horizon)
+        most = min(most, float(model.initial @ values))
         work -= 1
         if most > enough and work >= n_slopes:
             most = min(most, _bound_by_slopes(found, states, seen, low, high, horizon))
@@ -175,7 +177,7 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
             # What the others leave.
             upper[group] = np.minimum(upper[group], 1 - lower[group].sum() + lower[group])
             lower[group] = np.maximum(lower[group], 1 - upper[group].sum() + upper[group])
-            if (lower[group] <= upper[group]).all():
+            if (lower[group] <= upper[group] + ROUNDING).all():
                 add(lower, upper, -bound)
     return -heap[0][0]
 
@@ -196,12 +198,13 @@ def _bound_by_slopes(
     bound = float(model.initial @ values)
     for group in seen:
         for action in range(model.n_actions):
-            rewards = np.ascontiguousarray(advantages[:, :, action])
-            box = states, groups, low, high, int(group)
-            most = model.initial @ _most_met(*arrays, *box, rewards)
-            least = -(model.initial @ _most_met(*arrays, *box, -rewards))
-            up, down = (high - middle)[group, action], (middle - low)[group, action]
-            bound += max(float(up * most), float(-down * least), 0.0)
+            more = np.ascontiguousarray(advantages[:, :, action])
+            up, down = (
+                float(model.initial @ _most_met(*arrays, states, groups, low, high, group, each))
+                for each in (more, -more)
+            )
+            rises, falls = (high - middle)[group, action], (middle - low)[group, action]
+            bound += max(float(rises * up), float(falls * down), 0.0)
     return bound
 
 
@@ -209,7 +212,9 @@ def _inside(low: Floats, high: Floats) -> Floats:
     """A policy of the box, without chance where there is one."""
     room = (high - low).sum(axis=1, keepdims=True)
     left = 1 - low.sum(axis=1, keepdims=True)
-    policy = low + (high - low) * np.divide(left, room, out=np.zeros_like(room), where=room > 0)
+    policy: Floats = low + (high - low) * np.divide(
+        left, room, out=np.zeros_like(room), where=room > 0
+    )
     firm = high >= 1
     rows = np.flatnonzero(firm.any(axis=1))
     policy[rows] = np.eye(low.shape[1])[np.where(firm, low, -1.0)[rows].argmax(axis=1)]

@@ -93,10 +93,11 @@ class HallwayEnv(MapEnv):
 
     def observation_of(self, states: Any) -> NDArray[Any]:
         """The last reading."""
-        return _world().reading[states]
+        readings: NDArray[Any] = _world().reading[states]
+        return readings
 
     def cell_of(self, state: int) -> int:
-        row, column = _cells()[_world().hidden[state] // len(STEPS)]
+        row, column = _cells()[int(_world().hidden[state]) // len(STEPS)]
         return row * len(ROWS[0]) + column
 
 

@@ -7,9 +7,10 @@ training need to know nothing of noise.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from envs.finite_env import summing_to_one
 from mdp.transition_model import Floats, Ints, TransitionModel
@@ -57,19 +58,19 @@ def with_readings(hidden: TransitionModel, first: Floats, later: Floats) -> Worl
     joint = hidden.prob[..., None] * chances
     shape = (n_hidden, n_actions, n_outcomes * n_readings)
     following = number[hidden.next_state[..., None], np.arange(n_readings)]
-    columns = [joint, following] + [
-        np.repeat(array[..., None], n_readings, axis=3)
-        for array in (hidden.reward, hidden.terminated)
-    ]
-    columns = [column.reshape(shape) for column in columns]
     # What is possible first, in its order, and no more columns than needed.
-    order = np.argsort(columns[0] <= 0, axis=2, kind="stable")
-    order = order[:, :, : int((columns[0] > 0).sum(axis=2).max())]
-    prob, next_state, reward, terminated = (
-        np.take_along_axis(column, order, axis=2)[state_hidden] for column in columns
-    )
-    initial = hidden.initial[state_hidden] * first[state_hidden, state_reading]
+    possible = joint.reshape(shape) > 0
+    order = np.argsort(~possible, axis=2, kind="stable")[:, :, : int(possible.sum(axis=2).max())]
+
+    def of_states(array: NDArray[Any]) -> NDArray[Any]:
+        full = np.broadcast_to(array, joint.shape).reshape(shape)
+        return np.take_along_axis(full, order, axis=2)[state_hidden]
+
     model = TransitionModel(
-        summing_to_one(prob), next_state, reward, terminated, summing_to_one(initial)
+        prob=summing_to_one(of_states(joint)),
+        next_state=of_states(following),
+        reward=of_states(hidden.reward[..., None]),
+        terminated=of_states(hidden.terminated[..., None]),
+        initial=summing_to_one(hidden.initial[state_hidden] * first[state_hidden, state_reading]),
     )
     return World(model, state_hidden, state_reading)

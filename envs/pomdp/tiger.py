@@ -76,7 +76,8 @@ class TigerEnv(ChainEnv):
 
     def observation_of(self, states: Any) -> NDArray[Any]:
         """What was heard last."""
-        return _world(self.accuracy).reading[states]
+        heard: NDArray[Any] = _world(self.accuracy).reading[states]
+        return heard
 
     def letters(self) -> str:
         """The two doors; the robot stands where the tiger is."""

@@ -42,7 +42,7 @@ class HiddenScale:
     def yardstick(self, with_memory: bool) -> Yardstick:
         """The scale for agents that remember observations, or for those that do not."""
         lower, upper = self.memory if with_memory else self.now
-        hidden = HiddenState(self.full_optimum, tuple(self.memory), with_memory)
+        hidden = HiddenState(self.full_optimum, (self.memory.lower, self.memory.upper), with_memory)
         return Yardstick(upper, self.baseline, None if lower == upper else lower, hidden)
 
     @property
