@@ -332,8 +332,6 @@ RUN_COLUMNS = (
     "optimum",
     "optimum_at_least",  # lower end of a bracket; ``optimum`` is then the upper end
     "baseline",
-    "full_optimum",  # of agents that see the state, where observations hide it
-    "measured_by",  # then: "observation" or "memory", what the agents go by that ``optimum`` is of
     "gap",  # optimum minus final
     "score",  # final return, scaled: 0 is the best random or constant policy, 1 the optimum
     "best",  # highest return of an evaluation during training
@@ -355,12 +353,15 @@ RUN_COLUMNS = (
     "path",
 )
 
+# Further columns, if observations of some environment hide the state: the optimum of agents that
+# see it, and what agents go by that reach ``optimum``, "observation" or "memory".
+HIDDEN_COLUMNS = ("full_optimum", "measured_by")
+
 # Columns with the same name in ``run.json``.
 _FIGURES = (
     *("success_rate", "exact", "optimum", "optimum_at_least", "baseline", "gap", "score"),
-    *("full_optimum", "measured_by"),
+    *HIDDEN_COLUMNS,
 )
-_ONLY_IF_HIDDEN = frozenset({"full_optimum", "measured_by"})
 
 
 def read_results(
@@ -406,7 +407,7 @@ def read_results(
 
 def _columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     is_hidden = any(row.get("full_optimum") is not None for row in rows)
-    return [name for name in RUN_COLUMNS if is_hidden or name not in _ONLY_IF_HIDDEN]
+    return [*RUN_COLUMNS, *(HIDDEN_COLUMNS if is_hidden else ())]
 
 
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
