@@ -17,7 +17,7 @@ from experiments.plan import tuning_seeds
 from experiments.study import METRIC_WORDS, StudySpec
 from report.conclusions import conclusion, overall_sentences, pairs_both_ways, seeds_of
 from report.ranking import BANDIT_COLUMNS, COLUMNS, Cell, Column, Row, filled
-from report.words import enumeration, number, optimum_words, scale_words, seed_sentence
+from report.words import enumeration, number, optimum_words, seed_sentence
 from verdicts import Estimate, PairComparison, Verdict
 
 if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
@@ -174,8 +174,6 @@ def _caption(
     metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals"
     of_means = "those of means allow for runs that were not seen"
     told = [f"{means}: {metric} over {seeds_of(study, environment)}; {of_means}"]
-    if environment.full_optimum is not None:
-        told.append(scale_words(environment.full_optimum, environment.measured_by))
     for column, _ in filled(COLUMNS, rows):
         if column.terminal and column.caption and column.terminal not in left_out:
             told.append(f"{column.terminal}: {column.caption.format(**words)}")

@@ -74,8 +74,8 @@ def scale_words(full_optimum: float | None, measured_by: str | None) -> str:
         return ""
     goes_by = "all that it has observed" if measured_by == "memory" else "what it observes now"
     return (
-        f"observations hide the state: the optimum is that of an agent that goes by {goes_by}; "
-        f"one that saw the state could have {number(full_optimum)}"
+        f"observations hide the state: the optimum, one for all agents here, is that of an agent "
+        f"that goes by {goes_by}; one that saw the state could have {number(full_optimum)}"
     )
 
 
