@@ -222,8 +222,8 @@ def _improved(hidden: HiddenModel, plans: Floats, points: Floats) -> Floats:
     chosen = ahead[action[..., None], group[..., None], best].sum(axis=1)  # (A, n, C)
     chosen += hidden.reward[:, None]
     first = np.einsum("anc,nc->na", chosen, points).argmax(axis=1)
-    plans: Floats = np.unique(chosen[first, np.arange(len(points))], axis=0)
-    return plans
+    better: Floats = np.unique(chosen[first, np.arange(len(points))], axis=0)
+    return better
 
 
 def _points(hidden: HiddenModel, bound: Floats, horizon: int) -> Floats:
@@ -241,7 +241,9 @@ def _points(hidden: HiddenModel, bound: Floats, horizon: int) -> Floats:
             found[np.round(belief, DIGITS).tobytes()] = belief
             joint = np.einsum("c,cgd->gd", belief, hidden.arrive[(bound @ belief).argmax()])
     beliefs: Floats = np.array(list(found.values()))
-    return beliefs[np.linspace(0, len(beliefs) - 1, min(len(beliefs), MOST_POINTS)).astype(int)]
+    places = np.linspace(0, len(beliefs) - 1, min(len(beliefs), MOST_POINTS)).astype(np.int64)
+    spread: Floats = beliefs[places]
+    return spread
 
 
 def _as_bytes(rows: NDArray[np.float64]) -> NDArray[np.void]:
