@@ -316,8 +316,8 @@ def register(name: str, entry_point: str, **fields: Any) -> None:
         entry_point: where the class lives, a subclass of `BaseAlgorithm`: ``"module:Class"``.
         fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
             class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
-            ``for_bandits``, ``needs_masks``, ``package``, ``extra`` and ``engines``, which are
-            read off the class where they are left out.
+            ``for_bandits``, ``needs_masks``, ``has_memory``, ``package``, ``extra`` and
+            ``engines``, which are read off the class where they are left out.
 
     Raises:
         ValueError: if the name is taken, or an argument is none that an entry can have.

@@ -286,12 +286,13 @@ def _exact_evaluator(
     exact = None if has_memory(model) else evaluator_of(spec)
     if exact is None:
         return None, None
-    reason = exact.obstacle(model) or why_not_exact(model, exact.observations)
-    if reason:
+    obstacle = exact.obstacle(model)
+    if reason := obstacle or why_not_exact(model, exact.observations):
         _say(console, f"evaluations are sampled, not exact: {reason}")
-        # What such an agent remembers is not known.
-        scale = exact.scale
-        return None, exact.yardstick if scale is None else scale.yardstick(with_memory=True)
+        # A stranger's agent that cannot be asked for all states may remember what it saw.
+        if exact.scale is not None and not obstacle:
+            return None, exact.scale.yardstick(with_memory=True)
+        return None, exact.yardstick
     notes = [map_refusal(exact)]
     if exact.scale is not None and spec.verbose:
         notes.append(exact.scale.note)

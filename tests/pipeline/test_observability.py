@@ -5,9 +5,10 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 import pipeline.evaluation.histories
-from agents import load_algorithm
+from agents import ALGORITHMS, load_algorithm
+from agents.registry import AlgorithmEntry
 from pipeline.environments import make_evaluation_env
-from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
 from pipeline.evaluation.histories import HistoryEvaluator, by_histories, world_of_memory
 from pipeline.evaluation.observability import remembers
 from pipeline.evaluation.sampled import evaluate
@@ -122,7 +123,7 @@ class ByTime:
 
 def worth(agent, env_id, **env_kwargs):
     spec = spec_of("ppo_lstm", env_id, {"env_kwargs": env_kwargs} if env_kwargs else {})
-    return by_histories(spec, agent, world_of_memory(spec, agent))
+    return by_histories(spec, agent, evaluator_of_single(spec))
 
 
 def test_a_walk_by_the_clock_leaves_the_corridor_in_three_steps():
@@ -217,10 +218,40 @@ def test_runs_say_by_which_scale_they_are_measured(tmp_path):
     )  # fmt: skip
 
 
-def test_agents_of_ones_own_that_remember_have_the_scale_of_memory():
+def test_what_is_seen_has_one_scale_with_memory_too():
     spec = spec_of("ppo_lstm", "FrozenLake-v1")
     env = make_vec_env("FrozenLake-v1", 1)
     agent = load_algorithm("ppo_lstm")("MlpLstmPolicy", env, device="cpu")
     world = world_of_memory(spec, agent)
-    assert world.scale is None  # the lake is seen: there is one scale
+    assert world.scale is None
     assert HistoryEvaluator(spec, env, world).yardstick == world.yardstick
+
+
+class Remembering(load_algorithm("qlearning")):
+    """Says that it remembers something."""
+
+    def predict(self, observation, state=None, **kwargs):
+        actions, _ = super().predict(observation, **kwargs)
+        return actions, (np.zeros(1),)
+
+
+@pytest.mark.parametrize("has_memory", [False, True])
+def test_agents_of_ones_own_that_remember_have_the_scale_of_memory(
+    has_memory, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(
+        ALGORITHMS,
+        "remembering",
+        AlgorithmEntry(f"{__name__}:Remembering", "remembers", has_memory=has_memory),
+    )
+    assert remembers(spec_of("remembering", TIGER)) == has_memory
+    outcome = trained("remembering", TIGER, n_timesteps=50, log_folder=tmp_path)
+    assert not outcome.final.is_exact
+    assert outcome.final.summary()["measured_by"] == "memory"
+
+
+def test_who_draws_its_actions_is_not_followed():
+    spec = spec_of("random", TIGER, STACKED)
+    env = make_evaluation_env(spec, 1)
+    agent = load_algorithm("random")("RandomPolicy", env)
+    assert world_of_memory(spec, agent) is None
