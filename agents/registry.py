@@ -29,6 +29,7 @@ class AlgorithmEntry:
         observation_shape: the one observation shape that it understands, or None for any.
         for_bandits: whether it looks no further than the next reward.
         needs_masks: whether the environment must say which actions are valid.
+        has_memory: whether it acts by what it observed before, too.
         package: the import name of an optional package that it needs, or None.
         extra: the extra of this distribution that installs that package.
         engines: words for its argument ``engine``, the default first; one or none where there is
@@ -42,6 +43,7 @@ class AlgorithmEntry:
     observation_shape: tuple[int, ...] | None = None
     for_bandits: bool = False
     needs_masks: bool = False
+    has_memory: bool = False
     package: str | None = None
     extra: str | None = None
     engines: tuple[str, ...] = ()
@@ -155,6 +157,7 @@ def _contrib(
     observations: tuple[str, ...] = NETWORK_INPUTS,
     *,
     needs_masks: bool = False,
+    has_memory: bool = False,
 ) -> AlgorithmEntry:
     return AlgorithmEntry(
         entry_point,
@@ -162,6 +165,7 @@ def _contrib(
         observations,
         actions,
         needs_masks=needs_masks,
+        has_memory=has_memory,
         package="sb3_contrib",
         extra="contrib",
         engines=LIBRARY_ENGINES[:1],
@@ -254,6 +258,7 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         # As it is in sb3-contrib 2.9, which fails on the other spaces.
         ("Box", "Discrete", "MultiDiscrete"),
         ("Box", "Discrete", "MultiBinary", "Dict"),
+        has_memory=True,
     ),
     "ppo_mask": _contrib(
         "sb3_contrib:MaskablePPO",
@@ -311,8 +316,8 @@ def register(name: str, entry_point: str, **fields: Any) -> None:
         entry_point: where the class lives, a subclass of `BaseAlgorithm`: ``"module:Class"``.
         fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
             class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
-            ``for_bandits``, ``needs_masks``, ``package``, ``extra`` and ``engines``, which are
-            read off the class where they are left out.
+            ``for_bandits``, ``needs_masks``, ``has_memory``, ``package``, ``extra`` and
+            ``engines``, which are read off the class where they are left out.
 
     Raises:
         ValueError: if the name is taken, or an argument is none that an entry can have.

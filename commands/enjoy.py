@@ -313,10 +313,17 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
     """Say what the policy is worth, where that can be computed."""
     from commands.terminal import describe, print_refusal
     from pipeline.evaluation.exact import exact_evaluator, model_refusal
+    from pipeline.evaluation.histories import by_histories, world_of_memory
     from pipeline.evaluation.policies import why_not_exact
     from pipeline.signs_of_life import doing
 
     with doing(console, "working out what the policy is worth"):
+        world = world_of_memory(spec, model) if deterministic else None
+        if world is not None:
+            remembering = by_histories(spec, model, world)
+            if remembering is not None:
+                console.print(describe(remembering))
+                return
         evaluator = exact_evaluator(spec)
         if evaluator is None:
             print_refusal(console, model_refusal(spec))

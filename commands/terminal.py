@@ -218,6 +218,12 @@ def describe_measured(evaluation: Evaluation) -> str:
         optimum = f"optimum between {yardstick.at_least:.2f} and {yardstick.optimum:.2f}"
         most = _score(yardstick.lower_end, value)
         score += f" {yardstick.mark}" if score.endswith(most) else f" to {most} {yardstick.mark}"
+    if (hidden := yardstick.hidden) is not None:
+        optimum += " with memory (" if hidden.with_memory else " without memory ("
+        if not hidden.with_memory:
+            lower, upper = hidden.memory_optimum
+            optimum += f"{lower:.2f} to " * (lower < upper) + f"{upper:.2f} with, "
+        optimum += f"{hidden.full_optimum:.2f} by the state)"
     if not yardstick.has_scale:
         score = f"{yardstick.gap(value):.3g} below the optimum"
     text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"

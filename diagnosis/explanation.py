@@ -41,11 +41,12 @@ from mdp import (
 )
 from mdp.evaluation import canonical_policy, policy_matrix
 from mdp.gaps import GapByState, Repair, first_differences, gap_by_state, greedy_repairs
-from mdp.memoryless import best_memoryless
+from mdp.memoryless import observation_groups
 from mdp.transition_model import Bools, Floats, Ints
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation.advice import how_episodes_end, still_running
+from pipeline.evaluation.critics import EXPLORING
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.policies import believed_values
 from pipeline.train_spec import TrainSpec
@@ -67,13 +68,6 @@ UNFINISHED = ("never tried", "not settled", "look-ahead", "learning")
 MORE_TRAINING = 4
 # A return that is reached but for rounding, relative to it.
 ROUNDING = 1e-9
-# Agents that learn the values of the policy that they explore with.
-ON_POLICY = frozenset(
-    {
-        "sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo",
-        "semi_gradient_sarsa",
-    }
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -239,7 +233,7 @@ def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _
     if model.prob.size > MOST_OUTCOMES:
         return None
     epsilon = 0.0
-    if spec.algo in ON_POLICY and getattr(agent, "exploration", "") == "epsilon_greedy":
+    if spec.algo in EXPLORING and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
     lived = _noisy(model, epsilon) if epsilon > 0 else model
     return _Task(model, float(discount), epsilon, lived)
@@ -275,7 +269,9 @@ class _Found:
         self.evaluator, self.split, self.task, self.policy = evaluator, split, task, policy
         self.model, self.horizon = evaluator.model, evaluator.horizon
         self.agent, self.taken = agent, _first_actions(evaluator.model, policy, evaluator.horizon)
-        self.groups = _groups(evaluator.observations, self.model.reachable)
+        self.groups = None
+        if evaluator.scale is not None:
+            self.groups = observation_groups(evaluator.observations, self.model.reachable)
         self.beliefs = believed_values(agent, evaluator.observations)
         self.updates = _updates(agent, evaluator.observations)
         # optimal action values for its discount, and of its own objective, shape (S, A)
@@ -313,10 +309,12 @@ class _Found:
             told = f"the best for one that explores with epsilon {task.epsilon:g}"
             down_to(best, "exploring", f"{told} returns {best:.4g}")
         if self.groups is not None:
-            seen = best_memoryless(self.model, self.groups, self.horizon)
-            if seen is not None:
-                told = f"the best policy found that goes by what is observed returns {seen:.4g}"
-                down_to(seen, "not observable", told)
+            best_seen = None if self.evaluator.scale is None else self.evaluator.scale.best
+            if best_seen is not None:
+                is_best = best_seen.lower == best_seen.upper
+                told = f"the best policy{'' if is_best else ' found'} that goes by what is observed"
+                told += f" returns {best_seen.lower:.4g}"
+                down_to(best_seen.lower, "not observable", told)
         elif self.beliefs is not None:
             self._of_values(down_to, task)
         has_values = self.groups is None and self.beliefs is not None
@@ -597,15 +595,6 @@ def _first_actions(model: TransitionModel, policy: NDArray[Any], horizon: int) -
     canonical = canonical_policy(model, policy, horizon)
     likeliest: Ints = policy_matrix(model, canonical).argmax(axis=1)
     return likeliest
-
-
-def _groups(observations: NDArray[Any], reachable: Bools) -> Ints | None:
-    """The number of what is observed in each state, shape (S,); None where it tells them apart."""
-    rows = observations.reshape(len(observations), -1)
-    _, numbers = np.unique(rows, axis=0, return_inverse=True)
-    numbers = numbers.reshape(-1).astype(np.int64)
-    there = numbers[reachable]
-    return None if len(np.unique(there)) == len(there) else numbers
 
 
 def _updates(agent: BaseAlgorithm, observations: NDArray[Any]) -> Ints | None:

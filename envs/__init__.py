@@ -34,6 +34,12 @@ TEXTBOOK = {
     "ShortCorridor-v0": ("short_corridor:ShortCorridorEnv", 1000),
     "WindyGridworld-v0": ("windy_gridworld:WindyGridworldEnv", 1000),
 }
+# Where observations hide the state: entry points in `envs.pomdp`, and time limits.
+HIDING = {
+    "DarkWarehouse-v0": ("dark_warehouse:DarkWarehouseEnv", 100),
+    "Hallway-v0": ("hallway:HallwayEnv", 30),
+    "Tiger-v0": ("tiger:TigerEnv", 10),
+}
 
 gym.register(
     id="Warehouse-v0",
@@ -61,6 +67,8 @@ gym.register(
 )
 for textbook_id, (place, limit) in TEXTBOOK.items():
     gym.register(id=textbook_id, entry_point=f"envs.textbook.{place}", max_episode_steps=limit)
+for hiding_id, (place, limit) in HIDING.items():
+    gym.register(id=hiding_id, entry_point=f"envs.pomdp.{place}", max_episode_steps=limit)
 for bandit_id, entry_point in BANDITS.items():
     gym.register(
         id=bandit_id,

@@ -422,6 +422,10 @@ class EnvironmentAnalysis:
     #: The lower end of the optimum's bracket; None without a bracket.
     optimum_at_least: float | None = None
     optimum_is_proven: bool = True  #: whether the upper end of that bracket is proven
+    #: Where observations hide the state, the optimum of agents that see it; else None.
+    full_optimum: float | None = None
+    #: Then what agents go by whose optimum is the scale: ``observation`` or ``memory``.
+    measured_by: str | None = None
     #: The optima by agent, if agents play environments with different optima; else empty.
     optima: Mapping[str, float] = field(default_factory=dict)
     advice: tuple[str, ...] = ()  #: sentences on runs that failed, see `experiments.analysis`
@@ -515,12 +519,21 @@ def _analyse_environment(
         look=look,
         optimum_at_least=evidence.optimum_at_least,
         optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # None is none
+        full_optimum=_first(table, "full_optimum") if "full_optimum" in table else None,
+        measured_by=_measured_by(table),
         optima=_differing_optima(table),
         ends=evidence.ends,
         is_score=evidence.is_score,
         is_same=_are_alike(scores),
         impossible=_impossible(evidence, table),
     )
+
+
+def _measured_by(table: pd.DataFrame) -> str | None:
+    if "measured_by" not in table:
+        return None
+    found = table["measured_by"].dropna()
+    return str(found.iloc[0]) if len(found) else None
 
 
 def _impossible(evidence: Evidence, table: pd.DataFrame) -> tuple[str, ...]:

@@ -185,9 +185,14 @@ def _without_times(content: Sequence[Any]) -> list[Any]:
     return [*figures, *(column.tobytes() for name, column in columns if name not in TIMES)]
 
 
-def _is_single(planned: PlannedRun) -> bool:
-    """Whether a run is neither a batch, nor on a bandit, whose figures need all pulls."""
-    return not planned.is_batch and PULLS_FILE not in (planned.run.files.digests or {})
+def _is_single(planned: PlannedRun, found: RunResults) -> bool:
+    """Whether a run is no batch, has no pulls, and is measured by the same optimum for good.
+
+    Where observations hide the state, the scale changes with the other agents of the study.
+    """
+    has_pulls = PULLS_FILE in (planned.run.files.digests or {})
+    is_hidden = any(row.get("full_optimum") is not None for row in found.rows)
+    return not (planned.is_batch or has_pulls or is_hidden)
 
 
 def _is_our_own(planned: PlannedRun) -> bool:
@@ -335,7 +340,7 @@ class FigureStore:
             if (
                 self.folds
                 and found is not None
-                and _is_single(planned)
+                and _is_single(planned, found)
                 and (stays or _is_our_own(planned))
             ):
                 self._waiting.append((planned, *_content_of(planned, found)))

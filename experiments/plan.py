@@ -32,6 +32,7 @@ from pipeline.environments import (
     with_maps_read,
 )
 from pipeline.errors import UserError
+from pipeline.evaluation.observability import remembers
 from pipeline.files import plain
 from pipeline.models.load import agent_class
 from pipeline.runs import FINISHED, ReadRun, Run, environment_name
@@ -72,6 +73,8 @@ class PlannedRun:
     #: Whether it is a batch of all seeds of a bandit agent; ``seed`` is the first.
     is_batch: bool = False
     n_runs: int = 1  #: the number of runs in the batch
+    #: Whether some agent remembers observations of this environment: then all have its scale.
+    on_memory_scale: bool = False
 
     @property
     def labels(self) -> tuple[str, str]:
@@ -231,6 +234,7 @@ def plan(
                 check_fit(spec)
             specs[agent.label, environment.label] = spec
     batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
+    with_memory = {environment for (_, environment), spec in specs.items() if remembers(spec)}
     n_seeds = {labels: (counts or {}).get(labels, study.n_seeds) for labels in specs}
     for labels in batches:
         n_timesteps = specs[labels].hyperparams.n_timesteps or 0
@@ -238,7 +242,12 @@ def plan(
         n_bytes = n_seeds[labels] * n_timesteps * _BYTES_PER_PULL
         check_memory(pulls, n_bytes, " on ".join(labels))
     return [
-        _planned_run(study, root, *labels, seed, spec, n_seeds[labels] if labels in batches else 0)
+        replace(
+            _planned_run(
+                study, root, *labels, seed, spec, n_seeds[labels] if labels in batches else 0
+            ),
+            on_memory_scale=labels[1] in with_memory,
+        )
         for seed in study.seeds
         for labels, spec in specs.items()
         if seed == study.first_seed

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,6 +26,7 @@ from mdp.transition_model import Floats
 from pipeline.curve_pictures import MEANINGS, read_diagnosis
 from pipeline.digests import DamagedFileError, read_shaped
 from pipeline.errors import one_line
+from pipeline.evaluation.yardstick import with_memory
 from pipeline.loaded_code import DISTRIBUTIONS
 from pipeline.runs import Run
 from pipeline.signs_of_life import Tell, tell_nobody
@@ -59,6 +60,9 @@ _FINAL_FIGURES = (
 _OTHER_RETURNS = ("stochastic_return", "discount", "discounted_return", "discounted_optimum")
 # The last ones only if the optimum is bracketed.
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
+# Only if observations hide the state.
+_HIDDEN = ("full_optimum", "memory_optimum_at_least", "memory_optimum")
+_SCALES = ("observation", "memory")
 _MAPS = {
     "timesteps": "n",
     "values": "n states",
@@ -161,6 +165,13 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
     is_whole = known in ((), _YARDSTICK[:2], _YARDSTICK)
     if not is_whole or not all(_is_figure(final[name]) for name in known):
         raise DamagedFileError(run.info_path, "is damaged: it lacks the optimum's figures")
+    hidden = [name for name in _HIDDEN if name in final]
+    if hidden and (
+        not all(_is_figure(final.get(name)) for name in _HIDDEN)
+        or final.get("measured_by") not in _SCALES
+        or not known
+    ):
+        raise DamagedFileError(run.info_path, "is damaged: it lacks figures on what is observed")
     _check_texts(run, info)
     return {**info, "final": final}
 
@@ -428,10 +439,14 @@ RUN_COLUMNS = (
     "path",
 )
 
+# Further columns, if observations of some environment hide the state: the optimum of agents that
+# see it, and what agents go by that reach ``optimum``, "observation" or "memory".
+HIDDEN_COLUMNS = ("full_optimum", "measured_by")
+
 # Columns with the same name in ``run.json``.
 _FIGURES = (
     *("success_rate", "exact", "optimum", "optimum_at_least", "optimum_is_proven", "baseline"),
-    *("gap", "score", "acts_by", *_OTHER_RETURNS),
+    *("gap", "score", "acts_by", *_OTHER_RETURNS, *HIDDEN_COLUMNS),
 )
 
 
@@ -499,17 +514,22 @@ def _summary(
 ) -> pd.DataFrame:
     """The summary of runs in folders, by number of row, and of stored runs with their numbers."""
     if not stored:
-        return pd.DataFrame([*rows.values()], columns=list(RUN_COLUMNS))
+        return pd.DataFrame([*rows.values()], columns=_columns(rows.values()))
     table = {}
-    for name in RUN_COLUMNS:  # one after the other, because of the memory
+    for name in _columns(rows.values()):  # one after the other, because of the memory
         column: list[Any] = [None] * n_rows
         for number, row in rows.items():
             column[number] = row.get(name)
-        for numbers, runs in stored.values():
+        for numbers, runs in stored.values() if name in RUN_COLUMNS else ():
             for number, value in zip(numbers, runs.column(name, study), strict=True):
                 column[number] = value
         table[name] = pd.Series(column)
     return pd.DataFrame(table)
+
+
+def _columns(rows: Collection[Mapping[str, Any]]) -> list[str]:
+    is_hidden = any(row.get("full_optimum") is not None for row in rows)
+    return [*RUN_COLUMNS, *(HIDDEN_COLUMNS if is_hidden else ())]
 
 
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
@@ -599,7 +619,7 @@ def _summary_row(
     info = read_outcome(
         planned.run, ("final", "best_mean_return", "best_timesteps", "n_timesteps", "seconds")
     )
-    final = info["final"]
+    final = with_memory(info["final"]) if planned.on_memory_scale else info["final"]
     steps, values = evaluations.figures["step"], evaluations.figures["value"]
     return {
         **_named(planned),

@@ -1,40 +1,97 @@
-"""The best that can be done by what is observed, where several states look alike.
+"""The best that can be done by what is observed now, where several states look alike.
 
 Which stationary policy is best then is a hard problem (Littman, Memoryless Policies: Theoretical
-Limitations and Practical Results, 1994), and it may have to be random. What is found here is a
-lower bound: the best of several ascents along the exact gradient.
+Limitations and Practical Results, 1994), and it may have to be random. Several ascents along the
+exact gradient find a policy. A branch and bound over boxes of policies then proves how much better
+any other can be: within a box, an agent that sees the state and chooses anew at each step from the
+box's probabilities does at least as well as each policy of the box; and bounds of how the return
+grows with each probability bound it too. The smaller the boxes, the closer the bounds; with few
+observations and actions they meet what was found.
 """
 
 from __future__ import annotations
 
+import heapq
+from itertools import count, product
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
+from machine_code.compiling import called, compiled
+from mdp.evaluation import policy_return
 from mdp.gaps import policy_gradient
-from mdp.transition_model import Floats, Ints, TransitionModel
+from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
-# Outcomes of all states at all steps, beyond which the ascents take too long.
-MOST_OUTCOMES_CLIMBED = 5_000_000
+# Outcomes and choices of all states at all steps: of one return, beyond which nothing is climbed,
+# and of all, beyond which no ascent or box is begun, as beyond so many returns: some seconds.
+MOST_OUTCOMES_CLIMBED = 100_000_000
+MOST_WORK = 100_000_000
 RANDOM_STARTS = 4
+MOST_RETURNS = 100_000
+MOST_FIRM = 256  # policies without chance that are all tried
 # A policy that all but surely takes an action: further ascent changes its return by rounding.
 STEEP = 6.0
+# Relative to the return: bounds that close are taken to meet.
+PROVED = 1e-6
+ROUNDING = 1e-12  # of probabilities
 
 
-def best_memoryless(model: TransitionModel, groups: Ints, horizon: int) -> float | None:
-    """The highest return found of policies that go by the group of a state alone.
+class BestMemoryless(NamedTuple):
+    """What stationary policies can do that go by what is observed now."""
+
+    lower: float  # the return of `policy`
+    upper: float  # no policy returns more; equal to ``lower`` where that is proved within 1e-6
+    policy: Floats  # probabilities of actions, by observation, shape (G, A)
+    firm: float  # the highest return found without chance
+    is_firm_known: bool  # whether all policies without chance were tried
+
+    @property
+    def needs_chance(self) -> bool:
+        """Whether a random policy was found that is better than all without chance."""
+        return self.lower > self.firm + 10 * PROVED * max(1.0, abs(self.firm))
+
+
+def observation_groups(observations: NDArray[np.generic], reachable: Bools) -> Ints | None:
+    """The number of what is observed in each state, shape (S,); None where it tells them apart.
+
+    Args:
+        observations: of each state, states along the first axis.
+        reachable: the states that count, bool of shape (S,).
+    """
+    if observations.ndim == 1 and np.array_equal(observations, np.arange(len(observations))):
+        return None
+    rows = np.ascontiguousarray(observations.reshape(len(observations), -1))
+    as_bytes = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    _, numbers = np.unique(as_bytes, return_inverse=True)
+    groups: Ints = numbers.reshape(-1).astype(np.int64)
+    there = groups[reachable]
+    return None if len(np.unique(there)) == len(there) else groups
+
+
+def best_memoryless(
+    model: TransitionModel, groups: Ints, horizon: int, most: float = np.inf
+) -> BestMemoryless | None:
+    """What policies can do that go by the group of a state alone.
 
     Args:
         model: the decision process.
         groups: the number of what is observed in each state, from 0 on, shape (S,).
         horizon: the time limit in steps.
+        most: a return that is known to be out of reach, or just in it.
 
     Returns:
-        The return of a policy that was found; None where the search would take too long.
+        The best policy found, and what none exceeds; None where the search would take too long.
     """
     from scipy.optimize import minimize
 
-    if model.prob.size * horizon > MOST_OUTCOMES_CLIMBED:
+    states = np.flatnonzero(model.reachable)
+    size = len(states) * model.n_actions * (model.n_outcomes + model.n_actions) * horizon
+    if size > MOST_OUTCOMES_CLIMBED:
         return None
     n_groups, n_actions = int(groups.max()) + 1, model.n_actions
+    n_calls = max(int(MOST_WORK / size), 10)
+    found, firm = _Best(model, groups, horizon), -np.inf
 
     def downhill(flat: Floats) -> tuple[float, Floats]:
         logits = flat.reshape(n_groups, n_actions)
@@ -45,16 +102,244 @@ def best_memoryless(model: TransitionModel, groups: Ints, horizon: int) -> float
         mean = (shares * by_group).sum(axis=1, keepdims=True)
         return -value, -(shares * (by_group - mean)).ravel()
 
+    seen = np.unique(groups[states])
+    is_firm_known = n_actions ** len(seen) <= min(MOST_FIRM, n_calls)
+    for choice in product(range(n_actions), repeat=len(seen)) if is_firm_known else ():
+        actions = np.zeros(n_groups, np.int64)
+        actions[seen] = choice
+        firm = max(firm, found.take(np.eye(n_actions)[actions]))
     rng = np.random.default_rng(0)
     starts = [np.zeros((n_groups, n_actions))]
     starts += [np.tile(STEEP * row, (n_groups, 1)) / 2 for row in np.eye(n_actions)]
     starts += [rng.normal(size=(n_groups, n_actions)) for _ in range(RANDOM_STARTS)]
-    found = -np.inf
     for start in starts:
-        end = minimize(downhill, start.ravel(), jac=True, method="L-BFGS-B")
-        firm = np.eye(n_actions)[end.x.reshape(n_groups, n_actions).argmax(axis=1)]
-        found = max(found, -float(end.fun), policy_gradient(model, firm[groups], horizon)[0])
-    return found
+        if found.value >= most - PROVED * max(1.0, abs(most)) or n_calls <= 0:
+            break
+        most_calls = {"maxfun": n_calls}
+        end = minimize(downhill, start.ravel(), jac=True, method="L-BFGS-B", options=most_calls)
+        n_calls -= int(end.nfev)
+        logits = end.x.reshape(n_groups, n_actions)
+        found.take(_softmax(logits))
+        firm = max(firm, found.take(np.eye(n_actions)[logits.argmax(axis=1)]))
+    work = min(MOST_RETURNS, int(MOST_WORK / size))
+    upper = min(most, _bound_of_all(found, seen, horizon, work))
+    if upper <= found.value + PROVED * max(1.0, abs(found.value)):
+        upper = found.value
+    return BestMemoryless(found.value, upper, found.policy, firm, is_firm_known)
+
+
+class _Best:
+    """The best policy so far."""
+
+    def __init__(self, model: TransitionModel, groups: Ints, horizon: int) -> None:
+        self.model, self.groups, self.horizon = model, groups, horizon
+        self.value, self.policy = -np.inf, np.zeros((0, 0))
+
+    def take(self, policy: Floats) -> float:
+        """The return of a policy, shape (G, A), which is kept if it is the best."""
+        value = policy_return(self.model, policy[self.groups], self.horizon).expected_return
+        if value > self.value:
+            self.value, self.policy = value, policy
+        return value
+
+
+def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
+    """A return that no memoryless policy exceeds, by branch and bound with so many returns."""
+    model = found.model
+    enough = found.value + PROVED * max(1.0, abs(found.value))
+    arrays = model.prob, model.next_state, model.terminated, model.expected_reward
+    states: Ints = np.flatnonzero(model.reachable)
+    shape, groups = found.policy.shape, found.groups
+    order = count()  # so that arrays are never compared
+    heap: list[tuple[float, int, Floats, Floats]] = []
+    n_slopes = 2 * len(seen) * shape[1]
+
+    def add(low: Floats, high: Floats, most: float) -> None:
+        nonlocal work
+        values = _return_in_box(*arrays, states, groups, low, high, horizon)
+        most = min(most, float(model.initial @ values))
+        work -= 1
+        if most > enough and work >= n_slopes:
+            most = min(most, _bound_by_slopes(found, states, seen, low, high, horizon))
+            work -= n_slopes
+        heapq.heappush(heap, (-most, next(order), low, high))
+
+    add(np.zeros(shape), np.ones(shape), np.inf)
+    while work > 0 and -heap[0][0] > enough:
+        bound, _, low, high = heapq.heappop(heap)
+        width = (high - low)[seen]
+        row, action = np.unravel_index(width.argmax(), width.shape)
+        group = seen[row]
+        middle = (low[group, action] + high[group, action]) / 2
+        for part in (0, 1):
+            lower, upper = low.copy(), high.copy()
+            (upper if part == 0 else lower)[group, action] = middle
+            # What the others leave.
+            upper[group] = np.minimum(upper[group], 1 - lower[group].sum() + lower[group])
+            lower[group] = np.maximum(lower[group], 1 - upper[group].sum() + upper[group])
+            if (lower[group] <= upper[group] + ROUNDING).all():
+                add(lower, upper, -bound)
+    return -heap[0][0]
+
+
+def _bound_by_slopes(
+    found: _Best, states: Ints, seen: Ints, low: Floats, high: Floats, horizon: int
+) -> float:
+    """A return that no policy of the box exceeds, from one of its policies and bounds of slopes.
+
+    By how much another policy is better is, summed over observations and actions, the difference
+    of the two probabilities times what the other one expects to meet of the first one's advantages
+    (Kakade and Langford, 2002). An agent that sees the state bounds that from both sides.
+    """
+    model, groups = found.model, found.groups
+    arrays, middle = (model.prob, model.next_state, model.terminated), _inside(low, high)
+    policy = middle[groups]
+    values, advantages = _advantages(*arrays, model.expected_reward, states, policy, horizon)
+    bound = float(model.initial @ values)
+    for group in seen:
+        for action in range(model.n_actions):
+            more = np.ascontiguousarray(advantages[:, :, action])
+            up, down = (
+                float(model.initial @ _most_met(*arrays, states, groups, low, high, group, each))
+                for each in (more, -more)
+            )
+            rises, falls = (high - middle)[group, action], (middle - low)[group, action]
+            bound += max(float(rises * up), float(falls * down), 0.0)
+    return bound
+
+
+def _inside(low: Floats, high: Floats) -> Floats:
+    """A policy of the box, without chance where there is one."""
+    room = (high - low).sum(axis=1, keepdims=True)
+    left = 1 - low.sum(axis=1, keepdims=True)
+    policy: Floats = low + (high - low) * np.divide(
+        left, room, out=np.zeros_like(room), where=room > 0
+    )
+    firm = high >= 1
+    rows = np.flatnonzero(firm.any(axis=1))
+    policy[rows] = np.eye(low.shape[1])[np.where(firm, low, -1.0)[rows].argmax(axis=1)]
+    return policy
+
+
+@compiled
+def _return_in_box(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    states: Ints,
+    groups: Ints,
+    low: Floats,
+    high: Floats,
+    horizon: int,
+) -> Floats:
+    """The returns (S,) of an agent that sees the state and chooses within the box at each step."""
+    later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
+    values, is_used = np.zeros(prob.shape[1]), np.zeros(prob.shape[1], np.bool_)
+    for _ in range(horizon):
+        changed = False
+        for state in states:
+            _look_ahead(prob, next_state, terminated, state, later, values)
+            for action in range(prob.shape[1]):
+                values[action] += mean_reward[state, action]
+            group = groups[state]
+            now[state] = _best_in_box(values, low[group], high[group], is_used)
+            changed = changed or now[state] != later[state]
+        now, later = later, now
+        if not changed:
+            break
+    return later
+
+
+@compiled
+def _advantages(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    states: Ints,
+    policy: Floats,
+    horizon: int,
+) -> tuple[Floats, Floats]:
+    """The returns (S,) of a policy (S, A), and its advantages (horizon, S, A)."""
+    n_states, n_actions = policy.shape
+    advantages, values = np.zeros((horizon, n_states, n_actions)), np.zeros(n_actions)
+    later, now = np.zeros(n_states), np.zeros(n_states)
+    for step in range(horizon - 1, -1, -1):
+        for state in states:
+            _look_ahead(prob, next_state, terminated, state, later, values)
+            now[state] = 0.0
+            for action in range(n_actions):
+                values[action] += mean_reward[state, action]
+                now[state] += policy[state, action] * values[action]
+            for action in range(n_actions):
+                advantages[step, state, action] = values[action] - now[state]
+        now, later = later, now
+    return later, advantages
+
+
+@compiled
+def _most_met(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    states: Ints,
+    groups: Ints,
+    low: Floats,
+    high: Floats,
+    group: int,
+    rewards: Floats,
+) -> Floats:
+    """As `_return_in_box`, for rewards (horizon, S) that are had where a group is observed."""
+    later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
+    values, is_used = np.zeros(prob.shape[1]), np.zeros(prob.shape[1], np.bool_)
+    for step in range(len(rewards) - 1, -1, -1):
+        for state in states:
+            _look_ahead(prob, next_state, terminated, state, later, values)
+            of = groups[state]
+            now[state] = _best_in_box(values, low[of], high[of], is_used)
+            if of == group:
+                now[state] += rewards[step, state]
+        now, later = later, now
+    return later
+
+
+@called
+def _look_ahead(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    state: int,
+    later: Floats,
+    values: Floats,
+) -> None:
+    """What follows each action of a state, into ``values``."""
+    for action in range(prob.shape[1]):
+        values[action] = 0.0
+        for k in range(prob.shape[2]):
+            if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                values[action] += prob[state, action, k] * later[next_state[state, action, k]]
+
+
+@called
+def _best_in_box(values: Floats, low: Floats, high: Floats, is_used: Bools) -> float:
+    """The highest mean of values under the probabilities of a box."""
+    total, left = 0.0, 1.0
+    for action in range(len(values)):
+        is_used[action] = False
+        total += low[action] * values[action]
+        left -= low[action]
+    # What is left goes to the best action, as much as the box allows, then to the next.
+    for _ in range(len(values)):
+        best = -1
+        for action in range(len(values)):
+            if not is_used[action] and (best < 0 or values[action] > values[best]):
+                best = action
+        is_used[best] = True
+        more = max(min(high[best] - low[best], left), 0.0)
+        total += more * values[best]
+        left -= more
+    return total
 
 
 def _softmax(logits: Floats) -> Floats:

@@ -97,6 +97,7 @@ def _figures(record: Mapping[str, Any]) -> str:
         ("mean length of an episode", final["mean_length"]),
         ("success rate", final.get("success_rate")),
         ("best random or constant policy", final.get("baseline")),
+        ("optimum of an agent that sees the state, which is hidden", final.get("full_optimum")),
         *((label, final.get(name)) for name, label in _measured(final).items()),
     ]
     return _table([*rows, ("how", how)])

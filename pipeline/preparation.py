@@ -41,9 +41,11 @@ from pipeline.environments import (
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.critics import CriticRecorder, recorder_of
 from pipeline.evaluation.exact import ExactEvaluator, discount_note, evaluator_of, model_refusal
-from pipeline.evaluation.policies import why_not_exact
+from pipeline.evaluation.histories import BY_HISTORIES, HistoryEvaluator, world_of_memory
+from pipeline.evaluation.policies import has_memory, why_not_exact
 from pipeline.evaluation.sampled import SampledEvaluator, n_environments, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal
+from pipeline.evaluation.yardstick import Yardstick
 from pipeline.failures import exits_as_mistakes
 from pipeline.files import naming
 from pipeline.loaded_code import recorded_code
@@ -199,7 +201,10 @@ def _set_up(
     elif keeping.state is not None:
         model.set_logger(resumed_logger(model, keeping.state.note))
     is_bandit = env.has_attr("n_arms")
-    exact = _exact_evaluator(spec, model, console)
+    exact, yardstick = _exact_evaluator(spec, model, console)
+    world = None if exact is not None else world_of_memory(spec, model)
+    if world is not None:
+        _say(console, BY_HISTORIES)
     n_eval_envs = 1
     if exact is None and takes_batches(model):
         n_eval_envs = n_environments(spec.n_eval_envs, spec.eval_episodes)
@@ -211,7 +216,9 @@ def _set_up(
     evaluation = EvaluationCallback(
         run,
         eval_env,
-        exact or SampledEvaluator(spec, eval_env),
+        exact
+        or (HistoryEvaluator(spec, eval_env, world) if world is not None else None)
+        or SampledEvaluator(spec, eval_env, yardstick),
         *intervals,
         value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
         critics=critics,
@@ -277,23 +284,31 @@ def _say(console: Console, line: str) -> None:
 
 def _exact_evaluator(
     spec: TrainSpec, model: BaseAlgorithm, console: Console
-) -> ExactEvaluator | None:
-    """Make the exact evaluator, if the environment's model is known and the agent permits it."""
-    exact = evaluator_of(spec)
+) -> tuple[ExactEvaluator | None, Yardstick | None]:
+    """Make the exact evaluator, if the environment's model is known and the agent permits it.
+
+    And the yardstick, if it does not.
+    """
+    exact = None if has_memory(model) else evaluator_of(spec)
     if exact is None:
-        return None
-    reason = exact.obstacle(model) or why_not_exact(model, exact.observations)
-    if reason:
+        return None, None
+    obstacle = exact.obstacle(model)
+    if reason := obstacle or why_not_exact(model, exact.observations):
         _say(console, f"evaluations are sampled, not exact: {reason}")
-        return None
+        # A stranger's agent that cannot be asked for all states may remember what it saw.
+        if exact.scale is not None and not obstacle:
+            return None, exact.scale.yardstick(with_memory=True)
+        return None, exact.yardstick
     notes = [map_refusal(exact)]
+    if exact.scale is not None and spec.verbose:
+        notes.append(exact.scale.note)
     gamma = getattr(model, "gamma", None)
     is_bandit = model.env is not None and model.env.has_attr("n_arms")
     if spec.verbose and isinstance(gamma, float) and not is_bandit:
         notes.append(discount_note(spec, exact, gamma))
     for note in filter(None, notes):
         _say(console, note)
-    return exact
+    return exact, None
 
 
 def _critics(

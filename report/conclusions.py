@@ -24,6 +24,7 @@ from report.words import (
     number,
     optimum_words,
     ordinal,
+    scale_words,
     score_with_interval,
     seeds,
 )
@@ -318,6 +319,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
         failed=f"{failed}." if failed else "",
         notes=(
             *_on_other_tasks(environment),
+            *_on_the_hidden(environment),
             *on_unreliable(environment),
             *speed_sentences(environment),
             *_on_the_impossible(environment),
@@ -569,6 +571,13 @@ def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
             f"The agents do NOT PLAY THE SAME ENVIRONMENT: the optimum is {enumeration(each)}. "
             "Their returns cannot be compared."
         )
+
+
+def _on_the_hidden(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """By what observations the optimum is reached, and what agents could do that see the state."""
+    words = scale_words(environment.full_optimum, environment.measured_by)
+    if words:
+        yield f"{words[0].upper()}{words[1:]}."
 
 
 def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:

@@ -69,6 +69,17 @@ def optimum_words(optimum: float | None, at_least: float | None, is_proven: bool
     return f"{ends[0]} to {ends[1]} {bracket_mark(is_proven)}"
 
 
+def scale_words(full_optimum: float | None, measured_by: str | None) -> str:
+    """By what the best policy goes, and the optimum by the state; empty if observations tell it."""
+    if full_optimum is None:
+        return ""
+    goes_by = "all that it has observed" if measured_by == "memory" else "what it observes now"
+    return (
+        f"observations hide the state: the optimum, one for all agents here, is that of an agent "
+        f"that goes by {goes_by}; one that saw the state could have {number(full_optimum)}"
+    )
+
+
 def enumeration(words: Sequence[str]) -> str:
     """Words joined by commas, the last by "and"."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)

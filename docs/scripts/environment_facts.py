@@ -15,7 +15,12 @@ from gymnasium.envs.registration import load_env_creator
 
 import envs  # noqa: F401  # registers the environments
 from agents.registry import ALGORITHMS
-from envs.known_models import success_outcomes, time_limit, transition_model
+from envs.known_models import (
+    observations_of_states,
+    success_outcomes,
+    time_limit,
+    transition_model,
+)
 from mdp import (
     Hardness,
     TransitionModel,
@@ -24,7 +29,9 @@ from mdp import (
     hardness_of,
     policy_return,
 )
+from mdp.beliefs import Bracket
 from mdp.evaluation import PolicyReturn
+from pipeline.evaluation.observability import HiddenScale, hidden_scale
 from pipeline.settings.hyperparams import entry_names
 from pipeline.settings.values import parse_assignments
 
@@ -65,15 +72,30 @@ def optima_block(*written: str) -> str:
     for item in written:
         page, _, env_id = item.partition("=")
         found = solution(env_id)
-        figures = (
-            (number(found.optimum), number(found.random.expected_return)) if found else ("",) * 2
-        )
+        figures = (optimum_cell(found), number(found.random.expected_return)) if found else ("", "")
         env = made(env_id)
         summary = (inspect.getdoc(type(env.unwrapped)) or "").partition("\n")[0].rstrip(".")
         lines.append(
             f"| [`{env_id}`](environments/{page}.md) | {summary} | {' | '.join(figures)} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def optimum_cell(found: Solution) -> str:
+    """The optimum; where observations hide the state, also what can be reached by these."""
+    said = number(found.optimum)
+    if found.by_observation is None:
+        return said
+    return f"{said} by the state, {', '.join(observed(found.by_observation))}"
+
+
+def observed(scale: HiddenScale) -> tuple[str, str]:
+    """The optima of agents with memory and without."""
+
+    def words(ends: Bracket) -> str:
+        return " to ".join(dict.fromkeys(number(each) for each in ends))
+
+    return f"{words(scale.memory)} with memory", f"{words(scale.now)} without"
 
 
 def variants_block(*words: str) -> str:
@@ -158,11 +180,20 @@ def facts_table(env_id: str, *arguments: str) -> str:
             "transitions": "random" if is_random(model) else "deterministic",
             "rewards of a step": rewards(model),
             "**optimum**: the highest expected return": f"**{number(found.optimum)}**",
+            **by_observation(found.by_observation),
             "the best policy of one action throughout": number(found.best_constant),
             "random actions": random_actions(found.random),
         }
     rows["settings are shipped for"] = agents_with_settings(env_id)
     return "| | |\n|---|---|\n" + "\n".join(f"| {key} | {said} |" for key, said in rows.items())
+
+
+def by_observation(scale: HiddenScale | None) -> dict[str, str]:
+    """Rows on what can be reached by observations, if these hide the state."""
+    if scale is None:
+        return {}
+    said = " and ".join(observed(scale))
+    return {"the highest by what is observed, where a score is 1": f"**{said}**"}
 
 
 @dataclass(frozen=True)
@@ -172,6 +203,7 @@ class Solution:
     optimum: float
     best_constant: float
     random: PolicyReturn
+    by_observation: HiddenScale | None
 
 
 @lru_cache
@@ -182,11 +214,12 @@ def solution(env_id: str, *arguments: str) -> Solution | None:
     if model is None:
         return None
     uniform, *constant = baseline_policies(model)
-    return Solution(
-        optimum=finite_horizon_optimum(model, limit).start_value,
-        best_constant=max(policy_return(model, one, limit).expected_return for one in constant),
-        random=policy_return(model, uniform, limit, success=success_outcomes(env)),
-    )
+    optimum = finite_horizon_optimum(model, limit).start_value
+    best_constant = max(policy_return(model, one, limit).expected_return for one in constant)
+    random = policy_return(model, uniform, limit, success=success_outcomes(env))
+    baseline, seen = max(best_constant, random.expected_return), observations_of_states(env)
+    scale = None if seen is None else hidden_scale(model, seen, limit, optimum, baseline)
+    return Solution(optimum, best_constant, random, scale)
 
 
 def random_actions(found: PolicyReturn) -> str:

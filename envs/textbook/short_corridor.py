@@ -28,9 +28,9 @@ class ShortCorridorEnv(ChainEnv):
     goal. Going right with probability p takes (4 - 2 p) / (p (1 - p)) steps on average: 82 for .05,
     44 for .95, and at best 11.66, for p = 2 - sqrt(2), or .59.
 
-    The optimum that a run shows, -3, is for an agent that sees the states. An agent that does not
-    see them can reach -11.66 at most. Greedy evaluations say nothing here, because they always take
-    the more probable action.
+    The score's 1 is -11.66 for an agent without memory. With memory, as for one that sees the
+    states, it is -3. Greedy evaluations say nothing of agents without memory here, because they
+    always take the more probable action.
 
     ## Action Space
     `Discrete(2)`: 0 left, 1 right.

@@ -75,7 +75,9 @@ def advice(
         if still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # no policy ends an episode
             return None
     instead = how_episodes_end(evaluator, policy)
-    return Advice(instead, _try_first(spec, agent, evaluator, n_steps))
+    # What plans by the state reach says nothing of agents that do not see it.
+    hides = evaluator.scale is not None
+    return Advice(instead, None if hides else _try_first(spec, agent, evaluator, n_steps))
 
 
 def still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats:

@@ -42,6 +42,7 @@ from mdp import (
 )
 from mdp.transition_model import Bools, Floats
 from pipeline.environments import evaluation_kwargs, make_single_env
+from pipeline.evaluation.observability import HiddenScale, hidden_scale
 from pipeline.evaluation.policies import (
     OfLastPolicy,
     acts_by,
@@ -83,6 +84,7 @@ class ExactEvaluator:
     yardstick: Yardstick  #: the best possible and the baseline's return
     layout: GridLayout | None = None  #: where the states lie on a map, for grid worlds
     masks: Bools | None = None  #: action masks, shape (S, A), for agents that use them
+    scale: HiddenScale | None = None  #: where observations hide the state
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """Evaluate the agent's current policy exactly."""
@@ -174,8 +176,11 @@ def _observation_bytes(space: spaces.Space[Any]) -> int:
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     """Make the exact evaluator of a run, or None if episodes have to be sampled."""
-    if is_wrapped_as_vector(spec):
-        return None
+    return None if is_wrapped_as_vector(spec) else evaluator_of_single(spec)
+
+
+def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
+    """As `exact_evaluator`, of the environment without wrappers around the vector of several."""
     with closing(make_single_env(spec)) as env:
         model, horizon = transition_model(env), time_limit(env)
         if model is None or horizon is None:
@@ -192,8 +197,10 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         success, layout = success_outcomes(env), grid_layout(env)
     if layout is not None and layout.n_states != model.n_states:
         layout = None  # the states of a user's grid world are not cells
-    yardstick = Yardstick(optimum, baseline=float(baseline_return(model, horizon)))
-    return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks)
+    baseline = float(baseline_return(model, horizon))
+    scale = hidden_scale(model, observations, horizon, optimum, baseline)
+    yardstick = Yardstick(optimum, baseline) if scale is None else scale.yardstick(False)
+    return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks, scale)
 
 
 def _optimum(model: TransitionModel, horizon: int) -> float | None:
@@ -223,7 +230,7 @@ def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> st
     """
     with closing(make_single_env(spec, training=True)) as env:
         model = transition_model(env)
-    if model is None or model.prob.shape != exact.model.prob.shape:
+    if model is None or model.prob.shape != exact.model.prob.shape or exact.scale is not None:
         return None
     if model.prob.size > MOST_OUTCOMES_PLANNED or not 0 <= discount < 1:
         return None

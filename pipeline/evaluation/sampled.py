@@ -256,9 +256,9 @@ PRECISION_AT_THE_END = 0.01
 class SampledEvaluator:
     """Evaluates by episodes: a given number, or as few as are precise enough."""
 
-    def __init__(self, spec: TrainSpec, env: VecEnv) -> None:
+    def __init__(self, spec: TrainSpec, env: VecEnv, yardstick: Yardstick | None = None) -> None:
         self.env = env
-        self.yardstick = bracketed_yardstick(spec)
+        self.yardstick = yardstick or bracketed_yardstick(spec)
         self.seed = spec.seed
         self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
         # Explicit settings of when or how long to evaluate take precedence.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 # A run with a lower score has failed; a share of episodes from which on all are meant.
 FAILED, NEARLY_ALL = 0.05, 0.99
@@ -20,6 +21,16 @@ def bracket_mark(is_proven: bool) -> str:
 
 
 @dataclass(frozen=True)
+class HiddenState:
+    """What other agents can reach, where observations hide the state."""
+
+    full_optimum: float  # of agents that see the state
+    # bounds of the optimum of agents that remember all observations; equal where it is known
+    memory_optimum: tuple[float, float]
+    with_memory: bool  # whether the yardstick is for agents that remember, else for others
+
+
+@dataclass(frozen=True)
 class Yardstick:
     """The baseline and the optimum of an environment."""
 
@@ -31,6 +42,8 @@ class Yardstick:
     # optimum. None if the optimum is known.
     at_least: float | None = None
     is_proven: bool = True  # whether the upper end of the bracket, or the optimum, is proven
+    # if observations hide the state: then the optimum is that of policies that go by observations
+    hidden: HiddenState | None = None
 
     def gap(self, expected_return: float) -> float:
         """The distance of a return from the optimum, or from the upper end of its bracket."""
@@ -62,13 +75,30 @@ class Yardstick:
         """What is said behind the figures of a bracket; empty without one."""
         return "" if self.at_least is None else bracket_mark(self.is_proven)
 
-    def figures(self, expected_return: float) -> dict[str, float]:
+    def figures(self, expected_return: float) -> dict[str, Any]:
         """Score and gap of a return as JSON; with a bracket, for both of its ends."""
-        found = {"optimum": self.optimum, "baseline": self.baseline}
+        found: dict[str, Any] = {"optimum": self.optimum, "baseline": self.baseline}
         found |= {"gap": self.gap(expected_return), "score": self.score(expected_return)}
         if self.at_least is not None:
             found["optimum_at_least"] = self.at_least
             found["optimum_is_proven"] = self.is_proven
             found["gap_at_least"] = self.lower_end.gap(expected_return)
             found["score_at_most"] = self.lower_end.score(expected_return)
+        if self.hidden is not None:
+            found["full_optimum"] = self.hidden.full_optimum
+            found["memory_optimum_at_least"], found["memory_optimum"] = self.hidden.memory_optimum
+            found["measured_by"] = "memory" if self.hidden.with_memory else "observation"
         return found
+
+
+def with_memory(figures: dict[str, Any]) -> dict[str, Any]:
+    """Figures of a run, measured by what agents that remember observations can reach."""
+    if figures.get("measured_by") != "observation":
+        return figures
+    lower, upper = figures["memory_optimum_at_least"], figures["memory_optimum"]
+    hidden = HiddenState(figures["full_optimum"], (lower, upper), with_memory=True)
+    at_least = None if lower == upper else lower
+    yardstick = Yardstick(upper, figures["baseline"], at_least, hidden=hidden)
+    kept = {name: figures[name] for name in figures if not name.endswith("at_least")}
+    kept.pop("score_at_most", None)
+    return kept | yardstick.figures(figures["mean_return"])

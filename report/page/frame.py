@@ -24,7 +24,7 @@ from pipeline.errors import visible
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.ranking import bar
 from report.series import StudySeries
-from report.words import interval_alone, number, optimum_words, score_number
+from report.words import interval_alone, number, optimum_words, scale_words, score_number
 
 # From data to text that a browser can be handed: templates, JSON, inline scripts.
 
@@ -51,6 +51,7 @@ def templates(folder: str = "") -> Environment:
     environment.filters.update(
         number=number,
         optimum=optimum_words,
+        hidden=lambda one: scale_words(one.full_optimum, one.measured_by),
         interval=interval_alone,
         score=score_number,
         bar=bar,

@@ -66,6 +66,9 @@ WORLDS = {
     "GamblersProblem": ("GamblersProblem-v0", {"heads_probability": 0.55, "goal": 20}),
     "RiverSwim": ("RiverSwim-v0", {}),
     "ShortCorridor": ("ShortCorridor-v0", {}),
+    "Tiger": ("Tiger-v0", {}),
+    "Hallway": ("Hallway-v0", {}),
+    "DarkWarehouse": ("DarkWarehouse-v0", {"slip": 0.1}),
     "DeepSea": ("DeepSea-v0", {"size": 4}),
     "Racetrack": ("Racetrack-v0", {}),
 }

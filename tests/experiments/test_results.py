@@ -126,6 +126,52 @@ def test_a_row_for_each_run(tmp_path):
     assert {name: row[name] for name in expected} == expected
 
 
+CORRIDOR = EnvironmentSpec("ShortCorridor-v0", "ShortCorridor-v0")
+BY_OBSERVATION = {
+    "mean_return": -12.5, "optimum": -11.5, "baseline": -12.0, "gap": 1.0, "score": -1.0,
+    "exact": True, "full_optimum": -3.0, "memory_optimum": -3.0, "memory_optimum_at_least": -3.0,
+    "measured_by": "observation",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("agents", "scale"),
+    [
+        (("qlearning", "sarsa"), ("observation", -11.5, 1.0, -1.0)),
+        (("qlearning", "ppo_lstm"), ("memory", -3.0, 9.5, -0.5 / 9)),
+    ],
+)
+def test_where_an_agent_remembers_all_have_its_scale(tmp_path, agents, scale):
+    study = replace(study_of(n_seeds=1, agents=agents), environments=(CORRIDOR,))
+    planned = plan(study, tmp_path)
+    for run in planned:
+        own = {"optimum": -3.0, "measured_by": "memory", "gap": 9.5, "score": -0.5 / 9}
+        is_lstm = run.agent == "ppo_lstm"
+        write_run(run, [(100, -12.5)], final=BY_OBSERVATION | (own if is_lstm else {}))
+    results = read_results(study, planned, tmp_path)
+    for row in results.summary.to_dict("records"):
+        found = (row["measured_by"], row["optimum"], row["gap"], row["score"])
+        assert found == (scale[0], *map(pytest.approx, scale[1:]))
+        assert row["full_optimum"] == -3
+        assert row["threshold"] == pytest.approx(-12 + 0.95 * (scale[1] + 12))
+    (found,) = analyse(results).environments
+    assert (found.optimum, found.full_optimum, found.measured_by) == (scale[1], -3, scale[0])
+    assert not found.optima
+    assert "Observations hide the state" in said(analyse(results))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"full_optimum": None}, {"memory_optimum": "much"}, {"measured_by": "luck"}],
+)
+def test_damaged_figures_on_what_is_observed_are_told(tmp_path, changes):
+    study = replace(study_of(n_seeds=1, agents=("qlearning",)), environments=(CORRIDOR,))
+    planned = plan(study, tmp_path)
+    write_run(planned[0], [(100, -12.5)], final=BY_OBSERVATION | changes)
+    (left_out,) = read_results(study, planned, tmp_path).left_out
+    assert "lacks figures on what is observed" in left_out.reason
+
+
 def test_the_columns_of_the_files_that_others_read():
     """Once written down here: whoever reads the files reads them by these names."""
     assert " ".join(RUN_COLUMNS) == (

@@ -15,7 +15,6 @@ from mdp.gaps import (
     greedy_repairs,
     policy_gradient,
 )
-from mdp.memoryless import best_memoryless
 from tests.mdp.test_random_models import distributions, models
 
 
@@ -120,23 +119,6 @@ def test_splitting_agrees_with_ten_thousand_episodes():
     error = lost.std(axis=0) / np.sqrt(n_episodes)
     assert (np.abs(lost.mean(axis=0) - split.losses) <= 4 * error + 1e-9).all()
     assert (split.losses > 0).sum() > 5
-
-
-def test_the_best_that_goes_by_what_is_observed_is_random_in_the_short_corridor():
-    """Sutton and Barto, example 13.1: about -11.6 with a probability of about 0.59 for right."""
-    model = transition_model(gym.make("envs:ShortCorridor-v0"))
-    alike = np.zeros(model.n_states, np.int64)
-    right = 2 - np.sqrt(2)  # where the derivative of the return is zero
-    policy = np.tile([1 - right, right], (model.n_states, 1))
-    exact = policy_return(model, policy, 1000).expected_return
-    assert best_memoryless(model, alike, 1000) == pytest.approx(exact, abs=1e-4)
-    assert exact == pytest.approx(-11.66, abs=0.01)
-
-
-def test_where_each_state_is_seen_the_best_of_what_is_observed_is_the_best():
-    model = transition_model(gym.make("FrozenLake-v1", is_slippery=False))
-    found = best_memoryless(model, np.arange(model.n_states), 100)
-    assert found == pytest.approx(1.0)
 
 
 def test_worlds_that_are_too_large_are_refused():

@@ -318,6 +318,12 @@ GROWN = Standing(2, 0.015, 0.015, Design(QUESTION, (5, 8, 12), {}, 0))
           "optimum is 1 for a and 2 for b. Their returns cannot be compared.")]),
         ({"failures": FEW, "unreliable": (("a", "b"),)},
          ["a fails more often than b (6 of 10 runs against 0 of 10)."]),
+        ({"full_optimum": 110.0, "measured_by": "memory"},
+         [("Observations hide the state: the optimum, one for all agents here, is that of an agent "
+           "that goes by all that it has observed; one that saw the state could have 110.")]),
+        ({"full_optimum": 110.0, "measured_by": "observation"},
+         [("Observations hide the state: the optimum, one for all agents here, is that of an agent "
+           "that goes by what it observes now; one that saw the state could have 110.")]),
         ({"optimum": 101.0, "impossible": ("a",)}, [("a has MORE THAN ANY POLICY CAN REACH, "
           "101: the environment is not the one that the bracket is of, or the bracket is wrong.")]),
         ({"missing": {"a": 1, "b": 4}}, ["1 of 4 runs of a is missing.",

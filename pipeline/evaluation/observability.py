@@ -1,0 +1,115 @@
+"""The yardstick where observations hide the state: what an agent can reach by what it observes.
+
+Three optima are told: of agents that see the state, of those that remember all observations, and of
+those that go by the present observation alone. An agent is measured by the one of its kind.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.registry import ALGORITHMS
+from mdp import TransitionModel
+from mdp.beliefs import Bracket, memory_optimum
+from mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
+from pipeline.evaluation.yardstick import HiddenState, Yardstick
+from pipeline.train_spec import TrainSpec
+
+MOST_KEPT = 16
+
+
+def remembers(spec: TrainSpec) -> bool:
+    """Whether the run's agent acts by earlier observations too, as far as its settings tell."""
+    entry = ALGORITHMS.get(spec.algo)
+    return (entry is not None and entry.has_memory) or (spec.hyperparams.frame_stack or 1) > 1
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenScale:
+    """The optima of an environment whose observations hide the state."""
+
+    full_optimum: float
+    baseline: float
+    memory: Bracket  # of agents that remember all observations
+    now: Bracket  # of agents that go by the present observation
+    best: BestMemoryless | None  # the policy found for those; None where it was not searched
+
+    def yardstick(self, with_memory: bool) -> Yardstick:
+        """The scale for agents that remember observations, or for those that do not."""
+        lower, upper = self.memory if with_memory else self.now
+        hidden = HiddenState(self.full_optimum, (self.memory.lower, self.memory.upper), with_memory)
+        return Yardstick(upper, self.baseline, None if lower == upper else lower, hidden=hidden)
+
+    @property
+    def note(self) -> str | None:
+        """What a random policy can do, in one line, if the best one by observations is random."""
+        best = self.best
+        if best is None or not best.needs_chance:
+            return None
+        most = "at most" if best.is_firm_known else "as far as was found"
+        return (
+            f"the best policy without memory is random here and returns {best.lower:.2f}; always "
+            f"the same action at an observation, as in evaluations, {most} {best.firm:.2f}"
+        )
+
+
+def hidden_scale(
+    model: TransitionModel,
+    observations: NDArray[np.generic],
+    horizon: int,
+    full_optimum: float,
+    baseline: float,
+) -> HiddenScale | None:
+    """The optima by what is observed; None if the best policy by observations is the best of all.
+
+    Args:
+        model: the decision process.
+        observations: what is observed in each state, states along the first axis.
+        horizon: the time limit.
+        full_optimum: the optimum of agents that see the state.
+        baseline: the return of the best random or constant policy.
+    """
+    groups = observation_groups(observations, model.reachable)
+    if groups is None:
+        return None
+    digest = hashlib.blake2b(repr((horizon, model.prob.shape)).encode())
+    for array in (
+        *(model.prob, model.next_state, model.reward, model.terminated, model.initial),
+        groups,
+    ):
+        digest.update(array.tobytes())
+    key = digest.digest()
+    found = (
+        _kept.pop(key) if key in _kept else _scale(model, groups, horizon, full_optimum, baseline)
+    )
+    _kept[key] = found
+    if len(_kept) > MOST_KEPT:
+        _kept.popitem(last=False)
+    return found
+
+
+_kept: OrderedDict[bytes, HiddenScale | None] = OrderedDict()
+
+
+def _scale(
+    model: TransitionModel,
+    groups: NDArray[np.int64],
+    horizon: int,
+    full_optimum: float,
+    baseline: float,
+) -> HiddenScale | None:
+    memory = memory_optimum(model, groups, horizon) or Bracket(baseline, full_optimum)
+    most = min(memory.upper, full_optimum)
+    best = best_memoryless(model, groups, horizon, most)
+    if best is not None and best.lower >= full_optimum - PROVED * max(1.0, abs(full_optimum)):
+        return None
+    now = Bracket(baseline, most)
+    if best is not None:
+        now = Bracket(max(best.lower, baseline), max(best.upper, baseline))
+    least = memory.lower if memory.lower == memory.upper else max(memory.lower, now.lower)
+    return HiddenScale(full_optimum, baseline, Bracket(least, most), now, best)
