@@ -172,7 +172,6 @@ def _compare(args: argparse.Namespace) -> int:
     """Do a study, as the only one that does."""
     study = study_spec(args)
     from experiments.child_processes import end_server
-    from experiments.figures_store import FigureStore
     from experiments.looks import read_looks
     from experiments.plan import plan
     from experiments.run_limits import RunLimits
@@ -185,8 +184,10 @@ def _compare(args: argparse.Namespace) -> int:
     console = table_console()
     limits = RunLimits(study.run_timeout, study.run_memory)
     context = run_context(args, root, command_line(), limits, console)
+    planned = plan(study, root)  # which refuses what cannot be, before slow libraries are loaded
+    from experiments.figures_store import FigureStore
+
     context.store = FigureStore(folds=study.keep == "figures", first_seed=study.first_seed)
-    planned = plan(study, root)
     to_make_again = named_runs(planned, args.make_again)
     console.print(study.title, style="bold", highlight=False)
     with folder_lock(root, give_way, partial(say, console)), told_if_gone(root):

@@ -32,7 +32,6 @@ from pipeline.environments import (
     with_maps_read,
 )
 from pipeline.errors import UserError
-from pipeline.evaluation.observability import remembers
 from pipeline.files import plain
 from pipeline.models.load import agent_class
 from pipeline.runs import FINISHED, ReadRun, Run, environment_name
@@ -43,7 +42,7 @@ from pipeline.settings.hyperparams import (
     seeds_tuned_on,
     split,
 )
-from pipeline.train_spec import TrainSpec, completed
+from pipeline.train_spec import TrainSpec, completed, remembers
 
 # Fields in which runs with the same settings may differ: output paths, display, and the location
 # of modules.

@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
+from agents.registry import ALGORITHMS
 from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.user_modules import UserModule
 
@@ -135,3 +136,9 @@ def is_known_environment(env_id: str) -> bool:
     entry = None if registered is None else registered.entry_point
     wrapped = registered is not None and registered.additional_wrappers
     return isinstance(entry, str) and entry.startswith(HOMES) and not wrapped
+
+
+def remembers(spec: TrainSpec) -> bool:
+    """Whether the run's agent acts by earlier observations too, as far as its settings tell."""
+    entry = ALGORITHMS.get(spec.algo)
+    return (entry is not None and entry.has_memory) or (spec.hyperparams.frame_stack or 1) > 1

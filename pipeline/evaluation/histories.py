@@ -24,11 +24,10 @@ from mdp.memoryless import observation_groups
 from mdp.transition_model import Ints
 from pipeline.environments import make_single_env
 from pipeline.evaluation.exact import ExactEvaluator, evaluator_of_single
-from pipeline.evaluation.observability import remembers
 from pipeline.evaluation.policies import KNOWN_LIBRARIES, has_memory, takes_masks
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.yardstick import Yardstick
-from pipeline.train_spec import TrainSpec
+from pipeline.train_spec import TrainSpec, remembers
 
 # At one step, and in all: a second or two. To ask for one takes as long as for some.
 MOST_HISTORIES, MOST_IN_ALL, LEAST_AT_ONCE = 3_000, 30_000, 10

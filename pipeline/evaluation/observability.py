@@ -13,20 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.registry import ALGORITHMS
 from mdp import TransitionModel
 from mdp.beliefs import Bracket, memory_optimum
 from mdp.memoryless import PROVED, BestMemoryless, best_memoryless, observation_groups
 from pipeline.evaluation.yardstick import HiddenState, Yardstick
-from pipeline.train_spec import TrainSpec
 
 MOST_KEPT = 16
-
-
-def remembers(spec: TrainSpec) -> bool:
-    """Whether the run's agent acts by earlier observations too, as far as its settings tell."""
-    entry = ALGORITHMS.get(spec.algo)
-    return (entry is not None and entry.has_memory) or (spec.hyperparams.frame_stack or 1) > 1
 
 
 @dataclass(frozen=True, eq=False)

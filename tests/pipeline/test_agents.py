@@ -351,7 +351,7 @@ def test_an_agent_goes_on_with_its_masks_and_is_played_with_them(tmp_path):
 def test_an_agent_with_a_memory_is_judged_by_episodes_and_says_so(tmp_path, monkeypatch, capsys):
     outcome, printed = train_to(spec_of("ppo_lstm", LAKE, tmp_path))
     assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 100)
-    assert printed.count("evaluations are sampled, not exact: it acts by what it remembers") == 1
+    assert printed.count("exact, over all histories of observations, while those are few") == 1
     words = ["enjoy.py", "--algo", "ppo_lstm", "--env", LAKE, "-f", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [*words, "--no-render", "--n-episodes", "2"])
     assert enjoy.main() == 0

@@ -165,7 +165,7 @@ def test_every_text_of_every_component_is_known():
                 is_text = any(word in says for word in ("str", "Path", "Any"))
                 assert not is_text or name in HARMLESS, (cls, name, says)
     assert " ".join(sorted(places)) == (
-        "best_model_save_path filename folder log_path name_prefix save_path video_folder"
+        "best_model_save_path filename folder log_path name_prefix path save_path video_folder"
     )
 
 

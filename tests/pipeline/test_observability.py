@@ -10,9 +10,9 @@ from agents.registry import AlgorithmEntry
 from pipeline.environments import make_evaluation_env
 from pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
 from pipeline.evaluation.histories import HistoryEvaluator, by_histories, world_of_memory
-from pipeline.evaluation.observability import remembers
 from pipeline.evaluation.sampled import evaluate
 from pipeline.evaluation.yardstick import with_memory
+from pipeline.train_spec import remembers
 from tests.pipeline.short_runs import agent_of, spec_of, trained
 
 CORRIDOR, TIGER = "envs:ShortCorridor-v0", "envs:Tiger-v0"
