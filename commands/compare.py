@@ -184,11 +184,12 @@ def _compare(args: argparse.Namespace) -> int:
     console = table_console()
     limits = RunLimits(study.run_timeout, study.run_memory)
     context = run_context(args, root, command_line(), limits, console)
-    planned = plan(study, root)  # which refuses what cannot be, before slow libraries are loaded
-    from experiments.figures_store import FigureStore
-
-    context.store = FigureStore(folds=study.keep == "figures", first_seed=study.first_seed)
+    planned = plan(study, root)
     to_make_again = named_runs(planned, args.make_again)
+    if study.keep == "figures" or to_make_again or any(root.glob("runs/*/*.sqlite")):
+        from experiments.figures_store import FigureStore  # with slow libraries
+
+        context.store = FigureStore(folds=study.keep == "figures", first_seed=study.first_seed)
     console.print(study.title, style="bold", highlight=False)
     with folder_lock(root, give_way, partial(say, console)), told_if_gone(root):
         try:
