@@ -16,7 +16,6 @@ from pathlib import Path
 
 from drawing import mutants_of
 
-
 # They wait by the clock, which their processor time does not tell.
 WAITING = (
     "test_what_a_killed_worker_has_saved_is_gone_on_with",
