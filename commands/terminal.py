@@ -203,8 +203,9 @@ def describe_others(others: OtherReturns) -> str:
     if others.stochastic_return is not None and others.acts_by != "the same policy":
         told.append(f"return {others.stochastic_return:.2f} with {others.acts_by}, as in training")
     if others.discounted_return is not None and others.discount != 1:
-        figures = f"{others.discounted_return:.4g}, optimum {others.discounted_optimum:.4g}"
-        told.append(f"discounted by {others.discount:g}: {figures}")
+        told.append(f"discounted by {others.discount:g}: {others.discounted_return:.4g}")
+        if others.discounted_optimum is not None:
+            told[-1] += f", optimum {others.discounted_optimum:.4g}"
     return f"{'; '.join(told)} (exact)" if told else ""
 
 

@@ -243,7 +243,8 @@ def _discounted(row: Row) -> Cell | None:
     discount, optimum = row.agent.discount, row.agent.discounted_optimum
     if discount is None:  # an agent that has none
         return None
-    return _other_return(row.agent.discounted, f"by {discount:g}; optimum {number(optimum)}")
+    best = "" if optimum is None else f"; optimum {number(optimum)}"
+    return _other_return(row.agent.discounted, f"by {discount:g}{best}")
 
 
 OTHER_RETURNS = (

@@ -110,14 +110,22 @@ class ExactEvaluator:
         if isinstance(discount, int | float) and 0 <= discount <= 1:
             greedy = self.policy(agent, deterministic=True)
             worth = policy_return(self.model, greedy, self.horizon, discount).expected_return
-            optimum = self._optima.get(discount)
-            if optimum is None:
-                optimum = finite_horizon_optimum(self.model, self.horizon, discount).start_value
-                self._optima[discount] = optimum
             found = replace(
-                found, discount=discount, discounted_return=worth, discounted_optimum=optimum
+                found,
+                discount=discount,
+                discounted_return=worth,
+                discounted_optimum=self._discounted_optimum(discount),
             )
         return found
+
+    def _discounted_optimum(self, discount: float) -> float | None:
+        """The optimum under a discount; None where observations hide the state that it acts by."""
+        if self.scale is not None:
+            return None
+        if discount not in self._optima:
+            planned = finite_horizon_optimum(self.model, self.horizon, discount)
+            self._optima[discount] = planned.start_value
+        return self._optima[discount]
 
     @cached_property
     def _optima(self) -> dict[float, float]:
