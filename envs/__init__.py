@@ -36,7 +36,6 @@ TEXTBOOK = {
 }
 # Where observations hide the state: entry points in `envs.pomdp`, and time limits.
 HIDING = {
-    "DarkWarehouse-v0": ("dark_warehouse:DarkWarehouseEnv", 100),
     "Hallway-v0": ("hallway:HallwayEnv", 30),
     "Tiger-v0": ("tiger:TigerEnv", 10),
 }
@@ -45,6 +44,17 @@ gym.register(
     id="Warehouse-v0",
     entry_point="envs.warehouse:WarehouseEnv",
     max_episode_steps=1000,
+)
+gym.register(
+    id="DarkWarehouse-v0",
+    entry_point="envs.warehouse:WarehouseEnv",
+    max_episode_steps=100,
+    kwargs={
+        "desc": (".......", "#.#.#.#", "#.#.#.#", "#S#G#.#"),
+        "shelf_reward": -1,
+        "random_start": True,
+        "observation": "neighbours",
+    },
 )
 gym.register(
     id="MineMaze-v0",

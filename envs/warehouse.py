@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs.argument_checks import check_choice, check_number, check_whole_number
-from envs.grid import MAX_STATES, Description, GridWorld, Observation, Tile
+from envs.grid import MAX_STATES, MOVES, Description, GridWorld, Observation, Tile
 from mdp.transition_model import AnyInts, Bools
 
 MAX_SIZE = int(MAX_STATES**0.5)
@@ -96,7 +96,7 @@ DEFAULT_MAP = (
     ".####.###.",
     "S.........",
 )
-OBSERVATIONS = ("discrete", "position", "one_hot")
+OBSERVATIONS = ("discrete", "position", "one_hot", "neighbours")
 
 
 class WarehouseEnv(GridWorld):
@@ -127,7 +127,9 @@ class WarehouseEnv(GridWorld):
     With `observation="discrete"`, `Discrete(rows * columns)`: row times the number of columns plus
     column, row 0 being at the top. With `"position"`, `Box(0, 1, (2,), float32)`: row and column,
     each divided by its largest value. With `"one_hot"`, `Box(0, 1, (rows * columns,), float32)`: 1
-    at the robot's cell and 0 elsewhere.
+    at the robot's cell and 0 elsewhere. With `"neighbours"`, `Discrete(81)`: a number of four
+    digits in base 3, for the cells above, below, to the left and to the right: 0 an aisle, 1 a
+    shelf or the outer wall, 2 the goal. It does not tell where the robot is.
 
     ## Rewards
     - a move, also one against the outer wall, where the robot stays: -1
@@ -196,6 +198,8 @@ class WarehouseEnv(GridWorld):
             self.observation_space = spaces.Box(0, 1, (2,), np.float32)
         elif observation == "one_hot":
             self.observation_space = spaces.Box(0, 1, (self.map.n_cells,), np.float32)
+        elif observation == "neighbours":
+            self.observation_space = spaces.Discrete(3 ** len(MOVES))
 
     def observation_of(self, states: AnyInts) -> NDArray[Any]:
         """What is observed in each of many states: shape (n,), (n, 2) or (n, cells)."""
@@ -207,11 +211,23 @@ class WarehouseEnv(GridWorld):
             hot = np.zeros((len(states), self.map.n_cells), np.float32)
             hot[np.arange(len(states)), states] = 1
             return hot
-        return states
+        return self._neighbours[states] if self.observation == "neighbours" else states
+
+    @cached_property
+    def _neighbours(self) -> NDArray[np.int64]:
+        """What is beside each cell, as one number, shape (cells,)."""
+        letters = np.frombuffer(self.map.codes, np.uint8)
+        kinds = (letters == ord("#")) + 2 * (letters == ord("G"))
+        kinds = np.pad(kinds.reshape(self.map.n_rows, -1), 1, constant_values=1)
+        height, width = self.map.n_rows, self.map.n_columns
+        beside = [kinds[1 + y : 1 + y + height, 1 + x : 1 + x + width] for y, x in MOVES]
+        return np.ravel_multi_index(tuple(beside), (3,) * len(MOVES)).ravel()
 
     def _observe(self) -> Observation:
         if self.observation == "discrete":
             return self.s
+        if self.observation == "neighbours":
+            return int(self._neighbours[self.s])
         observed: NDArray[np.float32] = self.observation_of(np.array([self.s]))[0]
         return observed
 

@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -35,6 +36,7 @@ from pipeline.evaluation.observability import HiddenScale, hidden_scale
 from pipeline.settings.hyperparams import entry_names
 from pipeline.settings.values import parse_assignments
 
+PAGES = Path(__file__).resolve().parents[1] / "environments"
 LIMIT = 1000  # what commands take where an environment has none
 MOST_REWARDS = 8
 LEFT_OUT = ("Version History",)
@@ -63,7 +65,7 @@ def made(env_id: str, *arguments: str) -> gym.Env[Any, Any]:
 
 
 def optima_block(*written: str) -> str:
-    """A row for each environment: a link to its page, what it is, its optimum, what chance earns.
+    """A row for each environment: a link to its page, its first sentence, its optimum, and chance.
 
     Args:
         written: page and id, as in ``warehouse=Warehouse-v0``.
@@ -73,8 +75,8 @@ def optima_block(*written: str) -> str:
         page, _, env_id = item.partition("=")
         found = solution(env_id)
         figures = (optimum_cell(found), number(found.random.expected_return)) if found else ("", "")
-        env = made(env_id)
-        summary = (inspect.getdoc(type(env.unwrapped)) or "").partition("\n")[0].rstrip(".")
+        intro = (PAGES / f"{page}.md").read_text(encoding="utf-8").split("\n\n")[1]
+        summary = intro.partition(". ")[0].rstrip(".").replace("\n", " ")
         lines.append(
             f"| [`{env_id}`](environments/{page}.md) | {summary} | {' | '.join(figures)} |"
         )
