@@ -94,15 +94,19 @@ def main() -> None:
     storage = f"sqlite:///{Path(file).with_suffix('.db')}"
     started = time.process_time()
 
+    ended = threading.Event()
+
     def watch() -> None:
-        while time.process_time() - started < seconds:
-            time.sleep(0.2)
-        _thread.interrupt_main()
+        while not ended.wait(1.0):
+            # Again until it ends: an interrupt may come where Python ignores it.
+            if time.process_time() - started > seconds:
+                _thread.interrupt_main()
 
     threading.Thread(target=watch, daemon=True).start()
     # A ValueError: rl_zoo3 asks for the best trial where none is complete.
     with contextlib.suppress(KeyboardInterrupt, ValueError):
         CONTENDERS[contender](env_id, algo, n_timesteps, n_envs, seed, storage)
+    ended.set()
     taken = time.process_time() - started
     study = optuna.load_study(study_name="search", storage=storage)
     counts = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED)

@@ -30,8 +30,7 @@ def why_lines(explained: Explanation) -> list[str]:
         f"gap {gap:.4g}: it returns {explained.value:.6g}, the optimum is {optimum:.6g}",
     ]
     shown = [part for part in explained.parts if _is_shown(part, gap)]
-    width = max((len(part.name) for part in shown), default=0)
-    told += [f"  {part.name:<{width}} {part.loss:>9.4g}  {part.meaning}" for part in shown]
+    told += [f"  {part.loss:>9.4g} {part.name}: {part.meaning}" for part in shown]
     if explained.own_gap is not None:
         own = f"in its own objective, at discount {explained.discount:g}"
         told.append(f"the gap at the start {own}: {explained.own_gap:.4g}")

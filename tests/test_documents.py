@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from commands import compare, enjoy, train, tune
+from commands import audit, compare, enjoy, explain, shaping, train, tune
 from commands.compare import study_spec
 from commands.train import train_spec
 from commands.tune import tuning_spec
@@ -33,7 +33,7 @@ from recommended_commands import (  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
-COMMAND = re.compile(r"python ((?:train|enjoy|compare|tune)\.py [^`\n)#]*)")
+COMMAND = re.compile(r"python ((?:train|enjoy|compare|tune|explain|shaping|audit)\.py [^`\n)#]*)")
 # Each with the first document that it stands in.
 FOUND_IN = {
     command.strip(): document.name
@@ -41,6 +41,11 @@ FOUND_IN = {
     for command in COMMAND.findall(
         document.read_text().replace("--env\nWarehouse", "--env Warehouse")
     )
+}
+PARSED_ALONE = {
+    "explain.py": explain.build_parser,
+    "shaping.py": shaping.build_parser,
+    "audit.py": audit.build_parser,
 }
 COMMANDS = [pytest.param(each, id=f"{name}: {each}") for each, name in FOUND_IN.items()]
 
@@ -63,6 +68,8 @@ def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
     elif script == "tune.py":
         args = tune.build_parser().parse_args(words)
         assert tuning_spec(args).environment.env_id == args.env
+    elif script in PARSED_ALONE:  # the runs and modules that they name are examples
+        assert vars(PARSED_ALONE[script]().parse_args(words))
     else:
         monkeypatch.chdir(ROOT)
         args = compare.build_parser().parse_args(words)
