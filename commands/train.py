@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -38,6 +39,7 @@ from pipeline.stopping import StopRequest, stops_noticed
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from pipeline.callbacks import PullSummary
     from pipeline.preparation import Training
@@ -632,7 +634,31 @@ def print_lists() -> None:
         also = "\nalso: " + " ".join(others) if others else ""
         table.add_row(env_id, " ".join(with_entry) + also)
     console.print(table)
+    console.print()
+    console.print(_hardness_table())
     console.print(
         "\nAny other environment registered with Gymnasium works where the spaces fit; "
         "--gym-packages imports modules that register more, and agents of your own."
     )
+
+
+def _hardness_table() -> Table:
+    """How hard the environments are whose model is known, by numbers that were worked out."""
+    from rich.table import Table
+
+    import envs
+
+    def told(value: float | str | None) -> str:
+        if value is None or isinstance(value, str):
+            return value or "-"
+        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
+
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    table.add_column("how hard it is", style="bold", no_wrap=True)
+    for name in ("states", "diameter", "effective horizon", "random steps to a reward"):
+        table.add_column(name, justify="right")
+    numbers = "reachable_states", "diameter", "effective_horizon", "random_steps_to_reward"
+    stored = json.loads(Path(envs.__file__).with_name("hardness.json").read_text(encoding="utf-8"))
+    for env_id, found in sorted(stored.items()):
+        table.add_row(env_id, *(told(found[name]) for name in numbers))
+    return table

@@ -1,10 +1,18 @@
-"""What a page says of an environment: worked out from its model and its docstring, never typed."""
+"""What a page says of an environment: worked out from its model and its docstring, never typed.
+
+``train.py --list`` shows how hard environments are from ``envs/hardness.json``. After a model has
+changed, this program writes that file anew; else building the pages fails:
+
+    python docs/scripts/environment_facts.py
+"""
 
 from __future__ import annotations
 
 import inspect
+import json
 import re
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from math import inf
 from pathlib import Path
@@ -14,7 +22,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-import envs  # noqa: F401  # registers the environments
+import envs
 from agents.registry import ALGORITHMS
 from envs.known_models import (
     observations_of_states,
@@ -37,6 +45,7 @@ from pipeline.settings.hyperparams import entry_names
 from pipeline.settings.values import parse_assignments
 
 PAGES = Path(__file__).resolve().parents[1] / "environments"
+HARDNESS = Path(envs.__file__).with_name("hardness.json")
 LIMIT = 1000  # what commands take where an environment has none
 MOST_REWARDS = 8
 LEFT_OUT = ("Version History",)
@@ -123,6 +132,7 @@ def hardness_block(*ids: str) -> str:
         *("look-ahead", "effective horizon", "random actions to a reward", "to the goal"),
     ]
     lines = [f"| {' | '.join(heads)} |", f"|---|{'---:|' * (len(heads) - 1)}"]
+    assert hardness_as_data(ids) == json.loads(HARDNESS.read_text()), f"{HARDNESS.name} is stale"
     lines += [f"| `{env_id}` | {' | '.join(hardness_cells(env_id))} |" for env_id in ids]
     return "\n".join(lines) + "\n"
 
@@ -157,6 +167,22 @@ def hardness(env_id: str) -> Hardness | None:
     env = made(env_id)
     model, limit = transition_model(env), time_limit(env) or LIMIT
     return None if model is None else hardness_of(model, limit, success_outcomes(env))
+
+
+def hardness_as_data(ids: Iterable[str]) -> dict[str, dict[str, float | str | None]]:
+    """The numbers of several environments as JSON, to nine digits; an infinite one is "never"."""
+
+    def plain(value: float | None) -> float | str | None:
+        if value is None or isinstance(value, int):
+            return value
+        return "never" if value == inf else float(f"{value:.9g}")
+
+    found = {env_id: hardness(env_id) for env_id in ids}
+    return {
+        env_id: {name: plain(value) for name, value in asdict(one).items()}
+        for env_id, one in found.items()
+        if one is not None
+    }
 
 
 def picture(env_id: str) -> str:
@@ -268,3 +294,9 @@ def docstring_sections(cls: Any) -> list[str]:
     lead, *sections = re.split(r"(?m)^(?=## )", text.partition("\n")[2].strip())
     kept = [part.strip() for part in sections if part[3:].split("\n")[0] not in LEFT_OUT]
     return [part for part in (lead.strip(), *kept) if part]
+
+
+if __name__ == "__main__":
+    page = (PAGES.parent / "environments.md").read_text(encoding="utf-8")
+    (written,) = re.findall(r'"hardness: ([^"]*)"', page)
+    HARDNESS.write_text(json.dumps(hardness_as_data(written.split()), indent=1) + "\n")
