@@ -3,7 +3,7 @@
     python benchmarks/timed_search.py --env MountainCar-v0 --algo dqn -n 60000 --seconds 180
 
 Each contender searches several times, with other seeds each time. What it proposes is trained again
-on seeds that no search has seen, all with ``--engine auto``, and judged by the final policy's
+on seeds that no search has seen, all with ``--engine compiled``, and judged by the final policy's
 return. tune.py has its re-test within the budget: its search ends after ``SEARCH_SHARE`` of it. It
 proposes the shipped settings if nothing is shown to be better. The others propose their best trial,
 train with Stable-Baselines3, and have rl_zoo3's ranges; Optuna's search is that of many tutorials.
@@ -102,7 +102,7 @@ def returns(args: argparse.Namespace, name: str, file: Path | None, folder: Path
     import pandas as pd
 
     words: list[object] = ["compare.py", "--env", args.env, "--algos", args.algo]
-    words += ["--engine", "auto", "-n", args.n_timesteps, "--seeds", args.seeds, "-j", 1]
+    words += ["--engine", "compiled", "-n", args.n_timesteps, "--seeds", args.seeds, "-j", 1]
     words += ["--first-seed", FIRST_UNSEEN, "--no-report", "--name", name, "-f", folder]
     run([*words, *(() if file is None else ("--conf-file", file))])
     final = pd.read_csv(folder / name / "summary.csv")["final"]
