@@ -55,18 +55,8 @@ def tuned(args: argparse.Namespace, number: int, folder: Path) -> tuple[Path | N
     """A search of tune.py: the winner's file, its processor time and its number of trials."""
     first = 100 * number
     words: list[object] = ["tune.py", "--env", args.env, "--algo", args.algo]
-    words += [
-        "-n",
-        args.n_timesteps,
-        "--engine",
-        "auto",
-        "--trials",
-        1000,
-        "--seed",
-        number,
-        "--first-seed",
-        first,
-    ]
+    words += ["-n", args.n_timesteps, "--engine", "compiled", "--trials", 1000]
+    words += ["--seed", number, "--first-seed", first]
     words += ["--seeds-per-trial", 3, "--n-startup-trials", 5, "--retest", 2, "--retest-seeds", 8]
     words += ["-j", 1, "--no-report", "-f", folder, "--name", f"tune-{number}"]
     root = folder / f"tune-{number}"
