@@ -124,6 +124,23 @@ def chores(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "study_chores")
 
 
+@pytest.fixture
+def light_server(monkeypatch):
+    """What children are forked from has imported nothing, for tests that end it."""
+    preloaded, heavy = child_processes.PRELOADED, child_processes.server_pid()
+    child_processes.end_server()
+    monkeypatch.setattr(child_processes, "PRELOADED", [])
+
+    def is_there():
+        child_processes.start_server()
+        return child_processes.server_pid() != heavy
+
+    wait_for(is_there)  # one with threads is not gone as soon as it is a zombie
+    yield
+    child_processes.end_server()
+    multiprocessing.set_forkserver_preload(preloaded)
+
+
 def nothing():
     pass
 
@@ -212,6 +229,21 @@ def test_leaving_early_ends_the_children(chores, tmp_path):
         assert isinstance(executor.submit(alone, chores.add, 1, 1).exception(), StoppedError)
 
 
+@pytest.mark.usefixtures("light_server")
+def test_when_the_server_is_killed_all_go_on(chores, tmp_path, caplog):
+    with local_executor(2) as executor:
+        first = executor.submit(alone, chores.write_and_wait, str(tmp_path), "first")
+        wait_for(lambda: waiting_in(tmp_path))
+        server = child_processes.server_pid()
+        child_processes.end_server()
+        wait_for(lambda: not is_alive(server))
+        assert executor.submit(alone, chores.add, 1, 1).result()[0] == 2
+        (tmp_path / "go").touch()
+        assert first.result() == "first"
+    told = "the process that runs are forked from was killed; it is started anew"
+    assert caplog.messages == [told]
+
+
 def test_signals_of_a_whole_group_do_not_reach_the_children(chores):
     """The terminal sends Ctrl-C to all; what it means is decided above."""
     assert alone(chores.interrupt_itself, tries=1) == "still here"
@@ -270,7 +302,7 @@ def test_which_tasks_share_a_process(chores, tmp_path):
 
 # --- Runs that share a process: to the same bits, and which those are.
 
-SMALL = {"engine": "compiled", "n_timesteps": 600, "policy_kwargs": {"net_arch": [8]}}
+SMALL = {"engine": "compiled", "n_timesteps": 300, "policy_kwargs": {"net_arch": [8]}}
 Q = {**SMALL, "learning_starts": 50, "buffer_size": 300, "batch_size": 16}
 CLIPPED = [{"gymnasium.wrappers.ClipReward": {"min_reward": 0, "max_reward": 0.5}}]
 HOUSE = EnvironmentSpec("house", "Warehouse-v0", {"n_episodes": 60, "env_kwargs": {"slip": 0.1}})

@@ -161,6 +161,25 @@ def test_a_saturated_search_ends_and_ranks_by_steps_to_the_threshold(toy, tmp_pa
     assert not toy.search(toy.opened(tuning, tmp_path), toy.Launcher(), at_once, steps=steps).done
 
 
+def test_other_drivers_trials_are_waited_for_where_a_search_is_saturated(
+    toy, tmp_path, monkeypatch
+):
+    tuning, waits = toy.tuning(n_trials=12, sampler="random"), []
+    other = toy.opened(tuning, tmp_path)
+    other.queue.add_places()
+    theirs = other.queue.claim(lambda _: {})
+
+    def ends_meanwhile(_):
+        waits.append(toy.states(other).count("RUNNING"))
+        other.queue.give_back(theirs)
+
+    place = toy.opened(tuning, tmp_path)
+    monkeypatch.setattr(searching.time, "sleep", ends_meanwhile)
+    toy.search(place, toy.Launcher(), lambda *_: 1.0, steps=steps)
+    assert waits == [1]
+    assert toy.states(place) == ["WAITING"] + ["COMPLETE"] * 10 + ["WAITING"]
+
+
 def test_returns_of_1_are_no_optimum(toy, tmp_path):
     place = toy.opened(toy.tuning(n_trials=14, sampler="random"), tmp_path)
     toy.search(place, toy.Launcher(), lambda *_: 1.0, judged_by="final")
