@@ -22,13 +22,6 @@ from commands.compare import study_spec
 pytestmark = pytest.mark.usefixtures("pictures")
 
 
-@pytest.fixture
-def lake(type_command):
-    words = ("--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "2000", "--seed", "3")
-    assert type_command("train.py", *words, "--verbose", "0") == (0, "", "")
-    return "logs/qlearning/FrozenLake-v1_1"
-
-
 CORRIDOR = """
 import gymnasium
 from my_cells import LENGTH

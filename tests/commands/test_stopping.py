@@ -155,7 +155,7 @@ def test_a_comparison_by_a_log_ends_as_every_command(stopped, tmp_path):
 def test_killed_commands_end_as_they_would_have(tmp_path):
     script = ROOT / "benchmarks" / "fault_campaign.py"
     # Networks take several times as long.
-    words = ["--kills", "2", "--jobs", "2", "--only", "qlearning on Warehouse-v0"]
+    words = ["--kills", "1", "--jobs", "1", "--only", "qlearning on Warehouse-v0"]
     paths = os.pathsep.join([str(ROOT), str(script.parent)])
     result = subprocess.run(
         [sys.executable, str(script), *words],
@@ -168,7 +168,7 @@ def test_killed_commands_end_as_they_would_have(tmp_path):
     *_, total, _ = result.stdout.splitlines()
     cells = [cell.strip() for cell in total.split("│")[1:-1]]
     assert cells[0] == "all"
-    assert int(cells[2]) >= 2  # signals that were sent
+    assert int(cells[2]) >= 1  # signals that were sent
     assert int(cells[7]) >= 1  # commands that came to their end
     assert cells[8:] == ["0"] * 6
 

@@ -19,7 +19,6 @@ from experiments.study import (
     EnvironmentSpec,
     QuickSpec,
     StudySpec,
-    file_name,
     find_study,
     layered,
     read_study,
@@ -27,7 +26,6 @@ from experiments.study import (
 )
 from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
-from pipeline.files import portable_name
 from pipeline.runs import FAILED, FINISHED
 from pipeline.train_spec import TrainSpec
 from report.words import seed_sentence
@@ -199,14 +197,6 @@ def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
 
 
 # --- Names and files.
-
-
-@given(st.text() | st.text(min_size=99, max_size=300) | st.sampled_from(["CON", "nul.x", "a."]))
-def test_a_label_makes_a_plain_file_name(label):
-    name = file_name(label)
-    assert name == file_name(name) == portable_name(name)
-    assert re.fullmatch(r"[\w.=+,-]+", name)
-    assert name not in (".", "..")
 
 
 def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
