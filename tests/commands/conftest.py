@@ -1,5 +1,6 @@
 import os
 import sys
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import train
 import tune
 from commands import main, share
 from commands.cli import run_command
+from experiments import launching
+from pipeline.errors import UserError
 from pipeline.signs_of_life import Silence
 
 MAINS = {
@@ -73,3 +76,27 @@ def type_study(own_folder, monkeypatch, capfd):
         return stop.value.code, captured.out, captured.err
 
     return run
+
+
+@pytest.fixture
+def power_cut(monkeypatch):
+    """Within the ``with`` statement the second batch of runs ends after the first of them."""
+    do_runs = launching.execute
+
+    @contextmanager
+    def cut():
+        calls = []
+
+        def stopped(runs, *args):
+            calls.append(len(runs))
+            if len(calls) == 2:
+                do_runs(runs[:1], *args)
+                raise UserError("the power is gone")
+            return do_runs(runs, *args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(launching, "execute", stopped)
+            yield
+        assert len(calls) == 2
+
+    return cut

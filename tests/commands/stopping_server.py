@@ -11,18 +11,18 @@ import signal
 import sys
 import time
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 
 def do(words, plan, ignored=()):
-    """Run ``train.py`` in this process, which sends itself signals.
+    """Run a command in this process, which sends itself signals.
 
     Args:
-        words: the arguments.
+        words: the command's name, and its arguments.
         plan: for each moment that is to be hit the signals to send then, by name.
         ignored: names of signals that are ignored from outside.
     """
-    import train
     from commands.cli import run_command
     from pipeline import stopping
 
@@ -34,14 +34,15 @@ def do(words, plan, ignored=()):
     for moment, (owner, name, condition) in moments().items():
         if moment in plan:
             signalling(owner, name, condition, list(plan[moment]))
-    sys.argv = ["train.py", *words]
-    run_command(train.main)
+    sys.argv = words
+    run_command(import_module(words[0].removesuffix(".py")).main)
 
 
 def moments():
     """What is called at each moment: its owner, its name, and on which of the calls."""
     from agents.compiled import engine
     from commands import terminal
+    from experiments.off_policy import policy_files
     from pipeline import callbacks, files, preparation, training
     from pipeline.runs import Run
     from pipeline.state_saver import StateSaver
@@ -58,6 +59,7 @@ def moments():
         "judging": (training, "_judge", always),
         "drawing": (training, "draw_learning_curve", always),
         "recording": (Run, "end", always),
+        "reading a log": (policy_files, "read_logged", always),
         "closing": (training, "close_environments", always),
     }
 

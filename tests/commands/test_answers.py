@@ -2,18 +2,14 @@
 
 import json
 import os
-import runpy
 import shlex
 import subprocess
 import sys
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from commands import main as yardstick
 from commands.cli import as_called, called_as, run_command
 
 ROOT = Path(__file__).parents[2]
@@ -43,30 +39,22 @@ RUN = "qlearning on FrozenLake-v1, seed 0, 500 steps"
 STUDY = "qlearning, sarsa on FrozenLake-v1"
 SEARCH = "qlearning on FrozenLake-v1: a search for settings"
 PLAIN = "optimal on CliffWalking-v1, seed 0, 10 steps"
-CARTS = "ppo on CartPole-v1, seed 0, 500 steps"
 # Which words refuse what is recorded in ``tests/golden``; here, that it is said before anything.
 MISTAKES = [
     ("train.py --algo qlerning", "unknown agent 'qlerning': did you mean 'qlearning'?"),
-    (f"{QUICK} -params n_episodes:5", "not both"),
     (f"{QUICK} --conf-file broken.yml", "broken.yml:3:9: "),
     (f"{QUICK} --env Warehouse-v0 --env-kwargs desc:map.txt", "letter 'x' at row 2, column 2"),
-    (f"{QUICK} -i nowhere.zip", "no such model file: nowhere.zip"),
     ("train.py --algo qlearning --env MountainCarContinuous-v0",
      "fitting agents: ppo, a2c, sac, td3, ddpg, tqc, crossq, trpo, ars, ppo_lstm, random"),
-    ("train.py -optimize --n-trials 100", "by the command tune: see tune --help"),
 
     ("enjoy.py --algo dqn --env CartPole-v1",
      "train one with: python train.py --algo dqn --env CartPole-v1"),
     ("enjoy.py map.txt --trust", "unknown argument --trust: it is not needed"),
 
-    ("compare.py bad.yml --env Taxi-v4", "not both"),
     ("compare.py --env Taxi-v4 --algos dqn dqn", "--algos names one of them"),
     ("compare.py --env MountainCarContinuous-v0 --algos sarsa", "does not fit"),
-    (f"{PAIR} --metric finl", "did you mean 'final'?"),
-    (f"{PAIR} --gym-packages no_such", "cannot import no_such"),
     (f"{PAIR} --conf-file a.yml",
      "--conf-file a.yml: whose hyperparameters? a file has those of"),
-    (f"{PAIR} --conf-file sarsa:a.yml sarsa:a.yml", "--conf-file names two files for sarsa"),
     (f"{PAIR} --conf-file dqn:a.yml", "(qlearning, sarsa): qlearning:dqn:a.yml"),
     ("compare.py grows.yml --until-decided --replace",
      "--until-decided and --replace do not go together"),
@@ -74,15 +62,12 @@ MISTAKES = [
 
     (f"{TUNE} --first-seed 998", "seed 1000 is one of the search and of the re-test"),
     (f"{TUNE} --storage redis://u:secret@h", "--storage: 'redis://u:***@h' is no"),
-    (f"{TUNE} -n 9 --n-episodes 9", "give -n or --n-episodes, not both"),
-    (f"{TUNE} --n-evaluations 3", "--eval-freq"),
 ]  # fmt: skip
 # What only the libraries can tell comes after the line that is printed before they are loaded.
 LATE = [
     (f"{QUICK} -params learning_rat:0.1", RUN, "did you mean 'learning_rate'?"),
     (f"{QUICK} -tb /dev/null/logs", RUN, "Not a directory: /dev/null/logs"),
     (f"{QUICK} -params engine:compiled --vec-env subproc", RUN, "is not DummyVecEnv"),
-    (f"{QUICK} --algo ppo --env CartPole-v1 -params n_steps:1 n_envs:1", CARTS, "n_steps"),
     (f"{PAIR} -params gama:0.9", STUDY, "did you mean 'gamma'?"),
     (f"{QUICK} -f taken", RUN, "cannot make a run folder in taken/qlearning"),
     (f"{TUNE} --search-space odd.yml", SEARCH, "'maxx_episode_steps': did you mean"),
@@ -185,27 +170,6 @@ def test_mistakes_name_the_installed_command(type_command, tmp_path, words, said
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"yardstick{said}")
     assert type_command("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
-
-
-@pytest.mark.parametrize("program", ["train.py", "yardstick compare"])
-def test_ctrl_c_while_the_command_itself_is_imported(monkeypatch, capsys, program):
-    """Which takes a tenth of a second, in which a traceback would be all that there is to say."""
-    wanted = program.removesuffix(".py").split()[-1]
-
-    def find_spec(name, path=None, target=None):
-        if name == f"commands.{wanted}":
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(sys, "argv", program.split())
-    monkeypatch.setattr(sys, "meta_path", [SimpleNamespace(find_spec=find_spec), *sys.meta_path])
-    monkeypatch.delitem(sys.modules, f"commands.{wanted}", raising=False)
-    script = partial(runpy.run_path, str(ROOT / program), run_name="__main__")
-    with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
-        (script if program.endswith(".py") else yardstick)()
-    assert getattr(stop.value, "code", None) == 130
-    # What is a script has nothing to say it with.
-    said = "yardstick compare: interrupted\n" if program.startswith("yardstick") else ""
-    assert capsys.readouterr().err == said
 
 
 def test_ctrl_c_while_the_last_word_is_being_said(monkeypatch):

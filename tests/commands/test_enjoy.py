@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from rich.text import Text
 
 import train
 from commands import enjoy
@@ -94,7 +95,6 @@ RUN = "logs/random/FrozenLake-v1_1"
         ([*LAKE, "--load-last-checkpoint"], 80),
         ([*LAKE, "--load-best"], 40),  # a checkpoint in its place
         ([RUN], 100),
-        ([f"{RUN}/FrozenLake-v1"], 100),
         ([f"{RUN}/rl_model_40_steps.zip"], 40),
     ],
 )
@@ -115,8 +115,6 @@ REFUSED = [
     ("--n-envs 2 --render ansi", "--render ansi shows one environment"),
     ("--n-envs 2 --record film.gif", "--record shows one environment"),
     ("--fps 3 --render none", "--fps is the pace of --render ansi: give that too"),
-    ("--fps 61 --render ansi", "--fps: must be"),
-    ("--exp-id -1", "holds no FrozenLake-v1.zip"),
     ("--vec-normalize x.pkl", "no such file of statistics: x.pkl"),
     ("--norm-reward", "--norm-reward: no statistics of VecNormalize belong to this model"),
     ("--load-best", "holds no best_model.zip: its training may not have ended"),
@@ -140,17 +138,6 @@ def test_one_line_for_what_is_not_there_or_not_done(type_command, lake, tmp_path
     assert not (tmp_path / "logs" / "sarsa").exists()
 
 
-def test_without_checkpoints_none_is_played(type_command, lake):
-    for path in lake.glob("rl_model_*"):
-        path.unlink()
-    for words, complaint in (
-        (["--load-checkpoint", "7"], "holds no rl_model_7_steps.zip: its training may not have"),
-        (["--load-last-checkpoint"], "holds no checkpoint: train with --save-freq"),
-    ):
-        code, _, err = type_command("enjoy.py", *LAKE, *words)
-        assert (code, err.count("\n"), complaint in err) == (2, 1, True)
-
-
 # --- films ------------------------------------------------------------------------------------
 
 
@@ -171,9 +158,8 @@ def test_letters_and_films_of_each_step(type_command, tmp_path):
     assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
 
 
-@pytest.mark.parametrize("suffix", ["gif", "mp4"])
-def test_a_film_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, small_disk, suffix):
-    film = tmp_path / f"film.{suffix}"
+def test_a_film_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, small_disk):
+    film = tmp_path / "film.mp4"
     film.write_bytes(b"an earlier one")
     with small_disk(20), pytest.raises(OSError, match=r"too large|no whole film"):
         write_film(film, [np.zeros((8, 8, 3), np.uint8)])
@@ -215,22 +201,12 @@ REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty
 ICE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 
 
-def trained_on_ice(folder, n_steps):
-    """An agent that was trained for so many steps on ice that is not slippery."""
-    train_in(folder, *ICE, "-n", n_steps, "--env-kwargs", "is_slippery:False")
-    return choose_model(ModelRequest(algo=ICE[1], env_id=ICE[3], log_folder=folder / "logs"))
-
-
 @pytest.fixture(scope="module")
 def walker(tmp_path_factory):
-    """An agent that walks straight to the goal."""
-    return trained_on_ice(tmp_path_factory.mktemp("ice"), "3000")
-
-
-@pytest.fixture(scope="module")
-def wall(tmp_path_factory):
-    """An agent that has learnt nothing, and walks against the wall until the time limit."""
-    return trained_on_ice(tmp_path_factory.mktemp("ice"), "1")
+    """An agent that walks straight to the goal, on ice that is not slippery."""
+    folder = tmp_path_factory.mktemp("ice")
+    train_in(folder, *ICE, "-n", "3000", "--env-kwargs", "is_slippery:False")
+    return choose_model(ModelRequest(algo=ICE[1], env_id=ICE[3], log_folder=folder / "logs"))
 
 
 @pytest.fixture
@@ -242,19 +218,13 @@ def pauses(monkeypatch):
     return waited
 
 
-def letters(*words):
-    return build_parser().parse_args(["--render", "ansi", *map(str, words)])
-
-
 def played(chosen, *words, width=100):
     console = TextConsole(file=io.StringIO(), force_terminal=True, width=width, height=40)
-    play(console, chosen, letters(*words))
+    play(console, chosen, build_parser().parse_args(["--render", "ansi", *map(str, words)]))
     return console.file.getvalue()
 
 
 def without_style(text):
-    from rich.text import Text
-
     return Text.from_ansi(text).plain
 
 

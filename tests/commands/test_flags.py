@@ -1,26 +1,19 @@
 """From flags to specifications: what values mean, what is refused, and the flags of rl_zoo3."""
 
-import argparse
 import ast
 import inspect
 import re
-from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from agents import ALGORITHMS, load_algorithm
 from commands import compare, enjoy, train, tune
 from commands.cli import (
     INSTEAD,
     SET_BY_FLAGS,
-    folder_name,
     hint,
-    number_at_least_zero,
-    whole_number,
 )
 from commands.compare import study_spec
 from commands.enjoy import model_request
@@ -103,25 +96,6 @@ def test_flags_of_compare_reach_the_study(tmp_path):
         assert {one.agent for one in planned if training_changes(one.spec)} == changed
 
 
-NO_PAGES = {
-    "page.pdf": r"writes a \.html file, not 'page\.pdf'",
-    "no/page.html": "there is no folder no",
-    "/proc/page.html": "nothing can be written in /proc: No such file",
-    "folder.html": r"folder\.html is a folder",
-}
-
-
-def test_the_page_that_plays_a_training(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder.html").mkdir()
-    for more, n_episodes in (((), 0), (("--watch-episodes", "3"), 3)):
-        spec = trained(*SHORT, "--watch-learning", "page.html", *more)
-        assert (spec.watch_learning, spec.watch_episodes) == (Path("page.html"), n_episodes)
-    for name, complaint in NO_PAGES.items():
-        with pytest.raises(UserError, match=complaint):
-            trained(*SHORT, "--watch-learning", name)
-
-
 # --- every flag with every odd value: it has a meaning, or it is refused in one line -----------
 
 ODD = ("0", "-1", "-5", "7", "1e5", "100_000", "9" * 30, "1e999999999", "-1e999999999", "\u0663")
@@ -134,25 +108,21 @@ BASES = {
 REQUESTS = {train: train_spec, enjoy: model_request, compare: study_spec}
 
 
-def parsers():
-    return {module: module.build_parser() for module in BASES}
-
-
 # But for --gym-packages, whose modules are imported for good.
 FLAGS = [
     (module, action.option_strings[-1])
-    for module, parser in parsers().items()
-    for action in parser._actions
+    for module in BASES
+    for action in module.build_parser()._actions
     if action.option_strings and action.nargs != 0 and action.dest != "gym_packages"
 ]
 
 
 @pytest.mark.parametrize(("module", "flag"), FLAGS)
 def test_an_odd_value_has_a_meaning_or_is_refused_in_one_line(module, flag, capsys):
+    base = BASES[module]
+    if flag == "--n-episodes" and module is not enjoy:
+        base = base[:-2]
     for value in ODD:
-        base = BASES[module]
-        if flag == "--n-episodes" and module is not enjoy:
-            base = base[:-2]
         refusal = ""
         try:
             REQUESTS[module](module.build_parser().parse_args([*base, f"{flag}={value}"]))
@@ -191,40 +161,39 @@ def test_what_a_value_means(module, flag, taken, refused, capsys):
     parser = module.build_parser()
     (name,) = (a.dest for a in parser._actions if flag in a.option_strings)
     for text, value in taken.items():
-        assert getattr(parser.parse_args([f"{flag}={text}"]), name) == value
-        if not text.startswith("-"):
-            assert getattr(parser.parse_args([flag, text]), name) == value
+        for words in ([f"{flag}={text}"], *([] if text.startswith("-") else [[flag, text]])):
+            assert getattr(parser.parse_args(words), name) == value
     for text in refused.split():
         with pytest.raises(SystemExit):
             parser.parse_args([f"{flag}={text}"])
         assert f"not {text!r}" in capsys.readouterr().err
 
 
-@given(st.text() | st.floats().map(str) | st.integers().map(str))
-def test_any_other_text_is_refused(text):
-    for read in (whole_number(1, 100, {-1: "none"}), number_at_least_zero, folder_name):
-        with suppress(argparse.ArgumentTypeError):
-            value = read(text)
-            assert value == text if read is folder_name else float(text) == value
-            assert not isinstance(value, int) or value == -1 or 1 <= value <= 100
-
-
 # --- which engine: what --engine makes of trainings, studies and searches ------------------------
 
 
-@pytest.mark.parametrize(
-    ("words", "engine"),
-    [
-        ("ppo", None),
-        ("ppo --engine auto -params engine:auto gamma:0.9", "auto"),
-        ("double_dqn --engine compiled", "compiled"),
-        ("qlearning --engine interpreted", "interpreted"),
-        ("optimal --engine auto -n 10", None),
-        ("qrdqn --engine library -n 10", None),
-    ],
-)
-def test_an_engine_is_a_setting_where_there_is_a_choice(words, engine):
-    assert trained("--algo", *words.split()).hyperparams.algorithm.get("engine") == engine
+ENGINES = [
+    ("ppo", None),
+    ("ppo --engine auto -params engine:auto gamma:0.9", "auto"),
+    ("double_dqn --engine compiled", "compiled"),
+    ("qlearning --engine interpreted", "interpreted"),
+    ("optimal --engine auto -n 10", None),
+    ("qrdqn --engine library -n 10", None),
+]
+
+
+def test_an_engine_is_a_setting_where_there_is_a_choice(tmp_path):
+    for words, engine in ENGINES:
+        found = trained("--algo", *words.split()).hyperparams.algorithm.get("engine")
+        assert found == engine, words
+    words = ["--algos", "qlearning", "ppo", "optimal", "--engine", "auto", "-n", "9"]
+    planned = plan(compared(*LAKE, *words), tmp_path)
+    engines = {run.agent: run.spec.hyperparams.algorithm.get("engine") for run in planned}
+    assert engines == {"qlearning": "auto", "ppo": "auto", "optimal": None}
+    headline = "studies/library-vs-hand-rolled.yml"
+    for words, expected in (((), {"auto", None}), (("--engine", "compiled"), {"compiled"})):
+        agents = compared(headline, *words).agents
+        assert {agent.settings.get("engine") for agent in agents} == expected
 
 
 REFUSED = [
@@ -250,25 +219,12 @@ def test_what_is_refused_by_every_command(algo, words, complaint):
             ask()
 
 
-def test_compare_reaches_every_agent_and_a_study_file_too(tmp_path):
-    words = ["--algos", "qlearning", "ppo", "optimal", "--engine", "auto", "-n", "9"]
-    planned = plan(compared(*LAKE, *words), tmp_path)
-    engines = {run.agent: run.spec.hyperparams.algorithm.get("engine") for run in planned}
-    assert engines == {"qlearning": "auto", "ppo": "auto", "optimal": None}
-    headline = "studies/library-vs-hand-rolled.yml"
-    for words, expected in (((), {"auto", None}), (("--engine", "compiled"), {"compiled"})):
-        agents = compared(headline, *words).agents
-        assert {agent.settings.get("engine") for agent in agents} == expected
-
-
 @pytest.mark.parametrize(
     ("words", "search", "retest"),
     [
         ("ppo", "auto", None),
-        ("ppo --engine library", "library", "library"),
         ("ppo -params engine:compiled", "compiled", "compiled"),
         ("double_dqn", None, None),
-        ("qlearning", None, None),
     ],
 )
 def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(
@@ -296,37 +252,32 @@ def answer(module, words, capsys):
     return err
 
 
-@pytest.mark.parametrize(
-    ("module", "words", "meant"),
-    [
-        (TRAIN, "--lr 0.1", "behind -params: -params learning_rate:0.1 "),
-        (TRAIN, "--learning-rate 0.1 --algo qlearning", "-params learning_rate:0.1 "),
-        (TRAIN, "--gamma --seed 3", "-params gamma:VALUE "),
-        (TRAIN, "--alpha 0.1 --algo qlearning", "-params learning_rate:0.1 "),
-        (TRAIN, "--alpha 0.1 --algo linucb", "-params alpha:0.1 "),
-        (TRAIN, "--epsilon 0.1 --algo dqn", "-params exploration_final_eps:0.1 "),
-        (TRAIN, "--n-steps 128", "-params n_steps:128 "),
-        (TRAIN, "--n-steps 128 --algo qlearning", "did you mean '--n-timesteps'?"),
-        (TRAIN, "--net-arch [64]", '-params policy_kwargs:"dict(net_arch=[64, 64])" '),
-        (TRAIN, "--timesteps 5", "did you mean '--n-timesteps'?"),
-        (TRAIN, "--num_threads 2", "did you mean '--num-threads'?"),
-        (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
-        (TRAIN, "--wandb-entity=me", "-tb DIR writes TensorBoard logs"),
-        (TRAIN, "a\nb", "unknown argument "),
-        (ENJOY, "--log-folder x", "did you mean '--folder'?"),
-        (ENJOY, "--video x.gif", "did you mean '--record'?"),
-        (ENJOY, "--gamma 0.9", "a matter of training: train with -params gamma:VALUE "),
-        (COMPARE, "--seed 3", "did you mean '--seeds'?"),
-        (COMPARE, "--gamma 0.9 --algos dqn --env x", "-params gamma:VALUE "),
-        (COMPARE, "x.yml --gamma 0.9", "-params gamma:0.9 "),
-        (COMPARE, "--see 3", "unknown argument --see"),  # no abbreviation is taken
-    ],
-)
-def test_what_was_meant(module, words, meant, capsys):
-    assert meant in answer(module, words, capsys)
+MEANT = [
+    (TRAIN, "--lr 0.1", "behind -params: -params learning_rate:0.1 "),
+    (TRAIN, "--gamma --seed 3", "-params gamma:VALUE "),
+    (TRAIN, "--alpha 0.1 --algo qlearning", "-params learning_rate:0.1 "),
+    (TRAIN, "--alpha 0.1 --algo linucb", "-params alpha:0.1 "),
+    (TRAIN, "--epsilon 0.1 --algo dqn", "-params exploration_final_eps:0.1 "),
+    (TRAIN, "--n-steps 128", "-params n_steps:128 "),
+    (TRAIN, "--n-steps 128 --algo qlearning", "did you mean '--n-timesteps'?"),
+    (TRAIN, "--net-arch [64]", '-params policy_kwargs:"dict(net_arch=[64, 64])" '),
+    (TRAIN, "--num_threads 2", "did you mean '--num-threads'?"),
+    (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
+    (TRAIN, "--wandb-entity=me", "-tb DIR writes TensorBoard logs"),
+    (TRAIN, "a\nb", "unknown argument "),
+    (ENJOY, "--log-folder x", "did you mean '--folder'?"),
+    (ENJOY, "--gamma 0.9", "a matter of training: train with -params gamma:VALUE "),
+    (COMPARE, "--seed 3", "did you mean '--seeds'?"),
+    (COMPARE, "--gamma 0.9 --algos dqn --env x", "-params gamma:VALUE "),
+    (COMPARE, "x.yml --gamma 0.9", "-params gamma:0.9 "),
+    (COMPARE, "--see 3", "unknown argument --see"),  # no abbreviation is taken
+]
 
 
-def test_a_hyperparameter_of_another_agent_is_not_offered(capsys):
+def test_what_was_meant(capsys):
+    for module, words, meant in MEANT:
+        assert meant in answer(module, words, capsys)
+    # A hyperparameter of another agent is not offered.
     assert "-params" not in answer(TRAIN, "--batch-size 4 --algo qlearning", capsys)
 
 
@@ -335,16 +286,13 @@ def hyperparameters():
     return {p for algo in installed for p in inspect.signature(load_algorithm(algo)).parameters}
 
 
-def test_all_hyperparameters_are_known_by_name():
+def test_all_hyperparameters_are_known_by_name_and_other_names_lead_to_them():
     missed = {
         name
         for name in hyperparameters() - SET_BY_FLAGS
         if f"-params {name}:" not in hint([f"--{name}"], ["--hyperparams"], [])
     }
     assert missed == set()
-
-
-def test_other_names_lead_to_names_that_exist():
     meant = {name for names in OTHER_NAMES.values() for name in names}
     assert meant - hyperparameters() == {"n_timesteps", "n_episodes", "n_envs"}
     assert did_you_mean("ALPHA", ["alphas", "learning_rate"]) == "did you mean 'learning_rate'?"
@@ -361,40 +309,24 @@ ALLOWED = {
     "--verbose": "0",
     "--progress": None,
 }
-OTHERS = {
-    "--engine": "auto",
-    "--eval-freq": "5",
-    "--eval-episodes": "5",
-    "--hyperparams": "gamma:0.9",
-    "--env-kwargs": "a:1",
-    "--eval-env-kwargs": "a:1",
-    "--conf-file": "some.yml",
-    "--trained-agent": "some.zip",
-    "--tensorboard-log": "logs",
-}
-
-
-def flags():
-    """All flags, each with a value where it takes one: where it can be, what it is by default."""
-    for action in train.build_parser()._actions:
-        flag = action.option_strings[-1]
-        if flag not in ("--help", "--list", "--resume"):
-            value = ALLOWED.get(flag, OTHERS.get(flag, str(action.default)))
-            yield flag, None if action.nargs == 0 else value
+OTHERS = {"--engine": "auto", "--hyperparams": "gamma:0.9", "--eval-freq": "5"}
+OTHERS |= {"--eval-episodes": "5", "--env-kwargs": "a:1", "--eval-env-kwargs": "a:1"}
 
 
 def test_every_flag_beside_resume(type_in_own_folder, own_folder):
     (own_folder / "run").mkdir()
-    for flag, value in flags():
-        words = [flag] if value is None else [flag, value]
+    for action in train.build_parser()._actions:
+        flag = action.option_strings[-1]
+        if flag in ("--help", "--list", "--resume"):
+            continue
+        value = ALLOWED.get(flag, OTHERS.get(flag, str(action.default)))
+        words = [flag] if action.nargs == 0 else [flag, value]
         code, _, said = type_in_own_folder("train.py", "--resume", "run", *words)
         assert (code, said.count("\n")) == (2, 1)
         refusal = f"{flag} cannot be given with --resume: the run has its own"
         assert (refusal in said) == (flag not in ALLOWED), said
     assert not list((own_folder / "run").iterdir())
-
-
-def test_which_run_is_said_by_its_folder_or_by_its_agent_and_environment(type_in_own_folder):
+    # Which run is said by its folder, or by its agent and environment.
     code, _, said = type_in_own_folder("train.py", "--algo", "ppo", "--resume")
     assert (code, said.count("\n")) == (2, 1)
     assert "no run of ppo on CartPole-v1 in logs was interrupted" in said

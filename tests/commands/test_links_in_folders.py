@@ -23,14 +23,8 @@ from pipeline.train_spec import TrainSpec
 from pipeline.unfinished_runs import SaveInterval, StateKeeping
 from safe_files.files import UnsafeFileError, hold, read_file
 
-COMMANDS = {
-    "train": train.main,
-    "enjoy": enjoy.main,
-    "compare": compare.main,
-    "tune": tune.main,
-    "inspect": share.inspect,
-    "pack": share.pack,
-}
+MAINS = {each.__name__: each.main for each in (train, enjoy, compare, tune)}
+MAINS |= {"inspect": share.inspect, "pack": share.pack}
 SECRET = b"GIF89a the key to everything"
 LAKE, CART, ARMS = "FrozenLake-v1", "CartPole-v1", "BernoulliBandit-v0"
 SMALL = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
@@ -89,7 +83,7 @@ def type_command(tmp_path, monkeypatch, capfd):
         signal.alarm(250)  # seconds: a busy machine is slow, and a pipe waits for ever
         try:
             with pytest.raises(SystemExit) as stop:
-                run_command(COMMANDS[command])
+                run_command(MAINS[command])
         finally:
             signal.alarm(0)
         out, err = capfd.readouterr()
@@ -181,7 +175,7 @@ def interrupted(genuine, folder, has_state):
 # --- runs ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", AGENTS)
+@pytest.mark.parametrize("kind", ["network", "bandit"])
 def test_a_finished_run(runs, outside, type_command, kind):
     genuine, (algo, env_id, _) = runs[kind].path, AGENTS[kind]
     own = Path.cwd()
@@ -205,9 +199,7 @@ def test_a_finished_run(runs, outside, type_command, kind):
     attack(genuine, names, outside, copy, act)
 
 
-@pytest.mark.parametrize(
-    ("kind", "has_state"), [("table", True), ("network", True), ("table", False)]
-)
+@pytest.mark.parametrize(("kind", "has_state"), [("network", True), ("table", False)])
 def test_an_interrupted_run(runs, outside, type_command, kind, has_state):
     genuine = runs[kind].path
     folder = Path.cwd() / "begun" / genuine.parent.name / genuine.name
@@ -219,7 +211,7 @@ def test_an_interrupted_run(runs, outside, type_command, kind, has_state):
         assert code == 2, told
         check_untold(said, Path.cwd())
 
-    attack(folder, names_in(folder, OPTIONAL), outside, copy, act, n_each=6)
+    attack(folder, names_in(folder, OPTIONAL), outside, copy, act, n_each=3)
 
 
 def test_another_name_of_what_is_appended_to_keeps_what_it_holds(runs, outside, type_command):
@@ -249,22 +241,6 @@ def test_a_run_of_a_stranger_is_begun_again_and_writes_over_no_page(runs, type_c
     assert "is there already and stays" in said
     assert (outside / "key").read_bytes() == SECRET
     assert events.read_bytes() == b"mine"
-
-
-def test_a_run_of_rl_zoo3(runs, outside, type_command):
-    genuine, without = Path.cwd() / "zoo", shutil.ignore_patterns("run.json", "state")
-    shutil.copytree(runs["network"].path, genuine, ignore=without)
-    copy = Path.cwd() / "ppo" / "CartPole-v1_1"
-
-    def act(told):
-        play = ("--render", "none", "--n-episodes", "1")
-        said = type_command("enjoy", copy, *play)
-        more = type_command("enjoy", "--algo", "ppo", "--env", CART, "-f", Path.cwd(), *play)
-        check_untold(said[1] + more[1], Path.cwd())
-
-    names = [f"{CART}.zip", CART, f"{CART}/config.yml", f"{CART}/args.yml"]
-    names += [f"{CART}/vecnormalize.pkl", "vec_normalize.pkl", "config.yml", "args.yml"]
-    attack(genuine, names, outside, copy, act)
 
 
 def test_what_is_packed_is_what_the_record_names(runs, outside, type_command):
@@ -312,20 +288,6 @@ def test_a_search(outside, type_command):
         check_untold(said, Path.cwd())
 
     attack(root / "whole", TUNING_NAMES, outside, root / "copy", act)
-
-
-def test_a_pack(runs, outside, type_command):
-    genuine = Path.cwd() / "genuine"
-    assert type_command("pack", runs["network"].path, genuine)[0] == 0
-    copy = Path.cwd() / "copy"
-
-    def act(told):
-        code, said = type_command("pack", "--check", copy)
-        assert code == 2, told
-        said += type_command("enjoy", copy, "--render", "none", "--n-episodes", "1")[1]
-        check_untold(said, Path.cwd())
-
-    attack(genuine, names_in(genuine), outside, copy, act)
 
 
 # --- the door itself -----------------------------------------------------------------------------

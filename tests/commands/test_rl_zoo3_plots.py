@@ -19,19 +19,12 @@ ROOT = Path(compare.__file__).parent
 ENV_ID = "FrozenLake-v1"
 LIBRARY = {
     "ppo": {"n_steps": 32, "batch_size": 32, "n_epochs": 1},
-    "a2c": {},
-    "dqn": {"learning_starts": 10, "buffer_size": 100},
     "qrdqn": {"learning_starts": 10, "buffer_size": 100},
-    "trpo": {"n_steps": 32, "batch_size": 32},
     "ppo_lstm": {"policy": "MlpLstmPolicy", "n_steps": 32, "batch_size": 32, "n_epochs": 1},
 }
 OFF_POLICY = {"learning_starts": 90, "buffer_size": 200, "policy_kwargs": {"net_arch": [8]}}
-NOISE = {"noise_type": "normal", "noise_std": 0.1}
 CONTINUOUS = {
-    "sac": {**OFF_POLICY, "use_sde": True},
-    "td3": {**OFF_POLICY, **NOISE, "train_freq": [1, "episode"]},
-    "ddpg": {**OFF_POLICY, **NOISE, "noise_type": "ornstein-uhlenbeck"},
-    "tqc": OFF_POLICY,
+    "td3": {**OFF_POLICY, "noise_type": "normal", "noise_std": 0.1, "train_freq": [1, "episode"]},
     "crossq": {**OFF_POLICY, "normalize": True},
     # All candidates' episodes are of 30 steps, so that its two runs are equally long.
     "ars": {"n_delta": 2},

@@ -1,7 +1,6 @@
 """What is said of runs, of their engines, and of how far a study is; lists; to the letter."""
 
 import io
-import json
 import sys
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -26,11 +25,7 @@ from commands.terminal import (
     study_line,
     training_line,
 )
-from commands.train import (
-    print_header,
-    print_outcome,
-    watch_command,
-)
+from commands.train import print_header, print_outcome
 from commands.tune import TuningProgress
 from experiments.launching import RunFailure
 from experiments.plan import plan
@@ -39,12 +34,10 @@ from machine_code import WorkTime
 from pipeline import signs_of_life
 from pipeline.evaluation.sampled import Evaluation, OtherReturns
 from pipeline.evaluation.yardstick import Yardstick
-from pipeline.model_card import card
 from pipeline.preparation import EngineOutlook
 from pipeline.runs import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import UserModule
 
 
 @pytest.fixture(autouse=True)
@@ -100,18 +93,10 @@ def test_a_run_in_words():
         "best random or constant policy -20.00, score 0.90"
     )
     pulls = SimpleNamespace(n_pulls=1500, regret=None, reward=0.25, n_matched=1200)
-    outcome = outcome_of(
-        state="interrupted",
-        engine="compiled",
-        pulls=pulls,
-        final=SAMPLED,
-        best_return=3.25,
-        best_timesteps=10_000,
-        best_episodes=5,
-        evaluation_steps=700,
-        taken=WorkTime(),
-        n_steps=1000,
-    )
+    known = {"state": "interrupted", "engine": "compiled", "pulls": pulls, "final": SAMPLED}
+    known |= {"best_return": 3.25, "best_timesteps": 10_000, "best_episodes": 5}
+    known |= {"evaluation_steps": 700, "taken": WorkTime(), "n_steps": 1000}
+    outcome = outcome_of(**known)
     assert printed(outcome, spec_of("else where")) == [
         "interrupted  1,000 steps in 0.0 s of processor time (1,000,000,000,000 steps/s)",
         "engine       compiled",
@@ -136,17 +121,6 @@ def test_exact_returns_beside_that_of_the_greedy_policy_in_words():
     assert f"beside   {learnt}; {discounted} (exact)" in printed(outcome, spec_of())
 
 
-def test_a_card_marks_an_upper_end_without_a_proof():
-    proven = Yardstick(-38.0, -498.0, -60.0)
-    spec = {"algo": "qlearning", "env_id": "Acrobot-v1", "seed": 0, "hyperparams": {}}
-    record = {"spec": spec, "n_timesteps": 9, "versions": {}, "env_name": "Acrobot-v1"}
-    for yardstick, words in ((proven, ""), (replace(proven, is_proven=False), ", not proven")):
-        final = replace(SAMPLED, yardstick=yardstick).summary()
-        text = card({**record, "final": final}, [])
-        assert f"| score (1: the bracket's upper end{words}, 0: best" in text
-        assert ("an upper end that is not proven" in text) is bool(words)
-
-
 HEADERS = [
     ("dqn", {"policy": "MlpPolicy"}, ["policy=MlpPolicy  n_timesteps=9"]),
     ("qlearning", {"learning_rate": "exp_0.3_0.05"},
@@ -162,19 +136,9 @@ HEADERS = [
 
 @pytest.mark.parametrize(("algo", "settings", "lines"), HEADERS)
 def test_what_is_about_to_be_trained_is_explained(algo, settings, lines):
-    for budget, told in (({"n_timesteps": 9}, "9 steps"), ({"n_episodes": 1500}, "1,500 episodes")):
-        console = console_of(1000)
-        print_header(console, replace(spec_of(**settings, **budget), algo=algo))
-        head, *found = console.file.getvalue().splitlines()
-        assert head == f"{algo} on Lake-v1, seed 7, {told}"
-        ((name, number),) = budget.items()
-        assert found == [line.replace("n_timesteps=9", f"{name}={number}") for line in lines]
-
-
-def test_the_command_to_watch_with_names_modules():
-    modules = (UserModule("one", "one"), UserModule("./my two.py", "two", "/x/my two.py"))
-    command = watch_command(replace(spec_of(), user_modules=modules), outcome_of().run)
-    assert command.endswith(" --env Lake-v1 --gym-packages one './my two.py'")
+    console = console_of(1000)
+    print_header(console, replace(spec_of(**settings, n_timesteps=9), algo=algo))
+    assert console.file.getvalue().splitlines() == [f"{algo} on Lake-v1, seed 7, 9 steps", *lines]
 
 
 # --- engines: how long a training will take, known to a factor of two ---------------------------
@@ -249,36 +213,6 @@ def test_the_line_about_engines(pace, monkeypatch):
     monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: False)
     start = "compiled, about 2 s of processor time and once about 9 s of compiling ("
     assert head(COMPILED)().startswith(start)
-
-
-MINE = """
-from stable_baselines3.common.callbacks import BaseCallback
-class Mine(BaseCallback):
-    def _on_step(self):
-        return True
-"""
-
-
-def test_a_run_says_and_records_what_it_trains_on(type_in_own_folder, own_folder):
-    (own_folder / "each_step.py").write_text(MINE)
-    lake = ["train.py", "--env", "FrozenLake-v1", "--seed", "0", "--eval-freq", "-1"]
-    words = ["--algo", "ppo", "-n", "64", "--engine", "auto", "-params", "n_steps:64", "n_envs:1"]
-    code, out, err = type_in_own_folder(*lake, *words, "batch_size:64")
-    assert (code, err) == (0, "")
-    (line,) = [line for line in out.splitlines() if line.startswith("engine  library (")]
-    assert line.endswith(TOO_SHORT)
-    record = json.loads((own_folder / "logs/ppo/FrozenLake-v1_1/run.json").read_text())
-    assert record["engine"] == f"library: {TOO_SHORT}"
-    assert record["spec"]["hyperparams"]["engine"] == "auto"
-    assert f"engine: library: {TOO_SHORT}" in card(record, [])
-    words = ["--algo", "qlearning", "-n", "100", "--gym-packages", "each_step"]
-    _, out, err = type_in_own_folder(*lake, *words, "-params", "callback:each_step.Mine")
-    assert err == ""
-    assert (
-        "engine  interpreted, about a hundred times slower or more: Mine must be asked after each "
-        "step; made a BlockCallback, it would be asked only when it acts "
-        "(docs/training.md#from-python)"
-    ) in out.splitlines()
 
 
 # --- how far a study is: in a terminal, and where the output goes elsewhere ----------------------

@@ -22,53 +22,6 @@ from commands.compare import study_spec
 pytestmark = pytest.mark.usefixtures("pictures")
 
 
-@pytest.fixture
-def lake(type_command):
-    words = ("--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "2000", "--seed", "3")
-    assert type_command("train.py", *words, "--verbose", "0") == (0, "", "")
-    return "logs/qlearning/FrozenLake-v1_1"
-
-
-def test_a_run_is_packed_and_played(type_command, lake, tmp_path):
-    for target in ("there", "there.zip", None):
-        code, out, err = type_command("pack", lake, *filter(None, [target]))
-        named = target or "qlearning-FrozenLake-v1-3"
-        assert (code, err) == (0, "")
-        first, second = out.splitlines()
-        assert first == f"pack  {named}"
-        assert second.endswith(f" {named}")
-        said = f"{named}: 8 files, each as it was packed\n"
-        assert type_command("pack", named, "--check") == (0, said, "")
-    (tmp_path / "logs").rename(tmp_path / "elsewhere")
-    play = ("--render", "none", "--n-episodes", "2")
-    code, out, err = type_command("enjoy.py", "qlearning-FrozenLake-v1-3", *play)
-    assert (code, err) == (0, "")
-    assert "(exact)" in out
-    # A zip is found without its suffix, and a folder before it.
-    folder = tmp_path / "there"
-    for place in (folder / "FrozenLake-v1.zip", "there"):
-        found = type_command("enjoy.py", "there", *play)[1]
-        assert found.startswith(f"qlearning on FrozenLake-v1: {place}\n")
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def test_mistakes_end_in_one_line(type_command, lake, tmp_path, monkeypatch):
-    type_command("pack", lake, "there.zip")
-    (tmp_path / "empty.zip").write_bytes(b"PK\x05\x06" + bytes(18))
-    monkeypatch.setitem(sys.modules, "pygame", None)  # a package that drawing needs
-    for words, complaint in [
-        (("pack", lake, "no/there"), "there is no folder no to write the pack in"),
-        (("pack", lake, lake), "is there already: name another place for the pack"),
-        (("pack", lake, "there", "--check"), "--check writes nothing: leave out there"),
-        (("pack", "empty.zip", "--check"), "empty.zip"),
-        (("pack", "there.zip", "other"), "there.zip is a file: name the folder of a run\n"),
-        (("enjoy.py", "there.zip", "--record", "a.gif"), "FrozenLake-v1: pygame is not installed"),
-    ]:
-        code, out, err = type_command(*words)
-        assert (code, err.count("\n"), out == "") == (2, 1, words[0] == "pack")
-        assert complaint in err
-
-
 CORRIDOR = """
 import gymnasium
 from my_cells import LENGTH

@@ -11,8 +11,6 @@ import pytest
 import yaml
 
 import train
-from experiments import launching
-from pipeline.errors import UserError
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
@@ -106,32 +104,20 @@ def test_a_saturated_search_ends_and_its_re_test_grows_until_decided(search, own
     assert "the looks were fixed before the first of them and cannot change" in err
 
 
-def test_a_growing_re_test_that_is_stopped_between_goes_on(search, own_folder, monkeypatch):
+def test_a_growing_re_test_that_is_stopped_between_goes_on(search, own_folder, power_cut):
     (own_folder / "near.yml").write_text(NEAR)
     (own_folder / "nearby.yml").write_text(NEARBY)
     words = [*UNTIL_DECIDED, "--trials", "3", "--retest-seeds", "8", "--n-episodes", "600"]
     words += ["--conf-file", "near.yml", "--search-space", "nearby.yml"]
-
-    def retested(name, code=0):
-        found = search(*words, "--name", name)
-        assert found[0] == code
-        return json.loads((FOLDER.parent / name / "tuning.json").read_text()) if not code else None
-
-    whole, do_runs, calls = retested("whole"), launching.execute, []
-
-    def stopped(runs, *args):
-        calls.append(len(runs))
-        if len(calls) == 2:
-            do_runs(runs[:1], *args)
-            raise UserError("the power is gone")
-        return do_runs(runs, *args)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(launching, "execute", stopped)
-        retested("parts", 2)
-    assert len(calls) == 2
+    assert search(*words, "--name", "whole")[0] == 0
+    with power_cut():
+        assert search(*words, "--name", "parts")[0] == 2
+    assert search(*words, "--name", "parts")[0] == 0
+    whole, parts = (
+        json.loads((FOLDER.parent / name / "tuning.json").read_text())
+        for name in ("whole", "parts")
+    )
     assert whole["held_out_seeds"] == [*range(1000, 1012)]
-    parts = retested("parts")
     assert parts["retest"] == whole["retest"]
     assert parts["retest"]["settings"][1]["verdict"] == "undecided"
 

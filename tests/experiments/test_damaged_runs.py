@@ -1,19 +1,15 @@
 """Runs whose files are damaged: left out with the reason, and done again when that is asked for."""
 
 import json
-import runpy
 import shutil
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-import compare
 from commands.compare import RunContext, repair, run_study
 from experiments.bandits import STATISTICS_FILE
 from experiments.child_processes import NO_LIMITS
@@ -21,8 +17,6 @@ from experiments.plan import plan
 from experiments.results import (
     read_episodes,
     read_results,
-    read_run,
-    read_value_maps,
 )
 from experiments.run_folders import draft_path, move_damaged_aside
 from experiments.run_in_child import do_run
@@ -160,45 +154,6 @@ def test_what_a_comparison_does_not_read_is_not_held_against_it(grid):
     assert read_results(other, plan(other, root), root).left_out == ()
 
 
-PULLS, STATISTICS, MAPS = (
-    ("pulls", PULLS_FILE),
-    ("batch", STATISTICS_FILE),
-    ("grid", "value_maps.npz"),
-)
-WRONG_ARRAYS = {
-    "no arms": (*PULLS, "arms", None),
-    "arms that there are not": (*PULLS, "arms", lambda arms: arms + 10),
-    "arms below 0": (*PULLS, "arms", lambda arms: -arms - 1),
-    "few rewards": (*PULLS, "rewards", lambda rewards: rewards[:, 1:]),
-    "little regret": (*STATISTICS, "regret", lambda regret: regret[1:]),
-    "few runs": (*STATISTICS, "total_reward", lambda total: total[1:]),
-    "actions that there are not": (*MAPS, "actions", lambda a: a * 0 + 4),  # of 0 to 3
-    "actions below 0": (*MAPS, "actions", lambda a: -a - 1),
-    "no values": (*MAPS, "values", lambda values: values * np.nan),
-}
-
-
-@pytest.mark.parametrize("what", WRONG_ARRAYS)
-def test_arrays_of_no_form_in_runs_without_digests(copied, what):
-    kind, name, array, change = WRONG_ARRAYS[what]
-    study, planned, _ = copied(kind)
-    forget_digests(planned[0])
-    path = planned[0].path / name
-    expected = read_run(study, planned[0])
-    with np.load(path) as file:
-        arrays = dict(file)
-    if kind == "grid":
-        found = read_value_maps(planned[0].run)
-        assert all(np.array_equal(found[key], arrays[key]) for key in found)
-    np.savez(path, **arrays)
-    assert repr(read_run(study, planned[0]).rows) == repr(expected.rows)  # there are NaN in it
-    changed = {} if change is None else {array: change(arrays[array])}
-    del arrays[array]
-    np.savez(path, **arrays, **changed)
-    with pytest.raises(DamagedFileError, match=f"{name} is damaged: "):
-        read_run(study, planned[0])
-
-
 # --- What the command does about it.
 
 
@@ -213,19 +168,6 @@ def compare_again(capsys):
     return again
 
 
-def test_without_repair_a_damaged_run_stays_as_it_is(grid, compare_again):
-    study, planned, root = grid
-    path = planned[1].run.evaluations_path
-    flip(path)
-    before = path.read_bytes()
-    code, out = compare_again(study, planned, root)
-    assert code == 1
-    assert f"left out: qlearning on grid, seed 1: {path} is not as the run left it\n" in out
-    assert "1 run is damaged and in no figure; --repair does such runs again" in out
-    assert "1 of 2 runs of qlearning is missing" in out
-    assert path.read_bytes() == before
-
-
 def test_repair_moves_aside_what_is_done_again(grid, compare_again, capsys):
     def figures():
         table = read_results(study, planned, root).summary
@@ -234,7 +176,14 @@ def test_repair_moves_aside_what_is_done_again(grid, compare_again, capsys):
     study, planned, root = grid
     whole = figures()
     flip(planned[1].run.evaluations_path)
-    before = planned[1].run.evaluations_path.read_bytes()
+    path = planned[1].run.evaluations_path
+    before = path.read_bytes()
+    # Without being asked to the command leaves it as it is.
+    code, out = compare_again(study, planned, root)
+    assert (code, path.read_bytes()) == (1, before)
+    assert f"left out: qlearning on grid, seed 1: {path} is not as the run left it\n" in out
+    assert "1 run is damaged and in no figure; --repair does such runs again" in out
+    assert "1 of 2 runs of qlearning is missing" in out
     repair(Console(width=400), study, planned)
     assert "its folder is grid_2.damaged-1 now" in capsys.readouterr().out
     aside = planned[1].path.with_name("grid_2.damaged-1")
@@ -248,21 +197,6 @@ def test_repair_moves_aside_what_is_done_again(grid, compare_again, capsys):
     flip(planned[1].run.evaluations_path)
     ((_, place),) = move_damaged_aside(study, planned)
     assert place.name == "grid_2.damaged-2"
-
-
-def test_a_sample_of_the_campaign(tmp_path):
-    campaign = runpy.run_path(str(Path(compare.__file__).parent / "benchmarks/damaged_files.py"))
-    total = Counter()
-    for study, planned in campaign["finished_runs"](tmp_path):
-        for forget in (lambda run: None, forget_digests):
-            forget(planned)
-            for ends in campaign["campaign"](study, planned, flips=8, stride=149).values():
-                if forget is forget_digests:
-                    assert not any(end.startswith(campaign["BROKEN"]) for end in ends)
-                else:
-                    total += ends
-    assert set(total) == {campaign["REFUSED"], campaign["RIGHT"]}
-    assert min(total.values()) > 20
 
 
 # --- The files of a run's figures, where they have not the form that a run gives them.

@@ -167,7 +167,7 @@ def test_estimates_hit_the_truth_and_intervals_cover_it_as_often_as_they_say():
     with gym.make("SegmentBandit-v0") as env:
         rates, shares = env.unwrapped.means, env.unwrapped.context_probabilities
     points, covered = [], []
-    for seed in range(500):
+    for seed in range(250):
         rng = np.random.default_rng(seed)
         contexts = rng.choice(2, size=1000, p=shares)
         arms = (uneven[contexts].cumsum(axis=1) < rng.random((1000, 1))).sum(axis=1)
@@ -177,13 +177,13 @@ def test_estimates_hit_the_truth_and_intervals_cover_it_as_often_as_they_say():
         intervals = [mean_reward(getattr(terms, name)) for name in ESTIMATORS]
         points.append([interval.point for interval in intervals])
         covered.append([interval.low <= TRUTH <= interval.high for interval in intervals])
-    error = np.std(points, axis=0) / np.sqrt(500)
+    error = np.std(points, axis=0) / np.sqrt(250)
     # The self-normalised one is biased, by order 1/n: it is held to the same tolerance here.
     assert (np.abs(np.mean(points, axis=0) - TRUTH) < 3.5 * error).all()
-    assert (error < 0.003).all()
-    # 95 % of 500 have a standard error of 1 %; clicks are rare, and so intervals a bit short.
-    assert (np.mean(covered, axis=0) > 0.91).all()
-    assert (np.mean(covered, axis=0) < 0.98).all()
+    assert (error < 0.004).all()
+    # 95 % of 250 have a standard error of 1.4 %; clicks are rare, and so intervals a bit short.
+    assert (np.mean(covered, axis=0) > 0.9).all()
+    assert (np.mean(covered, axis=0) < 0.985).all()
 
 
 def test_replay_of_a_uniform_log_is_the_self_normalised_estimate(tmp_path):

@@ -26,7 +26,7 @@ from experiments.launching import execute
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from pipeline.loaded_code import distributions, files_in_settings, recorded_code
+from pipeline.loaded_code import files_in_settings, recorded_code
 from pipeline.settings.hyperparams import split
 from pipeline.user_modules import UserModule, import_typed
 
@@ -161,24 +161,37 @@ def test_a_worker_that_has_imported_other_contents_for_an_earlier_study(
             shutil.rmtree(root)
 
 
-def test_a_worker_of_another_version_is_set_aside_and_the_others_go_on(tmp_path, scheduler):
-    path = stale_distribution(tmp_path / "path", "scipy", "1.16.0")
-    with worker(scheduler, tmp_path / "w1", path), worker(scheduler, tmp_path / "w2"):
-        _, said = done(scheduler, tmp_path / "study", runs_of(tmp_path / "study"))
-    assert len(said) == 1
-    assert f"scipy 1.16.0 instead of {version('scipy')}" in said[0]
-    assert f" on {os.uname().nodename}: scipy" in said[0]
-
-
-def test_a_worker_without_this_project_is_set_aside(tmp_path, scheduler):
-    (tmp_path / "other" / "experiments").mkdir(parents=True)
-    (tmp_path / "other" / "experiments" / "__init__.py").touch()
-    (tmp_path / "other" / "experiments" / "cluster.py").touch()
-    stale = worker(scheduler, tmp_path / "w1", tmp_path / "other", cwd=tmp_path / "other")
-    with stale, worker(scheduler, tmp_path / "w2"):
-        _, said = done(scheduler, tmp_path / "study", runs_of(tmp_path / "study"))
-    assert len(said) == 1
-    assert "experiments.cluster" in said[0]
+def test_unfit_workers_are_set_aside_until_a_fit_one_comes(tmp_path, scheduler, monkeypatch):
+    """Where nobody else is left the study ends; those who wait get the worker that comes."""
+    stale = stale_distribution(tmp_path / "path", "scipy", "1.16.0")
+    other = tmp_path / "other"
+    (other / "experiments").mkdir(parents=True)
+    (other / "experiments" / "__init__.py").touch()
+    (other / "experiments" / "cluster.py").touch()
+    root, said = tmp_path / "study", []
+    runs = runs_of(root)
+    root.mkdir()
+    there = SchedulerAddress(scheduler.scheduler_address)
+    with (
+        worker(scheduler, tmp_path / "w1", stale),
+        worker(scheduler, tmp_path / "w2", other, cwd=other),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(cluster_launcher, "SECONDS_WITHOUT_FIT_WORKERS", 2.0)  # two minutes
+            with pytest.raises(UserError, match=r"for 2 s no worker "):
+                done(scheduler, root, runs)
+        launchers = cluster_launcher.cluster_launcher(there, root, "c", tell=said.append)
+        with launchers as launcher:
+            futures = [launcher.submit(run) for run in runs]
+            time.sleep(1)
+            assert not any(future.done() for future in futures)
+            with worker(scheduler, tmp_path / "w3"):
+                assert [future.result(timeout=60) for future in futures] == [None, None]
+    said = [line for line in said if "no runs" in line]
+    assert len(said) == 2
+    told = f" on {os.uname().nodename}: scipy 1.16.0 instead of {version('scipy')}"
+    assert any(told in line for line in said)
+    assert any("experiments.cluster" in line for line in said)
 
 
 def test_an_installed_module_of_other_contents_is_not_used(tmp_path, scheduler, monkeypatch):
@@ -196,33 +209,6 @@ def test_an_installed_module_of_other_contents_is_not_used(tmp_path, scheduler, 
     assert found == [5.0, 5.0]
     assert len(said) <= 1  # it may have had no order
     assert all("the module five_found has other contents" in line for line in said)
-
-
-def test_a_study_ends_when_nobody_is_left(tmp_path, scheduler, monkeypatch):
-    monkeypatch.setattr(cluster_launcher, "SECONDS_WITHOUT_FIT_WORKERS", 2.0)  # two minutes
-    path = stale_distribution(tmp_path / "path", "sb3_contrib", "2.8.0")
-    with (
-        worker(scheduler, tmp_path / "w", path),
-        pytest.raises(UserError, match=r"for 2 s no worker .*sb3-contrib 2.8.0 instead of"),
-    ):
-        done(scheduler, tmp_path / "study", runs_of(tmp_path / "study"))
-
-
-def test_the_last_fit_worker_is_replaced_by_another(tmp_path, scheduler):
-    """While a worker is set aside, runs are sent to named workers, and again if these are gone."""
-    path = stale_distribution(tmp_path / "path", "scipy", "1.16.0")
-    runs, root = runs_of(tmp_path / "study"), tmp_path / "study"
-    root.mkdir()
-    there = SchedulerAddress(scheduler.scheduler_address)
-    with (
-        worker(scheduler, tmp_path / "w1", path),
-        cluster_launcher.cluster_launcher(there, root, "c") as launcher,
-    ):
-        futures = [launcher.submit(run) for run in runs]
-        time.sleep(1)
-        assert not any(future.done() for future in futures)
-        with worker(scheduler, tmp_path / "w2"):
-            assert [future.result(timeout=60) for future in futures] == [None, None]
 
 
 # --- A worker that is asked to end, as by a queue before it kills a job, leaves in good order.
@@ -260,22 +246,6 @@ def test_workers_that_are_asked_to_end_are_no_loss_however_many(tmp_path, schedu
 
 
 # --- What is compared.
-
-
-def test_what_runs_load_is_named_with_what_it_requires():
-    found = distributions()
-    needed = ("rl-yardstick", "numpy", "scipy", "torch", "gymnasium", "sb3-contrib", "llvmlite")
-    for name in (*needed, "cloudpickle", "farama-notifications", "mpmath", "pygame-ce"):
-        assert found[name] == version(name)
-    assert found.keys().isdisjoint({"pytest", "sphinx", "optuna", "distributed", "ruff"})
-
-
-def test_what_the_users_modules_import_is_loaded_too(tmp_path):
-    (tmp_path / "imports_more.py").write_text("import yaml, os, hypothesis\nfrom bs4 import x\n")
-    module = UserModule("m", "imports_more", str(tmp_path / "imports_more.py"))
-    named = recorded_code([module])["distributions"]
-    assert named.keys() - distributions().keys() >= {"hypothesis", "beautifulsoup4", "soupsieve"}
-    assert recorded_code([]) == {"distributions": distributions()}
 
 
 def test_differences_are_told_by_name():

@@ -16,12 +16,8 @@ from pathlib import Path
 
 from drawing import mutants_of
 
-# Two wait by the clock, which processor time does not tell; one ends pytest itself by a signal.
-LEFT_OUT = (
-    "test_what_a_killed_worker_has_saved_is_gone_on_with",
-    "test_a_limit_of_time_is_that_of_the_task_alone_and_a_stop_ends_all",
-    "test_a_signal_ends_it_as_every_command",
-)
+# It waits by the clock, which processor time does not tell.
+LEFT_OUT = ("test_what_a_killed_worker_has_saved_is_gone_on_with",)
 
 
 def weights(root: Path) -> Counter[str]:

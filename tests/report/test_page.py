@@ -17,7 +17,6 @@ from experiments.analysis import analyse
 from experiments.results import read_compared
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.digests import DamagedFileError
-from report.conclusions import conclusion
 from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
 from report.page import SECTIONS, render, result_sections, write_report
@@ -126,39 +125,26 @@ def test_sections_headings_and_descriptions(page):
     assert sorted_headings == ["descending"] * 2  # the ranking of each environment
 
 
-def test_verdicts_are_those_of_the_files_and_rankings_begin_with_the_best(page, report_study):
-    analysis = report_study.analysis
-    said = [conclusion(analysis.study, place).everything for place in analysis.environments]
-    expected = [sentence for one in said for sentence in one]
-    assert len(expected) >= 3
-    assert [sentence for sentence in expected if sentence not in page.sections["verdict"]] == []
+def test_rankings_begin_with_the_best_and_an_agent_has_the_colour_of_printed_figures(
+    page, report_study
+):
     rankings = [text for a, text in page.all("table") if a.get("class") == "sortable"]
-    for environment, table in zip(analysis.environments, rankings, strict=True):
+    for environment, table in zip(report_study.analysis.environments, rankings, strict=True):
         places = [table.index(agent.agent) for agent in environment.agents]
         assert places == sorted(places)
-    # An agent has the colour of the printed figures.
     printed = agent_marks(report_study.study)
     for mark in page.data("data-page")["agents"]:
         assert COLOURS[mark["colour"]] == line_style(printed[mark["label"]])["color"]
 
 
-def test_settings_command_versions_and_failures(page, report_study):
-    settings = page.sections["settings"]
-    info = report_study.planned[0].run.read_info()
-    for part in (
-        "python compare.py 'a & b.yml'",
-        "Seeds: 0 to 1.",
-        "Seeds 0 to 1: the shipped settings of",
-        "2,000",  # steps run
-        "gamma",
-        info["versions"]["numpy"],
-        info["machine"]["processor"],
-    ):
+def test_settings_say_how_it_was_done_and_what_failed_and_not_where(page, report_study):
+    """Its other words are recorded in ``tests/golden``."""
+    settings, info = page.sections["settings"], report_study.planned[0].run.read_info()
+    for part in ("python compare.py 'a & b.yml'", info["versions"]["numpy"]):
         assert part in settings
-    assert f"cores{info['machine']['cores']}" in settings.replace("\n", "")
+    assert info["machine"]["processor"] in settings
     assert platform.node() not in "".join(info["machine"].values())
     assert "looked at" not in settings  # nobody has, by the file
-    assert "different versions" not in settings
     assert re.search(r"on Warehouse-v0, seed 1:\s+ValueError: <the> disk & all is full", settings)
 
 
@@ -220,38 +206,6 @@ def test_the_maps_are_those_of_the_run_folders(page, report_study):
         assert best == maps["optimal_actions"].tolist()
     # Holes and the goal end the episode: nothing is done there.
     assert data["matters"] == "1111101011100110"
-
-
-def test_bandits_have_their_section_and_other_environments_theirs(tmp_path, do_study, written):
-    agents = (
-        AgentSpec("qlearning", "qlearning", tuned=False),
-        AgentSpec("<b>Greedy</b>", "epsilon_greedy", tuned=False),
-        AgentSpec("thompson", "thompson", tuned=False),
-    )
-    places = (
-        EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 100}),
-        EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 60}),
-    )
-    both = StudySpec("s", "S", agents[:1], places, n_seeds=2)
-    page = written(analyse(do_study(both, tmp_path / "both")))
-    assert [page.data(f"data-curves-{place}") is None for place in (0, 1)] == [False, True]
-    assert [page.data(f"data-bandits-{place}") is None for place in (0, 1)] == [True, False]
-    assert "This environment is a bandit" in page.sections["curves"]
-    assert "This environment is no bandit" in page.sections["bandits"]
-    # A batch's agents are gone: there is nobody to film.
-    alone = StudySpec("s", "S", agents[1:], places[1:], n_seeds=2, metric="regret")
-    analysis = analyse(do_study(alone, tmp_path / "alone"))
-    page = written(analysis)
-    assert [*page.sections] == ["verdict", "ranking", "bandits", "comparison", "settings"]
-    assert "a lower regret of a run is better" in page.sections["comparison"]
-    assert page.all("b") == []
-    statistics = analysis.results.pulls["<b>Greedy</b>", "coins"]
-    curves = page.data("data-bandits-0")["curves"]["<b>Greedy</b>"]
-    assert curves["x"] == statistics.pulls.tolist()
-    for name, attribute in {"optimal": "optimal", "simple": "simple_regret"}.items():
-        assert curves[name] == pytest.approx(getattr(statistics, attribute), rel=1e-4), name
-    mean = curves["regret"]["mean"]["y"]
-    assert mean == pytest.approx(statistics.cumulative_regret, rel=1e-4)
 
 
 # --- films ----------------------------------------------------------------------------------------
@@ -376,25 +330,13 @@ def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
 
 
 def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_study, written):
-    agents = [AgentSpec(name, name) for name in ("qlearning", "sarsa", "random")]
-    places = [EnvironmentSpec("lake", "FrozenLake-v1"), EnvironmentSpec("pole", "CartPole-v1")]
-    places = [replace(place, settings={"n_timesteps": 400}) for place in places]
-    study = StudySpec(
-        "small",
-        "",
-        (*agents,),
-        (*places,),
-        n_seeds=2,
-        eval_freq=100,
-        eval_episodes=1,
-        diagnose=True,
-    )
+    agents = tuple(AgentSpec(name, name) for name in ("qlearning", "sarsa"))
+    places = (EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 400}),)
+    study = StudySpec("small", "", agents, places, 2, eval_freq=100, eval_episodes=1, diagnose=True)
     results = do_study(study, tmp_path / "runs")
     planned = results.planned
     page = written(analyse(results))
-    assert "diagnosis" in page.sections
-    (lake, pole) = page.data("data-diagnosis-0"), page.data("data-diagnosis-1")
-    assert pole is None
+    lake = page.data("data-diagnosis-0")
     assert lake["v_error"].keys() == {"qlearning", "sarsa"}
     assert lake["overestimation"].keys() == {"qlearning"}
     rows = [read_compared(one.run)["v_error"] for one in planned if one.labels == ("sarsa", "lake")]
@@ -402,7 +344,6 @@ def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_st
     assert curve["x"][-1] == 400
     assert curve["y"][-1] == pytest.approx(np.mean([row[-1] for row in rows]), rel=1e-4)
     assert page.data("data-diagnosis").keys() >= lake.keys()
-    damaged = planned[0].run.diagnosis_path
-    damaged.write_text("timesteps,v_error\n100,high\n")
+    planned[0].run.diagnosis_path.write_text("timesteps,v_error\n100,high\n")
     with pytest.raises(DamagedFileError, match=r"diagnosis\.csv is not as the run left it"):
         read_compared(planned[0].run)

@@ -232,19 +232,6 @@ def bandits(tmp_path_factory, do_study):
     return found
 
 
-def test_a_bandit_has_its_figures_by_pull(bandits):
-    coins, segments, testbed = (bandits[name].pulls for name in BANDITS)
-    assert [one.curves for one in bandits.values()] == [None] * 3
-    best = [one.best for one in (coins, segments, testbed)]
-    assert best == pytest.approx([0.75, 0.159, 1.5388], abs=1e-4)
-    assert coins.n_runs == 3
-    assert coins.bounds.auer[-1] == pytest.approx(46.545 * np.log(400) + 3.432, rel=1e-3)
-    assert coins.bounds.lai_robbins[[0, -1]] == pytest.approx([0, 2.564 * np.log(400)], rel=1e-3)
-    assert segments.bounds is None
-    # Arms that are drawn anew cannot be told apart over runs.
-    assert (testbed.bounds, testbed.arms, testbed.beliefs) == (None, None, ())
-
-
 def test_beliefs_are_densities(bandits):
     known = {belief.agent: belief for belief in bandits["BernoulliBandit-v0"].pulls.beliefs}
     assert set(known) == {"knows", "blind", "normal"}

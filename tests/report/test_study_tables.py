@@ -5,12 +5,9 @@ import math
 import re
 from dataclasses import replace
 
-import numpy as np
-import pandas as pd
 import pytest
 from rich.console import Console
 
-from experiments.bandits import pull_statistics
 from report.conclusions import conclusion
 from report.documents import (
     MARKUPS,
@@ -23,13 +20,12 @@ from report.documents import (
     standings,
     table_as,
     verdicts_as,
-    write_verdicts,
 )
 from report.page import result_sections
 from report.page.frame import Report
 from report.ranking import COLUMNS, Row
 from report.series import StudySeries
-from report.terminal import print_analysis, print_episodes_table
+from report.terminal import print_analysis
 from tests.report import made_up
 from verdicts import Estimate, FailureCount, ThresholdSummary
 
@@ -125,77 +121,23 @@ def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_foo
     assert not any("†" in said for said in conclusion(found.study, other).everything)
 
 
-FILE = """\
-# S
-
-`python compare.py a.yml`
-
-Seeds 0 to 3: nothing was tuned on these.
-
-|  | lake |
-| --- | --- |
-| `low` | 0.3 |
-| `first` | **0.9** (40 s) |
-
-LEGEND
-
-## lake
-
-|  | mean | median | score | failed | stays from | processor time |
-| --- | --- | --- | --- | --- | --- | --- |
-| `first` | 90 [89.9, 90.2] | 91 | 0.9 [0.8, 1.1] | 0 of 4 | 100 | 40 s |
-| `low` | 30 [29.9, 30.2] | 31 | 0.3 [0.2, 0.5] | - | 40 | - |
-
-lake: return of the final policy, with 95 % intervals over seeds.
-
-- first is best on average: return of the final policy 90, score 0.9 [0.8, 1.1]; the optimum is 100.
-- first is better on average than low (by -0.15 to -0.05 of the score).
-- low reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the median one from step 40 \
-on; first in 3 of 4 runs, the median one from step 100 on.
-"""
+SAFE = [
+    (latex_text, "double_dqn by 2 [1, 3]", r"double\_dqn by 2 [1, 3]"),
+    (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
+    (latex_text, "<a>|", r"\textless{}a\textgreater{}\textbar{}"),
+    (latex_text, '~ `b "c"', r"\textasciitilde{} {\char96}b {\char34}c{\char34}"),
+    (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
+    (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
+    (latex_text, "*x", r"{}*x"),
+    (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
+    (latex_text, "two\n\nlines \x1b[1m", r"two lines \textbackslash{}x1b[1m"),
+    (markdown_text, "a|b <b>*x*</b> [x](y) `c`", "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
+    (markdown_text, "# one\n\ntwo _three_", "\\# one two \\_three\\_"),
+    (name_of, "a`b|", "a\\`b\\|"),
+]
 
 
-def test_a_study_as_files(tmp_path):
-    place = replace(lake(), agents=(lake().agents[0], lake().agents[3]), pairs=lake().pairs[2:3])
-    found = made_up.analysis([place], ["low", "first"], root=tmp_path, cpu=CPU)
-    paths = write_verdicts(found, "python compare.py a.yml")
-    assert [path.name for path in paths] == ["verdicts.md", "verdicts.tex"]
-    markdown, latex = (path.read_text(encoding="utf-8") for path in paths)
-    assert markdown == FILE.replace("LEGEND", LEGEND)
-    # Both languages say the same.
-    words = [re.findall(r"[\d.]+|[a-z]{3,}", one) for one in (markdown, latex)]
-    assert [word for word in words[0] if word not in words[1]] == []
-    first = latex[latex.index(r"\begin{tabular}") : latex.index(r"\end{table}")]
-    assert first.splitlines() == [
-        r"\begin{tabular}{lr}",
-        r"\toprule",
-        r" & lake \\",
-        r"\midrule",
-        r"\texttt{low} & 0.3 \\",
-        r"\texttt{first} & \textbf{0.9} (40 s) \\",
-        r"\bottomrule",
-        r"\end{tabular}}",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("escaped", "text", "safe"),
-    [
-        (latex_text, "double_dqn by 2 [1, 3]", r"double\_dqn by 2 [1, 3]"),
-        (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
-        (latex_text, "<a>|", r"\textless{}a\textgreater{}\textbar{}"),
-        (latex_text, '~ `b "c"', r"\textasciitilde{} {\char96}b {\char34}c{\char34}"),
-        (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
-        (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
-        (latex_text, "*x", r"{}*x"),
-        (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
-        (latex_text, "two\n\nlines \x1b[1m", r"two lines \textbackslash{}x1b[1m"),
-        (markdown_text, "a|b <b>*x*</b> [x](y) `c`",
-         "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
-        (markdown_text, "# one\n\ntwo _three_", "\\# one two \\_three\\_"),
-        (name_of, "a`b|", "a\\`b\\|"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("escaped", "text", "safe"), SAFE)
 def test_nothing_of_a_text_is_markup(escaped, text, safe):
     assert escaped(text) == safe
 
@@ -263,8 +205,7 @@ second | 40 [39.9, 40.2] | 42 [41.9, 42.2] | 0.4 [0.3, 0.6] | 45 [44.9, 45.2] | 
 """  # noqa: E501  # as wide as it is printed
 
 
-@pytest.mark.parametrize("width", [80, 120])
-@pytest.mark.parametrize("options", [{}, {"force_terminal": True}], ids=["pipe", "terminal"])
+@pytest.mark.parametrize(("width", "options"), [(80, {"force_terminal": True}), (120, {})])
 def test_a_title_a_table_a_caption_and_sentences(width, options):
     agents = (made_up.agent("first", 90.0), made_up.agent("second", 40.0))
     pairs = (made_up.pair("first", "second", "better"),)
@@ -281,29 +222,6 @@ def test_a_title_a_table_a_caption_and_sentences(width, options):
     assert ("a wider terminal shows training and IQM too" in told) is (width == 80)
     for sentence in (*conclusion(found.study, place).everything, "Seeds 0 to 3: nothing was tuned"):
         assert sentence in told
-
-
-def test_three_agents_have_their_verdicts_in_a_matrix():
-    agents = [made_up.agent(name, mean) for name, mean in (("a", 90.0), ("[b]", 80.0), ("c", 70.0))]
-    pairs = (
-        made_up.pair("a", "[b]", "worse"),
-        made_up.pair("a", "c", "undecided"),
-        made_up.pair("[b]", "c", "equivalent"),
-    )
-    failed = {"a": FailureCount(0, 4, 0.6), "c": FailureCount(1, 4, 0.8)}
-    place = made_up.environment(agents, pairs=pairs, failures=failed)
-    lines = lines_of(print_analysis, made_up.analysis([place], ["a", "[b]", "c"]))
-    at = next(i for i, line in enumerate(lines) if line.split() == ["1", "2", "3"])
-    assert [line.split() for line in lines[at + 1 : at + 4]] == [
-        ["1", "a", "·", "<", "?"],
-        ["2", "[b]", ">", "·", "="],
-        ["3", "c", "?", "=", "·"],
-    ]
-    assert " ".join(lines[at + 4 : at + 7]) == (
-        "> better on average than the agent of the column, < worse, = equivalent, ? undecided; in "
-        "brackets: as long as further runs are like those that were seen 1 of 4 runs of c failed."
-    )
-    assert not any("is undecided" in line for line in lines)
 
 
 def test_marks_of_trainings_that_were_changed_and_dashes():
@@ -329,57 +247,7 @@ def test_marks_of_trainings_that_were_changed_and_dashes():
     assert "stays from" not in below(lines)
 
 
-# Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
-ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
-REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
-
-
-def test_bandits_have_a_table_of_their_own():
-    pulls = pull_statistics(ARMS, REWARDS, np.where(ARMS == 0, 0.3, 0.0), None, 2)
-    agents = (made_up.agent("first", 1.0), made_up.agent("no pulls", 3.0))
-    place = made_up.environment(agents, "coins", optimum=None, is_score=False)
-    names, found = ["first", "no pulls"], {("first", "coins"): pulls}
-    lines = lines_of(print_analysis, made_up.analysis([place], names, pulls=found, metric="regret"))
-    # The sums of regret are .6 and .3, and the last pulls .3 and 0; the last rewards 1 and 0.
-    headings = ["agent", "mean regret", "5% to 95% of runs", "simple regret", "reward", "best arm"]
-    row = ["first", "7 [6.9, 7.2]", "0.315 to 0.585", "0.15", "0.5", "50.0%", "10 s"]
-    assert cells(lines) == [[*headings, "CPU time"], row]
-    assert below(lines).startswith(
-        "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; simple regret: of "
-        "recommending the arm pulled most; reward, best arm: at the last pulls Undecided on "
-        "average: best is first (1 [0.9, 1.2]) or no pulls (3 [2.9, 3.2])."
-    )
-
-
-EPISODES = ["environment", "agent", "episode", "average", "minimum", "maximum"]
-
-
-@pytest.mark.parametrize("width", [80, 200])
-def test_blocks_of_episodes_agents_side_by_side_where_there_is_room(width):
-    names = ["qlearning", "expected_sarsa", "dqn, engine: auto", "a name of more than 20 letters"]
-    rows = [("lake", name, 1000, -27_427.5, -30_000.25, n) for n, name in enumerate(names)]
-    rows += [("lake", "qlearning", 2000, 1.5, 0, 0.5)]
-    lines = lines_of(print_episodes_table, pd.DataFrame(rows, columns=EPISODES), 1000, width=width)
-    assert "lake: return per 1000 episodes (average, min, max; all seeds)" in lines
-    assert max(map(len, lines)) <= width
-    figures = [f"-27,428  -30,000  {n}" for n in range(len(names))]
-    if width == 200:
-        assert cells(lines) == [
-            ["episode", *names],
-            ["1,000", *figures],
-            ["2,000", "1.5  0  0.5", *"---"],
-        ]
-    else:  # the others come below
-        assert [cell for row in cells(lines) for cell in row if cell in figures] == figures
-
-
 # === the ranking on the page ======================================================================
-
-
-def ranked(agents, metric="final", **changes):
-    """Headings of the page's table and its rows, of agents on an environment."""
-    table = table_of(agents, metric, **changes)
-    return table["headings"], table["rows"]
 
 
 def table_of(agents, metric="final", **changes):
@@ -387,6 +255,12 @@ def table_of(agents, metric="final", **changes):
     found = made_up.analysis([place], [agent.agent for agent in agents], metric=metric)
     (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
     return table
+
+
+def ranked(agents, metric="final", **changes):
+    """Headings of the page's table and its rows, of agents on an environment."""
+    table = table_of(agents, metric, **changes)
+    return table["headings"], table["rows"]
 
 
 RANKING = """
