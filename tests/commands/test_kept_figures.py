@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 import compare
 from experiments.figures_store import checksum_of, packed, unpacked
 from experiments.results import difference
+from pipeline.locks import folder_lock
 from pipeline.runs import Run
 
 ROOT = Path(compare.__file__).parent
@@ -82,6 +83,23 @@ def in_all(text):
     return re.sub(r" -(\{\})?-keep figures", "", text.replace("few", "all"))
 
 
+def test_tables_verdicts_and_page_are_those_of_folders_to_the_bit(both):
+    all_there, few, said = both
+    assert "24 runs, 24 of them there already" in said
+    for name in ("summary.csv", "verdicts.md", "verdicts.tex"):
+        texts = [(study / name).read_text(encoding="utf-8") for study in (all_there, few)]
+        assert texts[0] == in_all(texts[1]), name
+    curves = [gzip.decompress((study / "curves.csv.gz").read_bytes()) for study in (all_there, few)]
+    assert curves[0].count(b"\n") > 1000
+    assert curves[0] == curves[1]
+    for path in (all_there / "figures").glob("*.png"):
+        assert path.read_bytes() == (few / "figures" / path.name).read_bytes()
+    assert rows_of(few) == list(range(12))
+    assert len(folders(all_there)) == 12
+    assert 1 <= len(folders(few)) <= 6
+    assert "FrozenLake-v1_1" in folders(few)
+
+
 def parts_of(page):
     """The sections of a page, and what its scripts work with, unpacked."""
     for part in re.split(r"(?=<section |<script)", page.read_text(encoding="utf-8")):
@@ -93,26 +111,11 @@ def parts_of(page):
             yield in_all(part)
 
 
-def test_tables_verdicts_and_page_are_those_of_folders_to_the_bit(both):
-    all_there, few, said = both
-    assert "24 runs, 24 of them there already" in said
-    for name in ("summary.csv", "verdicts.md", "verdicts.tex"):
-        texts = [(study / name).read_text(encoding="utf-8") for study in (all_there, few)]
-        assert texts[0] == in_all(texts[1]), name
-    curves = [gzip.decompress((study / "curves.csv.gz").read_bytes()) for study in (all_there, few)]
-    assert curves[0].count(b"\n") > 1000
-    assert curves[0] == curves[1]
-    # The page is the same but for the maps of other runs.
-    pages = [list(parts_of(study / "report.html")) for study in (all_there, few)]
+def test_the_page_is_that_of_folders_but_for_the_maps_of_other_runs(both):
+    pages = [list(parts_of(study / "report.html")) for study in both[:2]]
     assert len(pages[0]) == len(pages[1]) > 15
     differ = [one[:80] for one, other in zip(*pages, strict=True) if one != other]
     assert all('id="data-policies' in part for part in differ), differ
-    for path in (all_there / "figures").glob("*.png"):
-        assert path.read_bytes() == (few / "figures" / path.name).read_bytes()
-    assert rows_of(few) == list(range(12))
-    assert len(folders(all_there)) == 12
-    assert 1 <= len(folders(few)) <= 6
-    assert "FrozenLake-v1_1" in folders(few)
 
 
 def test_a_run_is_made_again_to_the_bit(both, typed):
@@ -150,12 +153,13 @@ def test_a_run_that_comes_out_otherwise_is_told(typed, own_folder):
     assert f"FrozenLake-v1_{seed + 1}.otherwise" in folders(study)
 
 
-def test_after_a_stop_no_run_is_lost_or_counted_twice(typed, own_folder):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_after_a_stop_no_run_is_lost_or_counted_twice(typed, own_folder, number):
     words, n_seen = [*KEEP, "--seeds", 20], 0
     command = [sys.executable, str(ROOT / "compare.py"), *map(str, words), "-f", "few"]
     study = own_folder / "few" / NAME
     (study / "runs/qlearning").mkdir(parents=True)
-    for n_stored, number in ((3, signal.SIGKILL), (10, signal.SIGTERM)):
+    for n_stored in (3, 10):
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
         )
@@ -177,8 +181,38 @@ def test_after_a_stop_no_run_is_lost_or_counted_twice(typed, own_folder):
     pd.testing.assert_frame_equal(summary(own_folder / "all" / NAME), summary(study))
 
 
+def test_what_a_kill_between_commit_and_removal_leaves_is_removed(both, typed):
+    all_there, few, _ = both
+    before = folders(few)
+    name = next(name for name in folders(all_there) if name not in before)
+    shutil.copytree(all_there / "runs" / "qlearning" / name, few / "runs" / "qlearning" / name)
+    words = [*KEEP, "--seeds", 12, "-f", "few"]
+    assert "24 runs, 24 of them there already" in typed(*words)
+    assert folders(few) == before
+    assert len(summary(few)) == 24
+
+
+def test_an_unfinished_write_is_undone(both, typed):
+    _, few, _ = both
+    path = few / "runs" / "qlearning" / "FrozenLake-v1.sqlite"
+    killed = (
+        "import os, sqlite3, sys\n"
+        "database = sqlite3.connect(sys.argv[1], isolation_level=None)\n"
+        "database.execute('PRAGMA cache_size = 1')\n"
+        "database.execute('BEGIN IMMEDIATE')\n"
+        "database.execute('UPDATE runs SET final = 7.0, curves = zeroblob(90000)')\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    before = summary(few)
+    assert subprocess.run([sys.executable, "-c", killed, str(path)], check=False).returncode == -9
+    assert path.with_name(f"{path.name}-journal").exists()
+    typed(*KEEP, "--seeds", 12, "-f", "few")
+    pd.testing.assert_frame_equal(summary(few), before)
+
+
 DAMAGE = {
     "half of it": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "no database": lambda path: path.write_text("figures"),
     "another table": lambda path: sqlite3.connect(path).execute("CREATE VIEW more AS SELECT 1"),
 }
 
@@ -188,7 +222,7 @@ def a_figure(path):
         database.execute("UPDATE runs SET final = final + 0.5 WHERE seed = 3")
 
 
-@pytest.mark.parametrize("damage", ["a figure", "half of it", "another table"])
+@pytest.mark.parametrize("damage", ["a figure", "half of it", "no database", "another table"])
 def test_a_damaged_file_is_named_and_repaired(both, typed, damage):
     _, few, _ = both
     path = few / "runs" / "qlearning" / "FrozenLake-v1.sqlite"
@@ -205,6 +239,14 @@ def test_a_damaged_file_is_named_and_repaired(both, typed, damage):
     pd.testing.assert_frame_equal(summary(few), before)
 
 
+def test_a_second_command_is_refused(typed, own_folder):
+    typed(*KEEP, "--seeds", 2, "-f", "few")
+    with folder_lock(own_folder / "few" / NAME, lambda: None, print):
+        said = typed(*KEEP, "--seeds", 3, "-f", "few", code=2)
+    assert str(os.getpid()) in said
+    assert rows_of(own_folder / "few" / NAME) == [0, 1]
+
+
 def test_stored_runs_of_other_settings_are_replaced_only_when_asked(both, typed):
     _, few, _ = both
     other = [*KEEP, "--seeds", 12, "-f", "few", "-params", "gamma:0.9"]
@@ -214,6 +256,15 @@ def test_stored_runs_of_other_settings_are_replaced_only_when_asked(both, typed)
     moved = sorted(path.parent.name for path in few.glob("replaced/*/*/*.sqlite"))
     assert moved == ["qlearning", "sarsa"]
     assert rows_of(few) == list(range(12))
+
+
+def test_stored_runs_stay_done_without_the_flag_and_with_more_seeds(both, typed):
+    all_there, few, _ = both
+    words = [*TWO, "--no-report", "--seeds", 13]
+    assert "26 runs, 24 of them there already" in typed(*words, "-f", "few")
+    assert "FrozenLake-v1_13" in folders(few)
+    typed(*words, "-f", "all")
+    pd.testing.assert_frame_equal(summary(few), summary(all_there))
 
 
 def test_the_threshold_may_change_later(both, typed):
@@ -228,12 +279,15 @@ def test_the_threshold_may_change_later(both, typed):
     pd.testing.assert_frame_equal(one, other)
 
 
-def test_runs_on_bandits_keep_their_folders_and_what_needs_whole_runs_is_refused(typed, own_folder):
+def test_runs_on_bandits_keep_their_folders(typed, own_folder):
     words = ["--env", "BernoulliBandit-v0", "--algos", "ucb", "qlearning", "--seeds", 2, "-n", 60]
     typed(*words, "--no-report", "--keep", "figures", "-f", "few")
     (study,) = (own_folder / "few").iterdir()
     assert not list(study.rglob("*.sqlite"))
     assert folders(study) == ["BernoulliBandit-v0_1", "BernoulliBandit-v0_2"]
+
+
+def test_what_needs_whole_runs_is_refused(typed):
     for flag in (["--episodes-table", 10], ["--tensorboard"]):
         said = typed(*KEEP, "--seeds", 2, *flag, code=2)
         assert f"{flag[0]} needs more of each run than --keep figures keeps" in said

@@ -8,18 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 import compare
 from agents import load_algorithm
 from agents.bandits.runs import run_batch
+from experiments.analysis import analyse
 from experiments.bandits import (
     MAX_POINTS,
     QUANTILES,
     STATISTICS_FILE,
     PullStatistics,
     pull_statistics,
+    read_run,
+    run_regret,
     stacked_statistics,
 )
 from experiments.plan import plan
@@ -27,8 +30,10 @@ from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
 from pipeline.callbacks import PullRecorder
 from pipeline.runs import PULLS_FILE, Run
 from pipeline.training import train
+from report.series import auer_bound
 
 SEGMENT_MEANS = np.array([[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]])
+COINS = (0.2, 0.5, 0.75)
 
 
 def pulls_in(folder):
@@ -43,12 +48,15 @@ def recorded(algorithm, folder, env_id="SegmentBandit-v0", n_envs=2, **kwargs):
     return pulls_in(folder)
 
 
-PPO_KWARGS = {"policy": "MlpPolicy", "n_steps": 25, "batch_size": 25}
-
-
 @pytest.mark.parametrize(
     ("algorithm", "kwargs"),
-    [(load_algorithm("ucb"), {}), (load_algorithm("qlearning"), {}), (PPO, PPO_KWARGS)],
+    [
+        (load_algorithm("ucb"), {}),
+        (load_algorithm("qlearning"), {}),
+        (load_algorithm("random"), {"policy": "RandomPolicy"}),
+        (DQN, {"policy": "MlpPolicy", "learning_starts": 10, "train_freq": 1}),
+        (PPO, {"policy": "MlpPolicy", "n_steps": 25, "batch_size": 25}),
+    ],
 )
 def test_any_agent_leaves_its_pulls(algorithm, kwargs, tmp_path):
     pulls = recorded(algorithm, tmp_path, **kwargs)
@@ -180,13 +188,13 @@ def test_what_goes_as_a_batch(algo, settings, environment, is_batch):
     assert {(run.is_batch, run.n_runs) for run in runs} == {(is_batch, 3 if is_batch else 1)}
 
 
-def test_every_study_goes_in_batches():
-    for path in STUDIES:
-        whole = read_study(path)
-        for study, n_seeds in ((whole, whole.n_seeds), (whole.quickened(), whole.quick.seeds)):
-            runs = plan(study, Path("nowhere"))
-            assert len(runs) == len(study.agents) * len(study.environments)
-            assert {(run.is_batch, run.n_runs) for run in runs} == {(True, n_seeds)}, path
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_every_study_goes_in_batches(path):
+    whole = read_study(path)
+    for study, n_seeds in ((whole, whole.n_seeds), (whole.quickened(), whole.quick.seeds)):
+        runs = plan(study, Path("nowhere"))
+        assert len(runs) == len(study.agents) * len(study.environments)
+        assert {(run.is_batch, run.n_runs) for run in runs} == {(True, n_seeds)}
 
 
 AGENTS = {
@@ -232,9 +240,6 @@ def test_a_batch_is_its_runs(batches, label, tmp_path):
         assert (info["engine"], info["n_runs"], info["n_timesteps"]) == ("compiled batch", 5, 200)
 
 
-# --- The studies as they are shipped, with fewer runs.
-
-
 def test_a_batch_that_is_there_is_not_done_again_and_a_longer_one_is(tmp_path, do_study):
     study = study_of({"ucb": AGENTS["ucb"]}, n_seeds=3)
     first = do_study(study, tmp_path)
@@ -248,3 +253,67 @@ def test_a_batch_that_is_there_is_not_done_again_and_a_longer_one_is(tmp_path, d
     assert len(more.summary) == 6
     assert [path.name for path in (tmp_path / "runs" / "ucb").iterdir()] == ["segments_1"]
     assert list((tmp_path / ".drafts").iterdir()) == []
+
+
+def test_runs_beside_batches_and_seeds_that_begin_later(tmp_path, do_study):
+    """An agent of the library goes run by run, and its regret is counted over as many pulls."""
+    ppo = {"policy": "MlpPolicy", "n_steps": 64, "batch_size": 64, "n_envs": 2}
+    agents = {"ucb": ("ucb", {}), "ppo": ("ppo", ppo)}
+    study = study_of(agents, (replace(SEGMENTS, settings={"n_timesteps": 100}),), n_seeds=3)
+    results = do_study(study, tmp_path / "whole")
+    found = results.pulls["ppo", "segments"]
+    assert len(found.total_regret) == len(results.pulls["ucb", "segments"].total_regret) == 3
+    assert found.pulls[-1] == results.pulls["ucb", "segments"].pulls[-1] == 100
+    runs = [run for run in results.planned if run.agent == "ppo"]
+    for run, regret in zip(runs, found.total_regret, strict=True):
+        regrets = pulls_in(run.path)["regrets"]
+        assert regrets.shape == (2, 64)
+        in_time = regrets.T.ravel()[:100]
+        assert np.array_equal(read_run(run.path, 100)["regrets"], in_time)
+        assert run_regret(run) == pytest.approx(regret) == pytest.approx(in_time.sum())
+
+    part = do_study(replace(study, n_seeds=2, first_seed=1), tmp_path / "part")
+    columns = ["agent", "seed", "regret", "training"]
+    wanted = results.summary.loc[results.summary["seed"] >= 1, columns]
+    assert part.summary[columns].equals(wanted.reset_index(drop=True))
+    (environment,) = analyse(part).environments
+    assert [agent.n_missing for agent in environment.agents] == [0, 0]
+
+
+# --- The studies as they are shipped, with fewer runs.
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("bernoulli", {"Thompson": 14.8, "UCB1": 82.0, "epsilon 0.1": 275.5, "random": 2666.7}),
+        ("segments", {"Thompson by segment": 37, "Thompson, blind": 443, "random": 653}),
+        # The mean of alpha=0.2 is worse than that of 1 with a spread of 228 over runs.
+        ("segments", {"LinUCB alpha=1": 31.0, "LinUCB alpha=0.2": 155.0}),
+    ],
+)
+def test_regret_of_ten_thousand_pulls(do_study, tmp_path, name, expected):
+    """What is expected was measured over 5,000 to 40,000 runs by programs apart from this one.
+
+    How well agents do is tested with the agents; here that a label stands for its agent.
+    """
+    (path,) = [path for path in STUDIES if path.stem == f"bandit-{name}"]
+    study = read_study(path)
+    kept = tuple(spec for spec in study.agents if spec.label in expected)
+    place = study.environments[0]
+    study = replace(study, agents=kept, environments=(place,), n_seeds=60)
+    results = do_study(study, tmp_path)
+    found = {label: results.pulls[label, place.label] for label in expected}
+    for label, statistics in found.items():
+        # Four standard errors, and the last digit.
+        within = 4 * statistics.total_regret.std() / 60**0.5 + 1
+        assert statistics.total_regret.mean() == pytest.approx(expected[label], abs=within), label
+        assert statistics.pulls[-1] == 10_000
+    if name == "bernoulli":
+        assert (found["UCB1"].cumulative_regret <= auer_bound(COINS, found["UCB1"].pulls)).all()
+        assert found["Thompson"].moments.tolist() == [10, 100, 1000, 10_000]
+        # Less regret is better.
+        (environment,) = analyse(results).environments
+        assert [agent.agent for agent in environment.agents] == list(expected)
+        assert environment.agents[0].regret == environment.agents[0].metric.mean
+        assert {pair.verdict for pair in environment.pairs} == {"better"}

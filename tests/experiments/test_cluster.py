@@ -7,6 +7,8 @@ import ipaddress
 import json
 import os
 import runpy
+import shutil
+import signal
 import socket
 import ssl
 import subprocess
@@ -19,7 +21,6 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
-import psutil
 import pytest
 import yaml
 from distributed import Client, LocalCluster
@@ -87,12 +88,18 @@ def runs_of(root, modules=(), tensorboard=False, **marks):
 FILES = {"run/run.json": b"{}", "run/a/b.zip": b"\0\1", "tensorboard/x": b""}
 
 
-def test_what_is_packed_is_unpacked():
-    for answer in (
-        *(Answer("done"), Answer("done", files={}), Answer("done", files=FILES)),
-        *(Answer("failed", "thin ice", "Traceback"), Answer("stopped")),
-    ):
-        assert unpacked(packed(answer)) == answer
+@pytest.mark.parametrize(
+    "answer",
+    [
+        Answer("done"),
+        Answer("done", files={}),
+        Answer("done", files=FILES),
+        Answer("failed", "thin ice", "Traceback"),
+        Answer("stopped"),
+    ],
+)
+def test_what_is_packed_is_unpacked(answer):
+    assert unpacked(packed(answer)) == answer
 
 
 @given(st.binary(max_size=200))
@@ -133,10 +140,13 @@ ELSEWHERE += ["run/a\nb", "run/c:x", "run/nul", "run/x.", f"run/{'d/' * 9}x", f"
         (raw(["run/x", "run/X/y"]), "folder too"),
         (raw(kind="fine"), "no way to end"),
         (raw(reason=3), "lacks a text"),
+        (raw(details=None), "lacks a text"),
         (raw(reason="x" * 300_000), "too large"),
+        (None, "not bytes"),
         ("text", "not bytes"),
+        (bytearray(packed(Answer("done"))), "not bytes"),
     ],
-    ids=[*map(repr, ELSEWHERE), *map(str, range(7))],
+    ids=[*map(repr, ELSEWHERE), *map(str, range(10))],
 )
 def test_answers_that_are_refused(content, words):
     with pytest.raises(RefusedAnswerError, match=words):
@@ -204,6 +214,8 @@ LIES = {
     "no record": lacking("run/run.json"),
     "no evaluations": lacking("run/evaluations.npz"),
     "unfinished": with_record(unfinished),
+    "an empty record": with_record(lambda record: b"{}"),
+    "a changed record": with_record(lambda record: record.replace(b"seconds", b"secondS")),
     "another run": with_record(lambda record: record.replace(b'"seed": 0', b'"seed": 1')),
     "a stray file": lambda files: {**files, "run/more.txt": b"x"},
     "other content": lambda files: {**files, "run/evaluations.npz": b"x"},
@@ -310,22 +322,25 @@ def test_an_address_is_open_unless_it_is_of_this_machine_alone(address):
 
 
 OPEN = ["10.0.0.1", "node", "localhost.example.org", "0.0.0.0", "127.0.0.1@10.0.0.1"]  # noqa: S104
-# Whether there are certificates, whether it is said that no TLS is needed, and the refusal.
-SPOKEN_TO = [
-    *((f"tcp://{host}:8786", True, False, "without TLS") for host in OPEN),
-    *((f"tcp://{host}:8786", False, True, None) for host in OPEN),
-    ("tcp://localhost:8786", False, False, None),
-    ("tls://10.0.0.1:8786", True, False, None),
-    ("tls://10.0.0.1:8786", False, True, "ca-file"),
-    ("ws://127.0.0.1:8786", True, True, "begins with"),
-]
 
 
-@pytest.mark.parametrize(("address", "has_certificates", "is_insecure", "words"), SPOKEN_TO)
+@pytest.mark.parametrize(
+    ("address", "has_certificates", "is_insecure", "words"),
+    [
+        *((f"tcp://{host}:8786", True, False, "without TLS") for host in OPEN),
+        *((f"tcp://{host}:8786", False, True, None) for host in OPEN),
+        ("tcp://localhost:8786", False, False, None),
+        ("tls://10.0.0.1:8786", True, False, None),
+        ("tls://10.0.0.1:8786", False, True, "ca-file"),
+        ("ws://127.0.0.1:8786", True, True, "begins with"),
+    ],
+)
 def test_who_is_spoken_to(address, has_certificates, is_insecure, words):
-    refused = pytest.raises(UserError, match=words) if words else contextlib.nullcontext()
-    with refused:
+    if words is None:
         check_address(address, has_certificates, is_insecure)
+    else:
+        with pytest.raises(UserError, match=words):
+            check_address(address, has_certificates, is_insecure)
 
 
 def test_a_command_checks_before_it_connects(tmp_path, monkeypatch):
@@ -343,20 +358,20 @@ def test_a_command_checks_before_it_connects(tmp_path, monkeypatch):
 
 # --- When workers of jobs leave, and where keys and outputs are.
 
-HOUR, DAY = 3600, 86400
+MINUTE, HOUR, DAY = 60, 3600, 86400
 WALLTIMES = {
-    "slurm": {"30": 1800, "90:00": 5400, "0:50": 50, "1:30:00": 5400, "100:0:0": 100 * HOUR},
-    "pbs": {"04:00:00": 4 * HOUR},
-    "lsf": {"00:30": 1800, "90": 5400},
+    ("slurm", "30"): 30 * MINUTE,
+    ("slurm", "90:00"): 90 * MINUTE,
+    ("slurm", "0:50"): 50,
+    ("slurm", "1:30:00"): 90 * MINUTE,
+    ("slurm", "100:0:0"): 100 * HOUR,
+    ("slurm", "2-00"): 2 * DAY,
+    ("slurm", "2-12:30"): 2 * DAY + 12 * HOUR + 30 * MINUTE,
+    ("slurm", "2-12:30:15"): 2 * DAY + 12 * HOUR + 30 * MINUTE + 15,
+    ("pbs", "04:00:00"): 4 * HOUR,
+    ("lsf", "00:30"): 30 * MINUTE,
+    ("lsf", "90"): 90 * MINUTE,
 }
-WALLTIMES["slurm"] |= {"2-00": 2 * DAY, "2-12:30": 2.5 * DAY + 1800, "2-12:30:15": 2.5 * DAY + 1815}
-WRONG = ["", "0", "soon", "UNLIMITED", "1:2:3:4", "2-", "-3", "1.5", "2-1-1", "٣٠", "30 ", "4h"]
-REFUSED_WALLTIMES = [
-    *(("slurm", walltime, "of the form 30, 90:00, 1:30:00, 2-00, ") for walltime in WRONG),
-    *(("slurm", walltime, "in quotes") for walltime in (30, None)),
-    ("pbs", "2-00", "of the form 1:30:00;"),
-    ("lsf", "2-00", "of the form 90 or 1:30;"),
-]
 
 
 def queue_of(system, **settings):
@@ -364,18 +379,33 @@ def queue_of(system, **settings):
     return JobQueue(system, settings, 1, Path("q.yml"))
 
 
-def test_workers_leave_before_the_walltime_ends():
-    for system, walltimes in WALLTIMES.items():
-        for walltime, seconds in walltimes.items():
-            leaving = min(0.1 * seconds, 300)
-            words = [f"{seconds - leaving:.0f}s", "--lifetime-stagger", f"{leaving / 2:.0f}s"]
-            found = retiring(queue_of(system, walltime=walltime))
-            assert found == {"worker-extra-args": ["--lifetime", *words]}, walltime
-    for system, walltime, words in REFUSED_WALLTIMES:
-        with pytest.raises(UserError, match=f"^q.yml: {system}: walltime: .*{words}"):
-            retiring(queue_of(system, walltime=walltime))
-        own = {"walltime": walltime, "worker-extra-args": ["--lifetime", "1h"]}
-        assert retiring(queue_of(system, **own)) == {}
+@pytest.mark.parametrize(("system", "walltime"), WALLTIMES)
+def test_workers_leave_before_the_walltime_ends(system, walltime):
+    seconds = WALLTIMES[system, walltime]
+    leaving = min(0.1 * seconds, 300)
+    words = [f"{seconds - leaving:.0f}s", "--lifetime-stagger", f"{leaving / 2:.0f}s"]
+    assert retiring(queue_of(system, walltime=walltime)) == {
+        "worker-extra-args": ["--lifetime", *words]
+    }
+
+
+WRONG = ["", "0", "soon", "UNLIMITED", "1:2:3:4", "2-", "-3", "1.5", "2-1-1", "٣٠", "30 ", "4h"]
+
+
+@pytest.mark.parametrize(
+    ("system", "walltime", "words"),
+    [
+        *(("slurm", walltime, "of the form 30, 90:00, 1:30:00, 2-00, ") for walltime in WRONG),
+        *(("slurm", walltime, "in quotes") for walltime in (30, 14400, None)),
+        ("pbs", "2-00", "of the form 1:30:00;"),
+        ("lsf", "2-00", "of the form 90 or 1:30;"),
+    ],
+)
+def test_other_walltimes_are_refused(system, walltime, words):
+    with pytest.raises(UserError, match=f"^q.yml: {system}: walltime: .*{words}"):
+        retiring(queue_of(system, walltime=walltime))
+    own = {"walltime": walltime, "worker-extra-args": ["--lifetime", "1h"]}
+    assert retiring(queue_of(system, **own)) == {}
 
 
 def test_what_jobs_are_told(tmp_path, monkeypatch):
@@ -391,6 +421,58 @@ def test_what_jobs_are_told(tmp_path, monkeypatch):
     assert {"#SBATCH --no-requeue", "#SBATCH -q x"} <= set(script)
     assert f"#SBATCH -o {tmp_path}/study/jobs/dask-worker-%J.out" in script
     assert sorted(path.name for path in tmp_path.iterdir()) == ["slurm.yml", "study"]
+
+
+OPEN_QUEUE = """
+import sys, time
+from pathlib import Path
+from experiments.cluster.schedulers import opened_queue, JobQueue
+from pipeline.stopping import stops_noticed
+
+settings = {"cores": 1, "memory": "1GB", "interface": "lo", "shared-temp-directory": sys.argv[1]}
+with stops_noticed(), opened_queue(JobQueue("slurm", settings, 1, Path("q.yml")), Path("s")):
+    print(len(list(Path(sys.argv[1]).glob("*/.*key*"))), flush=True)
+    if sys.argv[2] == "error":
+        raise ValueError
+    time.sleep(60 * (sys.argv[2] != "normal"))
+"""
+
+
+def test_keys_go_however_the_command_ends(tmp_path):
+    for how in ("normal", "error", "SIGINT", "SIGTERM", "SIGHUP", "SIGKILL", "normal"):
+        with subprocess.Popen(
+            [sys.executable, "-c", OPEN_QUEUE, str(tmp_path), how],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        ) as process:
+            assert process.stdout.readline() == b"1\n"
+            if how.startswith("SIG"):
+                process.send_signal(signal.Signals[how])
+            process.wait(30)
+        left = [path.name for path in tmp_path.glob(".yardstick-keys-*")]
+        assert len(left) == (how == "SIGKILL")  # the next command removes them
+
+
+SLURM = ("munged", "slurmctld", "slurmd", "sbatch", "scancel", "scontrol", "squeue")
+
+
+@pytest.mark.skipif(not all(map(shutil.which, SLURM)), reason="apt-get install slurm-wlm munge")
+def test_a_study_by_the_real_slurm_is_that_of_this_machine():
+    words = ["--runs", "8", "--faults", "scancel", "requeue", "--cancellations", "0"]
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks/slurm.py"), *words],
+        # Which a server of processes in this one has set for what it forks.
+        env={key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=280,
+    )
+    assert done.returncode == 0, done.stdout
+    assert "disabled for job" in done.stdout  # requeueing
+    assert "8 of 8 runs" in done.stdout
 
 
 # --- Jobs of a queue that have ended are sent again, and others are left alone.
@@ -563,13 +645,16 @@ FAILED = packed(Answer("failed", "thin ice", "at length"))
 STOPPED = packed(Answer("stopped"))
 KILLED = KilledWorker("run", SimpleNamespace(address="tcp://w:1"), 3)
 NEVER, NO_RUN = "never came back", "3 times it did not come back as a run: "
-BEGUN, LEFT = (1, False), (1, True)
+BEGUN, LEFT, WAITED = (1, False), (1, True), (0, False)
 # Ends, how many workers begin and whether they leave, what is said, and how often it was sent.
 OUTCOMES = {
     "a failure": ([FAILED], BEGUN, "thin ice", 1),
+    "a failure without a word": ([packed(Answer("failed"))], BEGUN, "it does not say why", 1),
+    "stopped": ([STOPPED] * 5 + [FAILED], WAITED, "thin ice", 6),
     "stopped for ever": ([STOPPED], BEGUN, NEVER, MOST_SENDS),
     "stopped by workers that left": ([STOPPED] * 99 + [FAILED], LEFT, "thin ice", 100),
     "left however often": ([KILLED] * 99 + [FAILED], LEFT, "thin ice", 100),
+    "killed before it began": ([KILLED] * 5 + [FAILED], WAITED, "thin ice", 6),
     "left in good order": ([KILLED] * 5 + [FAILED], LEFT, "thin ice", 6),
     "killed": ([KILLED], BEGUN, "the worker that did it was lost 3 times (tcp://w:3)", 3),
     "begun elsewhere": ([FAILED], (4, True), "thin ice", 1),
@@ -672,13 +757,20 @@ def test_a_cluster_does_what_this_machine_does_whatever_dies(tmp_path, monkeypat
 
 def listening_in(pid):
     """The ports that a process and those that it has started listen to, with whose they are."""
-    process = psutil.Process(pid)
-    return {
-        connection.laddr.port: one.pid
-        for one in (process, *process.children(recursive=True))
-        for connection in one.net_connections("tcp")
-        if connection.status == psutil.CONN_LISTEN
-    }
+    owners, pids = {}, [pid]
+    for one in pids:
+        for file in Path(f"/proc/{one}").glob("task/*/children"):
+            pids += map(int, file.read_text().split())
+        for link in Path(f"/proc/{one}/fd").glob("*"):
+            with contextlib.suppress(OSError):
+                owners[str(link.readlink())] = one
+    ports = {}
+    for name in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
+            _, local, _, state, *_, inode = line.split()[:10]
+            if state == "0A" and f"socket:[{inode}]" in owners:
+                ports[int(local.rpartition(":")[2], 16)] = owners[f"socket:[{inode}]"]
+    return ports
 
 
 def answer_of(port, context=None):
@@ -704,13 +796,18 @@ def check_ports(n_processes, before):
         assert answer_of(port) == answer_of(port, context) == b""
 
 
-def test_all_ports_of_workers_and_jobs_want_a_certificate(tmp_path):
-    """The queue is played by a shell, which does what the script of a job says."""
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_all_ports_of_workers_here_want_a_certificate(tmp_path):
     before = listening_in(os.getpid())  # of servers that other tests have left
     with opened(LocalWorkers(1), tmp_path) as (connect, _), connect() as client:
         client.wait_for_workers(1, timeout=60)
         assert client.dashboard_link == ""
         check_ports(2, before)  # this one, with the scheduler and the nanny, and the worker
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_all_ports_of_jobs_want_a_certificate(tmp_path):
+    """The queue is played by a shell, which does what the script of a job says."""
     before = listening_in(os.getpid())
     settings = {"cores": 1, "memory": "1GB", "shared-temp-directory": str(tmp_path)}
     settings |= {"interface": "lo", "python": sys.executable, "local-directory": str(tmp_path)}
