@@ -237,10 +237,10 @@ def test_a_script_of_ones_own(type_audit, tmp_path):
 
 
 def test_a_class_of_ones_own(type_audit, tmp_path, monkeypatch):
-    text = "from stable_baselines3 import DQN\n\n\nclass Mine(DQN):\n    pass\n"
+    text = "from agents.tabular.one_step import QLearning\n\n\nclass Mine(QLearning):\n    pass\n"
     (tmp_path / "my_audited_agents.py").write_text(text)
     monkeypatch.setattr(audit, "__defaults__", ((probes.probe_ends, probes.probe_discount),))
-    flags = ("--gym-packages", "my_audited_agents.py", "-params", "batch_size:32")
+    flags = ("--gym-packages", "my_audited_agents.py", "-params", "learning_rate:0.1")
     code, out, err = type_audit("--algo", "my_audited_agents:Mine", *flags)
     assert (code, err) == (0, "")
     assert out.endswith(
