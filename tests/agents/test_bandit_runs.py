@@ -91,7 +91,7 @@ def test_rewards_that_do_not_fit(name, line):
 
 # --- the compiled batch --------------------------------------------------------------------------
 
-CLICKS = [(COINS, {}), (SEGMENTS, {}), (SEGMENTS, {"batch_size": 7, "pulls": 240})]
+CLICKS = [(COINS, {}), (SEGMENTS, {"batch_size": 7, "pulls": 240})]
 DRIFT = {"drift_std": 0.1, "n_arms": 4, "means": [0, 0, 0, 0]}
 NUMBERED = [*CLICKS, (NORMAL, {}), (NORMAL, DRIFT)]
 FALLING = {
@@ -104,10 +104,10 @@ FALLING = {
 EVERYWHERE, LINEAR = [*NUMBERED, ("LinearBandit-v0", {})], [*CLICKS, ("LinearBandit-v0", {})]
 COVERED = [
     ("epsilon_greedy", FALLING, NUMBERED),
-    ("boltzmann", {"temperature": 0.2}, NUMBERED[2:]),
+    ("boltzmann", {"temperature": 0.2}, NUMBERED[1:]),
     ("ucb", {"variant": "sutton_barto", "tie_breaking": "first"}, NUMBERED),
     ("ucb", {}, NUMBERED[2:]),
-    ("gradient_bandit", {}, NUMBERED[2:]),
+    ("gradient_bandit", {}, NUMBERED[1:]),
     ("gradient_bandit", {"baseline": False, "ignore_context": True}, CLICKS),
     ("thompson", {"likelihood": "gaussian", "ignore_context": True}, NUMBERED),
     ("linucb", {}, EVERYWHERE),
@@ -125,15 +125,15 @@ ARRAYS = ("seeds", "arms", "rewards", "regrets", "contexts", "estimates", "coeff
 
 @pytest.mark.parametrize(("name", "kwargs", "env_id", "env_kwargs"), CASES)
 def test_a_batch_is_its_runs_one_by_one(name, kwargs, env_id, env_kwargs):
-    batch = run_batch(name, kwargs, env_id, env_kwargs, [0, 7], 240)
-    single = run_one_by_one(name, kwargs, env_id, env_kwargs, [0, 7], 240)
+    batch = run_batch(name, kwargs, env_id, env_kwargs, [0, 7], 150)
+    single = run_one_by_one(name, kwargs, env_id, env_kwargs, [0, 7], 150)
     for array in ARRAYS:
         ours, theirs = getattr(batch, array), getattr(single, array)
         assert (ours is None) == (theirs is None), array
         if ours is not None:
             assert ours.dtype == theirs.dtype
             assert np.array_equal(ours, theirs, equal_nan=ours.dtype.kind == "f"), array
-    assert batch.arms.shape == (2, 240)
+    assert batch.arms.shape == (2, 150)
     assert len(set(batch.arms[0].tolist())) > 1
 
 
@@ -185,32 +185,19 @@ def test_wrappers_are_not_compiled_away():
         gym.registry.pop("Twice-v0")
 
 
-def test_agents_of_the_library_run_one_by_one():
-    settings = {"policy": "MlpPolicy", "n_steps": 32, "batch_size": 32}
-    result = run_one_by_one("ppo", settings, SEGMENTS, {}, [0, 1], pulls=50)
-    assert result.arms.shape == result.contexts.shape == (2, 50)
-    means = np.array([[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]])
-    expected = means.max(axis=1)[result.contexts] - means[result.contexts, result.arms]
-    assert result.regrets == pytest.approx(expected)
-    assert result.estimates is None
-    assert np.array_equal(result.optimal, expected == 0)
-
-
 # --- MABWiser ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("ours", "theirs", "env_id", "kwargs"),
     [
-        ("ucb", "mabwiser_ucb1", COINS, {}),
         ("ucb", "mabwiser_ucb1", NORMAL, {"c": 0.5}),
         ("linucb", "mabwiser_linucb", "LinearBandit-v0", {}),
-        ("linucb", "mabwiser_linucb", SEGMENTS, {"alpha": 0.5}),
     ],
 )
 def test_ours_and_theirs_pull_the_same_arms(ours, theirs, env_id, kwargs):
-    """1,500 pulls: the update is the same to the last digit that a decision can hang on."""
-    args = env_id, {"pulls": 1500}, [0]
+    """800 pulls: the update is the same to the last digit that a decision can hang on."""
+    args = env_id, {"pulls": 800}, [0]
     first = run_batch(ours, {**kwargs, "tie_breaking": "first"}, *args)
     second = run_one_by_one(theirs, kwargs, *args)
     assert np.array_equal(first.arms, second.arms)
@@ -234,10 +221,3 @@ def test_testbed_at_the_last_pull(name, kwargs, mean_loc, reward, optimal):
     result = run_batch(name, kwargs, NORMAL, {"mean_loc": mean_loc}, range(2000))
     assert result.rewards[:, -1].mean() == pytest.approx(reward, abs=0.15)
     assert 100 * result.optimal[:, -1].mean() == pytest.approx(optimal, abs=4)
-
-
-def test_what_a_pooled_test_loses():
-    """Agents that look at the segment win what others lose; a mean of 100 runs of 10,000 pulls."""
-    for kwargs, regret in (({"ignore_context": True}, 443), ({}, 37)):
-        result = run_batch("thompson", kwargs, SEGMENTS, {"pulls": 10_000}, range(100))
-        assert result.regrets.sum(axis=1).mean() == pytest.approx(regret, abs=5)

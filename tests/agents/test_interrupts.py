@@ -6,11 +6,10 @@ from contextlib import closing, contextmanager, nullcontext
 
 import numpy as np
 import pytest
-from stable_baselines3.common.env_util import make_vec_env
 
-from agents import load_algorithm
 from agents.common.callbacks import BlockCallback, Horizon
 from agents.compiled.engine import interrupts_held
+from tests.agents.trainings import LAKE, environment, make
 
 N_ENVS = 2
 
@@ -48,7 +47,7 @@ def test_the_first_interrupt_waits_and_the_second_does_not():
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_handler_of_ones_own_is_called_at_once_and_what_it_raises_waits(number):
     order = []
 
@@ -109,16 +108,14 @@ def check(model, folder):
 
 
 @contextmanager
-def made(folder=None, n_envs=N_ENVS):
-    folder = None if folder is None else str(folder)
-    env = make_vec_env("FrozenLake-v1", n_envs, seed=0, monitor_dir=folder)
-    with closing(env):
-        yield load_algorithm("sarsa")(env=env, seed=0, engine="compiled")
+def made(folder=None):
+    with closing(environment(LAKE, N_ENVS, folder=folder)) as env:
+        yield make("sarsa", env, engine="compiled")
 
 
 def test_interrupts_at_any_moment(tmp_path):
     rng = np.random.default_rng(0)
-    moments = zip(rng.integers(1, 400, 40).tolist(), rng.uniform(0.0, 0.004, 40), strict=True)
+    moments = zip(rng.integers(1, 400, 15).tolist(), rng.uniform(0.0, 0.004, 15), strict=True)
     alarm = handling(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     with made(tmp_path) as model, alarm:
         # Twice, so that all is compiled before the first interrupt comes.
@@ -136,14 +133,13 @@ def test_interrupts_at_any_moment(tmp_path):
             assert model.num_timesteps == after + 50
 
 
-@pytest.mark.parametrize("n_envs", [1, N_ENVS])
-def test_an_interrupted_training_is_one_that_a_callback_stopped(n_envs):
+def test_an_interrupted_training_is_one_that_a_callback_stopped():
     states = []
     for interrupts in (False, True):
-        with made(n_envs=n_envs) as model:
+        with made() as model:
             with pytest.raises(KeyboardInterrupt) if interrupts else nullcontext():
                 model.learn(10_000, callback=Stop(interrupts))
-            assert model.num_timesteps == 21 * n_envs
+            assert model.num_timesteps == 21 * N_ENVS
             model.learn(400, reset_num_timesteps=False)
             states.append((model.policy.q_table.tobytes(), model.rng.bit_generator.state))
     assert states[0] == states[1]

@@ -304,7 +304,7 @@ def test_the_largest_error_comes_first():
 # --- R-max ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("gamma", [0.0, 0.5, 0.999, 0.9999])
+@pytest.mark.parametrize("gamma", [0.0, 0.9999])
 def test_r_max_keeps_to_its_tolerance(gamma):
     fed = Fed("r_max", [[0]], gamma=gamma, known_after=1, tolerance=1e-4)
     assert fed.step(0, 0, 0.5, 0)[0, 0] == pytest.approx(0.5 / (1 - gamma), abs=1e-4)

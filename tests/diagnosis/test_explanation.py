@@ -110,10 +110,9 @@ def test_what_cannot_be_observed_is_a_part_of_its_own():
 @pytest.mark.parametrize(
     ("algo", "env_id", "entry", "steps"),
     [
-        ("qlearning", "FrozenLake-v1", {}, 3000),
-        ("double_qlearning", "Taxi-v4", {}, 3000),
-        ("monte_carlo", "FrozenLake-v1", {"gamma": 1.0}, 3000),
-        ("sarsa_lambda", "MineMaze-v0", {}, 2000),
+        ("qlearning", "FrozenLake-v1", {}, 1000),
+        ("double_qlearning", "Taxi-v4", {}, 1000),
+        ("monte_carlo", "FrozenLake-v1", {"gamma": 1.0}, 1000),
         ("r_max", "FrozenLake-v1", {}, 500),
         ("semi_gradient_sarsa", "CliffWalking-v1", {}, 1000),
         ("reinforce", "FrozenLake-v1", {}, 1000),
@@ -131,12 +130,10 @@ def test_parts_and_states_sum_to_the_gap_of_any_agent(algo, env_id, entry, steps
 
 
 def test_the_random_agent_and_planners_have_no_parts_but_states():
-    random, optimal = (
-        explained("random", "FrozenLake-v1"),
-        explained("optimal", "FrozenLake-v1", steps=1),
-    )
-    assert (random.parts, optimal.is_optimal) == ((), True)
+    random = explained("random", "FrozenLake-v1")
+    assert random.parts == ()
     assert random.losses.sum() == pytest.approx(random.gap, rel=1e-9)
+    assert explained("optimal", "FrozenLake-v1", steps=1).is_optimal
 
 
 def test_two_agents_part_where_one_of_them_goes_wrong():

@@ -50,6 +50,7 @@ SMALL = f"""{NOTE}
 from agents.small_loop import run_small
 print(int(run_small(4.0)), "compiled", int("compiling run_small" in names))
 """
+QUIET = SMALL.replace(NOTE, "names = []")  # warnings go to standard error
 
 
 @pytest.fixture(scope="module")
@@ -85,22 +86,13 @@ def outcome(root, code=SMALL, **environment):
     return int(value), engine, compiled == "1"
 
 
-def test_a_changed_rule_is_what_runs(checkout):
+def test_a_changed_rule_is_what_runs_and_damaged_code_is_compiled_anew(checkout):
     # The rule stands in another file than the loop. Back again, what was compiled is still there.
     rule = checkout / "agents" / "common" / "small_rule.py"
     first, second = RULE.replace("3.0", "7.0"), RULE.replace("3.0", "5.0")
-    rule.write_text(first)
-    assert outcome(checkout) == (29, "compiled", True)
-    assert outcome(checkout) == (29, "compiled", False)
-    rule.write_text(second)
-    assert outcome(checkout) == (21, "compiled", True)
-    rule.write_text(first)
-    assert outcome(checkout) == (29, "compiled", False)
-    rule.write_text(RULE)
-
-
-def test_damaged_machine_code_is_compiled_anew(checkout):
-    outcome(checkout)
+    for text, value, is_compiled in ((first, 29, True), (second, 21, True), (first, 29, False)):
+        rule.write_text(text)
+        assert outcome(checkout) == (value, "compiled", is_compiled)
     folder = checkout / "agents" / "__pycache__" / "machine_code"
     for place, path in enumerate(sorted(folder.rglob("*.nb[ic]"))):
         # Below the digest's folder; Numba writes each file under a longer name first.
@@ -108,8 +100,9 @@ def test_damaged_machine_code_is_compiled_anew(checkout):
         assert len(name) < code_cache.LONGEST_NAME + 8
         size = path.stat().st_size
         path.write_bytes(b"" if place % 2 else path.read_bytes()[: size // 2])
-    assert outcome(checkout) == (13, "compiled", True)
-    assert outcome(checkout) == (13, "compiled", False)
+    for is_compiled in (True, False):
+        assert outcome(checkout) == (29, "compiled", is_compiled)
+    rule.write_text(RULE)
 
 
 @pytest.fixture
@@ -123,23 +116,19 @@ def closed(checkout, tmp_path):
     return root
 
 
-def test_where_nothing_can_be_written_it_is_compiled_in_memory(closed, tmp_path):
-    (tmp_path / "home").write_text("")
-    nowhere = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": ""}
-    done = run(closed, **nowhere)
-    assert done.stdout.split() == ["13", "compiled", "1"]
-    assert "Traceback" not in done.stderr
-    assert run(closed, "import mdp.planning, agents.tabular.one_step", **nowhere).stderr == (
-        "no folder for machine code can be written: it is compiled anew in each process\n"
-    )
-
-
-def test_a_home_serves_where_the_checkout_cannot_be_written(closed, tmp_path):
+def test_where_the_checkout_cannot_be_written_a_home_serves_or_memory(closed, tmp_path):
     cache = tmp_path / "cache"
     code = "import agents; from machine_code import cache; print(cache.folder('agents'))"
     folder = Path(run(closed, code, XDG_CACHE_HOME=str(cache)).stdout.strip())
     assert folder.parent == cache / "yardstick" / "machine_code" / "agents"
     assert folder.is_dir()
+    (tmp_path / "home").write_text("")
+    nowhere = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": ""}
+    done = run(closed, f"import mdp.planning\n{QUIET}", **nowhere)
+    assert done.stdout.split() == ["13", "compiled", "0"]
+    assert done.stderr == (
+        "no folder for machine code can be written: it is compiled anew in each process\n"
+    )
 
 
 def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
@@ -179,23 +168,24 @@ class Own(QLearning):
     next_value = own_value
 """
 USE = """
+import numpy as np
 from own_rules import Own
-from stable_baselines3.common.env_util import make_vec_env
+from agents.common.algorithm import Transitions
 def q(cls):
-    env = make_vec_env("FrozenLake-v1", seed=0)
-    model = cls(env=env, seed=0, learning_rate=1.0, gamma=1.0, exploration_decay="constant")
-    model.learn(500)
-    return float(model.policy.q_table[0, 0]), model.engine_in_use
-print(*q(Own))
+    # Not a whole training, whose other functions would be compiled too.
+    model = cls(env="FrozenLake-v1", learning_rate=1.0, gamma=1.0)
+    model._begin_episodes()
+    zero, no = np.array([0]), np.array([False])
+    model._learn_from(Transitions(zero, zero, np.zeros(1), no, no, zero))
+    return float(model.policy.q_table[0, 0])
+print(q(Own))
 """
-
-
 AGAIN = """
 import importlib, own_rules
 from pathlib import Path
 source = Path(own_rules.__file__)
 source.write_text(source.read_text().replace("9.0", "5.25"))
-print(*q(importlib.reload(own_rules).Own))
+print(q(importlib.reload(own_rules).Own))
 """
 
 
@@ -203,11 +193,11 @@ def test_a_rule_of_the_users_own_follows_its_source(checkout):
     """From process to process, and in one where its class is defined anew, as in a notebook."""
     module = checkout / "own_rules.py"
     module.write_text(OWN_RULE.format(worth=7.0))
-    assert run(checkout, USE).stdout.split() == ["7.0", "compiled"]
+    assert run(checkout, USE).stdout.split() == ["7.0"]
     module.write_text(OWN_RULE.format(worth=9.0))
     printed = run(checkout, USE + AGAIN).stdout.split()
     module.unlink()
-    assert printed == ["9.0", "compiled", "5.25", "compiled"]
+    assert printed == ["9.0", "5.25"]
 
 
 def test_old_machine_code_goes_away(tmp_path, monkeypatch):
@@ -253,11 +243,8 @@ FOLDERS = {
     "in a folder that others read": (lambda at: changed(at / "open", 0o755) / "cache", None),
     "of another": (lambda at: changed(at / "cache", owner=NOBODY), "belongs to another"),
     "writable by all": (lambda at: changed(at / "cache", 0o777), "mode 777"),
-    "writable by all, sticky": (lambda at: changed(at / "cache", 0o1777), "mode 1777"),
-    "writable by the group": (lambda at: changed(at / "cache", 0o770), "mode 770"),
     "readable by others": (lambda at: changed(at / "cache", 0o755), "mode 755"),
     "in a folder of all": (lambda at: changed(at / "tmp", 0o777) / "cache", "mode 777"),
-    "in a folder of the group": (lambda at: changed(at / "tmp", 0o775) / "cache", "mode 775"),
     "in a folder of another": (
         lambda at: changed(at / "home", 0o755, NOBODY) / "cache", "belongs to another"),
     "far below a folder of all": (
@@ -304,21 +291,16 @@ class Payload:
         return os.mkdir, (self.mark,)
 
 
-def plant(folder, payload, change):
-    """Exchange all that Numba would unpickle, and do something to each such file."""
+def plant(folder, mark, mode):
+    """Exchange all that Numba would unpickle."""
     for path in folder.rglob("*.nb[ic]"):
-        path.write_bytes(payload)
-        change(path)
+        path.write_bytes(pickle.dumps(Payload(mark)))
+        path.chmod(mode)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [lambda path: os.chown(path, NOBODY, NOBODY), lambda path: path.chmod(0o666)],
-    ids=["of another", "writable by all"],
-)
-def test_a_file_of_anyones_in_ones_own_folder_is_not_unpickled(checkout, tmp_path, change):
-    assert outcome(checkout)[2] is not None
-    plant(checkout / "agents", pickle.dumps(Payload(tmp_path / "mark")), change)
+def test_a_file_of_anyones_in_ones_own_folder_is_not_unpickled(checkout, tmp_path):
+    outcome(checkout)
+    plant(checkout / "agents", tmp_path / "mark", 0o666)
     said = f"{SMALL}print(sum('cannot be used' in name for name in names))"
     assert run(checkout, said).stdout.split()[:3] == ["13", "compiled", "1"]
     assert not (tmp_path / "mark").exists()
@@ -331,12 +313,12 @@ def test_a_folder_of_anyones_is_passed_over_in_one_line(checkout, tmp_path):
     shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
     assert outcome(root) == (13, "compiled", True)
     folder = root / "agents" / "__pycache__" / "machine_code"
-    plant(folder, pickle.dumps(Payload(tmp_path / "mark")), lambda path: None)
+    plant(folder, tmp_path / "mark", 0o600)
     folder.chmod(0o777)
     (tmp_path / "home").write_text("")
     nowhere = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": ""}
-    done = run(root, SMALL.replace(NOTE, "names = ['compiling run_small']\n"), **nowhere)
-    assert done.stdout.split() == ["13", "compiled", "1"]
+    done = run(root, QUIET, **nowhere)
+    assert done.stdout.split() == ["13", "compiled", "0"]
     assert done.stderr.strip() == (
         f"no folder for machine code is safe: {folder} is open to other users, mode 777: it is "
         "compiled anew in each process"

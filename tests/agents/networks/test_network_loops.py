@@ -181,7 +181,9 @@ def followed(mode, case):
     assert model.engine_in_use.partition(" but")[0].partition(":")[0] == expected
     exact = [diary.exact, [(step, list(record)) for step, record in lists.dumps]]
     logged = [value for _, record in lists.dumps for value in record.values()]
-    close = [*diary.close, *(value.numpy() for value in model.policy.state_dict().values())]
+    moments = model.policy.optimizer.state_dict()["state"]
+    kept = [np.asarray(moments[i][name]) for i in sorted(moments) for name in sorted(moments[i])]
+    close = [*diary.close, *(value.numpy() for value in model.policy.state_dict().values()), *kept]
     if name.startswith(("dqn", "do", "de")):
         exact += [getattr(model.replay_buffer, array).tolist() for array in REPLAY]
         assert model.replay_buffer.timeouts.any() == ("replay_buffer_kwargs" not in settings)
@@ -235,15 +237,12 @@ CASES = {  # agent, environment, how many, episodes between two records, setting
     "two environments": ("dqn", lake, 2, 3, {**Q, "gradient_steps": -1, "tau": 0.5}),
     "episodes": ("dqn", pole, 1, 3, {**Q, "train_freq": (2, "episode"), "gradient_steps": -1}),
     "steps": ("dqn", vectors, 2, 3, {**Q, "n_steps": 3, "train_freq": 3, "gradient_steps": 2}),
-    "more steps than episodes have": ("dqn", lake, 2, 3, {**Q, "n_steps": 40, "gamma": 0.9}),
     "double": ("double_dqn", pole, 2, 3, {**Q, "tau": 0.5}),
     "deep": ("deep_qlearning", lake, 1, 3, {**Q, "exploration_fraction": 0.5}),
     "no time limits": ("dqn", lake, 1, 3, {**Q, **UNLIMITED}),
     "greedy at once": ("dqn", vectors, 1, 3, {**Q, "exploration_fraction": 0.0}),
     "narrow": ("double_dqn", lake, 1, 3, {**Q, **policy(net_arch=[70, 1, 3], **IDENTITY)}),
-    "tangents": ("deep_qlearning", pole, 1, 3, {**Q, **policy(activation_fn=nn.Tanh)}),
     "matrices": ("dqn", Matrices, 2, 3, {**Q, "n_steps": 3, "max_grad_norm": 0.1}),
-    "normalised": ("dqn", Matrices, 1, 3, {**Q, "wrap": normalised, "n_steps": 3}),
     "ppo, normalised": ("ppo", Matrices, 2, 3, {**PPO, "wrap": normalised}),
     "ppo, clipped by a function": (
         "ppo", lake, 1, 3, {**PPO, "clip_range": lambda remaining: 0.05 + 0.2 * remaining}),
@@ -253,17 +252,20 @@ CASES = {  # agent, environment, how many, episodes between two records, setting
     "ppo on vectors": ("ppo", vectors, 1, 1, {**PPO, "batch_size": 8, "clip_range_vf": 0.1}),
     "ppo on poles": ("ppo", pole, 2, 3, {**PPO, "target_kl": 0.003}),
     "ppo, a remainder of one": ("ppo", vectors, 2, 3, {**PPO, "n_steps": 25, "batch_size": 7}),
-    "ppo on matrices": ("ppo", Matrices, 2, 3, {**PPO, "normalize_advantage": False}),
     "ppo by Adam": (
         "ppo", lake, 1, 3,
         {**PPO, **policy(th.optim.Adam, betas=(0.5, 0.9), eps=1e-3, weight_decay=0.1)}),
-    "ppo by AdamW": ("ppo", pole, 1, 3, {**PPO, **policy(th.optim.AdamW, weight_decay=3.0)}),
+    "ppo by AdamW": (
+        "ppo", Matrices, 1, 3,
+        {**PPO, "normalize_advantage": False, **policy(th.optim.AdamW, weight_decay=3.0)}),
     "ppo, two networks": (
         "ppo", pole, 1, 3,
         {**PPO, "max_grad_norm": 0.01, "ent_coef": 0.1,
          **policy(net_arch={"pi": [70, 1], "vf": []}, activation_fn=nn.ReLU)}),
     "a2c": ("a2c", lake, 2, 1, {"gamma": 0.9, "gae_lambda": 0.8}),
-    "a2c on poles": ("a2c", pole, 1, 3, {"normalize_advantage": True, "ent_coef": 0.1}),
+    "a2c by RMSprop": (
+        "a2c", pole, 1, 3,
+        {"normalize_advantage": True, "ent_coef": 0.1, **policy(th.optim.RMSprop, eps=1e-5)}),
     "a2c with decay": (
         "a2c", pole, 1, 3, policy(RMSpropTFLike, eps=1e-5, weight_decay=0.1)),
 }  # fmt: skip
@@ -292,7 +294,6 @@ ENVS = {
     "vectors": partial(vectors, 12),
     "pole": partial(pole, 30),
     "Warehouse": partial(gym.make, "Warehouse-v0", max_episode_steps=20),
-    "Taxi": partial(gym.make, "Taxi-v4", max_episode_steps=25),
 }
 Q_OFTEN = {**Q, "learning_starts": 50, "buffer_size": 150, "batch_size": 16}
 KINDS = {
@@ -350,7 +351,7 @@ def assert_same(ours, theirs):
     assert [name for name in ours if not np.array_equal(ours[name], theirs[name])] == []
 
 
-LONGER = [(env, kind) for env in ("Warehouse", "Taxi") for kind in ("dqn, two", "ppo, two")]
+LONGER = [("Warehouse", "dqn, two"), ("Warehouse", "ppo, two")]
 
 
 @pytest.mark.parametrize(("env", "kind"), [*(("lake", kind) for kind in KINDS), *LONGER])
@@ -363,40 +364,18 @@ def test_both_end_in_the_same_bits_wherever_blocks_end(env, kind):
         assert_same(learn(make(env, kind), "compiled", 500, *callbacks), parts)
 
 
-class LogReader(BlockCallback):
-    """Keeps what the log says now and then, and has it written down and forgotten now and then."""
-
-    every_n_steps = 37
-
-    def __init__(self):
-        super().__init__()
-        self.read = []
-
-    def _on_step(self):
-        said = self.logger.name_to_value.items()
-        self.read.append({k: v for k, v in said if k.startswith(("train/", "rollout/expl"))})
-        if len(self.read) % 2:
-            self.logger.dump(self.num_timesteps)
-        return True
-
-
 @pytest.mark.parametrize(
     ("env", "kind"),
-    [("vectors", "dqn, two"), ("vectors", "ppo, two"), *(("pole", kind) for kind in KINDS)],
+    [("vectors", "dqn, two"), *(("pole", kind) for kind in ("dqn, episodes", "ppo, two", "a2c"))],
 )
-def test_a_training_that_was_stopped_goes_on_and_its_log_is_the_same(env, kind):
-    models, readers = [], []
+def test_a_training_that_was_stopped_goes_on(env, kind):
+    models = []
     for mode in MODES:
-        reader = LogReader()
         stop = Every(123, lambda model: False)
-        model = learn(make(env, kind), mode, 1000, stop, reader, log_interval=None)
+        model = learn(make(env, kind), mode, 1000, stop)
         assert model.num_timesteps == 123 * model.n_envs
-        models.append(learn(model, mode, 300, reader, reset_num_timesteps=False, log_interval=None))
-        readers.append(reader.read)
+        models.append(learn(model, mode, 300, reset_num_timesteps=False))
     assert_same(*models)
-    assert len(readers[1]) == models[0].num_timesteps // 37
-    for read, expected in zip(readers[1], readers[0], strict=True):
-        assert read == pytest.approx(expected, nan_ok=True)
 
 
 # --- changes by hand -----------------------------------------------------------------------------
@@ -468,7 +447,12 @@ def unchanged():
     return {k: learn(make("lake", k), "compiled", 250).policy.state_dict() for k in ("dqn", "ppo")}
 
 
-@pytest.mark.parametrize(("what", "kind"), [(w, k) for w in CHANGES for k in ("dqn", "ppo")])
+OF_DQN = ("optimizer's state", "weights in place", "gamma", "weights", "clipping")
+
+
+@pytest.mark.parametrize(
+    ("what", "kind"), [*((what, "ppo") for what in CHANGES), *((what, "dqn") for what in OF_DQN)]
+)
 def test_a_change_counts_in_both_ways(what, kind, unchanged):
     change = CHANGES[what]
     models = [learn(make("lake", kind), mode, 250, Every(150, change)) for mode in MODES]
@@ -483,14 +467,13 @@ def freeze(model):
 
 
 FATAL = {
-    "its optimizer is SGD, not Adam or RMSp": ("dqn", take(th.optim.SGD)),
-    "some of its parameters are frozen": ("ppo", freeze),
+    "its optimizer is SGD, not Adam or RMSp": ("dqn", take(th.optim.SGD), "parts"),
+    "some of its parameters are frozen": ("ppo", freeze, "compiled"),
 }
 
 
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("reason", FATAL)
-def test_what_cannot_be_gone_on_with_ends_the_training(reason, mode):
-    kind, change = FATAL[reason]
+def test_what_cannot_be_gone_on_with_ends_the_training(reason):
+    kind, change, mode = FATAL[reason]
     with pytest.raises(ValueError, match=f"cannot go on: {reason}"):
         learn(make("lake", kind), mode, 400, Every(150, change))
