@@ -86,9 +86,9 @@ def agent_of(values, **arguments):
     return agent
 
 
-# With four states and four actions a row mistaken for a column raises no error.
-@pytest.mark.parametrize("shape", [(4, 4), (3, 5)])
-@pytest.mark.parametrize("rate", [0.2, 5.0])
+# Four states and four actions above all: there, a row mistaken for a column raises no error.
+@pytest.mark.parametrize("shape", [(4, 4), (3, 5), (1, 3), (3, 1)])
+@pytest.mark.parametrize("rate", [0.2, 1.0, 5.0])
 def test_probabilities_row_by_row(shape, rate):
     """Values without ties, whose rows have their best in different places; and large ones."""
     values = np.random.default_rng(3).normal(size=shape) + 1e5 * np.arange(shape[0])[:, None]
@@ -102,6 +102,18 @@ def test_probabilities_row_by_row(shape, rate):
     np.testing.assert_allclose(agent.action_probabilities(), greedy, rtol=0, atol=1e-15)
     agent = agent_of(values, exploration="boltzmann", temperature=rate)
     np.testing.assert_allclose(agent.action_probabilities(), softmax, rtol=1e-12)
+
+
+def test_tied_actions_share_or_the_first_has_all():
+    values = np.array([[1.0, 2, 2, 0], [3, 3, 3, 3], [5, 4, 5, 5], [0, 0, 0, 9]])
+    greedy = {
+        "random": [[0, 1 / 2, 1 / 2, 0], [1 / 4] * 4, [1 / 3, 0, 1 / 3, 1 / 3], [0, 0, 0, 1]],
+        "first": [[0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]],
+    }
+    for ties, shares in greedy.items():
+        arguments = {"exploration_initial_eps": 0.4, "exploration_final_eps": 0.4}
+        found = agent_of(values, tie_breaking=ties, **arguments).action_probabilities()
+        np.testing.assert_allclose(found, 0.1 + 0.6 * np.array(shares), rtol=1e-14)
 
 
 EXPONENTIALLY = {"exploration_decay": "exponential", "exploration_fraction": 1.0}

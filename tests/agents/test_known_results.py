@@ -1,4 +1,8 @@
-"""What is known exactly, or from books: plans, mazes, cliffs, deep seas."""
+"""What is known exactly, or from books and long campaigns: plans, mazes, cliffs, deep seas.
+
+The coursework warehouse's figures were measured over 30 seeds with programs of their own, written
+after a coursework's code: shelf reward -1, at most 1000 steps, 1000 episodes, ties on the first.
+"""
 
 import re
 
@@ -13,12 +17,14 @@ from agents import load_algorithm
 from agents.common.callbacks import EpisodeBudget
 from envs.known_models import time_limit, transition_model
 from mdp import (
+    TransitionModel,
     finite_horizon_optimum,
+    policy_iteration,
     policy_return,
     value_iteration,
 )
 
-N_SEEDS = 5
+N_SEEDS = 10
 
 
 def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
@@ -29,7 +35,23 @@ def made(name, env_id, seed=0, n_envs=1, env_kwargs=None, **settings):
 # --- planning ------------------------------------------------------------------------------------
 
 
-WITH_A_MODEL = ["FrozenLake-v1", "MaximizationBias-v0", "CliffWalking-v1"]
+def test_policy_iteration_by_hand():
+    """To stay in state 0 earns 1, in state 1 it earns 3; to go over earns nothing."""
+    next_state = np.array([[[0], [1]], [[1], [1]]])
+    model = TransitionModel(
+        prob=np.ones(next_state.shape),
+        next_state=next_state,
+        reward=np.array([[[1.0], [0.0]], [[3.0], [3.0]]]),
+        terminated=np.zeros(next_state.shape, dtype=bool),
+        initial=np.array([1.0, 0.0]),
+    )
+    plan = policy_iteration(model, 0.5)
+    assert plan.values == pytest.approx([3, 6])
+    assert plan.action_values[0] == pytest.approx([2.5, 3])
+    assert (plan.policy[0], plan.iterations) == (1, 2)
+
+
+WITH_A_MODEL = ["FrozenLake-v1", "WindyGridworld-v0", "MaximizationBias-v0", "CliffWalking-v1"]
 
 
 @pytest.mark.parametrize("gamma", [0.9, 1.0])
@@ -110,11 +132,34 @@ def test_cliff_walking_as_in_the_book():
     assert -28 < np.mean(online["sarsa"]) < -20
 
 
+# Step size, discount, epsilon; mean returns of episodes 1-100, 200-300 and the last 100.
+COURSEWORK = [
+    (0.1, 0.9, 0.1, (-61, 4), (76.2, 0.7), (76.5, 0.5)),
+    (0.9, 0.9, 0.1, (51.0, 3), (76.4, 0.7), (76.4, 0.7)),
+    (0.01, 0.9, 0.1, (-393, 15), (-81.5, 8), (48.2, 4)),
+    (0.1, 0.9, 0.9, (-256, 15), (-149, 10), (-146, 10)),
+    (0.1, 0.1, 0.1, (-291, 60), (-985, 25), (-975, 40)),
+]
+
+
+@pytest.mark.parametrize(
+    ("learning_rate", "gamma", "epsilon", "early", "middle", "late"), COURSEWORK
+)
+def test_the_coursework_warehouse(learning_rate, gamma, epsilon, early, middle, late):
+    settings = {"learning_rate": learning_rate, "gamma": gamma, "exploration_initial_eps": epsilon}
+    settings |= {"tie_breaking": "first", "env_kwargs": {"shelf_reward": -1}}
+    runs = [returns_of("qlearning", "Warehouse-v0", s, 1000, **settings) for s in range(N_SEEDS)]
+    returns = np.mean([returns for _, returns in runs], axis=0)
+    parts = returns[:100], returns[200:300], returns[-100:]
+    for part, (expected, tolerance) in zip(parts, (early, middle, late), strict=True):
+        assert part.mean() == pytest.approx(expected, abs=tolerance)
+
+
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "bound"), [("DeepSea-v0", {"size": 10}, 1.0), ("RiverSwim-v0", {}, 100.0)]
 )
 def test_it_finds_what_epsilon_greedy_never_sees(env_id, kwargs, bound):
-    """On each of five seeds the optimum, and next to nothing.
+    """On each of ten seeds the optimum, and next to nothing.
 
     Where time is short one would not swim on at the end, which is worth .02 % and no table can say.
     """

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import envs  # noqa: F401  # registers the environments
 from agents import ALGORITHMS, load_algorithm
+from agents.bandits.algorithm import Pull
 from agents.bandits.upper_bounds import kl_ucb_index
 from agents.library import DQN, DoubleDQN
 from envs.known_models import action_masks_of_states
@@ -108,11 +109,42 @@ def masks_of(draw, n):
     return np.array(draw(st.lists(rows, min_size=n, max_size=n)))
 
 
+def few(n):
+    return settings(max_examples=n, deadline=None, derandomize=True)
+
+
 # --- what is masked is not done ------------------------------------------------------------------
+
+GREEDILY = {"exploration_initial_eps": 0.5, "exploration_decay": "constant"}
+# That all of them keep to masks, in either engine, is seen in test_engines.py.
+TRIED = {
+    "double_qlearning": GREEDILY,
+    "sarsa, epsilon": GREEDILY,
+    "sarsa, boltzmann": {"exploration": "boltzmann", "temperature": 0.5},
+    "sarsa, gaussian": {"exploration": "gaussian_noise", "noise_std": 20.0},
+}
+
+
+@pytest.mark.parametrize("row", TRIED)
+@few(8)
+@given(allowed=masks_of(C), ties=st.sampled_from(["random", "first"]))
+def test_a_masked_action_is_never_chosen(row, allowed, ties):
+    # Tables full of noise: what is best is mostly masked. The environment itself refuses.
+    noisy = {"tie_breaking": ties, "initial_q_std": 5.0, **TRIED[row]}
+    agent = on_ring(row.partition(",")[0], allowed, 2, **noisy).learn(60)
+    obs = np.arange(C).repeat(20)
+    for deterministic in (True, False):
+        told = agent.predict(obs, deterministic=deterministic, action_masks=allowed[obs])[0]
+        assert allowed[obs, told].all()
+    if "gaussian" not in row:
+        met = agent.policy.masks.any(axis=1)
+        probabilities = agent.action_probabilities()
+        assert not probabilities[met][~allowed[met]].any()
+        np.testing.assert_allclose(probabilities.sum(axis=1), 1)
 
 
 @pytest.mark.parametrize("name", BANDITS)
-@settings(max_examples=3, derandomize=True)
+@few(8)
 @given(masks=masks_of(2 * C), ties=st.sampled_from(["random", "first"]), batch=st.integers(1, 3))
 def test_a_masked_arm_is_never_pulled(name, masks, ties, batch):
     model = in_shop(name, masks, 2, batch, tie_breaking=ties).learn(60)  # the shop refuses
@@ -154,7 +186,7 @@ def test_masked_arms_might_as_well_not_be_there(name):
     assert ends[0] == ends[1]
 
 
-@pytest.mark.parametrize("name", ["dyna_q_plus", "ucb", "linucb"])
+@pytest.mark.parametrize("name", ["dyna_q_plus", *BANDITS])
 def test_a_zip_brings_the_masks_back_and_one_can_begin_or_cease_to_go_by_them(name, tmp_path):
     def env(masks):
         kind = partial(Ring, masks) if name in TABULAR else partial(Shop, masks, 3)
@@ -171,10 +203,6 @@ def test_a_zip_brings_the_masks_back_and_one_can_begin_or_cease_to_go_by_them(na
     met = model.policy.masks.any(axis=1)
     assert met.sum() >= 2
     assert np.array_equal(model.policy.masks[met], BY_CONTEXT[met])
-    if name in TABULAR:
-        probabilities = loaded.action_probabilities()
-        assert not probabilities[met][~BY_CONTEXT[met]].any()
-        np.testing.assert_allclose(probabilities.sum(axis=1), 1)
     for agent in (model, loaded):
         agent.set_env(env(BY_CONTEXT))
         agent.env.seed(3)
@@ -270,11 +298,17 @@ def shares(model, mask, n=20_000):
     return np.bincount(arms, minlength=A) / n
 
 
+def softmax(values):
+    weights = np.exp(np.array(values) - max(values))
+    return weights / weights.sum()
+
+
 @pytest.mark.parametrize("name", ["ucb", "kl_ucb"])
 def test_bounds_count_all_pulls_of_the_context(name):
     """Source: the awake upper estimated rewards of Kleinberg, Niculescu-Mizil and Sharma, 2010."""
-    means = np.array([0.6, 0.3, 0.9, 0.0])
-    counts = np.array([50, 20, 9000, 1000] if name == "ucb" else [60, 10, 9000, 10_000])
+    means, counts = np.array([0.6, 0.3, 0.9, 0.0]), np.array([50, 20, 9000, 1000])
+    if name == "kl_ucb":
+        counts = np.array([60, 10, 9000, 10_000])
 
     def best(pulls):
         if name == "kl_ucb":
@@ -292,6 +326,18 @@ def test_bounds_count_all_pulls_of_the_context(name):
     assert model.predict(0, deterministic=True, action_masks=[0, 0, 1, 1])[0] == 2
 
 
+def test_gradient_step_among_the_arms_of_the_pull():
+    model = knowing("gradient_bandit", [2.0, 0.5, -1.0, 1.0], [2, 1, 0, 1], learning_rate=0.5)
+    model.policy.tables.sums[0] = [1.0, 3.0, 0.0, 4.0]
+    model._learn(Pull(0, 3, 5.0, 1.0, [False, True, False, True]))
+    less, more = softmax([0.5, 1.0])
+    advantage = 0.5 * (5.0 - 2.0)  # the average of four rewards, two of them of a masked arm
+    expected = [2.0, 0.5 - advantage * less, -1.0, 1.0 + advantage * (1 - more)]
+    assert model.policy.scores[0].tolist() == pytest.approx(expected, rel=1e-14)
+    assert model.policy.counts[0].tolist() == [2, 1, 0, 2]
+    assert model.policy.sums[0].tolist() == [1.0, 3.0, 0.0, 9.0]
+
+
 def test_late_feedback_remembers_what_was_allowed_and_how_likely_the_pull_was():
     """Two days of other masks, and feedback on the second; nothing was learnt before."""
     days = [[[True, True, False, False]] * C, EVERYTHING.tolist()]
@@ -304,22 +350,24 @@ def test_late_feedback_remembers_what_was_allowed_and_how_likely_the_pull_was():
 
 # --- deep Q-learning -----------------------------------------------------------------------------
 
+BOTH = pytest.mark.parametrize("algorithm", [DQN, DoubleDQN])
 SMALL = {"seed": 0, "learning_starts": 50, "policy_kwargs": {"net_arch": [8]}}
 MASKED = {"policy": "MlpPolicy", "mask_actions": True, "buffer_size": 1000, **SMALL}
 
 
 def warehouse(n_envs=1):
-    limit = {"max_episode_steps": 25}
-    return make_vec_env("Warehouse-v0", n_envs, 0, env_kwargs=limit, wrapper_class=ActionMasks)
+    env_kwargs = {"max_episode_steps": 25}
+    return make_vec_env("Warehouse-v0", n_envs, 0, env_kwargs=env_kwargs, wrapper_class=ActionMasks)
 
 
-def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(tmp_path):
+@BOTH
+def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(algorithm, tmp_path):
     env = warehouse(n_envs=2)
-    DQN(env=env, **{**MASKED, "mask_actions": False}).save(tmp_path / "plain")
+    algorithm(env=env, **{**MASKED, "mask_actions": False}).save(tmp_path / "plain")
     changed = {"mask_actions": True, "exploration_final_eps": 0.5}
-    agent = DQN.load(tmp_path / "plain", env=env, **changed).learn(900)
+    agent = algorithm.load(tmp_path / "plain", env=env, **changed).learn(900)
     agent.save(tmp_path / "agent")
-    loaded = DQN.load(tmp_path / "agent", env=env).learn(60)
+    loaded = algorithm.load(tmp_path / "agent", env=env).learn(60)
     assert loaded.mask_actions
     masks = action_masks_of_states(env.envs[0])
     for one in (agent, loaded):
@@ -332,8 +380,24 @@ def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(tmp_path):
         np.testing.assert_array_equal(kept[going_on], masks[after][going_on])
     # Cut-off episodes too, whose environments have been reset by then.
     assert agent.replay_buffer.timeouts.sum() > 20
-    plain = DQN.load(tmp_path / "agent", env=env, mask_actions=False).learn(60)
+    plain = algorithm.load(tmp_path / "agent", env=env, mask_actions=False).learn(60)
     assert type(plain.replay_buffer) is stable_baselines3.common.buffers.ReplayBuffer
+
+
+@BOTH
+def test_deep_agents_predict_among_the_allowed(algorithm):
+    agent, obs = algorithm(env=warehouse(), **MASKED), np.arange(100)
+    masks = np.random.default_rng(0).random((100, 4)) < 0.4
+    masks[:, 2] |= ~masks.any(axis=1)
+    with th.no_grad():
+        values = agent.q_net(agent.policy.obs_to_tensor(obs)[0]).numpy()
+    best = np.where(masks, values, -np.inf).argmax(axis=1)
+    for state, mask, expected in ((obs, masks, best), (5, masks[5], best[5])):
+        chosen = agent.predict(state, deterministic=True, action_masks=mask)[0]
+        np.testing.assert_array_equal(chosen, expected)
+    agent.exploration_rate = 1.0
+    for _ in range(10):
+        assert masks[obs, agent.predict(obs, action_masks=masks)[0]].all()
 
 
 class TwoStates(gym.Env):

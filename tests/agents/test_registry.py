@@ -1,18 +1,23 @@
 """The table of agents: where they live, what spaces they fit, and how others are added."""
 
 import importlib.util
+import re
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
 
 import agents
 import envs  # noqa: F401  # registers the bandits
 from agents import ALGORITHMS, fitting_algorithms, load_algorithm
+from agents.bandits.runs import run_batch, run_one_by_one
 from pipeline.settings.values import algorithm_parameters
+from tests.agents.hand_fed import Told
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "policy_iteration", "optimal"]
@@ -86,7 +91,9 @@ def test_which_agents_fit(env_id, names):
 
 ANY = "Box or Discrete or MultiDiscrete or MultiBinary"
 MISFITS = [  # agent, observations, actions, and why it does not fit
+    ("qlearning", DISCRETE, DISCRETE, ""),
     ("ppo", spaces.Dict({"a": BOX}), DISCRETE, ""),
+    ("angle", BOX, spaces.Discrete(2), ""),
     ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
     ("qlearning", BOX, DISCRETE, f"it observes Discrete spaces, not {BOX}"),
     ("sarsa", spaces.Discrete(4, start=1), DISCRETE,
@@ -211,7 +218,9 @@ MINE = "some_module:Mine"
         ("ppo", MINE, {}, "an agent ppo already (agents.library:PPO)"),
         ("PPO", MINE, {}, "there is an agent ppo already"),
         ("taken", "some_module:Other", {}, "register some_module:Other under another name"),
+        ("taken", MINE, {"actions": ["Box"]}, "there is an agent taken already"),
         ("../up", MINE, {}, "the name of an agent holds letters, digits and _"),
+        ("a/b", MINE, {}, "not 'a/b'"),
         ("", MINE, {}, "not ''"),
         ("mine", "some_module.Mine", {}, "is named as 'module:Class', not 'some_module.Mine'"),
         ("mine", dict, {}, "is named as 'module:Class'"),
@@ -241,3 +250,54 @@ def test_a_class_that_is_none():
 
 
 # --- the agents that CONTRIBUTING.md writes, as they stand there ----------------------------------
+
+DOCUMENT = Path(__file__).parents[2] / "CONTRIBUTING.md"
+EXAMPLES = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+# An entry in the table of agents, and hyperparameters.
+OTHER_LINES = 7
+
+
+@pytest.fixture
+def example(tmp_path):
+    """The class of one of the examples, from a module of its own, and the module's lines."""
+
+    def load(name):
+        (code,) = [code for code in EXAMPLES if f"class {name}(" in code]
+        path = tmp_path / f"example_{name.lower()}.py"
+        path.write_text(code)
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return getattr(module, name), len(code.splitlines())
+
+    return load
+
+
+def test_a_tabular_rule(example):
+    """Next values 4, 8, 6, 6: half the mean and half the best 8 make 7, and 2 + 0.5 * 7 is 5.5."""
+    cautious, lines = example("CautiousQLearning")
+    assert lines + OTHER_LINES <= 45
+    told = Told(cautious, 2, 4, caution=0.5, gamma=0.5, learning_rate=1.0)
+    told.agent.policy.q_tables.numpy()[0, 1] = [4, 8, 6, 6]
+    told.step(0, 3, 2.0, 1)
+    assert told.agent.policy.q_table[0, 3] == 2 + 0.5 * (0.5 * 6 + 0.5 * 8)
+    tables = []
+    for engine in ("compiled", "interpreted"):
+        env = make_vec_env("FrozenLake-v1", 2, seed=3)
+        model = cautious(env=env, seed=1, caution=0.4, engine=engine).learn(2000)
+        assert model.engine_in_use.startswith(engine)
+        tables.append(model.policy.q_tables.numpy().copy())
+    assert np.array_equal(*tables)
+    assert tables[0].any()
+    with pytest.raises(ValueError, match="caution must lie between 0 and 1, not 2"):
+        cautious(env="FrozenLake-v1", caution=2)
+
+
+def test_a_bandit_index(example):
+    moss, lines = example("MOSS")
+    assert lines + OTHER_LINES <= 30
+    arguments = moss, {}, "BernoulliBandit-v0", {}, [0, 1], 200
+    batch, single = run_batch(*arguments), run_one_by_one(*arguments)
+    assert np.array_equal(batch.arms, single.arms)
+    assert np.array_equal(batch.rewards, single.rewards)
+    assert batch.optimal[:, 100:].mean() > 0.5

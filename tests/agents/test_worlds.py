@@ -4,15 +4,20 @@ import numba
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
+from hypothesis import given
+from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import envs  # noqa: F401  # registers the environments
 from agents.compiled.generators import handles_of, next_uniform, skip_uniform
+from agents.compiled.greedy_play import COMPENSATED_SUM
+from agents.compiled.loop import add_to_return, begin_episode
 from agents.compiled.worlds import (
     CAR_STATE,
     CART_POLE_ENV,
     MOUNTAIN_CAR_ENV,
     STATE,
+    bin_index,
     compile_envs,
     drive,
     swing,
@@ -33,6 +38,12 @@ def swing_each(records, world, terminated):
 def drive_each(records, world, terminated):
     for i in range(len(records)):
         terminated[i] = drive(world, records[i])
+
+
+@numba.njit
+def bins_of(records, world, indices):
+    for i in range(len(records)):
+        indices[i] = bin_index(world, records[i])
 
 
 def world_of(env):
@@ -86,9 +97,9 @@ def records_of(kind, names, states):
 def test_steps_equal_gymnasiums(case):
     make, step_each, kind, names = PHYSICS[case]
     env, rng = make(), np.random.default_rng(0)
-    states = random_states(5_000)
+    states = random_states(20_000)
     if kind is MOUNTAIN_CAR_ENV:
-        states = rng.uniform([-1.1, -0.05], [0.5, 0.05], (5_000, 2))
+        states = rng.uniform([-1.1, -0.05], [0.5, 0.05], (20_000, 2))
         states[::5, 0] = rng.uniform(-1.1, -1.08, len(states[::5]))  # against the wall
         states[1::5, 0] = rng.uniform(0.35, 0.5, len(states[1::5]))  # before the flag
     records = records_of(kind, names, states)
@@ -104,6 +115,66 @@ def test_steps_equal_gymnasiums(case):
     assert reached.tobytes() == expected.tobytes()
     assert terminated.tolist() == ended
     assert 0.005 < terminated.mean() < 0.98
+
+
+BINNED = [
+    {"bins": 50, "low": [-0.41887903, -0.87266463], "high": [0.41887903, 0.87266463]},
+    {"bins": [10, 3], "low": -0.1, "high": [0.3, 0.7]},
+    {"bins": 1, "low": -1, "high": 1},
+]
+
+
+@pytest.mark.parametrize("dims", [[2, 3], [3, 0]])
+@pytest.mark.parametrize("kwargs", BINNED)
+def test_bins_equal_the_wrappers(kwargs, dims):
+    env = pole(**kwargs, dims=dims)
+    uniform = np.random.default_rng(0).uniform(-1, 1, (20_000, 4))
+    cuts = zip(env.low, env.high, env.bins, strict=True)
+    edges = np.concatenate([np.linspace(low, high, n + 1) for low, high, n in cuts])
+    extremes = np.array([*edges, *np.nextafter(edges, 9), 0.0, -0.0, 1e30, -1e30, 5e-324])
+    extremes = np.repeat(extremes, 4).reshape(-1, 4)
+    states = np.concatenate([random_states(10_000), uniform, extremes])
+    indices = np.empty(len(states), dtype=np.int64)
+    bins_of(records_of(CART_POLE_ENV, STATE, states), world_of(env), indices)
+    seen = states.astype(np.float32)
+    assert indices.tolist() == [env.observation(state) for state in seen]
+    np.testing.assert_array_equal(indices, env.map_observations(seen))
+    assert len(np.unique(indices)) > 0.8 * env.observation_space.n
+
+
+# --- Monitor's sums -------------------------------------------------------------------------------
+
+
+@numba.njit
+def running_sums(record, rewards, compensated, sums):
+    begin_episode(record)
+    for i in range(len(rewards)):
+        add_to_return(record, rewards[i], compensated)
+        sums[i] = record.episode_return + record.compensation
+
+
+def compensated_sum(values):
+    """Neumaier's sum, which Python's `sum` of floats is from 3.12 on."""
+    total, lost = 0.0, 0.0
+    for value in values:
+        new_total = total + value
+        larger, smaller = (total, value) if abs(total) >= abs(value) else (value, total)
+        lost += (larger - new_total) + smaller
+        total = new_total
+    return total + lost if lost else total
+
+
+def plain_sum(values):
+    return float(np.add.accumulate([0.0, *values])[-1])
+
+
+@given(values=st.lists(st.floats(-1e12, 1e12), max_size=40))
+def test_sums_by_either_rule_and_as_this_python_does(values):
+    rules = ((True, compensated_sum), (False, plain_sum), (COMPENSATED_SUM, sum))
+    for compensated, add_up in rules:
+        sums = np.empty(len(values))
+        running_sums(np.zeros(1, dtype=CART_POLE_ENV)[0], np.array(values), compensated, sums)
+        assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
 
 
 # --- generators ----------------------------------------------------------------------------------

@@ -1,24 +1,30 @@
 """Values under a discount, and what advantage estimation expects, by hand and by enumeration."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mdp import policy_return
-from mdp.advantages import discounted_values, expected_estimates
-from tests.mdp.worlds import deterministic, distributions, models
+from mdp import TransitionModel, policy_return
+from mdp.advantages import discounted_values, expected_estimates, expected_next
+from tests.mdp.test_random_models import distributions, models
 
-# Two states: 0 goes on (rewards 1 and 2, then the end), 1 stays for nothing.
-CHAIN = deterministic([[1, 0], [1, 1]], [[1, 0], [2, 0]], [[0, 0], [1, 0]])
+
+def chain():
+    """Two states: 0 goes on (rewards 1 and 2, then the end), 1 stays for nothing."""
+    prob = np.ones((2, 2, 1))
+    following = np.array([[[1], [0]], [[1], [1]]])
+    reward = np.array([[[1.0], [0.0]], [[2.0], [0.0]]])
+    ends = np.array([[[False], [False]], [[True], [False]]])
+    return TransitionModel(prob, following, reward, ends, np.array([1.0, 0.0]))
+
+
 EVEN = np.full((2, 2), 0.5)
 
 
 def test_values_of_a_chain_worked_out_by_hand():
     # V(1) = 1/2 2 + 1/2 1/2 V(1), and V(0) = 1/2 (1 + 1/2 V(1)) + 1/2 1/2 V(0).
-    found = discounted_values(CHAIN, EVEN, 0.5)
+    found = discounted_values(chain(), EVEN, 0.5)
     assert found.values == pytest.approx([10 / 9, 4 / 3])
     assert found.action_values == pytest.approx(np.array([[5 / 3, 5 / 9], [2, 2 / 3]]))
     assert found.advantages == pytest.approx(np.array([[5 / 9, -5 / 9], [2 / 3, -2 / 3]]))
@@ -26,11 +32,11 @@ def test_values_of_a_chain_worked_out_by_hand():
 
 def test_without_discount_what_may_never_end_has_no_value():
     # In state 1 it stays for ever; without it, state 0 would have one.
-    found = discounted_values(CHAIN, np.array([[0.5, 0.5], [0.0, 1.0]]), 1.0)
+    found = discounted_values(chain(), np.array([[0.5, 0.5], [0.0, 1.0]]), 1.0)
     assert np.isnan(found.values).all()
     assert found.action_values[1, 0] == 2.0
     assert np.isnan(found.action_values[[0, 0, 1], [0, 1, 1]]).all()
-    ends = discounted_values(CHAIN, np.array([[1.0, 0.0], [0.5, 0.5]]), 1.0)
+    ends = discounted_values(chain(), np.array([[1.0, 0.0], [0.5, 0.5]]), 1.0)
     assert ends.values == pytest.approx([3.0, 2.0])
 
 
@@ -49,7 +55,7 @@ def test_values_are_those_of_long_episodes_from_each_state(case):
     found = discounted_values(model, policy, discount)
     for state in np.flatnonzero(model.reachable):
         start = np.eye(model.n_states)[state]
-        there = replace(model, initial=start)
+        there = TransitionModel(model.prob, model.next_state, model.reward, model.terminated, start)
         value = policy_return(there, policy, None, discount).expected_return
         assert found.values[state] == pytest.approx(value, abs=1e-9)
         assert policy[state] @ found.advantages[state] == pytest.approx(0.0, abs=1e-9)
@@ -95,3 +101,30 @@ def test_what_estimates_expect_is_the_mean_over_all_that_may_happen(case, trace)
             for a in range(model.n_actions)
         )
         assert found == pytest.approx(told, abs=1e-9)
+
+
+@given(drawn_cases())
+def test_with_lambda_1_the_bias_is_that_of_the_state_alone(case):
+    """Of estimates over whole episodes: whatever the critic says, it is a mere baseline."""
+    model, policy, critic, discount = case
+    policy = policy / policy.sum(axis=1, keepdims=True)
+    exact = discounted_values(model, policy, discount)
+    reachable = np.flatnonzero(model.reachable)
+    pairs = np.array([(s, a, 400) for s in reachable for a in range(model.n_actions)]).T
+    given_action, given_state = expected_estimates(model, policy, critic, discount, 1.0, pairs)
+    assert given_action - given_state == pytest.approx(exact.advantages[pairs[0], pairs[1]])
+    assert given_state == pytest.approx((exact.values - critic)[pairs[0]])
+
+
+@given(drawn_cases())
+def test_with_lambda_0_the_bias_is_what_the_critic_errs_by_one_step_later(case):
+    model, policy, critic, discount = case
+    policy = policy / policy.sum(axis=1, keepdims=True)
+    exact = discounted_values(model, policy, discount)
+    reachable = np.flatnonzero(model.reachable)
+    pairs = np.array([(s, a, 7) for s in reachable for a in range(model.n_actions)]).T
+    given_action, given_state = expected_estimates(model, policy, critic, discount, 0.0, pairs)
+    wrong = discount * expected_next(model, critic - np.nan_to_num(exact.values))
+    wrong -= (policy * wrong).sum(axis=1, keepdims=True)
+    bias = given_action - given_state - exact.advantages[pairs[0], pairs[1]]
+    assert bias == pytest.approx(wrong[pairs[0], pairs[1]], abs=1e-9)

@@ -1,13 +1,14 @@
 """What planning says of its own error, against the error itself, in exact fractions."""
 
 import itertools
+from dataclasses import replace
 from fractions import Fraction
-from functools import cache
 
 import numpy as np
 import pytest
 
 from mdp import TransitionModel, policy_iteration, value_iteration
+from mdp.planning import FinitePart, PlanningProblem
 
 STATES, ACTIONS, OUTCOMES = 3, 2, 2
 EPSILON = float(np.finfo(np.float64).eps)
@@ -54,10 +55,9 @@ def solved(matrix):
     return [row[-1] for row in matrix]
 
 
-@cache
-def exact_optimum(seed, scale, discount):
+def exact_optimum(model, discount):
     """The best value of each state over all stationary policies that surely come to an end."""
-    model, gamma, found = drawn_model(seed, scale, costly=discount == 1), Fraction(discount), []
+    gamma, found = Fraction(discount), []
     for policy in itertools.product(range(ACTIONS), repeat=STATES):
         rows = []
         for state, action in enumerate(policy):
@@ -95,7 +95,7 @@ def test_bounds_are_never_below_the_error_and_not_far_above(discount, tolerance,
     rounding = 10_000 if costly else 32 / (1 - discount)
     for seed in range(N_MODELS):
         model = drawn_model(seed, scale, costly=costly)
-        exact = exact_optimum(seed, scale, discount)
+        exact = exact_optimum(model, discount)
         plan = value_iteration(model, discount, tolerance * scale)
         error = true_error(plan.values, exact)
         assert error <= plan.error_bound
@@ -108,6 +108,23 @@ def test_bounds_are_never_below_the_error_and_not_far_above(discount, tolerance,
     if tolerance > 1e-10:
         # A sweep brings values nearer by the discount: that much of the bound is error at most.
         assert (0.2 if costly else 0.85 * discount) < max(shares) <= discount
+
+
+@pytest.mark.parametrize(
+    ("change", "bound"), [(0.0, 0.0), (0.25, 2 / 3), (0.5, 2.0), (1 - 1e-9, 2e9), (1.0, np.inf)]
+)
+def test_the_bound_without_discount_by_hand(change, bound):
+    """A step costs 1 and ends the episode with a chance of 1/2: M is 0, and the value -2."""
+    model = TransitionModel(
+        prob=np.array([[[0.5, 0.5]]]),
+        next_state=np.zeros((1, 1, 2), np.int64),
+        reward=np.full((1, 1, 2), -1.0),
+        terminated=np.array([[[False, True]]]),
+        initial=np.ones(1),
+    )
+    problem = PlanningProblem(model, 1.0, replace(FinitePart.everything(model), step_cost=1.0))
+    found = problem.error_bound(np.array([-2.0]), change)
+    assert found == pytest.approx(bound, rel=1e-5, abs=1e-13)
 
 
 def rounded(values, times):

@@ -3,12 +3,15 @@
 from dataclasses import replace
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
+from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import (
     TransitionModel,
     baseline_policies,
+    baseline_return,
     finite_horizon_optimum,
     optimal_choices,
     optimum_far_from_limit,
@@ -17,7 +20,10 @@ from mdp import (
     state_visitation,
     value_iteration,
 )
-from tests.mdp.worlds import deterministic, model_of
+
+
+def model_of(env_id, **kwargs):
+    return transition_model(gym.make(f"envs:{env_id}", **kwargs))
 
 
 def coin(end, reward=1.0):
@@ -66,6 +72,48 @@ def test_drawn_rewards_add_their_own_variance(horizon):
         added = 4 / (1 - 0.8 * discount**2)
         assert found.return_variance == pytest.approx(known.return_variance + added)
         assert replace(found, return_variance=0.0) == replace(known, return_variance=0.0)
+
+
+def test_random_moves_in_the_warehouse():
+    for shelf_reward, expected in ((-100, -27_427), (-1, -776)):
+        model = model_of("Warehouse-v0", shelf_reward=shelf_reward)
+        uniform, *constant = baseline_policies(model)
+        found = policy_return(model, uniform, 1000).expected_return
+        assert found == pytest.approx(expected, abs=0.5)
+        returns = [policy_return(model, policy, 1000).expected_return for policy in constant]
+        assert returns[1:] == [-1000, -1000, -1000]
+        assert baseline_return(model, 1000) == pytest.approx(max(-1000, expected), abs=0.5)
+
+
+def test_the_best_routes_of_the_warehouse():
+    env = gym.make("envs:Warehouse-v0")
+    model, success = transition_model(env), success_outcomes(env)
+    best = value_iteration(model, 1.0)
+    found = policy_return(model, best.policy, 1000, success=success)
+    assert [*vars(found).values()] == [79.0, 0.0, 22.0, 0.0, 1.0]
+    visits = state_visitation(model, best.policy, 1000)
+    assert sorted(visits)[-22:] == [1.0] * 22
+    assert visits.sum() == 22
+    values, optimal = optimal_choices(model, 1000)
+    np.testing.assert_array_equal(values[model.reachable], best.values[model.reachable])
+    assert optimal[np.arange(100), best.policy].all()
+
+    def routes(state):
+        following = [
+            (model.next_state[state, a, 0], model.terminated[state, a, 0])
+            for a in np.flatnonzero(optimal[state])
+        ]
+        return sum(1 if ended else routes(reached) for reached, ended in following)
+
+    assert routes(90) == 2
+
+
+def test_the_frozen_lake_without_time_limit():
+    env = gym.make("FrozenLake-v1")
+    model, success = transition_model(env), success_outcomes(env)
+    found = policy_return(model, value_iteration(model, 1.0).policy, None, success=success)
+    assert found.success_rate == found.expected_return == pytest.approx(14 / 17)
+    assert found.return_variance == pytest.approx(14 / 17 * 3 / 17)
 
 
 def test_large_chains_are_solved_as_small_ones_are(monkeypatch):
@@ -149,7 +197,15 @@ def corridor():
     """
     next_state = [[0, 1], [0, 2], [1, 3], [2, 3], [4, 4]]
     reward = [[-1, -1], [-1, -1], [-1, -1], [-1, 10], [50, 50]]
-    return deterministic(next_state, reward, np.array(reward) == 10)
+    terminated = np.zeros((5, 2, 1), bool)
+    terminated[3, RIGHT] = True
+    return TransitionModel(
+        prob=np.ones((5, 2, 1)),
+        next_state=np.array(next_state)[:, :, None],
+        reward=np.array(reward, float)[:, :, None],
+        terminated=terminated,
+        initial=np.array([1.0, 0, 0, 0, 0]),
+    )
 
 
 HALF = np.full((5, 2), 0.5)
@@ -171,6 +227,18 @@ def test_values_of_a_corridor_worked_by_hand(policy, horizon, values):
     assert state_values(corridor(), np.array(policy), horizon).tolist() == values
 
 
+def test_what_is_best_in_a_corridor():
+    values, optimal = optimal_choices(corridor(), 100)
+    assert values.tolist() == [7, 8, 9, 10, 0]
+    assert optimal[:4].tolist() == [[False, True]] * 4
+    # Too late to get out of states 0 and 1: all ways of losing time are equal.
+    values, optimal = optimal_choices(corridor(), 2)
+    assert values.tolist() == [-2, -2, 9, 10, 0]
+    assert optimal[:4].tolist() == [[True, True], [True, True], [False, True], [False, True]]
+    values, optimal = optimal_choices(corridor(), 1)
+    assert values.tolist() == [-1, -1, -1, 10, 0]
+
+
 @pytest.mark.parametrize(("advantage", "n_best"), [(0.0, 2), (1e-11, 2), (1e-7, 1)])
 def test_actions_are_equal_within_rounding(advantage, n_best):
     model = coin(1.0, reward=5.0)
@@ -184,7 +252,13 @@ def test_actions_are_equal_within_rounding(advantage, n_best):
 
 def test_a_way_that_goes_round_for_a_million_steps():
     """0 leads to 1, and 1 and 2 to each other, for 1, 2 and 3; seven steps are 1 + 3 (2 + 3)."""
-    model = deterministic([[1], [2], [1]], [[1], [2], [3]], [[0]] * 3)
+    model = TransitionModel(
+        prob=np.ones((3, 1, 1)),
+        next_state=np.array([1, 2, 1]).reshape(3, 1, 1),
+        reward=np.array([1.0, 2.0, 3.0]).reshape(3, 1, 1),
+        terminated=np.zeros((3, 1, 1), bool),
+        initial=np.array([1.0, 0, 0]),
+    )
     policy = np.zeros(3, int)
     assert policy_return(model, policy, 7).expected_return == 16
     assert policy_return(model, policy, 10**6 + 1).expected_return == 1 + 5 * 10**6 / 2
@@ -194,13 +268,27 @@ def test_a_way_that_goes_round_for_a_million_steps():
 # --- a limit far away ----------------------------------------------------------------------------
 
 
-def far_goal(length, step=-1.0, end=0.0):
-    """A corridor: 1 goes on, 0 stays; each step and the end earn something."""
-    places = np.arange(length)
-    ends = np.zeros((length, 2))
-    ends[-1, 1] = True
-    ahead = np.stack([places, np.minimum(places + 1, length - 1)], axis=1)
-    return deterministic(ahead, np.where(ends, end, step), ends)
+@pytest.mark.parametrize("slip", [0.0, 0.1])
+def test_of_a_warehouse_it_is_found(slip):
+    env = gym.make("envs:RandomWarehouse-v0", size=15, slip=slip, max_episode_steps=5000)
+    model, horizon = transition_model(env), time_limit(env)
+    found, expected = optimum_far_from_limit(model, horizon), finite_horizon_optimum(model, horizon)
+    assert found == pytest.approx(expected.start_value, abs=1e-6)
+
+
+def far_goal(length, **changes):
+    """A corridor: 1 goes on, 0 stays; each step costs 1, and what is changed."""
+    shape = (length, 2, 1)
+    ahead = np.stack([np.arange(length), np.minimum(np.arange(length) + 1, length - 1)], axis=1)
+    terminated = np.zeros(shape, bool)
+    terminated[-1, 1] = True
+    return TransitionModel(
+        prob=np.ones(shape),
+        next_state=ahead.reshape(shape),
+        reward=np.where(terminated, changes.get("end", 0.0), changes.get("step", -1.0)),
+        terminated=terminated,
+        initial=np.eye(length)[0],
+    )
 
 
 def test_a_limit_that_matters_is_noticed():

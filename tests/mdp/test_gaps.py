@@ -1,10 +1,12 @@
-"""The gap of a policy, split over states: exact sums, and repairs by brute force."""
+"""The gap of a policy, split over states: exact sums, repairs by brute force, sampled episodes."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from envs.known_models import transition_model
 from mdp import finite_horizon_optimum, policy_return
 from mdp.gaps import (
     TooLargeError,
@@ -13,7 +15,7 @@ from mdp.gaps import (
     greedy_repairs,
     policy_gradient,
 )
-from tests.mdp.worlds import distributions, model_of, models
+from tests.mdp.test_random_models import distributions, models
 
 
 @st.composite
@@ -45,20 +47,6 @@ def test_what_states_lose_sums_to_the_gap(drawn):
     assert (split.optimum, split.value) == pytest.approx((optimum, value), abs=1e-9)
     assert (split.losses >= 0).all()
     assert split.losses.sum() == pytest.approx(optimum - value, abs=1e-9)
-    # A state's loss: how likely it is at each step, times what its actions there fall short.
-    there, losses, states = model.initial, np.zeros(model.n_states), np.arange(model.n_states)
-    for step in range(horizon):
-        chances = policy
-        if policy.dtype == np.int64:
-            chances = np.eye(model.n_actions)[policy[step] if policy.ndim == 2 else policy]
-        left = horizon - step - 1
-        after = finite_horizon_optimum(model, left).values if left else np.zeros(model.n_states)
-        going_on = np.where(model.terminated, 0.0, model.prob)
-        values = model.expected_reward + (going_on * after[model.next_state]).sum(axis=2)
-        losses += there * (values.max(axis=1) - (chances * values).sum(axis=1))
-        moved = there[:, None, None] * chances[:, :, None] * going_on
-        there = np.array([moved[model.next_state == state].sum() for state in states])
-    assert split.losses == pytest.approx(losses, abs=1e-9)
 
 
 @given(models_and_policies(n_policies=2))
@@ -104,7 +92,36 @@ def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     assert (nearby - value) / step == pytest.approx((slope * toward).sum(), abs=1e-3 * scale)
 
 
+def test_splitting_agrees_with_ten_thousand_episodes():
+    """Each state's loss is what episodes lose there, within four standard errors."""
+    model = transition_model(gym.make("FrozenLake-v1"))
+    horizon, n_episodes, rng = 30, 10_000, np.random.default_rng(0)
+    policy = rng.integers(model.n_actions, size=model.n_states)
+    split = gap_by_state(model, policy, horizon)
+    best = [np.zeros(model.n_states)]
+    for _ in range(horizon):
+        after = np.where(model.terminated, 0.0, best[-1][model.next_state])
+        values = model.expected_reward + (model.prob * after).sum(axis=2)
+        best.append(values.max(axis=1))
+    lost = np.zeros((n_episodes, model.n_states))
+    state = rng.choice(model.n_states, n_episodes, p=model.initial)
+    running = np.ones(n_episodes, bool)
+    for left in range(horizon, 0, -1):
+        after = np.where(model.terminated, 0.0, best[left - 1][model.next_state])
+        values = model.expected_reward + (model.prob * after).sum(axis=2)
+        cost = best[left][state] - values[state, policy[state]]
+        lost[np.flatnonzero(running), state[running]] += cost[running]
+        shares = model.prob[state, policy[state]].cumsum(axis=1)
+        outcome = (rng.random(n_episodes)[:, None] > shares).sum(axis=1)
+        at = state, policy[state], np.minimum(outcome, model.n_outcomes - 1)
+        running &= ~model.terminated[at]
+        state = model.next_state[at]
+    error = lost.std(axis=0) / np.sqrt(n_episodes)
+    assert (np.abs(lost.mean(axis=0) - split.losses) <= 4 * error + 1e-9).all()
+    assert (split.losses > 0).sum() > 5
+
+
 def test_worlds_that_are_too_large_are_refused():
-    model = model_of("RandomWarehouse-v0", size=100)
+    model = transition_model(gym.make("envs:RandomWarehouse-v0", size=100).unwrapped)
     with pytest.raises(TooLargeError, match="too many to keep"):
         first_differences(model, np.zeros(model.n_states, int), np.zeros(model.n_states, int), 9999)

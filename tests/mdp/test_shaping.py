@@ -9,15 +9,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mdp import policy_return
+from mdp import TransitionModel, policy_return
 from mdp.gaps import first_differences
 from mdp.shaping import discounted_effect, effect_under_limit
-from tests.mdp.worlds import deterministic, models
+from tests.mdp.test_random_models import models
+
+DISCOUNTS = [0.3, 0.9]
+
+
+def chain(rewards, ends, following):
+    """A model with one outcome for each state and action, which begins in state 0."""
+    following = np.array(following)[..., None]
+    return TransitionModel(
+        prob=np.ones(following.shape),
+        next_state=following,
+        reward=np.array(rewards, np.float64)[..., None],
+        terminated=np.array(ends, np.bool_)[..., None],
+        initial=np.eye(len(following))[0],
+    )
 
 
 def crossing(stop=1.0):
     """In state 0: stop for a reward, or go on to state 1 for nothing, where the end earns 3."""
-    return deterministic([[0, 1], [1, 1]], [[stop, 0.0], [3.0, 3.0]], [[1, 0], [1, 1]])
+    return chain([[stop, 0.0], [3.0, 3.0]], [[True, False], [True, True]], [[0, 1], [1, 1]])
 
 
 @pytest.mark.parametrize(
@@ -44,7 +58,7 @@ def test_a_bonus_for_stopping_by_hand(bonus, same, discounted, judged, factor):
 def test_a_bonus_that_can_be_collected_again_and_again_changes_the_optimum():
     # The bicycle of Randlov and Alstrom (1998): a reward for coming nearer, none taken back.
     rewards, ends = [[0.0, -0.1], [-0.1, 1.0]], [[False, False], [False, True]]
-    original = deterministic([[0, 1], [0, 1]], rewards, ends)
+    original = chain(rewards, ends, [[0, 1], [0, 1]])
     bonus = np.array([[0.0, 0.5], [0.0, 0.0]])[..., None]
     looping = replace(original, reward=original.reward + bonus)
     found = discounted_effect(original, looping, 0.9, 6)
@@ -73,7 +87,7 @@ def potentials(model):
     return hnp.arrays(np.int64, model.n_states, elements=st.integers(-9, 9))
 
 
-@given(st.data(), models(), st.sampled_from([0.3, 0.9]), st.sampled_from([0.01, 1.0, 7.0]))
+@given(st.data(), models(), st.sampled_from(DISCOUNTS), st.sampled_from([0.01, 1.0, 7.0]))
 def test_a_potential_costs_nothing_and_is_found(data, model, discount, factor):
     potential = data.draw(potentials(model)).astype(np.float64)
     found = discounted_effect(model, shaped_by(model, potential, discount, factor), discount, 5)
@@ -102,7 +116,15 @@ def test_a_potential_costs_nothing_without_a_discount_if_episodes_end_in_time(da
     assert found.returns == pytest.approx((found.optimum,) * 2, abs=1e-9)
 
 
-@given(st.data(), models(states=3, actions=2), st.sampled_from([0.3, 0.9]))
+def test_a_potential_that_is_not_0_where_time_runs_out_changes_what_is_optimal():
+    rewards, ends = np.zeros((2, 2)), np.zeros((2, 2))
+    original = chain(rewards, ends, [[0, 1], [1, 1]])
+    found = effect_under_limit(original, shaped_by(original, np.array([0.0, 1.0]), 1.0), 3)
+    assert found.differs.tolist() == [True, False]
+    assert (found.optimum, found.returns) == (0.0, (0.0, 0.0))
+
+
+@given(st.data(), models(states=3, actions=2), st.sampled_from(DISCOUNTS))
 def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount):
     rewards = hnp.arrays(np.int64, model.prob.shape, elements=st.integers(-3, 3))
     shaped = replace(model, reward=data.draw(rewards))
@@ -173,7 +195,7 @@ def test_rewards_times_a_negative_number_are_no_potential():
         (lambda: discounted_effect(crossing(), crossing(), 1.0, 10), "discount is 1.0"),
         (lambda: effect_under_limit(crossing(), crossing(), 0), "horizon is 0"),
         (
-            lambda: effect_under_limit(crossing(), deterministic([[0, 0]], [[0, 0]], [[1, 1]]), 3),
+            lambda: effect_under_limit(crossing(), chain([[0.0, 0.0]], [[1, 1]], [[0, 0]]), 3),
             "1 states and 2 actions cannot be compared with 2 states",
         ),
         (lambda: discounted_effect(crossing(), crossing(), 0.5, 10**9), "too many to plan"),
