@@ -234,6 +234,7 @@ REFUSED = [
     ("GaussianBandit", {"means": [1, 2], "mean_loc": 4}, "mean_loc is for means that are drawn"),
     ("GaussianBandit", {"means": [1, None]}, "means[1] must be a finite number, not None"),
     ("GaussianBandit", {"reward_std": -1}, "reward_std must be a finite number"),
+    ("LinearBandit", {"arm_parameters": []}, "arm_parameters must be a list of rows of numbers"),
     ("LinearBandit", {"arm_parameters": [[1, 2]]}, "arm_parameters must have two rows or more"),
     ("LinearBandit", {"arm_parameters": [[1, 2], [1]]}, "[1] has length 1, arm_parameters[0] has"),
     ("LinearBandit", {"arm_parameters": [[1, 2], [3, 4]], "n_features": 3}, "is 3, but 2 are"),

@@ -106,7 +106,7 @@ class Odd(Corridor):
         return obs, reward, terminated, truncated, info
 
     def observe(self):
-        return self.s + 1 if self.how == "shifted" else self.s
+        return {"shifted": self.s + 1, "pair": (0, self.s)}.get(self.how, self.s)
 
 
 def ladder(reward):
@@ -153,7 +153,10 @@ FALSE = {
     "no number": (lambda: Odd("nothing"), "step gave state 1 with reward nan"),
     "shifted": (
         lambda: Odd("shifted"), "reset gave state 1, where initial_state_distrib says"),
+    "pair": (lambda: Odd("pair"), r"the observation is \(0, 0\), not the number of a state"),
     "a short outcome": (lambda: with_p({0: {0: [(1.0,)]}}), NO_MODEL),
+    "three actions": (lambda: with_spaces(5, 3),
+        f"^{NO_MODEL}: it has 2 actions, where the space is Discrete\\(3\\)$"),
     "six states": (lambda: with_spaces(6, 2),
         f"^{NO_MODEL}: it has 5 states, where the space is Discrete\\(6\\)$"),
 }  # fmt: skip
