@@ -481,7 +481,7 @@ LONGS = b"".join(b"\x8a\x0f" + (M61 * i).to_bytes(15, "little") + b"N" for i in 
 BOMBS = {
     "one text in many arrays": ARRAY_MEMO + b"](" + ARRAY * 150 + b"e.",
     "many lists": b"](" + b"]" * 2_000_000 + b"e.",
-    "many places of the memo": b"N" + b"\x94" * 4_000_000 + b".",
+    "many places of the memo": b"N" + b"\x94" * 8_000_000 + b".",
     "many calls": DEQUE + b"\x940](" + b"h\x00)R" * 1_000_000 + b"e.",
     "a wide text":
         b"X" + (16 * MB + 4).to_bytes(4, "little") + b"a" * 16 * MB + b"\xf0\x9f\x98\x80.",
