@@ -87,7 +87,9 @@ INSTRUCTIONS = {
     "a call of a call that is huge once it is written out":
         SHORT_LAYERS + DEQUE + SHORT_TOP + b"\x85R)R",
     "tuples in tuples": b"N" + b"\x85" * 2_000,
+    "two states": CONSTANT + b")\x81}b}b",
     "the state of a list": b"]}b",
+    "the state of a name": name("builtins", "int") + b"}b",
     "a state that is its own object":
         FLOAT_SCHEDULE + b")\x81\x94}" + text("value_schedule") + b"h\x00sb",
     # Places of the stack and of the memo.
@@ -96,9 +98,14 @@ INSTRUCTIONS = {
     "an object among its own items": DEQUE + b")R\x94h\x00a",
     # Keys and members whose hash is not theirs alone, or takes for ever.
     "a key that is an object": b"}" + DEQUE + b")RNs",
+    "a key that is a truth": b"}\x88Ns",
+    "frozen members that are tuples": SHORT_LAYERS + b"(" + SHORT_TOP + b"\x91",
     "members that are tuples": SHORT_LAYERS + b"\x8f(" + SHORT_TOP + b"\x90",
     # Instructions of no model.
     "an extension code": b"\x82\x01",
+    "arguments by keyword": CONSTANT + b")}\x92",
+    "a long number of -1 bytes": b"\x8b\xff\xff\xff\xff",
+    "an array of -1 numbers": array(bytes(8), b"J\xff\xff\xff\xff\x85"),
     # The last byte makes it as long as it says.
     "a long number of a megabyte": b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f",
     "a frame without an end": b"\x95" + b"\xff" * 8 + b"N",
@@ -119,6 +126,7 @@ ATTACKS = {attack: START + instructions + b"." for attack, instructions in INSTR
     "a persistent id": START + b"Px\n.",
     "a buffer from elsewhere": b"\x80\x05\x97.",
     "a whole number of protocol 0": b"I" + b"9" * 10**6 + b"\n.",
+    "protocol 255": b"\x80\xff.",
     "nothing": b"",
 }
 
@@ -411,6 +419,8 @@ def odd_zips(genuine):
         "a member at another's place": directory(raw, policy, 42, bytes(4)),
         "a larger size": directory(raw, policy, 24, struct.pack("<L", 1 << 31)),
         "a place behind the end": directory(raw, policy, 42, struct.pack("<L", 1 << 30)),
+        "encrypted": directory(raw, policy, 8, struct.pack("<H", 1)),
+        "a smaller size": directory(raw, policy, 24, struct.pack("<L", 10)),
         "bzip2": directory(raw, policy, 10, struct.pack("<H", 12)),
         "of a later version": directory(raw, policy, 6, struct.pack("<H", 255)),
         "another checksum": directory(raw, policy, 16, struct.pack("<L", 1)),
