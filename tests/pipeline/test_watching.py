@@ -9,14 +9,19 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from rich.console import Console
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from pipeline import progress, signs_of_life, watching
+from pipeline.agent_settings import resolved_spec
+from pipeline.environments import make_training_env
 from pipeline.errors import UserError
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.progress import ProgressDisplay
-from pipeline.settings.hyperparams import split
+from pipeline.settings.hyperparams import read_hyperparams, split
 from pipeline.signs_of_life import Heartbeat, doing
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
@@ -167,6 +172,46 @@ def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, st
     assert rows["exploration"][0] == (1.0 if algo == "dqn" else pytest.approx(np.nan, nan_ok=True))
     lengths = [float(row[0]) for row in episodes_of(outcome.run.path)]
     assert rows["training_return"][-1] == pytest.approx(np.mean(lengths[-100:]))
+
+
+def test_of_many_maps_every_second_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(watching, "MOST_MAPS", 4)  # so that there are soon too many
+    spec = spec_of(algo="ppo", settings=SMALL_PPO, log_folder=tmp_path)
+    training, _ = done(replace(spec, watch_learning=tmp_path / "page.html"))
+    for _ in range(2):
+        training.watch.finish()
+    # Ten updates; the last one is kept though it is none of every fourth.
+    assert training.watch.moments.rows["number"].tolist() == [0, 4, 8, 10]
+    assert (training.watch.stride, training.watch.n_units) == (4, 10)
+
+
+@pytest.mark.parametrize("env_id", ["FrozenLake-v1"])
+def test_what_is_played_covers_the_rise_of_the_greedy_policys_return(env_id):
+    """Replayed from the records: it is low where the window begins, and high where it ends."""
+    settings = read_hyperparams("qlearning", env_id) | {"n_timesteps": 60_000}
+    settings.pop("n_episodes", None)
+    spec = resolved_spec(settings, algo="qlearning", env_id=env_id, seed=0)
+    exact, env = exact_evaluator(spec), make_training_env(spec, None)
+    agent, recorder = make_model(spec, None, env, algorithm_kwargs(spec)), TableRecorder(0, exact)
+    agent.learn(60_000, recorder)
+    begin, end = recorder.window()
+    table = recorder.initial["q_tables"].copy()
+    returns, changes = {}, recorder.changes.rows
+    for step in sorted({*range(0, len(recorder.steps) + 1, 50), begin, end}):
+        now = changes[changes["step"] < step]
+        table.reshape(-1)[now["entry"]] = now["after"]
+        agent.policy.q_tables.copy_(th.from_numpy(table))
+        returns[step] = exact(agent).mean_return
+    low, high = returns[0], max(returns.values())
+    assert high >= 0.9 * exact.yardstick.optimum if high > 0 else high > low
+    assert returns[begin] <= low + 0.35 * (high - low)
+    assert max(value for step, value in returns.items() if begin <= step <= end) >= (
+        low + 0.9 * (high - low)
+    )
+    assert 5000 <= end - begin <= 20_000
+    # It begins with an episode.
+    before = recorder.moves.rows[recorder.moves.rows["step"] == begin - 1]
+    assert begin == 0 or before["end"][0] != 0
 
 
 def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
