@@ -136,7 +136,7 @@ def test_a_broken_file_is_told_with_its_place(tmp_path, content, complaint):
 def test_one_name_is_given_once_and_a_text_has_an_end():
     with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
         parse_assignments(["gamma:0.9", "gamma:0.8"])
-    with pytest.raises(UserError, match="^ppo: .*longer than 10000 characters"):
+    with pytest.raises(UserError, match=r"^ppo: .*longer than 10000 characters"):
         parse_literal("1" * 20_000, "ppo")
 
 
