@@ -17,11 +17,8 @@ from mdp import policy_return, value_iteration
 
 CARDS = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 10, 10, 10]
 SUTTON = {"sab": True}
-PUBLISHED = [
-    (SUTTON, -0.0431),
-    ({"sab": False, "natural": True}, -0.0257),
-    ({"sab": False, "natural": False}, -0.0466),
-]
+NATURAL = {"sab": False, "natural": True}
+PUBLISHED = [(SUTTON, -0.0431), (NATURAL, -0.0257), ({"sab": False, "natural": False}, -0.0466)]
 STICK, HIT = 0, 1
 
 
@@ -91,10 +88,9 @@ def test_the_policy_is_that_of_figure_5_2():
         assert policy[natural_state(dealer)] == STICK
 
 
-@pytest.mark.parametrize("rules", [rules for rules, _ in PUBLISHED[:2]], ids=["sab", "natural"])
-def test_starts_and_steps_of_played_hands_have_the_models_chances(rules):
-    env = gym.make("Blackjack-v1", **rules).unwrapped
-    model, n = blackjack_model(env), 10_000
+def test_starts_and_steps_of_played_hands_have_the_models_chances():
+    env = gym.make("Blackjack-v1", **NATURAL).unwrapped
+    model, n = blackjack_model(env), 5000
     starts, reached, tried = np.zeros(model.n_states), {}, {}
     env.reset(seed=1)
     for i in range(n):
@@ -127,19 +123,14 @@ def test_a_natural_looks_as_any_21_does_and_wins_are_successes():
     assert set(transition_model(env).reward[success_outcomes(env)].tolist()) == {1.0, 1.5}
 
 
-def test_agents_that_plan_take_it_and_compiled_training_does_not():
-    env = FlattenToDiscrete(gym.make("Blackjack-v1", max_episode_steps=100))
-    agent = load_algorithm("optimal")(env=env, seed=0).learn(10)
-    assert agent.predict(state_of(13, 2, False))[0] == STICK
-    with pytest.raises(NotCompilable, match="does not go on from where its attribute s is set"):
-        compile_envs(load_algorithm("qlearning")(env=env).env)
-
-
 class Cheating(BlackjackEnv):
     """Its steps may do anything."""
 
 
-def test_another_blackjack_is_not_believed():
+def test_another_blackjack_is_not_believed_and_none_is_compiled():
     changed = BlackjackEnv()
     changed.step = lambda action: None
     assert transition_model(Cheating()) is transition_model(changed) is None
+    agent = load_algorithm("qlearning")(env=FlattenToDiscrete(gym.make("Blackjack-v1")))
+    with pytest.raises(NotCompilable, match="does not go on from where its attribute s is set"):
+        compile_envs(agent.env)

@@ -51,7 +51,6 @@ def count(drawn, colour):
     ("actions", "text"),
     [
         ([], "(start)\n..G\n.#.\nR..\n"),
-        ([RIGHT], "(right)\n..G\n.#.\nSR.\n"),
         ([RIGHT, RIGHT, RIGHT], "(right)\n..G\n.#.\nS*R\n"),
         ([RIGHT, RIGHT, UP, UP], "(up)\n..R\n.#*\nS**\n"),
     ],
@@ -62,21 +61,6 @@ def test_text_of_a_map(actions, text):
     assert shown(env) == "(start)\n..G\n.#.\nR..\n"
     maze = MineMazeEnv(desc=["SPPM", "...G"], render_mode="ansi")
     assert shown(maze, RIGHT, DOWN) == "(down)\nS*PM\n.R.G\n"
-
-
-def test_text_of_a_large_map_shows_what_is_near():
-    rows = ["." * 300] * 200
-    rows[100] = "." * 150 + "S" + "." * 149
-    rows[199] = "." * 299 + "G"
-    env = WarehouseEnv(desc=rows, render_mode="ansi")
-    title, *lines = shown(env).splitlines()
-    assert title == "(start) rows 80-119, columns 100-199"
-    assert [len(line) for line in lines] == [100] * 40
-    assert lines[20] == "." * 50 + "R" + "." * 49
-    env.s = 200 * 300 - 2
-    title, *lines = env.render().splitlines()
-    assert title == "(start) rows 160-199, columns 200-299"
-    assert lines[-1].endswith("..RG")
 
 
 class Terminal(io.StringIO):

@@ -29,29 +29,14 @@ VARIANTS = [
     *IDS,
     ("Warehouse-v0", {"slip": 0.3, "random_start": True}),
     ("Warehouse-v0", {"slip": 1, "shelf_reward": -1, "observation": "position"}),
-    ("Warehouse-v0", {"random_start": True, "observation": "one_hot"}),
-    ("Warehouse-v0", {"desc": ["S.G"], "observation": "position"}),
     ("MineMaze-v0", {"slip": 0.2, "random_start": True, "power_reward": 0}),
     ("RandomWarehouse-v0", {"size": 15, "map_seed": 3, "slip": 0.1, "random_start": True}),
-    ("BernoulliBandit-v0", {"probabilities": [0, 1], "pulls": 20}),
-    ("GaussianBandit-v0", {"means": [0.0] * 10, "drift_std": 0.01}),
     ("GaussianBandit-v0", {"n_arms": 3, "mean_loc": 4, "reward_std": 0, "pulls": 50}),
     ("LinearBandit-v0", {"arm_parameters": [[1.0, 0.0], [0.0, 1.0]], "pulls": 30}),
     ("SegmentBandit-v0", {"batch_size": 7, "pulls": 25}),
     ("WindyGridworld-v0", {"moves": "king_and_stay", "stochastic": True}),
     ("DynaMaze-v0", {"maze": "shortcut", "changed": True, "change_after_steps": 50}),
     ("DeepSea-v0", {"deterministic": False}),
-]
-HEADINGS = [
-    "Description",
-    "Action Space",
-    "Observation Space",
-    "Rewards",
-    "Starting State",
-    "Episode End",
-    "Information",
-    "Arguments",
-    "Version History",
 ]
 
 
@@ -85,14 +70,6 @@ def assert_equal(one, other):
     assert env_checker.data_equivalence(one, other, exact=True)
 
 
-@every_id
-def test_the_docstring_has_the_headings_of_toy_text(env_id, kwargs):
-    lines = [
-        line.strip() for line in type(gym.make(env_id, **kwargs).unwrapped).__doc__.split("\n")
-    ]
-    assert [line[3:] for line in lines if line.startswith("## ")] == HEADINGS
-
-
 def test_an_id_with_the_package_in_front_registers_it():
     made = ", ".join(f"make('envs:{name}', **{kwargs!r})" for name, kwargs in IDS)
     code = f"from gymnasium import make; print(*(env.unwrapped.spec.id for env in ({made},)))"
@@ -110,24 +87,17 @@ def test_the_checkers_of_gymnasium_and_stable_baselines3_find_nothing(env_id, kw
 
 
 @every_variant
-def test_its_spec_and_a_seed_give_the_same_episodes_again(env_id, kwargs):
-    env = gym.make(env_id, max_episode_steps=40, **kwargs)
+def test_its_spec_a_seed_and_copies_in_mid_episode_give_the_same_episodes(env_id, kwargs):
+    env = gym.make(env_id, render_mode="rgb_array", max_episode_steps=40, **kwargs)
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.spec.max_episode_steps == 40
     assert_equal(env.reset(seed=5), again.reset(seed=5))
-    assert_equal(play(env, 200, seed=4), play(again, 200, seed=4))
-
-
-@every_variant
-def test_a_copy_made_in_mid_episode_goes_on_alike(env_id, kwargs):
-    env = gym.make(env_id, render_mode="rgb_array", **kwargs)
-    env.reset(seed=5)
-    play(env, 37, seed=2)
+    assert_equal(play(env, 77, seed=4), play(again, 77, seed=4))
     env.render()
-    copies = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
-    expected = play(env, 100, seed=3)
+    copies = [again, pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    expected = play(env, 60, seed=3)
     for other in copies:
-        assert_equal(play(other, 100, seed=3), expected)
+        assert_equal(play(other, 60, seed=3), expected)
         np.testing.assert_array_equal(other.render(), env.render())
 
 
@@ -231,16 +201,12 @@ CHANGING = {"maze": "blocking", "changed": True}
 REFUSED = [
     ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),
     ("Warehouse", {"slip": NAN}, "slip must be a finite number from 0 to 1, not nan"),
-    ("Warehouse", {"slip": "0.1"}, "slip must be a finite number from 0 to 1, not '0.1'"),
     ("Warehouse", {"slip": True}, "slip must be a finite number from 0 to 1, not True"),
     ("Warehouse", {"shelf_reward": "a"}, "shelf_reward must be a finite number, not 'a'"),
     ("Warehouse", {"observation": "positon"}, "'positon': did you mean 'position'? It must be one"),
-    ("Warehouse", {"observation": "xyz"}, "'xyz': it must be one of discrete, position, one_hot"),
     ("MineMaze", {"step_reward": INF}, "step_reward must be a finite number, not inf"),
-    ("MineMaze", {"goal_reward": None}, "goal_reward must be a finite number, not None"),
     ("MineMaze", {"random_start": 1}, "random_start must be true or false, not 1"),
     ("RandomWarehouse", {"size": 1}, "size must be a whole number from 2 to 4096, not 1"),
-    ("RandomWarehouse", {"size": 2.5}, "size must be a whole number from 2 to 4096, not 2.5"),
     ("RandomWarehouse", {"shelf_density": 1.1}, "shelf_density must be a finite number from 0 to"),
     ("RandomWarehouse", {"map_seed": -1}, "map_seed must be a whole number from 0 to 9223372036"),
     ("DynaMaze", {"maze": "block"}, "unknown maze 'block': did you mean 'blocking'"),
@@ -257,21 +223,17 @@ REFUSED = [
     ("MaximizationBias", {"reward_std": -1}, "reward_std must be a finite number"),
     ("RiverSwim", {"n_states": 1}, "n_states must be a whole number from 2"),
     ("DeepSea", {"size": 1}, "size must be a whole number from 2"),
-    ("DeepSea", {"map_seed": -1}, "map_seed must be a whole number"),
     ("Racetrack", {"track": "middle"}, "unknown track 'middle'"),
     ("JacksCarRental", {"variant": "exam"}, "unknown variant 'exam': did you mean 'exam"),
     ("JacksCarRental", {"first_cars": 21}, "first_cars must be a whole number from 0 to 20"),
     ("BernoulliBandit", {"probabilities": [0.5]}, "must hold 2 numbers or more, not 1"),
     ("BernoulliBandit", {"probabilities": 0.5}, "must be a list of numbers, not 0.5"),
-    ("BernoulliBandit", {"probabilities": "ab"}, "must be a list of numbers, not 'ab'"),
     ("BernoulliBandit", {"probabilities": [0.5, 1.5]}, "[1] must be a finite number from"),
     ("BernoulliBandit", {"pulls": 0}, "pulls must be a whole number from 1 to 1000000000, not 0"),
-    ("GaussianBandit", {"n_arms": 1}, "n_arms must be a whole number from 2 to 10000, not 1"),
     ("GaussianBandit", {"means": [1, 2], "n_arms": 3}, "n_arms is 3, but 2 are given: leave it"),
     ("GaussianBandit", {"means": [1, 2], "mean_loc": 4}, "mean_loc is for means that are drawn"),
     ("GaussianBandit", {"means": [1, None]}, "means[1] must be a finite number, not None"),
     ("GaussianBandit", {"reward_std": -1}, "reward_std must be a finite number"),
-    ("GaussianBandit", {"drift_std": NAN}, "drift_std must be a finite number"),
     ("LinearBandit", {"arm_parameters": []}, "arm_parameters must be a list of rows of numbers"),
     ("LinearBandit", {"arm_parameters": [[1, 2]]}, "arm_parameters must have two rows or more"),
     ("LinearBandit", {"arm_parameters": [[1, 2], [1]]}, "[1] has length 1, arm_parameters[0] has"),

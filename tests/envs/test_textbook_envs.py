@@ -41,24 +41,17 @@ def test_values_of_short_walks_are_those_of_the_book():
     np.testing.assert_allclose(values[1:6], np.arange(1, 6) / 6, atol=1e-9)
     values = optimal_values("RandomWalk-v0", n_states=19, left_reward=-1)
     np.testing.assert_allclose(values[1:20], np.arange(-18, 19, 2) / 20, atol=1e-9)
-    assert optimum_of("RandomWalk-v0") == pytest.approx(0.5)
 
 
 def test_the_walk_of_a_thousand_states_is_example_9_1():
-    kwargs = {"n_states": 1000, "max_jump": 100, "left_reward": -1}
-    model = model_of("RandomWalk-v0", **kwargs)
+    model = model_of("RandomWalk-v0", n_states=1000, max_jump=100, left_reward=-1)
     # From state 1, one jump to the left in two leads beyond the end.
-    assert model.prob[1, 0][model.next_state[1, 0] == 0].sum() == pytest.approx(0.5)
-    assert model.prob[31, 0][model.next_state[31, 0] == 0].sum() == pytest.approx(70 / 200)
+    for state, chance in ((1, 0.5), (31, 70 / 200)):
+        assert model.prob[state, 0][model.next_state[state, 0] == 0].sum() == pytest.approx(chance)
     assert sorted(set(model.next_state[500, 0].tolist())) == [*range(400, 500), *range(501, 601)]
-    values = optimal_values("RandomWalk-v0", **kwargs)[1:1001]
-    # The linear system by itself: each value is the mean of what 200 jumps lead to.
-    padded = np.concatenate([[-1.0] * 100, values, [1.0] * 100])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 201).sum(axis=1)
-    np.testing.assert_allclose(values, (windows - values) / 200, atol=1e-9)
 
 
-@pytest.mark.parametrize("p", [0.05, 0.3, 0.59, 0.95])
+@pytest.mark.parametrize("p", [0.05, 0.59])
 def test_returns_of_the_corridor_are_those_of_the_closed_form(p):
     # Example 13.1: v1 = 1 + p v2 + (1-p) v1, v2 = 1 + p v1 + (1-p) v3, v3 = 1 + (1-p) v2.
     policy = np.tile([1 - p, p], (4, 1))
@@ -79,11 +72,6 @@ def test_the_second_state_of_the_corridor_alone_is_reversed():
 # --- WindyGridworld -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("moves", "steps"), [("rook", 15), ("king", 7), ("king_and_stay", 7)])
-def test_the_shortest_ways_through_the_wind(moves, steps):
-    assert optimum_of("WindyGridworld-v0", moves=moves) == -steps
-
-
 def next_by_hand(state, down, right, gust):
     """A step as the book describes it, written out once more."""
     wind = [0, 0, 0, 1, 1, 1, 2, 2, 1, 0]
@@ -93,7 +81,9 @@ def next_by_hand(state, down, right, gust):
     return 10 * min(max(row + down, 0), 6) + min(max(column + right, 0), 9)
 
 
-def test_every_step_in_a_wind_that_varies():
+def test_the_shortest_ways_and_every_step_in_the_wind():
+    for name, steps in (("rook", 15), ("king", 7), ("king_and_stay", 7)):
+        assert optimum_of("WindyGridworld-v0", moves=name) == -steps
     model = model_of("WindyGridworld-v0", moves="king_and_stay", stochastic=True)
     moves = [(-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1), (0, 0)]
     assert model.n_actions == 9
@@ -120,11 +110,6 @@ def test_values_of_the_gambler_are_those_of_bold_play():
             bold[capital] = 0.4 * bold[capital + stake] + 0.6 * bold[capital - stake]
     np.testing.assert_allclose(values[1:100], bold[1:100], atol=1e-9)
     assert values[[25, 50, 75]] == pytest.approx([0.16, 0.4, 0.4 + 0.6 * 0.4], abs=1e-12)
-    # On a kind coin the timid one unit is best.
-    values = optimal_values("GamblersProblem-v0", heads_probability=0.6, goal=10)
-    ratio = 0.4 / 0.6
-    ruin = (1 - ratio ** np.arange(1, 10)) / (1 - ratio**10)
-    np.testing.assert_allclose(values[1:10], ruin, atol=1e-9)
 
 
 def test_a_stake_that_is_too_large_is_not_taken():
@@ -170,8 +155,7 @@ def test_swimming_right_for_ever_earns_what_its_chain_says():
     assert left == pytest.approx(20 * 0.005)
 
 
-@pytest.mark.parametrize("size", [2, 10, 30])
-@pytest.mark.parametrize("map_seed", [None, 0, 5])
+@pytest.mark.parametrize(("size", "map_seed"), [(2, 0), (10, None), (30, 5)])
 def test_the_treasure_is_worth_99_hundredths(size, map_seed):
     kwargs = {"size": size, "map_seed": map_seed}
     assert optimum_of("DeepSea-v0", **kwargs) == pytest.approx(0.99, abs=1e-12)
@@ -239,21 +223,18 @@ def test_steps_of_the_racetrack(noise, start, action, expected):
     assert outcomes(noise, start, action) == expected
 
 
-def test_sizes_of_the_tracks():
+def test_tracks_and_the_cells_that_a_line_enters():
     found = {}
     for name, rows in TRACKS.items():
         text = "".join(rows)
         found[name] = (len(rows), len(rows[0]), text.count("S"), text.count("G"), len(cells(rows)))
     assert found == {"left": (32, 17, 6, 6, 298), "right": (30, 32, 23, 9, 515)}
-
-
-@pytest.mark.parametrize("up", range(5))
-@pytest.mark.parametrize("right", range(5))
-def test_a_line_enters_the_cells_that_its_points_lie_in(up, right):
     # Many points of the line, none of them on a border between cells.
-    shares = (np.arange(10_000) + 0.5) / 10_000 + 1e-7
-    points = [(int(up * t + 0.5), int(right * t + 0.5)) for t in shares if t <= 1]
-    assert crossed_cells(up, right) == [cell for cell in dict.fromkeys(points) if cell != (0, 0)]
+    shares = (np.arange(1000) + 0.5) / 1000 + 1e-7
+    for up, right in np.ndindex(5, 5):
+        points = [(int(up * t + 0.5), int(right * t + 0.5)) for t in shares if t <= 1]
+        entered = [cell for cell in dict.fromkeys(points) if cell != (0, 0)]
+        assert crossed_cells(up, right) == entered
 
 
 def test_without_noise_planning_is_as_fast_as_a_search():
@@ -326,20 +307,15 @@ def test_the_model_backs_values_up_as_the_book_does(variant, days):
     possible = np.isfinite(by_hand)
     np.testing.assert_allclose(found[possible], by_hand[possible], atol=1e-9)
     assert np.array_equal(action_masks_of_states(env), possible)
-    # The states are the evenings, in the order of the outcomes.
-    assert np.array_equal(model.next_state[0, 0], np.arange(N * N))
     # More cars than there are cannot be moved: 2 and 0 of them here.
     for array in (model.prob, model.reward):
-        np.testing.assert_array_equal(array[2 * N, 10], array[2 * N, 7])
-        np.testing.assert_array_equal(array[2 * N, 0], array[2 * N, 5])
+        np.testing.assert_array_equal(array[2 * N, [10, 0]], array[2 * N, [7, 5]])
 
 
-def test_optimal_values_and_policy_are_those_of_figure_4_2(days):
+def test_optimal_values_and_policy_are_those_of_figure_4_2():
     masks = action_masks_of_states(gym.make("JacksCarRental-v0"))
     plan = policy_iteration(model_of("JacksCarRental-v0"), 0.9, mask=masks)
     values, moves = plan.values.reshape(N, N), plan.policy.reshape(N, N) - 5
-    backed_up = action_values(values, days, exercise=False).max(axis=2)
-    np.testing.assert_allclose(backed_up, values, atol=1e-6)
     assert (values[20, 20], values[0, 0]) == pytest.approx((636.99, 421.41), abs=0.005)
     # The borders of the figure: nothing to move with few cars, five from a full first place.
     assert moves[20].tolist() == [5, 5, 5, 5, 4, 4, 3, 3, 3, 3, 2, 2, 2, 2, 2, 1, 1, 1, 0, 0, 0]
@@ -359,12 +335,11 @@ def test_optimal_values_and_policy_are_those_of_figure_4_2(days):
     [
         ("DeepSea-v0", {"size": 4, "deterministic": False, "map_seed": None}, 15, 1),
         ("MaximizationBias-v0", {"reward_mean": 2, "reward_std": 3}, 1, 4),
-        ("JacksCarRental-v0", {}, 21 * 3 + 2, 6),
         ("JacksCarRental-v0", {"variant": "exercise"}, 21 * 15 + 12, 10),
     ],
 )
 def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, action):
-    env, n, found = gym.make(env_id, **kwargs).unwrapped, 10_000, []
+    env, n, found = gym.make(env_id, **kwargs).unwrapped, 4000, []
     env.reset(seed=4)
     for _ in range(n):
         env.s = state
@@ -376,7 +351,7 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     variance = prob @ (model.reward_variance[state, action] + (mean - expected) ** 2)
     # Five standard errors of each; that of a normal variance is itself times sqrt(2 / n).
     assert rewards.mean() == pytest.approx(expected, abs=5 * np.sqrt(variance / n))
-    assert rewards.var() == pytest.approx(variance, rel=0.08)
+    assert rewards.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / n))
     counts, chances = np.bincount(states.astype(int), minlength=len(model.prob)), 0 * model.initial
     np.add.at(chances, model.next_state[state, action], prob)
     assert (np.abs(counts - n * chances) <= 5 * np.sqrt(n * chances) + 3).all()

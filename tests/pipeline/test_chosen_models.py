@@ -61,30 +61,27 @@ def normalised(tmp_path_factory):
     return train_to(logs, "a2c", entry, save_freq=60, eval_freq=40)
 
 
-@pytest.mark.parametrize(
-    ("which", "name", "n_seen"),
-    [
+def test_a_model_is_played_on_the_statistics_of_its_moment(normalised):
+    logs = normalised.path.parent.parent
+    for which, name, n_seen in (
         # Two observations at the beginning, and two for each step of both environments.
         ("final", "CartPole-v1/vecnormalize.pkl", [202]),
         ("best", "best_model_vecnormalize.pkl", range(42, 203, 40)),
         ("last checkpoint", "rl_model_vecnormalize_180_steps.pkl", [182]),
         (60, "rl_model_vecnormalize_60_steps.pkl", [62]),
-    ],
-)
-def test_a_model_is_played_on_the_statistics_of_its_moment(normalised, which, name, n_seen):
-    path, logs = normalised.path / name, normalised.path.parent.parent
-    assert seen(path) in n_seen
-    chosen = choose_model(ModelRequest(algo="a2c", env_id=CART, log_folder=logs, which=which))
-    assert chosen.statistics.path == path
-    again = choose_model(ModelRequest(chosen.path, log_folder=logs))
-    assert again.statistics.path.samefile(path)
+    ):
+        path = normalised.path / name
+        assert seen(path) in n_seen
+        chosen = choose_model(ModelRequest(algo="a2c", env_id=CART, log_folder=logs, which=which))
+        assert chosen.statistics.path == path
+        again = choose_model(ModelRequest(chosen.path, log_folder=logs))
+        assert again.statistics.path.samefile(path)
 
 
 @pytest.mark.parametrize(
     ("model", "said", "n_seen", "expected"),
     [
         # Two for the new beginning. Where the entry says nothing, the agent's own settings count.
-        ("", {}, 244, {"clip_obs": 3.0}),
         ("rl_model_60_steps", {}, 104, {"clip_obs": 3.0}),
         ("", {"normalize": {"clip_obs": 4.0}, "gamma": 0.5}, 244, {"clip_obs": 4.0, "gamma": 0.5}),
         ("", {"normalize": False}, None, None),
@@ -201,12 +198,12 @@ def check_is_of(genuine, other, algo, model):
     assert not np.array_equal(first, second)
 
 
-@pytest.mark.parametrize("by", ["its folder", "its run, for a film"])
-def test_playing(runs, swapped, by):
+@pytest.mark.parametrize("by_folder", [True, False])
+def test_playing(runs, swapped, by_folder):
     run, opens = swapped("a2c")
-    if by == "its folder":
+    if by_folder:
         chosen = choose_model(ModelRequest(run.path, log_folder=run.path.parent, device="cpu"))
-    else:
+    else:  # as a film does
         spec = spec_of("a2c", CART, {**SMALL_A2C, "normalize": True})
         chosen = model_of_run(run.model_path, spec, run)
     env = playing_env(chosen, None)
@@ -262,28 +259,20 @@ def cart_poles(n_envs, statistics=None):
     return VecFrameStack(normalization, 2)
 
 
-def write_settings(folder, config, **args):
-    folder.mkdir(parents=True)
-    (folder / "config.yml").write_text(yaml.dump(config))
-    args = OrderedDict([("algo", "a2c"), ("env_kwargs", None), *args.items()])
-    (folder / "args.yml").write_text(yaml.dump(args))
-
-
 @pytest.fixture(scope="module")
 def zoo(tmp_path_factory):
-    """A log folder as rl_zoo3 leaves it: a normalised CartPole and a lake without ice."""
+    """A log folder as rl_zoo3 leaves it, of a normalised CartPole."""
     zoo = tmp_path_factory.mktemp("zoo")
     run = zoo / "a2c" / "CartPole-v1_1"
-    write_settings(run / "CartPole-v1", CONFIG, env="CartPole-v1")
+    folder = run / "CartPole-v1"
+    folder.mkdir(parents=True)
+    (folder / "config.yml").write_text(yaml.dump(CONFIG))
+    args = OrderedDict(algo="a2c", env_kwargs=None, env="CartPole-v1")
+    (folder / "args.yml").write_text(yaml.dump(args))
     env = cart_poles(2)
     model = A2C("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [4]}).learn(300)
     model.save(run / "CartPole-v1")
     env.save(run / "CartPole-v1" / "vecnormalize.pkl")
-    dry = {"is_slippery": False}
-    run = zoo / "a2c" / "FrozenLake-v1_1"
-    config = OrderedDict(policy="MlpPolicy", env_kwargs={"map_name": "8x8"})
-    write_settings(run / "FrozenLake-v1", config, env="FrozenLake-v1", env_kwargs=dry)
-    A2C("MlpPolicy", gym.make("FrozenLake-v1", **dry), seed=0).save(run / "FrozenLake-v1")
     return zoo
 
 
@@ -308,10 +297,9 @@ def hub(zoo, folder, *settings):
     return folder
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_it_plays_as_the_library_evaluates_it(zoo, tmp_path, n_envs):
+def test_it_plays_as_the_library_evaluates_it(zoo, tmp_path):
     run = zoo / "a2c" / "CartPole-v1_1"
-    env = cart_poles(n_envs, run / "CartPole-v1" / "vecnormalize.pkl")
+    env = cart_poles(3, run / "CartPole-v1" / "vecnormalize.pkl")
     env.seed(0)
     model = A2C.load(run / "CartPole-v1.zip")
     expected = evaluate_policy(model, env, 7, return_episode_rewards=True)
@@ -320,13 +308,19 @@ def test_it_plays_as_the_library_evaluates_it(zoo, tmp_path, n_envs):
     whole = hub(zoo, tmp_path, "args.yml", "config.yml", "vec_normalize.pkl")
     for request in (
         ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=zoo),
-        ModelRequest(run, log_folder=zoo),
         ModelRequest(run / "CartPole-v1", log_folder=zoo),
         ModelRequest(run / "CartPole-v1.zip", log_folder=zoo),
-        ModelRequest(whole, log_folder=tmp_path),
         ModelRequest(whole / "a2c-CartPole-v1"),
     ):
-        assert returns_of(request, 7, n_envs) == expected
+        assert returns_of(request, 7, 3) == expected
+    # Named statistics are used where the folder says no more than that two frames are stacked.
+    for name in ("args.yml", "vec_normalize.pkl"):
+        (whole / name).unlink()
+    (whole / "config.yml").write_text("frame_stack: 2")
+    saved = run / "CartPole-v1" / "vecnormalize.pkl"
+    named = ModelRequest(whole, "a2c", "CartPole-v1", statistics=saved)
+    assert returns_of(named, 7, 3) == expected
+    assert choose_model(named).spec.hyperparams.normalize["clip_obs"] == 2.0
 
 
 def test_returns_of_rewards_as_training_normalised_them(zoo):
@@ -339,20 +333,7 @@ def test_returns_of_rewards_as_training_normalised_them(zoo):
     env.close()
 
 
-def test_named_statistics_are_used(zoo, tmp_path):
-    """Also where the folder says no more than that two frames are stacked."""
-    bare = hub(zoo, tmp_path)
-    (bare / "config.yml").write_text("frame_stack: 2")
-    saved = zoo / "a2c" / "CartPole-v1_1" / "CartPole-v1" / "vecnormalize.pkl"
-    named = ModelRequest(bare, "a2c", "CartPole-v1", statistics=saved)
-    whole = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=zoo)
-    assert returns_of(named, 5) == returns_of(whole, 5)
-    assert choose_model(named).spec.hyperparams.normalize["clip_obs"] == 2.0
-
-
 SAID = ("args.yml", "config.yml")
-
-
 REFUSED = [
     ((), {}, "is in no run folder: say what it is with --algo"),
     (
@@ -396,11 +377,8 @@ APPLY = "!!python/object/apply:"
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (f"{APPLY}os.system [touch x]", "os.system is not allowed here"),
         (f"{APPLY}collections.OrderedDict [[[a, {APPLY}os.getcwd []]]]", "is not allowed here"),
-        ("!!python/object/new:collections.OrderedDict [[[a, 1]]]", "is not allowed here"),
         (f"{APPLY}collections.OrderedDict [[[a, 1], [a, 2]]]", "no OrderedDict of different keys"),
-        (f"{APPLY}collections.OrderedDict [[[[1], 2]]]", "no OrderedDict of different keys"),
         (f"{APPLY}collections.OrderedDict x", "no OrderedDict of different keys"),
         (f"&a {APPLY}collections.OrderedDict [[[a, *a]]]", "nested too deeply"),
         ("[1, 2]", "must map names to values"),

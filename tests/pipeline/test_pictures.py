@@ -119,11 +119,6 @@ def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(algo, entry, tmp_path)
     assert run.value_map_path.read_bytes().startswith(b"\x89PNG")
 
 
-def recorded(recorder):
-    with np.load(recorder.path) as file:
-        return file["timesteps"].tolist()
-
-
 def test_of_very_many_maps_every_second_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(value_maps, "MAX_MAPS", 4)  # of which there are soon very many
     evaluator, agent = made(LAKE)

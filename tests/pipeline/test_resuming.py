@@ -15,7 +15,6 @@ import torch as th
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents import ALGORITHMS
 from pipeline import state_files, state_saver
 from pipeline.agent_settings import resolved_spec
 from pipeline.digests import LOCK
@@ -35,7 +34,7 @@ from pipeline.unfinished_runs import (
 from pipeline.user_modules import import_typed
 
 GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
-ARMS, LINEAR = "BernoulliBandit-v0", "LinearBandit-v0"
+WAREHOUSE, ARMS, LINEAR = "Warehouse-v0", "BernoulliBandit-v0", "LinearBandit-v0"
 SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
 EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
 LAGGING = {"n_steps": 3, "train_freq": 4, "target_update_interval": 30, "tau": 0.7}
@@ -47,62 +46,68 @@ SPARING = {
 }
 # Ten rewards of 0.1 are not 1: what Monitor adds up depends on the order.
 FINE = {"env_kwargs": {"reward_schedule": (1.7, -0.3, 0.1)}}
-
-# Every agent, and the settings whose state is kept in a place of its own.
-TRAININGS = [
-    (GRID, "qlearning", 600, {"engine": "compiled", **FINE}),
-    (GRID, "qlearning", 600, {"engine": "interpreted", "n_envs": 3, **FINE}),
-    (GRID, "sarsa", 600, {"engine": "compiled", "n_envs": 3, **FINE}),
-    ("Warehouse-v0", "expected_sarsa", 600, {"mask_actions": True}),
-    (GRID, "double_qlearning", 600, {"learning_rate": "lin_0.5"}),
-    (GRID, "n_step_sarsa", 600, {"engine": "compiled", "n_envs": 3}),
-    ("Warehouse-v0", "n_step_tree_backup", 600, {"engine": "interpreted", "n_envs": 2}),
-    ("Warehouse-v0", "sarsa_lambda", 600, {"engine": "compiled", "trace_type": "dutch"}),
-    ("Warehouse-v0", "q_lambda", 600, {"engine": "interpreted", "n_envs": 3}),
-    ("Warehouse-v0", "monte_carlo", 600, {"engine": "interpreted"}),
-    (GRID, "off_policy_monte_carlo", 600, {"engine": "compiled", "n_envs": 3}),
-    (GRID, "qlearning_ucb", 600, {"value_bound": 1.0}),
-    (GRID, "dyna_q", 600, {"outcomes_kept": 3, "n_envs": 2}),
-    (GRID, "dyna_q_plus", 600, {"engine": "interpreted"}),
-    (GRID, "prioritized_sweeping", 600, {"initial_q_std": 1.0, "n_envs": 2}),
-    (GRID, "r_max", 600, {"known_after": 3, "value_bound": 1.0}),
-    (GRID, "semi_gradient_sarsa", 600, {"engine": "compiled", "n_envs": 3}),
-    ("MountainCar-v0", "semi_gradient_q", 600, {"engine": "interpreted"}),
-    (GRID, "actor_critic", 600, {"gamma_power": True, "n_envs": 2}),
-    # Cut off in the middle of episodes.
-    (LEFT_RIGHT, "reinforce", 600, {"engine": "compiled"}),
-    (GRID, "reinforce", 600, {"engine": "interpreted", "n_envs": 2}),
-    *((GRID, name, 300, {}) for name in ("value_iteration", "policy_iteration", "optimal")),
-    (GRID, "random", 300, {}),
-    (LEFT_RIGHT, "angle", 300, {}),
-    (LEFT_RIGHT, "dqn", 300, {**EAGER, "n_steps": 3, "exploration_fraction": 0.5}),
-    (LEFT_RIGHT, "dqn", 300, {**EAGER, **SPARING}),
-    ("Warehouse-v0", "double_dqn", 300, {**EAGER, "mask_actions": True}),
-    ("Warehouse-v0", "deep_qlearning", 200, {}),
-    # Long enough for `auto` to compile it, as a whole and for what is left.
-    (GRID, "double_dqn", 5000, EAGER),
-    (SWING, "ppo", 600, {**SMALL, "use_sde": True, "normalize": True, "frame_stack": 2}),
-    # Cut off in the middle of rollouts, and after some moves of the target network.
-    (LEFT_RIGHT, "ppo", 600, {**SMALL, "engine": "compiled", "learning_rate": "lin_0.001"}),
-    (LEFT_RIGHT, "ppo", 600, {**SMALL, "engine": "compiled", "normalize": True}),
-    (GRID, "dqn", 300, {**EAGER, **LAGGING, "engine": "compiled"}),
-    (GRID, "a2c", 300, {"n_envs": 2, "n_steps": 7, "engine": "compiled"}),
-    (SWING, "sac", 200, {**EAGER, "use_sde": True, "normalize": True}),
-    (SWING, "td3", 200, {**EAGER, **NOISE}),
-    (SWING, "ddpg", 200, {**EAGER, "noise_type": "normal", "noise_std": 0.1}),
-    (LEFT_RIGHT, "qrdqn", 200, EAGER),
-    *((SWING, name, 150, EAGER) for name in ("tqc", "crossq")),
-    (LEFT_RIGHT, "trpo", 400, {"n_steps": 64, "batch_size": 32, "n_envs": 1}),
-    (SWING, "ars", 4000, {"n_delta": 2, "n_top": 1, "n_envs": 1, "normalize": True}),
-    (LEFT_RIGHT, "ppo_lstm", 400, {**SMALL, "policy_kwargs": {"lstm_hidden_size": 16}}),
-    ("Warehouse-v0", "ppo_mask", 400, SMALL),
-    *((ARMS, name, 300, {}) for name in ("epsilon_greedy", "boltzmann", "ucb", "kl_ucb")),
-    *((ARMS, name, 300, {}) for name in ("gradient_bandit", "exp3", "thompson")),
-    *((LINEAR, name, 300, {}) for name in ("linucb", "lin_thompson", "lin_epsilon_greedy")),
-    *((ARMS, f"mabwiser_{name}", 200, {}) for name in ("epsilon_greedy", "ucb1", "thompson")),
-    (LINEAR, "mabwiser_linucb", 200, {}),
-]
+EACH_7 = {"callback": [{"pipeline.callbacks.EpisodeCheckpoint": {"every_n_episodes": 7}}]}
+FALLING = {"callback": [*EACH_7["callback"], "pipeline.callbacks.ExponentialExploration"]}
 OFF = StateKeeping(SaveInterval(is_off=True))
+
+
+def row(env_id, algo, steps, settings=None, **more):
+    """A training; an agent is trained before it, it is watched or logged where ``more`` says so."""
+    settings = {} if settings is None else settings
+    name = " ".join([algo, env_id, *settings, str(settings.get("engine", "")), *more])
+    return pytest.param(env_id, algo, steps, settings, more, id=name)
+
+
+# Each kind of agent, and the settings whose state is kept in a place of its own.
+TRAININGS = [
+    row(GRID, "qlearning", 600, {"engine": "compiled", **FINE}),
+    row(GRID, "qlearning", 600, {"engine": "interpreted", "n_envs": 3, **FINE}),
+    row(GRID, "sarsa", 600, {"engine": "compiled", "n_envs": 3}),
+    row(WAREHOUSE, "double_qlearning", 600, {"mask_actions": True, "learning_rate": "lin_0.5"}),
+    row(GRID, "n_step_sarsa", 600, {"engine": "compiled", "n_envs": 3}),
+    row(WAREHOUSE, "n_step_tree_backup", 600, {"engine": "interpreted", "n_envs": 2}),
+    row(WAREHOUSE, "sarsa_lambda", 600, {"engine": "compiled", "trace_type": "dutch"}),
+    row(WAREHOUSE, "monte_carlo", 600, {"engine": "interpreted"}),
+    row(GRID, "off_policy_monte_carlo", 600, {"engine": "compiled", "n_envs": 3}),
+    row(GRID, "dyna_q", 600, {"outcomes_kept": 3, "n_envs": 2}),
+    row(GRID, "prioritized_sweeping", 600, {"initial_q_std": 1.0, "n_envs": 2}),
+    row(GRID, "r_max", 600, {"known_after": 3, "value_bound": 1.0}),
+    row(GRID, "semi_gradient_sarsa", 600, {"engine": "compiled", "n_envs": 3}),
+    row(GRID, "actor_critic", 600, {"gamma_power": True, "n_envs": 2}),
+    row(LEFT_RIGHT, "reinforce", 600, {"engine": "compiled"}),  # in the middle of episodes
+    row(GRID, "value_iteration", 300),
+    row(GRID, "random", 300),
+    row(LEFT_RIGHT, "dqn", 300, {**EAGER, "n_steps": 3, "exploration_fraction": 0.5}),
+    row(LEFT_RIGHT, "dqn", 300, {**EAGER, **SPARING}),
+    row(WAREHOUSE, "double_dqn", 300, {**EAGER, "mask_actions": True}),
+    row(WAREHOUSE, "deep_qlearning", 200),
+    row(SWING, "ppo", 600, {**SMALL, "use_sde": True, "normalize": True, "frame_stack": 2}),
+    # In the middle of rollouts, and after some moves of the target network.
+    row(LEFT_RIGHT, "ppo", 600, {**SMALL, "engine": "compiled", "normalize": True}),
+    row(GRID, "dqn", 300, {**EAGER, **LAGGING, "engine": "compiled"}),
+    row(GRID, "a2c", 300, {"n_envs": 2, "n_steps": 7, "engine": "compiled"}),
+    row(SWING, "sac", 200, {**EAGER, "use_sde": True, "normalize": True}),
+    row(SWING, "td3", 200, {**EAGER, **NOISE}),
+    row(SWING, "ars", 4000, {"n_delta": 2, "n_top": 1, "n_envs": 1, "normalize": True}),
+    row(LEFT_RIGHT, "ppo_lstm", 400, {**SMALL, "policy_kwargs": {"lstm_hidden_size": 16}}),
+    row(WAREHOUSE, "ppo_mask", 400, SMALL),
+    row(ARMS, "gradient_bandit", 300),
+    row(LINEAR, "linucb", 300),
+    row(LINEAR, "mabwiser_linucb", 200),
+    # Where a trained agent goes on.
+    row(GRID, "sarsa", 600, {"engine": "interpreted", "n_envs": 3}, trained_agent=200),
+    row(LINEAR, "linucb", 600, trained_agent=200),
+    # Budgets in episodes, callbacks and checkpoints.
+    row(GRID, "qlearning", None, {"n_episodes": 30, **EACH_7}, save_freq=50),
+    row(GRID, "dqn", None, {"n_episodes": 30, **EAGER, **FALLING}, save_freq=50),
+    # What is kept of a training that is watched.
+    row(GRID, "double_qlearning", 600, watch_learning="page.html"),
+    row(GRID, "ppo", 600, {**SMALL, "n_envs": 1, "engine": "compiled"}, watch_learning="page.html"),
+    # What TensorBoard reads: by iterations, by an interval that the agent has of its own, by steps.
+    row(LEFT_RIGHT, "ppo", 1500, SMALL, log_interval=3),
+    row(LEFT_RIGHT, "a2c", 1500, {"n_envs": 1}, log_interval=-1),
+    row(LEFT_RIGHT, "dqn", 600, EAGER, log_interval=-1),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -120,9 +125,12 @@ def spec_of(folder, env_id, algo, n_timesteps, settings, **more):
     if env_id == SWING and algo != "ars":  # whose networks are large by themselves
         entry["policy_kwargs"] = {"net_arch": [16]}
     raw = override({**entry, "n_timesteps": n_timesteps}, settings)
-    if "n_episodes" not in settings:
-        raw.pop("n_episodes", None)
-    common = {"seed": 3, "log_folder": folder, "verbose": 0, "pictures": False}
+    raw.pop("n_timesteps" if "n_episodes" in settings else "n_episodes", None)
+    if "log_interval" in more:
+        more["tensorboard_log"] = folder / "log"
+    if "watch_learning" in more:
+        more["watch_learning"] = folder / more["watch_learning"]
+    common = {"seed": 3, "log_folder": folder / "logs", "verbose": 0, "pictures": False}
     common |= {"eval_episodes": None, "final_episodes": None}
     return resolved_spec(raw, algo=algo, env_id=env_id, **{**common, **more})
 
@@ -156,11 +164,10 @@ def until_cut_off(training, monkeypatch, n_states=2):
     return training.run
 
 
-def cut_off(spec, monkeypatch, every=None):
+def cut_off(spec, monkeypatch):
     """A run whose process ended, with two states in its folder."""
-    every = every or spec.hyperparams.n_timesteps // 6
-    keeping = StateKeeping(SaveInterval(steps=every))
-    return until_cut_off(training_of(spec, keeping), monkeypatch)
+    every = (spec.hyperparams.n_timesteps or 120) // 6
+    return until_cut_off(training_of(spec, StateKeeping(SaveInterval(steps=every))), monkeypatch)
 
 
 def recorded(run):
@@ -199,7 +206,8 @@ def bits(value):
 
 
 def assert_same(training, other):
-    """All files, and what each Monitor remembers."""
+    """All files, what each Monitor remembers, and what was noted for the page of the learning."""
+    assert training.model.num_timesteps == other.model.num_timesteps
     folders = training.run.path, other.run.path
     names, others = (
         {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
@@ -212,97 +220,40 @@ def assert_same(training, other):
         lists, again = (each.model.get_env().get_attr(remembered) for each in (training, other))
         assert lists == again
     assert {type(length) for monitor in again for length in monitor} <= {int}
+    if training.watch is not None:
+        tables = ("moments",) if hasattr(training.watch, "moments") else ("steps", "changes")
+        for name in tables:
+            kept, again = (getattr(each.watch, name).rows for each in (training, other))
+            assert len(kept) > 9
+            assert kept.tobytes() == again.tobytes()
 
 
-@pytest.mark.parametrize(("env_id", "algo", "steps", "settings"), TRAININGS)
-def test_the_result_is_that_of_an_undisturbed_run(
-    tmp_path, monkeypatch, env_id, algo, steps, settings
-):
-    whole = carried_out(spec_of(tmp_path / "whole", env_id, algo, steps, settings))
-    run = cut_off(spec_of(tmp_path / "parts", env_id, algo, steps, settings), monkeypatch)
-    again = gone_on(run)
-    assert again.model.num_timesteps == whole.model.num_timesteps
-    assert_same(whole, again)
-    assert not run.state_path.exists()
-
-
-def test_every_agent_is_tried():
-    assert {algo for _, algo, _, _ in TRAININGS} == set(ALGORITHMS)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "algo", "settings"),
-    [(GRID, "sarsa", {"engine": "interpreted", "n_envs": 3}), (LINEAR, "linucb", {})],
-)
-def test_so_it_is_where_a_trained_agent_goes_on(tmp_path, monkeypatch, env_id, algo, settings):
-    begun = carried_out(spec_of(tmp_path / "first", env_id, algo, 200, settings))
-    trained = {"trained_agent": begun.run.model_path}
-    whole = carried_out(spec_of(tmp_path / "whole", env_id, algo, 600, settings, **trained))
-    run = cut_off(spec_of(tmp_path / "parts", env_id, algo, 600, settings, **trained), monkeypatch)
-    again = gone_on(run)
-    assert again.model.num_timesteps == whole.model.num_timesteps > 600
-    assert_same(whole, again)
-
-
-@pytest.mark.parametrize(
-    ("algo", "settings", "tables"),
-    [
-        ("double_qlearning", {}, ("steps", "moves", "changes")),
-        ("dqn", EAGER, ("moments",)),
-        ("ppo", {**SMALL, "n_envs": 1, "engine": "compiled"}, ("moments",)),
-    ],
-)
-def test_a_run_that_is_watched_goes_on_being_watched(tmp_path, monkeypatch, algo, settings, tables):
-    watched = {"watch_learning": tmp_path / "page.html"}
-    whole = carried_out(spec_of(tmp_path / "whole", GRID, algo, 600, settings, **watched))
-    run = cut_off(spec_of(tmp_path / "parts", GRID, algo, 600, settings, **watched), monkeypatch)
-    assert recorded(run).watch_learning == watched["watch_learning"]
-    rest = gone_on(run)
-    for name in tables:
-        kept, again = (getattr(training.watch, name).rows for training in (whole, rest))
-        assert len(kept) > 9
-        assert kept.tobytes() == again.tobytes()
-
-
-@pytest.mark.parametrize("algo", ["qlearning", "dqn"])
-def test_budgets_in_episodes_callbacks_and_checkpoints(tmp_path, monkeypatch, algo):
-    checkpoint = {"pipeline.callbacks.EpisodeCheckpoint": {"every_n_episodes": 7}}
-    settings = {"n_episodes": 30, "callback": [checkpoint]}
-    if algo == "dqn":
-        settings["callback"].append("pipeline.callbacks.ExponentialExploration")
-        settings |= EAGER
-    raw = {**override(read_hyperparams(algo, GRID, None), settings), "n_episodes": 30}
-    raw.pop("n_timesteps", None)
-    common = {"verbose": 0, "pictures": False, "save_freq": 50, "log_folder": tmp_path / "whole"}
-    spec = resolved_spec(raw, algo=algo, env_id=GRID, seed=3, **common)
-    whole = carried_out(spec)
-    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch, every=20)
-    again = gone_on(run)
-    assert len(run.checkpoints()) > 3
-    assert_same(whole, again)
-
-
-def events(folder):
-    """What TensorBoard reads of a folder, but for speeds and durations."""
+def events(spec):
+    """What TensorBoard reads of a training's only folder, but for speeds and durations."""
+    (folder,) = (spec.tensorboard_log / spec.env_id).iterdir()
     reader = EventAccumulator(str(folder))
     reader.Reload()
     names = [name for name in reader.Tags()["scalars"] if not name.startswith("time/")]
+    assert len(names) > 5
     return {name: [(e.step, e.value) for e in reader.Scalars(name)] for name in names}
 
 
-@pytest.mark.parametrize(
-    ("algo", "interval", "settings"),
-    [("ppo", 3, SMALL), ("a2c", -1, {"n_envs": 1}), ("dqn", -1, EAGER)],
-)
-def test_logs_go_on_in_their_folder(tmp_path, monkeypatch, algo, interval, settings):
-    spec = spec_of(tmp_path / "whole", LEFT_RIGHT, algo, 1500, settings, log_interval=interval)
-    carried_out(replace(spec, tensorboard_log=tmp_path / "log"))
-    parts = replace(spec, log_folder=tmp_path / "parts", tensorboard_log=tmp_path / "other")
-    gone_on(cut_off(parts, monkeypatch))
-    whole, resumed = (events(tmp_path / n / LEFT_RIGHT / f"{algo}_1") for n in ("log", "other"))
-    assert len(whole) > 5
-    assert resumed == whole
-    assert [path.name for path in (tmp_path / "other" / LEFT_RIGHT).iterdir()] == [f"{algo}_1"]
+@pytest.mark.parametrize(("env_id", "algo", "steps", "settings", "more"), TRAININGS)
+def test_the_result_is_that_of_an_undisturbed_run(
+    tmp_path, monkeypatch, env_id, algo, steps, settings, more
+):
+    if "trained_agent" in more:
+        begun = spec_of(tmp_path / "first", env_id, algo, more["trained_agent"], settings)
+        more = {"trained_agent": carried_out(begun).run.model_path}
+    whole = carried_out(spec_of(tmp_path / "whole", env_id, algo, steps, settings, **more))
+    spec = spec_of(tmp_path / "parts", env_id, algo, steps, settings, **more)
+    run = cut_off(spec, monkeypatch)
+    again = gone_on(run)
+    assert_same(whole, again)
+    assert not run.state_path.exists()
+    assert ("save_freq" in more) == (len(run.checkpoints()) > 3)
+    if "log_interval" in more:
+        assert events(spec) == events(whole.spec)
 
 
 @pytest.fixture
@@ -313,16 +264,12 @@ def parts(tmp_path, monkeypatch):
     return whole, cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
 
 
-def test_it_can_be_cut_off_again_and_again(parts, monkeypatch):
+def test_cut_off_again_and_the_newest_state_damaged(parts, monkeypatch):
+    """The older state serves then."""
     whole, run = parts
     for _ in range(2):
         keeping = go_on(run, StateKeeping(SaveInterval(steps=30)), pytest.fail)
         until_cut_off(training_of(recorded(run), keeping, run), monkeypatch)
-    assert_same(whole, gone_on(run))
-
-
-def test_the_older_state_serves_where_the_newest_is_damaged(parts):
-    whole, run = parts
     newest = max(run.state_path.glob("*.state"), key=lambda path: path.stat().st_mtime_ns)
     newest.write_bytes(newest.read_bytes()[:-5])
     told = []
@@ -349,18 +296,25 @@ def tabular(tmp_path, monkeypatch):
     return cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
 
 
-def test_a_state_beside_other_settings_is_refused(tabular, tmp_path, monkeypatch):
+def test_the_newest_unfinished_run_and_a_state_of_other_settings(tabular, tmp_path, monkeypatch):
+    logs = tabular.path.parents[1]
+    carried_out(spec_of(tmp_path, GRID, "qlearning", 300, {}))
+    assert newest_unfinished(logs, "qlearning", GRID).path == tabular.path
     other = cut_off(spec_of(tmp_path, GRID, "sarsa", 600, {}), monkeypatch)
-    for path in other.state_path.iterdir():
-        (tabular.state_path / path.name).write_bytes(path.read_bytes())
+    for path in tabular.state_path.iterdir():
+        (other.state_path / path.name).write_bytes(path.read_bytes())
     with pytest.raises(UserError, match="of other settings"):
-        go_on(tabular, StateKeeping(), pytest.fail)
+        go_on(other, StateKeeping(), pytest.fail)
+    gone_on(tabular)
+    for algo, said in (("qlearning", "all 2 are finished"), ("ppo", "none at all")):
+        with pytest.raises(UserError, match=said):
+            newest_unfinished(logs, algo, GRID)
 
 
 def test_a_state_of_other_sources_is_told_of_and_no_bug_of_theirs_is_a_traceback(
     tmp_path, monkeypatch
 ):
-    with monkeypatch.context() as context:
+    with monkeypatch.context() as context:  # of an older release
         context.setattr("pipeline.state_files.source_digest", lambda: "older")
         run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
     told = []
@@ -383,7 +337,7 @@ def test_what_has_changed_since_the_run_began_is_told(tmp_path, monkeypatch):
     module.write_text("x = 1\n")
     monkeypatch.setattr(sys, "path", [*sys.path])
     mine = {"user_modules": import_typed([str(module)]), "gym_packages": ("things_of_mine",)}
-    spec = spec_of(tmp_path, GRID, "qlearning", 600, {}, trained_agent=agent, **mine)
+    spec = replace(spec_of(tmp_path, GRID, "qlearning", 600, {}, **mine), trained_agent=agent)
     run, told = cut_off(spec, monkeypatch), []
     again = recorded_training(run, spec.user_modules)
     tell_changes(run, again, told.append)
@@ -392,15 +346,6 @@ def test_what_has_changed_since_the_run_began_is_told(tmp_path, monkeypatch):
     agent.write_bytes(b"another")
     tell_changes(run, again, told.append)
     assert [line.split()[0] for line in told] == [str(module), str(agent)]
-
-
-def test_the_newest_unfinished_run(tabular, tmp_path):
-    carried_out(spec_of(tmp_path, GRID, "qlearning", 300, {}))
-    assert newest_unfinished(tmp_path, "qlearning", GRID).path == tabular.path
-    gone_on(tabular)
-    for algo, said in (("qlearning", "all 2 are finished"), ("sarsa", "none at all")):
-        with pytest.raises(UserError, match=said):
-            newest_unfinished(tmp_path, algo, GRID)
 
 
 @pytest.mark.parametrize(
@@ -429,7 +374,6 @@ NO_HOME = FileNotFoundError("the user has no home folder")
     [
         ("write_state", FULL, "no state was saved: {folder}: No space left on device"),
         ("write_state", MemoryError(), "no state was saved: there is no memory left for it"),
-        ("user_key", FULL, "no state can be kept: the key to saved states: No space left"),
         ("user_key", NO_HOME, "no state can be kept: the key to saved states: the user has no"),
         (None, None, "no state can be kept: --vec-env subproc: environments are in other proces"),
     ],
@@ -440,7 +384,7 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
     def fail(*_):
         raise type(error)(*error.args)
 
-    if part:
+    if part:  # the disk, the memory and the home folder misbehave
         monkeypatch.setattr(state_files, part, fail)
     vec_env = "dummy" if part else "subproc"
     spec = spec_of(tmp_path, GRID, "qlearning", 300, {"n_envs": 2}, vec_env=vec_env)
@@ -460,9 +404,9 @@ def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeyp
         synced.append(Path(f"/proc/self/fd/{number}").readlink().name)
         fsync(number)
 
-    monkeypatch.setattr("os.fsync", noted)
-    log = {"tensorboard_log": tmp_path / "log", "log_interval": 1, "eval_freq": 50}
-    cut_off(spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL, **log), monkeypatch)
+    monkeypatch.setattr("os.fsync", noted)  # what the disk is told
+    spec = spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL, log_interval=1, eval_freq=50)
+    cut_off(spec, monkeypatch)
     before = synced[: next(i for i, name in enumerate(synced) if ".state." in name)]
     assert {"0.monitor.csv", "1.monitor.csv", "run.json", "best_model.zip"} <= {*before}
     assert any(name.startswith("events.out.tfevents") for name in before)

@@ -53,17 +53,15 @@ def test_runs_are_numbered_from_one_and_gaps_are_not_filled(tmp_path):
         Run.find(tmp_path, "sarsa", "Taxi-v3", 2)
     Run.find(tmp_path, "sarsa", TAXI).discard()
     assert Run.find(tmp_path, "sarsa", TAXI).path.name == "Taxi-v4_1"
-
-
-OTHERS = "Taxi-v4 Taxi-v4_0 Taxi-v4_x Taxi-v4_7_old Taxi-v4_7.zip Taxi-v4_-7 MyTaxi-v4_7 Taxi-v40_7"
-
-
-def test_folders_of_other_names_do_not_count(tmp_path):
-    for neighbour in OTHERS.split():
-        (tmp_path / "sarsa" / neighbour).mkdir(parents=True)
-        with pytest.raises(NoRunError, match="no run of sarsa on Taxi-v4"):
-            Run.find(tmp_path, "sarsa", TAXI)
-    assert claim_names(tmp_path, TAXI, 1) == ["Taxi-v4_1"]
+    # A unique suffix counts and is found; folders of other names do not count.
+    suffix = f"_{uuid4()}"
+    Run.claim(tmp_path, "a", TAXI, suffix)
+    newest = Run.find(tmp_path, "a", TAXI)
+    assert (newest.path.name, newest.model_path.name) == (f"Taxi-v4_1{suffix}", "Taxi-v4.zip")
+    for name in ("", "_0", "_x", "_7_old", "_7.zip", "_-7"):
+        (tmp_path / "b" / f"Taxi-v4{name}").mkdir(parents=True)
+        with pytest.raises(NoRunError, match="no run of b on Taxi-v4"):
+            Run.find(tmp_path, "b", TAXI)
 
 
 CLAIMS = """
@@ -87,14 +85,6 @@ def test_processes_never_share_a_folder(tmp_path):
         process.stdin.flush()
     names = [name for process in processes for name in process.communicate()[0].split()]
     assert sorted(names) == sorted(f"Taxi-v4_{n}" for n in range(1, 51))
-
-
-def test_runs_with_a_unique_suffix_count_and_are_found(tmp_path):
-    suffix = f"_{uuid4()}"
-    Run.claim(tmp_path, "sarsa", TAXI, suffix)
-    newest = Run.find(tmp_path, "sarsa", TAXI)
-    assert (newest.path.name, newest.model_path.name) == (f"Taxi-v4_1{suffix}", "Taxi-v4.zip")
-    assert claim_names(tmp_path, TAXI, 1) == ["Taxi-v4_2"]
 
 
 @pytest.mark.parametrize(
@@ -126,16 +116,6 @@ def test_checkpoints_are_ordered_by_steps(tmp_path):
     assert run.checkpoints() == [run.checkpoint_path(n) for n in (30, 200, 1000)]
 
 
-def test_info_names_the_process_while_it_is_at_work(tmp_path):
-    run = Run.claim(tmp_path, "sarsa", "Taxi-v4")
-    assert run.read_info() == {"state": "running", "process": mark()}
-    run.update_info(seed=3)
-    assert run.read_info() == {"state": "running", "seed": 3, "process": mark()}
-    run.update_info(state="finished", final={"mean_return": 7.5})
-    expected = {"state": "finished", "seed": 3, "final": {"mean_return": 7.5}}
-    assert run.read_info() == json.loads(run.info_path.read_text()) == expected
-
-
 # --- the record and the digests ------------------------------------------------------------------
 
 
@@ -151,18 +131,12 @@ def run(tmp_path):
     return run
 
 
-def test_the_digests_are_those_of_sha256sum_and_the_record_has_its_own(run):
+def test_the_digests_are_those_of_the_files_and_the_record_has_its_own(run):
     record = run.read_info()
     listed = record["files"]
     assert list(listed) == ["0.monitor.csv", "Lake-v1/config.yml", "run.json"]
-    known = subprocess.run(  # a fixed command
-        ["/usr/bin/sha256sum", "0.monitor.csv", "Lake-v1/config.yml"],
-        cwd=run.path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert known.stdout == "".join(f"{listed[name]}  {name}\n" for name in list(listed)[:2])
+    for name in list(listed)[:2]:
+        assert listed[name] == hashlib.sha256((run.path / name).read_bytes()).hexdigest()
     record = json.loads(run.info_path.read_text())
     own = record["files"].pop("run.json")
     text = json.dumps(record, sort_keys=True, separators=(",", ":"))
@@ -171,6 +145,10 @@ def test_the_digests_are_those_of_sha256sum_and_the_record_has_its_own(run):
     run.update_info(state="failed")
     assert run.read_info()["state"] == "failed"
     assert sealed({"state": "running"}) == {"state": "running"}
+    # It names the process while that is at work.
+    begun = Run.claim(run.path / "more", "sarsa", TAXI)
+    begun.update_info(seed=3)
+    assert begun.read_info() == {"state": "running", "seed": 3, "process": mark()}
 
 
 # The last ones lose the digests, for which one letter of a name is enough.
@@ -220,6 +198,13 @@ def test_files_are_held_against_their_digests(run, tmp_path_factory):
 
     csv, elsewhere = run.path / "0.monitor.csv", tmp_path_factory.mktemp("elsewhere")
     assert run.files.read(csv) == b"r,l,t\n"
+    # Files of the user's are nobody's business, and are not read as if the run had left them.
+    for name in ("notes.txt", "1.monitor.csv"):
+        (run.path / name).write_text("mine")
+        run.files.check(run.path / name)
+    check_digest(run, run.path.parent / "elsewhere.zip")
+    check_digest(None, csv)
+    assert [path.name for path in run.files.matching("*.monitor.csv")] == ["0.monitor.csv"]
     csv.write_bytes(b"r,l,u\n")
     check_refused("is not as the run left it")
     with pytest.raises(UserError, match=r"left it: train again, or name another copy of it$"):
@@ -236,17 +221,6 @@ def test_files_are_held_against_their_digests(run, tmp_path_factory):
     os.mkfifo(csv)
     with pytest.raises(DamagedFileError, match="is no regular file"):
         read_record(csv)
-
-
-def test_files_of_the_user_are_nobodys_business(run):
-    (run.path / "notes.txt").write_text("mine")
-    (run.path / "1.monitor.csv").write_text("mine")
-    (run.path / "notes.txt").write_text("mine, changed")
-    run.files.check(run.path / "notes.txt")
-    check_digest(run, run.path.parent / "elsewhere.zip")
-    check_digest(None, run.path / "0.monitor.csv")
-    # What the run did not leave is not read as if it had.
-    assert [path.name for path in run.files.matching("*.monitor.csv")] == ["0.monitor.csv"]
 
 
 # --- arrays --------------------------------------------------------------------------------------
@@ -284,17 +258,14 @@ GOOD = npy(np.arange(3.0))
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"", "not a zip file"),
         (archive(a=np.arange(9))[:-30], "not a zip file"),
         (archive(a=np.array([{}], object)), "Object arrays cannot be loaded"),
         (archive(a=np.array(["text"])), "where numbers belong"),
-        (archive(a=np.array([1j])), "complex128 where numbers belong"),
         (archive(a=np.zeros(1, [("x", "f8")])), "where numbers belong"),
         (zipped([("a.txt", b"")]), "what is no array"),
         (zipped([("a.npy", b"\x93NUMPY\x03\x00")]), "EOF"),
         (zipped([("a.npy", header("(1000000000000,)"))]), "Unable to allocate|EOF"),
         (zipped([("a.npy", header("(-1,)") + bytes(8))]), "negative"),
-        (zipped([("a.npy", header("(1L,)") + bytes(8))]), "Python 2"),
         (zipped([("a.npy", header("(1") + bytes(8))]), "parse|EOF"),
         (zipped([("a.npy", GOOD)], compression=zipfile.ZIP_BZIP2), "compressed in a way"),
         (zipped([(f"{i}.npy", GOOD) for i in range(1001)]), "too many of them"),

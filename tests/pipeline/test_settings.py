@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents import ALGORITHMS, load_algorithm
-from pipeline.errors import UserError, did_you_mean
+from pipeline.errors import UserError
 from pipeline.settings.components import (
     build_algorithm_kwargs,
     build_value,
@@ -116,11 +116,10 @@ def test_each_text_is_read_or_refused(section, text, mark, expected, tmp_path):
         (b"", ": must map environment ids to hyperparameters"),
         (b"A: " + b"[" * 3000, ":1:53: is nested too deeply, or too large"),
         (b"A: {b: " + b"9" * 5000 + b"}", "is too long for a number"),
-        (b"A: {b: " + b":".join([b"1"] * 5000) + b"}", "is too long for a number"),
         (b"A: \xff", ": is not a text file"),
         (b"# " + b"x" * 600_000, "is larger than 262,144 bytes"),
     ],
-    ids=["empty", "deep", "9", "1:1", "latin", "large"],
+    ids=["empty", "deep", "9", "latin", "large"],
 )
 def test_a_broken_file_is_told_with_its_place(tmp_path, content, complaint):
     path = tmp_path / "ppo.yml"
@@ -132,6 +131,13 @@ def test_a_broken_file_is_told_with_its_place(tmp_path, content, complaint):
     if len(content) > 100_000:
         with pytest.raises(UserError, match=complaint):
             entry_names("ppo", path)
+
+
+def test_one_name_is_given_once_and_a_text_has_an_end():
+    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
+        parse_assignments(["gamma:0.9", "gamma:0.8"])
+    with pytest.raises(UserError, match=r"^ppo: .*longer than 10000 characters"):
+        parse_literal("1" * 20_000, "ppo")
 
 
 def test_what_is_no_readable_file(tmp_path):
@@ -147,19 +153,12 @@ def test_what_is_no_readable_file(tmp_path):
             read_hyperparams("ppo", "A", path)
 
 
-@pytest.mark.parametrize(
-    ("first", "form", "place"),
-    [("[x, x, x, x]", "[{}]", "5"), ("{x: 1}", "{{<<: [{}]}}", "5")],
-    ids=["lists", "merge keys"],
-)
-def test_anchors_cannot_unfold_without_end(first, form, place):
-    lines = [f"a0: &a0 {first}"]
-    lines += [f"a{i}: &a{i} " + form.format(", ".join([f"*a{i - 1}"] * 9)) for i in range(1, 10)]
-    with pytest.raises(UserError, match=rf"^bomb:{place}:\d+: .*too large"):
+def test_what_is_shared_adds_up():
+    """To a size without end, and to a depth."""
+    lines = ["a0: &a0 [x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)]
+    with pytest.raises(UserError, match=r"^bomb:5:\d+: .*too large"):
         parse_yaml("\n".join(lines), "bomb")
-
-
-def test_what_is_shared_adds_to_the_depth_too():
     lines = ["a0: &a0 [x]", *(f"a{i}: &a{i} [*a{i - 1}]" for i in range(1, 60))]
     with pytest.raises(UserError, match=r"^deep:49:\d+: is nested too deeply"):
         parse_yaml("\n".join(lines), "deep")
@@ -173,28 +172,10 @@ def test_what_is_shared_adds_to_the_depth_too():
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("(" * 500, "column"),
-        ("-" * 9_000 + "1", "cannot be read"),
-        ("1" * 20_000, "longer than 10000 characters"),
-        ("9" * 6_000, "column 1"),
-    ],
-    ids=lambda text: f"{text[:3]} x {len(text)}",
-)
-def test_long_texts_are_refused_in_one_short_line(text, complaint):
-    with pytest.raises(UserError, match=f"^ppo: .*{complaint}") as caught:
-        parse_literal(text, "ppo")
-    assert len(str(caught.value)) < 400
-
-
-@pytest.mark.parametrize(
     "text",
     [
         "__import__('os').system('touch {}')",
         "[open('{}', 'w')]",
-        "[].__class__.__base__.__subclasses__()",
-        "[x for x in [open('{}', 'w')]]",
         "f\"{{open('{}', 'w')}}\"",
         "a[open('{}', 'w')]",
     ],
@@ -213,9 +194,7 @@ def test_nothing_is_ever_run(text, tmp_path):
     ("words", "meant"),
     [
         ("learning_rate=0.1 gamma:0.9", "learning_rate:0.1"),
-        ("learning_rate 0.1", "learning_rate:0.1"),
         ("learning_rate = 0.1", "learning_rate:0.1"),
-        ("learning_rate =0.1", "learning_rate:0.1"),
         ("learning_rate: 0.1 gamma:0.9", "learning_rate:0.1"),
         ("a=b=c", "a:b=c"),
         ("p=dict(a=[64,8])", "'p:dict(a=[64,8])'"),
@@ -230,24 +209,19 @@ def test_an_assignment_in_another_spelling_gets_ours(words, meant):
     assert hint == (f": did you mean {meant}?" if meant else "")
 
 
-def test_one_name_is_given_once():
-    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
-        parse_assignments(["gamma:0.9", "gamma:0.8"])
-
-
 # --- entries and an agent's arguments ------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_an_algorithms_own_defaults_pass(name):
-    parameters = constructor_parameters(load_algorithm(name))
+def test_an_algorithms_own_defaults_pass():
     elsewhere = {"policy", "env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
-    defaults = {
-        name: parameter.default
-        for name, parameter in parameters.items()
-        if name not in elsewhere and not name.startswith("_")
-    }
-    assert check_algorithm_kwargs(defaults, parameters, "here") == defaults
+    for algo in ALGORITHMS:
+        parameters = constructor_parameters(load_algorithm(algo))
+        defaults = {
+            name: parameter.default
+            for name, parameter in parameters.items()
+            if name not in elsewhere and not name.startswith("_")
+        }
+        assert check_algorithm_kwargs(defaults, parameters, "here") == defaults, algo
 
 
 # --- anything at all -----------------------------------------------------------------------------
@@ -308,16 +282,3 @@ def test_junk_is_read_or_refused_in_one_line(text, content):
 
 
 # --- hints and errors ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "known", "hint"),
-    [
-        ("PPPO", ["a2c", "ppo"], "did you mean 'ppo'?"),
-        ("xyz", ["a2c", "ppo"], "known are a2c, ppo"),
-        ("xyz", list(map(str, range(50))), ""),
-        ("xyz", [], ""),
-    ],
-)
-def test_hints_name_the_nearest_else_a_short_list_else_nothing(name, known, hint):
-    assert did_you_mean(name, known) == hint

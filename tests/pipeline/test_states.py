@@ -1,7 +1,6 @@
 """What a state keeps of objects: they go on as those would have that were saved."""
 
 import collections
-import csv
 import dataclasses
 import datetime
 import decimal
@@ -12,8 +11,6 @@ import logging
 import operator
 import random
 import re
-import subprocess
-import sys
 import threading
 import types
 import weakref
@@ -25,9 +22,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import DQN, HerReplayBuffer
-from stable_baselines3.common.envs import BitFlippingEnv
-from stable_baselines3.common.utils import set_random_seed
 
 from pipeline.state_files import read_state, write_state
 from pipeline.states import NotFittingError, NotKeepableError, pickled, unpickled
@@ -280,13 +274,6 @@ def test_values(tmp_path, value):
     assert found == value
 
 
-def test_zeros_at_the_end_take_no_room(tmp_path):
-    buffer = np.zeros((1000, 100))
-    buffer[2, 3] = 1.0
-    assert np.array_equal(again(buffer, tmp_path), buffer)
-    assert (tmp_path / "state").stat().st_size < 4000
-
-
 SEEN = "now"
 
 
@@ -323,6 +310,10 @@ def test_texts_and_paths_follow_a_folder_that_was_moved(tmp_path):
     original = Holder(held=["/a/b", "/a/b/c", "/a/bc", Path("/a/b/d"), "x" * 300, ("/a/b",)])
     found = gone_through(original, Holder(), tmp_path, {"/a/b": "/z"})
     assert found.held == ["/z", "/z/c", "/a/bc", Path("/z/d"), "x" * 300, ("/z",)]
+    buffer = np.zeros((1000, 100))
+    buffer[2, 3] = 1.0  # the zeros at its end take no room
+    assert np.array_equal(again(buffer, tmp_path), buffer)
+    assert (tmp_path / "state").stat().st_size < 4000
 
 
 # --- what belongs to the process, and what lies outside of it ------------------------------------
@@ -350,40 +341,16 @@ def test_what_the_new_training_has_not_is_missed_by_its_place(tmp_path):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: csv.reader(["a", "b"]),
-        lambda: subprocess.Popen([sys.executable, "-c", ""]),
         random.SystemRandom,
         lambda: (i for i in range(3)),
         lambda: memoryview(b"a"),
         lambda: th.zeros(2).to_sparse(),
         lambda: Path(__file__).open(),  # noqa: SIM115
     ],
-    ids=["rows", "process", "entropy", "generator", "memory", "sparse", "file"],
+    ids=["entropy", "generator", "memory", "sparse", "file"],
 )
 def test_what_cannot_be_kept_is_refused_by_its_place(make):
     value = make()
     with pytest.raises(NotKeepableError, match=r"^it\.held\[0\]: "):
         pickled({"it": Holder(held=[value])})
-    for end in ("wait", "close"):
-        if not isinstance(value, types.GeneratorType):
-            getattr(value, end, lambda: None)()
-
-
-@pytest.mark.parametrize("n_steps", [30, 150], ids=["partly full", "round once"])
-def test_replay_buffers_of_goals_go_on(tmp_path, n_steps):
-    def make():
-        env = BitFlippingEnv(n_bits=4, max_steps=4)
-        common = {"learning_starts": 20, "buffer_size": 100, "seed": 1, "device": "cpu"}
-        common |= {"replay_buffer_class": HerReplayBuffer, "policy_kwargs": {"net_arch": [8]}}
-        return DQN("MultiInputPolicy", env, **common)
-
-    original, built = make().learn(n_steps), make()
-    found = gone_through(original, built, tmp_path)
-    assert found is built
-    assert found.env is found.replay_buffer.env
-    weights = []
-    for model in (original, found):
-        set_random_seed(2)
-        model.learn(100, reset_num_timesteps=False)
-        weights.append([p.tolist() for p in model.policy.parameters()])
-    assert weights[0] == weights[1]
+    getattr(value, "close", lambda: None)()

@@ -80,16 +80,13 @@ def train_with(callback, folder, env_id, env_kwargs, n_envs=1, steps=1000):
     return model, [{name: row[name] for name in names} for row in rows]
 
 
-def both_callbacks(run, folder, env_id, env_kwargs, after=lambda: None, **options):
+def both_callbacks(run, folder, env_id, env_kwargs, eval_freq):
     """Ours and the library's, which see the same episodes: nothing is random there."""
     env, other = (make_vec_env(env_id, 1, env_kwargs=env_kwargs) for _ in range(2))
     play = partial(evaluate, env=env, n_episodes=3, seed=99)
-    common = {"callback_after_eval": after(), **options}
     paths = {"log_path": str(folder), "best_model_save_path": str(folder)}
-    library = EvalCallback(
-        other, n_eval_episodes=3, verbose=0, **paths, **options, callback_after_eval=after()
-    )
-    return EvaluationCallback(run, env, play, **common), library
+    library = EvalCallback(other, n_eval_episodes=3, verbose=0, eval_freq=eval_freq, **paths)
+    return EvaluationCallback(run, env, play, eval_freq=eval_freq), library
 
 
 @pytest.mark.parametrize(
@@ -209,7 +206,7 @@ class Record(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize(("name", "n_envs"), [("qlearning", 1), ("sarsa", 3), ("dqn", 3)])
+@pytest.mark.parametrize(("name", "n_envs"), [("qlearning", 1), ("dqn", 3)])
 def test_an_episode_budget_ends_training_and_drives_the_schedules(name, n_envs):
     n_episodes = 20
     kwargs = TINY_DQN if name == "dqn" else {}
@@ -229,41 +226,29 @@ def checkpoint_steps(folder):
     return sorted(int(name.split("_")[2]) for name in names)
 
 
-@pytest.mark.parametrize(
-    ("n_envs", "every", "steps"),
-    [
-        (1, 70, [70, 140]),
-        # The first step at or after each multiple.
-        (3, 50, [51, 102, 150, 201]),
-        (3, 2, list(range(3, 202, 3))),
-        (1, 500, []),
-    ],
-)
-def test_checkpoints_by_steps(tmp_path, n_envs, every, steps):
-    model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
-    model.learn(200, callback=StepCheckpoint(every, tmp_path))
-    assert checkpoint_steps(tmp_path) == steps
-    for n in steps[:2]:
-        loaded = type(model).load(tmp_path / f"rl_model_{n}_steps.zip")
-        assert loaded.num_timesteps == n
+def test_checkpoints_by_steps_and_by_episodes(tmp_path):
+    for n_envs, every, steps in ((1, 70, [70, 140]), (3, 50, [51, 102, 150, 201]), (1, 500, [])):
+        folder = tmp_path / f"steps {every}"  # the first step at or after each multiple
+        folder.mkdir()
+        model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
+        model.learn(200, callback=StepCheckpoint(every, folder))
+        assert checkpoint_steps(folder) == steps
+    loaded = type(model).load(tmp_path / "steps 50" / "rl_model_102_steps.zip")
+    assert loaded.num_timesteps == 102
+    for n_envs, every in ((1, 1), (3, 4)):
+        folder, record = tmp_path / f"episodes {every}", Record()
+        folder.mkdir()
+        model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
+        model.learn(300, callback=CallbackList([record, EpisodeCheckpoint(every, folder)]))
+        expected = n_envs * np.flatnonzero(np.diff(np.array(record.ended) // every)) + n_envs
+        assert checkpoint_steps(folder) == expected.tolist()
+        assert len(expected) > 3
     for kind, unit in ((StepCheckpoint, "steps"), (EpisodeCheckpoint, "episodes")):
         with pytest.raises(ValueError, match=f"every_n_{unit} must be at least 1, not 0"):
             kind(0, tmp_path)
 
 
-@pytest.mark.parametrize(("n_envs", "every"), [(1, 1), (3, 4)])
-def test_checkpoints_by_episodes(tmp_path, n_envs, every):
-    model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
-    record = Record()
-    model.learn(300, callback=CallbackList([record, EpisodeCheckpoint(every, tmp_path)]))
-    counts = np.array(record.ended) // every
-    expected = n_envs * np.flatnonzero(np.diff(counts)) + n_envs
-    assert checkpoint_steps(tmp_path) == expected.tolist()
-    assert len(expected) > 3
-
-
-@pytest.mark.parametrize(("train_freq", "gradient_steps"), [(1, 1), (4, 2)])
-def test_epsilon_falls_with_each_update(train_freq, gradient_steps):
+def test_epsilon_falls_with_each_update():
     seen = []
 
     class Look(BaseCallback):
@@ -272,7 +257,7 @@ def test_epsilon_falls_with_each_update(train_freq, gradient_steps):
             return True
 
     exploration = ExponentialExploration(initial_eps=0.9, final_eps=0.2, decay=0.97)
-    rhythm = {"train_freq": train_freq, "gradient_steps": gradient_steps, "seed": 0}
+    rhythm = {"train_freq": 4, "gradient_steps": 2, "seed": 0}
     model = DQN("MlpPolicy", Monitor(gym.make(LAKE)), **rhythm, **TINY_DQN)
     model.learn(150, callback=CallbackList([exploration, Look()]))
     assert len(seen) == model.num_timesteps
@@ -281,7 +266,6 @@ def test_epsilon_falls_with_each_update(train_freq, gradient_steps):
     assert seen[-1][0] >= 50
     for n_updates, epsilon in seen:
         assert epsilon == max(0.2, 0.9 * 0.97**n_updates)
-    assert {epsilon for _, epsilon in seen} >= {0.9, 0.2}
     for name in ("initial_eps", "final_eps", "decay"):
         for value in (-0.1, 1.1, float("nan")):
             with pytest.raises(ValueError, match=f"{name} must lie between 0 and 1, not {value}"):
@@ -360,9 +344,9 @@ def test_goals_are_replayed_in_hindsight_by_the_entry_that_rl_zoo3_has(tmp_path,
 # --- bandits: judged by regret, drawn by pull, kept when interrupted -----------------------------
 
 
-def train_on(folder, algo, env_id, eval_freq=None, **settings):
+def train_on(folder, algo, env_id, **settings):
     """The outcome, its pulls, the names of its files and what is printed of it."""
-    fields = {"log_folder": folder, "eval_freq": eval_freq, "pictures": True, "verbose": 1}
+    fields = {"log_folder": folder, "pictures": True, "verbose": 1}
     spec = spec_of(algo, env_id, settings, n_timesteps=300, **fields)
     console = Console(width=160, file=io.StringIO())
     outcome = train(spec, console, {}, "train.py")
@@ -372,11 +356,8 @@ def train_on(folder, algo, env_id, eval_freq=None, **settings):
     return outcome, pulls, {file.name for file in path.iterdir()}, console.file.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("algo", "env_id"), [("linucb", "LinearBandit-v0"), ("ucb", "GaussianBandit-v0")]
-)
-def test_regret_is_the_judgement_where_arms_are_drawn_anew(algo, env_id, tmp_path):
-    outcome, pulls, names, text = train_on(tmp_path, algo, env_id)
+def test_regret_is_the_judgement_where_arms_are_drawn_anew(tmp_path):
+    outcome, pulls, names, text = train_on(tmp_path, "linucb", "LinearBandit-v0")
     regret = float(pulls["regrets"].sum())
     info = outcome.run.read_info()
     assert outcome.pulls.regret == info["regret"] == regret > 0
