@@ -1,11 +1,12 @@
 """Maps, and the worlds on them: steps worked by hand, rules spelt out, optima by search."""
 
 import itertools
+import tracemalloc
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra, shortest_path
@@ -13,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra, shortest_path
 from envs.grid import GridMap, distances_to
 from envs.mine_maze import MineMazeEnv
 from envs.textbook.dyna_maze import DynaMazeEnv
-from envs.warehouse import WarehouseEnv, random_warehouse
+from envs.warehouse import RandomWarehouseEnv, WarehouseEnv, random_warehouse
 
 UP, DOWN, LEFT, RIGHT = range(4)
 ROWS = ["..G", ".#.", "S.."]
@@ -28,7 +29,9 @@ def walk(env, letters):
 # --- maps -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("start", "newline", "end"), [("", "\n", ""), ("\ufeff", "\r\n", "\n\n")])
+@pytest.mark.parametrize("start", ["", "\ufeff"], ids=["plain", "marked as UTF-8"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("end", ["", "\n", "\n\n"])
 def test_a_map_is_read_from_rows_text_and_files(tmp_path, newline, end, start):
     path = tmp_path / "map.txt"
     path.write_bytes((start + newline.join(ROWS) + end.replace("\n", newline)).encode())
@@ -41,18 +44,22 @@ def test_a_map_is_read_from_rows_text_and_files(tmp_path, newline, end, start):
 
 BROKEN = [
     ([], "the map is empty"),
+    ([""], "the map is empty"),
     ("\n", "the map is empty"),
     (["S..", "..", "..G"], "row 2 has 2 cells and row 1 has 3: they differ from column 3 on"),
+    (["S..", "....", "..G"], "row 2 has 4 cells and row 1 has 3: they differ from column 4 on"),
     (["...", "..G"], "the map has no start: mark it with the letter S"),
     (["..S", "S.G"], "two starts, at row 1, column 3 and at row 2, column 1; there must be one"),
     (["S..", "..."], "the map has no goal: mark it with the letter G"),
     (["S..", ".x.", "..G"], "unknown letter 'x' at row 2, column 2; known are # . S G"),
+    (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2"),
     (
         ["S#.", "#..", "..G"],
         "the goal at row 3, column 3 cannot be reached from the start at row 1, column 1",
     ),
     ("missing.txt", "cannot read the map file missing.txt: No such file or directory"),
     (7, "desc must be a list of rows"),
+    ([1, 2], "desc must be a list of rows"),
     (["S" + "." * 5000 + "G"] * 5000, "5000 rows of 5002 cells, more than 16,777,216 cells"),
     ("/dev/zero", "is no regular file"),
 ]
@@ -65,7 +72,7 @@ def test_a_broken_map_is_refused_in_one_line(desc, message):
     assert "\n" not in str(refused.value)
 
 
-def test_broken_files_and_mazes(tmp_path):
+def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path):
     path = tmp_path / "map.txt"
     for content, message in (
         (b"S.\n?G\n", r"map\.txt: unknown letter '\?' at row 2, column 1"),
@@ -78,14 +85,18 @@ def test_broken_files_and_mazes(tmp_path):
         file.truncate(2**40)  # it takes no room on the disk
     with pytest.raises(ValueError, match="is larger than"):
         WarehouseEnv(desc=path)
-    # A maze has letters of its own, and room for so many cells of power.
+
+
+def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
     for desc, message in (
         (["S#G"], r"unknown letter '#' at row 1, column 2; known are S \. M P"),
         (["SMG"], "the goal at row 1, column 3 cannot be reached"),
         (["S" + "P" * 25 + "G"], r"has 27 cells, 25 of them to collect: these make 27 \* 2\*\*25"),
+        (["S" + "P" * 100_000 + "G"], r"100002 cells, 100000 of them to collect"),
     ):
         with pytest.raises(ValueError, match=message):
             MineMazeEnv(desc=desc)
+    assert MineMazeEnv(desc=["S" + "P" * 18 + "G"]).dynamics.n_states == 20 * 2**18
     # Of several goals the nearest counts.
     assert WarehouseEnv(desc=["G..S.G", "......"]).shortest_path_length == 2
 
@@ -93,7 +104,6 @@ def test_broken_files_and_mazes(tmp_path):
 ROW_OF = st.integers(1, 7).flatmap(lambda n: st.lists(st.booleans(), min_size=n, max_size=n))
 
 
-@settings(max_examples=40)
 @given(st.integers(1, 7), ROW_OF, st.randoms(), st.data())
 def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, data):
     free = np.array([shuffler.sample(row, len(row)) for _ in range(n_rows)])
@@ -243,7 +253,6 @@ SIDES = {UP: (LEFT, RIGHT), DOWN: (LEFT, RIGHT), LEFT: (UP, DOWN), RIGHT: (UP, D
 
 
 @pytest.mark.parametrize("kind", [WarehouseEnv, MineMazeEnv])
-@settings(max_examples=40)
 @given(st.data(), st.sampled_from([0, 0.25, 1]), st.booleans(), st.integers(0, 2**32))
 def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start, seed):
     rows = data.draw(maps("..#" if kind is WarehouseEnv else "...M"))
@@ -284,7 +293,6 @@ def shelves(rows):
     return np.array([[letter == "#" for letter in row] for row in rows])
 
 
-@settings(max_examples=40)
 @given(st.integers(2, 9), st.floats(0, 1), st.integers(0, 2**63 - 1))
 def test_no_more_shelves_are_taken_out_than_needed(size, density, seed):
     # The generator's first numbers give the map before; Dijkstra on it the fewest shelves.
@@ -307,21 +315,43 @@ def test_a_seed_names_a_map_for_good():
     expected = ["...##G", "#...#.", "#.....", "..##.#", "......", "S###.#"]
     assert random_warehouse(6, 0.4, 7) == expected
     assert len({tuple(random_warehouse(10, 0.3, seed)) for seed in range(20)}) == 20
+
+
+def test_the_density_is_as_asked_for():
+    # A million cells at 0.3 have a standard deviation of 0.00046.
+    assert abs(shelves(random_warehouse(1000, 0.3, 5)).mean() - 0.3) < 0.002
     # A full warehouse keeps all but one shortest way of eleven cells.
     assert [shelves(random_warehouse(6, density)).sum() for density in (0, 1)] == [0, 36 - 11]
 
 
-@pytest.mark.parametrize(("kwargs", "limit"), [({"size": 50}, None), ({"max_episode_steps": 3}, 3)])
+@pytest.mark.parametrize(
+    ("kwargs", "limit"),
+    [({"size": 50}, None), ({"max_episode_steps": 3}, 3), ({"max_episode_steps": 10**6}, 10**6)],
+    ids=["ten shortest ways", "shorter", "longer"],
+)
 def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(kwargs, limit):
     env = gym.make("envs:RandomWarehouse-v0", slip=0.1, **kwargs)
     limit = limit or 10 * env.unwrapped.shortest_path_length
     again = gym.make(env.spec)
     assert env.spec.max_episode_steps == again.spec.max_episode_steps == limit
     assert np.array_equal(again.unwrapped.desc, env.unwrapped.desc)
-    assert str(again) == str(env)
     assert str(env).count("TimeLimit") == 1
+    assert str(again) == str(env)
     endless = gym.make("envs:RandomWarehouse-v0", max_episode_steps=-1)
     assert "TimeLimit" not in str(endless)
+    assert endless.unwrapped.shortest_path_length > 0
+
+
+def test_steps_and_resets_among_a_million_cells_take_little_memory():
+    env = RandomWarehouseEnv(size=1000, random_start=True)
+    env.reset(seed=0)
+    tracemalloc.start()
+    for step in range(100):
+        env.step(step % 4)
+        env.reset()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e3
 
 
 # --- mazes that change ----------------------------------------------------------------------------
@@ -362,3 +392,15 @@ def test_it_waits_until_nobody_stands_where_a_wall_comes():
     assert env.map.rows[3] == ".########"
     assert not np.array_equal(env.render()[200:256, 512:], before[200:256, 512:])
     assert walk(env, "D")[3][0]["bumped"]
+
+
+def test_what_a_changing_maze_tells_is_of_the_moment():
+    env = DynaMazeEnv(**CHANGING, change_after_steps=2, random_start=True, slip=0.25)
+    env.reset(seed=0)
+    before = env.P, env.initial_state_distrib
+    env.s = 0
+    walk(env, "UU")
+    assert env.map.rows[3] == ".########"
+    assert before[0] != env.P
+    assert not np.array_equal(env.initial_state_distrib, before[1])
+    assert env.dynamics.outcome_prob == (0.75, 0.125, 0.125)

@@ -6,7 +6,6 @@ import pytest
 
 import envs  # noqa: F401 (registers the environments)
 from envs.known_models import observations_of_states, time_limit, transition_model
-from envs.pomdp.hallway import _world
 from envs.pomdp.readings import with_readings
 from mdp import TransitionModel, finite_horizon_optimum
 
@@ -26,14 +25,19 @@ def test_the_tiger_is_heard_where_it_is_with_the_accuracy():
     env = gym.make("Tiger-v0", accuracy=0.8)
     model, heard = transition_model(env), observations_of_states(env)
     hidden = [env.unwrapped.cell_of(state) for state in range(6)]
-    assert [*zip(hidden, heard.tolist(), strict=True)] == [(s // 3, s % 3) for s in range(6)]
-    anywhere = [0.5, 0, 0, 0.5, 0, 0]
-    np.testing.assert_allclose(model.initial, anywhere)
+    assert list(zip(hidden, heard.tolist(), strict=True)) == [
+        (tiger, sound) for tiger in (0, 1) for sound in (0, 1, 2)
+    ]
+    np.testing.assert_allclose(model.initial, [0.5, 0, 0, 0.5, 0, 0])
     for state in range(6):
-        expected = [[0, 0.8, 0.2, 0, 0, 0], [0, 0, 0, 0, 0.2, 0.8]][hidden[state]]
-        for action, after in enumerate((expected, anywhere, anywhere)):
-            found = chances("Tiger-v0", state, action, accuracy=0.8)
-            np.testing.assert_allclose(found, after)
+        near, far = (0.8, 0.2) if hidden[state] == 0 else (0.2, 0.8)
+        expected = np.zeros(6)
+        expected[3 * hidden[state] + 1], expected[3 * hidden[state] + 2] = near, far
+        np.testing.assert_allclose(chances("Tiger-v0", state, 0, accuracy=0.8), expected)
+        for door in (1, 2):
+            np.testing.assert_allclose(
+                chances("Tiger-v0", state, door, accuracy=0.8), [0.5, 0, 0, 0.5, 0, 0]
+            )
     rewards = [[-1.0, -100.0, 10.0]] * 3 + [[-1.0, 10.0, -100.0]] * 3
     np.testing.assert_allclose(model.expected_reward, rewards)
     assert finite_horizon_optimum(model, time_limit(env)).start_value == pytest.approx(100)
@@ -45,8 +49,15 @@ NORTH, EAST, SOUTH, WEST = range(4)
 STAY, FORWARD, RIGHT, AROUND, LEFT = range(5)
 
 
+def hallway():
+    env = gym.make("Hallway-v0")
+    return env, transition_model(env), env.unwrapped
+
+
 def places(cell, action, facing):
     """By cell and facing, the chances after an action; cells 0 to 10 are the row, then alcoves."""
+    from envs.pomdp.hallway import _world
+
     world = _world()
     state = int(np.flatnonzero(world.hidden == 4 * cell + facing)[0])
     found = {}
@@ -58,32 +69,41 @@ def places(cell, action, facing):
 
 
 # Rows of the file hallway.POMDP, with its states written as cell and facing.
-FORWARDS = [
-    (0, EAST, {(1, EAST): 0.8, (0, EAST): 0.2}),
-    (0, WEST, {(1, EAST): 0.025, (1, WEST): 0.025, (0, WEST): 0.95}),
-    (1, NORTH, {(2, EAST): 0.05, (0, WEST): 0.05, (1, NORTH): 0.9}),
-    (2, EAST, {(3, EAST): 0.8, (11, SOUTH): 0.05, (1, EAST): 0.025, (1, WEST): 0.025,
-               (2, EAST): 0.1}),
-    (2, NORTH, {(3, EAST): 0.05, (11, NORTH): 0.025, (11, SOUTH): 0.025, (1, WEST): 0.05,
-                (2, NORTH): 0.85}),
-    (12, NORTH, {(4, NORTH): 0.8, (12, NORTH): 0.2}),
-]  # fmt: skip
-TURNS = {RIGHT: (0.1, 0.7, 0.1, 0.1), AROUND: (0.1, 0.15, 0.6, 0.15), LEFT: (0.1, 0.1, 0.1, 0.7)}
+@pytest.mark.parametrize(
+    ("cell", "facing", "expected"),
+    [
+        (0, EAST, {(1, EAST): 0.8, (0, EAST): 0.2}),
+        (0, WEST, {(1, EAST): 0.025, (1, WEST): 0.025, (0, WEST): 0.95}),
+        (1, NORTH, {(2, EAST): 0.05, (0, WEST): 0.05, (1, NORTH): 0.9}),
+        (2, EAST, {(3, EAST): 0.8, (11, SOUTH): 0.05, (1, EAST): 0.025, (1, WEST): 0.025,
+                   (2, EAST): 0.1}),
+        (2, SOUTH, {(3, EAST): 0.05, (11, SOUTH): 0.8, (1, WEST): 0.05, (2, SOUTH): 0.1}),
+        (2, NORTH, {(3, EAST): 0.05, (11, NORTH): 0.025, (11, SOUTH): 0.025, (1, WEST): 0.05,
+                    (2, NORTH): 0.85}),
+        (12, NORTH, {(4, NORTH): 0.8, (12, NORTH): 0.2}),
+        (12, SOUTH, {(4, NORTH): 0.025, (4, SOUTH): 0.025, (12, SOUTH): 0.95}),
+    ],
+)  # fmt: skip
+def test_moving_forward_is_that_of_the_original(cell, facing, expected):
+    assert places(cell, FORWARD, facing) == expected
 
 
-def test_moving_and_turning_are_those_of_the_original():
-    for cell, facing, expected in FORWARDS:
-        assert places(cell, FORWARD, facing) == expected
+def test_turning_is_that_of_the_original():
     for facing in range(4):
         turned = [(5, (facing + turn) % 4) for turn in range(4)]
-        for action, by_turn in TURNS.items():
+        for action, by_turn in (
+            (RIGHT, (0.1, 0.7, 0.1, 0.1)), (AROUND, (0.1, 0.15, 0.6, 0.15)),
+            (LEFT, (0.1, 0.1, 0.1, 0.7)),
+        ):  # fmt: skip
             assert places(5, action, facing) == dict(zip(turned, by_turn, strict=True))
         assert places(5, STAY, facing) == {(5, facing): 1}
 
 
 def test_readings_are_those_of_the_original():
-    env = gym.make("Hallway-v0")
-    model, world = transition_model(env), _world()
+    from envs.pomdp.hallway import _world
+
+    env, model, _ = hallway()
+    world = _world()
 
     def readings(cell, facing):
         """The chances of readings at the start, given where that is."""
@@ -121,6 +141,15 @@ def test_the_dark_shows_the_four_cells_beside():
     ]  # fmt: skip
     assert env.reset(seed=0)[0] == seen[0]
     assert env.step(3)[0] == seen[1]
+
+
+def test_aisles_of_the_dark_look_alike():
+    env = gym.make("DarkWarehouse-v0")
+    model, seen = transition_model(env), observations_of_states(env)
+    assert model.reachable.sum() == 15
+    # Three aisles of two cells and an end, of which the goal takes one.
+    assert len(set(seen[model.reachable].tolist())) == 7
+    assert len({int(seen[7 + 1]), int(seen[7 + 3]), int(seen[7 + 5]), int(seen[14 + 1])}) == 1
 
 
 # --- readings ------------------------------------------------------------------------------------
@@ -166,6 +195,7 @@ def test_readings_leave_the_hidden_process_as_it_is():
 @pytest.mark.parametrize(
     ("first", "later", "message"),
     [
+        (np.ones((2, 1)), np.ones((1, 2, 1)), "they must be"),
         (np.ones((3, 1)), np.ones((2, 2, 1)), "they must be"),
         (np.full((2, 2), 0.4), np.full((2, 2, 2), 0.5), "first has readings whose chances"),
         (np.full((2, 2), 0.5), np.full((2, 2, 2), 0.6), "later has readings whose chances"),

@@ -1,9 +1,15 @@
 """Names become objects of admitted kinds alone: those in files, and modules that the user typed."""
 
+import contextlib
 import dataclasses
+import importlib
+import importlib.metadata
+import inspect
 import math
 import os
+import pkgutil
 import sys
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -11,10 +17,11 @@ import pytest
 import stable_baselines3 as sb3
 from gymnasium.wrappers import ClipReward, TimeLimit
 from stable_baselines3.common.callbacks import (
+    BaseCallback,
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack
 from torch import nn, optim
 
 from agents import load_algorithm
@@ -24,10 +31,12 @@ from pipeline.settings.components import (
     build_algorithm_kwargs,
     callbacks,
     confined,
+    names_a_place,
     vec_wrapper_factory,
     wrapper_factory,
 )
 from pipeline.settings.hyperparams import split
+from pipeline.settings.values import constructor_parameters
 from pipeline.user_modules import (
     UserModule,
     as_flag,
@@ -51,13 +60,15 @@ def cartpole():
     return gym.make("CartPole-v1").unwrapped
 
 
-def test_wrappers_of_environments_and_of_vectorised_ones():
-    """A list wraps from the inside out."""
+def test_a_list_wraps_from_the_inside_out():
     given = [{TIME_LIMIT: {"max_episode_steps": "1e2"}}, {CLIP: {"max_reward": 0}}, MONITOR]
     env = wrapper_factory(given)(cartpole())
     layers = [env, env.env, env.env.env]
     assert [type(layer) for layer in layers] == [Monitor, ClipReward, TimeLimit]
     assert layers[2]._max_episode_steps == 100
+
+
+def test_a_wrapper_of_a_vectorised_environment():
     env = vec_wrapper_factory({FRAME_STACK: {"n_stack": 3}})(DummyVecEnv([cartpole]))
     assert isinstance(env, VecFrameStack)
     assert env.observation_space.shape == (12,)
@@ -110,7 +121,55 @@ def test_arguments_make_an_agent():
 
 # --- where components write ----------------------------------------------------------------------
 
-OUTSIDE = ["/etc/x", "..", "a/../../x", "C:x", "\\x", "//server/x", "a\0b"]
+PACKAGES = ("stable_baselines3", "sb3_contrib", "gymnasium.wrappers", "envs.wrappers")
+PACKAGES += ("agents.common", "pipeline")
+# Texts, and values of any kind, that say what is done and not where to write.
+HARMLESS = {
+    *("action_mask_fn", "args", "channels_order", "callback", "dict_time_key", "dtype", "during"),
+    *("env", "filter_keys", "func", "info_keywords", "key", "kwargs", "norm_obs_keys", "obs_key"),
+    *("padding_type", "render_key", "reset_keywords", "stats_key", "verbose"),
+}
+
+
+def import_whole(package):
+    """Import all of a package, but for parts that need what is not installed."""
+    module = importlib.import_module(package)
+    for info in pkgutil.walk_packages(getattr(module, "__path__", []), f"{package}."):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(info.name)
+
+
+def all_below(cls):
+    return {cls}.union(*map(all_below, cls.__subclasses__()))
+
+
+def test_every_text_of_every_component_is_known():
+    """What takes a text, or does not say what it takes, is a place or known to be harmless."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for package in PACKAGES:
+            import_whole(package)
+    found = set().union(*map(all_below, (gym.Wrapper, VecEnvWrapper, BaseCallback)))
+    classes = [cls for cls in found if cls.__module__.startswith(PACKAGES)]
+    assert len(classes) > 80
+    places = set()
+    for cls in classes:
+        for name, parameter in constructor_parameters(cls).items():
+            annotation = parameter.annotation
+            says = "Any" if annotation is inspect.Parameter.empty else str(annotation)
+            if names_a_place(name):
+                places.add(name)
+                # Nor does any write somewhere without being told where.
+                assert "prefix" in name or parameter.default in (inspect.Parameter.empty, None)
+            elif not says.startswith("collections.abc.Callable"):  # no file can name a function
+                is_text = any(word in says for word in ("str", "Path", "Any"))
+                assert not is_text or name in HARMLESS, (cls, name, says)
+    assert " ".join(sorted(places)) == (
+        "best_model_save_path filename folder log_path name_prefix path save_path video_folder"
+    )
+
+
+OUTSIDE = ["/etc/x", "..", "a/../../x", "C:x", "C:/x", "\\x", "..\\x", "//server/x", "a\0b"]
 PLACES = {
     "callback": lambda place, run: callbacks({CHECKPOINT: {"save_path": place}}, (), run),
     "prefix": lambda place, run: callbacks({CHECKPOINT: {"name_prefix": f"{place}/x"}}, (), run),
@@ -198,7 +257,11 @@ def test_a_module_is_found_by_its_name_and_by_its_path(write, own_folder, monkey
 
 
 # --- names that are taken, modules that fail -----------------------------------------------------
-@pytest.mark.parametrize("name", ["envs", "pipeline", "tune"])
+OURS = ["envs", "agents", "mdp", "verdicts", "pipeline", "experiments", "tuning"]
+OURS += ["report", "commands", "train", "enjoy", "compare", "tune"]
+
+
+@pytest.mark.parametrize("name", OURS)
 def test_a_module_with_the_name_of_ours_is_refused(write, name):
     folder = write(**{name: "raise SystemExit('it was imported')"})
     for form in (name, f"./{name}.py"):

@@ -90,7 +90,9 @@ SEVERAL = {"n_steps": 3, "train_freq": (1, "episode")}
 ORNSTEIN, NORMAL = OrnsteinUhlenbeckActionNoise(*NOISE), NormalActionNoise(*NOISE)
 CART, SWING = "CartPole-v1", "Pendulum-v1"
 CASES = {
+    "ppo": case(sb3.PPO, CART, ROLLOUT, n_envs=2),
     "ppo with schedules, normalised": case(sb3.PPO, CART, ROLLOUT, SCHEDULES, around="normalize"),
+    "ppo with sde": case(sb3.PPO, SWING, ROLLOUT, SDE),
     "ppo on dictionaries": case(sb3.PPO, bits, ROLLOUT, policy="MultiInputPolicy"),
     "a2c on stacked frames": case(sb3.A2C, CART, STACKED, around="stack"),
     "dqn": case(sb3.DQN, CART, FEW),
@@ -98,6 +100,7 @@ CASES = {
     "dqn with hindsight": case(sb3.DQN, bits, FEW, HINDSIGHT, policy="MultiInputPolicy"),
     "sac with sde and noise": case(sb3.SAC, SWING, FEW, SDE, {"action_noise": ORNSTEIN}),
     "td3 with noise": case(sb3.TD3, SWING, FEW, {"action_noise": NORMAL}, n_envs=2),
+    "ddpg": case(sb3.DDPG, SWING, FEW),
     "qrdqn": case(contrib.QRDQN, CART, FEW),
     "tqc": case(contrib.TQC, SWING, FEW),
     "crossq": case(contrib.CrossQ, SWING, FEW),

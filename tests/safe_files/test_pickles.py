@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_files.files import UnsafeFileError
@@ -25,7 +25,6 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=50)
 @given(VALUES, st.integers(4, 5))
 def test_plain_data_comes_out_as_it_went_in(value, protocol):
     assert read_pickle(pickle.dumps(value, protocol)) == value
@@ -56,6 +55,12 @@ def test_calls_and_names_are_written_down_and_not_made():
     assert call.maker == Name("builtins", "print")
     assert call.args == ("called",)
     assert name == Name("builtins", "int")
+
+
+def test_shared_parts_stay_shared():
+    part = [1]
+    first, second = read_pickle(pickle.dumps([part, part]))
+    assert first is second
 
 
 @pytest.mark.parametrize("protocol", [4, 5])
