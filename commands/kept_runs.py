@@ -85,7 +85,8 @@ def _do_again(
             shutil.rmtree(place, ignore_errors=True)
             put_in_place(run.path, place)
             who = f"{run.agent} on {run.environment}, seed {run.seed}"
-            words = "came out otherwise than the first time, as with other versions or processors"
+            words = "came out differently than the first time, "
+            words += "as it can with other versions or processors"
             say(context.console, f"{who}: {words}; see {place}")
         elif run.is_finished:
             context.store.keep(run)
@@ -93,7 +94,7 @@ def _do_again(
 
 
 def _otherwise(run: PlannedRun) -> Path:
-    """Where the folder of a run is that came out otherwise than the first time."""
+    """Where the folder of a run is that came out differently than the first time."""
     return run.path.with_name(f"{run.path.name}.otherwise")
 
 

@@ -106,7 +106,7 @@ FAULTS: Mapping[str, Fault] = {
         "What was learnt is not in the saved file.", "Stable-Baselines3: BaseAlgorithm.save"
     ),
     "zip-forgets-optimizer": Fault(
-        "The optimizer's state is not in the saved file: training goes on differently.",
+        "The optimizer's state is not in the saved file: training continues differently.",
         "Stable-Baselines3: BaseAlgorithm._get_torch_save_params",
     ),
     "zip-forgets-schedules": Fault(

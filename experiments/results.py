@@ -125,7 +125,7 @@ def _table_of(content: bytes) -> Floats:
 
 def _check_finite(path: Path, *arrays: NDArray[Any]) -> None:
     if not all(np.isfinite(array).all() for array in arrays):
-        raise DamagedFileError(path, "is damaged: it holds what is no finite number")
+        raise DamagedFileError(path, "is damaged: it holds a number that is not finite")
 
 
 def read_evaluations(run: Run) -> tuple[Floats, Floats]:

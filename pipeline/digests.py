@@ -74,7 +74,7 @@ class RecordedFiles:
             content = read_file(path, limit)
         recorded = self._recorded(path)
         if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
-            raise DamagedFileError(path, "is not as the run left it")
+            raise DamagedFileError(path, "has changed since the run wrote it")
         return content
 
     def check(self, path: Path) -> None:
@@ -82,7 +82,7 @@ class RecordedFiles:
         recorded = self._recorded(path)
         with _as_damage(path):
             if recorded is not None and digest_of(path) != recorded:
-                raise DamagedFileError(path, "is not as the run left it")
+                raise DamagedFileError(path, "has changed since the run wrote it")
 
     def _recorded(self, path: Path) -> str | None:
         """The recorded digest of a file; None if there is none, or the file is not the run's."""
@@ -151,7 +151,7 @@ def read_record(path: Path) -> dict[str, Any]:
         files = record[FIELD]
         has_digests = isinstance(files, dict) and all(isinstance(d, str) for d in files.values())
         if not has_digests or files.get(RECORD) != _seal(record):
-            raise DamagedFileError(path, "is damaged: it is not as the run left it")
+            raise DamagedFileError(path, "is damaged: it has changed since the run wrote it")
     return record
 
 
@@ -217,7 +217,7 @@ def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
             arrays = {name: archive[name] for name in archive.files}
             for array in arrays.values():
                 if not isinstance(array, np.ndarray):
-                    raise ValueError("it holds what is no array")
+                    raise ValueError("it holds something that is not an array")
                 if array.dtype.kind not in _KINDS:
                     raise ValueError(f"it holds {array.dtype} where numbers belong")
             return arrays

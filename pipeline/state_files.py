@@ -133,7 +133,7 @@ def read_state(file: BufferedReader, key: bytes) -> SavedState:
         raise BadStateError(f"functions in it were compiled by {header['python']}, another Python")
     parts = [_part(file, *part) for part in header["parts"]]
     if file.read(1):
-        raise BadStateError("it is damaged: it goes on after its end")
+        raise BadStateError("it is damaged: bytes follow its end")
     places = [Place(tuple(steps), name) for steps, name in header["places"]]
     return SavedState(Pickled(_as_array(parts[0]).data, places, parts[1:]), header["note"])
 

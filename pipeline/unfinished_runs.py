@@ -138,11 +138,11 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
             path.unlink()
     else:
         if state.note["spec"] != settings_digest(run.recorded_spec()):
-            raise UserError(f"{run.state_path} holds the state of a run of other settings")
+            raise UserError(f"{run.state_path} holds the state of a run with other settings")
         if not state.is_of_these_sources:
             tell(
-                f"{run.state_path} was saved by other sources of Yardstick, so that the result may "
-                "differ; remove it to begin the run anew"
+                f"{run.state_path} was saved by other code of Yardstick, so the result may "
+                "differ; remove it to start the run again"
             )
         cut_back(run.path, state.note["log_folder"], state.note["files"])
     return replace(keeping, state=state, goes_on=True, was_cut_off=True)
@@ -189,7 +189,7 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, P
             found = None
         if found != tuple(position):
             raise UserError(
-                f"{path} is not as the run left it: it cannot go on from its state; remove "
+                f"{path} has changed since the run wrote it, so the run cannot resume; remove "
                 f"{run_folder / STATE_FOLDER} to begin the run again"
             )
     for path in [*monitor_files(run_folder), *_event_files(log_folder)]:

@@ -146,7 +146,7 @@ class Reader(pickle._Unpickler):
     def load_reduce(self) -> None:
         args, maker = self.stack.pop(), self.stack.pop()
         if not (isinstance(maker, Name | Made) and isinstance(args, tuple)):
-            raise UnsafeFileError("a pickle that calls what is no name")
+            raise UnsafeFileError("a pickle that calls something that is not a name")
         self.stack.append(Made(maker, args))
 
     load_newobj = load_reduce
@@ -154,7 +154,9 @@ class Reader(pickle._Unpickler):
     def load_build(self) -> None:
         state, top = self.stack.pop(), self.stack[-1]
         if not isinstance(top, Made) or top.state is not None:
-            raise UnsafeFileError("a pickle that sets the state of what is no new object")
+            raise UnsafeFileError(
+                "a pickle that sets the state of something that is not a new object"
+            )
         top.state = state
 
     def load_bytearray8(self) -> None:

@@ -209,7 +209,7 @@ def failing_in_a_line(given: str | None) -> Iterator[None]:
         if not _LIBRARIES & {kind.__module__.partition(".")[0] for kind in type(error).__mro__}:
             raise
         name = OWN_FILE if given is None else f"--storage {without_secret(given)}"
-        goes_on = "; what is done stays, and the same command goes on"
+        goes_on = "; finished work is kept, and the same command continues"
         if isinstance(error, json.JSONDecodeError):
             name, goes_on = f"{name} is damaged", ""
         raise UserError(f"{name}: {reason_of(error)}{goes_on}") from error

@@ -229,7 +229,7 @@ class ClusterLauncher:
         if now > self._fit_until + SECONDS_WITHOUT_FIT_WORKERS:
             raise UserError(
                 f"--cluster: for {SECONDS_WITHOUT_FIT_WORKERS:.0f} s no worker had the code of "
-                f"this command ({next(iter(self._aside.values()))}): start workers anew, from the "
+                f"this command ({next(iter(self._aside.values()))}): restart the workers with the "
                 "same versions; finished runs are kept, and the same command continues"
             )
         if is_new and self._aside:

@@ -111,7 +111,7 @@ def how_episodes_end(evaluator: ExactEvaluator, policy: Any) -> str:
     if n_states == 1:
         where = f"it stays at {places[0]}"
     elif n_states <= MOST_STATES_NAMED:
-        where = f"it goes round between {'; '.join(places[:n_states])}"
+        where = f"it circles between {'; '.join(places[:n_states])}"
     else:
         n_reachable = int(evaluator.model.reachable.sum())
         where = f"it never leaves {n_states} of {n_reachable} states, such as {places[0]}"

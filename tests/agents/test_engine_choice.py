@@ -103,7 +103,7 @@ INTERPRETED = {  # reason: environment, settings, callback
     "the environment is shown on the screen": (partial(lake, env_kwargs={"render_mode": "human"}),),
     "under DiscretizeObservation and Monitor alone": (partial(pole, gym.wrappers.Autoreset),),
     "with its default reward alone": (partial(pole, sutton_barto_reward=True),),
-    "does not go on from where its attribute s is set": (lambda: TimeLimit(Deaf(), 10),),
+    "does not continue from the state": (lambda: TimeLimit(Deaf(), 10),),
     "the environment's P is not what step does: state ": (calm,),
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
     "a schedule is a Python function": (

@@ -149,7 +149,7 @@ def test_a_run_that_comes_out_otherwise_is_told(typed, own_folder):
         change = "UPDATE runs SET model = ?, checksum = ? WHERE seed = ?"
         database.execute(change, (*row[-2:], seed))
     said = typed(*KEEP, "--seeds", 9, "-f", "few", "--make-again", f"qlearning:{seed}", code=1)
-    assert f"seed {seed}: came out otherwise than the first time" in said
+    assert f"seed {seed}: came out differently than the first time" in said
     assert f"FrozenLake-v1_{seed + 1}.otherwise" in folders(study)
 
 

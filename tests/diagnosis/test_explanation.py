@@ -65,7 +65,7 @@ def test_one_wrong_action_is_named_with_what_mending_it_regains():
     assert found.gap == pytest.approx(1.0)
     assert parts_of(found)["look-ahead"] == pytest.approx(1.0)
     assert found.is_caught
-    assert "goes round between" in found.ending
+    assert "circles between" in found.ending
     assert [(name, pytest.approx(value)) for name, value in found.repairs] == [
         ("row 4, column 3", pytest.approx(1.0))
     ]

@@ -132,5 +132,5 @@ def test_another_blackjack_is_not_believed_and_none_is_compiled():
     changed.step = lambda action: None
     assert transition_model(Cheating()) is transition_model(changed) is None
     agent = load_algorithm("qlearning")(env=FlattenToDiscrete(gym.make("Blackjack-v1")))
-    with pytest.raises(NotCompilable, match="does not go on from where its attribute s is set"):
+    with pytest.raises(NotCompilable, match="does not continue from the state"):
         compile_envs(agent.env)

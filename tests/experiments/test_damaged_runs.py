@@ -181,7 +181,9 @@ def test_repair_moves_aside_what_is_done_again(grid, compare_again, capsys):
     # Without being asked to the command leaves it as it is.
     code, out = compare_again(study, planned, root)
     assert (code, path.read_bytes()) == (1, before)
-    assert f"left out: qlearning on grid, seed 1: {path} is not as the run left it\n" in out
+    assert (
+        f"left out: qlearning on grid, seed 1: {path} has changed since the run wrote it\n" in out
+    )
     assert "1 run is damaged and in no figure; --repair does such runs again" in out
     assert "1 of 2 runs of qlearning is missing" in out
     repair(Console(width=400), study, planned)

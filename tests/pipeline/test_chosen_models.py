@@ -233,7 +233,7 @@ def test_a_swap_before_the_training_begins_is_found(swapped, tmp_path):
     run, _ = swapped("dqn")
     path = agent_to_continue(run.path)
     spec = spec_of("dqn", CART, SMALL_DQN, log_folder=tmp_path / "logs", trained_agent=path)
-    with pytest.raises(UserError, match=r"CartPole-v1\.zip is not as the run left it"):
+    with pytest.raises(UserError, match=r"CartPole-v1\.zip has changed since the run wrote it"):
         prepare(spec, Console(quiet=True), {}, "train.py")
     assert not (tmp_path / "logs").exists()
 

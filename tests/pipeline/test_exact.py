@@ -361,7 +361,7 @@ INTO_THE_HOLE = {0: prefers(2), 1: prefers(1)}  # on the lake 1 is down and 2 is
     ("env_id", "table", "instead"),
     [
         (WAREHOUSE, AGAINST_THE_WALL, f"{LATE}: it stays at row 8, column 1"),
-        (WAREHOUSE, BETWEEN_TWO, f"{LATE}: it goes round between row 10, column 1; row 10, colu"),
+        (WAREHOUSE, BETWEEN_TWO, f"{LATE}: it circles between row 10, column 1; row 10, colu"),
         (LAKE, INTO_THE_HOLE, "100% of its episodes end before the time limit, 0.0% of all with"),
         ("Taxi-v4", [0, 0, 0, 0, 0, -1], f"{LATE}: it never leaves 60 of 400 states"),
     ],

@@ -162,7 +162,7 @@ NOT_PACKED = {
     "kwargs.api_key looks like a secret": lambda _, set_: set_.update(env_kwargs={"api_key": "x"}),
     "names .*, a place on this machine": lambda _, set_: set_.update(note=f"see {HOME}/notes"),
     "cannot be packed: 'std_return'": lambda info, _: info["final"].pop("std_return"),
-    "is not as the run left it": lambda info, _: info["files"].update(WRONG_DIGEST),
+    "has changed since the run wrote it": lambda info, _: info["files"].update(WRONG_DIGEST),
 }
 
 
@@ -305,7 +305,9 @@ LOCKED = json.dumps({**mark(), "token": "x"})
 NOT_PACKED_OF_A_STUDY = {
     "holds no finished run": lambda root: shutil.rmtree(root / "runs"),
     "is no regular file": lambda root: os.mkfifo(root / "verdicts.md"),
-    "is not as the run left it": lambda root: (root / SARSA / "FrozenLake-v1.zip").write_bytes(b""),
+    "has changed since the run wrote it": lambda root: (
+        root / SARSA / "FrozenLake-v1.zip"
+    ).write_bytes(b""),
     "summary.csv is damaged": lambda root: (root / "summary.csv").write_text("a,b\n"),
     r"z names .* nothing was": lambda root: (root / "curves.csv.gz").write_bytes(
         gzip.compress(HOME.encode())

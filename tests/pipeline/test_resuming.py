@@ -320,7 +320,7 @@ def test_a_state_of_other_sources_is_told_of_and_no_bug_of_theirs_is_a_traceback
     told = []
     keeping = go_on(run, StateKeeping(), told.append)
     (line,) = told
-    assert "was saved by other sources of Yardstick, so that the result may differ" in line
+    assert "was saved by other code of Yardstick, so the result may differ" in line
 
     def restore(*_):
         raise AttributeError("'Evaluation' object has no attribute 'new'")
@@ -393,7 +393,7 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
     assert carry_out(training).state == "finished"
     (line,) = [line for line in file.getvalue().splitlines() if "state" in line]
     assert line.startswith(said.format(folder=training.run.state_path))
-    assert line.endswith("--resume begins it anew") == ("can be kept" in said)
+    assert line.endswith("--resume starts it again from the beginning") == ("can be kept" in said)
 
 
 def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeypatch):

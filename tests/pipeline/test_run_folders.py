@@ -206,7 +206,7 @@ def test_files_are_held_against_their_digests(run, tmp_path_factory):
     check_digest(None, csv)
     assert [path.name for path in run.files.matching("*.monitor.csv")] == ["0.monitor.csv"]
     csv.write_bytes(b"r,l,u\n")
-    check_refused("is not as the run left it")
+    check_refused("has changed since the run wrote it")
     with pytest.raises(UserError, match=r"left it: train again, or name another copy of it$"):
         check_digest(run, csv)
     (elsewhere / "link").symlink_to(run.path)
@@ -262,7 +262,7 @@ GOOD = npy(np.arange(3.0))
         (archive(a=np.array([{}], object)), "Object arrays cannot be loaded"),
         (archive(a=np.array(["text"])), "where numbers belong"),
         (archive(a=np.zeros(1, [("x", "f8")])), "where numbers belong"),
-        (zipped([("a.txt", b"")]), "what is no array"),
+        (zipped([("a.txt", b"")]), "something that is not an array"),
         (zipped([("a.npy", b"\x93NUMPY\x03\x00")]), "EOF"),
         (zipped([("a.npy", header("(1000000000000,)"))]), "Unable to allocate|EOF"),
         (zipped([("a.npy", header("(-1,)") + bytes(8))]), "negative"),

@@ -74,7 +74,7 @@ def test_every_flipped_bit_every_truncation_and_every_appendix_is_noticed(tmp_pa
         content[place] ^= 1
         with pytest.raises(state_files.BadStateError):
             read(tmp_path, content[:place])
-    with pytest.raises(state_files.BadStateError, match="goes on after its end"):
+    with pytest.raises(state_files.BadStateError, match="bytes follow its end"):
         read(tmp_path, content + b"\0")
     assert read(tmp_path, content).note == {"spec": "abc"}  # without unpickling
 
@@ -235,7 +235,7 @@ def test_what_was_appended_since_is_removed(logs):
         path.unlink()
         if rows is not None:
             path.write_bytes(rows)
-        with pytest.raises(UserError, match=r"0\.monitor\.csv is not as the run left it"):
+        with pytest.raises(UserError, match=r"0\.monitor\.csv has changed since the run wrote it"):
             cut_back(run, log, positions)
         assert (path.read_bytes() if path.exists() else None) == rows
         path.touch()

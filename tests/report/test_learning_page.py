@@ -186,5 +186,7 @@ def test_each_agent_that_learns_is_shown_once_and_kept(done, analysis, tmp_path)
     results = replace(analysis.results, finished=(other,), root=tmp_path / "other")
     pages, _ = done(replace(analysis, results=results))
     assert pages["Q-learning & co"].place == ""
-    assert pages["Q-learning & co"].words.startswith("the agent came out otherwise than in the run")
+    assert pages["Q-learning & co"].words.startswith(
+        "the agent came out differently than in the run"
+    )
     assert not list((tmp_path / "other").rglob("*.html"))

@@ -345,5 +345,7 @@ def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_st
     assert curve["y"][-1] == pytest.approx(np.mean([row[-1] for row in rows]), rel=1e-4)
     assert page.data("data-diagnosis").keys() >= lake.keys()
     planned[0].run.diagnosis_path.write_text("timesteps,v_error\n100,high\n")
-    with pytest.raises(DamagedFileError, match=r"diagnosis\.csv is not as the run left it"):
+    with pytest.raises(
+        DamagedFileError, match=r"diagnosis\.csv has changed since the run wrote it"
+    ):
         read_compared(planned[0].run)

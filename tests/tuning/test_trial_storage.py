@@ -61,7 +61,7 @@ def test_a_folder_of_any_name_keeps_its_own_file_and_one_that_is_damaged_is_one_
     storage.create_new_study([1], "s")
     assert (root / "trials.db").stat().st_size
     (root / "trials.db").write_bytes(b"no database any more")
-    expected = r"^trials\.db: .*; what is done stays, and the same"
+    expected = r"^trials\.db: .*; finished work is kept, and the same"
     with pytest.raises(UserError, match=expected), failing_in_a_line(None):
         storage.create_new_study([1], "t")
     with pytest.raises(UserError, match=r"^trials\.db is damaged: "), failing_in_a_line(None):

@@ -8,7 +8,7 @@ const shown = (value, digits = 4) => {
   return Number(value.toPrecision(digits)).toLocaleString("en", { maximumFractionDigits: 8 });
 };
 
-// In what is no table, null stands for what is not there; in a table it is no number.
+// Outside of tables, null stands for what is missing; in a table, for a number that is NaN.
 const entries = (values) => Float64Array.from(values, (value) => value ?? NaN);
 
 // The tables after any number of steps: changes are put in place going forwards, and taken back.
