@@ -8,8 +8,8 @@ hyperparameters, and prints the processor time and the number of trials as its l
 
 from __future__ import annotations
 
-import _thread
 import contextlib
+import signal
 import sys
 import threading
 import time
@@ -93,20 +93,18 @@ def main() -> None:
     torch.set_num_threads(1)
     storage = f"sqlite:///{Path(file).with_suffix('.db')}"
     started = time.process_time()
-
-    ended = threading.Event()
+    # Whoever is started in the background ignores it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def watch() -> None:
-        while not ended.wait(1.0):
-            # Again until it ends: an interrupt may come where Python ignores it.
-            if time.process_time() - started > seconds:
-                _thread.interrupt_main()
+        while time.process_time() - started < seconds:
+            time.sleep(0.2)
+        signal.raise_signal(signal.SIGINT)
 
     threading.Thread(target=watch, daemon=True).start()
     # A ValueError: rl_zoo3 asks for the best trial where none is complete.
     with contextlib.suppress(KeyboardInterrupt, ValueError):
         CONTENDERS[contender](env_id, algo, n_timesteps, n_envs, seed, storage)
-    ended.set()
     taken = time.process_time() - started
     study = optuna.load_study(study_name="search", storage=storage)
     counts = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED)
