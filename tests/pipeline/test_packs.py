@@ -355,9 +355,9 @@ def forged(path, changes, mode=0):
 @pytest.mark.parametrize("target", ["pack", "pack.zip"])
 def test_a_changed_file_is_found(packed, target):
     path = packed("table", target)
-    for content, said in ((b"other", "not as"), (None, "missing")):
+    for content, said in ((b"other", "has changed"), (None, "is missing")):
         rewritten(path, {"README.md": content})
-        with pytest.raises(UserError, match=rf"not as it was packed: README\.md is {said}"):
+        with pytest.raises(UserError, match=rf"not as it was packed: README\.md {said}"):
             check_pack(path)
 
 

@@ -207,7 +207,7 @@ def test_files_are_held_against_their_digests(run, tmp_path_factory):
     assert [path.name for path in run.files.matching("*.monitor.csv")] == ["0.monitor.csv"]
     csv.write_bytes(b"r,l,u\n")
     check_refused("has changed since the run wrote it")
-    with pytest.raises(UserError, match=r"left it: train again, or name another copy of it$"):
+    with pytest.raises(UserError, match=r"wrote it: train again, or name another copy of it$"):
         check_digest(run, csv)
     (elsewhere / "link").symlink_to(run.path)
     with pytest.raises(DamagedFileError):
