@@ -303,7 +303,7 @@ def test_the_newest_unfinished_run_and_a_state_of_other_settings(tabular, tmp_pa
     other = cut_off(spec_of(tmp_path, GRID, "sarsa", 600, {}), monkeypatch)
     for path in tabular.state_path.iterdir():
         (other.state_path / path.name).write_bytes(path.read_bytes())
-    with pytest.raises(UserError, match="of other settings"):
+    with pytest.raises(UserError, match="with other settings"):
         go_on(other, StateKeeping(), pytest.fail)
     gone_on(tabular)
     for algo, said in (("qlearning", "all 2 are finished"), ("ppo", "none at all")):
