@@ -85,8 +85,7 @@ def _do_again(
             shutil.rmtree(place, ignore_errors=True)
             put_in_place(run.path, place)
             who = f"{run.agent} on {run.environment}, seed {run.seed}"
-            words = "came out differently than the first time, "
-            words += "as it can with other versions or processors"
+            words = "came out differently than the first time: another version or processor?"
             say(context.console, f"{who}: {words}; see {place}")
         elif run.is_finished:
             context.store.keep(run)

@@ -643,22 +643,17 @@ def print_lists() -> None:
 
 
 def _hardness_table() -> Table:
-    """How hard the environments are whose model is known, by numbers that were worked out."""
+    """How hard the environments are whose model is known, as the pages say it."""
     from rich.table import Table
 
     import envs
 
-    def told(value: float | str | None) -> str:
-        if value is None or isinstance(value, str):
-            return value or "-"
-        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-
     table = Table(box=None, padding=(0, 2, 0, 0))
     table.add_column("how hard it is", style="bold", no_wrap=True)
-    for name in ("states", "diameter", "effective horizon", "random steps to a reward"):
-        table.add_column(name, justify="right")
-    numbers = "reachable_states", "diameter", "effective_horizon", "random_steps_to_reward"
+    heads = "states", "diameter", "effective horizon", "random actions to a reward"
+    for head in heads:
+        table.add_column(head, justify="right")
     stored = json.loads(Path(envs.__file__).with_name("hardness.json").read_text(encoding="utf-8"))
     for env_id, found in sorted(stored.items()):
-        table.add_row(env_id, *(told(found[name]) for name in numbers))
+        table.add_row(env_id, *(found[head] for head in heads))
     return table

@@ -149,9 +149,7 @@ def _ensure_fork_server() -> None:
             pid = server_pid()
             forkserver.ensure_running()
             if pid is not None and server_pid() != pid:
-                _log.warning(
-                    "the process that runs are forked from was killed; it is started again"
-                )
+                _log.warning("the process that forks runs was killed; it is started again")
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 

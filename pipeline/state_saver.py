@@ -149,9 +149,7 @@ class StateSaver(BlockCallback):
         except (NotKeepableError, UserError) as error:
             self.is_off = True
             what = f"no state can be kept: {one_line(error)}"
-            self.tell(
-                f"{what}; if this run is cut off, --resume starts it again from the beginning"
-            )
+            self.tell(f"{what}; if this run is cut off, --resume starts it from the beginning")
         except OSError as error:
             reason = error.strerror or one_line(error)
             self._tell_once(f"no state was saved: {self.run.state_path}: {reason}")

@@ -243,8 +243,8 @@ def _discounted(row: Row) -> Cell | None:
     discount, optimum = row.agent.discount, row.agent.discounted_optimum
     if discount is None:  # an agent that has none
         return None
-    best = "" if optimum is None else f"; optimum {number(optimum)}"
-    return _other_return(row.agent.discounted, f"by {discount:g}{best}")
+    words = [f"by {discount:g}", *([f"optimum {number(optimum)}"] if optimum is not None else [])]
+    return _other_return(row.agent.discounted, "; ".join(words))
 
 
 OTHER_RETURNS = (

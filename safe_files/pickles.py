@@ -154,9 +154,7 @@ class Reader(pickle._Unpickler):
     def load_build(self) -> None:
         state, top = self.stack.pop(), self.stack[-1]
         if not isinstance(top, Made) or top.state is not None:
-            raise UnsafeFileError(
-                "a pickle that sets the state of something that is not a new object"
-            )
+            raise UnsafeFileError("a pickle that sets the state of an object that is not new")
         top.state = state
 
     def load_bytearray8(self) -> None:

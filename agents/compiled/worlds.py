@@ -456,9 +456,7 @@ def _finite_model(env: Env) -> FiniteModel:
         names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
         raise NotCompilable(f"{names} must see every step")
     if not check.state_can_be_set:
-        raise NotCompilable(
-            "the environment does not continue from the state that its attribute s is set to"
-        )
+        raise NotCompilable("the environment does not continue from the state that s is set to")
     monitor = monitor_of(env)
     seen_by_monitor = model if monitor is None else transition_model(monitor.env)
     assert seen_by_monitor is not None

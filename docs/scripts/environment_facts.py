@@ -11,8 +11,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from math import inf
 from pathlib import Path
@@ -45,6 +44,10 @@ from pipeline.settings.hyperparams import entry_names
 from pipeline.settings.values import parse_assignments
 
 PAGES = Path(__file__).resolve().parents[1] / "environments"
+HARDNESS_HEADS = (
+    *("states", "diameter", "pairs", "smallest gap", "mean gap", "variance", "look-ahead"),
+    *("effective horizon", "random actions to a reward", "to the goal"),
+)
 HARDNESS = Path(envs.__file__).with_name("hardness.json")
 LIMIT = 1000  # what commands take where an environment has none
 MOST_REWARDS = 8
@@ -127,20 +130,17 @@ def variants_block(*words: str) -> str:
 
 def hardness_block(*ids: str) -> str:
     """A row for each environment: how hard it is, by its model under its time limit."""
-    heads = [
-        *("id", "states", "diameter", "pairs", "smallest gap", "mean gap", "variance"),
-        *("look-ahead", "effective horizon", "random actions to a reward", "to the goal"),
-    ]
-    lines = [f"| {' | '.join(heads)} |", f"|---|{'---:|' * (len(heads) - 1)}"]
     stored = json.loads(HARDNESS.read_text(encoding="utf-8"))
-    for env_id, found in hardness_as_data(ids).items():
-        assert stored.get(env_id) == found, f"{HARDNESS.name} is stale: {env_id}"
-    lines += [f"| `{env_id}` | {' | '.join(hardness_cells(env_id))} |" for env_id in ids]
+    lines = [f"| id | {' | '.join(HARDNESS_HEADS)} |", f"|---|{'---:|' * len(HARDNESS_HEADS)}"]
+    for env_id in ids:
+        cells = hardness_cells(env_id)
+        assert stored.get(env_id) == cells, f"{HARDNESS.name} is stale: {env_id}"
+        lines.append(f"| `{env_id}` | {' | '.join(cells.values())} |")
     return "\n".join(lines) + "\n"
 
 
-def hardness_cells(env_id: str) -> list[str]:
-    """The numbers of `mdp.Hardness` as the table has them: "-" for None, "never" for infinite."""
+def hardness_cells(env_id: str) -> dict[str, str]:
+    """The numbers of `mdp.Hardness`, by the table's heads: "-" for None, "never" for infinite."""
 
     def cell(value: float | None) -> str:
         return "-" if value is None else "never" if value == inf else number(value)
@@ -149,7 +149,7 @@ def hardness_cells(env_id: str) -> list[str]:
     assert found is not None, f"{env_id} has no model"
     unreached = found.states - found.reachable_states
     bound = found.effective_horizon
-    return [
+    cells = [
         f"{found.reachable_states:,}" + (f" of {found.states:,}" if unreached else ""),
         cell(found.diameter),
         "-" if found.connected is None else f"{100 * found.connected:.3g} %",
@@ -161,6 +161,7 @@ def hardness_cells(env_id: str) -> list[str]:
         cell(found.random_steps_to_reward),
         cell(found.random_steps_to_goal),
     ]
+    return dict(zip(HARDNESS_HEADS, cells, strict=True))
 
 
 @lru_cache
@@ -169,22 +170,6 @@ def hardness(env_id: str) -> Hardness | None:
     env = made(env_id)
     model, limit = transition_model(env), time_limit(env) or LIMIT
     return None if model is None else hardness_of(model, limit, success_outcomes(env))
-
-
-def hardness_as_data(ids: Iterable[str]) -> dict[str, dict[str, float | str | None]]:
-    """The numbers of several environments as JSON, to nine digits; an infinite one is "never"."""
-
-    def plain(value: float | None) -> float | str | None:
-        if value is None or isinstance(value, int):
-            return value
-        return "never" if value == inf else float(f"{value:.9g}")
-
-    found = {env_id: hardness(env_id) for env_id in ids}
-    return {
-        env_id: {name: plain(value) for name, value in asdict(one).items()}
-        for env_id, one in found.items()
-        if one is not None
-    }
 
 
 def picture(env_id: str) -> str:
@@ -301,4 +286,5 @@ def docstring_sections(cls: Any) -> list[str]:
 if __name__ == "__main__":
     page = (PAGES.parent / "environments.md").read_text(encoding="utf-8")
     (written,) = re.findall(r'"hardness: ([^"]*)"', page)
-    HARDNESS.write_text(json.dumps(hardness_as_data(written.split()), indent=1) + "\n")
+    stored = {env_id: hardness_cells(env_id) for env_id in written.split()}
+    HARDNESS.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")

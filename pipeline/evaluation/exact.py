@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -110,27 +111,16 @@ class ExactEvaluator:
         if isinstance(discount, int | float) and 0 <= discount <= 1:
             greedy = self.policy(agent, deterministic=True)
             worth = policy_return(self.model, greedy, self.horizon, discount).expected_return
+            optimum = self._optimum_under(discount) if self.scale is None else None
             found = replace(
-                found,
-                discount=discount,
-                discounted_return=worth,
-                discounted_optimum=self._discounted_optimum(discount),
+                found, discount=discount, discounted_return=worth, discounted_optimum=optimum
             )
         return found
 
-    def _discounted_optimum(self, discount: float) -> float | None:
-        """The optimum under a discount; None where observations hide the state that it acts by."""
-        if self.scale is not None:
-            return None
-        if discount not in self._optima:
-            planned = finite_horizon_optimum(self.model, self.horizon, discount)
-            self._optima[discount] = planned.start_value
-        return self._optima[discount]
-
     @cached_property
-    def _optima(self) -> dict[float, float]:
-        """The optima under discounts that were asked for."""
-        return {}
+    def _optimum_under(self) -> Callable[[float], float]:
+        """The function from a discount to the optimum of agents that see the state."""
+        return cache(lambda d: finite_horizon_optimum(self.model, self.horizon, d).start_value)
 
     @cached_property
     def _worth(self) -> OfLastPolicy[Evaluation]:

@@ -42,8 +42,7 @@ class OtherReturns:
     stochastic_return: float | None = None  # of the policy that it acts by in training
     discount: float | None = None  # the agent's
     discounted_return: float | None = None  # of the greedy policy, under that discount
-    # the highest one under it, and under the time limit; None where observations hide the state
-    discounted_optimum: float | None = None
+    discounted_optimum: float | None = None  # the highest; None where the state is hidden
 
 
 @dataclass(frozen=True)

@@ -378,8 +378,7 @@ def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:
     what = difference(planned.run, training.run)
     if what:
         raise UserError(
-            f"{what} came out differently than in the run, "
-            "as it can with another version or processor"
+            f"{what} came out differently than in the run: another version or processor?"
         )
     assert training.watch is not None
     path.parent.mkdir(parents=True, exist_ok=True)

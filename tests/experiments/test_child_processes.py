@@ -240,7 +240,7 @@ def test_when_the_server_is_killed_all_go_on(chores, tmp_path, caplog):
         assert executor.submit(alone, chores.add, 1, 1).result()[0] == 2
         (tmp_path / "go").touch()
         assert first.result() == "first"
-    told = "the process that runs are forked from was killed; it is started again"
+    told = "the process that forks runs was killed; it is started again"
     assert caplog.messages == [told]
 
 

@@ -1,5 +1,6 @@
 """Exact evaluation is what the agents' own actions come to; and advice where they failed."""
 
+import copy
 import math
 
 import numpy as np
@@ -48,7 +49,8 @@ def spec_of(env_id, entry=None):
 
 
 def briefly_trained(name, spec):
-    n_steps, arguments = AGENTS[name]
+    # A copy: A2C writes its optimizer into the policy's arguments, for all who share them.
+    n_steps, arguments = copy.deepcopy(AGENTS[name])
     return agent_of(name, make_training_env(spec, None), **arguments).learn(n_steps)
 
 
@@ -59,7 +61,7 @@ def briefly_trained(name, spec):
         # A hidden natural is judged by what the agent sees.
         ("qlearning", "Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}, 3000),
         ("qlearning", WAREHOUSE, SLIPPERY, 200),
-        ("ppo", "MineMaze-v0", {"env_kwargs": DEEP}, 200),
+        ("ppo", "MineMaze-v0", {"env_kwargs": DEEP}, 2000),
         ("dqn", WAREHOUSE, POSITION, 200),
         ("ppo", WAREHOUSE, HOT, 200),
     ],

@@ -393,7 +393,7 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
     assert carry_out(training).state == "finished"
     (line,) = [line for line in file.getvalue().splitlines() if "state" in line]
     assert line.startswith(said.format(folder=training.run.state_path))
-    assert line.endswith("--resume starts it again from the beginning") == ("can be kept" in said)
+    assert line.endswith("--resume starts it from the beginning") == ("can be kept" in said)
 
 
 def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeypatch):
