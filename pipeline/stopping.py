@@ -160,7 +160,7 @@ def stops_noticed() -> Iterator[StopRequest]:
     if _current or threading.current_thread() is not threading.main_thread():
         yield current()
         return
-    request, tell = StopRequest(), sys.unraisablehook
+    request, tell, show = StopRequest(), sys.unraisablehook, sys.excepthook
     before = {number: signal.getsignal(number) for number in SIGNALS}
     _current.append(request)
 
@@ -168,9 +168,14 @@ def stops_noticed() -> Iterator[StopRequest]:
         if not isinstance(unraisable.exc_value, Stopped):
             tell(unraisable)
 
+    def show_others(kind: Any, error: BaseException, trace: Any) -> None:
+        if not isinstance(error, Stopped):
+            show(kind, error, trace)
+
     try:
-        # A callback from C code, as in Numba's compiler, cannot raise: a timer raises later.
-        sys.unraisablehook = tell_others
+        # A callback from C code, as in Numba's compiler, cannot raise, and C code that imports
+        # NumPy prints what is raised in it: a timer raises later.
+        sys.unraisablehook, sys.excepthook = tell_others, show_others
         for number, handler in before.items():
             if handler in (signal.SIG_DFL, signal.default_int_handler):
                 signal.signal(number, request.notice)
@@ -178,7 +183,7 @@ def stops_noticed() -> Iterator[StopRequest]:
     finally:
         request._patience = math.inf  # first: a signal could still arrive during the next call
         request._set_timer(math.inf)
-        sys.unraisablehook = tell
+        sys.unraisablehook, sys.excepthook = tell, show
         for number, handler in before.items():
             if handler is not None:
                 signal.signal(number, handler)

@@ -125,6 +125,14 @@ def lose_in_c(stop):
         raise RuntimeError("no compiled object yet")
 
 
+def print_in_c(stop):
+    """C code that imports NumPy prints what is raised in it, and goes on."""
+    with stop.waiting(0.0):
+        raising = b"import os, signal; os.kill(os.getpid(), signal.SIGTERM); [i for i in range(9)]"
+        assert ctypes.pythonapi.PyRun_SimpleString(raising) == -1
+        time.sleep(LONG)
+
+
 def turn_into_another(stop):
     with stop.waiting(0.0):
         try:
@@ -134,7 +142,7 @@ def turn_into_another(stop):
 
 
 WAYS = (hold, wait_in_the_midst, ask_twice, begin_without_time, swallow, lose_in_c)
-WAYS += (turn_into_another,)
+WAYS += (print_in_c, turn_into_another)
 
 
 @pytest.mark.usefixtures("by_default")
