@@ -178,7 +178,8 @@ def _course(console: Console, one: Asked, stack: ExitStack, last: Explanation) -
     for path in saved:
         then = _loaded(model_of_run(path, one.chosen.spec, run), stack)
         course[then.num_timesteps] = replace(one, agent=then).explanation()
-    course.setdefault(one.agent.num_timesteps, last)
+    # A checkpoint is saved before its step is learnt from, and the agent after it.
+    course[one.agent.num_timesteps] = last
     for line in course_lines(course):
         say(console, line)
     return [{"timesteps": steps, **each.as_data()} for steps, each in course.items()]

@@ -73,6 +73,7 @@ class StateSaver(BlockCallback):
         self.tell = tell  # receives one line on why no state is saved
         self.state = keeping.state  # the state to resume from
         self.is_off = keeping.interval.is_off
+        self.is_wanted: bool | None = None  # the last answer to an engine, until it acts on it
         note = {} if self.state is None else self.state.note
         self.n_saved = int(note.get("number", 0))
         self.n_rollouts = int(note.get("rollouts", 0))
@@ -102,7 +103,8 @@ class StateSaver(BlockCallback):
         return Horizon(calls=max(-(-steps // self.training_env.num_envs), 1))
 
     def wants_position(self) -> bool:
-        return self.state is not None or self._is_due() or current().number is not None
+        self.is_wanted = self.state is not None or self._is_due() or current().number is not None
+        return self.is_wanted
 
     def at_safe_moment(self) -> None:
         if getattr(self.model, "tells_safe_moments", False):
@@ -120,6 +122,14 @@ class StateSaver(BlockCallback):
         return True
 
     def _act(self) -> None:
+        # An engine that was told no has not written the environments' states. What has come since,
+        # a signal or the end of the pause, waits for the next moment.
+        is_wanted, self.is_wanted = self.is_wanted, None
+        if is_wanted is not False:
+            self._restore_or_save()
+        self.n_rollouts += 1
+
+    def _restore_or_save(self) -> None:
         if self.state is not None:
             state, self.state = self.state, None
             self._go_back_to(state)
@@ -131,7 +141,6 @@ class StateSaver(BlockCallback):
                 if not (self.is_off or stop.is_urgent):
                     self.save()
             stop.raise_if_asked()
-        self.n_rollouts += 1
 
     def _is_due(self) -> bool:
         if self.is_off:

@@ -1,4 +1,5 @@
 import os
+import random
 import sys
 from contextlib import contextmanager
 from functools import partial
@@ -33,6 +34,12 @@ COMMANDS |= {"pack": partial(run_command, share.pack), "yardstick": main}
 def nothing_takes_long(monkeypatch):
     """However slow the machine is, no command says that it is still loading."""
     monkeypatch.setattr(Silence.__init__, "__defaults__", (1e9,))
+
+
+@pytest.fixture(autouse=True)
+def seeds_are_drawn_alike(request, monkeypatch):
+    """A command without --seed draws one: what fails once has to fail again."""
+    monkeypatch.setattr("secrets.randbelow", random.Random(request.node.nodeid).randrange)
 
 
 @pytest.fixture

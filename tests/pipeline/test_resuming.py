@@ -4,6 +4,7 @@ import io
 import json
 import os
 import shutil
+import signal
 import sys
 import zipfile
 from dataclasses import replace
@@ -15,6 +16,8 @@ import torch as th
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from agents.compiled import engine as compiled_engine
+from agents.networks import engine as network_engine
 from pipeline import state_files, state_saver
 from pipeline.agent_settings import resolved_spec
 from pipeline.digests import LOCK
@@ -22,6 +25,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation import sampled
 from pipeline.runs import Run, at_work_on
 from pipeline.settings.hyperparams import override, read_hyperparams
+from pipeline.stopping import stops_noticed
 from pipeline.training import carry_out, prepare
 from pipeline.unfinished_runs import (
     SaveInterval,
@@ -254,6 +258,36 @@ def test_the_result_is_that_of_an_undisturbed_run(
     assert ("save_freq" in more) == (len(run.checkpoints()) > 3)
     if "log_interval" in more:
         assert events(spec) == events(whole.spec)
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings", "engine"),
+    [
+        ("qlearning", {"engine": "compiled", **FINE}, compiled_engine),
+        ("dqn", {**EAGER, "engine": "compiled"}, network_engine),
+    ],
+)
+def test_a_stop_just_after_the_engine_asked_waits_for_the_next_block(
+    tmp_path, monkeypatch, algo, settings, engine
+):
+    """What is in the records of compiled code, the environments do not have then."""
+    whole = carried_out(spec_of(tmp_path / "whole", GRID, algo, 600, settings))
+    training = training_of(spec_of(tmp_path / "parts", GRID, algo, 600, settings), StateKeeping())
+    ask, stopped_at = engine.wants_position, []
+
+    def asked_and_stopped(callback):
+        wanted = ask(callback)
+        if training.model.num_timesteps > 100 and not stopped_at:
+            assert not wanted
+            stopped_at.append(training.model.num_timesteps)
+            signal.raise_signal(signal.SIGTERM)
+        return wanted
+
+    with stops_noticed(), monkeypatch.context() as context:
+        context.setattr(engine, "wants_position", asked_and_stopped)
+        assert carry_out(training).state == "interrupted"
+    assert stopped_at[0] < training.model.num_timesteps < 600
+    assert_same(whole, gone_on(training.run))
 
 
 @pytest.fixture
