@@ -295,13 +295,15 @@ class CompiledNetworks(BaseAlgorithm):
 
     def greedy_player(self, seen: Any) -> NetworkPlayer:
         """What plays as `predict` does on compiled environments; ``seen`` reads observations."""
-        space = self.observation_space
+        space, policy = self.observation_space, self.policy
+        policy.set_training_mode(False)  # as `predict` does at each call
 
         def predicted(inputs: Inputs) -> int:
             shown = inputs.indices if isinstance(seen, Numbers) else inputs.vectors
             observation = np.reshape(shown[0], space.shape or ()).astype(space.dtype)
-            actions, _ = self.predict(observation[None], deterministic=True)
-            return int(actions[0])
+            tensor, _ = policy.obs_to_tensor(observation[None])
+            with th.no_grad():
+                return int(policy._predict(tensor, deterministic=True))
 
         return network_player(self.shared_networks(seen)[0][0], seen, predicted)
 

@@ -19,17 +19,20 @@ from agents.networks.perceptron import (
     Inputs,
     Layers,
     Singles,
+    biases_of,
     forward,
     last_outputs,
     make_inputs,
     make_outputs,
+    outputs_of,
+    weights_of,
 )
 from agents.networks.torch_bridge import FlatTensors, Network, Reference, address_of, call
 from machine_code.compiling import inlined, kernel
 
-# By so much, relative to the largest output, the best has to be ahead: many times what rounding
-# makes of layers of 256 units. And by so much at least, since PyTorch compares probabilities.
-CLEARLY, AT_LEAST = 1e-4, 1e-6
+# By so much, relative to what is added up for an output, the best has to be ahead: twenty times what
+# rounding made of trained networks. And by so much at least, since PyTorch compares probabilities.
+CLEARLY, AT_LEAST = 4e-6, 1e-6
 
 _ASKED = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_double)
 
@@ -49,15 +52,27 @@ def choose_surely(network: Any, _: float, __: float) -> int:
     """The best action for the observation in ``network.single``."""
     forward(network.layers, network.flat, network.single, 1, network.single_outputs)
     outputs = last_outputs(network.layers, network.single_outputs, 1)[0]
-    best, largest = first_best(outputs), 0.0
-    for k in range(len(outputs)):
-        largest = max(largest, abs(outputs[k]))
+    best, unsure = first_best(outputs), _unsure(network, outputs)
     for k in range(len(outputs)):
         # Numbers that are none are not ahead either.
-        ahead = outputs[best] - outputs[k] > max(CLEARLY * largest, AT_LEAST)
-        if k != best and not ahead:
+        if k != best and not outputs[best] - outputs[k] > unsure:
             return call(network.ask, network, 0.0, 0.0)
     return best
+
+
+@inlined
+def _unsure(network: Any, outputs: Singles) -> float:
+    """Up to which difference rounding may decide between two outputs."""
+    layers, last = network.layers, len(network.layers.sizes) - 2
+    weights, most = weights_of(layers, network.flat, last), 0.0
+    for k in range(len(outputs)):
+        added = abs(biases_of(layers, network.flat, last)[k])
+        if last > 0:
+            below = outputs_of(layers, network.single_outputs, last - 1, 1)[0]
+            for j in range(len(below)):
+                added += abs(below[j] * weights[j, k])
+        most = max(most, added, abs(outputs[k]))
+    return max(CLEARLY * most, AT_LEAST)
 
 
 class AskingNetwork(Reference):
