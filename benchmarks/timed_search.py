@@ -90,11 +90,21 @@ def searched_by_peer(
 def returns(args: argparse.Namespace, name: str, file: Path | None, folder: Path) -> str:
     """Mean, lowest and highest return of settings on unseen seeds; None are the shipped ones."""
     import pandas as pd
+    import yaml
 
-    words: list[object] = ["compare.py", "--env", args.env, "--algos", args.algo]
-    words += ["--engine", "compiled", "-n", args.n_timesteps, "--seeds", args.seeds, "-j", 1]
-    words += ["--first-seed", FIRST_UNSEEN, "--no-report", "--name", name, "-f", folder]
-    run([*words, *(() if file is None else ("--conf-file", file))])
+    if not (folder / name).exists():
+        study = {
+            "title": name,
+            "environments": [args.env],
+            "agents": [args.algo],
+            "seeds": {"first": FIRST_UNSEEN, "count": args.seeds},
+            "eval_freq": args.n_timesteps,  # what judges a run comes after it
+        }
+        asked = folder / f"{name}.yml"
+        asked.write_text(yaml.safe_dump(study))
+        words: list[object] = ["compare.py", asked, "-n", args.n_timesteps, "-j", 1]
+        words += ["--engine", "compiled", "--no-report", "--name", name, "-f", folder]
+        run([*words, *(() if file is None else ("--conf-file", file))])
     final = pd.read_csv(folder / name / "summary.csv")["final"]
     assert len(final) == args.seeds, f"{name}: {len(final)} of {args.seeds} runs"
     return f"{final.mean():.3g} | {final.min():.3g} to {final.max():.3g}"
@@ -131,7 +141,8 @@ def main() -> int:
                 else searched_by_peer(args, name, number, folder)
             )
             file, taken, n_trials = search
-            found = returns(args, f"{name.removesuffix('.py')}-judged-{number}", file, folder)
+            judged = f"{name.removesuffix('.py')}-judged-{number}" if file else "shipped"
+            found = returns(args, judged, file, folder)
             what = "the shipped settings" if file is None else "a trial"
             print(f"| {name} | {number} | {taken:.0f} s | {n_trials} | {what} | {found} |")
             sys.stdout.flush()
