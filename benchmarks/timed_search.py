@@ -58,6 +58,7 @@ def tuned(args: argparse.Namespace, number: int, folder: Path) -> tuple[Path | N
     words += ["-n", args.n_timesteps, "--engine", "compiled", "--trials", 1000]
     words += ["--seed", number, "--first-seed", first]
     words += ["--seeds-per-trial", 3, "--n-startup-trials", 5, "--retest", 2, "--retest-seeds", 8]
+    words += ["--eval-freq", args.n_timesteps // 2]  # as often as the others
     words += ["-j", 1, "--no-report", "-f", folder, "--name", f"tune-{number}"]
     root = folder / f"tune-{number}"
     run(words, root, SEARCH_SHARE * args.seconds)
