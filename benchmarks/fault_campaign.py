@@ -213,6 +213,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=max((os.cpu_count() or 2) // 2, 1))
     parser.add_argument("--only", nargs="+", default=[], help="names of the commands to try")
     args = parser.parse_args()
+    # Whoever is started in the background ignores it, and so would the commands.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="fault-campaign-") as folder:
         os.environ["XDG_CONFIG_HOME"] = str(Path(folder) / "config")
         found = (short_cases if args.at_calls else cases)(Path(folder))

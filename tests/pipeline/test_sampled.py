@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from rich.console import Console
@@ -409,3 +410,23 @@ def test_compiled_play_is_the_same_to_the_bit(
         assert found.successes is expected.successes is None
     # Where evaluation is exact, or nothing is compiled, there is no copy.
     assert [compiled_copy(make_vec_env(name, 1)) for name in (LAKE, "Acrobot-v1")] == [None] * 2
+
+
+def test_where_actions_are_close_the_library_is_asked_and_nowhere_else(monkeypatch):
+    """Rounding makes 1e-8 of these outputs of 0.1, whose differences are some 1e-5."""
+    settings = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [256, 256]}}
+    model = load_algorithm("dqn")(env=environments(CAR, n=1), seed=1, **settings)
+    generator = th.Generator().manual_seed(0)
+    with th.no_grad():
+        weight, bias = model.q_net.q_net[-1].parameters()
+        weight[1:] = weight[0] + 1e-4 * th.randn(2, 256, generator=generator)
+        bias[1:] = bias[0]
+    ours, plain = environments(CAR), environments(CAR)
+    expected = evaluate(model, plain, 20, 1)
+    asked, predict = [], type(model.policy)._predict
+    monkeypatch.setattr(
+        type(model.policy), "_predict", lambda *a, **k: asked.append(0) or predict(*a, **k)
+    )
+    found = evaluate_compiled(model, compiled_copy(ours), 20, 1)
+    assert figures(found) == figures(expected)
+    assert 0 < len(asked) < found.lengths.sum() / 5
