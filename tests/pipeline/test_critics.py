@@ -161,7 +161,7 @@ def test_means_of_many_rollouts_are_what_estimates_are_said_to_expect(corridor_r
     errors, places, stds = [], [], []
     with pytest.MonkeyPatch.context() as context:
         context.setattr(critics, "expected_estimates", noting)
-        for buffer in collect(agent, 30):
+        for buffer in collect(agent, 12):
             stds.append(recorder.rollout_figures(0)["gae_std"])
             (states, actions, _), (expected, _) = noted[-1]
             errors.append(buffer.advantages.reshape(-1) - expected)
@@ -257,7 +257,7 @@ def test_more_steps_give_a_better_gradient(corridor_registered):
         agent, _, recorder = on_corridor(
             corridor_registered, "a2c", n_steps=n_steps, gae_lambda=1.0, engine="library"
         )
-        figures = [recorder.rollout_figures(0) for _ in collect(agent, 20)]
+        figures = [recorder.rollout_figures(0) for _ in collect(agent, 10)]
         found.append(
             {
                 k: np.mean([1 / f[k] if k == "gradient_snr" else f[k] for f in figures])
