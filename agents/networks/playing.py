@@ -30,8 +30,9 @@ from agents.networks.perceptron import (
 from agents.networks.torch_bridge import FlatTensors, Network, Reference, address_of, call
 from machine_code.compiling import inlined, kernel
 
-# By so much, relative to what is added up for an output, the best has to be ahead: twenty times what
-# rounding made of trained networks. And by so much at least, since PyTorch compares probabilities.
+# By so much, relative to what is added up for an output, the best has to be ahead: ten times what
+# rounding made of networks of 64 to 400 units. And by so much at least, since PyTorch compares
+# probabilities.
 CLEARLY, AT_LEAST = 4e-6, 1e-6
 
 _ASKED = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_double)
