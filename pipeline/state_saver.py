@@ -259,8 +259,11 @@ def _garbage_left() -> Iterator[None]:
 
 
 def _log_folder(model: BaseAlgorithm) -> str | None:
+    """The folder of TensorBoard; without it, the library makes one that nobody reads."""
     folder = model.logger.dir
-    return None if folder is None else str(Path(folder).absolute())
+    if folder is None or model.tensorboard_log is None:
+        return None
+    return str(Path(folder).absolute())
 
 
 # Rebuilt from the settings; training changes nothing in them.
@@ -402,6 +405,6 @@ def resumed_logger(model: BaseAlgorithm, note: dict[str, Any]) -> Logger:
     folder = note["log_folder"]
     names = ["stdout"] if model.verbose > 0 or folder is None else []
     names += [] if folder is None else ["tensorboard"]
-    logger = IterationLogger(folder, [make_output_format(name, folder or "") for name in names])
+    logger = IterationLogger(folder, [make_output_format(name, folder or ".") for name in names])
     logger.before = iterations_before(model, note)
     return logger

@@ -290,6 +290,18 @@ def test_a_stop_just_after_the_engine_asked_waits_for_the_next_block(
     assert_same(whole, gone_on(training.run))
 
 
+def test_a_log_that_nobody_asked_for_is_not_begun(tmp_path, monkeypatch):
+    """The library's own folder for a log on the screen is that of temporary files."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    run = cut_off(spec_of(tmp_path, LEFT_RIGHT, "dqn", 300, EAGER, verbose=2), monkeypatch)
+    keeping = go_on(run, OFF, pytest.fail)
+    carried_out(replace(recorded(run), verbose=2), keeping, run)
+    assert [*temporary.glob("SB3-*")]
+    assert not [*temporary.rglob("events*")]
+
+
 @pytest.fixture
 def parts(tmp_path, monkeypatch):
     """An undisturbed training with a replay buffer, and a run of it that was cut off."""
