@@ -178,8 +178,7 @@ def _course(console: Console, one: Asked, stack: ExitStack, last: Explanation) -
     for path in saved:
         then = _loaded(model_of_run(path, one.chosen.spec, run), stack)
         course[then.num_timesteps] = replace(one, agent=then).explanation()
-    # A checkpoint is saved before its step is learnt from, and the agent after it.
-    course[one.agent.num_timesteps] = last
+    course[one.agent.num_timesteps] = last  # a checkpoint has not learnt from its last step
     for line in course_lines(course):
         say(console, line)
     return [{"timesteps": steps, **each.as_data()} for steps, each in course.items()]

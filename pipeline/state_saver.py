@@ -73,7 +73,7 @@ class StateSaver(BlockCallback):
         self.tell = tell  # receives one line on why no state is saved
         self.state = keeping.state  # the state to resume from
         self.is_off = keeping.interval.is_off
-        self.is_wanted: bool | None = None  # the last answer to an engine, until it acts on it
+        self.acts = True  # at the next safe moment, unless an engine has heard that it need not
         note = {} if self.state is None else self.state.note
         self.n_saved = int(note.get("number", 0))
         self.n_rollouts = int(note.get("rollouts", 0))
@@ -103,8 +103,8 @@ class StateSaver(BlockCallback):
         return Horizon(calls=max(-(-steps // self.training_env.num_envs), 1))
 
     def wants_position(self) -> bool:
-        self.is_wanted = self.state is not None or self._is_due() or current().number is not None
-        return self.is_wanted
+        self.acts = self.state is not None or self._is_due() or current().number is not None
+        return self.acts
 
     def at_safe_moment(self) -> None:
         if getattr(self.model, "tells_safe_moments", False):
@@ -122,11 +122,10 @@ class StateSaver(BlockCallback):
         return True
 
     def _act(self) -> None:
-        # An engine that was told no has not written the environments' states. What has come since,
-        # a signal or the end of the pause, waits for the next moment.
-        is_wanted, self.is_wanted = self.is_wanted, None
-        if is_wanted is not False:
+        # Else the environments' states are not written: what has come since then has to wait.
+        if self.acts:
             self._restore_or_save()
+        self.acts = True
         self.n_rollouts += 1
 
     def _restore_or_save(self) -> None:
@@ -259,11 +258,8 @@ def _garbage_left() -> Iterator[None]:
 
 
 def _log_folder(model: BaseAlgorithm) -> str | None:
-    """The folder of TensorBoard; without it, the library makes one that nobody reads."""
     folder = model.logger.dir
-    if folder is None or model.tensorboard_log is None:
-        return None
-    return str(Path(folder).absolute())
+    return None if folder is None else str(Path(folder).absolute())
 
 
 # Rebuilt from the settings; training changes nothing in them.
@@ -404,7 +400,7 @@ def resumed_logger(model: BaseAlgorithm, note: dict[str, Any]) -> Logger:
     """A logger that appends to the log of a saved state."""
     folder = note["log_folder"]
     names = ["stdout"] if model.verbose > 0 or folder is None else []
-    names += [] if folder is None else ["tensorboard"]
-    logger = IterationLogger(folder, [make_output_format(name, folder or ".") for name in names])
+    names += [] if model.tensorboard_log is None else ["tensorboard"]
+    logger = IterationLogger(folder, [make_output_format(name, folder or "") for name in names])
     logger.before = iterations_before(model, note)
     return logger

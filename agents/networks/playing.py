@@ -19,7 +19,6 @@ from agents.networks.perceptron import (
     Inputs,
     Layers,
     Singles,
-    biases_of,
     forward,
     last_outputs,
     make_inputs,
@@ -31,8 +30,7 @@ from agents.networks.torch_bridge import FlatTensors, Network, Reference, addres
 from machine_code.compiling import inlined, kernel
 
 # By so much, relative to what is added up for an output, the best has to be ahead: ten times what
-# rounding made of networks of 64 to 400 units. And by so much at least, since PyTorch compares
-# probabilities.
+# rounding made of 64 to 400 units. And by so much at least, since PyTorch compares probabilities.
 CLEARLY, AT_LEAST = 4e-6, 1e-6
 
 _ASKED = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_double)
@@ -64,15 +62,15 @@ def choose_surely(network: Any, _: float, __: float) -> int:
 @inlined
 def _unsure(network: Any, outputs: Singles) -> float:
     """Up to which difference rounding may decide between two outputs."""
-    layers, last = network.layers, len(network.layers.sizes) - 2
-    weights, most = weights_of(layers, network.flat, last), 0.0
+    layers, last, most = network.layers, len(network.layers.sizes) - 2, 0.0
+    weights = weights_of(layers, network.flat, last)
     for k in range(len(outputs)):
-        added = abs(biases_of(layers, network.flat, last)[k])
+        added = abs(outputs[k])
         if last > 0:
             below = outputs_of(layers, network.single_outputs, last - 1, 1)[0]
             for j in range(len(below)):
                 added += abs(below[j] * weights[j, k])
-        most = max(most, added, abs(outputs[k]))
+        most = max(most, added)
     return max(CLEARLY * most, AT_LEAST)
 
 

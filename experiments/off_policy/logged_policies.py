@@ -20,7 +20,7 @@ from experiments.off_policy.estimators import (
     evaluate_policy,
     terms_as_logged,
 )
-from experiments.off_policy.policy_files import PolicyFile, find_policy, read_logged
+from experiments.off_policy.policy_files import PolicyFile, read_logged
 from mdp.transition_model import Floats
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.policies import policy_matrix, why_not_exact
@@ -56,11 +56,6 @@ class Comparison:
     # The user's policies; then each arm as a constant policy, and the log's own policy.
     rows: tuple[Judged, ...]
     notes: tuple[str, ...]  # notes for reading the figures
-
-
-def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
-    """Load an agent from its run folder or its zip: `find_policy`, then `load_policy`."""
-    return load_policy(find_policy(path), modules)
 
 
 def load_policy(found: PolicyFile, modules: Iterable[UserModule] = ()) -> LoggedPolicy:

@@ -98,11 +98,6 @@ class ChosenModel:
         return self.file.path
 
 
-def choose_model(request: ModelRequest) -> ChosenModel:
-    """The requested model, ready to play: `find_model`, then `with_statistics`."""
-    return with_statistics(find_model(request), request.statistics)
-
-
 def find_model(request: ModelRequest) -> ChosenModel:
     """Find the requested model, without importing slow libraries."""
     if request.statistics is not None and not request.statistics.is_file():

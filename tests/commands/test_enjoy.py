@@ -18,9 +18,10 @@ from commands import enjoy
 from commands.enjoy import build_parser, figures_table, play
 from commands.terminal import TextConsole
 from pipeline.evaluation.policies import ActionFigures
-from pipeline.models.choose import ModelRequest, choose_model
+from pipeline.models.choose import ModelRequest
 from pipeline.models.load import load_to_play
 from pipeline.playing import FRAMES_PER_SECOND, write_film
+from tests.pipeline.short_runs import choose_model
 
 LAKE = ["--algo", "random", "--env", "FrozenLake-v1"]
 QUICK = ["train.py", "--seed", "0", "-n", "100", "--eval-freq", "-1", "--verbose", "1"]

@@ -30,9 +30,10 @@ from experiments.off_policy.estimators import (
 from experiments.off_policy.logged_policies import (
     LoggedPolicy,
     compare_policies,
+    load_policy,
     read_logged,
-    read_policy,
 )
+from experiments.off_policy.policy_files import find_policy
 from pipeline.errors import UserError
 from verdicts import Estimate, paired_difference
 
@@ -364,7 +365,7 @@ def test_an_agent_is_read_with_the_log_it_was_trained_on(log, tmp_path):
     def read(place, **hyperparams):
         info["spec"]["hyperparams"] = hyperparams
         (folder / "run.json").write_text(json.dumps(info))
-        return read_policy(place)
+        return load_policy(find_policy(place))
 
     for place in (folder, folder / "Lake.zip"):
         policy = read(place, env_kwargs={"log": str(path)})
@@ -376,4 +377,4 @@ def test_an_agent_is_read_with_the_log_it_was_trained_on(log, tmp_path):
         with pytest.raises(UserError, match=f"was trained with {key}: it observes more than a log"):
             read(folder, **{key: value})
     (folder / "run.json").unlink()
-    assert read_policy(folder / "Lake.zip").log is None
+    assert load_policy(find_policy(folder / "Lake.zip")).log is None

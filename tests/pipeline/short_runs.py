@@ -3,6 +3,7 @@
 from rich.console import Console
 
 from agents import load_algorithm
+from pipeline.models.choose import find_model, with_statistics
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
@@ -27,3 +28,8 @@ def agent_of(name, env, **arguments):
     """An agent that has learnt nothing, by its usual policy."""
     algorithm = load_algorithm(name)
     return algorithm(next(iter(algorithm.policy_aliases)), env, **{"seed": 0, **arguments})
+
+
+def choose_model(request):
+    """The requested model, ready to play."""
+    return with_statistics(find_model(request), request.statistics)

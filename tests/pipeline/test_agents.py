@@ -25,7 +25,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.policies import policy_matrix
 from pipeline.evaluation.sampled import evaluate
-from pipeline.models.choose import ModelRequest, choose_model
+from pipeline.models.choose import ModelRequest
 from pipeline.models.load import (
     load_model,
     load_replay_buffer,
@@ -34,7 +34,7 @@ from pipeline.models.load import (
 from pipeline.playing import play_episodes, playing_env
 from pipeline.settings.components import build_algorithm_kwargs
 from pipeline.settings.hyperparams import split
-from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of
+from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of, choose_model
 from tests.pipeline.short_runs import spec_of as spec_for
 
 # --- zips of our subclasses of library agents: loaded as data, they are what the library loads ---

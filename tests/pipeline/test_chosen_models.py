@@ -22,13 +22,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from pipeline.errors import UserError
-from pipeline.models.choose import ModelRequest, agent_to_continue, choose_model, model_of_run
+from pipeline.models.choose import ModelRequest, agent_to_continue, model_of_run
 from pipeline.models.find import model_at, replay_buffer_of, run_of
 from pipeline.models.load import load_model, load_to_play, with_normalised_rewards
 from pipeline.playing import play_episodes, playing_env
 from pipeline.settings.yaml import read_saved_settings
 from pipeline.training import prepare
-from tests.pipeline.short_runs import CART, spec_of, trained
+from tests.pipeline.short_runs import CART, choose_model, spec_of, trained
 
 SMALL_A2C = {"policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}
 SMALL_DQN = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 10, "buffer_size": 500}

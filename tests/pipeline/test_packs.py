@@ -23,11 +23,11 @@ from pipeline.digests import LOCK, sealed
 from pipeline.errors import UserError
 from pipeline.locks import mark
 from pipeline.model_card import fenced
-from pipeline.models.choose import ModelRequest, choose_model
+from pipeline.models.choose import ModelRequest
 from pipeline.packs import check_pack, is_study, pack, pack_study, unpacked
 from pipeline.scrubbing import check_untold, without_places
 from safe_files.files import UnsafeFileError
-from tests.pipeline.short_runs import CART, LAKE, trained
+from tests.pipeline.short_runs import CART, LAKE, choose_model, trained
 
 HOME = str(Path.home())
 SMALL = {"n_steps": 32, "batch_size": 32, "policy_kwargs": {"net_arch": [8]}}
