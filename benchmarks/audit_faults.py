@@ -150,28 +150,20 @@ def report(rows: list[dict[str, Any]]) -> str:
         told = ", ".join(f"{answer}: {n}" for answer, n in others.items())
         total, slowest = sum(said[fault].values()), max(times[fault])
         lines += [f"| {fault} | {said[fault][fault]} of {total} | {told} | up to {slowest:.0f} s |"]
-    alarms = [row for row in right if row["said"]]
+    alarms = sorted({row["name"] for row in right if row["said"]})
+    unsaid = [f"`{row['name']}`" for row in right if row["exit_code"] == 2]
     lines += [
         "",
         (
             f"Of {len(right)} audits of {len({row['name'] for row in right})} agents that are "
-            f"right, {len(alarms)} named a fault."
+            f"right, {sum(bool(row['said']) for row in right)} named a fault"
+            f"{f' ({chr(44).join(alarms)})' if alarms else ''}. "
+            f"{sum(row['exit_code'] == 0 for row in right)} were found right; nothing could be "
+            f"said in {len(unsaid)}{f' ({chr(44).join(unsaid)})' if unsaid else ''}. An audit "
+            f"took up to {max((row['seconds'] for row in right), default=0):.0f} s of processor "
+            "time."
         ),
-        "",
-        "| agent | seeds | right | nothing can be said | accused | processor time |",
-        "| --- | --- | --- | --- | --- | --- |",
     ]
-    for name in dict.fromkeys(row["name"] for row in right):
-        own = [row for row in right if row["name"] == name]
-        codes = Counter(row["exit_code"] for row in own)
-        accused = ", ".join(sorted({row["said"][0] for row in own if row["said"]}))
-        slowest = max(row["seconds"] for row in own)
-        lines += [
-            (
-                f"| `{name}` | {len(own)} | {codes[0]} | {codes[2]} | {codes[1]} {accused} | "
-                f"up to {slowest:.0f} s |"
-            )
-        ]
     return "\n".join(lines) + "\n"
 
 
