@@ -47,12 +47,13 @@ def judged(root: Path) -> StudyAnalysis:
 
 
 def verdicts(analysis: StudyAnalysis) -> str:
-    """What is said of each environment."""
+    """Who is best on each environment, and what is noted there."""
     parts = []
     for environment in analysis.environments:
-        said = conclusion(analysis.study, environment).everything
+        said = conclusion(analysis.study, environment)
         parts.append(f"**{markdown_text(environment.environment)}**\n")
-        parts.append("\n".join(f"- {markdown_text(text)}" for text in said) + "\n")
+        lines = (f"- {markdown_text(text)}" for text in (said.lead, *said.notes))
+        parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
 
 
