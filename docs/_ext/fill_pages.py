@@ -8,8 +8,8 @@ The kinds: ``code``, with names that the linked file defines; ``environment``, w
 arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, likewise, for
 a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``hardness``,
 likewise, for a table of how hard they are; ``agents`` and ``agents-by-spaces``, with nothing, for
-tables of agents; ``trainings``, for what commands reach; ``reference``, with a module and perhaps
-names in it, for their docstrings below a heading;
+tables of agents; ``flags``, with the name of a command; ``trainings``, for what commands reach;
+``reference``, with a module and perhaps names in it, for their docstrings below a heading;
 ``timings``, for the linked file of what `benchmarks/timing.py` has measured.
 """
 
@@ -24,6 +24,8 @@ from sphinx.application import Sphinx
 
 DOCS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(DOCS.parent), str(DOCS / "scripts")]
+
+from flag_tables import flags_block  # noqa: E402
 
 from agent_tables import agents_block, by_spaces_block  # noqa: E402
 from code_blocks import code_block  # noqa: E402
@@ -52,6 +54,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "docstring": docstring_block,
     "environment": environment_block,
     "facts": facts_block,
+    "flags": flags_block,
     "hardness": hardness_block,
     "optima": optima_block,
     "reference": reference_block,
