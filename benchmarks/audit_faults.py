@@ -4,7 +4,7 @@
     python benchmarks/audit_faults.py --only 'tables.q_*' --seeds 1
     python benchmarks/audit_faults.py FOLDER              # files with tables of your own
     python benchmarks/audit_faults.py --right --seeds 3   # shipped agents instead
-    python benchmarks/audit_faults.py --publish           # writes docs/measured/audit-faults.md
+    python benchmarks/audit_faults.py --publish           # writes docs/measured/audit-faults.json
 
 A file of planted faults has a table ``FAULTS``: names of its functions or classes, and the id of
 the fault that each has; ``RIGHT`` may name others that have none, and ``KINDS`` may say what an
@@ -35,7 +35,11 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 PLANTED = ROOT / "benchmarks" / "planted_faults"
-MEASURED = ROOT / "docs" / "measured" / "audit-faults.md"
+MEASURED = ROOT / "docs" / "measured" / "audit-faults.json"
+sys.path.append(str(ROOT / "docs" / "scripts"))
+
+from measured_tables import publish  # noqa: E402
+
 RESULTS = ROOT / "build" / "audit-faults.jsonl"
 NOTHING = "-"
 
@@ -201,9 +205,8 @@ def main() -> None:
     if args.publish:
         head = ["git", "rev-parse", "--short", "HEAD"]
         version = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-        MEASURED.write_text(
-            f"{text}\nThe last of them was measured with version {version.strip()}.\n",
-            encoding="utf-8",
+        publish(
+            MEASURED, f"{text}\nThe last of them was measured with version {version.strip()}.\n"
         )
 
 

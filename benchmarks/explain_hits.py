@@ -7,8 +7,8 @@ known mistake: too low a discount, too few steps, too little exploration. Each r
 explained; then the proposal and the usual changes (`experiments.interventions`) are trained with
 the seeds 0 to 3. A proposal hits where no change is better on average by over 5 % of the gap of the
 runs as they are; where nothing is proposed, that is a hit if no change regains 5 % of that gap.
-The result goes to docs/measured/explain-hits.md; what the explanations of the first ten say, to
-docs/measured/why-not-optimal.md.
+The result goes to docs/measured/explain-hits.json; what the explanations of the first ten say, to
+docs/measured/why-not-optimal.json.
 """
 
 from __future__ import annotations
@@ -23,6 +23,10 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 MEASURED = ROOT / "docs" / "measured"
+sys.path.append(str(ROOT / "docs" / "scripts"))
+
+from measured_tables import publish  # noqa: E402
+
 SEED = 4
 MATTERS = 0.05  # of the gap
 
@@ -139,14 +143,14 @@ def main() -> None:
         places.append(where(words, found))
         print(" | ".join(rows[-1]), flush=True)
     headings = ["run of seed 4", "mean gap, seeds 0 to 3", "proposed", "won", "hit"]
-    pages = {"explain-hits.md": f"{hits(rows)}\n\n{as_markdown(headings, rows)}"}
+    pages = {"explain-hits.json": f"{hits(rows)}\n\n{as_markdown(headings, rows)}"}
     headings = ["run of seed 4", "return", "gap", "in its own objective", "parts of the gap"]
     headings += ["worst state", "states to mend, and what that regains"]
-    pages["why-not-optimal.md"] = as_markdown(headings, places[: len(SHIPPED)])
+    pages["why-not-optimal.json"] = as_markdown(headings, places[: len(SHIPPED)])
     for name, text in pages.items():
         print(text)
         if args.publish:
-            (MEASURED / name).write_text(text, encoding="utf-8")
+            publish(MEASURED / name, text)
 
 
 if __name__ == "__main__":

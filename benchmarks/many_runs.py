@@ -23,7 +23,11 @@ from pathlib import Path
 from experiments.figures_store import SUFFIX, checksum_of
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs/measured/many-runs.md"
+sys.path.append(str(ROOT / "docs" / "scripts"))
+
+from measured_tables import publish  # noqa: E402
+
+PAGE = ROOT / "docs/measured/many-runs.json"
 SIZES = (1_000, 10_000, 100_000)
 AGENTS = ("qlearning", "sarsa")
 STUDY = ["--env", "FrozenLake-v1", "--algos", *AGENTS, "--n-episodes", "20", "--keep", "figures"]
@@ -150,7 +154,7 @@ def main() -> None:
     text = table(rows)
     print(text)
     if args.publish:
-        PAGE.write_text(text, encoding="utf-8")
+        publish(PAGE, text)
 
 
 if __name__ == "__main__":

@@ -20,11 +20,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass
 from functools import cache, cached_property
+from io import StringIO
 from itertools import combinations
 from pathlib import Path
 
@@ -53,7 +55,12 @@ from verdicts import (
 Scores = NDArray[np.float64]
 Draw = Callable[[Generator, int], Scores]
 
-MEASURED = Path(__file__).resolve().parent.parent / "docs" / "measured"
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+MEASURED = DOCS / "measured"
+sys.path.append(str(DOCS / "scripts"))
+
+from measured_tables import publish  # noqa: E402
+
 ALPHA = 0.05
 MARGIN = 0.02
 ENDS = Ends(0.0, 1.0)
@@ -521,10 +528,10 @@ def main() -> None:
     for name in args.tables or TABLES:
         with ExitStack() as stack:
             if args.publish:
-                path = MEASURED / f"verdict-{name}.md"
-                file = stack.enter_context(path.open("w", encoding="utf-8"))
-                stack.enter_context(redirect_stdout(file))
+                text = stack.enter_context(redirect_stdout(StringIO()))
             TABLES[name](args.studies)
+        if args.publish:
+            publish(MEASURED / f"verdict-{name}.json", text.getvalue())
 
 
 if __name__ == "__main__":

@@ -10,7 +10,8 @@ a part of these; ``optima`` and ``variants``, with several ids, for tables of op
 likewise, for a table of how hard they are; ``agents`` and ``agents-by-spaces``, with nothing, for
 tables of agents; ``flags``, with the name of a command; ``trainings``, for what commands reach;
 ``reference``, with a module and perhaps names in it, for their docstrings below a heading;
-``timings``, for the linked file of what `benchmarks/timing.py` has measured.
+``measured``, for the linked file of what a benchmark has published; ``timings``, likewise of
+`benchmarks/timing.py`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from environment_facts import (  # noqa: E402
     optima_block,
     variants_block,
 )
-from measured_tables import timings_block  # noqa: E402
+from measured_tables import measured_block, timings_block  # noqa: E402
 from recommended_commands import trainings_block, with_outcomes  # noqa: E402
 
 
@@ -56,6 +57,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "facts": facts_block,
     "flags": flags_block,
     "hardness": hardness_block,
+    "measured": measured_block,
     "optima": optima_block,
     "reference": reference_block,
     "timings": timings_block,
@@ -71,7 +73,7 @@ def filled(text: str, folder: Path) -> str:
     def fill(line: re.Match[str]) -> str:
         target, kind, arguments = line.groups()
         words = (arguments or "").split()
-        if kind in ("code", "timings"):
+        if kind in ("code", "measured", "timings"):
             words = [(folder / target).resolve().relative_to(DOCS.parent).as_posix(), *words]
         return KINDS[kind](*words).rstrip("\n")
 

@@ -1,4 +1,4 @@
-"""Tables of what `benchmarks/timing.py` has measured, for pages."""
+"""What benchmarks have measured, from docs/measured, as tables and sentences of pages."""
 
 from __future__ import annotations
 
@@ -30,3 +30,37 @@ def timings_block(path: str) -> str:
         f"{found['cores']} cores with a load of {found['load']}."
     )
     return "\n".join(lines) + "\n"
+
+
+def measured_block(path: str) -> str:
+    """The sentences and tables that `publish` has kept.
+
+    Args:
+        path: of the file, from the root of the repository.
+    """
+    parts = json.loads((ROOT / path).read_text(encoding="utf-8"))
+    return "\n\n".join(part if isinstance(part, str) else _table(part) for part in parts) + "\n"
+
+
+def _table(rows: list[list[str]]) -> str:
+    heading, *body = rows
+    lines = [heading, ["---"] * len(heading), *body]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def publish(path: Path, text: str) -> None:
+    """Keep Markdown that consists of paragraphs and tables: a row of a table in a line."""
+    parts: list[str | list[list[str]]] = []
+    for block in filter(None, (block.strip() for block in text.split("\n\n"))):
+        if block.startswith("|"):
+            cells = [line.strip()[1:-1].split("|") for line in block.splitlines()]
+            parts.append([[cell.strip() for cell in row] for k, row in enumerate(cells) if k != 1])
+        else:
+            parts.append(" ".join(block.split()))
+    written = [
+        json.dumps(part, ensure_ascii=False)
+        if isinstance(part, str)
+        else "[\n" + ",\n".join(json.dumps(row, ensure_ascii=False) for row in part) + "\n]"
+        for part in parts
+    ]
+    path.write_text("[\n" + ",\n".join(written) + "\n]\n", encoding="utf-8")
