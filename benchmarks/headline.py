@@ -52,7 +52,9 @@ def verdicts(analysis: StudyAnalysis) -> str:
     for environment in analysis.environments:
         said = conclusion(analysis.study, environment)
         parts.append(f"**{markdown_text(environment.environment)}**\n")
-        lines = (f"- {markdown_text(text)}" for text in (said.lead, *said.notes))
+        # What the legend of the table says already is left out.
+        notes = [said.lead, *(text for text in said.notes if not text.startswith("†"))]
+        lines = (f"- {markdown_text(text)}" for text in notes)
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
 
