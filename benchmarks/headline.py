@@ -20,8 +20,7 @@ from experiments.analysis import StudyAnalysis, analyse
 from experiments.plan import plan
 from experiments.results import read_results
 from experiments.study import read_study
-from report.conclusions import conclusion
-from report.documents import headline, markdown_text, table_as
+from report.documents import headline, table_as
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDY = ROOT / "studies" / "library-vs-hand-rolled.yml"
@@ -46,19 +45,6 @@ def judged(root: Path) -> StudyAnalysis:
     return analysis
 
 
-def verdicts(analysis: StudyAnalysis) -> str:
-    """Who is best on each environment, and what is noted there."""
-    parts = []
-    for environment in analysis.environments:
-        said = conclusion(analysis.study, environment)
-        parts.append(f"**{markdown_text(environment.environment)}**\n")
-        # What the legend of the table says already is left out.
-        notes = [said.lead, *(text for text in said.notes if not text.startswith("†"))]
-        lines = (f"- {markdown_text(text)}" for text in notes)
-        parts.append("\n".join(lines) + "\n")
-    return "\n".join(parts)
-
-
 def filled(page: str, blocks: Mapping[str, str]) -> str:
     """The page with what stands in its blocks replaced, as far as they are given."""
 
@@ -76,10 +62,7 @@ def main() -> None:
     )
     parser.add_argument("study", type=Path, metavar="FOLDER", help="where the study lies")
     analysis = judged(parser.parse_args().study)
-    blocks = {
-        "held-out": table_as("md", headline(analysis)),
-        "verdicts-held-out": verdicts(analysis),
-    }
+    blocks = {"held-out": table_as("md", headline(analysis))}
     for path in PAGES:
         path.write_text(filled(path.read_text(encoding="utf-8"), blocks), encoding="utf-8")
         print(f"filled {path}")

@@ -127,5 +127,5 @@ def test_blocks_of_the_headline_study_are_replaced_and_the_others_stay():
         for path in headline.PAGES
     } == {
         "README.md": {"held-out"},
-        "library-vs-hand-rolled.md": {"held-out", "verdicts-held-out"},
+        "library-vs-hand-rolled.md": {"held-out"},
     }
