@@ -97,7 +97,9 @@ def test_the_readmes_script_prints_what_stands_below_it(capsys):
 
 def test_what_the_readme_and_the_page_on_compare_point_to_is_there():
     for text, folder in ((README, ROOT), (COMPARE, ROOT / "docs")):
-        targets = re.findall(r"\]\(([^)#]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+        targets = re.findall(r"\]\(([^)#\s]+)(?: \"[^\"]*\")?\)", text) + re.findall(
+            r'src="([^"]+)"', text
+        )
         files = [target for target in targets if not target.startswith("http")]
         assert len(files) >= 4
         assert [name for name in files if not (folder / name).exists()] == []
