@@ -58,7 +58,7 @@ format: $(STAMP) ## Format the code and mend what ruff can mend
 	$(BIN)/ruff format .
 
 bench: peers ## Time everything, with one round
-	$(BIN)/python benchmarks/timing.py --rounds 1 tabular networks bandits evaluation planning processes page
+	$(BIN)/python benchmarks/timing.py --rounds 1 tabular networks bandits evaluation planning processes
 
 mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0
 	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED)

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import atexit
 import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-from signal import Signals
 from typing import Any
 
 from _run_contents import contents
@@ -61,10 +57,6 @@ CONTINUATIONS = (
     ("BernoulliBandit-v0", "ucb", 20_000, ""),
     ("LinearBandit-v0", "linucb", 10_000, ""),
 )
-# For stops at single system calls: short, since each is started hundreds of times.
-TUNE = "--env FrozenLake-v1 --algo qlearning --trials 3 --seeds-per-trial 2 -n 300 --no-report"
-BANDITS = "--env BernoulliBandit-v0 --algos ucb thompson --seeds 2 -n 200 --no-report -j 2"
-SHORT = "--env FrozenLake-v1 --algos qlearning a2c --seeds 2 -n 100 --no-report -j 2"
 STUDY = "--env CartPole-v1 FrozenLake-v1 --algos dqn qlearning --seeds 3 -j 2 --no-report"
 FILMS = "--env FrozenLake-v1 --algos qlearning sarsa --seeds 1 -j 2 --name films --no-report"
 LAKE = "--env FrozenLake-v1 --algo qlearning"
@@ -74,31 +66,6 @@ for seed in range(2):
     with gymnasium.make("SegmentBandit-v0") as env:
         envs.bandits.log_uniformly(env, 3000, seed=seed, path=f"{sys.argv[1]}-{seed}.csv")
 """
-
-
-@dataclass(frozen=True)
-class Stop:
-    """A signal that a command gets when it is about to change its folder.
-
-    Attributes:
-        call: which of the system calls that do, counted over all its processes; 0 for none.
-        signal: what the caller gets.
-    """
-
-    call: int = 0
-    signal: Signals = Signals.SIGKILL
-
-
-@cache
-def _stopping_library() -> Path:
-    """The library that sends the signal, compiled; it is removed with this process."""
-    folder = tempfile.TemporaryDirectory()
-    atexit.register(folder.cleanup)
-    source = Path(__file__).with_name("_stop_at_call.c")
-    library = Path(folder.name) / "stop_at_call.so"
-    compiler = shutil.which("cc") or "cc"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl"], check=True)
-    return library
 
 
 @dataclass
@@ -115,10 +82,8 @@ class Case:
         before: those of commands that are run once, in peace.
         begins_with_them: whether it finds in its folder what they have left.
         is_told: whether it prints what comes out.
-        is_short: whether it is for stops at single system calls.
         whole: the files of the undisturbed one.
         seconds: what that took.
-        calls: how often that changed something in its folder.
         counts: what became of the disturbed ones.
     """
 
@@ -128,10 +93,8 @@ class Case:
     before: tuple[list[str], ...] = ()
     begins_with_them: bool = False
     is_told: bool = False
-    is_short: bool = False
     whole: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
-    calls: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     said: str = ""
 
@@ -150,10 +113,9 @@ class Case:
         for name in ("warm", "whole"):
             logs = self.folder_of(name)
             begun = time.monotonic()
-            self._must(self.start(logs, Stop() if self.is_short else None))
+            self._must(self.start(logs))
             self.seconds = time.monotonic() - begun
             self.read_said()
-        self.calls = self.calls_made() if self.is_short else 0
         self.whole = self.result(self.folder / "whole")
 
     def _must(self, process: subprocess.Popen[str]) -> None:
@@ -166,17 +128,11 @@ class Case:
             shutil.copytree(self.folder / "before", self.folder / name)
         return self.folder / name
 
-    def start(self, logs: Path, stop: Stop | None = None) -> subprocess.Popen[str]:
+    def start(self, logs: Path) -> subprocess.Popen[str]:
         """Start the command in a session of its own, so that what it leaves can be found."""
-        return self._started(self.words, logs, stop)
+        return self._started(self.words, logs)
 
-    def calls_made(self) -> int:
-        """How often the last start with a `Stop` has changed something in its folder."""
-        return int.from_bytes((self.folder / "calls").read_bytes(), sys.byteorder)
-
-    def _started(
-        self, words: list[str], logs: Path, stop: Stop | None = None
-    ) -> subprocess.Popen[str]:
+    def _started(self, words: list[str], logs: Path) -> subprocess.Popen[str]:
         before = self.folder / "before"
         filled = [
             word.replace("{logs}", str(logs)).replace("{before}", str(before)) for word in words
@@ -185,15 +141,6 @@ class Case:
             filled = [str(ROOT / filled[0]), *filled[1:], "-f", str(logs)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
         environment["PYTHONFAULTHANDLER"] = "1"  # what hangs tells where
-        if stop is not None:
-            (self.folder / "calls").write_bytes(bytes(8))
-            environment |= {
-                "LD_PRELOAD": str(_stopping_library()),
-                "STOP_UNDER": str(logs),
-                "STOP_COUNTER": str(self.folder / "calls"),
-                "STOP_AT": str(stop.call),
-                "STOP_SIGNAL": str(stop.signal.value),
-            }
         with (self.folder / "output").open("a") as output:
             return subprocess.Popen(
                 [sys.executable, *filled],
@@ -218,31 +165,6 @@ class Case:
         # What takes long is told of before the table.
         table = self.said[self.said.find("┏") :]
         return {**found, "what it said": table} if self.is_told else found
-
-
-def short_cases(folder: Path) -> list[Case]:
-    """Those that are stopped at single system calls."""
-    train = f"train.py {LAKE} -n 500 --seed 1 --resume-or-start --save-state-every 100".split()
-    dqn = [*_training("CartPole-v1", "dqn", 400, EAGER), "--save-state-every", "100"]
-    pack = ["-m", "commands.share", "pack", "{before}/qlearning/FrozenLake-v1_1", "{logs}/pack"]
-    commands = {
-        "a table": train,
-        "dqn": dqn,
-        "a study": f"compare.py {SHORT} --name short".split(),
-        "a study of bandits": f"compare.py {BANDITS} --name bandits".split(),
-        "a search": f"tune.py {TUNE} --retest 1 --retest-seeds 2 -j 1".split(),
-        "a pack": pack,
-        "a zipped pack": [*pack[:-1], "{logs}/pack.zip"],
-    }
-    found = [
-        Case(name, folder / name, words, is_short=True)
-        if "pack" not in name
-        else Case(name, folder / name, words, (train,), begins_with_them=True, is_short=True)
-        for name, words in commands.items()
-    ]
-    for case in found:
-        case.folder.mkdir(parents=True)
-    return found
 
 
 def cases(folder: Path) -> list[Case]:

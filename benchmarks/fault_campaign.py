@@ -2,7 +2,6 @@
 
     python benchmarks/fault_campaign.py --kills 30       # a look, a minute or two
     python benchmarks/fault_campaign.py --kills 1000     # docs/reliability.md: half an hour
-    python benchmarks/fault_campaign.py --at-calls --kills 400  # the same page: half an hour
 
 Every agent is trained once in peace. Then the same command is started again and again, and gets a
 signal at a moment drawn uniformly from the time that it takes: SIGKILL, SIGTERM, SIGINT, or SIGINT
@@ -10,11 +9,6 @@ twice. When a process has come to the end, its files are held against those of t
 bit for bit, but for moments and durations. After twenty signals it is left alone. A study is
 treated likewise, the signal going to the driver, to one of its workers, or to all its processes; so
 are filming and judging by a log, which begin anew.
-
-With ``--at-calls`` short commands, also a search and a pack, get one of the first three signals
-when one of their processes is about to make the k-th system call that changes the folder: write,
-fsync, rename, mkdir, unlink and the like; k is drawn uniformly. Before SIGKILL half of a write is
-done. After three such stops the command is left alone. That needs Linux and a C compiler.
 
 Counted are results that differ, files that are damaged, processes that are left, and files that are
 left. All must be none.
@@ -36,12 +30,11 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from signal import Signals
 
 from rich.console import Console
 from rich.table import Table
 
-from _campaign_commands import Case, Stop, cases, short_cases
+from _campaign_commands import Case, cases
 
 SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGINT twice")
 TARGETS = ("driver", "worker", "all")
@@ -50,21 +43,19 @@ MOST_SIGNALS = 20  # that one command gets before it is left alone
 LONGEST = 60  # seconds of a start, beside twenty times as long as in peace
 
 
-def disturbed(case: Case, seed: int, most: int) -> int:
+def disturbed(case: Case, seed: int) -> int:
     """Run the command until it is done, with a signal each time; the number of signals.
 
     Args:
         case: the command.
         seed: of the moments.
-        most: signals after which it is left alone.
     """
     draw = random.Random(f"{case.name} {seed}")  # noqa: S311  # to be repeated, not kept secret
     logs = case.folder_of(f"disturbed {seed}")
-    disturb = _stop_at_a_call if case.is_short else _stop_after_seconds
     signals, kills = 0, case.counts["SIGKILL"]
     for _ in range(MOST_STARTS):
-        if signals < most:
-            process, is_stopped = disturb(case, logs, draw)
+        if signals < MOST_SIGNALS:
+            process, is_stopped = _stop_after_seconds(case, logs, draw)
             signals += is_stopped
         else:
             process = case.start(logs)
@@ -90,17 +81,6 @@ def _ended(case: Case, process: subprocess.Popen[str]) -> int:
         process.wait()
         print(f"{case.name} hangs:\n{case.read_said()}", file=sys.stderr)
         return 0
-
-
-def _stop_at_a_call(
-    case: Case, logs: Path, draw: random.Random
-) -> tuple[subprocess.Popen[str], bool]:
-    stop = Stop(draw.randint(1, case.calls), Signals[draw.choice(SIGNALS[:3])])
-    process = case.start(logs, stop)
-    _ended(case, process)
-    is_stopped = case.calls_made() >= stop.call
-    case.counts[stop.signal.name] += is_stopped
-    return process, is_stopped
 
 
 def _stop_after_seconds(
@@ -209,7 +189,6 @@ def main() -> int:
     """Do the campaign; 1 where something is not none."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--kills", type=int, default=30, help="signals in all, at least")
-    parser.add_argument("--at-calls", action="store_true", help="stop at single system calls")
     parser.add_argument("--jobs", type=int, default=max((os.cpu_count() or 2) // 2, 1))
     parser.add_argument("--only", nargs="+", default=[], help="names of the commands to try")
     args = parser.parse_args()
@@ -217,15 +196,14 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="fault-campaign-") as folder:
         os.environ["XDG_CONFIG_HOME"] = str(Path(folder) / "config")
-        found = (short_cases if args.at_calls else cases)(Path(folder))
+        found = cases(Path(folder))
         chosen = [case for case in found if case.name in args.only or not args.only]
-        most = 3 if args.at_calls else MOST_SIGNALS
         signals, seed = 0, 0
         with ThreadPoolExecutor(args.jobs) as pool:
             list(pool.map(Case.prepare, chosen))
             list(pool.map(Case.run_in_peace, chosen))
             while signals < args.kills:
-                signals += sum(pool.map(partial(disturbed, seed=seed, most=most), chosen))
+                signals += sum(pool.map(partial(disturbed, seed=seed), chosen))
                 seed += 1
                 print(f"{signals:,} signals", flush=True)
                 Console(width=180).print(table(chosen))

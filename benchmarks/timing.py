@@ -34,7 +34,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # before libraries are
 
 ROOT = Path(__file__).resolve().parent.parent
 MEASURED = ROOT / "docs" / "measured"
-TABLES = ("tabular", "networks", "bandits", "evaluation", "planning", "processes", "page")
+TABLES = ("tabular", "networks", "bandits", "evaluation", "planning", "processes")
 
 # One measurement: so many of the table's unit.
 Contender = Callable[[], float]

@@ -1,9 +1,7 @@
 """`audit`: planted faults are named, what is right passes, and mistakes end in one line."""
 
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,19 +15,7 @@ from diagnosis.faults import FAULTS
 from diagnosis.probe_worlds import Record, World, make_env
 from diagnosis.probes import Finding, watkins_table
 from diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
-
-PLANTED = Path(__file__).resolve().parents[2] / "benchmarks" / "planted_faults"
-
-
-def planted(name):
-    spec = importlib.util.spec_from_file_location(f"planted_{name}", PLANTED / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-TABLES, LIBRARIES = planted("tables"), planted("libraries")
+from tests.diagnosis import planted_classes, planted_tables
 
 
 def verdict_on(subject, *probed):
@@ -40,13 +26,13 @@ def verdict_on(subject, *probed):
 # --- what is found --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*TABLES.FAULTS, *TABLES.RIGHT])
+@pytest.mark.parametrize("name", [*planted_tables.FAULTS, *planted_tables.RIGHT])
 def test_faults_of_tables_are_named_and_right_ones_pass(name):
-    subject = ScriptSubject(name, getattr(TABLES, name), {}, TABLES.KINDS.get(name))
+    subject = ScriptSubject(name, getattr(planted_tables, name), {}, planted_tables.KINDS.get(name))
     probed = []
     if name.startswith("memory"):  # which are slow
         subject.steps, probed = 1000, [probes.probe_age, probes.probe_copies]
-    verdict, fault = verdict_on(subject, *probed), TABLES.FAULTS.get(name)
+    verdict, fault = verdict_on(subject, *probed), planted_tables.FAULTS.get(name)
     assert [finding.fault for finding in verdict.faults][:1] == [fault] * (fault is not None)
     assert fault or {finding.state for finding in verdict.findings} <= {"ok", "skipped"}
     assert verdict.exit_code == (1 if fault else 0) or probed
@@ -66,8 +52,10 @@ def test_faults_of_tables_are_named_and_right_ones_pass(name):
 def test_faults_of_classes_are_named(name, right, probe, monkeypatch):
     """Where values do not settle the steps are doubled, which would take minutes."""
     monkeypatch.setattr(probes, "MOST_DOUBLINGS", 1)
-    accused = ClassSubject(name, getattr(LIBRARIES, name), {})
-    assert {f.fault for f in audit(accused, [0], [probe]) if f.fault} == {LIBRARIES.FAULTS[name]}
+    accused = ClassSubject(name, getattr(planted_classes, name), {})
+    assert {f.fault for f in audit(accused, [0], [probe]) if f.fault} == {
+        planted_classes.FAULTS[name]
+    }
     if right:
         passed = ClassSubject(right, class_named(right), {})
         assert {f.state for f in audit(passed, [0], [probe])} == {"ok"}
@@ -87,16 +75,16 @@ def test_observations_changed_in_place_are_the_librarys_affair():
 
 def restless(make_env, seed, gamma, steps):
     """Values that never come to rest."""
-    agent = TABLES.q_right(make_env, seed, gamma, steps)
+    agent = planted_tables.q_right(make_env, seed, gamma, steps)
     agent.values = lambda obs: np.full(2, float(steps))
     return agent
 
 
 def shifted(make_env, seed, gamma, steps):
     """Values that no fault explains."""
-    agent = TABLES.q_right(make_env, seed, gamma, steps)
+    agent = planted_tables.q_right(make_env, seed, gamma, steps)
     table = agent.table + 3.0
-    agent.values = lambda obs: table[TABLES.number(obs)]
+    agent.values = lambda obs: table[planted_tables.number(obs)]
     return agent
 
 
@@ -105,7 +93,7 @@ UNSAID = [
     (shifted, "q_learning", probes.probe_ends, "unsaid",
      "4.00 and not 1: no fault known here explains it"),
     # What it claims to be has to be known.
-    (TABLES.q_right, None, probes.probe_next_action, "skipped", "--kind"),
+    (planted_tables.q_right, None, probes.probe_next_action, "skipped", "--kind"),
 ]  # fmt: skip
 
 
@@ -123,7 +111,7 @@ def test_seeds_that_disagree_decide_nothing(monkeypatch):
         yield Finding("a probe", state, "", "traces" if state == "fault" else "")
 
     monkeypatch.setitem(TITLES, moody, "a probe")  # which the page of probes does not list
-    found = list(audit(ScriptSubject("moody", TABLES.q_right, {}), range(3), [moody]))
+    found = list(audit(ScriptSubject("moody", planted_tables.q_right, {}), range(3), [moody]))
     assert [(f.state, f.text) for f in found] == [("unsaid", "seeds disagree: ok, traces, unsaid")]
 
 
@@ -172,7 +160,7 @@ def test_every_fault_has_a_sentence_and_a_source():
     for fault in FAULTS.values():
         assert fault.sentence.endswith(".")
         assert fault.source
-    assert set(TABLES.FAULTS.values()) | set(LIBRARIES.FAULTS.values()) == set(FAULTS)
+    assert set(planted_tables.FAULTS.values()) | set(planted_classes.FAULTS.values()) == set(FAULTS)
     assert tuple(subjects.KINDS) == KINDS
 
 
