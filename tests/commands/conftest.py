@@ -1,7 +1,6 @@
 import os
 import random
 import sys
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -15,8 +14,6 @@ import train
 import tune
 from commands import main, share
 from commands.cli import run_command
-from experiments import launching
-from pipeline.errors import UserError
 from pipeline.signs_of_life import Silence
 
 MAINS = {
@@ -84,27 +81,3 @@ def type_study(own_folder, monkeypatch, capfd):
         return stop.value.code, captured.out, captured.err
 
     return run
-
-
-@pytest.fixture
-def power_cut(monkeypatch):
-    """Within the ``with`` statement the second batch of runs ends after the first of them."""
-    do_runs = launching.execute
-
-    @contextmanager
-    def cut():
-        calls = []
-
-        def stopped(runs, *args):
-            calls.append(len(runs))
-            if len(calls) == 2:
-                do_runs(runs[:1], *args)
-                raise UserError("the power is gone")
-            return do_runs(runs, *args)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(launching, "execute", stopped)
-            yield
-        assert len(calls) == 2
-
-    return cut

@@ -41,26 +41,19 @@ def do(words, plan, ignored=()):
 def moments():
     """What is called at each moment: its owner, its name, and on which of the calls."""
     from agents.compiled import engine
-    from commands import terminal
-    from experiments.off_policy import policy_files
-    from pipeline import callbacks, files, preparation, training
+    from pipeline import files, preparation, training
     from pipeline.runs import Run
     from pipeline.state_saver import StateSaver
 
     calls = iter(range(10**9))
     return {
         "set-up": (preparation, "make_evaluation_env", always),
-        "between": (terminal, "print_refusal", always),
-        "before the first step": (StateSaver, "_on_training_start", always),
         "compiling": (engine, "run_block", always),
         "training": (StateSaver, "_on_step", lambda *_: next(calls) == 3),
-        "evaluating": (callbacks.EvaluationCallback, "_append", always),
         "saving": (files, "put_in_place", lambda draft, path, *_: path.name == "FrozenLake-v1.zip"),
         "judging": (training, "_judge", always),
         "drawing": (training, "draw_learning_curve", always),
         "recording": (Run, "end", always),
-        "reading a log": (policy_files, "read_logged", always),
-        "closing": (training, "close_environments", always),
     }
 
 
