@@ -22,6 +22,7 @@ MAINS = {
     "explain.py": explain.main,
     "shaping.py": shaping.main,
     "compare.py": compare.main,
+    "tune.py": tune.main,
 }
 COMMANDS = {name: partial(run_command, main) for name, main in MAINS.items()}
 COMMANDS |= {"pack": partial(run_command, share.pack), "yardstick": main}
