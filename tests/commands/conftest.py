@@ -53,6 +53,21 @@ def no_pictures_elsewhere(request, monkeypatch):
         monkeypatch.setattr("pipeline.training.draw", lambda *_: None)
 
 
+@pytest.fixture(scope="session")
+def train_in():
+    """Train inside a folder, without pictures."""
+
+    def do(folder, *words):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            patch.setattr("pipeline.training.draw", lambda *_: None)
+            patch.setattr("sys.argv", ["train.py", "--verbose", "0", "--seed", "0", *words])
+            assert train.main() == 0
+        return folder
+
+    return do
+
+
 @pytest.fixture
 def type_command(monkeypatch, capsys, tmp_path):
     """Run a command line in this process, inside an empty folder: exit code, output, errors."""

@@ -29,10 +29,6 @@ OPTIONAL += ("replay_buffer.pkl", "vec_normalize.pkl", "best_model_vecnormalize.
 STUDY = ("--env", LAKE, "--algos", "random", "--seeds", "2", "-n", "20", "--no-report", "-j", "1")
 STUDY_NAMES = ("looks.json", "summary.csv", "curves.csv.gz", "report.html", "verdicts.md", ".lock")
 STUDY_NAMES += (".drafts", "failures", "figures", "films", "learning", "replaced", "runs")
-TUNING = ("--env", LAKE, "--algo", "qlearning", "--n-episodes", "20", "--seeds-per-trial", "1")
-TUNING += ("--n-trials", "2", "--retest", "0", "-j", "1", "--no-report")
-TUNING_NAMES = ("trials.db", "trials.db-journal", "tuning.json", "winner.yml", "retest", ".lock")
-TUNING_NAMES += ("runs", ".drafts", "report.html")
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +233,7 @@ def test_what_is_packed_is_what_the_record_names(runs, outside, type_command):
     assert "aaa.gif is no regular file: it is a link" in said
 
 
-# --- studies, searches, packs --------------------------------------------------------------------
+# --- studies --------------------------------------------------------------------------------------
 
 
 def test_a_study(outside, type_command):
@@ -254,18 +250,6 @@ def test_a_study(outside, type_command):
     run = Path(next(name for name in names_in(whole) if name.endswith(f"/{RECORD}")))
     names = [*STUDY_NAMES, "failures/x.txt", "replaced/1", *map(str, (run, *run.parents[:2]))]
     attack(whole, names, outside, root / "copy", act)
-
-
-def test_a_search(outside, type_command):
-    root = Path.cwd() / "logs" / "tuning"
-    assert type_command("tune.py", *TUNING, "--name", "whole")[0] == 0
-
-    def act(told):
-        code, said = type_command("tune.py", *TUNING, "--name", "copy")
-        assert code == 2, told
-        check_untold(said, Path.cwd())
-
-    attack(root / "whole", TUNING_NAMES, outside, root / "copy", act)
 
 
 # --- the door itself -----------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """What ends a command from outside: signals, kills, environments that exit, folders that go."""
 
 import contextlib
+import functools
 import json
 import os
 import signal
@@ -12,7 +13,13 @@ from pathlib import Path
 
 import pytest
 
+import train
 from agents import load_algorithm
+from agents.compiled import engine as compiled
+from commands.cli import run_command
+from pipeline import files, preparation, stopping, training
+from pipeline.runs import Run
+from pipeline.state_saver import StateSaver
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,42 +31,74 @@ WORDS = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "600", "--seed",
 SECONDS = 10
 
 
-@pytest.fixture(scope="module")
-def server():
-    process = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("stopping_server.py"))],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        yield process
+def moments():
+    """What is called at each moment: its owner, its name, and on which of the calls."""
+    steps = iter(range(10**9))
+    return {
+        "set-up": (preparation, "make_evaluation_env", always),
+        "compiling": (compiled, "run_block", always),
+        "training": (StateSaver, "_on_step", lambda *_: next(steps) == 3),
+        "saving": (files, "put_in_place", lambda draft, path, *_: path.name == "FrozenLake-v1.zip"),
+        "judging": (training, "_judge", always),
+        "drawing": (training, "draw_learning_curve", always),
+        "recording": (Run, "end", always),
+    }
+
+
+def always(*_):
+    return True
+
+
+def signalling(owner, name, condition, signals):
+    """Let the function send the signals before it begins, the first time that it is its turn."""
+    function = getattr(owner, name)
+
+    @functools.wraps(function)
+    def send(*args, **kwargs):
+        if signals and condition(*args):
+            Path("signalled").write_text(str(time.monotonic()))
+            while signals:
+                signal.raise_signal(signal.Signals[signals.pop(0)])
+        return function(*args, **kwargs)
+
+    setattr(owner, name, send)
+
+
+def train_in_child(words, plan, ignored):
+    """Train, and send signals by moment; what a forked process does, which has all its modules."""
+    stopping.SECONDS_OF_ONE_REQUEST = 0.0  # here they are meant one by one
+    for number in stopping.SIGNALS:  # whatever the tests were started under
+        default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, signal.SIG_IGN if number.name in ignored else default)
+    for moment, place in moments().items():
+        if moment in plan:
+            signalling(*place, plan[moment].split())
+    sys.argv = ["train.py", *words]
+    code = 99
+    with Path("out").open("w") as sys.stdout, Path("err").open("w") as sys.stderr:
+        try:
+            run_command(train.main)
+        except SystemExit as stop:
+            code = stop.code
+    os._exit(code)
 
 
 @pytest.fixture
-def stopped(server, tmp_path):
-    """Do a command, with signals by moment; the exit code."""
-
-    def run(*words, ignored=(), **plan):
-        plan = {moment.replace("_", " "): names.split() for moment, names in plan.items()}
-        request = {"folder": str(tmp_path), "words": words, "plan": plan, "ignored": ignored}
-        server.stdin.write(json.dumps(request) + "\n")
-        server.stdin.flush()
-        answer = json.loads(server.stdout.readline())
-        (tmp_path / "signalled").unlink()
-        assert answer["seconds"] < SECONDS
-        return answer["code"]
-
-    return run
-
-
-@pytest.fixture
-def train_stopped(stopped, tmp_path):
+def train_stopped(tmp_path, monkeypatch):
     """Train, with signals by moment; exit code, the run's record or None, and the run folder."""
+    monkeypatch.chdir(tmp_path)
 
-    def run(*words, engine="interpreted", **options):
-        code = stopped("train.py", *WORDS, *words, "-params", f"engine:{engine}", **options)
+    def run(*words, engine="interpreted", ignored=(), **plan):
+        words = [*WORDS, *words, "-params", f"engine:{engine}"]
+        if not (child := os.fork()):
+            try:
+                train_in_child(words, plan, ignored)
+            finally:
+                os._exit(98)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        signalled = tmp_path / "signalled"
+        assert time.monotonic() - float(signalled.read_text()) < SECONDS
+        signalled.unlink()
         folder = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
         record = json.loads((folder / "run.json").read_text()) if folder.exists() else None
         for path in folder.rglob("*.zip"):
@@ -95,6 +134,7 @@ MOMENTS = [
     MOMENTS,
     ids=[", ".join(f"{moment}: {names}" for moment, names in plan.items()) for plan, *_ in MOMENTS],
 )
+@pytest.mark.usefixtures("pictures")
 def test_how_a_training_ends_by_signals(train_stopped, tmp_path, plan, code, state):
     moment, *others = plan
     first, *more = plan[moment].split()
@@ -216,7 +256,6 @@ class Removing(gym.Env):
 gym.register("Removing-v0", Removing, max_episode_steps=10)
 """
 TRAIN = "train.py --algo qlearning"
-SEARCH = "tune.py --algo qlearning --trials 2 -j 2"
 STUDY = "compare.py --algos qlearning --seeds 3 --no-report -j 2 --name study"
 GONE = "this folder is gone: somebody has removed or renamed it\n"
 
@@ -234,18 +273,10 @@ def words_for(own_folder):
     return words
 
 
-@pytest.mark.parametrize(
-    ("command", "folder"),
-    [(TRAIN, "logs/qlearning/Removing-v0_1"), (SEARCH, "logs/Removing-v0_qlearning")],
-)
-def test_a_folder_that_is_gone_ends_the_command(
-    type_in_own_folder, words_for, own_folder, command, folder
-):
-    code, out, err = type_in_own_folder(*words_for(command, folder))
-    assert (code, err.count("\n")) == (2, 1), err
-    assert err.startswith(f"{command.split()[0]}: error: logs/")
-    assert err.endswith(f": {GONE}")
-    assert "another" not in out
+def test_a_folder_that_is_gone_ends_the_training(type_in_own_folder, words_for, own_folder):
+    folder = "logs/qlearning/Removing-v0_1"
+    code, _, err = type_in_own_folder(*words_for(TRAIN, folder))
+    assert (code, err) == (2, f"train.py: error: {folder}: {GONE}")
     assert not (own_folder / folder).exists()
 
 
