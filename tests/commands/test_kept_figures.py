@@ -149,7 +149,7 @@ def test_a_run_that_comes_out_otherwise_is_told(both, typed):
 
 def test_after_a_kill_no_run_is_lost_or_counted_twice(both, typed, own_folder):
     all_there, _, _ = both
-    words, study = [*KEEP, "--seeds", 12, "-f", "killed"], own_folder / "killed" / NAME
+    words, study = [*KEEP, "--seeds", 40, "-f", "killed"], own_folder / "killed" / NAME
     command = [sys.executable, str(ROOT / "compare.py"), *map(str, words)]
     (study / "runs/qlearning").mkdir(parents=True)
     process = subprocess.Popen(
@@ -164,12 +164,14 @@ def test_after_a_kill_no_run_is_lost_or_counted_twice(both, typed, own_folder):
             n_seen = len(rows_of(study))
     process.kill()
     process.communicate()
-    assert 3 <= len(rows_of(study)) < 12
+    assert 3 <= len(rows_of(study)) < 40
     typed(*words)
     for agent in ("qlearning", "sarsa"):
-        assert rows_of(study, agent) == list(range(12))
+        assert rows_of(study, agent) == list(range(40))
         assert len(folders(study, agent)) <= 7
-    pd.testing.assert_frame_equal(summary(all_there), summary(study))
+    table = summary(study)
+    first = table[table["seed"] < 12].reset_index(drop=True)
+    pd.testing.assert_frame_equal(summary(all_there), first, check_dtype=False)
 
 
 def test_what_a_kill_between_commit_and_removal_leaves_is_removed(both, typed):

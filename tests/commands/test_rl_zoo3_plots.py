@@ -18,8 +18,7 @@ ENV_ID = "FrozenLake-v1"
 ALL_PLOTS = ["rl_zoo3.plots.all_plots", "-l", "ours", "--no-display", "-print"]
 AGENTS = {
     "qlearning": {},
-    "ppo": {"tuned": False, "policy": "MlpPolicy", "n_steps": 32, "batch_size": 32, "n_epochs": 1}
-    | {"normalize": True},
+    "ppo": {"tuned": False, "policy": "MlpPolicy", "n_steps": 32, "batch_size": 32, "n_epochs": 1},
 }
 # rl_zoo3.enjoy needs `requests` for downloads, which are not made here.
 RUN = """
@@ -75,11 +74,11 @@ def test_plots_and_enjoy_of_rl_zoo3_take_the_runs_of_studies(tmp_path, monkeypat
     runs = tmp_path / "zoo" / "runs"
     base = ["-e", ENV_ID, "-f", runs]
     play = ["--algo", "ppo", "--env", ENV_ID, "-f", runs, "--no-render", "-n", 150]
-    played, learnt, plotted, _ = zoo(
-        ["rl_zoo3.enjoy", *play, "--device", "cpu", "--gym-packages", "envs", "--load-best"],
+    learnt, plotted, _, played = zoo(
         ["rl_zoo3.plots.plot_train", *base, "-a", "ppo", "-x", "episodes", "-w", 2],
         [*ALL_PLOTS, *base, "-a", *AGENTS, "-o", "data"],
         ["rl_zoo3.plots.plot_from_file", "-i", "data.pkl", "-o", "picture"],
+        ["rl_zoo3.enjoy", *play, "--device", "cpu", "--gym-packages", "envs"],
         cwd=tmp_path,
     )
     assert f"ppo/{ENV_ID}_2" in played
