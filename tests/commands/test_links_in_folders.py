@@ -242,7 +242,7 @@ def test_a_study(outside, type_command):
     whole = root / "whole"
 
     def act(told):
-        repair = ("--repair",) if "is folder" in told else ()
+        repair = ("--repair",) if "is like" in told else ()
         code, said = type_command("compare.py", *STUDY, "--name", "copy", *repair)
         assert code == 2, told
         check_untold(said, Path.cwd())

@@ -208,7 +208,7 @@ gym.register("Leaving-v0", Leaving, max_episode_steps=10)
 @pytest.mark.parametrize(
     ("kwargs", "line", "text"),
     [
-        (["at_reset:20", "words:('bye',)"], 19, "SystemExit: bye"),
+        (["at_reset:20", "words:['bye']"], 19, "SystemExit: bye"),
         (["kind:'KeyboardInterrupt'"], 24, "KeyboardInterrupt"),
     ],
 )
