@@ -1,4 +1,4 @@
-"""Agents and environments of one's own: as two pages write them, and in one file each."""
+"""Agents and environments of one's own, as pages write them."""
 
 import json
 import re
@@ -53,39 +53,7 @@ def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("the environment's P is not what step does: state ")
 
 
-# --- one file, whose lines are counted ------------------------------------------------------------
-
-GRID = '''\
-"""A pond: ice all around, and one hole."""
-
-import gymnasium as gym
-
-from envs.grid import GridWorld
-from envs.grid import Tile
-
-gym.register("my/Pond-v0", "pond:Pond", max_episode_steps=50)
-
-
-class Pond(GridWorld):
-    """A robot crosses a pond around a hole, ``H``, that costs it 10 and ends the episode."""
-
-    def __init__(self, slip: float = 0.1, render_mode: str | None = None) -> None:
-        ice = Tile(-1.0)
-        tiles = {
-            ".": ice,
-            "S": ice,
-            "H": Tile(-10.0, terminated=True),
-            "G": Tile(0.0, terminated=True),
-        }
-        super().__init__(
-            ["S...", ".H..", "...G"],
-            tiles,
-            edge=Tile(-1.0, blocked=True),
-            slip=slip,
-            random_start=False,
-            render_mode=render_mode,
-        )
-'''
+# --- the examples of CONTRIBUTING ----------------------------------------------------------------
 
 
 def contributed(title, entry):
@@ -102,33 +70,26 @@ INDEX = contributed("MOSS", '"moss", "moss:MOSS", observations="Discrete", for_b
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "most_lines", "words", "engine"),
+    ("name", "text", "words"),
     [
-        ("cautious", RULE, 50, "--env FrozenLake-v1 --algo cautious -n 300 -params caution:0.3",
-         "compiled"),
-        ("moss", INDEX, 35, "--env BernoulliBandit-v0 --algo moss -n 200", None),
-        ("pond", GRID, 35, "--env my/Pond-v0 --algo qlearning -n 2000", "compiled"),
+        ("cautious", RULE, "--env FrozenLake-v1 --algo cautious -n 300 -params caution:0.3"),
+        ("moss", INDEX, "--env BernoulliBandit-v0 --algo moss -n 200"),
     ],
-    ids=["cautious", "moss", "pond"],
-)  # fmt: skip
-def test_a_rule_an_index_or_a_grid_world_is_one_file(
-    own_folder, type_in_own_folder, name, text, most_lines, words, engine
-):
-    assert len(text.splitlines()) <= most_lines
+    ids=["cautious", "moss"],
+)
+def test_a_rule_or_an_index_is_one_file(own_folder, type_in_own_folder, name, text, words):
     (own_folder / f"{name}.py").write_text(text)
     command = ["train.py", "--gym-packages", name, "--seed", "0", *words.split()]
     assert type_in_own_folder(*command)[::2] == (0, "")
     (path,) = Path("logs").glob("*/*/run.json")
     record = json.loads(path.read_text())
     assert record["final"]["exact"]
-    assert record.get("engine") == engine or engine is None
-    if name == "cautious":
-        assert record["spec"]["hyperparams"]["caution"] == 0.3
-        # A wrong value of its setting is refused in a line.
-        code, _, err = type_in_own_folder(*command[:-1], "caution:2")
-        assert (code, err.count("\n")) == (2, 1)
-        assert "caution" in err
-    elif name == "moss":
+    if name == "moss":
         assert 0 < record["regret"] < 100  # of 200 pulls, each of which can cost half a click
-    else:
-        assert record["final"]["optimum"] > -10
+        return
+    assert record["engine"] == "compiled"
+    assert record["spec"]["hyperparams"]["caution"] == 0.3
+    # A wrong value of its setting is refused in a line.
+    code, _, err = type_in_own_folder(*command[:-1], "caution:2")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "caution" in err

@@ -67,11 +67,11 @@ def divergence(p, q):
     return special.rel_entr(p, q) + special.rel_entr(1 - p, 1 - q)
 
 
-def bonus_target(bonus, *, at_the_end=True, discounted=False):
+def bonus_target(bonus, *, at_the_end=True):
     """Q-learning's target and a bonus."""
 
     def target(reward, discount, terminated, next_values, count, scale):
-        added = bonus(count, scale) * (discount if discounted else 1)
+        added = bonus(count, scale)
         if terminated:
             return reward + added * at_the_end
         return reward + added + discount * next_values.max()
@@ -195,8 +195,6 @@ def means_of_returns(answer):
 CASES = {
     checker.check_index: [
         (lambda mean, n, t: mean + np.sqrt(2 * np.log(t) / n), "Right."),
-        (lambda mean, n, t: None, "It cannot be called or gives no number"),
-        (lambda mean, n, t: np.sqrt(2 * np.log(t) / n), "If the mean rises by 0.1"),
         (lambda mean, n, t: mean, "The index has to lie above the mean"),
         (lambda mean, n, t: mean + np.log(t) / n, "With four times as many pulls"),
         (lambda mean, n, t: mean + np.sqrt(2 * t / n), "The bonus has to grow with all pulls"),
@@ -208,7 +206,6 @@ CASES = {
         (lambda p: p, "It fails when it is called"),
         (lambda p, q: [p, q], "It has to give a number"),
         (lambda p, q: -p * math.log(q), "For two equal probabilities it has to be 0"),
-        (lambda p, q: -divergence(p, q), "It has to be above 0 wherever p and q differ"),
         (lambda p, q: p * math.log(p / q), "It falls below 0. A pull can pay 1"),
         (lambda p, q: divergence(p, q) / math.log(2), "The form is right, but"),
         (lambda p, q: divergence(q, p), "The two are the wrong way round"),
@@ -218,35 +215,24 @@ CASES = {
         (lambda n, e: (2 / e) ** n, "Right."),
         (lambda n, e: (e / 2) ** n, "That is the chance that one episode"),
         (lambda n, e: (2 / e) ** (n - 1), "There is one move too few"),
-        (lambda n, e: (1 / e) ** n, "A random action is the right one in half"),
-        (lambda n, e: 2**n, "Epsilon is missing"),
         (lambda n, e: 2 * n / e, "For 5 rows and epsilon 0.1 it is too low."),
     ],
     exploration.check_bonus_target: [
         (bonus_target(lambda n, s: s / math.sqrt(n)), "Right."),
-        (lambda r, *_: r, "With a scale of 0 it should be the target of Q-learning. If"),
         (
             bonus_target(lambda n, s: 1 / math.sqrt(n)),
             "With a scale of 0 it should be the target of Q-learning. When the episode",
         ),
         (bonus_target(lambda n, s: s / math.sqrt(n), at_the_end=False), "There is no bonus at the"),
-        (
-            bonus_target(lambda n, s: s / math.sqrt(n), discounted=True),
-            "The bonus depends on the d",
-        ),
         (bonus_target(lambda n, s: s * math.sqrt(n)), "What was tried less often"),
-        (bonus_target(lambda n, s: s**2 / math.sqrt(n)), "If the scale is twice"),
         (bonus_target(lambda n, s: s / n), "The bonus falls too fast"),
         (bonus_target(lambda n, s: 2 * s / math.sqrt(n)), "The form is right, but"),
     ],
     traces.check_return: [
         (n_step_return, "Right."),
-        (lambda r, d, v: 1.0, "Where all rewards and the value are 0"),
         (lambda r, d, v: sum(r) + d * v, "With 3 steps: the rewards are not discounted"),
         (lambda r, d, v: n_step_return(r, d, v, first=1), "With 3 steps: the first reward is disc"),
-        (lambda r, d, v: n_step_return(r[::-1], d, v), "With 3 steps: the last reward counts most"),
         (lambda r, d, v: max(r) + d * v, "What one reward counts depends on the others"),
-        (lambda r, d, v: n_step_return(r, d, 0), "With 3 steps: the value of the state after"),
         (
             lambda r, d, v: n_step_return(r, d, v, powers=lambda n: n - 1),
             "With 3 steps: the value after the last step is discounted too little",
@@ -260,7 +246,6 @@ CASES = {
         (changed(lambda own, rate: rate), "The state that is visited now"),
         (changed(lambda *_: 1, lambda z, *_: 0 * z), "The other states are forgotten"),
         (changed(lambda *_: 1, lambda z, *_: z), "The traces of the other states have to"),
-        (changed(lambda *_: 1, lambda z, d, _: d * z + 0.1), "A state that was never"),
         (
             changed(lambda *_: 1, lambda z, d, _: d * z),
             "The traces of the other states do not fade enough: lambda",
@@ -271,28 +256,18 @@ CASES = {
         (lambda r, t, v, d: (r + d * v.T).T, "The shape has to be (12,), one target for each step"),
         (lambda r, t, v, d: r + d * v.max(), ROWS),
         (lambda r, t, v, d: r + d * v.max(axis=1), "When the episode has terminated nothing"),
-        (lambda r, t, v, d: r + d * t * v.max(axis=1), "It is the wrong way round"),
-        (lambda r, t, v, d: targets(r, t, v, 1), "With a discount of 0 only the reward"),
-        (lambda r, t, v, d: r, "If the best next value rises by 1"),
         (lambda r, t, v, d: targets(r, t, v, d, lambda v: v.min(axis=1)), "If the best next value"),
-        (
-            lambda r, t, v, d: targets(r, t, v, d, lambda v: v.mean(axis=1)),
-            "All next actions count",
-        ),
     ],
     networks.check_double_targets: [
         (doubled(online, lagging), "Right."),
         (doubled(lagging, online), "The roles are the wrong way round"),
         (doubled(lagging, lagging), "The target network chooses and judges."),
         (doubled(online, online), "The target network has no part in it"),
-        (doubled(online, np.add), "The values of both networks count. Only one"),
         (lambda r, t, a, b, d: r + d * b[:, a.argmax(axis=1)][0], ROWS),
         (lambda r, t, a, b, d: r + d * b.max(axis=1), "When the episode has terminated"),
     ],
     networks.check_loss: [
         (huber, "Right."),
-        (lambda e: huber(e) + 1, "Without an error there is no loss."),
-        (lambda e: e, "A loss is never below 0."),
         (lambda e: e**2 / 2 if e < 1 else e - 0.5, "An error above and one below"),
         (abs, "Between -1 and 1 it has to be half the square"),
         (lambda e: e**2 / 2, "Beyond 1 it has to be a straight line"),
@@ -302,24 +277,13 @@ CASES = {
     figures.check_score: [
         (score, "Right."),
         (lambda x, top, low: top - x, "The optimum has the score 0"),
-        (lambda x, top, low: 1 - score(x, top, low), "The optimum has the sco"),
-        (lambda x, top, low: x / top, "The baseline has to have the score 0"),
         (lambda x, top, low: (x - low) / top, "The optimum has to have the sc"),
         (lambda *all_: max(score(*all_), 0), "Who is worse than the baseline"),
         (lambda x, *_: (x + 20) / 100, "It is right for one optimum"),
     ],
     figures.check_gain: [
         (gain, "Right."),
-        (lambda r, a, e: r, "Where new and old probability are equal"),
-        (
-            lambda r, a, e: a * (1 if a > 0 else r),
-            "Within the bounds the gain is the ratio times the advantage.",
-        ),
         (lambda r, a, e: r * a, "Nothing is bounded"),
-        (
-            lambda r, a, e: max(r * a, np.clip(r, 1 - e, 1 + e) * a),
-            "A good action (advantage above",
-        ),
         (
             lambda r, a, e: np.clip(r, 1 - e, 1 + e) * a,
             "A good action that has become much less pr",
@@ -332,21 +296,15 @@ CASES = {
     ],
     figures.check_wins: [
         (wins, "Right."),
-        (lambda x, y: np.sum(x[:, None] > y), "A share lies between 0 and 1"),
         (lambda x, y: np.mean(x > y), "It depends on the order of the seeds."),
         (lambda x, y: np.mean(x[:, None] > y), "Two agents that always tie win"),
         (lambda x, y: wins(y, x), "It is the share that the second agent wins."),
-        (
-            lambda x, y: 0.5 + np.clip(x.mean() - y.mean(), -5, 5) / 10,
-            "How far a run is ahead must",
-        ),
         (
             lambda x, y: wins(x[: len(y)], y[: len(x)]),
             "It is right where both have the same number",
         ),
     ],
     policy_values: [
-        (..., "Not done yet."),
         ("many", "It has to be an array of numbers, one value for each state."),
         (np.ones(15), "The shape has to be (16,), one value for each state; it is (15,)."),
         (np.full(16, np.nan), "There are numbers in it that are not finite."),
@@ -356,11 +314,8 @@ CASES = {
     follows_the_best: [
         (q_target, "Right."),
         (lambda *_: None, "It cannot be called or gives no number"),
-        (lambda *_: "one", "It cannot be called or gives no number: could not"),
-        (lambda r, d, t, v: v[9], "It cannot be called or gives no number: index 9"),
         (lambda *_: float("nan"), "It gives a number that is not finite."),
         (lambda r, d, t, v: r + d * v.max(), "When the episode has terminated"),
-        (lambda r, d, t, v: r if t else r + v.max(), "With a discount of 0"),
         (lambda r, d, t, v: r, "If all next values rise by 1"),
         (lambda r, d, t, v: r if t else r + d * v.mean(), "If the best next value"),
     ],
@@ -373,7 +328,6 @@ CASES = {
     ],
     follows_the_mean: [
         (expected_target, "Right."),
-        (lambda *_, **__: float("nan"), "It gives a number that is not finite."),
         (best_left_out, "With epsilon 1 all actions are equally probable"),
         (
             lambda r, d, t, v, epsilon: r if t else r + d * v.mean(),
@@ -382,20 +336,15 @@ CASES = {
     ],
     regrets: [
         (np.cumsum([0.7, 0.0, 0.4, 0.7, 0.0]), "Right."),
-        (..., "Not done yet."),
-        (np.ones(3), "The shape has to be (5,)"),
         ([0.7, 0.0, 0.4, 0.7, 0.0], "Regret never falls, but yours does at pull 2."),
-        (np.cumsum([0.7, 0.1, 0.4, 0.7, 0.1]), "A pull of the best arm loses nothing"),
         (np.cumsum([1.0, 0.0, 0.4, 0.0, 0.0]), "Pulls of arm 0 add different amounts."),
         (np.cumsum([0.2, 0.0, 0.4, 0.2, 0.0]), "A pull of arm 0 adds the wrong amount"),
     ],
     means_of_returns: [
         (..., "Not done yet."),
-        (np.zeros(19), "The shape has to be (21,)"),
         (n_step_means(ZEROS, 1), "They look one step ahead only"),
         ((np.arange(21) - 10) / 10, "No estimate is in them any more"),
         (lambda_means(ZEROS, 0.8, lambda k: 0.8**k), "The weights have to sum up to 1"),
-        (lambda_means(ZEROS, 0.8, lambda k: 0.2 * 0.8 ** (k + 1)), "All weights are too small"),
         (n_step_means(ZEROS, 5), "The two sides"),
     ],
 }
@@ -491,8 +440,5 @@ def test_means_of_the_lambda_return():
         means[4] += 0.01
         said = traces.check_lambda_targets(WALK, decay, given, means)
         assert "places, most in state 4: yours is higher" in said
-
-
-def test_a_sum_that_ends_too_early_is_near():
     said = traces.check_lambda_targets(WALK, 0.8, ZEROS, lambda_means(ZEROS, 0.8, n=20))
     assert said.endswith("They are near: perhaps the sum ends too early.")

@@ -1,7 +1,6 @@
 import os
 import random
 import sys
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -15,8 +14,6 @@ import train
 import tune
 from commands import main, share
 from commands.cli import run_command
-from experiments import launching
-from pipeline.errors import UserError
 from pipeline.signs_of_life import Silence
 
 MAINS = {
@@ -25,6 +22,7 @@ MAINS = {
     "explain.py": explain.main,
     "shaping.py": shaping.main,
     "compare.py": compare.main,
+    "tune.py": tune.main,
 }
 COMMANDS = {name: partial(run_command, main) for name, main in MAINS.items()}
 COMMANDS |= {"pack": partial(run_command, share.pack), "yardstick": main}
@@ -53,6 +51,21 @@ def no_pictures_elsewhere(request, monkeypatch):
     """They take most of a short run."""
     if "pictures" not in request.fixturenames:
         monkeypatch.setattr("pipeline.training.draw", lambda *_: None)
+
+
+@pytest.fixture(scope="session")
+def train_in():
+    """Train inside a folder, without pictures."""
+
+    def do(folder, *words):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            patch.setattr("pipeline.training.draw", lambda *_: None)
+            patch.setattr("sys.argv", ["train.py", "--verbose", "0", "--seed", "0", *words])
+            assert train.main() == 0
+        return folder
+
+    return do
 
 
 @pytest.fixture
@@ -84,27 +97,3 @@ def type_study(own_folder, monkeypatch, capfd):
         return stop.value.code, captured.out, captured.err
 
     return run
-
-
-@pytest.fixture
-def power_cut(monkeypatch):
-    """Within the ``with`` statement the second batch of runs ends after the first of them."""
-    do_runs = launching.execute
-
-    @contextmanager
-    def cut():
-        calls = []
-
-        def stopped(runs, *args):
-            calls.append(len(runs))
-            if len(calls) == 2:
-                do_runs(runs[:1], *args)
-                raise UserError("the power is gone")
-            return do_runs(runs, *args)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(launching, "execute", stopped)
-            yield
-        assert len(calls) == 2
-
-    return cut

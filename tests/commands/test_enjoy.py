@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 from rich.text import Text
 
-import train
 from commands import enjoy
 from commands.enjoy import build_parser, figures_table, play
 from commands.terminal import TextConsole
@@ -28,17 +27,8 @@ QUICK = ["train.py", "--seed", "0", "-n", "100", "--eval-freq", "-1", "--verbose
 PLAY = ["enjoy.py", *LAKE, "--no-render"]
 
 
-def train_in(folder, *words):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setattr("pipeline.training.draw", lambda *_: None)  # it takes longest
-        patch.setattr("sys.argv", ["train.py", "--verbose", "0", "--seed", "0", *words])
-        assert train.main() == 0
-    return folder
-
-
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def trained(train_in, tmp_path_factory):
     words = ["-n", "100", "--eval-freq", "-1", "--save-freq", "40"]
     return train_in(tmp_path_factory.mktemp("lake"), *LAKE, *words)
 
@@ -69,8 +59,6 @@ def test_so_many_steps_or_so_many_episodes_in_silence_if_asked(type_command):
     assert both == lengths[:3]
     assert sum(episodes(type_command(*PLAY, "-n", "60")[1])) <= 60
     assert type_command(*PLAY, "--verbose", "0") == (0, "", "")
-    # Flags of rl_zoo3 that ask for what is always done.
-    assert type_command(*PLAY, "--custom-objects", "--deterministic") == usual
 
 
 @pytest.mark.usefixtures("lake")
@@ -91,7 +79,6 @@ RUN = "logs/random/FrozenLake-v1_1"
 @pytest.mark.parametrize(
     ("choice", "n_steps"),
     [
-        ([*LAKE, "--exp-id", "1"], 100),
         ([*LAKE, "--load-checkpoint", "40"], 40),
         ([*LAKE, "--load-last-checkpoint"], 80),
         ([*LAKE, "--load-best"], 40),  # a checkpoint in its place
@@ -114,7 +101,6 @@ def test_what_is_chosen_is_played_and_trained_further(type_command, lake, choice
 CHECKPOINTS = "holds no rl_model_50_steps.zip: there are checkpoints after 40, 80 steps"
 REFUSED = [
     ("--n-envs 2 --render ansi", "--render ansi shows one environment"),
-    ("--n-envs 2 --record film.gif", "--record shows one environment"),
     ("--fps 3 --render none", "--fps is the pace of --render ansi: give that too"),
     ("--vec-normalize x.pkl", "no such file of statistics: x.pkl"),
     ("--norm-reward", "--norm-reward: no statistics of VecNormalize belong to this model"),
@@ -203,7 +189,7 @@ ICE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 
 
 @pytest.fixture(scope="module")
-def walker(tmp_path_factory):
+def walker(train_in, tmp_path_factory):
     """An agent that walks straight to the goal, on ice that is not slippery."""
     folder = tmp_path_factory.mktemp("ice")
     train_in(folder, *ICE, "-n", "3000", "--env-kwargs", "is_slippery:False")

@@ -9,14 +9,19 @@ import pytest
 
 from report.documents import write_tables
 
-TRAIN = ("train.py", "--algo", "qlearning", "--env", "FrozenLake-v1", "-n", 3000, "--eval-freq", -1)
+PAIR = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
+
+
+@pytest.fixture(scope="module")
+def trained(train_in, tmp_path_factory):
+    words = ["-n", "3000", "--eval-freq", "-1", "--save-freq", "1000"]
+    return train_in(tmp_path_factory.mktemp("lake"), *PAIR, *words)
 
 
 @pytest.fixture
-def run(type_command):
+def run(type_command, trained, tmp_path):
     """A run of Q-learning that has not settled, with checkpoints."""
-    code, _, _ = type_command(*TRAIN, "--save-freq", 1000, "--verbose", 0)
-    assert code == 0
+    shutil.copytree(trained / "logs", tmp_path / "logs")
     return "logs/qlearning/FrozenLake-v1_1"
 
 
@@ -30,7 +35,7 @@ def test_a_run_is_explained_in_twelve_lines_and_as_json(type_command, run):
     assert {"name", "loss", "visits", "action", "best", "updates"} <= data["states"][0].keys()
     zipped = type_command("explain.py", f"{run}/FrozenLake-v1.zip")[1]
     assert zipped.splitlines()[1:] == out.splitlines()[1:]
-    found = type_command("explain.py", "--algo", "qlearning", "--env", "FrozenLake-v1")[1]
+    found = type_command("explain.py", *PAIR)[1]
     assert found.splitlines()[1:] == out.splitlines()[1:]
 
 
@@ -62,7 +67,7 @@ def test_checkpoints_show_the_course_and_two_agents_where_they_part(type_command
 
 
 def test_the_course_ends_with_the_agent_which_has_learnt_from_its_last_step(type_command):
-    type_command("train.py", *TRAIN[1:5], "-n", 1, "--save-freq", 1, "--verbose", 0)
+    type_command("train.py", *PAIR, "-n", 1, "--save-freq", 1, "--verbose", 0)
     found = {}
     for name in ("FrozenLake-v1.zip", "rl_model_1_steps.zip"):
         path = f"logs/qlearning/FrozenLake-v1_1/{name}"
@@ -75,7 +80,9 @@ def test_the_course_ends_with_the_agent_which_has_learnt_from_its_last_step(type
 
 def test_what_cannot_be_explained_is_refused_in_one_line(type_command, run):
     cart = "logs/random/CartPole-v1_1"
-    type_command("train.py", "--algo", "random", "--env", "CartPole-v1", "-n", 100)
+    type_command(
+        "train.py", "--algo", "random", "--env", "CartPole-v1", "-n", 100, "--eval-freq", -1
+    )
     for words, line in (
         (["--algo", "qlearning", "--env", "Taxi-v4"], "train one with"),
         ([run, "--test", "gama:0.9"], "gama"),

@@ -1,6 +1,7 @@
 """What ends a command from outside: signals, kills, environments that exit, folders that go."""
 
 import contextlib
+import functools
 import json
 import os
 import signal
@@ -12,7 +13,13 @@ from pathlib import Path
 
 import pytest
 
+import train
 from agents import load_algorithm
+from agents.compiled import engine as compiled
+from commands.cli import run_command
+from pipeline import files, preparation, stopping, training
+from pipeline.runs import Run
+from pipeline.state_saver import StateSaver
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,42 +31,74 @@ WORDS = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "600", "--seed",
 SECONDS = 10
 
 
-@pytest.fixture(scope="module")
-def server():
-    process = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("stopping_server.py"))],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        yield process
+def moments():
+    """What is called at each moment: its owner, its name, and on which of the calls."""
+    steps = iter(range(10**9))
+    return {
+        "set-up": (preparation, "make_evaluation_env", always),
+        "compiling": (compiled, "run_block", always),
+        "training": (StateSaver, "_on_step", lambda *_: next(steps) == 3),
+        "saving": (files, "put_in_place", lambda draft, path, *_: path.name == "FrozenLake-v1.zip"),
+        "judging": (training, "_judge", always),
+        "drawing": (training, "draw_learning_curve", always),
+        "recording": (Run, "end", always),
+    }
+
+
+def always(*_):
+    return True
+
+
+def signalling(owner, name, condition, signals):
+    """Let the function send the signals before it begins, the first time that it is its turn."""
+    function = getattr(owner, name)
+
+    @functools.wraps(function)
+    def send(*args, **kwargs):
+        if signals and condition(*args):
+            Path("signalled").write_text(str(time.monotonic()))
+            while signals:
+                signal.raise_signal(signal.Signals[signals.pop(0)])
+        return function(*args, **kwargs)
+
+    setattr(owner, name, send)
+
+
+def train_in_child(words, plan, ignored):
+    """Train, and send signals by moment; what a forked process does, which has all its modules."""
+    stopping.SECONDS_OF_ONE_REQUEST = 0.0  # here they are meant one by one
+    for number in stopping.SIGNALS:  # whatever the tests were started under
+        default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, signal.SIG_IGN if number.name in ignored else default)
+    for moment, place in moments().items():
+        if moment in plan:
+            signalling(*place, plan[moment].split())
+    sys.argv = ["train.py", *words]
+    code = 99
+    with Path("out").open("w") as sys.stdout, Path("err").open("w") as sys.stderr:
+        try:
+            run_command(train.main)
+        except SystemExit as stop:
+            code = stop.code
+    os._exit(code)
 
 
 @pytest.fixture
-def stopped(server, tmp_path):
-    """Do a command, with signals by moment; the exit code."""
-
-    def run(*words, ignored=(), **plan):
-        plan = {moment.replace("_", " "): names.split() for moment, names in plan.items()}
-        request = {"folder": str(tmp_path), "words": words, "plan": plan, "ignored": ignored}
-        server.stdin.write(json.dumps(request) + "\n")
-        server.stdin.flush()
-        answer = json.loads(server.stdout.readline())
-        (tmp_path / "signalled").unlink()
-        assert answer["seconds"] < SECONDS
-        return answer["code"]
-
-    return run
-
-
-@pytest.fixture
-def train_stopped(stopped, tmp_path):
+def train_stopped(tmp_path, monkeypatch):
     """Train, with signals by moment; exit code, the run's record or None, and the run folder."""
+    monkeypatch.chdir(tmp_path)
 
-    def run(*words, engine="interpreted", **options):
-        code = stopped("train.py", *WORDS, *words, "-params", f"engine:{engine}", **options)
+    def run(*words, engine="interpreted", ignored=(), **plan):
+        words = [*WORDS, *words, "-params", f"engine:{engine}"]
+        if not (child := os.fork()):
+            try:
+                train_in_child(words, plan, ignored)
+            finally:
+                os._exit(98)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        signalled = tmp_path / "signalled"
+        assert time.monotonic() - float(signalled.read_text()) < SECONDS
+        signalled.unlink()
         folder = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
         record = json.loads((folder / "run.json").read_text()) if folder.exists() else None
         for path in folder.rglob("*.zip"):
@@ -76,21 +115,15 @@ def holds(folder):
 
 # Signals by moment; how the process ends, and the state of the run, if one has begun.
 MOMENTS = [
-    ({"set-up": "SIGINT"}, 130, None),
-    ({"between": "SIGTERM"}, 143, None),
-    ({"before the first step": "SIGINT"}, 130, None),
+    ({"set-up": "SIGTERM"}, 143, None),
     ({"compiling": "SIGINT"}, 130, "interrupted"),
     ({"training": "SIGTERM"}, 143, "interrupted"),
-    ({"training": "SIGHUP"}, 129, "interrupted"),
-    ({"evaluating": "SIGINT"}, 130, "interrupted"),
     ({"saving": "SIGHUP"}, 129, "interrupted"),
     ({"judging": "SIGTERM"}, 143, "interrupted"),
     ({"drawing": "SIGINT"}, 130, "interrupted"),
     ({"recording": "SIGTERM"}, 0, "finished"),
-    ({"closing": "SIGTERM"}, 0, "finished"),
     # The second leaves out what can be.
     ({"training": "SIGINT SIGTERM"}, 130, "interrupted"),
-    ({"training": "SIGINT", "saving": "SIGTERM"}, 130, "interrupted"),
     ({"training": "SIGINT", "drawing": "SIGTERM"}, 130, "interrupted"),
     ({"saving": "SIGINT SIGINT SIGTERM"}, -signal.SIGTERM, "running"),  # the third ends it at once
 ]
@@ -101,6 +134,7 @@ MOMENTS = [
     MOMENTS,
     ids=[", ".join(f"{moment}: {names}" for moment, names in plan.items()) for plan, *_ in MOMENTS],
 )
+@pytest.mark.usefixtures("pictures")
 def test_how_a_training_ends_by_signals(train_stopped, tmp_path, plan, code, state):
     moment, *others = plan
     first, *more = plan[moment].split()
@@ -111,8 +145,7 @@ def test_how_a_training_ends_by_signals(train_stopped, tmp_path, plan, code, sta
     assert (found, record and record["state"]) == (code, state)
     if state is None:
         assert not (tmp_path / "logs").exists()
-        how = "interrupted" if code == 130 else f"ended by {first}"
-        assert (tmp_path / "err").read_text() == f"train.py: {how}\n"
+        assert (tmp_path / "err").read_text() == "train.py: ended by SIGTERM\n"
     elif state == "running":
         (draft,) = [name for name in holds(folder) if name.endswith(".tmp")]
         assert draft.startswith(".FrozenLake-v1.zip.")
@@ -137,113 +170,57 @@ def test_how_a_training_ends_by_signals(train_stopped, tmp_path, plan, code, sta
 def test_what_is_ignored_from_outside_stays_ignored(train_stopped):
     code, record, _ = train_stopped(ignored=["SIGHUP", "SIGINT"], training="SIGHUP SIGINT SIGHUP")
     assert (code, record["state"]) == (0, "finished")
-    # As in the background.
-    code, record, _ = train_stopped(ignored=["SIGINT"], training="SIGINT SIGTERM")
-    assert code == 143
-
-
-def test_a_comparison_by_a_log_ends_as_every_command(stopped, tmp_path):
-    (tmp_path / "log.csv").write_text("arm,reward,propensity\n0,1,0.5\n")
-    words = ("compare.py", "--logged", "log.csv", "--policy", "run")
-    assert stopped(*words, **{"reading a log": "SIGTERM"}) == 143
-    assert (tmp_path / "err").read_text() == "compare.py: ended by SIGTERM\n"
-
-
-# --- a sample of the campaigns of kills: nothing differs, and nothing is left -------------------
-
-
-def test_killed_commands_end_as_they_would_have(tmp_path):
-    script = ROOT / "benchmarks" / "fault_campaign.py"
-    # Networks take several times as long.
-    words = ["--kills", "1", "--jobs", "1", "--only", "qlearning on Warehouse-v0"]
-    paths = os.pathsep.join([str(ROOT), str(script.parent)])
-    result = subprocess.run(
-        [sys.executable, str(script), *words],
-        env={**os.environ, "PYTHONPATH": paths, "TMPDIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    *_, total, _ = result.stdout.splitlines()
-    cells = [cell.strip() for cell in total.split("│")[1:-1]]
-    assert cells[0] == "all"
-    assert int(cells[2]) >= 1  # signals that were sent
-    assert int(cells[7]) >= 1  # commands that came to their end
-    assert cells[8:] == ["0"] * 6
 
 
 # --- what an environment raises to end the program is its run's failure ------------------------
 
 LEAVING = """
-import gymnasium as gym
-
 import builtins
+
+import gymnasium as gym
 
 
 class Leaving(gym.Env):
     observation_space = gym.spaces.Discrete(4)
     action_space = gym.spaces.Discrete(2)
+    resets = 0
 
-    def __init__(self, where="step", kind="SystemExit", words=None, after=1, render_mode=None):
-        self.where, self.after, self.words, self.calls = where, after, words, 0
-        self.kind = getattr(builtins, kind)
-
-    def leave(self, where):
-        self.calls += where == self.where
-        if where == self.where and self.calls > self.after:
-            raise self.kind() if self.words is None else self.kind(self.words)
+    def __init__(self, at_reset=0, kind="SystemExit", words=(), render_mode=None):
+        self.at_reset, self.error = at_reset, getattr(builtins, kind)(*words)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.leave("reset")
+        self.resets += 1
+        if self.resets == self.at_reset:
+            raise self.error
         return 0, {}
 
     def step(self, action):
-        self.leave("step")
-        return int(self.np_random.integers(4)), 1.0, bool(self.np_random.random() < 0.2), False, {}
-
-    def close(self):
-        self.leave("close")
+        if not self.at_reset:
+            raise self.error
+        return 0, 1.0, bool(self.np_random.random() < 0.2), False, {}
 
 
 gym.register("Leaving-v0", Leaving, max_episode_steps=10)
 """
 
 
-@pytest.fixture
-def train_leaving(type_in_own_folder, own_folder, monkeypatch):
-    """Train on an environment that leaves; code, what is said, and the record if there is one."""
-    (own_folder / "leaving.py").write_text(LEAVING)
-
-    def train(*kwargs, algo="qlearning"):
-        code, _, said = type_in_own_folder(
-            *("train.py", "--env", "Leaving-v0", "--algo", algo, "-n", "300", "--verbose", "0"),
-            *("--gym-packages", "leaving.py", "--eval-freq", "100", "--env-kwargs", *kwargs),
-        )
-        record = own_folder / "logs" / algo / "Leaving-v0_1" / "run.json"
-        return code, said, json.loads(record.read_text()) if record.exists() else None
-
-    return train
-
-
-AT_RESET, AT_STEP = "where:'reset' after:20", "where:'step' after:0"
-
-
 @pytest.mark.parametrize(
-    ("kind", "words", "moment"),
+    ("kwargs", "line", "text"),
     [
-        ("SystemExit", "0", AT_STEP),
-        ("SystemExit", "'text'", AT_RESET),
-        ("KeyboardInterrupt", "", AT_STEP),
+        (["at_reset:20", "words:['bye']"], 19, "SystemExit: bye"),
+        (["kind:'KeyboardInterrupt'"], 24, "KeyboardInterrupt"),
     ],
 )
-def test_a_run_has_failed_and_says_where(train_leaving, kind, words, moment):
-    more = [f"words:{words}"] if words else []
-    code, said, record = train_leaving(*moment.split(), f"kind:'{kind}'", *more)
-    text = f"{kind}: {words}".replace("'", "").removesuffix(": ")
+def test_a_run_has_failed_and_says_where(type_in_own_folder, own_folder, kwargs, line, text):
+    (own_folder / "leaving.py").write_text(LEAVING)
+    code, _, said = type_in_own_folder(
+        *("train.py", "--env", "Leaving-v0", "--algo", "qlearning", "-n", "300", "--verbose", "0"),
+        *("--gym-packages", "leaving.py", "--eval-freq", "100", "--env-kwargs", *kwargs),
+    )
     assert (code, said.count("\n")) == (2, 1)
-    assert f"leaving.py:18: {text}, which ends no command" in said
+    assert f"leaving.py:{line}: {text}, which ends no command" in said
+    record = json.loads((own_folder / "logs/qlearning/Leaving-v0_1/run.json").read_text())
     assert record["state"] == "failed"
     assert text in record["reason"]
 
@@ -261,8 +238,8 @@ class Removing(gym.Env):
     observation_space = gym.spaces.Discrete(4)
     action_space = gym.spaces.Discrete(2)
 
-    def __init__(self, folder, by="removing", render_mode=None):
-        self.folder, self.by, self.steps = pathlib.Path(folder), by, 0
+    def __init__(self, folder, render_mode=None):
+        self.folder, self.steps = pathlib.Path(folder), 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -272,68 +249,43 @@ class Removing(gym.Env):
         self.steps += 1
         if self.steps == 500 and self.folder.exists():
             self.folder.rename(f"{self.folder}-elsewhere")
-            if self.by == "removing":
-                shutil.rmtree(f"{self.folder}-elsewhere")
+            shutil.rmtree(f"{self.folder}-elsewhere")
         return int(self.np_random.integers(4)), 1.0, bool(self.np_random.random() < 0.2), False, {}
 
 
 gym.register("Removing-v0", Removing, max_episode_steps=10)
 """
-TRAINING = ["train.py", "--algo", "qlearning", "-n", "100000000", "-f", "logs"]
-TUNE = [
-    "tune.py",
-    "--algo",
-    "qlearning",
-    "-n",
-    "100000000",
-    "--trials",
-    "2",
-    "-j",
-    "2",
-    "-f",
-    "logs",
-]
-COMPARE = ["compare.py", "study.yml", "--no-report", "-j", "2", "-f", "logs"]
-STUDY = """
-environments:
-  one: {{id: Removing-v0, n_timesteps: 100000000, env_kwargs: {{folder: {folder}, by: {by}}}}}
-agents: {{one: {{algo: qlearning}}}}
-seeds: 3
-"""
-COMMANDS = {
-    "a run": (TRAINING, "logs/qlearning/Removing-v0_1", "removing"),
-    "a search": (TUNE, "logs/Removing-v0_qlearning", "removing"),
-    "all studies": (COMPARE, "logs", "renaming"),
-}
-GONE = "this folder is gone: somebody has removed or renamed it"
+TRAIN = "train.py --algo qlearning"
+STUDY = "compare.py --algos qlearning --seeds 3 --no-report -j 2 --name study"
+GONE = "this folder is gone: somebody has removed or renamed it\n"
 
 
-def words_for(own_folder, words, folder, by):
+@pytest.fixture
+def words_for(own_folder):
     """The words of a command, in which an environment removes a folder."""
-    there = own_folder / folder
     (own_folder / "removing.py").write_text(REMOVING)
-    (own_folder / "study.yml").write_text(STUDY.format(folder=there, by=by))
-    settings = ["--env", "Removing-v0", "--env-kwargs", f"folder:'{there}'", f"by:'{by}'"]
-    return [*words, "--gym-packages", "removing", *([] if "study.yml" in words else settings)]
+
+    def words(command, folder):
+        there = ["--env-kwargs", f"folder:'{own_folder / folder}'"]
+        own = ["--env", "Removing-v0", "--gym-packages", "removing", *there]
+        return [*command.split(), "-n", "100000000", "-f", "logs", *own]
+
+    return words
 
 
-@pytest.mark.parametrize("what", COMMANDS)
-def test_a_folder_that_is_gone_ends_the_command(type_in_own_folder, own_folder, what):
-    words, folder, by = COMMANDS[what]
-    code, out, err = type_in_own_folder(*words_for(own_folder, words, folder, by))
-    assert (code, err.count("\n")) == (2, 1), err
-    assert err.startswith(f"{words[0]}: error: logs/")
-    assert err.endswith(f": {GONE}\n")
-    assert "another" not in out
+def test_a_folder_that_is_gone_ends_the_training(type_in_own_folder, words_for, own_folder):
+    folder = "logs/qlearning/Removing-v0_1"
+    code, _, err = type_in_own_folder(*words_for(TRAIN, folder))
+    assert (code, err) == (2, f"train.py: error: {folder}: {GONE}")
     assert not (own_folder / folder).exists()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
-def test_no_process_is_left_of_a_study_whose_folder_is_gone(own_folder):
-    words = words_for(own_folder, COMPARE, "logs/study", "removing")
-    command = [sys.executable, ROOT / words[0], *words[1:]]
+def test_no_process_is_left_of_a_study_whose_folder_is_gone(words_for, own_folder):
+    program, *words = words_for(STUDY, "logs/study")
+    command = [sys.executable, ROOT / program, *words]
     done = subprocess.run(command, check=False, timeout=120, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (2, f"compare.py: error: logs/study: {GONE}\n")
+    assert (done.returncode, done.stderr) == (2, f"compare.py: error: logs/study: {GONE}")
     deadline = time.monotonic() + 20
     while (left := processes_in(own_folder)) and time.monotonic() < deadline:
         time.sleep(0.1)

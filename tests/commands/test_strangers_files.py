@@ -93,18 +93,12 @@ def test_a_zip_is_played_trained_further_or_judged(type_in_own_folder, evil_zip,
         log_uniformly(env, 100, 0, own_folder / "log.csv")
     choice = ["--algo", "ppo", "--env", ENV]
     for words in (
-        ["enjoy.py", evil_zip, *PLAY],
         ["enjoy.py", evil_zip.parent, *PLAY],
         ["train.py", *choice, "-n", "8", "-i", evil_zip, "-params", "n_steps:8"],
         ["compare.py", "--logged", "log.csv", "--policy", evil_zip],
-        ["compare.py", "--logged", "log.csv", "--policy", evil_zip.parent],
     ):
         check_refused(type_in_own_folder(*words), mark, "ep_info_buffer", "posix.mkdir")
     assert not list((own_folder / "logs").rglob("run.json"))
-    (own_folder / "ppo").mkdir()
-    evil_zip.parent.rename(own_folder / "ppo" / f"{ENV}_1")
-    answer = type_in_own_folder("enjoy.py", "-f", own_folder, *choice, *PLAY)
-    check_refused(answer, mark, "ep_info_buffer", "posix.mkdir")
 
 
 # --- statistics and replay buffers ---------------------------------------------------------------
@@ -136,8 +130,6 @@ def test_a_replay_buffer_beside_the_agent(type_in_own_folder, own_folder, payloa
 
 ASKING = {
     "the environment's id": {"env_id": f"gift.extra:{ENV}"},
-    "a module of Python's": {"env_id": f"this:{ENV}"},
-    "modules that were imported then": {"gym_packages": ["gift.extra"]},
     "the folder, and a wrapper in it": {
         "gym_packages": ["gift"],
         "hyperparams": {"env_wrapper": "gift.extra.Wrapper"},
@@ -151,8 +143,7 @@ def test_a_run_asks_for_a_module(type_in_own_folder, own_folder, way):
     run = hand_written_run(own_folder / "gift", **ASKING[way])
     (run / "extra.py").write_text(MODULE)
     answer = type_in_own_folder("enjoy.py", run / f"{ENV}.zip", *PLAY)
-    assert not {"gift", "gift.extra", "this"} & sys.modules.keys()
-    assert "Beautiful" not in answer[1]
+    assert not {"gift", "gift.extra"} & sys.modules.keys()
     check_refused(answer, run / "mark", "--gym-packages")
 
 
@@ -172,19 +163,14 @@ def test_a_study_asks_for_a_module(type_in_own_folder, own_folder, name):
         assert name not in sys.modules
 
 
-ZOO = ("rl_zoo3/wrappers.py",)
+ZOO = ("rl_zoo3/wrappers.py", "rl_zoo3/__init__.py")
+INSTALLED = "one that says it is installed"
 STRANGERS = {
-    "a package": ("rl_zoo3.wrappers", (*ZOO, "rl_zoo3/__init__.py")),
-    "a package that lacks its __init__": ("rl_zoo3.wrappers", ZOO),
-    "one that says it is installed": (
-        "rl_zoo3.wrappers",
-        (*ZOO, "rl_zoo3/__init__.py", "rl_zoo3-2.9.2.dist-info/METADATA"),
-    ),
+    "a package": ("rl_zoo3.wrappers", ZOO),
+    INSTALLED: ("rl_zoo3.wrappers", (*ZOO, "rl_zoo3-2.9.2.dist-info/METADATA")),
     "a part of a library": ("stable_baselines3.extra", ("stable_baselines3/extra.py",)),
     "one of the same name as Python's": ("gymnasium.this", ("gymnasium/this.py",)),
 }
-
-
 ROADS = ("beside a typed module", "PYTHONPATH", "loaded by a typed one")
 
 
@@ -192,8 +178,10 @@ ROADS = ("beside a typed module", "PYTHONPATH", "loaded by a typed one")
 @pytest.mark.parametrize(
     ("way", "road"),
     [
-        *zip(STRANGERS, (*ROADS, *ROADS), strict=False),
-        *(("one that says it is installed", road) for road in ROADS[:2]),
+        ("a package", "PYTHONPATH"),
+        *((INSTALLED, road) for road in ROADS),
+        ("a part of a library", "beside a typed module"),
+        ("one of the same name as Python's", "PYTHONPATH"),
     ],
 )
 def test_settings_name_a_class_of_a_strangers(
@@ -205,23 +193,21 @@ def test_settings_name_a_class_of_a_strangers(
         path = own_folder / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("import gymnasium\nclass Stray(gymnasium.Wrapper): pass\n" + MODULE)
-    if "says" in way:
+    if way == INSTALLED:
         record = "".join(f"{name},,\n" for name in files)
         (own_folder / "rl_zoo3-2.9.2.dist-info" / "RECORD").write_text(record)
         metadata = "Metadata-Version: 2.1\nName: rl_zoo3\nVersion: 2.9.2\n"
         (own_folder / "rl_zoo3-2.9.2.dist-info" / "METADATA").write_text(metadata)
-    (own_folder / "mine.py").write_text("x = 1\n")
+    mine = "x = 1\n"
     if road == "PYTHONPATH":
         monkeypatch.setattr(sys, "path", [str(own_folder), *sys.path])
     elif road == "loaded by a typed one":
-        text = f"try:\n    import {module}\nexcept ImportError:\n    pass\n"
-        (own_folder / "mine.py").write_text(text)
+        mine = f"try:\n    import {module}\nexcept ImportError:\n    pass\n"
+    (own_folder / "mine.py").write_text(mine)
     settings = f"CartPole-v1:\n  n_timesteps: 8\n  env_wrapper: {module}.Stray\n"
     (own_folder / "settings.yml").write_text(settings)
     words = ["--algo", "random", "--env", "CartPole-v1", "--conf-file", "settings.yml"]
-    code, _, err = type_in_own_folder("train.py", *words, "--gym-packages", "mine")
-    assert (code, err.count("\n")) == (2, 1), err
-    assert f"env_wrapper: {module}.Stray: " in err
+    answer = type_in_own_folder("train.py", *words, "--gym-packages", "mine")
+    check_refused(answer, own_folder / "logs", f"env_wrapper: {module}.Stray: ")
     if road != "loaded by a typed one":
         assert not list(own_folder.rglob("mark"))
-    assert not (own_folder / "logs").exists()
