@@ -12,8 +12,6 @@ import pytest
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from agents import ALGORITHMS, load_algorithm
 from agents.common.model_files import JsonAlgorithm
@@ -161,21 +159,6 @@ def test_predict_takes_one_observation_or_many_and_arguments_have_names(name):
 
 
 # --- the library's services ----------------------------------------------------------------------
-
-
-def test_training_under_other_vec_envs():
-    name, env_id = "sarsa", LAKE
-    forks = {"start_method": "fork"}  # they would import for seconds
-    env = make_vec_env(env_id, 2, 5, vec_env_cls=SubprocVecEnv, vec_env_kwargs=forks)
-    parallel = make(name, env).learn(200)
-    env.close()
-    alone = make(name, environment(env_id, 2, 5)).learn(200)
-    for key, part in alone.policy.state_dict().items():
-        assert th.equal(part, parallel.policy.state_dict()[key])
-    assert parallel.rng.bit_generator.state == alone.rng.bit_generator.state
-    bare = DummyVecEnv([lambda: gym.make(env_id).unwrapped])  # no Monitor
-    for other in (VecNormalize(environment(env_id, 2), norm_obs=False), bare):
-        assert make(name, other).learn(100).num_timesteps == 100
 
 
 def test_another_environment_is_begun_anew_and_a_loaded_agent_can_go_on_in_an_episode(tmp_path):

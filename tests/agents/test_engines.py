@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.wrappers import ClipReward, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -220,10 +219,8 @@ CHANGES = {
     "gamma": put(gamma=0.3),
     "sample averages": put(learning_rate="sample_average"),
     "epsilon": put(exploration_schedule=FloatSchedule(0.9)),
-    "ties": put(tie_breaking="first"),
     "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
     "environment's generator": seed_the_environment_anew,
-    "zeros in the tables": lambda model: model.policy.q_tables.zero_(),
     "zeros that are loaded": put_zeros,
     "tables of the same values": replace_by_loading,
 }
@@ -264,10 +261,8 @@ def wrapped(wrapper, **attributes):
 HALVES = [0.5, 0.5]
 BY_HAND = {  # a world, and what is done to it between two trainings
     "an outcome in place": lake_of(lambda env: env.P[0][2].__setitem__(1, (1 / 3, 5, 0.5, True))),
-    "a model": lake_of(lambda env: setattr(env, "P", FrozenLakeEnv(is_slippery=False).P)),
     "a start": lake_of(lambda env: env.initial_state_distrib.__setitem__(slice(2), HALVES)),
     "a tile": house_of(lambda house: house.tiles.update({ord("#"): Tile(-7, blocked=True)})),
-    "the edge": house_of(lambda house: setattr(house, "edge", Tile(-3, blocked=True))),
     "a scale": wrapped(partial(ScaleReward, scale=2.0), scale=3.0),
     "the last reward": wrapped(partial(TerminationReward, reward=-1.0), last_reward=-2.0),
     "the time limit": wrapped(partial(TimeLimit), _max_episode_steps=7),

@@ -165,15 +165,10 @@ def test_compiled_says_why_not_and_auto_falls_back(reason):
     assert model.num_timesteps >= 30
 
 
-@pytest.mark.parametrize("at_end", [False, True])
-@pytest.mark.parametrize("name", ["dqn", "ppo"])
+@pytest.mark.parametrize(("name", "at_end"), [("dqn", False), ("dqn", True), ("ppo", False)])
 def test_states_that_networks_have_no_weights_for_are_refused(name, at_end):
     """Compiled code would read whatever lies behind the weights."""
     model = made(name, Any(spaces.Discrete(3), shown=3, ends=float(at_end)), engine="compiled")
-    if name == "ppo" and at_end:
-        model.learn(100)  # nobody looks at what an episode has ended with
-        assert model.num_timesteps >= 100
-        return
     with pytest.raises(ValueError, match=r"observation 3 is not in Discrete\(3\)"):
         model.learn(100)
 

@@ -405,35 +405,18 @@ def take(optimizer_class):
     return change
 
 
-def load_other_weights(model):
-    weights = {name: value * 0.5 for name, value in model.policy.state_dict().items()}
-    model.policy.load_state_dict(weights)
-
-
 def put(**attributes):
     return lambda model: vars(model).update(attributes)
-
-
-def change_the_optimizer(model):
-    model.policy.optimizer.param_groups[0].update(weight_decay=0.3, betas=(0.5, 0.7))
-
-
-def seed_the_environment_anew(model):
-    model.env.envs[0].unwrapped.np_random = np.random.default_rng(3)
 
 
 CHANGES = {
     "optimizer's state": load_another_optimizer_state,
     "weights in place": weigh(0.7),
     "another optimizer": take(th.optim.RMSprop),
-    "optimizer's settings": change_the_optimizer,
     "all parameters": lambda model: model.set_parameters(model.get_parameters()),
     "gamma": put(gamma=0.3),
-    "norm": put(max_grad_norm=0.01),
     "rate": put(lr_schedule=FloatSchedule(0.03)),
     "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
-    "environment's generator": seed_the_environment_anew,
-    "weights": load_other_weights,
     "clipping": put(clip_range=FloatSchedule(0.01)),
 }
 
