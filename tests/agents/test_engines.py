@@ -70,13 +70,11 @@ def both_shaped(env):
 
 
 def rows():
-    """Each agent as the contract has it; one agent in every other world, under wrappers, masks."""
-    numbers, places = itertools.cycle((1, 3, 8)), iter(WORLDS)
+    """Each agent as the contract has it, in one of the worlds; and wrappers, vectors, masks."""
+    numbers, places = itertools.cycle((1, 3, 8)), itertools.cycle(WORLDS)
     for name in TABULAR:
         place = next(places)
         yield f"{name} {place}", name, WORLDS[place], next(numbers), AGENTS[name][1]
-    for place in places:
-        yield f"qlearning {place}", "qlearning", WORLDS[place], next(numbers), {}
     for name in TILED:
         env_id, settings = AGENTS[name]
         yield f"{name} {env_id}", name, (env_id, {}), 2, settings
