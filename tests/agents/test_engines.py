@@ -1,7 +1,6 @@
 """The compiled loop ends in the same bits as the interpreted one: agents, worlds, settings."""
 
 import copy
-import gc
 import itertools
 from functools import partial
 from typing import NamedTuple
@@ -10,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.wrappers import ClipReward, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.utils import FloatSchedule
 
@@ -72,34 +70,30 @@ def both_shaped(env):
 
 
 def rows():
-    """Each agent as the contract has it, as it is by itself, and among masks; and wrappers."""
+    """Each agent as the contract has it, in one of the worlds; and wrappers, vectors, masks."""
     numbers, places = itertools.cycle((1, 3, 8)), itertools.cycle(WORLDS)
-    for i, name in enumerate([*TABULAR, *TABULAR]):
-        place, settings = next(places), AGENTS[name][1] if i < len(TABULAR) else {}
-        yield f"{name} {place}", name, WORLDS[place], next(numbers), settings
+    for name in TABULAR:
+        place = next(places)
+        yield f"{name} {place}", name, WORLDS[place], next(numbers), AGENTS[name][1]
     for name in TILED:
         env_id, settings = AGENTS[name]
         yield f"{name} {env_id}", name, (env_id, {}), 2, settings
     for wrapper in (both_shaped, FlattenToDiscrete, PassiveEnvChecker):
         slippery = HOUSE, {**SLIPPERY, "wrapper": wrapper}
         yield f"under {wrapper.__name__}", "sarsa", slippery, 2, {"learning_rate": 0.3}
-    for name in ("qlearning", "sarsa"):
-        yield f"{name} CartPole", name, ("CartPole-v1", {"wrapper": IN_BINS}), 2, LESS
-    masked = {"mask_actions": True}
-    tiny = HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}
-    still = LAKE, {"wrapper": IdleActionMasks, "is_slippery": False}
-    taxis = ("Taxi-v4", {}), ("Taxi-v4", {"wrapper": ActionMasks})
-    for i, name in enumerate(TABULAR):
-        place = (*taxis, tiny, still)[i % 4]
-        yield f"{name} masked", name, place, 1 + i % 3, masked
-    for kind, explores in (("noise", NOISE), ("boltzmann", COOLING)):
-        yield f"{kind} masked", "sarsa", tiny, 1, {**masked, **explores, "initial_q_std": 5.0}
-    for name in ("semi_gradient_sarsa", "actor_critic"):
-        yield f"{name} lake", name, WORLDS["lake"], 2, {"gamma": 0.9, **LESS}
-    yield "tiles CartPole", "semi_gradient_q", ("CartPole-v1", {}), 1, {**SWING, **LESS}
+    yield "bins of CartPole", "qlearning", ("CartPole-v1", {"wrapper": IN_BINS}), 2, LESS
+    yield "tiles of CartPole", "semi_gradient_q", ("CartPole-v1", {}), 1, {**SWING, **LESS}
     # Episodes of 82 steps, more than there is room for at first.
     left_at_first = {"initial_preferences": [1.47, -1.47], "learning_rate": 0.002}
     yield "reinforce", "reinforce", ("ShortCorridor-v0", {}), 2, left_at_first
+    # That all agents keep to masks is seen in test_masks.py, where steps are interpreted.
+    masked = {"mask_actions": True}
+    tiny = HOUSE, {"desc": ["S.", "#G"], "max_episode_steps": 5}
+    still = LAKE, {"wrapper": IdleActionMasks, "is_slippery": False}
+    noise = {**masked, **NOISE, "initial_q_std": 5.0}
+    yield "noise masked", "sarsa", tiny, 1, noise
+    yield "boltzmann masked", "sarsa", still, 3, {**masked, **COOLING}
+    yield "masked", "dyna_q_plus", ("Taxi-v4", {"wrapper": ActionMasks}), 2, masked
 
 
 ROWS = {row[0]: row[1:] for row in rows()}
@@ -130,7 +124,7 @@ def test_same_bits_also_where_engines_take_turns(row, tmp_path):
         model = in_world(name, place, n_envs, folder, **settings)
         for engine in engines:  # neither call ends where an episode does
             model.engine = engine
-            model.learn(701, reset_num_timesteps=False)
+            model.learn(501, reset_num_timesteps=False)
             assert model.engine_in_use.startswith(engine)
         model.env.close()
         lines = [path.read_text().splitlines()[1:] for path in sorted(folder.glob("*.csv"))]
@@ -147,12 +141,9 @@ def test_same_bits_also_where_engines_take_turns(row, tmp_path):
         assert not model.policy.visit_counts.numpy()[:, masked].any()
 
 
-@pytest.mark.parametrize(
-    ("tiled", "name"), [("semi_gradient_sarsa", "sarsa"), ("semi_gradient_q", "qlearning")]
-)
-def test_tiles_of_numbers_are_the_table_to_the_bit(tiled, name):
+def test_tiles_of_numbers_are_the_table_to_the_bit():
     models = []
-    for each in (tiled, name):
+    for each in ("semi_gradient_q", "qlearning"):
         model = in_world(each, WORLDS["lake"], 3, gamma=0.97, learning_rate=0.3)
         model.set_random_seed(1)  # the table has drawn its first entries
         models.append(model.learn(4000))
@@ -193,7 +184,6 @@ class Change(BlockCallback):
     def _on_step(self):
         if self.n_calls == 500:
             self.change(self.model)
-            gc.collect()  # nobody else keeps what was replaced
         return True
 
 
@@ -227,10 +217,8 @@ CHANGES = {
     "gamma": put(gamma=0.3),
     "sample averages": put(learning_rate="sample_average"),
     "epsilon": put(exploration_schedule=FloatSchedule(0.9)),
-    "ties": put(tie_breaking="first"),
     "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
     "environment's generator": seed_the_environment_anew,
-    "zeros in the tables": lambda model: model.policy.q_tables.zero_(),
     "zeros that are loaded": put_zeros,
     "tables of the same values": replace_by_loading,
 }
@@ -271,10 +259,8 @@ def wrapped(wrapper, **attributes):
 HALVES = [0.5, 0.5]
 BY_HAND = {  # a world, and what is done to it between two trainings
     "an outcome in place": lake_of(lambda env: env.P[0][2].__setitem__(1, (1 / 3, 5, 0.5, True))),
-    "a model": lake_of(lambda env: setattr(env, "P", FrozenLakeEnv(is_slippery=False).P)),
     "a start": lake_of(lambda env: env.initial_state_distrib.__setitem__(slice(2), HALVES)),
     "a tile": house_of(lambda house: house.tiles.update({ord("#"): Tile(-7, blocked=True)})),
-    "the edge": house_of(lambda house: setattr(house, "edge", Tile(-3, blocked=True))),
     "a scale": wrapped(partial(ScaleReward, scale=2.0), scale=3.0),
     "the last reward": wrapped(partial(TerminationReward, reward=-1.0), last_reward=-2.0),
     "the time limit": wrapped(partial(TimeLimit), _max_episode_steps=7),
@@ -346,14 +332,10 @@ def misshape(model):
     model._memory = Footprints(np.zeros((1, 16), dtype=np.int64))
 
 
-@pytest.mark.parametrize("change", [None, forget])
-def test_both_loops_work_on_a_memory_in_place(change, tmp_path):
-    models = assert_engines_agree(
-        walker, lambda model: model.learn(2000, callback=change and Change(change))
-    )
+def test_both_loops_work_on_a_memory_in_place(tmp_path):
+    models = assert_engines_agree(walker, lambda m: m.learn(1200, callback=Change(forget)))
     # The step on which a callback acts is learnt from after it.
-    share = 1000 if change is None else 501
-    assert models[1]._memory.visits.sum(axis=1).tolist() == [share, share]
+    assert models[1]._memory.visits.sum(axis=1).tolist() == [101, 101]
     # Another training begins with nothing, as does what was loaded; one that goes on keeps it.
     assert models[1].learn(200)._memory.visits.sum() == 200
     assert models[1].learn(200, reset_num_timesteps=False)._memory.visits.sum() == 400
@@ -362,4 +344,4 @@ def test_both_loops_work_on_a_memory_in_place(change, tmp_path):
     assert loaded._memory.visits.tolist() == np.zeros((3, 16)).tolist()
     for model in models:
         with pytest.raises(ValueError, match=r"must be of shape \(2, 16\) and int64, not \("):
-            model.learn(2000, callback=Change(misshape))
+            model.learn(1200, callback=Change(misshape))

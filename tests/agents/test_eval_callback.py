@@ -2,15 +2,11 @@
 
 from functools import partial
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.wrappers import TransformReward
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    EvalCallback,
-)
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -24,7 +20,7 @@ LAKE, WAREHOUSE, CART = "FrozenLake-v1", "envs:Warehouse-v0", "CartPole-v1"
 WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}
 IN_BINS = partial(DiscretizeObservation, bins=[1, 6, 12, 6], **WIDTHS)
 NETWORK = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}
-STEPS = 1200
+STEPS = 800
 
 
 class LibraryEvaluation(EvalCallback):
@@ -103,11 +99,9 @@ def found(algo, env_id, engine, folder, kind=EvalCallback, wrapper=None, n_envs=
 
 RANDOMLY = {"deterministic": False}
 TABLES = [
-    ("qlearning", LAKE, None, {}, 1),
-    ("qlearning", LAKE, None, RANDOMLY, 3),
+    ("qlearning", LAKE, None, {**RANDOMLY, "exploration": "gaussian_noise"}, 3),
     ("double_qlearning", WAREHOUSE, None, {**RANDOMLY, "tie_breaking": "first"}, 2),
-    ("sarsa", CART, IN_BINS, {}, 3),
-    ("dyna_q", LAKE, None, {**RANDOMLY, "exploration": "gaussian_noise"}, 1),
+    ("qlearning", CART, IN_BINS, {}, 1),
     ("semi_gradient_sarsa", "MountainCar-v0", None, {}, 2),
 ]
 
@@ -132,9 +126,7 @@ def test_tables_find_what_is_found_in_python(
     ("algo", "env_id", "settings"),
     [
         ("ppo", CART, {"n_steps": 64}),
-        ("ppo", WAREHOUSE, {"n_steps": 64}),
         ("dqn", LAKE, {}),
-        ("dqn", CART, {"learning_starts": 10}),
     ],
 )
 def test_networks_find_what_the_library_finds(algo, env_id, settings, tmp_path, python_steps):
@@ -167,25 +159,6 @@ def test_what_rounding_could_decide_is_asked_of_pytorch(tmp_path, python_steps):
     assert len(set(library[0])) > 1
     python_steps.clear()
     assert run(EvalCallback, tmp_path / "b") == library
-    assert not python_steps
-
-
-def test_environments_without_monitor_are_counted_as_the_library_counts(tmp_path, python_steps):
-    results, told = [], []
-    for engine in ("interpreted", "compiled"):
-        python_steps.clear()
-        model = load_algorithm("qlearning")(env=make_vec_env(LAKE, 1), seed=0, engine=engine)
-        env = gym.make(LAKE)
-        env.reset(seed=5)
-        callback = EvalCallback(env, eval_freq=100, log_path=str(tmp_path / engine))
-        model.env.seed(0)
-        with pytest.warns(UserWarning, match="Monitor") as caught:
-            model.learn(400, callback=callback)
-        told.append([(str(w.message), w.category) for w in caught if "Monitor" in str(w.message)])
-        results.append((callback.evaluations_results, callback.evaluations_length))
-    assert results[1] == results[0]
-    assert told[1] == told[0]
-    assert len(told[0]) == 4
     assert not python_steps
 
 

@@ -87,8 +87,8 @@ def agent_of(values, **arguments):
 
 
 # Four states and four actions above all: there, a row mistaken for a column raises no error.
-@pytest.mark.parametrize("shape", [(4, 4), (3, 5), (1, 3), (3, 1)])
-@pytest.mark.parametrize("rate", [0.2, 1.0, 5.0])
+@pytest.mark.parametrize("shape", [(4, 4), (3, 1)])
+@pytest.mark.parametrize("rate", [0.2, 5.0])
 def test_probabilities_row_by_row(shape, rate):
     """Values without ties, whose rows have their best in different places; and large ones."""
     values = np.random.default_rng(3).normal(size=shape) + 1e5 * np.arange(shape[0])[:, None]

@@ -135,9 +135,7 @@ def test_cliff_walking_as_in_the_book():
 # Step size, discount, epsilon; mean returns of episodes 1-100, 200-300 and the last 100.
 COURSEWORK = [
     (0.1, 0.9, 0.1, (-61, 4), (76.2, 0.7), (76.5, 0.5)),
-    (0.9, 0.9, 0.1, (51.0, 3), (76.4, 0.7), (76.4, 0.7)),
     (0.01, 0.9, 0.1, (-393, 15), (-81.5, 8), (48.2, 4)),
-    (0.1, 0.9, 0.9, (-256, 15), (-149, 10), (-146, 10)),
     (0.1, 0.1, 0.1, (-291, 60), (-985, 25), (-975, 40)),
 ]
 
@@ -171,7 +169,7 @@ def test_it_finds_what_epsilon_greedy_never_sees(env_id, kwargs, bound):
         assert worth(greedy, env_id, kwargs)[0] < 0.04 * optimum
 
 
-@pytest.mark.parametrize("env_id", ["DynaMaze-v0", "WindyGridworld-v0", "DeepSea-v0"])
+@pytest.mark.parametrize("env_id", ["DynaMaze-v0", "DeepSea-v0"])
 def test_one_try_is_enough_where_nothing_is_random(env_id):
     """Each episode on which R-max is not optimal makes a pair known: no more episodes than pairs.
 

@@ -73,7 +73,7 @@ def test_squared_loss_by_hand(discounts, loss):
 )  # fmt: skip
 def test_where_it_is_dqn_to_the_bit(algorithm, env_id, settings, is_same):
     arguments = {**SETTINGS, "exploration_fraction": 1, **settings}
-    models = [each("MlpPolicy", env_id, **arguments).learn(600) for each in (DQN, algorithm)]
+    models = [each("MlpPolicy", env_id, **arguments).learn(250) for each in (DQN, algorithm)]
     weights = [parameters_to_vector(model.q_net.parameters()) for model in models]
     assert th.equal(*weights) == is_same
 
@@ -170,7 +170,7 @@ def test_the_search_itself_is_the_librarys():
 
 # --- agents that do not learn --------------------------------------------------------------------
 
-N = 20_000
+N = 5000
 
 
 class Still(gym.Env):
@@ -220,6 +220,6 @@ def test_random_actions_are_uniform_independent_and_follow_the_seed(kind):
 def test_the_cart_is_pushed_to_where_the_pole_leans():
     agent = AngleAgent("AnglePolicy", "CartPole-v1")
     # Whatever the position and the velocities say.
-    for angle, others in itertools.product((-0.2, -1e-6, 0.0, 1e-6, 0.2), (-2.0, 0.0, 2.0)):
+    for angle, others in itertools.product((-0.2, -1e-6, 0.0, 1e-6, 0.2), (-2.0, 2.0)):
         action, _ = agent.predict(np.array([others, others, angle, others], np.float32))
         assert action == (1 if angle > 0 else 0)

@@ -106,16 +106,12 @@ def test_what_is_observed_and_which_bounds_it_has():
     ("settings", "message"),
     [
         ({}, "dimension 1 of the observations has no bounds: give low and high, a number or 2 of"),
-        ({"low": -1}, "dimension 1 of the observations has no bounds: give low and high"),
         ({"low": -1, "high": [1, 2, 3]}, r"high must be a number or 2 numbers, not \[1, 2, 3\]"),
         ({"low": 1, "high": [2, 1]}, r"low must be below high, not 1 and 1 \(dimension 1\)"),
         ({"low": "a", "high": 1}, "low must be finite numbers, not 'a'"),
         ({"low": math.nan, "high": 1}, "low must be finite numbers, not nan"),
-        ({"low": True, "high": 1}, "low must be finite numbers, not True"),
         ({"low": -1, "high": 1, "n_tiles": 0}, "n_tiles must be from 1 to 20,000,000, not 0"),
-        ({"low": -1, "high": 1, "n_tiles": [8]}, r"n_tiles must be a number or 2 numbers"),
         ({"low": -1, "high": 1, "n_tilings": 2.5}, "n_tilings must be whole numbers, not 2.5"),
-        ({"low": -1, "high": 1, "n_tilings": [4]}, r"n_tilings must be whole numbers, not \[4\]"),
         ({"low": -1, "high": 1, "n_tilings": True}, "n_tilings must be whole numbers, not True"),
         ({"low": -1, "high": 1, "n_tiles": 3000}, r"make 216,144,024 weights for 3 actions, more"),
         ({"low": -1, "high": 1, "n_tiles": 10**9}, f"n_tiles must be from 1 to {MOST_WEIGHTS:,}"),
@@ -329,7 +325,6 @@ def test_values_and_preferences_begin_where_they_are_told_to():
 
 CHANCE = {"initial_preferences": [1.47, -1.47]}
 CORRIDOR = [  # within a tenth of the best, -11.66; bootstrapping fails, as all states look alike
-    ("reinforce", {**CHANCE, "learning_rate": 2**-11}, True),
     ("reinforce", {**CHANCE, "learning_rate": 2**-9, "baseline": "value",
                    "value_step_size": 2**-6}, True),
     ("actor_critic", {"learning_rate": 2**-6, "value_step_size": 2**-4}, False),

@@ -67,11 +67,9 @@ HILLS = {"force": 0.002, "gravity": 0.003, "max_speed": 0.05, "goal_position": 0
 HILLS |= {"min_position": -1.1, "max_position": 0.5}
 SEMI_IMPLICIT = {"kinematics_integrator": "semi-implicit euler"}
 PHYSICS = {
-    "pole": (pole, swing_each, CART_POLE_ENV, STATE),
     "semi-implicit pole": (
         lambda: altered(pole(), **SEMI_IMPLICIT), swing_each, CART_POLE_ENV, STATE),
     "pole on the moon": (lambda: altered(pole(), **MOON), swing_each, CART_POLE_ENV, STATE),
-    "car": (MountainCarEnv, drive_each, MOUNTAIN_CAR_ENV, CAR_STATE),
     "stopping car": (
         lambda: MountainCarEnv(goal_velocity=0.03), drive_each, MOUNTAIN_CAR_ENV, CAR_STATE),
     "car in hills": (
@@ -97,9 +95,9 @@ def records_of(kind, names, states):
 def test_steps_equal_gymnasiums(case):
     make, step_each, kind, names = PHYSICS[case]
     env, rng = make(), np.random.default_rng(0)
-    states = random_states(20_000)
+    states = random_states(8000)
     if kind is MOUNTAIN_CAR_ENV:
-        states = rng.uniform([-1.1, -0.05], [0.5, 0.05], (20_000, 2))
+        states = rng.uniform([-1.1, -0.05], [0.5, 0.05], (8000, 2))
         states[::5, 0] = rng.uniform(-1.1, -1.08, len(states[::5]))  # against the wall
         states[1::5, 0] = rng.uniform(0.35, 0.5, len(states[1::5]))  # before the flag
     records = records_of(kind, names, states)
@@ -120,7 +118,6 @@ def test_steps_equal_gymnasiums(case):
 BINNED = [
     {"bins": 50, "low": [-0.41887903, -0.87266463], "high": [0.41887903, 0.87266463]},
     {"bins": [10, 3], "low": -0.1, "high": [0.3, 0.7]},
-    {"bins": 1, "low": -1, "high": 1},
 ]
 
 
@@ -179,7 +176,7 @@ def test_sums_by_either_rule_and_as_this_python_does(values):
 
 # --- generators ----------------------------------------------------------------------------------
 
-KINDS = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox)
+KINDS = (np.random.PCG64, np.random.MT19937)
 
 
 @kernel

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv
 from torch import nn
 
 import envs  # noqa: F401  # registers the environments
@@ -77,29 +77,22 @@ BRIDGED = "compiled but for the environment: "
 AUTO = {"engine": "auto"}
 PLANS = [
     # agent, settings, environment, callback, budget, what is chosen
-    *((name, {}, lake, None, LONG, "library") for name in ("ppo", "dqn", "a2c")),
-    *((name, {}, lake, None, LONG, "compiled") for name in ("double_dqn", "deep_qlearning")),
+    ("ppo", {}, lake, None, LONG, "library"),
+    ("deep_qlearning", {}, lake, None, LONG, "compiled"),
     ("double_dqn", {"engine": "library"}, lake, None, LONG, "library"),
     ("dqn", AUTO, lake, None, LONG, "compiled"),
     *((name, AUTO, lake, None, FEW, TOO_SHORT) for name in ("dqn", "a2c")),
     ("ppo", {**AUTO, "n_steps": 128}, lake, None, FEW, TOO_SHORT),
     # A rollout is collected to its end, which here takes 16,384 steps.
     ("ppo", AUTO, lake, None, FEW, "compiled"),
-    ("double_dqn", {}, pole, None, FEW, TOO_SHORT),
     ("double_dqn", {"engine": "compiled"}, lake, None, 1, "compiled"),
     # Not the steps count, but what is learnt from them.
     ("dqn", {**AUTO, "learning_starts": LONG}, pole, None, 10_000, TOO_SHORT),
     ("dqn", {**AUTO, "train_freq": 1}, pole, None, 10_000, "compiled"),
     ("ppo", {**AUTO, "n_epochs": 40}, lake, None, 12_000, "compiled"),
-    # Callbacks and environments move the environment to Python, and never the engine.
+    # Callbacks move the environment to Python, and never the engine.
     ("double_dqn", {}, lake, Sparse, LONG, "compiled"),
-    ("double_dqn", {}, lake, lambda: EvalCallback(lake()), LONG, "compiled"),
     ("double_dqn", {}, lake, Plain, LONG, f"{BRIDGED}Plain must be asked after each step"),
-    ("double_dqn", {}, lake, Plain, FEW, TOO_SHORT),
-    ("double_dqn", {}, lambda: gym.make("Acrobot-v1"), None, LONG,
-     f"{BRIDGED}the environment's transition model is not known"),
-    ("ppo", AUTO, lambda: VecNormalize(lake(), norm_obs=False), None, LONG,
-     f"{BRIDGED}VecNormalize is not DummyVecEnv"),
     ("double_dqn", {}, lake, lambda: [EpisodeBudget(10)], EPISODES, TOO_SHORT),
     ("double_dqn", {}, lake, lambda: EpisodeBudget(10_000), EPISODES, "compiled"),
 ]  # fmt: skip
@@ -108,7 +101,6 @@ PLANS = [
 @pytest.mark.parametrize("case", range(len(PLANS)))
 def test_which_engine_trains(case):
     name, settings, env, callback, budget, chosen = PLANS[case]
-
     model = made(name, env(), **settings)
     assert str(model.engine_plan(budget, callback and callback())) == chosen
 
@@ -173,15 +165,10 @@ def test_compiled_says_why_not_and_auto_falls_back(reason):
     assert model.num_timesteps >= 30
 
 
-@pytest.mark.parametrize("at_end", [False, True])
-@pytest.mark.parametrize("name", ["dqn", "ppo"])
+@pytest.mark.parametrize(("name", "at_end"), [("dqn", False), ("dqn", True), ("ppo", False)])
 def test_states_that_networks_have_no_weights_for_are_refused(name, at_end):
     """Compiled code would read whatever lies behind the weights."""
     model = made(name, Any(spaces.Discrete(3), shown=3, ends=float(at_end)), engine="compiled")
-    if name == "ppo" and at_end:
-        model.learn(100)  # nobody looks at what an episode has ended with
-        assert model.num_timesteps >= 100
-        return
     with pytest.raises(ValueError, match=r"observation 3 is not in Discrete\(3\)"):
         model.learn(100)
 
@@ -226,12 +213,12 @@ def test_environments_are_called_where_they_have_to_be(reason, name):
 Q = {"learning_starts": 50, "buffer_size": 400, "target_update_interval": 20}
 FALLING = library_schedule(ExponentialSchedule(0.001, 0.0001))
 AGENTS = {
-    "dqn": ("DQN", "FrozenLake-v1", Q),
     "double_dqn": ("DQN", "CartPole-v1", Q),
     "deep_qlearning": ("DQN", "FrozenLake-v1", {**Q, "n_steps": 3}),
-    "ppo": ("PPO", "FrozenLake-v1", {"n_steps": 64, "learning_rate": FALLING}),
-    "a2c": ("A2C", "CartPole-v1", {}),
-}
+    "ppo": (
+        "PPO", "FrozenLake-v1",
+        {"n_steps": 64, "n_epochs": 2, "learning_rate": FALLING, "clip_range": FALLING}),
+}  # fmt: skip
 # Wherever the project is installed, its packages are out of reach here.
 ELSEWHERE = """
 import sys
@@ -295,7 +282,7 @@ def test_files_open_where_this_project_is_not(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored")  # the library's, of its own choice
-@pytest.mark.parametrize(("name", "asked"), [("double_dqn", ()), ("a2c", ()), ("ppo", (Plain,))])
+@pytest.mark.parametrize(("name", "asked"), [("double_dqn", ()), ("ppo", (Plain,))])
 def test_files_are_like_the_librarys_and_go_on_in_either_engine(name, asked, tmp_path):
     model = None
     for engine in ("library", "compiled"):
