@@ -171,8 +171,11 @@ def test_what_cannot_be_asked_for_all_states_is_sampled(algo, tmp_path, monkeypa
 # --- agents that are told what is valid ----------------------------------------------------------
 SMALL = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
 NETWORK = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 10, "buffer_size": 500}
-AGENTS = {"dqn": NETWORK, "double_dqn": NETWORK, "ppo_mask": SMALL, "ppo": SMALL}
-AGENTS |= {"ppo_lstm": {**SMALL, "policy_kwargs": {"lstm_hidden_size": 8}}}
+AGENTS = {
+    "dqn": {**NETWORK, "engine": "library"},
+    "ppo_mask": SMALL,
+    "ppo_lstm": {**SMALL, "policy_kwargs": {"lstm_hidden_size": 8}},
+}
 
 
 class Corridor(gym.Env):
@@ -231,8 +234,8 @@ def spec_of(algo, env_id=WAREHOUSE, folder=None, fields=(), **entry):
 
 
 def masked(name, spec, steps=200):
-    env = make_training_env(spec, None)
-    return agent_of(name, env, mask_actions=True, **AGENTS.get(name, {})).learn(steps)
+    env, settings = make_training_env(spec, None), AGENTS.get(name, {"engine": "interpreted"})
+    return agent_of(name, env, mask_actions=True, **settings).learn(steps)
 
 
 def corridors(n_envs):

@@ -1,9 +1,8 @@
-"""What `--diagnose` compares, by hand, by finite differences and by many rollouts; and no more."""
+"""What `--diagnose` compares, by hand, by finite differences and by many rollouts."""
 
 import csv
 import io
 from dataclasses import replace
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +12,7 @@ from rich.console import Console
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from mdp import TransitionModel, policy_return, state_visitation
+from mdp.advantages import expected_estimates
 from pipeline.environments import make_training_env
 from pipeline.evaluation import critics
 from pipeline.evaluation.critics import (
@@ -148,44 +148,44 @@ def collect(agent, n_rollouts=1):
         yield agent.rollout_buffer
 
 
-@pytest.mark.parametrize("trace", [0.0, 0.7, 1.0])
-def test_means_of_many_rollouts_are_what_estimates_are_said_to_expect(corridor_registered, trace):
-    """By state and action: within 4.5 standard errors, some 10 pairs being compared."""
-    agent, _, recorder = on_corridor(corridor_registered, gae_lambda=trace, engine="library")
-    noted, told = [], critics.expected_estimates
+def steps_left(episode_starts, limit):
+    """Of how many TD errors an estimate is at most the sum, by step and environment."""
+    n_steps, n_envs = episode_starts.shape
+    left, ages = np.zeros((n_steps, n_envs), np.int64), np.zeros(n_envs, np.int64)
+    for step, starts in enumerate(episode_starts):
+        ages[starts > 0] = 0
+        left[step] = np.minimum(n_steps - step, limit - ages)
+        ages += 1
+    return left
 
-    def noting(*args):
-        noted.append((args[-1], told(*args)))
-        return noted[-1][1]
 
-    errors, places, stds = [], [], []
-    with pytest.MonkeyPatch.context() as context:
-        context.setattr(critics, "expected_estimates", noting)
-        for buffer in collect(agent, 12):
-            stds.append(recorder.rollout_figures(0)["gae_std"])
-            (states, actions, _), (expected, _) = noted[-1]
-            errors.append(buffer.advantages.reshape(-1) - expected)
-            places.append(2 * states + actions)
+def test_estimates_of_rollouts_are_compared_with_what_is_expected_of_them(corridor_registered):
+    """And what is expected is their mean, by state and action: within 4.5 standard errors."""
+    agent, world, recorder = on_corridor(corridor_registered, gae_lambda=0.7, engine="library")
+    errors, places = [], []
+    for buffer in collect(agent, 12):
+        found = recorder.rollout_figures(0)
+        states = buffer.observations.reshape(-1).astype(int)
+        actions = buffer.actions.reshape(-1).astype(int)
+        policy, critic = recorder.policy(), critics.own_values(agent, world.observations)
+        advantages = world.values(policy, 0.9).advantages[states, actions]
+        steps = states, actions, steps_left(buffer.episode_starts, 50).reshape(-1)
+        expected, shared = expected_estimates(world.model, policy, critic, 0.9, 0.7, steps)
+        errors.append(buffer.advantages.reshape(-1) - expected)
+        places.append(2 * states + actions)
+        for name, each in (
+            ("gae_bias", expected - shared - advantages),
+            ("gae_offset", shared),
+            ("gae_std", errors[-1]),
+        ):
+            assert found[name] == pytest.approx(np.sqrt((each**2).mean())), name
     errors, places = np.concatenate(errors), np.concatenate(places)
     assert len(np.unique(places)) >= 7
-    assert np.sqrt((errors**2).mean()) == pytest.approx(np.sqrt(np.mean(np.square(stds))))
     for place in np.unique(places):
         of_pair = errors[places == place]
         # Estimates of one episode depend on each other: counted as if a tenth were independent.
         error = of_pair.std() / np.sqrt(max(len(of_pair) / 10, 1))
         assert abs(of_pair.mean()) <= 4.5 * error + 1e-6, place
-
-
-def test_bias_vanishes_at_lambda_1_and_variance_grows(corridor_registered):
-    found = {}
-    for trace in (0.0, 1.0):
-        settings = {"gae_lambda": trace, "engine": "library", "n_steps": 2048, "limit": 1000}
-        agent, _, recorder = on_corridor(corridor_registered, **settings)
-        next(collect(agent))
-        found[trace] = recorder.rollout_figures(0)
-    # Estimates that the end of the rollout cuts off keep some of it.
-    assert found[1.0]["gae_bias"] < 0.1 * found[0.0]["gae_bias"]
-    assert found[1.0]["gae_std"] > 2 * found[0.0]["gae_std"]
 
 
 def test_the_exact_gradient_is_that_of_finite_differences():
@@ -232,6 +232,8 @@ def test_the_gradient_of_a_minibatch_is_the_one_that_the_library_descends(corrid
     ((steps, centred),) = minibatches(agent, estimates, 0)
     assert sorted(steps) == list(range(1024))
     assert centred.mean() == pytest.approx(0.0, abs=1e-9)
+    agent.batch_size = 205  # of which 1024 steps are five but for one
+    assert [len(batch) for batch, _ in minibatches(agent, estimates, 0)] == [205] * 4
     states = world.states_of(buffer.observations, 1024)
     weights = np.zeros((1, 5, 2))
     np.add.at(
@@ -250,23 +252,16 @@ def test_the_gradient_of_a_minibatch_is_the_one_that_the_library_descends(corrid
     assert ours == pytest.approx(theirs, abs=1e-5)
 
 
-def test_more_steps_give_a_better_gradient(corridor_registered):
-    """Thirty times the steps: the noise falls about thirtyfold, the signal stays."""
-    found = []
-    for n_steps in (16, 480):
-        agent, _, recorder = on_corridor(
-            corridor_registered, "a2c", n_steps=n_steps, gae_lambda=1.0, engine="library"
-        )
-        figures = [recorder.rollout_figures(0) for _ in collect(agent, 10)]
-        found.append(
-            {
-                k: np.mean([1 / f[k] if k == "gradient_snr" else f[k] for f in figures])
-                for k in ("gradient_cosine", "gradient_snr")
-            }
-        )
-    few, many = found
-    assert many["gradient_cosine"] > max(few["gradient_cosine"], 0.8)
-    assert 8 < few["gradient_snr"] / many["gradient_snr"] < 120
+def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient(corridor_registered):
+    """Twice the gradient errs by the gradient, its opposite by twice the gradient."""
+    _, _, recorder = on_corridor(corridor_registered)
+    true = np.random.default_rng(0).normal(size=(5, 2)) / 10
+    states, actions, steps = np.repeat(np.arange(5), 2), np.tile([0, 1], 5), np.arange(10)
+    for multiples, cosine, ratio in (((2,), 1, 1), ((-1,), -1, 1 / 4), ((2, -1), 0, 1 / 2.5)):
+        batches = [(steps, 10 * multiple * true.reshape(-1)) for multiple in multiples]
+        found = recorder.gradient_figures(true, states, actions, batches)
+        assert found["gradient_cosine"] == pytest.approx(cosine, abs=1e-4)
+        assert found["gradient_snr"] == pytest.approx(ratio, rel=1e-3)
 
 
 # --- a training -----------------------------------------------------------------------------------
@@ -276,99 +271,68 @@ def prepared(spec, console=None):
     return prepare(spec, console or Console(quiet=True), {}, "train.py")
 
 
-CASES = [
-    ("qlearning", LAKE, {"engine": "compiled"}, "overestimation"),
-    ("sarsa", LAKE, {"engine": "interpreted"}, "q_error"),
-    ("dqn", LAKE, {**EAGER, "engine": "library"}, "overestimation"),
-    ("dqn", LAKE, {**EAGER, "engine": "compiled"}, "overestimation"),
-    ("actor_critic", LAKE, {}, "v_error"),
-    ("ppo", LAKE, LIBRARY, "gradient_cosine"),
-    ("ppo", LAKE, COMPILED, "gradient_cosine"),
-    ("a2c", LAKE, {"n_envs": 2, "n_steps": 7, "engine": "compiled"}, "gae_bias"),
-    ("ppo_mask", WAREHOUSE, PPO, "gradient_snr"),
-    ("trpo", LAKE, {"n_steps": 64, "n_envs": 2, "batch_size": 32}, "gae_std"),
-]
-
-
-@pytest.mark.parametrize(("algo", "env_id", "settings", "column"), CASES)
-def test_the_agent_is_the_same_to_the_last_bit(tmp_path, algo, env_id, settings, column):
-    spec = resumable(tmp_path / "plain", env_id, algo, 600, settings, eval_freq=100)
-    plain = carried_out(spec)
-    with_it = carried_out(replace(spec, log_folder=tmp_path / "compared", diagnose=True))
-    for path in sorted(plain.run.path.rglob("*.zip")):
-        again = with_it.run.path / path.relative_to(plain.run.path)
-        assert content(path) == content(again), path.name
-    rows = rows_of(with_it.run)
-    assert len(rows) >= 6
-    assert np.isfinite([row[column] for row in rows[:5]]).all()
-    assert not plain.run.diagnosis_path.exists()
-
-
-@pytest.mark.parametrize(("algo", "env_id", "settings", "column"), CASES)
-def test_a_run_that_was_cut_off_has_the_same_figures(
-    tmp_path, monkeypatch, algo, env_id, settings, column
+@pytest.mark.parametrize(
+    ("algo", "env_id", "settings", "eval_freq", "column"),
+    [
+        ("qlearning", LAKE, {"engine": "compiled"}, 70, "overestimation"),
+        ("qlearning", LAKE, {"engine": "compiled"}, None, "overestimation"),
+        ("sarsa", LAKE, {"engine": "interpreted"}, 100, "q_error"),
+        ("actor_critic", LAKE, {}, 100, "v_error"),
+        ("dqn", LAKE, {**EAGER, "engine": "compiled"}, 100, "overestimation"),
+        ("ppo", LAKE, LIBRARY, 70, "gradient_cosine"),
+        ("ppo", LAKE, COMPILED, None, "gradient_cosine"),
+        ("ppo_mask", WAREHOUSE, PPO, 100, "gradient_snr"),
+    ],
+)
+def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_was_cut_off(
+    tmp_path, monkeypatch, algo, env_id, settings, eval_freq, column
 ):
-    for name, eval_freq in (("each", 70), ("some", None)):
-        monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 2e-3)
-        monkeypatch.setattr(critics, "SECONDS_OF_NETWORKS", 5e-2)
-        spec = resumable(
-            tmp_path / name / "whole",
-            env_id,
-            algo,
-            600,
-            settings,
-            diagnose=True,
-            eval_freq=eval_freq,
-        )
-        whole = carried_out(spec)
-        run = cut_off(replace(spec, log_folder=tmp_path / name / "parts"), monkeypatch)
-        gone_on(run)
-        assert run.diagnosis_path.read_bytes() == whole.run.diagnosis_path.read_bytes()
-        assert column in rows_of(run)[0]
+    """Without ``eval_freq`` not every evaluation is compared."""
+    monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 2e-3)
+    monkeypatch.setattr(critics, "SECONDS_OF_NETWORKS", 5e-2)
+    spec = resumable(tmp_path / "plain", env_id, algo, 600, settings, eval_freq=eval_freq)
+    plain = carried_out(spec)
+    spec = replace(spec, diagnose=True)
+    whole = carried_out(replace(spec, log_folder=tmp_path / "whole"))
+    for path in sorted(plain.run.path.rglob("*.zip")):
+        again = whole.run.path / path.relative_to(plain.run.path)
+        assert content(path) == content(again), path.name
+    assert not plain.run.diagnosis_path.exists()
+    rows = rows_of(whole.run)
+    assert len(rows) >= (1 if eval_freq is None else 6)
+    assert np.isfinite([row[column] for row in rows[:5]]).all()
+    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
+    gone_on(run)
+    assert run.diagnosis_path.read_bytes() == whole.run.diagnosis_path.read_bytes()
+
+
+class KeepsRollout(RolloutRecorder):
+    """Keeps a rollout of the compiled engine, and what is found out of it."""
+
+    def _on_rollout_end(self):
+        self.found, buffer = self.rollout_figures(0), self.model.rollout_buffer
+        names = ("rewards", "observations", "actions", "advantages", "episode_starts", "values")
+        self.rollout = {name: np.array(getattr(buffer, name)) for name in names}
+        self.asked_at = None
 
 
 def test_both_engines_say_the_same_of_the_same_agent(corridor_registered):
     """Of one policy and one rollout, which the compiled engine collects."""
-    agent, world, recorder = on_corridor(corridor_registered, engine="compiled", batch_size=64)
-    seen = {}
-
-    def look(self):
-        seen["compiled"] = self.rollout_figures(0)
-        buffer = self.model.rollout_buffer
-        copy = SimpleNamespace(
-            **{
-                k: np.array(getattr(buffer, k))
-                for k in (
-                    "rewards",
-                    "observations",
-                    "actions",
-                    "advantages",
-                    "episode_starts",
-                    "values",
-                )
-            }
-        )
-        seen["rollout"] = copy
-        self.asked_at = None
-
+    agent, world, _ = on_corridor(corridor_registered, engine="compiled", batch_size=64)
+    other, _, theirs = on_corridor(corridor_registered, engine="library", batch_size=64)
+    other.policy.load_state_dict(agent.policy.state_dict())
+    recorder = KeepsRollout(None, world, spec_of("ppo", corridor_registered), explores=True)
     recorder.asked_at = 1
-    with pytest.MonkeyPatch.context() as context:
-        context.setattr(RolloutRecorder, "_on_rollout_end", look)
-        other = on_corridor(corridor_registered, engine="library", batch_size=64)[0]
-        other.policy.load_state_dict(agent.policy.state_dict())
-        agent.learn(1024, callback=recorder)
-    # The library works out advantages of the same rollout anew, with the same networks.
-    theirs = RolloutRecorder(None, world, spec_of("ppo", corridor_registered), explores=True)
-    theirs.model = other
-    rollout, buffer = seen["rollout"], other.rollout_buffer
-    for name in ("rewards", "observations", "actions", "episode_starts"):
-        getattr(buffer, name)[:] = getattr(rollout, name)
-    tensor, _ = other.policy.obs_to_tensor(rollout.observations.reshape(-1))
+    agent.learn(1024, callback=recorder)
+    # The library works out the values of the same rollout anew, with the same networks.
+    rollout, buffer = recorder.rollout, other.rollout_buffer
+    for name in rollout.keys() - {"values"}:
+        getattr(buffer, name)[:] = rollout[name]
+    tensor, _ = other.policy.obs_to_tensor(rollout["observations"].reshape(-1))
     with th.no_grad():
         buffer.values[:] = other.policy.predict_values(tensor).numpy().reshape(buffer.values.shape)
-    assert buffer.values == pytest.approx(rollout.values, abs=1e-5)
-    buffer.advantages[:] = rollout.advantages
-    assert theirs.rollout_figures(0) == pytest.approx(seen["compiled"], rel=1e-4)
+    assert buffer.values == pytest.approx(rollout["values"], abs=1e-5)
+    assert theirs.rollout_figures(0) == pytest.approx(recorder.found, rel=1e-4)
 
 
 def said(spec):
@@ -380,10 +344,8 @@ def said(spec):
 HOT = {"env_wrapper": "envs.wrappers.OneHotObservation"}
 NO_DIAGNOSIS = [
     ("ppo", CART, {}, {}, "the exact model of CartPole-v1 is not known"),
-    ("random", LAKE, {}, {}, "random has no"),
     ("value_iteration", LAKE, {}, {}, "a planner's values are exact already"),
     ("reinforce", LAKE, {}, {}, "reinforce has no values"),
-    ("sac", "Pendulum-v1", {}, {}, "the exact model of Pendulum-v1 is not known"),
     ("ppo", LAKE, {**HOT, "normalize": True}, {}, "a VecEnv wrapper changes what the agent sees"),
     ("ppo_lstm", LAKE, {}, {}, "it acts by what it remembers"),
     ("qlearning", LAKE, {}, {"eval_freq": -1}, "there are no evaluations during this training"),
@@ -419,9 +381,9 @@ def test_comparisons_are_thinned_out_evenly_and_by_no_clock(tmp_path, monkeypatc
     assert len(rows_of(carried_out(each).run)) == 40
 
 
-def test_figures_reach_the_library_s_log(tmp_path):
-    spec = resumable(tmp_path, LAKE, "ppo", 600, COMPILED, diagnose=True, eval_freq=100)
-    training = prepared(spec)
+def test_figures_reach_the_library_s_log_and_a_picture(tmp_path):
+    spec = resumable(tmp_path, LAKE, "ppo", 300, LIBRARY, diagnose=True, eval_freq=100)
+    training = prepared(replace(spec, pictures=True))
     logged = []
     record = training.model.logger.record
     training.model.logger.record = lambda name, *a, **k: (
@@ -430,13 +392,6 @@ def test_figures_reach_the_library_s_log(tmp_path):
     )
     carry_out(training)
     assert {"diagnosis/v_error", "diagnosis/gradient_snr"} <= set(logged)
-
-
-def test_a_picture_shows_what_was_compared(tmp_path):
-    spec = resumable(
-        tmp_path, LAKE, "ppo", 300, LIBRARY, diagnose=True, eval_freq=100, pictures=True
-    )
-    training = carried_out(spec)
     assert (training.run.path / "diagnosis.png").stat().st_size > 5000
 
 

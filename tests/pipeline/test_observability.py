@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from stable_baselines3.common.env_util import make_vec_env
 
 import pipeline.evaluation.histories
 from agents import ALGORITHMS, load_algorithm
@@ -13,10 +12,11 @@ from pipeline.evaluation.histories import HistoryEvaluator, by_histories, world_
 from pipeline.evaluation.sampled import evaluate
 from pipeline.evaluation.yardstick import with_memory
 from pipeline.train_spec import remembers
-from tests.pipeline.short_runs import agent_of, spec_of, trained
+from tests.pipeline.short_runs import LAKE, agent_of, spec_of, trained
 
 CORRIDOR, TIGER = "envs:ShortCorridor-v0", "envs:Tiger-v0"
 BEST_OF_CORRIDOR = -(6 + 4 * np.sqrt(2))
+SHORT = {"n_steps": 16, "batch_size": 16}
 STACKED = {"env_wrapper": "envs.wrappers.OneHotObservation", "frame_stack": 2}
 
 
@@ -46,7 +46,7 @@ def test_figures_are_put_on_the_scale_of_memory_and_only_where_that_differs():
     assert wider["score"] == pytest.approx(1 / 9)
     assert wider["gap"] == pytest.approx(8)
     assert with_memory(wider) == wider
-    plain = {"mean_return": 0.5, **yardstick_of("qlearning", "FrozenLake-v1").figures(0.5)}
+    plain = {"mean_return": 0.5, **yardstick_of("qlearning", LAKE).figures(0.5)}
     assert with_memory(plain) is plain
     assert "full_optimum" not in plain
 
@@ -67,7 +67,7 @@ def test_a_bracket_on_the_scale_of_memory_has_both_of_its_ends():
 @pytest.mark.parametrize(
     ("env_id", "entry"),
     [
-        ("FrozenLake-v1", {}),
+        (LAKE, {}),
         ("Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}),
         ("envs:Warehouse-v0", {"env_kwargs": {"observation": "position"}}),
         (CORRIDOR, {"env_kwargs": {"max_episode_steps": 1}}),
@@ -84,7 +84,16 @@ def test_the_note_tells_what_chance_could_do():
         "the best policy without memory is random here and returns -11.66; always the same action "
         "at an observation, as in evaluations, at most -1000.00"
     )
-    assert exact_evaluator(spec_of("qlearning", TIGER)).scale.note is None
+
+
+def test_no_discounted_optimum_is_told_where_observations_hide_the_state():
+    """To listen for all ten steps; whoever sees the state earns 95.62."""
+    evaluator = exact_evaluator(spec_of("qlearning", TIGER))
+    assert evaluator.scale.note is None
+    agent = load_algorithm("qlearning")(env=TIGER, gamma=0.99, tie_breaking="first")
+    found = evaluator.other_returns(agent)
+    assert found.discounted_return == pytest.approx(-(1 - 0.99**10) / 0.01)
+    assert found.discounted_optimum is None
 
 
 def test_an_agent_remembers_by_its_kind_or_by_stacked_observations():
@@ -167,32 +176,31 @@ def test_histories_that_an_agent_does_not_tell_apart_are_one(monkeypatch):
     assert found.mean_return < found.yardstick.optimum == pytest.approx(9.438, abs=1e-3)
 
 
-@pytest.mark.parametrize("env_id", [TIGER, "envs:DarkWarehouse-v0"])
 @pytest.mark.parametrize(
-    ("algo", "entry"),
+    ("algo", "env_id", "entry"),
     [
-        ("ppo_lstm", {"policy_kwargs": {"lstm_hidden_size": 4}, "n_steps": 16, "batch_size": 16}),
-        ("ppo", {**STACKED, "n_steps": 16, "batch_size": 16}),
+        ("ppo_lstm", TIGER, {**SHORT, "policy_kwargs": {"lstm_hidden_size": 4}}),
+        ("ppo", "envs:DarkWarehouse-v0", {**STACKED, **SHORT}),
     ],
 )
-def test_all_histories_say_what_many_episodes_say(algo, entry, env_id):
+def test_all_histories_say_what_many_episodes_say(algo, env_id, entry):
     entry = {**entry, "env_kwargs": {"max_episode_steps": 8}}
     spec = spec_of(algo, env_id, entry)
     env = make_evaluation_env(spec, 8)
     arguments = spec.hyperparams.algorithm
     agent = agent_of(algo, env, device="cpu", **arguments).learn(32)
     exact = by_histories(spec, agent, world_of_memory(spec, agent))
-    sampled = evaluate(agent, env, 2000, seed=0)
-    error = exact.exact_std / np.sqrt(2000)
+    sampled = evaluate(agent, env, 800, seed=0)
+    error = exact.exact_std / np.sqrt(800)
     assert abs(sampled.mean_return - exact.mean_return) <= 4 * error + 1e-6
     assert sampled.std_return == pytest.approx(exact.exact_std, rel=0.2, abs=1e-6)
     assert sampled.mean_length == pytest.approx(exact.mean_length, rel=0.05)
 
 
 def test_too_many_histories_are_sampled_and_that_is_said(monkeypatch):
-    spec = spec_of("ppo_lstm", TIGER, {"n_steps": 16, "batch_size": 16})
+    spec = spec_of("ppo_lstm", TIGER, SHORT)
     env = make_evaluation_env(spec, 2)
-    agent = agent_of("ppo_lstm", env, device="cpu", n_steps=16, batch_size=16)
+    agent = agent_of("ppo_lstm", env, device="cpu", **SHORT)
     evaluator = HistoryEvaluator(spec, env, world_of_memory(spec, agent))
     assert evaluator.at_the_end(agent).is_exact
     monkeypatch.setattr(pipeline.evaluation.histories, "MOST_HISTORIES", 1)
@@ -207,8 +215,7 @@ def test_too_many_histories_are_sampled_and_that_is_said(monkeypatch):
 
 
 def test_runs_say_by_which_scale_they_are_measured(tmp_path):
-    entry = {"n_steps": 16, "batch_size": 16}
-    outcome = trained("ppo_lstm", TIGER, entry, n_timesteps=32, log_folder=tmp_path)
+    outcome = trained("ppo_lstm", TIGER, SHORT, n_timesteps=32, log_folder=tmp_path)
     assert outcome.final.is_exact
     assert outcome.run.read_info()["final"]["measured_by"] == "memory"
     plain = trained("qlearning", TIGER, n_timesteps=200, log_folder=tmp_path)
@@ -219,12 +226,10 @@ def test_runs_say_by_which_scale_they_are_measured(tmp_path):
 
 
 def test_what_is_seen_has_one_scale_with_memory_too():
-    spec = spec_of("ppo_lstm", "FrozenLake-v1")
-    env = make_vec_env("FrozenLake-v1", 1)
-    agent = load_algorithm("ppo_lstm")("MlpLstmPolicy", env, device="cpu")
-    world = world_of_memory(spec, agent)
+    spec = spec_of("ppo_lstm", LAKE)
+    world = evaluator_of_single(spec)
     assert world.scale is None
-    assert HistoryEvaluator(spec, env, world).yardstick == world.yardstick
+    assert HistoryEvaluator(spec, make_evaluation_env(spec, 1), world).yardstick == world.yardstick
 
 
 class Remembering(load_algorithm("qlearning")):
@@ -235,16 +240,12 @@ class Remembering(load_algorithm("qlearning")):
         return actions, (np.zeros(1),)
 
 
-@pytest.mark.parametrize("has_memory", [False, True])
-def test_agents_of_ones_own_that_remember_have_the_scale_of_memory(
-    has_memory, tmp_path, monkeypatch
-):
-    monkeypatch.setitem(
-        ALGORITHMS,
-        "remembering",
-        AlgorithmEntry(f"{__name__}:Remembering", "remembers", has_memory=has_memory),
-    )
-    assert remembers(spec_of("remembering", TIGER)) == has_memory
+def test_agents_of_ones_own_that_remember_have_the_scale_of_memory(tmp_path, monkeypatch):
+    """Whether they are registered so or not."""
+    for has_memory in (True, False):
+        entry = AlgorithmEntry(f"{__name__}:Remembering", "remembers", has_memory=has_memory)
+        monkeypatch.setitem(ALGORITHMS, "remembering", entry)
+        assert remembers(spec_of("remembering", TIGER)) == has_memory
     outcome = trained("remembering", TIGER, n_timesteps=50, log_folder=tmp_path)
     assert not outcome.final.is_exact
     assert outcome.final.summary()["measured_by"] == "memory"
