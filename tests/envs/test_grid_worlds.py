@@ -122,7 +122,6 @@ def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, da
 # --- steps worked by hand -------------------------------------------------------------------------
 
 
-SHORTEST = "RRRRRUURRUULLUURURRRUU"
 OWN = {"desc": ["S#", ".G"], "shelf_reward": -7, "step_reward": -0.5, "goal_reward": 3}
 OWN_MINES = {"step_reward": -2, "mine_reward": -5, "power_reward": 4, "goal_reward": 10}
 STEPS = {  # a world, moves, and what they come to: states, rewards and what was bumped into
@@ -130,15 +129,13 @@ STEPS = {  # a world, moves, and what they come to: states, rewards and what was
     "warehouse": (
         WarehouseEnv(), "DLURLD", [90, 90, 80, 80, 80, 90], [-1, -1, -1, -100, -1, -1], "yynyyn"),
     # After the end nothing moves.
-    "shortest way": (
-        WarehouseEnv(), SHORTEST + "D", None, [*[-1] * 21, 100, 0], "n" * 23),
-    "own rewards": (WarehouseEnv(**OWN), "RUDR", [0, 0, 2, 3], [-7, -0.5, -0.5, 3], "yynn"),
+    "own rewards": (
+        WarehouseEnv(**OWN), "RUDRU", [0, 0, 2, 3, 3], [-7, -0.5, -0.5, 3, 0], "yynnn"),
     # Off the map, then to the power at (1, 3) and back onto it, then onto the mine at (2, 3). The
     # power is the first of three: its bit counts 36 * 1.
     "mines": (
         MineMazeEnv(), "URRDRLRD", [0, 1, 2, 8, 36 + 9, 36 + 8, 36 + 9, 36 + 15],
         [-1, -1, -1, -1, 0, -1, -1, -101], "ynnnnnnn"),
-    "way out": (MineMazeEnv(), "RRDRRDDDDR", None, [-1, -1, -1, 0, *[-1] * 5, 99], "n" * 10),
     "own mines": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "URR", [0, 7, 8], [-2, 2, 8], "ynn"),
     "a mine of one's own": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "D", [3], [-7], "n"),
     "collected once": (
@@ -162,6 +159,7 @@ def test_steps_by_hand(name):
         assert "".join("ny"[info["bumped"]] for info in infos) == bumped
         at_goal = [env.map.rows[row][column] == "G" for row, column in at(infos)]
         assert [info["is_success"] for info in infos] == at_goal
+        assert {type(index) for place in at(infos) for index in place} == {int}
         at_mine = [env.map.rows[row][column] == "M" for row, column in at(infos)]
         assert over == [goal or mine for goal, mine in zip(at_goal, at_mine, strict=True)]
 
@@ -318,16 +316,16 @@ def test_a_seed_names_a_map_for_good():
 
 
 def test_the_density_is_as_asked_for():
-    # A million cells at 0.3 have a standard deviation of 0.00046.
-    assert abs(shelves(random_warehouse(1000, 0.3, 5)).mean() - 0.3) < 0.002
+    # A quarter of a million cells at 0.3 have a standard deviation of 0.0009.
+    assert abs(shelves(random_warehouse(500)).mean() - 0.3) < 0.004
     # A full warehouse keeps all but one shortest way of eleven cells.
     assert [shelves(random_warehouse(6, density)).sum() for density in (0, 1)] == [0, 36 - 11]
 
 
 @pytest.mark.parametrize(
     ("kwargs", "limit"),
-    [({"size": 50}, None), ({"max_episode_steps": 3}, 3), ({"max_episode_steps": 10**6}, 10**6)],
-    ids=["ten shortest ways", "shorter", "longer"],
+    [({"size": 50}, None), ({"max_episode_steps": 10**6}, 10**6)],
+    ids=["ten shortest ways", "longer"],
 )
 def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(kwargs, limit):
     env = gym.make("envs:RandomWarehouse-v0", slip=0.1, **kwargs)
@@ -337,13 +335,10 @@ def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(
     assert np.array_equal(again.unwrapped.desc, env.unwrapped.desc)
     assert str(env).count("TimeLimit") == 1
     assert str(again) == str(env)
-    endless = gym.make("envs:RandomWarehouse-v0", max_episode_steps=-1)
-    assert "TimeLimit" not in str(endless)
-    assert endless.unwrapped.shortest_path_length > 0
 
 
-def test_steps_and_resets_among_a_million_cells_take_little_memory():
-    env = RandomWarehouseEnv(size=1000, random_start=True)
+def test_steps_and_resets_among_many_cells_take_little_memory():
+    env = RandomWarehouseEnv(size=500, random_start=True)
     env.reset(seed=0)
     tracemalloc.start()
     for step in range(100):

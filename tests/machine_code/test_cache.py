@@ -50,7 +50,6 @@ SMALL = f"""{NOTE}
 from agents.small_loop import run_small
 print(int(run_small(4.0)), "compiled", int("compiling run_small" in names))
 """
-QUIET = SMALL.replace(NOTE, "names = []")  # warnings go to standard error
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +85,17 @@ def outcome(root, code=SMALL, **environment):
     return int(value), engine, compiled == "1"
 
 
-def test_a_changed_rule_is_what_runs_and_damaged_code_is_compiled_anew(checkout):
+class Payload:
+    """Makes a folder where it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = str(mark)
+
+    def __reduce__(self):
+        return os.mkdir, (self.mark,)
+
+
+def test_a_changed_rule_is_what_runs_and_files_that_do_not_serve_are_replaced(checkout, tmp_path):
     # The rule stands in another file than the loop. Back again, what was compiled is still there.
     rule = checkout / "agents" / "common" / "small_rule.py"
     first, second = RULE.replace("3.0", "7.0"), RULE.replace("3.0", "5.0")
@@ -94,41 +103,22 @@ def test_a_changed_rule_is_what_runs_and_damaged_code_is_compiled_anew(checkout)
         rule.write_text(text)
         assert outcome(checkout) == (value, "compiled", is_compiled)
     folder = checkout / "agents" / "__pycache__" / "machine_code"
-    for place, path in enumerate(sorted(folder.rglob("*.nb[ic]"))):
+    files = sorted(folder.rglob("*.nb[ic]"))
+    for place, path in enumerate(files):
         # Below the digest's folder; Numba writes each file under a longer name first.
         name = path.relative_to(folder).as_posix().partition("/")[2] + ".tmp.0123456789abcdef"
         assert len(name) < code_cache.LONGEST_NAME + 8
         size = path.stat().st_size
         path.write_bytes(b"" if place % 2 else path.read_bytes()[: size // 2])
-    for is_compiled in (True, False):
-        assert outcome(checkout) == (29, "compiled", is_compiled)
+    assert outcome(checkout) == (29, "compiled", True)
+    for path in files:  # that anyone may have written
+        path.write_bytes(pickle.dumps(Payload(tmp_path / "mark")))
+        path.chmod(0o666)
+    said = f"{SMALL}print(sum('cannot be used' in name for name in names))"
+    assert run(checkout, said).stdout.split() == ["29", "compiled", "1", "1"]
+    assert not (tmp_path / "mark").exists()
+    assert outcome(checkout) == (29, "compiled", False)
     rule.write_text(RULE)
-
-
-@pytest.fixture
-def closed(checkout, tmp_path):
-    """A checkout in which no machine code can be written."""
-    root = tmp_path / "closed"
-    shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
-    # A file where a folder is wanted stops root as well, whom permissions do not stop.
-    for package in ("mdp", "agents"):
-        (root / package / "__pycache__").write_text("")
-    return root
-
-
-def test_where_the_checkout_cannot_be_written_a_home_serves_or_memory(closed, tmp_path):
-    cache = tmp_path / "cache"
-    code = "import agents; from machine_code import cache; print(cache.folder('agents'))"
-    folder = Path(run(closed, code, XDG_CACHE_HOME=str(cache)).stdout.strip())
-    assert folder.parent == cache / "yardstick" / "machine_code" / "agents"
-    assert folder.is_dir()
-    (tmp_path / "home").write_text("")
-    nowhere = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": ""}
-    done = run(closed, f"import mdp.planning\n{QUIET}", **nowhere)
-    assert done.stdout.split() == ["13", "compiled", "0"]
-    assert done.stderr == (
-        "no folder for machine code can be written: it is compiled anew in each process\n"
-    )
 
 
 def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
@@ -140,15 +130,13 @@ def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
     folder = cache.folder("agents")
     source = Path("mdp/graph.py")
     source.write_text(source.read_text() + "\\n")
-    import numpy as np
-    from agents.common.exploration import highest_value
-    print(highest_value(np.array([1.0, 3.0, 2.0])))
-    print(len(list(folder.rglob("exploration.highest_value*"))))
+    from agents.small_loop import run_small
+    print(run_small(4.0), len(list(folder.rglob("*.nb[ic]"))))
     """
     before = (checkout / "mdp" / "graph.py").read_text()
     (checkout / "mdp" / "graph.py").write_text(f"# Another digest.\n{before}")
     try:
-        assert run(checkout, code).stdout.split() == ["3.0", "0"]
+        assert run(checkout, code).stdout.split() == ["13.0", "0"]
     finally:
         (checkout / "mdp" / "graph.py").write_text(before)
 
@@ -281,49 +269,42 @@ def test_a_folder_of_root_is_not_a_users():
         shutil.rmtree(place)
 
 
-class Payload:
-    """Makes a folder where it is unpickled."""
-
-    def __init__(self, mark):
-        self.mark = str(mark)
-
-    def __reduce__(self):
-        return os.mkdir, (self.mark,)
+CLOSED = "no folder for machine code can be written"
+UNSAFE = "no folder for machine code is safe: {} is open to other users, mode 777"
 
 
-def plant(folder, mark, mode):
-    """Exchange all that Numba would unpickle."""
-    for path in folder.rglob("*.nb[ic]"):
-        path.write_bytes(pickle.dumps(Payload(mark)))
-        path.chmod(mode)
-
-
-def test_a_file_of_anyones_in_ones_own_folder_is_not_unpickled(checkout, tmp_path):
-    outcome(checkout)
-    plant(checkout / "agents", tmp_path / "mark", 0o666)
-    said = f"{SMALL}print(sum('cannot be used' in name for name in names))"
-    assert run(checkout, said).stdout.split()[:3] == ["13", "compiled", "1"]
-    assert not (tmp_path / "mark").exists()
-    # They were replaced by files that serve.
-    assert outcome(checkout) == (13, "compiled", False)
-
-
-def test_a_folder_of_anyones_is_passed_over_in_one_line(checkout, tmp_path):
-    root = tmp_path / "open"
-    shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
-    assert outcome(root) == (13, "compiled", True)
-    folder = root / "agents" / "__pycache__" / "machine_code"
-    plant(folder, tmp_path / "mark", 0o600)
-    folder.chmod(0o777)
-    (tmp_path / "home").write_text("")
-    nowhere = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": ""}
-    done = run(root, QUIET, **nowhere)
-    assert done.stdout.split() == ["13", "compiled", "0"]
-    assert done.stderr.strip() == (
-        f"no folder for machine code is safe: {folder} is open to other users, mode 777: it is "
-        "compiled anew in each process"
-    )
-    assert not (tmp_path / "mark").exists()
+@pytest.mark.parametrize(
+    ("is_open", "has_home", "reason"),
+    [(False, True, None), (False, False, CLOSED), (True, False, UNSAFE)],
+    ids=["a home", "nowhere", "open to all"],
+)
+def test_where_the_checkout_does_not_serve_a_home_does_or_memory(
+    is_open, has_home, reason, tmp_path, monkeypatch, caplog
+):
+    beside = tmp_path / "agents" / "__pycache__"
+    beside.parent.mkdir()
+    # A file where a folder is wanted stops root as well, whom permissions do not stop.
+    if is_open:
+        beside.mkdir()
+        changed(beside / "machine_code", 0o777)
+    else:
+        beside.write_text("")
+    home = tmp_path / "home"
+    if not has_home:
+        home.write_text("")
+    monkeypatch.setattr(code_cache, "ROOT", tmp_path)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+    code_cache.warn_once.cache_clear()
+    found = code_cache.folder.__wrapped__("agents")
+    if reason is None:
+        assert found.parent == home / "yardstick" / "machine_code" / "agents"
+        assert found.is_dir()
+        assert not caplog.messages
+    else:
+        code_cache.folder.__wrapped__("agents")
+        line = reason.format(beside / "machine_code")
+        assert (found, caplog.messages) == (None, [f"{line}: it is compiled anew in each process"])
 
 
 # --- the sources themselves -----------------------------------------------------------------------

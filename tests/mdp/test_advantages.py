@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mdp import TransitionModel, policy_return
-from mdp.advantages import discounted_values, expected_estimates, expected_next
+from mdp.advantages import discounted_values, expected_estimates
 from tests.mdp.test_random_models import distributions, models
 
 
@@ -114,17 +114,3 @@ def test_with_lambda_1_the_bias_is_that_of_the_state_alone(case):
     given_action, given_state = expected_estimates(model, policy, critic, discount, 1.0, pairs)
     assert given_action - given_state == pytest.approx(exact.advantages[pairs[0], pairs[1]])
     assert given_state == pytest.approx((exact.values - critic)[pairs[0]])
-
-
-@given(drawn_cases())
-def test_with_lambda_0_the_bias_is_what_the_critic_errs_by_one_step_later(case):
-    model, policy, critic, discount = case
-    policy = policy / policy.sum(axis=1, keepdims=True)
-    exact = discounted_values(model, policy, discount)
-    reachable = np.flatnonzero(model.reachable)
-    pairs = np.array([(s, a, 7) for s in reachable for a in range(model.n_actions)]).T
-    given_action, given_state = expected_estimates(model, policy, critic, discount, 0.0, pairs)
-    wrong = discount * expected_next(model, critic - np.nan_to_num(exact.values))
-    wrong -= (policy * wrong).sum(axis=1, keepdims=True)
-    bias = given_action - given_state - exact.advantages[pairs[0], pairs[1]]
-    assert bias == pytest.approx(wrong[pairs[0], pairs[1]], abs=1e-9)

@@ -78,52 +78,49 @@ def true_error(values, exact):
     return max(abs(Fraction(float(v)) - e) for v, e in zip(values, exact, strict=True))
 
 
-SCALES = (1e-3, 1.0, 1e9)
-DISCOUNTS = (0.5, 0.9, 0.99)
 N_MODELS = 10
 
 
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("tolerance", [1e-10, 1e-3, 1.0])
-@pytest.mark.parametrize("discount", [*DISCOUNTS, 1.0])
-def test_bounds_are_never_below_the_error_and_not_far_above(discount, tolerance, scale):
+@pytest.mark.parametrize("scale", [1e-3, 1e9])
+@pytest.mark.parametrize("discount", [0.5, 0.9, 0.99, 1.0])
+def test_bounds_are_never_below_the_error_and_not_far_above(discount, scale):
     """Without discount each step costs something and may end the episode: the bound is proven.
 
     Since some models reach the bound of sweeps up to one sweep, it is not far above the error.
     """
-    shares, costly = [], discount == 1
+    costly, shares = discount == 1, {1e-10: [], 1e-3: [], 1.0: []}
     rounding = 10_000 if costly else 32 / (1 - discount)
     for seed in range(N_MODELS):
         model = drawn_model(seed, scale, costly=costly)
         exact = exact_optimum(model, discount)
-        plan = value_iteration(model, discount, tolerance * scale)
-        error = true_error(plan.values, exact)
-        assert error <= plan.error_bound
-        assert plan.error_bound <= max(tolerance * scale, rounded(plan.values, rounding))
-        shares.append(float(error / Fraction(plan.error_bound)))
-        if tolerance == 1.0:  # that of a solved system is rounding alone
-            plan = policy_iteration(model, discount)
-            assert true_error(plan.values, exact) <= plan.error_bound
-            assert plan.error_bound <= rounded(plan.values, rounding)
-    if tolerance > 1e-10:
+        for tolerance, found in shares.items():
+            plan = value_iteration(model, discount, tolerance * scale)
+            error = true_error(plan.values, exact)
+            assert error <= plan.error_bound
+            assert plan.error_bound <= max(tolerance * scale, rounded(plan.values, rounding))
+            found.append(float(error / Fraction(plan.error_bound)))
+        plan = policy_iteration(model, discount)  # that of a solved system is rounding alone
+        assert true_error(plan.values, exact) <= plan.error_bound
+        assert plan.error_bound <= rounded(plan.values, rounding)
+    for tolerance in (1e-3, 1.0):
         # A sweep brings values nearer by the discount: that much of the bound is error at most.
-        assert (0.2 if costly else 0.85 * discount) < max(shares) <= discount
+        assert (0.2 if costly else 0.85 * discount) < max(shares[tolerance]) <= discount
 
 
 @pytest.mark.parametrize(
     ("change", "bound"), [(0.0, 0.0), (0.25, 2 / 3), (0.5, 2.0), (1 - 1e-9, 2e9), (1.0, np.inf)]
 )
 def test_the_bound_without_discount_by_hand(change, bound):
-    """A step costs 1 and ends the episode with a chance of 1/2: M is 0, and the value -2."""
+    """A step costs 1, or ends the episode with a chance of 1/2 and earns 4: M is 5, the value 3."""
     model = TransitionModel(
         prob=np.array([[[0.5, 0.5]]]),
         next_state=np.zeros((1, 1, 2), np.int64),
-        reward=np.full((1, 1, 2), -1.0),
+        reward=np.array([[[-1.0, 4.0]]]),
         terminated=np.array([[[False, True]]]),
         initial=np.ones(1),
     )
     problem = PlanningProblem(model, 1.0, replace(FinitePart.everything(model), step_cost=1.0))
-    found = problem.error_bound(np.array([-2.0]), change)
+    found = problem.error_bound(np.array([3.0]), change)
     assert found == pytest.approx(bound, rel=1e-5, abs=1e-13)
 
 

@@ -39,13 +39,6 @@ def choice(rewards):
     return deterministic([[0] * len(rewards)], [rewards], [[False] * len(rewards)])
 
 
-@pytest.mark.parametrize("n", [2, 3, 7])
-def test_a_corridor_is_as_wide_as_it_is_long(n):
-    found = hardness_of(corridor(n, ends=False), 50)
-    assert (found.states, found.reachable_states) == (n, n)
-    assert (found.diameter, found.connected) == (n - 1, 1.0)
-
-
 def test_random_actions_take_n_squared_steps_to_the_end_of_a_corridor():
     """A walk that is held at 0 needs n (n + 1) steps to n; the limit of 10,000 cuts off none."""
     steps, episodes = random_wait(corridor(5, ends=True), corridor(5, ends=True).reward > 0, 10_000)
@@ -121,53 +114,10 @@ def test_arms_that_are_alike_are_no_mistake():
     assert (alone.lookahead, alone.effective_horizon) == (1, None)
 
 
-def test_looking_two_steps_ahead():
-    """Left earns .3 for good; right earns 1 if right follows, else -1: random actions shun it."""
-    ends = [[True, False], [True, True]]
-    model = deterministic([[0, 1], [0, 0]], [[0.3, 0.0], [-1.0, 1.0]], ends)
-    assert looking_ahead(model, 10)[0] == 2
-
-
 def test_a_world_that_is_too_large_has_fewer_numbers():
     long = corridor(2000, ends=False)
     assert diameter(long) is None
     assert looking_ahead(long, 20_000) == (None, None)
-
-
-def gorp(model, horizon, k, episodes, rng):
-    """What Greedy Over Random Policy earns, as Laidlaw and others (2023) have it: algorithm 1."""
-    taken, earned, state = 0, 0.0, 0
-    while taken < horizon:
-        means = {}
-        for plan in itertools.product(range(model.n_actions), repeat=min(k, horizon - taken)):
-            rest = (episodes, horizon - taken - len(plan))
-            actions = np.hstack([np.tile(plan, (episodes, 1)), rng.integers(2, size=rest)])
-            at, total = np.full(episodes, state), np.zeros(episodes)
-            running = np.ones(episodes, bool)
-            for action in actions.T:
-                total += running * model.reward[at, action, 0]
-                running = running & ~model.terminated[at, action, 0]
-                at = model.next_state[at, action, 0]
-            means[plan] = total.mean()
-        action = max(means, key=means.get)[0]
-        earned += model.reward[state, action, 0]
-        taken += 1
-        if model.terminated[state, action, 0]:
-            break
-        state = model.next_state[state, action, 0]
-    return earned
-
-
-def test_gorp_needs_no_more_episodes_than_the_bound_says():
-    model, horizon = corridor(3, ends=True), 12
-    lookahead, bound = looking_ahead(model, horizon)
-    assert (lookahead, bound < horizon) == (1, True)
-    episodes = round(2 ** (bound - 1))
-    assert 2 ** (bound - 1) == pytest.approx(episodes)
-    best = finite_horizon_optimum(model, horizon).start_value
-    rng = np.random.default_rng(0)
-    earned = [gorp(model, horizon, 1, episodes, rng) for _ in range(40)]
-    assert np.mean(np.array(earned) == best) >= 0.5
 
 
 # Against brute force.
