@@ -22,7 +22,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from pipeline.errors import UserError
-from pipeline.models.choose import ModelRequest, agent_to_continue, model_of_run
+from pipeline.models.choose import ModelRequest, model_of_run
 from pipeline.models.find import model_at, replay_buffer_of, run_of
 from pipeline.models.load import load_model, load_to_play, with_normalised_rewards
 from pipeline.playing import play_episodes, playing_env
@@ -189,13 +189,12 @@ def swapped(runs, tmp_path, monkeypatch):
 
 def weights(model):
     state = model.policy.state_dict().values()
-    return np.concatenate([value.detach().numpy().ravel() for value in state])
+    return np.concatenate([value.detach().numpy().ravel() for value in state]).tolist()
 
 
 def check_is_of(genuine, other, algo, model):
     first, second = (weights(load_model(algo, run.model_path)) for run in (genuine, other))
-    np.testing.assert_array_equal(weights(model), first)
-    assert not np.array_equal(first, second)
+    assert weights(model) == first != second
 
 
 @pytest.mark.parametrize("by_folder", [True, False])
@@ -226,16 +225,6 @@ def test_going_on(runs, swapped, tmp_path):
     check_is_of(*runs["dqn"], "dqn", training.model)
     training.model.env.close()
     training.eval_env.close()
-
-
-def test_a_swap_before_the_training_begins_is_found(swapped, tmp_path):
-    """The first look is for refusals without delay; what counts is what is loaded."""
-    run, _ = swapped("dqn")
-    path = agent_to_continue(run.path)
-    spec = spec_of("dqn", CART, SMALL_DQN, log_folder=tmp_path / "logs", trained_agent=path)
-    with pytest.raises(UserError, match=r"CartPole-v1\.zip has changed since the run wrote it"):
-        prepare(spec, Console(quiet=True), {}, "train.py")
-    assert not (tmp_path / "logs").exists()
 
 
 # --- agents of others: rl_zoo3's layout and a model hub's, made with the library alone -----------
@@ -379,9 +368,7 @@ APPLY = "!!python/object/apply:"
     [
         (f"{APPLY}collections.OrderedDict [[[a, {APPLY}os.getcwd []]]]", "is not allowed here"),
         (f"{APPLY}collections.OrderedDict [[[a, 1], [a, 2]]]", "no OrderedDict of different keys"),
-        (f"{APPLY}collections.OrderedDict x", "no OrderedDict of different keys"),
         (f"&a {APPLY}collections.OrderedDict [[[a, *a]]]", "nested too deeply"),
-        ("[1, 2]", "must map names to values"),
         ("1: 2", "must map names to values"),
     ],
 )
