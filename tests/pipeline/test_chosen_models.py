@@ -22,7 +22,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from pipeline.errors import UserError
-from pipeline.models.choose import ModelRequest, model_of_run
+from pipeline.models.choose import ModelRequest, agent_to_continue, model_of_run
 from pipeline.models.find import model_at, replay_buffer_of, run_of
 from pipeline.models.load import load_model, load_to_play, with_normalised_rewards
 from pipeline.playing import play_episodes, playing_env
@@ -225,6 +225,16 @@ def test_going_on(runs, swapped, tmp_path):
     check_is_of(*runs["dqn"], "dqn", training.model)
     training.model.env.close()
     training.eval_env.close()
+
+
+def test_a_swap_before_the_training_begins_is_found(swapped, tmp_path):
+    """The first look is for refusals without delay; what counts is what is loaded."""
+    run, _ = swapped("dqn")
+    path = agent_to_continue(run.path)
+    spec = spec_of("dqn", CART, SMALL_DQN, log_folder=tmp_path / "logs", trained_agent=path)
+    with pytest.raises(UserError, match=r"CartPole-v1\.zip has changed since the run wrote it"):
+        prepare(spec, Console(quiet=True), {}, "train.py")
+    assert not (tmp_path / "logs").exists()
 
 
 # --- agents of others: rl_zoo3's layout and a model hub's, made with the library alone -----------
