@@ -81,7 +81,7 @@ TRAININGS = [
     row(GRID, "a2c", 300, {"n_envs": 2, "n_steps": 7, **COMPILED}),
     row(SWING, "sac", 200, {**EAGER, "use_sde": True, "normalize": True}),
     row(SWING, "td3", 200, {**EAGER, **NOISE}),
-    row(SWING, "ars", 2400, {"n_delta": 2, "n_top": 1, "n_envs": 1, "normalize": True}),
+    row(SWING, "ars", 4000, {"n_delta": 2, "n_top": 1, "n_envs": 1, "normalize": True}),
     row(LEFT_RIGHT, "ppo_lstm", 400, {**SMALL, "policy_kwargs": {"lstm_hidden_size": 16}}),
     # Where a trained agent goes on.
     row(GRID, "sarsa", 600, {"engine": "interpreted", "n_envs": 3, **FINE}, trained_agent=200),
