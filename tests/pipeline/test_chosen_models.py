@@ -189,13 +189,12 @@ def swapped(runs, tmp_path, monkeypatch):
 
 def weights(model):
     state = model.policy.state_dict().values()
-    return np.concatenate([value.detach().numpy().ravel() for value in state])
+    return np.concatenate([value.detach().numpy().ravel() for value in state]).tolist()
 
 
 def check_is_of(genuine, other, algo, model):
     first, second = (weights(load_model(algo, run.model_path)) for run in (genuine, other))
-    np.testing.assert_array_equal(weights(model), first)
-    assert not np.array_equal(first, second)
+    assert weights(model) == first != second
 
 
 @pytest.mark.parametrize("by_folder", [True, False])
@@ -379,9 +378,7 @@ APPLY = "!!python/object/apply:"
     [
         (f"{APPLY}collections.OrderedDict [[[a, {APPLY}os.getcwd []]]]", "is not allowed here"),
         (f"{APPLY}collections.OrderedDict [[[a, 1], [a, 2]]]", "no OrderedDict of different keys"),
-        (f"{APPLY}collections.OrderedDict x", "no OrderedDict of different keys"),
         (f"&a {APPLY}collections.OrderedDict [[[a, *a]]]", "nested too deeply"),
-        ("[1, 2]", "must map names to values"),
         ("1: 2", "must map names to values"),
     ],
 )

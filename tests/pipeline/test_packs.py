@@ -125,10 +125,10 @@ def test_a_pack_verifies_and_plays_elsewhere_and_has_the_same_bytes_each_time(pa
         assert path == runs["table"].model_path
 
 
-@pytest.mark.parametrize("name", ["table", "ppo"])
-def test_nothing_of_the_machine_is_in_it(packed, runs, name):
-    folder = packed(name)
-    home = str(runs[name].path.parents[2])
+def test_nothing_of_the_machine_is_in_it(packed, runs):
+    folder, run = packed("ppo"), runs["ppo"]
+    assert b"private" in members(run.model_path)["data"]  # the folder of its log
+    home = str(run.path.parents[2])
     for path in filter(Path.is_file, folder.rglob("*")):
         inside = members(path).values() if path.suffix == ".zip" else ()
         for place in (home, HOME, "private", "--token", "args.txt"):
@@ -137,8 +137,6 @@ def test_nothing_of_the_machine_is_in_it(packed, runs, name):
     record = json.loads((folder / "run.json").read_text())
     assert "machine" not in record
     assert record["spec"]["log_folder"] == "logs"
-    if name == "ppo":  # whose own zip names the folder of the log
-        assert b"private" in members(runs[name].model_path)["data"]
 
 
 @pytest.fixture
@@ -210,25 +208,19 @@ def test_a_card_quotes_what_a_strangers_run_says(runs, changed, tmp_path):
 def test_scripts_play_without_this_project(packed, tmp_path):
     """All in one process, which takes its time to import; from the folders, as a reader would."""
     lines = ["import os, sys"]
-    for name in ("ppo", "dqn", "table"):
+    for name in ("dqn", "table"):
         folder = packed(name, name)
         script = code_in((folder / "README.md").read_text(encoding="utf-8"), "python")
-        assert len(script.splitlines()) <= (99 if name == "table" else 11)
         if name == "table":  # whose agent is of this project
             lines.append("assert not {'agents', 'envs', 'pipeline', 'safe_files'} & {*sys.modules}")
         lines += [f"os.chdir({str(folder)!r})", script]
     program = tmp_path / "all.py"
     program.write_text("\n".join(lines))
     done = subprocess.run(
-        [sys.executable, "-I", str(program)],
-        capture_output=True,
-        text=True,
-        env={name: text for name, text in os.environ.items() if name != "PYTHONPATH"},
-        check=False,
+        [sys.executable, "-I", str(program)], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    lake, pole, table = done.stdout.splitlines()
-    assert 0 <= float(lake.split()[1]) <= 1
+    pole, table = done.stdout.splitlines()
     assert 8 <= float(pole.split()[1]) <= 500
     assert table == "return 1.00 +/- 0.00"
 
@@ -289,13 +281,13 @@ def test_a_study_holds_what_others_need_and_nothing_of_this_machine(study, packe
     assert [is_study(study), is_study(study / "runs/qlearning/FrozenLake-v1_1")] == [True, False]
 
 
-@pytest.mark.parametrize("inside", [RUN, RUN.removesuffix(".zip")])
-def test_a_run_in_a_study_is_played(packed_study, inside):
-    with unpacked(packed_study / inside) as (folder, zipped_in):
-        chosen = choose_model(ModelRequest(path=folder, zipped_in=zipped_in))
-        assert (chosen.spec.algo, chosen.spec.env_id) == ("qlearning", "FrozenLake-v1")
-        assert zipped_in == packed_study
-    assert not folder.exists()
+def test_a_run_in_a_study_is_played(packed_study):
+    for inside in (RUN, RUN.removesuffix(".zip")):
+        with unpacked(packed_study / inside) as (folder, zipped_in):
+            chosen = choose_model(ModelRequest(path=folder, zipped_in=zipped_in))
+            assert (chosen.spec.algo, chosen.spec.env_id) == ("qlearning", "FrozenLake-v1")
+            assert zipped_in == packed_study
+        assert not folder.exists()
     for path in (packed_study, packed_study / "runs" / "x"):
         with pytest.raises(UserError, match=r"such as .*study\.zip/runs/qlearning/FrozenLake-v1_1"):
             unpacked(path).__enter__()
@@ -332,10 +324,6 @@ def test_what_is_not_packed_of_a_study(study, tmp_path, complaint):
 
 def rewritten(path, changes, mode=0):
     """Change files of a pack, leave some out (None), or add some with attributes of their own."""
-    if path.is_dir():
-        for name, content in changes.items():
-            (path / name).unlink() if content is None else (path / name).write_bytes(content)
-        return
     files = {**members(path), **changes}
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in files.items():
@@ -352,20 +340,22 @@ def forged(path, changes, mode=0):
     rewritten(path, {**changes, "study.json": json.dumps({"files": digests}).encode()}, mode)
 
 
-@pytest.mark.parametrize("target", ["pack", "pack.zip"])
-def test_a_changed_file_is_found(packed, target):
-    path = packed("table", target)
+def test_a_changed_file_is_found(packed):
+    path, folder = packed("table", "pack.zip"), packed("table", "folder")
     for content, said in ((b"other", "has changed"), (None, "is missing")):
         rewritten(path, {"README.md": content})
-        with pytest.raises(UserError, match=rf"not as it was packed: README\.md {said}"):
-            check_pack(path)
+        card = folder / "README.md"
+        card.unlink() if content is None else card.write_bytes(content)
+        for changed in (path, folder):
+            with pytest.raises(UserError, match=rf"not as it was packed: README\.md {said}"):
+                check_pack(changed)
 
 
-# Of both kinds of packs: other files, their attributes, and the complaint.
+# Other files, their attributes, and the complaint: of both kinds of packs, of runs, of studies.
 ATTACKS = [
     *(
         ({name: b"evil"}, 0, f"{name!r}, which would lie elsewhere")
-        for name in ("../evil", "/evil", "C:\\evil", "con", "folder/", "")
+        for name in ("../evil", "/evil", "C:\\evil", "con", "folder/", "", "runs/a/b/evil")
     ),
     ({"link": b"/etc/passwd"}, stat.S_IFLNK | 0o777, ", which is no regular file"),
     ({"pipe": b""}, stat.S_IFIFO | 0o600, ", which is no regular file"),
@@ -378,22 +368,25 @@ ON_A_RUN = [
     ({"zeros": bytes(80 << 20)}, 0, "would take more memory than"),
     ({f"n{number}": b"" for number in range(1001)}, 0, "is no pack that may be opened"),
 ]
-ON_A_STUDY = [
-    ({"runs/a/b/evil": b""}, 0, "'runs/a/b/evil', which would lie elsewhere"),
-    ({RUN: bytes(90 << 20)}, 0, "would take more memory than"),
-]
+ON_A_STUDY = [*ATTACKS, ({RUN: bytes(90 << 20)}, 0, "would take more memory than")]
 
 
-def test_nothing_is_written_elsewhere_and_nothing_odd_is_opened(packed, tmp_path):
-    path = packed("table", "pack.zip")
+def refuse_all(opened, path, attacks, change):
+    """Each attack is refused, and nothing is written elsewhere."""
     genuine = path.read_bytes()
-    for changes, mode, complaint in [*ATTACKS, *ON_A_RUN]:
+    for changes, mode, complaint in attacks:
         path.write_bytes(genuine)
-        rewritten(path, changes, mode)
+        change(path, changes, mode)
         with pytest.raises(UserError, match=re.escape(complaint)):
-            check_pack(path)
-        assert not list(tmp_path.rglob("*evil*"))
-    content = bytearray(genuine)
+            opened(path)
+        assert not list(path.parent.rglob("*evil*"))
+    path.write_bytes(genuine)
+
+
+def test_hostile_packs_of_runs_are_refused(packed, tmp_path):
+    path = packed("table", "pack.zip")
+    refuse_all(check_pack, path, [*ATTACKS, *ON_A_RUN], rewritten)
+    content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 255
     path.write_bytes(content)
     with pytest.raises(UserError, match="is no pack that may be opened"):
@@ -403,23 +396,21 @@ def test_nothing_is_written_elsewhere_and_nothing_odd_is_opened(packed, tmp_path
         check_pack(tmp_path / "empty")
 
 
-def test_hostile_packs_of_studies_are_refused(packed_study, tmp_path):
-    genuine = packed_study.read_bytes()
-    for name, content in (("report.html", b"x"), ("more.py", b""), ("study.json", b"{")):
-        packed_study.write_bytes(genuine)
-        rewritten(packed_study, {name: content})
-        with pytest.raises(UserError, match="is not as it was packed"):
-            check_pack(packed_study)
-    for changes, mode, complaint in [*ATTACKS, *ON_A_STUDY]:
-        packed_study.write_bytes(genuine)
-        forged(packed_study, changes, mode)
-        for opened in (check_pack, lambda path: unpacked(path / RUN).__enter__()):
-            with pytest.raises(UserError, match=re.escape(complaint)):
-                opened(packed_study)
-        assert not list(tmp_path.rglob("*evil*"))
-    forged(packed_study, {RUN: b"PK"})
-    with pytest.raises(UserError, match="is no pack that may be opened"):
-        unpacked(packed_study / RUN).__enter__()
+def play(path):
+    unpacked(path / RUN).__enter__()
+
+
+@pytest.mark.parametrize("opened", [check_pack, play])
+def test_hostile_packs_of_studies_are_refused(packed_study, opened):
+    refuse_all(opened, packed_study, ON_A_STUDY, forged)
+    if opened is play:
+        forged(packed_study, {RUN: b"PK"})
+        with pytest.raises(UserError, match="is no pack that may be opened"):
+            play(packed_study)
+    else:
+        changed = [({"report.html": b"x"}, 0), ({"more.py": b""}, 0), ({"study.json": b"{"}, 0)]
+        attacks = [(*change, "is not as it was packed") for change in changed]
+        refuse_all(check_pack, packed_study, attacks, rewritten)
 
 
 def test_a_forged_record_leads_nowhere_else_and_imports_nothing(packed, tmp_path, monkeypatch):

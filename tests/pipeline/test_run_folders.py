@@ -5,9 +5,8 @@ import io
 import json
 import math
 import os
-import subprocess
-import sys
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from uuid import uuid4
 
@@ -16,14 +15,13 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline import files, runs
+from pipeline import files
 from pipeline.digests import DamagedFileError, read_arrays, read_record, sealed
 from pipeline.errors import UserError
 from pipeline.locks import mark
 from pipeline.models.find import check_digest
 from pipeline.runs import NoRunError, Run, environment_name
 
-ROOT = Path(runs.__file__).parent.parent
 TAXI = "Taxi-v4"
 
 
@@ -64,27 +62,10 @@ def test_runs_are_numbered_from_one_and_gaps_are_not_filled(tmp_path):
             Run.find(tmp_path, "b", TAXI)
 
 
-CLAIMS = """
-import sys
-from pathlib import Path
-from pipeline.runs import Run
-print("ready", flush=True)
-sys.stdin.readline()
-for _ in range(25):
-    print(Run.claim(Path(sys.argv[1]), "sarsa", "Taxi-v4").path.name)
-"""
-
-
-def test_processes_never_share_a_folder(tmp_path):
-    words, pipes = [sys.executable, "-c", CLAIMS, str(tmp_path)], {"stdin": -1, "stdout": -1}
-    processes = [subprocess.Popen(words, cwd=ROOT, text=True, **pipes) for _ in range(2)]
-    for process in processes:
-        assert process.stdout.readline() == "ready\n"
-    for process in processes:
-        process.stdin.write("go\n")
-        process.stdin.flush()
-    names = [name for process in processes for name in process.communicate()[0].split()]
-    assert sorted(names) == sorted(f"Taxi-v4_{n}" for n in range(1, 51))
+def test_claims_at_the_same_time_never_share_a_folder(tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        claimed = pool.map(lambda _: claim_names(tmp_path, TAXI, 1), range(40))
+    assert sorted(claimed) == sorted([f"Taxi-v4_{n}"] for n in range(1, 41))
 
 
 @pytest.mark.parametrize(
@@ -174,9 +155,8 @@ def test_a_changed_record_is_refused(run, old):
 @pytest.mark.parametrize(
     "content",
     [
-        *(b"", b"null", b"[1]", b"{", b'{"a": "\xff"}', b"[" * 100_000),
+        *(b"", b"[1]", b'{"a": "\xff"}', b"[" * 100_000, b'{"a": ' + b"9" * 5000 + b"}"),
         b'{"a": ' + b"[" * 200 + b"]" * 200 + b"}",
-        b'{"a": ' + b"9" * 5000 + b"}",
         *(b'{"files": 3}', b'{"files": {"x": 3}}', b'{"files": {}}'),
     ],
     ids=lambda content: f"{content[:9]!r} x {len(content)}",
@@ -227,9 +207,9 @@ def test_files_are_held_against_their_digests(run, tmp_path_factory):
 PATH = Path("run/evaluations.npz")
 
 
-def archive(save=np.savez, **arrays):
+def archive(**arrays):
     stream = io.BytesIO()
-    save(stream, **arrays)
+    np.savez(stream, **arrays)
     return stream.getvalue()
 
 
@@ -241,18 +221,8 @@ def zipped(members, **options):
     return stream.getvalue()
 
 
-def header(shape):
-    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
-
-
-def npy(array):
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
-
-
-GOOD = npy(np.arange(3.0))
+HUGE = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + "\n"
+HUGE = b"\x93NUMPY\x01\x00" + len(HUGE).to_bytes(2, "little") + HUGE.encode()
 
 
 @pytest.mark.parametrize(
@@ -264,11 +234,9 @@ GOOD = npy(np.arange(3.0))
         (archive(a=np.zeros(1, [("x", "f8")])), "where numbers belong"),
         (zipped([("a.txt", b"")]), "something that is not an array"),
         (zipped([("a.npy", b"\x93NUMPY\x03\x00")]), "EOF"),
-        (zipped([("a.npy", header("(1000000000000,)"))]), "Unable to allocate|EOF"),
-        (zipped([("a.npy", header("(-1,)") + bytes(8))]), "negative"),
-        (zipped([("a.npy", header("(1") + bytes(8))]), "parse|EOF"),
-        (zipped([("a.npy", GOOD)], compression=zipfile.ZIP_BZIP2), "compressed in a way"),
-        (zipped([(f"{i}.npy", GOOD) for i in range(1001)]), "too many of them"),
+        (zipped([("a.npy", HUGE)]), "Unable to allocate|EOF"),
+        (zipped([("a.npy", b"")], compression=zipfile.ZIP_BZIP2), "compressed in a way"),
+        (zipped([(f"{i}.npy", b"") for i in range(1001)]), "too many of them"),
     ],
 )
 def test_anything_else_is_refused_in_one_line(content, reason):
@@ -297,15 +265,14 @@ def test_the_draft_lies_beside_and_the_old_file_stays_until_the_end(tmp_path):
         assert len({draft, *names(tmp_path)}) == 4
 
 
-@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
 @pytest.mark.parametrize("old", ["old", None])
-def test_a_writer_that_fails_changes_nothing(tmp_path, error, old):
+def test_a_writer_that_is_stopped_changes_nothing(tmp_path, old):
     path = tmp_path / "model.zip"
     if old is not None:
         path.write_text(old)
-    with pytest.raises(error), files.replacing(path) as file:  # noqa: PT012  # half of it is the point
+    with pytest.raises(KeyboardInterrupt), files.replacing(path) as file:  # noqa: PT012  # half of it
         file.write(b"half")
-        raise error
+        raise KeyboardInterrupt
     assert names(tmp_path) == ([] if old is None else ["model.zip"])
     assert old is None or path.read_text() == old
 
@@ -313,7 +280,8 @@ def test_a_writer_that_fails_changes_nothing(tmp_path, error, old):
 # --- names and JSON ------------------------------------------------------------------------------
 DEVICES = {"CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$"}
 DEVICES |= {f"{port}{digit}" for port in ("COM", "LPT") for digit in "0123456789¹²³"}
-NAMES = st.text(st.characters(exclude_categories=["Cs"])) | st.sampled_from(
+LETTERS = st.characters(exclude_categories=["Cs"])
+NAMES = st.text(LETTERS) | st.sampled_from(
     [*DEVICES, "con", "Nul.txt", "aux .zip", "com1.a.b", "a.", "a ", ".", "..", "a:b", "a/b", "a?b"]
 )
 
@@ -329,7 +297,7 @@ def is_acceptable(name):
     )
 
 
-@given(NAMES | st.text(min_size=100, max_size=400), NAMES)
+@given(NAMES | st.text(LETTERS, min_size=100, max_size=400), NAMES)
 @example("COM¹.x", "com¹.x")
 @example("CON", "con")
 @example("a:", "a?")
@@ -348,15 +316,6 @@ def test_a_name_is_one_that_every_system_takes_and_two_stay_two(name, other):
         assert portable.casefold() != there.casefold()
 
 
-def strictly(text):
-    """The value of a text that a strict reader takes."""
-
-    def refuse(name):
-        raise AssertionError(f"{name} is no JSON")
-
-    return json.loads(text, parse_constant=refuse)
-
-
 def test_what_is_no_json_is_written_as_the_nearest_that_is():
     odd = {
         "nan": math.nan,
@@ -366,7 +325,9 @@ def test_what_is_no_json_is_written_as_the_nearest_that_is():
         "surrogate": "\udcff",
         1: np.bool_(True),
     }
-    assert strictly(files.json_text(odd, indent=2)) == {
+    text = files.json_text(odd, indent=2)
+    # A strict reader takes it.
+    assert json.loads(text, parse_constant=pytest.fail) == {
         "nan": None,
         "limits": [-math.inf, math.inf],
         "array": [0, 1, 2],
