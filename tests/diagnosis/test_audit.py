@@ -42,10 +42,10 @@ def verdict_on(subject, probe):
 @pytest.mark.parametrize("name", [*TABLES.FAULTS, *TABLES.RIGHT])
 def test_faults_of_tables_are_named_and_right_ones_pass(name):
     subject = ScriptSubject(name, getattr(TABLES, name), {}, TABLES.KINDS.get(name))
-    probed = probes.PROBES
+    probed, seeds = probes.PROBES, range(1)
     if name.startswith("memory"):  # which are slow
-        subject.steps, probed = 1000, [probes.probe_age, probes.probe_copies]
-    findings, fault = audit(subject, [0], probed), TABLES.FAULTS.get(name)
+        subject.steps, probed, seeds = 1000, [probes.probe_age, probes.probe_copies], range(3)
+    findings, fault = audit(subject, seeds, probed), TABLES.FAULTS.get(name)
     if fault:  # what comes first is what is wrong
         assert next((finding.fault for finding in findings if finding.fault), None) == fault
     else:
@@ -76,7 +76,7 @@ def test_faults_of_classes_are_named(name, right, probe, monkeypatch):
 def test_observations_changed_in_place_are_the_librarys_affair():
     """DummyVecEnv keeps no copy of an episode's last observation: no fault of any agent."""
     subject = ClassSubject("dqn", class_named("dqn"), {})
-    subject.steps = 100
+    subject.steps = 300
     finding = list(audit(subject, [0], [probes.probe_copies]))
     assert [each.state for each in finding] == ["ok"]
     assert "DummyVecEnv" in finding[0].text
@@ -239,12 +239,13 @@ def test_a_script_of_ones_own(type_audit, tmp_path):
 def test_a_class_of_ones_own(type_audit, tmp_path, monkeypatch):
     text = "from agents.tabular.one_step import QLearning\n\n\nclass Mine(QLearning):\n    pass\n"
     (tmp_path / "my_audited_agents.py").write_text(text)
-    monkeypatch.setattr(audit, "__defaults__", ((probes.probe_discount,),))
+    monkeypatch.setattr(audit, "__defaults__", ((probes.probe_ends, probes.probe_discount),))
     flags = ("--gym-packages", "my_audited_agents.py", "-params", "learning_rate:0.1")
     code, out, err = type_audit("--algo", "my_audited_agents:Mine", *flags)
     assert (code, err) == (0, "")
     assert out.endswith(
         "audit of my_audited_agents:Mine\n"
+        "  the end of an episode               ok\n"
         "  the discount                        ok\n"
         "right, as far as these probes see\n"
     )

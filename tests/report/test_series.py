@@ -219,7 +219,7 @@ def beliefs(tmp_path_factory, do_study):
     """By name, of agents that know contexts, that do not, and that take rewards as Gaussian."""
     asked = {
         "SegmentBandit-v0": {"knows": {}, "blind": {"ignore_context": True}},
-        "BernoulliBandit-v0": {"normal": {"likelihood": "gaussian"}},
+        "BernoulliBandit-v0": {"normal": {"likelihood": "gaussian"}, "coins": {}},
     }
     found = {}
     for env_id, settings in asked.items():
@@ -232,12 +232,12 @@ def beliefs(tmp_path_factory, do_study):
 
 
 def test_beliefs_are_densities(beliefs):
-    for agent, ends in (("normal", [0.2 - 2, 0.75 + 2]), ("knows", [0, 1])):
+    for agent, ends in (("normal", [0.2 - 2, 0.75 + 2]), ("coins", [0, 1])):
         found = beliefs[agent]
         assert found.points[[0, -1]] == pytest.approx(ends)
         for y in found.densities[0, 0]:
             assert integrate.trapezoid(y, found.points) == pytest.approx(1, abs=0.02)
-    assert beliefs["normal"].true_means[0][2] == 0.75
+        assert found.true_means[0][2] == 0.75
     assert beliefs["knows"].moments.tolist() == [10, 100, 400]
     assert beliefs["knows"].densities.shape[:3] == (3, 2, 3)
     assert beliefs["knows"].true_means == [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]

@@ -262,6 +262,18 @@ def test_what_no_model_has_is_refused(genuine, change):
     assert refusal.value.key in named - {"policy_kwargs"}
 
 
+def test_a_model_has_settings_and_tensors_and_may_have_more_of_these(genuine):
+    without = {name: held for name, held in genuine.items() if name != "data"}
+    with pytest.raises(UnsafeFileError, match="lacks its settings"):
+        load(without)
+    for members in (without, {"data": genuine["data"]}):
+        with pytest.raises(UnsafeFileError, match="lacks parts that a model has"):
+            first_look(zip_of(members))
+    assert first_look(zip_of({**genuine, "my_own.pth": genuine["policy.pth"]}))["n_steps"] == 2048
+    with pytest.raises(UnsafeFileError, match="no model file has"):
+        first_look(zip_of({**genuine, "my own.pth": genuine["policy.pth"]}))
+
+
 def test_an_environment_id_in_the_settings_imports_nothing(genuine, tmp_path):
     model = load(with_settings(genuine, env="this:Zen-v0", tensorboard_log=str(tmp_path / "log")))
     assert model.env is model.tensorboard_log is None
@@ -356,6 +368,10 @@ def not_tensors(mark):
         "signs that a terminal obeys": (with_members(zeros, data=b"ca\x1b[2J\nb\n."), begin),
         "TorchScript": (with_members(zeros, constants=b""), "Missing key(s) in state_dict"),
         "a cut one": (zeros[:-30], no_zip),
+        "numbers of another machine": (
+            zip_of({"archive/data.pkl": b"\x80\x02}.", "archive/byteorder": b"big"}),
+            f"{begin}numbers in another order of bytes",
+        ),
         "one that was deflated": (zip_of(deflated, zipfile.ZIP_DEFLATED), "compressed"),
         "one of no bytes": (b"", no_zip),
         "lists in lists": (with_members(zeros, data=deep), f"{begin}is nested more than 40 deep"),

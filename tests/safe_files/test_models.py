@@ -90,9 +90,7 @@ SEVERAL = {"n_steps": 3, "train_freq": (1, "episode")}
 ORNSTEIN, NORMAL = OrnsteinUhlenbeckActionNoise(*NOISE), NormalActionNoise(*NOISE)
 CART, SWING = "CartPole-v1", "Pendulum-v1"
 CASES = {
-    "ppo with schedules, normalised": case(
-        sb3.PPO, CART, ROLLOUT, SCHEDULES, n_envs=2, around="normalize"
-    ),
+    "ppo with schedules, normalised": case(sb3.PPO, CART, ROLLOUT, SCHEDULES, around="normalize"),
     "ppo with sde": case(sb3.PPO, SWING, ROLLOUT, SDE),
     "a2c on stacked frames": case(sb3.A2C, CART, STACKED, around="stack"),
     "dqn of several steps": case(sb3.DQN, "FrozenLake-v1", FEW, SEVERAL),
@@ -183,6 +181,17 @@ def test_a_genuine_model_goes_on_as_the_library_would(name, tmp_path):
     assert not th.equal(weights(ours), our_weights)
     assert ours.num_timesteps == library.num_timesteps
     assert inspect_model(tmp_path / "model.zip").suspicious == ()
+
+
+def test_statistics_keep_their_settings_and_are_refused_elsewhere(tmp_path):
+    path, flags = str(tmp_path / "statistics.pkl"), {"training": False, "norm_reward": False}
+    made = VecNormalize(make_vec_env(CART), **flags, clip_obs=3.0, clip_reward=4.0, gamma=0.9)
+    made.save(path)
+    found = load_vec_normalize(path, make_vec_env(CART))
+    for name in ("norm_obs", *flags, "clip_obs", "clip_reward", "gamma", "epsilon"):
+        assert getattr(found, name) == getattr(made, name), name
+    with pytest.raises(UnsafeFileError, match=r"holds statistics of Box.*, not of Box"):
+        load_vec_normalize(path, make_vec_env(SWING))
 
 
 # What the file says of its schedules, and what stands in their place.
