@@ -214,36 +214,32 @@ def test_best_expected_reward(env_id, kwargs, expected):
     assert best == (None if expected is None else pytest.approx(expected))
 
 
-BANDITS = ("BernoulliBandit-v0", "SegmentBandit-v0", "GaussianBandit-v0")
-
-
 @pytest.fixture(scope="module")
-def bandits(tmp_path_factory, do_study):
-    """By environment what agents did that know contexts, that do not, and that are Gaussian."""
-    settings = {"knows": {}, "blind": {"ignore_context": True}}
-    settings["normal"] = {"likelihood": "gaussian"}
+def beliefs(tmp_path_factory, do_study):
+    """By name, of agents that know contexts, that do not, and that take rewards as Gaussian."""
+    asked = {
+        "SegmentBandit-v0": {"knows": {}, "blind": {"ignore_context": True}},
+        "BernoulliBandit-v0": {"normal": {"likelihood": "gaussian"}, "coins": {}},
+    }
     found = {}
-    for names, env_ids in ((settings, BANDITS[:2]), (["normal"], BANDITS[2:])):
-        agents = [AgentSpec(name, "thompson", settings[name], tuned=False) for name in names]
-        places = [EnvironmentSpec(name, name, {"n_timesteps": 400}) for name in env_ids]
+    for env_id, settings in asked.items():
+        agents = [AgentSpec(name, "thompson", settings[name], tuned=False) for name in settings]
+        places = [EnvironmentSpec(env_id, env_id, {"n_timesteps": 400})]
         study = StudySpec("s", "S", tuple(agents), tuple(places), n_seeds=3, metric="regret")
         series = study_series(analyse(do_study(study, tmp_path_factory.mktemp("study"))))
-        found |= {one.environment.environment: one for one in series.environments}
+        found |= {belief.agent: belief for belief in series.environments[0].pulls.beliefs}
     return found
 
 
-def test_beliefs_are_densities(bandits):
-    known = {belief.agent: belief for belief in bandits["BernoulliBandit-v0"].pulls.beliefs}
-    assert set(known) == {"knows", "blind", "normal"}
-    for agent, ends in (("normal", [0.2 - 2, 0.75 + 2]), ("knows", [0, 1])):
-        found = known[agent]
+def test_beliefs_are_densities(beliefs):
+    for agent, ends in (("normal", [0.2 - 2, 0.75 + 2]), ("coins", [0, 1])):
+        found = beliefs[agent]
         assert found.points[[0, -1]] == pytest.approx(ends)
         for y in found.densities[0, 0]:
             assert integrate.trapezoid(y, found.points) == pytest.approx(1, abs=0.02)
         assert found.true_means[0][2] == 0.75
-    by_context = {belief.agent: belief for belief in bandits["SegmentBandit-v0"].pulls.beliefs}
-    assert by_context["knows"].moments.tolist() == [10, 100, 400]
-    assert by_context["knows"].densities.shape[:3] == (3, 2, 3)
-    assert by_context["knows"].true_means == [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]
+    assert beliefs["knows"].moments.tolist() == [10, 100, 400]
+    assert beliefs["knows"].densities.shape[:3] == (3, 2, 3)
+    assert beliefs["knows"].true_means == [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]
     # What an agent believes of an arm over all contexts has no one true mean.
-    assert by_context["blind"].true_means == [[None] * 3]
+    assert beliefs["blind"].true_means == [[None] * 3]

@@ -122,17 +122,13 @@ def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_foo
 
 
 SAFE = [
-    (latex_text, "double_dqn by 2 [1, 3]", r"double\_dqn by 2 [1, 3]"),
     (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
-    (latex_text, "<a>|", r"\textless{}a\textgreater{}\textbar{}"),
     (latex_text, '~ `b "c"', r"\textasciitilde{} {\char96}b {\char34}c{\char34}"),
     (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
     (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
     (latex_text, "*x", r"{}*x"),
     (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
-    (latex_text, "two\n\nlines \x1b[1m", r"two lines \textbackslash{}x1b[1m"),
     (markdown_text, "a|b <b>*x*</b> [x](y) `c`", "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
-    (markdown_text, "# one\n\ntwo _three_", "\\# one two \\_three\\_"),
     (name_of, "a`b|", "a\\`b\\|"),
 ]
 

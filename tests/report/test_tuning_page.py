@@ -43,7 +43,6 @@ def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
         ([0.2, 0.9, 0.96, 0.98, 1.0], {}, 0.9 - 0.015),
         # The shipped settings are shown, where they double the axis at most.
         ([0.85, 0.9, 0.95, 0.98, 1.0], {5: 0.0}, 0.85 - 0.0225),
-        ([0.81, 0.9, 0.95, 0.98, 1.0], {5: 0.0}, 0.81 - 0.0285),
         ([0.79, 0.9, 0.95, 0.98, 1.0], {5: 0.0}, 0.9 - 0.015),
         # Trials that were ended early lie beyond, and have no say.
         ([0.9, 0.95, 1.0], {3: 0.0, 4: 0.5}, 0.9 - 0.015),
@@ -51,7 +50,6 @@ def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
         ([1.0, 1.0, 1.0], {3: 0.0, 4: 0.5}, 0.5 - 0.075),
         # All fit in.
         ([0.9, 0.92, 0.98, 1.0], {}, None),
-        ([1.0, 1.0], {}, None),
         ([], {}, None),
     ],
 )
@@ -91,9 +89,6 @@ def test_lines_run_through_the_parameters_between_their_ends(tuning_record):
     # The worst first, so that the best are drawn over them.
     assert [line["number"] for line in shown["lines"]] == [1, 0, 3, 6, 2]
     assert [line["group"] for line in shown["lines"]] == [0, 1, 2, 3, 4]
-    del tuning_record["trials"][0]["params"]["rate"]
-    (first,) = [x for x in parallel(Trials(tuning_record), {})["lines"] if x["number"] == 0]
-    assert (first["at"][0], first["said"][0]) == (None, "not there")
 
 
 def test_the_parameter_that_decides_matters_most(tuning_record, tuning_trial):

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import pickletools
 import struct
 import tracemalloc
 import warnings
@@ -23,6 +24,7 @@ from safe_files import UnsafeFileError, inspect_model, load_model, load_replay_b
 from safe_files.archives import first_look
 from safe_files.buffers_and_statistics import read_normalization
 from safe_files.known_objects import load_tensors, read_pickle
+from safe_files.pickles import PRICES
 
 UTILS = "stable_baselines3.common.utils"
 START = b"\x80\x04"
@@ -76,11 +78,9 @@ INSTRUCTIONS = {
     "getattr": name("builtins", "getattr"),
     "a way through attributes": name(UTILS, "FloatSchedule.__init__.__globals__"),
     "the state of a class, by slots": CONSTANT + b"N}" + text("__call__") + DEQUE + b"s\x86b",
-    "the state of a class": CONSTANT + b"}" + text("x") + b"K\x01sb",
     "an object that is called": CONSTANT + b")R)R",
     "an attribute that is no setting": with_state(CONSTANT, "__class__", b"K\x01"),
     "a schedule that is a class": with_state(FLOAT_SCHEDULE, "value_schedule", RELU),
-    "a class that is called": RELU + b")R",
     "lists in lists": b"]" * 5000 + b"a" * 4999,
     "a huge index of the memo": b"Nr\xff\xff\xff\x0f0h\x01",
     "an array of gigabytes": name("numpy._core.multiarray", "_reconstruct")
@@ -93,10 +93,7 @@ INSTRUCTIONS = {
     "a call of a call": DEQUE + b")R)R",
     "a call of a call that is huge once it is written out":
         SHORT_LAYERS + DEQUE + SHORT_TOP + b"\x85R)R",
-    "calls of calls, deep": DEQUE + b")R" * 2_000,
-    "tuples in tuples": b"N" + b"\x85" * 2_000,
     "two states": CONSTANT + b")\x81}b}b",
-    "the state of a list": b"]}b",
     "the state of a name": name("builtins", "int") + b"}b",
     "a state that is its own object":
         FLOAT_SCHEDULE + b")\x81\x94}" + text("value_schedule") + b"h\x00sb",
@@ -105,19 +102,12 @@ INSTRUCTIONS = {
     "an item of a name": name("os", "environ") + b"Na",
     "a member of an object": DEQUE + b")R(K\x01\x90",
     "a place of the memo that is empty": b"h\x07",
-    "a list of itself": b"]\x94h\x00a",
     "an object among its own items": DEQUE + b")R\x94h\x00a",
     "an object in its own argument": b"]\x94" + DEQUE + b"h\x00\x85R\x94a",
     # Keys and members whose hash is not theirs alone, or takes for ever.
     "a key that is an object": b"}" + DEQUE + b")RNs",
-    "a key that is a truth": b"}\x88Ns",
     "members that are tuples": SHORT_LAYERS + b"\x8f(" + SHORT_TOP + b"\x90",
     "frozen members that are tuples": SHORT_LAYERS + b"(" + SHORT_TOP + b"\x91",
-    "keys of an object that are tuples":
-        SHORT_LAYERS + name("collections", "OrderedDict") + b")R" + SHORT_TOP + b"Ns",
-    # Instructions of no model.
-    "an extension code": b"\x82\x01",
-    "arguments by keyword": CONSTANT + b")}\x92",
     # The last byte makes it as long as it says.
     "a long number of a megabyte": b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f",
     "a long number of -1 bytes": b"\x8b\xff\xff\xff\xff",
@@ -139,13 +129,7 @@ ATTACKS = {attack: START + instructions + b"." for attack, instructions in INSTR
     "a whole number of thousands of digits": pickle.dumps(10**5000),
     "an infinite schedule": pickle.dumps(ConstantSchedule(float("inf"))),
     "a schedule that is no number": pickle.dumps(ConstantSchedule(float("nan"))),
-    "an instance": b"(S'true'\nios\nsystem\n.",
-    "a persistent id": START + b"Px\n.",
-    "a buffer from elsewhere": b"\x80\x05\x97.",
-    "a whole number of protocol 0": b"I" + b"9" * 10**6 + b"\n.",
     "protocol 255": b"\x80\xff.",
-    "nothing": b"",
-    "no end": START + b"N",
 }
 
 
@@ -180,19 +164,10 @@ def test_attacks_by_pickle_are_refused(attack, loaders):
     assert ConstantSchedule(0.5)(1.0) == 0.5
 
 
-# Odd, and harmless: nothing that the file names is made.
-HARMLESS = {
-    "a call that is thrown away": START + name("os", "system") + text("true") + b"\x85R0N.",
-    "bytes behind the end": pickle.dumps(None) + b"cos\nsystem\n",
-    "a pickle behind the end": pickle.dumps(None) + pickle.dumps(print),
-    "many empty frames": START + (b"\x95" + bytes(8)) * 1000 + b"N.",
-    "a frame beyond the file": START + b"\x95" + struct.pack("<Q", 1 << 40) + b"N.",
-}
-
-
-@pytest.mark.parametrize("oddity", HARMLESS)
-def test_what_is_odd_and_harmless_is_data(oddity):
-    assert read_pickle(HARMLESS[oddity]) is None
+def test_no_other_instruction_makes_or_fetches_anything():
+    others = {op.name for op in pickletools.opcodes} - PRICES.keys()
+    assert others >= {"GLOBAL", "INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"}
+    assert others >= {"PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER", "INT", "LONG"}
 
 
 @pytest.fixture(scope="module")
@@ -256,28 +231,21 @@ NO_ATTRIBUTE, NO_MEMBER = "no attribute of a model", "which no model file has"
 CHANGES = {
     "a method": ({"predict": 1}, NO_ATTRIBUTE),
     "a class": ({"__class__": 1}, NO_ATTRIBUTE),
-    "a property": ({"policy_aliases": 1}, NO_ATTRIBUTE),
-    "no name": ({"not a name": 1}, NO_ATTRIBUTE),
     "wide networks": ({"policy_kwargs": {"net_arch": [10**6, 10**6]}}, "memory"),
-    "a wide part": ({"policy_kwargs": {"net_arch": {"pi": [10**9], "vf": [4]}}}, "memory"),
     "layers of no number": ({"policy_kwargs": {"net_arch": [NOT_A_NUMBER]}}, "holds no such model"),
     "layers below zero": ({"policy_kwargs": {"net_arch": [-5]}}, "holds no such model"),
     "many steps": ({"n_steps": 10**15}, "n_steps"),
     "steps below zero": ({"n_steps": -1}, "n_steps"),
-    "steps in words": ({"n_steps": "many"}, "n_steps"),
     "steps of no number": ({"n_steps": NOT_A_NUMBER}, "n_steps"),
     "many environments": ({"n_envs": 10**9}, "n_steps|n_envs"),
-    "environments of no number": ({"n_envs": NOT_A_NUMBER}, "n_steps|n_envs"),
     "a script": ({"extra.py": b""}, NO_MEMBER),
     "a way out": ({"../escaped.pth": b""}, NO_MEMBER),
-    "a place of the system": ({"/etc/passwd": b""}, NO_MEMBER),
     "tensors by the name of a method": ({"predict.pth": b""}, NO_MEMBER),
     "variables by that of another": (
         {"pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})},
         r"policy\.predict",
     ),
     "no settings": ({"data": b""}, "settings that are no JSON"),
-    "settings that are a zip": ({"data": b"PK\x03\x04"}, "settings that are no JSON"),
     "settings in settings": ({"data": b"[" * 100_000}, "settings that are no JSON"),
     "settings of nothing": ({"data": b"{}"}, "does not say its policy's class"),
 }
@@ -292,6 +260,18 @@ def test_what_no_model_has_is_refused(genuine, change):
         load(members)
     named = {None, "n_steps", "policy_class", *changes}
     assert refusal.value.key in named - {"policy_kwargs"}
+
+
+def test_a_model_has_settings_and_tensors_and_may_have_more_of_these(genuine):
+    without = {name: held for name, held in genuine.items() if name != "data"}
+    with pytest.raises(UnsafeFileError, match="lacks its settings"):
+        load(without)
+    for members in (without, {"data": genuine["data"]}):
+        with pytest.raises(UnsafeFileError, match="lacks parts that a model has"):
+            first_look(zip_of(members))
+    assert first_look(zip_of({**genuine, "my_own.pth": genuine["policy.pth"]}))["n_steps"] == 2048
+    with pytest.raises(UnsafeFileError, match="no model file has"):
+        first_look(zip_of({**genuine, "my own.pth": genuine["policy.pth"]}))
 
 
 def test_an_environment_id_in_the_settings_imports_nothing(genuine, tmp_path):
@@ -340,8 +320,6 @@ def entropy(change):
 WRONG_TENSORS = {
     "a weight that is no number": weight(lambda w: w.fill_(th.nan)),
     "a weight of float64": weight(lambda w: w.double()),
-    "a weight of int8": weight(lambda w: w.to(th.int8)),
-    "a weight of half": weight(lambda w: w.half()),
     "a complex weight": weight(lambda w: w + 1j),
     "a weight of another shape": weight(lambda w: th.zeros(2)),
     "a weight that is a list": weight(lambda w: [0.0]),
@@ -352,7 +330,6 @@ WRONG_TENSORS = {
     "a count of steps that is a text": average(lambda s: s.update(step="many")),
     "averages of no parameter": (ACTOR, lambda o: o["state"].update({77: {"step": 1}})),
     "a learning rate that is a text": group(lr="fast"),
-    "an infinite learning rate": group("ent_coef_optimizer.pth", lr=float("inf")),
     "one beta": group(betas=(0.9,)),
     "an entropy coefficient of another kind": entropy(lambda v: v.double()),
     "several entropy coefficients": entropy(lambda v: th.zeros(3)),
@@ -387,25 +364,22 @@ def not_tensors(mark):
     return {
         "a call": (tensors(Attack(mark)), f"{begin}holds posix.mkdir{may_not}"),
         "a call in the old format": (tensors(Attack(mark), **old), no_zip),
-        "a call of protocol 4": (tensors(Attack(mark), pickle_protocol=4), "posix.mkdir"),
         "a pickle": (pickle.dumps(Attack(mark)), no_zip),
-        "a network": (tensors(th.nn.Linear(1, 1)), f"torch.nn.modules.linear.Linear{may_not}"),
-        "an array": (tensors(np.ones(1)), f"numpy._core.multiarray._reconstruct{may_not}"),
         "signs that a terminal obeys": (with_members(zeros, data=b"ca\x1b[2J\nb\n."), begin),
         "TorchScript": (with_members(zeros, constants=b""), "Missing key(s) in state_dict"),
         "a cut one": (zeros[:-30], no_zip),
+        "numbers of another machine": (
+            zip_of({"archive/data.pkl": b"\x80\x02}.", "archive/byteorder": b"big"}),
+            f"{begin}numbers in another order of bytes",
+        ),
         "one that was deflated": (zip_of(deflated, zipfile.ZIP_DEFLATED), "compressed"),
         "one of no bytes": (b"", no_zip),
         "lists in lists": (with_members(zeros, data=deep), f"{begin}is nested more than 40 deep"),
-        "a tensor of tensors": (
-            tensors({"x": th.nested.nested_tensor([th.ones(1)])}),
-            f"torch._utils._rebuild_nested_tensor{may_not}",
-        ),
         "a tensor of nothing": (tensors({"x": th.ones(1, device="meta")}), may_not),
     }
 
 
-@pytest.mark.filterwarnings("always", "ignore:.*nested tensors")
+@pytest.mark.filterwarnings("always")
 def test_what_is_no_tensor_is_told_in_one_line_of_ours(genuine, tmp_path, recwarn):
     """PyTorch warns, and explains in several lines how to have the code run after all."""
     mark = tmp_path / "mark"
@@ -436,21 +410,6 @@ def test_a_zip_that_unpacks_out_of_proportion_is_refused(genuine, tmp_path):
         tracemalloc.stop()
 
 
-def test_what_zip64_says_leads_nowhere(genuine):
-    """The end of a zip may count, measure and place its list of members with 64 bits each."""
-    raw = zip_of(genuine)
-    end, most = raw.rfind(b"PK\5\6"), 2**64 - 1
-    size, start = struct.unpack("<2L", raw[end + 12 : end + 20])
-    n = len(genuine)
-    whole = (n, size, start)
-    for says in (whole, (n, size, most), (n, most, start), (most, most, most)):
-        end64 = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, says[0], *says)
-        end64 += struct.pack("<4sLQL", b"PK\6\7", 0, end, 1)
-        small = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, 2**32 - 1, 2**32 - 1, 0)
-        told = refusal_of(raw[:end] + end64 + small)
-        assert told is None if says == whole else "no whole zip" in told
-
-
 def directory(raw, member, offset, packed):
     """A zip whose list of members says something else of one of them."""
     at = raw.find(b"PK\1\2")
@@ -468,27 +427,14 @@ def odd_zips(genuine):
             archive.writestr(member, held)
     longer = zip_of({**genuine, "policy.pth!x": b"another"})
     bomb = zip_of({"archive/data.pkl": bytes(100 * MB)}, zipfile.ZIP_DEFLATED)
-    link = zipfile.ZipInfo("policy.pth")
-    link.create_system, link.external_attr = 3, 0o120777 << 16
-    linked = io.BytesIO()
-    with zipfile.ZipFile(linked, "w") as archive:
-        archive.writestr(link, "/etc/passwd")
-        for member in genuine.keys() - {"policy.pth"}:
-            archive.writestr(member, genuine[member])
     return {
         "a member twice": two.getvalue(),
         "a name with a zero in it": longer.replace(b"policy.pth!x", b"policy.pth\0x"),
-        "a member that is a link": linked.getvalue(),
         "a member at another's place": directory(raw, policy, 42, bytes(4)),
         "a smaller size": directory(raw, policy, 24, struct.pack("<L", 10)),
         "a larger size": directory(raw, policy, 24, struct.pack("<L", 1 << 31)),
-        "larger sizes": directory(raw, policy, 20, struct.pack("<2L", 1 << 29, 1 << 29)),
         "a place behind the end": directory(raw, policy, 42, struct.pack("<L", 1 << 30)),
         "bzip2": directory(raw, policy, 10, struct.pack("<H", 12)),
-        "no method": directory(raw, policy, 10, struct.pack("<H", 93)),
-        "encrypted": directory(raw, policy, 8, struct.pack("<H", 1)),
-        "of a later version": directory(raw, policy, 6, struct.pack("<H", 255)),
-        "a field beyond the list": directory(raw, policy, 30, struct.pack("<H", 60_000)),
         "another checksum": directory(raw, policy, 16, struct.pack("<L", 1)),
         "a bomb in a bomb": zip_of({**genuine, "policy.pth": bomb}, zipfile.ZIP_DEFLATED),
     }
@@ -504,15 +450,6 @@ def refusal_of(content):
         load_model(PPO, io.BytesIO(content))
     except UnsafeFileError as error:
         return str(error)
-
-
-def test_what_stands_before_a_zip_and_how_many_members_it_says_is_not_read(genuine):
-    raw = zip_of(genuine)
-    others = zip_of({"extra.py": b"raise SystemExit"})
-    end = raw.rfind(b"PK\5\6")
-    fewer = raw[: end + 8] + struct.pack("<2H", 1, 1) + raw[end + 12 :]
-    for content in (START + b"cos\nsystem\n." + raw, others + raw, fewer):
-        assert isinstance(load_model(PPO, io.BytesIO(content)), PPO)
 
 
 def test_what_is_no_regular_file_is_refused(tmp_path):
@@ -557,8 +494,6 @@ LONGS = b"".join(b"\x8a\x0f" + (M61 * i).to_bytes(15, "little") + b"N" for i in 
 BOMBS = {
     "one text in many arrays": ARRAY_MEMO + b"](" + ARRAY * 150 + b"e.",
     "many lists": b"](" + b"]" * 4_000_000 + b"e.",
-    "many dictionaries": b"](" + b"}" * 4_000_000 + b"e.",
-    "many marks": b"(" * 4_000_000 + b".",
     "many places of the memo": b"N" + b"\x94" * 4_000_000 + b".",
     "many calls": DEQUE + b"\x940](" + b"h\x00)R" * 1_000_000 + b"e.",
     "a wide text":
@@ -567,16 +502,12 @@ BOMBS = {
     "keys of one hash": b"}(" + LONGS + b"u.",
     # What reading them takes just fits the budget.
     "lists that just fit": b"](" + b"](Ne" * 230_000 + b"e.",
-    "tuples that just fit": b"](" + b"N\x85" * 460_000 + b"e.",
-    "nothing at many places": b"](" + b"N" * 1_900_000 + b"e.",
     "calls that just fit": DEQUE + b"\x940](" + b"h\x00)R" * 140_000 + b"e.",
-    "names that just fit": text("a") + b"\x940](" + b"h\x00h\x00\x93" * 300_000 + b"e.",
     "a list in lists in lists":
         b"](" + b"N" * 3000 + b"e\x940](" + b"h\x00" * 3000 + b"e\x940](" + b"h\x01" * 3000 + b"e.",
 }  # fmt: skip
 JSON_BOMBS = {
     "lists in JSON": "[" + "[]," * 3_000_000 + "[]]",
-    "dictionaries in JSON": "[" + "{}," * 3_000_000 + "{}]",
     "numbers in JSON": "[" + "1," * 5_000_000 + "1]",
 }
 
@@ -652,10 +583,7 @@ STORAGES = {
         file_of(OLD_LAYERS + storage(FLOAT, PATH, HUGE), bytes(4)),
     "a kind that is huge once it is written out":
         file_of(OLD_LAYERS + storage(HUGE, PATH, b"K\x01"), bytes(4)),
-    "a size that is a list": file_of(
-        storage(b"ctorch\nComplexDoubleStorage\n", PATH, b"](" + b"N" * 900_000 + b"e"), FOUR),
     "a size that is no number": file_of(storage(FLOAT, PATH, NAN), bytes(4)),
-    "a size that is a float": file_of(storage(FLOAT, PATH, b"G?\xf0" + bytes(6)), bytes(4)),
     "a storage that is no tuple": file_of(b"NQ", bytes(4)),
     "a record elsewhere": file_of(storage(FLOAT, pickled_text("../x"), b"K\x01"), bytes(4)),
     "the state of a storage": file_of(FEW + b"}b", FOUR),
@@ -663,8 +591,6 @@ STORAGES = {
         file_of(REBUILT + FEW + b"K\x00K\x02\x85" + NAN + b"\x85\x89}tR", FOUR),
     "a size that has no end":
         file_of(REBUILT + FEW + b"K\x00" + LONG + b"\x85K\x01\x85\x89}tR", FOUR),
-    "40 dimensions": file_of(
-        REBUILT + FEW + b"K\x00(" + b"K\x01" * 40 + b"t(" + b"K\x01" * 40 + b"t\x89}tR", FOUR),
     "a record under two names": zip_of({
         "archive/data.pkl": b"\x80\x02" + FEW + b".",
         "archive/data/0": FOUR,
@@ -674,11 +600,7 @@ STORAGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("attack", STORAGES)
-def test_storages_that_pytorch_does_not_write_are_refused(attack):
-    assert check_peak(attack, STORAGES[attack], lambda stream: load_tensors(stream.read()))
-
-
+# Stored numbers, those it says it has, and its place, shape and strides.
 VIEWS = {
     "no stride": (1, 1, 0, (10**9,), (0,)),
     "no stride at all": (1, 1, 0, (10**15,), (0,)),
@@ -687,33 +609,34 @@ VIEWS = {
     "a tensor beyond its storage": (1, 1, 0, (10**9,), (1,)),
     "a place beyond its storage": (1, 1, 10**9, (1,), (1,)),
 }
+STORAGES |= {lie: view(*tensor) for lie, tensor in VIEWS.items()}
+
+
+@pytest.mark.parametrize("attack", STORAGES)
+def test_storages_that_pytorch_does_not_write_are_refused(attack):
+    assert check_peak(attack, STORAGES[attack], lambda stream: load_tensors(stream.read()))
+
+
 NETWORKS = {
     "wide layers": {"net_arch": [30_000, 30_000]},
-    "many layers": {"net_arch": [1] * 100_000},
-    "many outputs": {"net_arch": {"pi": [1], "vf": [10**9]}},
     "features": {"features_extractor_kwargs": {"features_dim": 10**9}, "net_arch": [10**6, 10**6]},
 }
 
 
 def hostile_zips(genuine):
     """Each attack as a zip of a model."""
-    # All are read as statistics below, and these as the settings of a model too.
-    for bomb in ("one text in many arrays", "many lists", "a wide text"):
-        content = base64.b64encode(START + BOMBS[bomb]).decode()
-        changed = with_settings(genuine, invented={":type:": "x", ":serialized:": content})
-        yield bomb, zip_of(changed, zipfile.ZIP_DEFLATED)
+    # All are read as statistics below, and one as the settings of a model too.
+    content = base64.b64encode(START + BOMBS["one text in many arrays"]).decode()
+    changed = with_settings(genuine, invented={":type:": "x", ":serialized:": content})
+    yield "one text in many arrays", zip_of(changed, zipfile.ZIP_DEFLATED)
     for bomb, held in JSON_BOMBS.items():
         data = genuine["data"].decode().rstrip()[:-1] + f', "invented": {held}}}'
         yield bomb, zip_of({**genuine, "data": data}, zipfile.ZIP_DEFLATED)
-    for lie, tensor in VIEWS.items():
-        yield lie, zip_of({**genuine, "policy.pth": view(*tensor)})
     far = view(*VIEWS["no stride at all"])
-    for member in ("policy.optimizer.pth", "pytorch_variables.pth"):
+    for member in ("policy.pth", "policy.optimizer.pth", "pytorch_variables.pth"):
         yield f"a lie in {member}", zip_of({**genuine, member: far})
     for wish, kwargs in NETWORKS.items():
         yield wish, zip_of(with_settings(genuine, policy_kwargs=kwargs))
-    both = with_settings({**genuine, "policy.pth": far}, policy_kwargs=NETWORKS["wide layers"])
-    yield "wide layers and a lie", zip_of(both)
     yield "many members", zip_of({**genuine, **{f"x{i}": b"" for i in range(30_000)}})
     inflated = zip_of({**genuine, "tensors.pth": bytes(400 * MB)}, zipfile.ZIP_DEFLATED)
     yield "a member that inflates", inflated

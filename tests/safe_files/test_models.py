@@ -90,17 +90,13 @@ SEVERAL = {"n_steps": 3, "train_freq": (1, "episode")}
 ORNSTEIN, NORMAL = OrnsteinUhlenbeckActionNoise(*NOISE), NormalActionNoise(*NOISE)
 CART, SWING = "CartPole-v1", "Pendulum-v1"
 CASES = {
-    "ppo": case(sb3.PPO, CART, ROLLOUT, n_envs=2),
     "ppo with schedules, normalised": case(sb3.PPO, CART, ROLLOUT, SCHEDULES, around="normalize"),
     "ppo with sde": case(sb3.PPO, SWING, ROLLOUT, SDE),
-    "ppo on dictionaries": case(sb3.PPO, bits, ROLLOUT, policy="MultiInputPolicy"),
     "a2c on stacked frames": case(sb3.A2C, CART, STACKED, around="stack"),
-    "dqn": case(sb3.DQN, CART, FEW),
     "dqn of several steps": case(sb3.DQN, "FrozenLake-v1", FEW, SEVERAL),
     "dqn with hindsight": case(sb3.DQN, bits, FEW, HINDSIGHT, policy="MultiInputPolicy"),
     "sac with sde and noise": case(sb3.SAC, SWING, FEW, SDE, {"action_noise": ORNSTEIN}),
     "td3 with noise": case(sb3.TD3, SWING, FEW, {"action_noise": NORMAL}, n_envs=2),
-    "ddpg": case(sb3.DDPG, SWING, FEW),
     "qrdqn": case(contrib.QRDQN, CART, FEW),
     "tqc": case(contrib.TQC, SWING, FEW),
     "crossq": case(contrib.CrossQ, SWING, FEW),
@@ -187,6 +183,17 @@ def test_a_genuine_model_goes_on_as_the_library_would(name, tmp_path):
     assert inspect_model(tmp_path / "model.zip").suspicious == ()
 
 
+def test_statistics_keep_their_settings_and_are_refused_elsewhere(tmp_path):
+    path, flags = str(tmp_path / "statistics.pkl"), {"training": False, "norm_reward": False}
+    made = VecNormalize(make_vec_env(CART), **flags, clip_obs=3.0, clip_reward=4.0, gamma=0.9)
+    made.save(path)
+    found = load_vec_normalize(path, make_vec_env(CART))
+    for name in ("norm_obs", *flags, "clip_obs", "clip_reward", "gamma", "epsilon"):
+        assert getattr(found, name) == getattr(made, name), name
+    with pytest.raises(UnsafeFileError, match=r"holds statistics of Box.*, not of Box"):
+        load_vec_normalize(path, make_vec_env(SWING))
+
+
 # What the file says of its schedules, and what stands in their place.
 OLD_SCHEDULES = {
     "dqn_2.3.2": (sb3.DQN, {"learning_rate": 1e-3}),
@@ -213,18 +220,6 @@ def test_models_of_older_versions_are_loaded_with_other_schedules(name):
     told = inspect_model(path).suspicious
     assert told
     assert all("holds a function with its code" in line for line in told)
-
-
-def test_a_schedule_of_ones_own_is_refused_and_can_be_replaced(tmp_path):
-    schedule = lambda progress: 1e-3 * progress  # noqa: E731
-    model = sb3.PPO("MlpPolicy", "CartPole-v1", learning_rate=schedule, device="cpu")
-    model.save(tmp_path / "model")
-    with pytest.raises(UnsafeFileError, match="function with its code") as refusal:
-        load_model(sb3.PPO, tmp_path / "model.zip")
-    assert refusal.value.key == "learning_rate"
-    ours = load_model(sb3.PPO, tmp_path / "model.zip", learning_rate=2e-3)
-    assert ours.lr_schedule(0.5) == 2e-3
-    assert th.equal(weights(ours), weights(model))
 
 
 class OwnPolicy(sb3.ppo.MlpPolicy):

@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_files.files import UnsafeFileError
@@ -25,6 +25,7 @@ VALUES = st.recursive(
 )
 
 
+@settings(max_examples=30)
 @given(VALUES, st.integers(4, 5))
 def test_plain_data_comes_out_as_it_went_in(value, protocol):
     assert read_pickle(pickle.dumps(value, protocol)) == value
@@ -64,7 +65,7 @@ def test_shared_parts_stay_shared():
 
 
 @pytest.mark.parametrize("protocol", [4, 5])
-@pytest.mark.parametrize("axes", [(0, 1, 2), (2, 1, 0), (0, 2, 1)])
+@pytest.mark.parametrize("axes", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
 def test_arrays_come_out_as_they_went_in(axes, protocol):
     """Pictures with their channels in front are views with the axes in another order."""
     array = np.arange(24, dtype=np.uint8).reshape(2, 3, 4).transpose(axes)

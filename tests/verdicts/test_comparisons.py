@@ -1,10 +1,11 @@
 """Comparisons of two agents: pairs, rank-sum tests and means, by hand, by SciPy, in simulation."""
 
+from functools import partial
 from itertools import combinations, product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
@@ -21,6 +22,7 @@ from verdicts import (
     holm,
     judge_means,
     judge_pairs,
+    level_of_environment,
     level_of_look,
     mean_interval,
     paired_difference,
@@ -45,7 +47,6 @@ QUICK = {"seed": 0, "n_resamples": 50}
 PAIRS = st.integers(2, 9).flatmap(
     lambda n: st.tuples(*[st.lists(st.integers(-3, 3), min_size=n, max_size=n)] * 2)
 )
-OPPOSITE = {"better": "worse", "worse": "better"}
 
 
 def interval(found):
@@ -80,15 +81,7 @@ def test_the_probability_is_the_mann_whitney_statistic(pair):
     found = probability_of_improvement(first, second, **QUICK)
     statistic = stats.mannwhitneyu(first, second).statistic
     assert found.point == pytest.approx(statistic / len(first) ** 2)
-
-
-@given(PAIRS)
-def test_the_two_probabilities_add_up_to_one(pair):
-    one = probability_of_improvement(*pair, **QUICK)
-    other = probability_of_improvement(*reversed(pair), **QUICK)
-    assert one.point + other.point == pytest.approx(1)
-    assert interval(one) == pytest.approx([1 - other.high, 1 - other.low])
-    assert 0 <= one.low <= one.point <= one.high <= 1
+    assert 0 <= found.low <= found.point <= found.high <= 1
 
 
 def test_seeds_of_each_environment_are_resampled_by_themselves():
@@ -111,6 +104,20 @@ def test_winning_always_leaves_a_doubt():
     lost = probability_of_improvement([[1, 1]] * 5, [[2, 2]] * 5, seed=0)
     exact = stats.binomtest(0, 10).proportion_ci(method="exact")
     assert [lost.point, *interval(lost)] == pytest.approx([0, 0, exact.high])
+
+
+def test_of_many_seeds_the_interval_is_that_of_leaving_one_out():
+    """The jackknife has the variance of DeLong; two environments alike halve it."""
+    n = 250
+    first, second = np.random.default_rng(0).normal([[0.3], [0]], 1, size=(2, n))
+    wins = first[:, None] > second
+    without = (wins.sum() - wins.sum(axis=0) - wins.sum(axis=1) + np.diag(wins)) / (n - 1) ** 2
+    half = stats.norm.isf(0.05) * np.sqrt((n - 1) * without.var())
+    for k in (1, 2):
+        several = (np.tile(each, (k, 1)).T for each in (first, second))
+        found = probability_of_improvement(*several, seed=0, confidence=0.9)
+        ends = wins.mean() - half / k**0.5, wins.mean() + half / k**0.5
+        assert interval(found) == pytest.approx(ends, abs=2e-4)
 
 
 @pytest.mark.parametrize(("truth", "n"), [(0.95, 5), (0.7, 30)])
@@ -189,22 +196,6 @@ def verdicts(scores, margin=0.0, **arguments):
     return {(one.first, one.second): one.verdict for one in found}
 
 
-def test_each_verdict():
-    noise = np.concatenate([NOISE, NOISE / 2])
-    scores = {
-        "base": np.zeros(12),
-        "ahead": 5 + noise,
-        "behind": -5 + noise,
-        "close": 0.1 * noise,
-        "noisy": 0.1 + 10 * noise,
-    }
-    found = verdicts(scores, margin=0.5)
-    assert found["base", "ahead"] == "worse"
-    assert found["base", "behind"] == "better"
-    assert found["base", "close"] == "equivalent"
-    assert found["base", "noisy"] == "undecided"
-
-
 def test_a_comparison_holds_its_parts_together():
     rng = np.random.default_rng(2)
     first, second = rng.normal(size=8) + 0.5, rng.normal(size=8)
@@ -231,6 +222,9 @@ def test_the_typical_run_is_another_question_than_the_mean():
     (one,) = compare_pairs({"x": steady, "y": failing}, ends=(0, 1), **QUICK)
     assert (one.verdict, one.typical) == ("undecided", "worse")
     assert one.mean.point > 0
+    # A typical run lies within the margin, but one in four lies beyond it, always on one side.
+    often = {"x": np.repeat([0.0, 5.0], [30, 10]), "y": np.zeros(40)}
+    assert compare_pairs(often, 1.0, **QUICK)[0].typical == "better"
 
 
 def test_many_pairs_and_later_looks_ask_for_more():
@@ -264,62 +258,58 @@ def test_agents_without_chance_are_told_apart_by_what_they_are():
     assert said == [True, False]
 
 
-def test_few_seeds_leave_everything_undecided():
-    for n in (2, 4):
-        (one,) = compare_pairs({"x": [5] * n + [NAN], "y": [1] * (n + 1)}, 10, **QUICK)
-        assert (one.verdict, one.typical) == ("undecided", "undecided")
-        assert (one.mean.low, one.mean.high) == (-1, 1)
-
-
-@given(PAIRS, st.sampled_from([0, 0.5, 2]))
-def test_the_other_way_round_is_the_opposite(pair, margin):
-    first, second = pair
-    (one,) = compare_pairs({"x": first, "y": second}, margin, **QUICK)
-    (other,) = compare_pairs({"y": second, "x": first}, margin, **QUICK)
-    assert other.verdict == OPPOSITE.get(one.verdict, one.verdict)
-    assert other.typical == OPPOSITE.get(one.typical, one.typical)
-    turned = one.swapped()
-    assert (turned.first, turned.second, turned.said) == ("y", "x", other.said)
-    assert turned.seeds_needed == other.seeds_needed
-    assert list(vars(turned.mean).values()) == pytest.approx(
-        list(vars(other.mean).values()), abs=1e-4, nan_ok=True
-    )
-    found, expected = turned.probability_of_improvement, other.probability_of_improvement
-    assert [found.point, *interval(found)] == pytest.approx(
-        [expected.point, *interval(expected)], nan_ok=True
-    )
-
-
-@given(PAIRS, st.sampled_from([0, 0.5]), st.sampled_from([0.25, 4]), st.integers(-100, 100))
-def test_the_unit_of_the_scores_does_not_matter(pair, margin, scale, shift):
+@settings(deadline=None, max_examples=40)
+@given(PAIRS, st.sampled_from([0, 0.5, 2]), st.sampled_from([0.25, 4]), st.integers(-100, 100))
+def test_what_holds_of_every_comparison(pair, margin, scale, shift):
     first, second = map(np.array, pair)
     (one,) = compare_pairs({"x": first, "y": second}, margin, **QUICK)
-    moved = {"x": first * scale + shift, "y": second * scale + shift}
+    # Neither does the unit matter nor who stands first.
+    moved = {"y": second * scale + shift, "x": first * scale + shift}
     (other,) = compare_pairs(moved, margin * scale, **QUICK)
-    assert (one.said, one.typical) == (other.said, other.typical)
-    assert other.probability_of_improvement == one.probability_of_improvement
-
-
-@given(PAIRS, st.sampled_from([0, 1]))
-def test_undecided_asks_for_more_seeds_than_there_are(pair, margin):
-    (one,) = compare_pairs(dict(zip("xy", pair, strict=True)), margin, **QUICK)
-    if one.verdict == "undecided" and one.seeds_needed is not None:
-        assert one.seeds_needed > one.probability_of_improvement.n
+    turned = one.swapped()
+    for name in ("first", "second", "said", "typical", "seeds_needed", "n_seeds"):
+        assert getattr(turned, name) == getattr(other, name), name
+    for name in ("mean", "probability_of_improvement"):
+        found, expected = (list(vars(getattr(each, name)).values()) for each in (turned, other))
+        assert found == pytest.approx(expected, abs=1e-4, nan_ok=True), name
+    # Intervals are possible, and say what the verdict says.
+    mean = one.mean
+    assert -1 <= mean.low <= mean.seen_low <= mean.seen_high <= mean.high <= 1
+    low, high = (mean.seen_low, mean.seen_high) if one.is_conditional else (mean.low, mean.high)
+    assert {"better": low >= 0, "worse": high <= 0}.get(one.verdict, True)
+    if one.verdict == "undecided":
+        assert mean.seen_low <= 1e-4
+        assert mean.seen_high >= -1e-4
+        assert one.seeds_needed is None or one.seeds_needed > len(first)
     else:
         assert one.seeds_needed is None
 
 
-@given(PAIRS, st.sampled_from([0, 0.5, 2]))
-def test_intervals_are_possible_and_say_what_verdicts_say(pair, margin):
-    (one,) = compare_pairs(dict(zip("xy", pair, strict=True)), margin, **QUICK)
-    mean = one.mean
-    assert -1 <= mean.low <= mean.seen_low <= mean.seen_high <= mean.high <= 1
-    low, high = (mean.seen_low, mean.seen_high) if one.is_conditional else (mean.low, mean.high)
-    if one.verdict in OPPOSITE:
-        assert low >= 0 if one.verdict == "better" else high <= 0
-    elif one.verdict == "undecided":
-        assert mean.seen_low <= 1e-4
-        assert mean.seen_high >= -1e-4
+def test_each_pair_has_its_share_of_the_error_rate():
+    """Of the first of unknown looks 90 %, of this 75 % for means, half of it for who is best."""
+    rng = np.random.default_rng(0)
+    scores = {name: rng.beta(3, 2, size=9) for name in "abc"}
+    for names, share in (("ab", 1), ("abc", 2 * 3)):
+        given = {name: scores[name] for name in names}
+        found = compare_pairs(given, 0.05, ends=(0, 1), **QUICK)[0]
+        assert found.mean == compare_means(*(scores[n] for n in "ab"), 0.045 * 0.75 / share)
+        # The next look has half of a tenth; about so many seeds then show the difference.
+        n_pairs = len(names) * (len(names) - 1) // 2
+        quantiles = stats.norm.isf([0.0025 * 0.75 / n_pairs / 2, 0.2])
+        apart = scores["a"].mean() - scores["b"].mean()
+        variance = scores["a"].var(ddof=1) + scores["b"].var(ddof=1)
+        reach = max(abs(apart), 0.05 - abs(apart))
+        assert found.seeds_needed == np.ceil(sum(quantiles) ** 2 * variance / reach**2) + 1
+
+
+def test_looks_and_environments_spend_no_more_than_there_is():
+    spent = [level_of_look(0.05, look) for look in range(1, 1000)]
+    assert 0.0499 < sum(spent) < 0.05
+    assert spent == sorted(spent, reverse=True)
+    assert sum(level_of_look(0.05, look, 5) for look in range(1, 6)) == pytest.approx(0.05)
+    # Where there are several environments, all of them together are one more.
+    shares = [level_of_environment(0.06, n) for n in (1, 2, 3)]
+    assert shares == pytest.approx([0.06, 0.02, 0.015])
 
 
 @pytest.mark.parametrize(
@@ -338,10 +328,9 @@ def test_wrong_arguments_are_named(scores, options, message):
 
 
 def test_scores_that_do_not_pair_up_are_refused():
-    with pytest.raises(ValueError, match="do not pair up"):
-        probability_of_improvement([1, 2], [1, 2, 3], seed=0)
-    with pytest.raises(ValueError, match="do not pair up"):
-        paired_difference([1, 2], [1, 2, 3])
+    for compare in (partial(probability_of_improvement, seed=0), paired_difference):
+        with pytest.raises(ValueError, match="do not pair up"):
+            compare([1, 2], [1, 2, 3])
 
 
 # === rank-sum tests ===============================================================================
@@ -359,20 +348,16 @@ def test_the_rank_sum_test_counts_every_split(first, second):
     assert found == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("n", "m"), [(5, 5), (4, 9), (20, 20)])
-def test_without_ties_it_is_scipys(n, m):
-    rng = np.random.default_rng(n)
-    first, second = rng.normal(size=n) + 0.5, rng.normal(size=m)
-    expected = stats.mannwhitneyu(first, second, alternative="greater", method="exact").pvalue
-    assert rank_sum_p_value(first, second) == pytest.approx(expected)
-
-
 def test_many_scores_with_ties_are_tested_as_counted_ones():
     # Fisher's exact test is the rank-sum test of scores that are 0 or 1.
     first, second = np.repeat([0.0, 1.0], [2, 28]), np.repeat([0.0, 1.0], [10, 20])
     exact = stats.fisher_exact([[28, 2], [20, 10]], alternative="greater").pvalue
     assert rank_sum_p_value(first, second) == pytest.approx(exact, rel=0.2)
     assert rank_sum_p_value(np.ones(40), np.ones(40)) == 1
+    # As many as are counted out.
+    first, second = np.random.default_rng(20).normal([[0.5], [0]], 1, size=(2, 20))
+    expected = stats.mannwhitneyu(first, second, alternative="greater", method="exact").pvalue
+    assert rank_sum_p_value(first, second) == pytest.approx(expected)
 
 
 def test_scores_that_differ_in_the_last_bits_are_equal():
@@ -420,16 +405,9 @@ def test_the_interval_of_a_median_of_differences_covers(n):
     assert 0.025 < ((low > 0) | (high < 0)).mean() < 0.065
 
 
-def test_looks_spend_no_more_than_there_is():
-    spent = [level_of_look(0.05, look) for look in range(1, 1000)]
-    assert 0.0499 < sum(spent) < 0.05
-    assert spent == sorted(spent, reverse=True)
-    assert sum(level_of_look(0.05, look, 5) for look in range(1, 6)) == pytest.approx(0.05)
-
-
 # --- error rates ---------------------------------------------------------------------------------
 
-STUDIES = 500
+STUDIES = 250
 TYPICAL_LEVEL = 0.5  # of which a tenth is for typical runs
 # A right test at 5 % exceeds this in one of 10,000 such checks.
 MOST_WRONG = stats.binom.isf(1e-4, STUDIES, 0.05) / STUDIES
@@ -444,16 +422,15 @@ WORLDS = {
 }
 
 
-@pytest.mark.parametrize("n", [5, 12])
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize(
+    ("world", "n"), [("log-normal", 12), ("tied", 5), ("a steady agent beside one around it", 5)]
+)
 def test_agents_are_rarely_told_apart_or_called_equal_wrongly(world, n):
     rng, apart, equal = np.random.default_rng(0), 0, 0
     for _ in range(STUDIES):
         x, y = WORLDS[world](rng, (2, n))
-        apart += judge_pairs({"x": x, "y": y}, 0.0, TYPICAL_LEVEL)["x", "y"].typical in (
-            "better",
-            "worse",
-        )
+        said = judge_pairs({"x": x, "y": y}, 0.0, TYPICAL_LEVEL)["x", "y"].typical
+        apart += said in ("better", "worse")
         moved = {"x": x, "y": y + 1}
         equal += judge_pairs(moved, 1 - 1e-9, TYPICAL_LEVEL)["x", "y"].typical == "equivalent"
     assert max(apart, equal) / STUDIES <= MOST_WRONG
@@ -472,46 +449,51 @@ def normal_scores(n, mean=0.6, deviation=0.06):
     return mean + deviation * z / z.std(ddof=1)
 
 
-A, B = np.array([0.9, 0.8, 0.95, 0.7, 0.85]), np.array([0.6, 0.75, 0.5, 0.65, 0.72])
-
-
-def test_welchs_test_is_scipys():
-    expected = stats.ttest_ind(A, B, equal_var=False, alternative="greater").pvalue
-    assert welch_p_value(A, B) == pytest.approx(expected)
-
-
-def test_all_ways_to_deal_out_ten_scores_are_counted():
-    pooled, statistic = np.concatenate([A, B]), []
-    for first in combinations(range(10), 5):
-        x, y = pooled[list(first)], np.delete(pooled, first)
-        spread = x.var(ddof=1) / 5 + y.var(ddof=1) / 5
+def every_split(first, second):
+    """The share of all ways to deal the scores out with at least this statistic of Welch."""
+    pooled, statistic = np.concatenate([first, second]), []
+    for rows in combinations(range(len(pooled)), len(first)):
+        x, y = pooled[list(rows)], np.delete(pooled, rows)
+        spread = x.var(ddof=1) / len(x) + y.var(ddof=1) / len(y)
         statistic.append((x.mean() - y.mean()) / np.sqrt(spread))
-    share = np.mean(np.array(statistic) >= statistic[0] - 1e-9)
-    assert permutation_p_value(A, B) == pytest.approx(share)
+    return np.mean(np.array(statistic) >= statistic[0] - 1e-9)
 
 
-def test_runs_that_share_their_seeds_are_held_against_each_other():
-    apart = A - B
-    flips = np.array([np.dot(signs, apart) for signs in product((1, -1), repeat=5)])
-    expected = stats.ttest_rel(A, B, alternative="greater").pvalue
-    assert paired_p_value(A, B) == pytest.approx(max(expected, np.mean(flips >= flips[0])))
+@pytest.mark.parametrize("seed", range(3))
+def test_of_runs_that_were_seen_the_larger_of_two_p_values_counts(seed):
+    x, y = np.random.default_rng(seed).normal([[1.0], [0]], 1, size=(2, 5))
+    by_t = stats.ttest_ind(x, y, equal_var=False, alternative="greater").pvalue
+    assert welch_p_value(x, y) == pytest.approx(by_t)
+    assert permutation_p_value(x, y) == pytest.approx(every_split(x, y))
+    assert seen_p_value(x, y) == pytest.approx(max(by_t, every_split(x, y)))
 
 
-@pytest.mark.parametrize("n", [5, 10, 50])
+@pytest.mark.parametrize("n", [5, 8, 11, 12])
+@pytest.mark.parametrize("spread", [0.1, 1.0])
+def test_runs_that_share_their_seeds_are_held_against_each_other(n, spread):
+    """Their signs are flipped in all ways, where that can show as much as the t test."""
+    apart = np.linspace(1.0 - spread, 1.0 + spread, n)
+    first, second = np.arange(n) + apart, np.arange(n, dtype=float)
+    flips = np.array([np.dot(signs, apart) for signs in product((1, -1), repeat=n)])
+    by_t = stats.ttest_rel(first, second, alternative="greater").pvalue
+    by_signs = np.mean(flips >= flips[0] - 1e-9) if n < 12 else 0.0
+    assert paired_p_value(first, second) == pytest.approx(max(by_t, by_signs))
+
+
+@pytest.mark.parametrize(("n", "within"), [(5, 0.02), (10, 0.02), (50, 0.02), (3000, 0.002)])
 @pytest.mark.parametrize("share", [0, 0.2, 0.5, 1])
-def test_of_zeros_and_ones_the_interval_is_that_of_clopper_and_pearson(n, share):
+def test_of_zeros_and_ones_the_interval_is_that_of_clopper_and_pearson(n, within, share):
     n_ones = round(share * n)
     scores = np.repeat([1.0, 0.0], [n_ones, n - n_ones])
     low = stats.beta.ppf(0.025, n_ones, n - n_ones + 1) if n_ones else 0.0
     high = stats.beta.isf(0.025, n_ones + 1, n - n_ones) if n_ones < n else 1.0
     # The quantiles come from 4,000 draws.
-    assert mean_interval(scores, 0.05) == pytest.approx((low, high), abs=0.02)
+    assert mean_interval(scores, 0.05) == pytest.approx((low, high), abs=within)
+    # What does not depend on chance has no interval.
+    assert mean_interval(np.full(n, share), 0.05, exact=True) == pytest.approx((share, share))
 
 
-def test_what_does_not_depend_on_chance_has_no_interval():
-    assert mean_interval([0.8] * 5, 0.05, exact=True) == pytest.approx((0.8, 0.8))
-
-
+@settings(deadline=None, max_examples=40)
 @given(SCORES, SCORES, st.sampled_from([0.05, 0.01]))
 def test_intervals_say_what_the_tests_say(first, second, level):
     found, said = compare_means(first, second, level), judge_means(first, second, level)
@@ -525,14 +507,6 @@ def test_intervals_say_what_the_tests_say(first, second, level):
     assert found.low <= found.seen_low <= found.seen_high <= found.high
     assert found.low <= found.point + 1e-9
     assert found.point <= found.high + 1e-9
-
-
-@given(SCORES, SCORES)
-def test_it_does_not_matter_who_stands_first(first, second):
-    one, other = compare_means(first, second, 0.05), compare_means(second, first, 0.05).swapped()
-    said = judge_means(first, second, 0.05, margin=0.02)
-    assert said == judge_means(second, first, 0.05, margin=0.02).swapped()
-    assert (one.low, one.high) == pytest.approx((other.low, other.high), abs=1e-4)
 
 
 CASES = {
@@ -553,6 +527,12 @@ CASES = {
     ),
     "none against three of ten": ([0.95] * 10, [0.95] * 7 + [0.0] * 3, "undecided", False),
     "a fair coin that fell on one side": ([1.0] * 5, [0.5] * 5, "better", True),
+    "a little apart, which nothing could turn round": (
+        normal_scores(400, 0.912, 0.001),
+        normal_scores(400, 0.9, 0.001),
+        "better",
+        False,
+    ),
     "all alike": ([0.86] * 5, [0.86] * 5, "equivalent", True),
     "the same at 200 seeds": (
         normal_scores(200, 0.95, 0.01),
@@ -568,6 +548,7 @@ def test_what_is_said_of_two_agents(case):
     first, second, verdict, is_conditional = CASES[case]
     said = judge_means(first, second, 0.05, margin=0.02)
     assert (said.verdict, said.is_conditional) == (verdict, is_conditional)
+    assert judge_means(second, first, 0.05, margin=0.02) == said.swapped()
 
 
 def test_a_claim_with_a_condition_turns_round_where_that_share_lies_outside():
@@ -644,10 +625,24 @@ def test_who_always_has_the_most_there_is_is_ahead_of_whoever_once_had_less(othe
     # The same from below, where an agent always has the least.
     least, other = 1 - most, 1 - np.array(other)
     assert judge_means(other, least, 0.05, margin=0.02, exact=(False, True)) == said
+    # A loss that is too small to be within the margin's reach is one all the same.
+    once = [1.0] * 9 + [1 - 1e-8]
+    assert judge_means(np.ones(10), once, 0.05, exact=(True, False)) == MeanVerdict("better")
     # Of one that only had the most so far nothing is known.
     assert judge_means(most, 1 - other, 0.05, margin=0.0).verdict == "undecided"
 
 
+def test_few_seeds_claim_nothing():
+    assert (fewest_seeds(0.045), fewest_seeds(0.045, n_pairs=45)) == (5, 7)
+    x, y = np.array([0.95, 0.94, 0.96, 0.95]), np.array([0.2, 0.25, 0.22, 0.21])
+    assert seeds_needed(x, y, 0.05) == 5
+    found = compare_means(x, y, 0.05)
+    assert (found.low, found.high, found.seen_low, found.seen_high) == (-1, 1, -1, 1)
+    (one,) = compare_pairs({"x": [*x, NAN], "y": [*y, 0.2]}, 10, **QUICK)
+    assert (one.verdict, one.typical) == ("undecided", "undecided")
+
+
+@settings(deadline=None, max_examples=40)
 @given(st.lists(SCORES, min_size=3, max_size=5), st.floats(0.01, 0.2))
 def test_better_has_no_circles(runs, level):
     n = min(map(len, runs))
@@ -659,19 +654,3 @@ def test_better_has_no_circles(runs, level):
     assert all(scores[a].mean() > scores[b].mean() for a, b in better)
     sure = {pair for pair in better if not said[pair].is_conditional}
     assert all((a, d) in sure for a, b in sure for c, d in sure if b == c)
-
-
-def test_few_seeds_claim_nothing():
-    assert fewest_seeds(0.045) == 5
-    assert fewest_seeds(0.045, n_pairs=45) == 7
-    needed = seeds_needed(np.array([0.95, 0.94, 0.96]), np.array([0.2, 0.25, 0.22]), 0.05)
-    assert needed == 5
-
-
-def test_a_fair_coin_beside_its_middle_is_called_ahead_only_with_a_condition():
-    """Two in 32 studies of five seeds see one side of it alone."""
-    for side in (0.0, 1.0):
-        scores = {"steady": np.full(5, 0.5), "coin": np.full(5, side)}
-        mean = judge_pairs(scores, 0, 0.045, ends=UNIT)["steady", "coin"].mean
-        assert mean.verdict in ("better", "worse")
-        assert mean.is_conditional

@@ -353,6 +353,19 @@ def test_the_ratio_of_steps_worked_by_hand():
     assert turned.ratio.high < 1
 
 
+@given(*[st.lists(st.sampled_from([100.0, 200, 300, 500, NEVER]), min_size=5, max_size=9)] * 2)
+def test_the_ratio_is_that_of_all_pairs_and_turns_round(first, second):
+    (one,) = compare_speed({"x": first, "y": second}, 100)
+    (other,) = compare_speed({"y": second, "x": first}, 100)
+    ratios = [1.0 if x == y == NEVER else y / x for x in first for y in second]
+    middle = np.sort(ratios)[[(len(ratios) - 1) // 2, len(ratios) // 2]]
+    assert one.ratio.point == middle.sum() / 2
+    with np.errstate(divide="ignore"):
+        turned = 1 / np.array([other.ratio.high, other.ratio.low])
+    assert [one.ratio.low, one.ratio.high] == pytest.approx(turned)
+    assert (one.sooner, one.adjusted_p_value) == (other.sooner, other.adjusted_p_value)
+
+
 def test_nothing_is_said_below_the_grid_of_the_evaluations():
     steps = {"quick": [100.0] * 10, "slow": [200.0] * 10}
     (apart,) = compare_speed(steps, 100)
@@ -420,4 +433,5 @@ def test_failing_more_often_is_fishers_test():
     assert fail_more_often({"y": count(4, 10), "x": count(0, 10)}) == []
     # Of three pairs the surest has to be three times as sure.
     assert fail_more_often({"y": count(5, 10), "x": count(0, 10), "z": count(2, 10)}) == []
-    assert fail_more_often({"x": count(0, 0), "y": count(4, 4)}) == []
+    # Who has no run makes no pair.
+    assert fail_more_often({"y": count(5, 10), "x": count(0, 10), "z": count(0, 0)}) == [("y", "x")]
