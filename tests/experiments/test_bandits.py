@@ -18,7 +18,6 @@ from experiments.analysis import analyse
 from experiments.bandits import (
     MAX_POINTS,
     QUANTILES,
-    STATISTICS_FILE,
     PullStatistics,
     pull_statistics,
     read_run,
@@ -52,8 +51,6 @@ def recorded(algorithm, folder, env_id="SegmentBandit-v0", n_envs=2, **kwargs):
     ("algorithm", "kwargs"),
     [
         (load_algorithm("ucb"), {}),
-        (load_algorithm("qlearning"), {}),
-        (load_algorithm("random"), {"policy": "RandomPolicy"}),
         (DQN, {"policy": "MlpPolicy", "learning_starts": 10, "train_freq": 1}),
         (PPO, {"policy": "MlpPolicy", "n_steps": 25, "batch_size": 25}),
     ],
@@ -197,28 +194,16 @@ def test_every_study_goes_in_batches(path):
         assert {(run.is_batch, run.n_runs) for run in runs} == {(True, n_seeds)}
 
 
-AGENTS = {
-    "ucb": ("ucb", {}),
-    "thompson": ("thompson", {}),
-    "linucb": ("linucb", {}),
-    "gradient": ("gradient_bandit", {"learning_rate": 0.1}),
-}
-
-
-@pytest.fixture(scope="module")
-def batches(tmp_path_factory, do_study):
-    return do_study(study_of(AGENTS), tmp_path_factory.mktemp("batches"))
-
-
-@pytest.mark.parametrize("label", AGENTS)
-def test_a_batch_is_its_runs(batches, label, tmp_path):
-    planned = next(run for run in batches.planned if run.agent == label)
+def test_a_batch_is_its_runs(tmp_path, do_study):
+    """Those of each rule are compared with the agents, pull by pull."""
+    study = study_of({"it": ("thompson", {})})
+    batches, (planned,) = do_study(study, tmp_path), plan(study, tmp_path)
     folders = [tmp_path / str(seed) for seed in range(5)]
     for seed, folder in enumerate(folders):  # as train.py does each
         run = Run(folder, "SegmentBandit-v0")
         run.params_path.mkdir(parents=True)
         train(replace(planned.spec, seed=seed, verbose=0), Console(quiet=True), {}, "", run)
-    rows = batches.summary[batches.summary["agent"] == label]
+    rows = batches.summary
     assert rows["seed"].tolist() == [0, 1, 2, 3, 4]
     pulls = [pulls_in(folder) for folder in folders]
     assert rows["regret"].tolist() == [float(np.cumsum(each["regrets"][0])[-1]) for each in pulls]
@@ -226,33 +211,17 @@ def test_a_batch_is_its_runs(batches, label, tmp_path):
     assert rows["training"].tolist() == rows["last_episodes"].tolist() == rewards
     assert len(set(rows["regret"])) > 1
     # What is told of runs that were done one by one is the same too, but for what a batch adds.
-    ours, theirs = batches.pulls[label, "segments"], stacked_statistics(planned.spec, folders)
+    ours, theirs = batches.pulls["it", "segments"], stacked_statistics(planned.spec, folders)
     for field in dataclasses.fields(PullStatistics):
         if field.name not in {"estimates", "estimates_std", "moments", "posteriors"}:
             one, other = getattr(ours, field.name), getattr(theirs, field.name)
             assert np.array_equal(one, other, equal_nan=True), field.name
-    if label == "thompson":
-        result = run_batch("thompson", {}, "SegmentBandit-v0", {}, range(5), 200)
-        assert np.array_equal(ours.posteriors, result.posteriors[0])
-        assert ours.moments.tolist() == [10, 100, 200]
-        assert ours.estimates == pytest.approx(np.nanmean(result.estimates, axis=0))
-        info = planned.run.read_info()
-        assert (info["engine"], info["n_runs"], info["n_timesteps"]) == ("compiled batch", 5, 200)
-
-
-def test_a_batch_that_is_there_is_not_done_again_and_a_longer_one_is(tmp_path, do_study):
-    study = study_of({"ucb": AGENTS["ucb"]}, n_seeds=3)
-    first = do_study(study, tmp_path)
-    (planned,) = plan(study, tmp_path)
-    assert planned.is_finished
-    before = (planned.path / STATISTICS_FILE).stat().st_mtime_ns
-    do_study(study, tmp_path)
-    assert (planned.path / STATISTICS_FILE).stat().st_mtime_ns == before
-    more = do_study(replace(study, n_seeds=6), tmp_path)
-    assert more.summary["regret"].tolist()[:3] == first.summary["regret"].tolist()
-    assert len(more.summary) == 6
-    assert [path.name for path in (tmp_path / "runs" / "ucb").iterdir()] == ["segments_1"]
-    assert list((tmp_path / ".drafts").iterdir()) == []
+    result = run_batch("thompson", {}, "SegmentBandit-v0", {}, range(5), 200)
+    assert np.array_equal(ours.posteriors, result.posteriors[0])
+    assert ours.moments.tolist() == [10, 100, 200]
+    assert ours.estimates == pytest.approx(np.nanmean(result.estimates, axis=0))
+    info = planned.run.read_info()
+    assert (info["engine"], info["n_runs"], info["n_timesteps"]) == ("compiled batch", 5, 200)
 
 
 def test_runs_beside_batches_and_seeds_that_begin_later(tmp_path, do_study):
@@ -287,9 +256,17 @@ def test_runs_beside_batches_and_seeds_that_begin_later(tmp_path, do_study):
     ("name", "expected"),
     [
         ("bernoulli", {"Thompson": 14.8, "UCB1": 82.0, "epsilon 0.1": 275.5, "random": 2666.7}),
-        ("segments", {"Thompson by segment": 37, "Thompson, blind": 443, "random": 653}),
-        # The mean of alpha=0.2 is worse than that of 1 with a spread of 228 over runs.
-        ("segments", {"LinUCB alpha=1": 31.0, "LinUCB alpha=0.2": 155.0}),
+        (
+            "segments",
+            # The mean of alpha=0.2 is worse than that of 1 with a spread of 228 over runs.
+            {
+                "Thompson by segment": 37,
+                "Thompson, blind": 443,
+                "random": 653,
+                "LinUCB alpha=1": 31.0,
+                "LinUCB alpha=0.2": 155.0,
+            },
+        ),
     ],
 )
 def test_regret_of_ten_thousand_pulls(do_study, tmp_path, name, expected):

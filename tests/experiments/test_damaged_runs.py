@@ -91,8 +91,15 @@ READ = {
 }
 
 
-@pytest.mark.parametrize("damage", [flip, Path.unlink], ids=["flip", "missing"])
-@pytest.mark.parametrize(("kind", "name"), [(kind, n) for kind, ns in READ.items() for n in ns])
+@pytest.mark.parametrize(
+    ("kind", "name", "damage"),
+    [
+        *((kind, name, flip) for kind, names in READ.items() for name in names),
+        ("grid", "evaluations.npz", Path.unlink),
+        ("batch", STATISTICS_FILE, Path.unlink),
+        ("pulls", "run.json", Path.unlink),
+    ],
+)
 def test_a_damaged_run_is_left_out_and_said_to_be(copied, kind, name, damage):
     study, planned, root = copied(kind)
     damage(planned[0].path / name)
@@ -204,8 +211,8 @@ def test_repair_moves_aside_what_is_done_again(grid, compare_again, capsys):
 # --- The files of a run's figures, where they have not the form that a run gives them.
 
 # Rows after the first line and that of the names.
-ROWS = ["1,2", "nan,2,3", "1,0,3", "1,two,3", "1e999,2,3", "1,2,3\n1,2", "1_0,2,3"]
-MONITORS = ["", "#{}", "#{}\n", "r,l,t\n1,2,3\n", "#{}\nr,l\n1,2\n", "#{}\n\0\0\xff\n"]
+ROWS = ["1,2", "nan,2,3", "1,0,3", "1,two,3", "1e999,2,3", "1_0,2,3"]
+MONITORS = ["", "#{}", "r,l,t\n1,2,3\n", "#{}\nr,l\n1,2\n", "#{}\n\0\0\xff\n"]
 MONITORS += [f"#{{}}\nr,l,t\n{row}\n" for row in [*ROWS, '1,2,3\n"1,2,3']]
 
 

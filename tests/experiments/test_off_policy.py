@@ -208,7 +208,7 @@ def test_replay_of_a_uniform_log_is_the_self_normalised_estimate(tmp_path):
 # --- Where a log stops being one: each limit from both of its sides.
 
 TINY = 5e-324  # the smallest number above 0
-JUST_ABOVE_1, JUST_BELOW_1 = np.nextafter(1, 2), np.nextafter(1, 0)
+JUST_ABOVE_1 = np.nextafter(1, 2)
 NO_PROPENSITY = r"propensity of pull 2 is .*, it must be above 0 and at most 1"
 NO_ARMS = "arms must lie between 0 and 1, as the policy's columns"
 NOT_1 = r"sum of the policy's probabilities of pull 2 is .*be 1$"
@@ -218,16 +218,15 @@ SHAPES = r"a policy of shape \(3, 2\) needs 3 arms and propensities"
 @pytest.mark.parametrize(
     ("name", "values", "refusal"),
     [
-        *(("propensity", value, None) for value in (1e-300, JUST_BELOW_1, 1.0)),
-        *(("propensity", p, NO_PROPENSITY) for p in (0.0, -TINY, JUST_ABOVE_1, np.nan, np.inf)),
+        *(("propensity", value, None) for value in (1e-300, 1.0)),
+        *(("propensity", p, NO_PROPENSITY) for p in (0.0, JUST_ABOVE_1, np.nan)),
         *(("row", row, None) for row in ((0, 1), (0.5, 0.5 + 9e-7), (0.5, 0.5 - 9e-7))),
-        *(("row", (0.5, 0.5 + x), NOT_1) for x in (2e-6, -2e-6, np.nan)),
+        *(("row", row, NOT_1) for row in ((0.5, 0.5 + 2e-6), (0.5, 0.5 - 2e-6), (0.5, np.nan))),
         *(("row", row, NOT_1) for row in ((-TINY, 1), (1.5, -0.5))),
-        *(("arms", arms, None) for arms in ((0, 0, 0), (1, 1, 1))),
         # Python would take -1 for the last arm.
-        *(("arms", arms, NO_ARMS) for arms in ((0, 1, -1), (-2, 0, 0), (0, 1, 2))),
-        *(("arms", arms, SHAPES) for arms in ((0, 1), (0, 1, 0, 1), [[0], [1], [0]])),
-        *(("propensities", [0.5] * n, SHAPES) for n in (2, 4)),
+        *(("arms", arms, NO_ARMS) for arms in ((0, 1, -1), (0, 1, 2))),
+        *(("arms", arms, SHAPES) for arms in ((0, 1), [[0], [1], [0]])),
+        ("propensities", [0.5] * 4, SHAPES),
     ],
 )
 def test_what_weights_are_made_of(name, values, refusal):
@@ -327,16 +326,13 @@ def test_the_policies_asked_about_stand_before_their_alternatives(log):
     assert given.ips.tolist() == logged.ips.tolist() == [i % 5 for i in range(60)]
     assert (first.ips + second.ips) / 2 == pytest.approx(logged.ips)
     assert (given.effective, logged.effective) == (60, 60)
-    assert comparison.notes == ()
-
-
-def test_figures_on_the_log_that_an_agent_was_trained_on_flatter_it(log):
-    path = log(NUMBERS)
-    # Another file, even of the same pulls, is another log; and one that is gone is not known.
-    others = dict.fromkeys((log(NUMBERS, "same.csv"), path.with_name("gone.csv"), None), ())
-    told = "runs/random was trained on this log: its figures flatter it; judge by another"
-    for trained_on, notes in {path: (told,), **others}.items():
-        assert compare_policies(read_logged(path), [random_agent(path, trained_on)]).notes == notes
+    # Figures on the log that an agent was trained on flatter it. Another file, even of the same
+    # pulls, is another log; and one that is gone is not known.
+    notes = ("runs/random was trained on this log: its figures flatter it; judge by another",)
+    others = (log(NUMBERS, "same.csv"), path.with_name("gone.csv"), None)
+    for trained_on, expected in {path: notes, **dict.fromkeys(others, ())}.items():
+        agent = random_agent(path, trained_on)
+        assert compare_policies(read_logged(path), [agent]).notes == expected
 
 
 @pytest.mark.parametrize(

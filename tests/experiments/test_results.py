@@ -24,7 +24,7 @@ from experiments.results import (
 )
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.runs import FINISHED
-from report.conclusions import conclusion, places_without_a_run
+from report.conclusions import places_without_a_run
 from report.documents import write_tables
 from report.figures import write_figures
 from report.series import episodes_table, study_series
@@ -82,12 +82,6 @@ def read_one(root, evaluations, episodes):
     (planned,) = plan(study, root)
     write_run(planned, evaluations, episodes)
     return read_results(study, [planned], root)
-
-
-def said(analysis):
-    """All sentences in one text."""
-    found = [conclusion(analysis.study, place).everything for place in analysis.environments]
-    return " ".join([*(text for texts in found for text in texts), *places_without_a_run(analysis)])
 
 
 # --- Rows and curves.
@@ -149,7 +143,6 @@ def test_where_an_agent_remembers_all_have_its_scale(tmp_path, agents, scale):
     (found,) = analyse(results).environments
     assert (found.optimum, found.full_optimum, found.measured_by) == (scale[1], -3, scale[0])
     assert not found.optima
-    assert "Observations hide the state" in said(analyse(results))
 
 
 def test_the_columns_of_the_files_are_documented():
@@ -232,37 +225,15 @@ def test_ranks_estimates_and_pairs(tmp_path):
     assert {name: values.tolist() for name, values in found.items()} == finals
 
 
-# How runs of Q-learning end, and those of SARSA, by seed; and what is said of it. The sentences
-# themselves are tested with the report.
-EQUAL_BUT_ONE = "are equal (medians 90 and 90; 1 of 12 runs of qlearning failed)."
-ONE_MISSING = "2 of 4 runs of qlearning are missing."
-TOO_FEW = "the optimum is 100; 4 seeds decide nothing, about 7 like these would."
-SAID = {
-    "better": ([10, 11, 12, 13, 14], [90, 91, 92, 91, 91], "sarsa is better on average than ql"),
-    # Of such a share five further runs show none with a probability of 0.05.
-    "equivalent": ([90, 91, 90, 91, 90], [90.1, 91, 90, 91, 90], "up to 45% of further ones"),
-    "equivalent but for a failure": ([90] * 11 + [0], [90] * 12, EQUAL_BUT_ONE),
-    "undecided": ([80] * 7, [90] * 6 + [10], "qlearning is undecided on average against sarsa ("),
-    "too few": ([10, 11, 12, 13], [90, 91, 92, 91], TOO_FEW),
-    "missing runs": ([9, None, None, 9], [5] * 4, ONE_MISSING),
-    "no run": ([None] * 4, [5] * 4, "No run of qlearning has finished."),
-    "speed": (
-        [100] * 4,
-        [5] * 4,
-        "in 4 of 4 runs, the median one from step 100 on; sarsa in none.",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", SAID)
-def test_what_is_said_of_runs(tmp_path, case):
-    *finals, sentence = SAID[case]
-    finals = dict(zip(("qlearning", "sarsa"), finals, strict=True))
-    results = results_of(study_of(n_seeds=len(finals["sarsa"])), tmp_path, finals)
-    text = said(analyse(results))
-    assert sentence in text
-    asks = re.search(r"; about [\d,]+ seeds are needed to decide\)\.", text)
-    assert bool(asks) == (case in ("undecided", "equivalent but for a failure"))
+def test_missing_runs_and_failures_are_counted(tmp_path):
+    finals = {"qlearning": [90] * 11 + [0, None], "sarsa": [90] * 13}
+    (environment,) = analyse(results_of(study_of(n_seeds=13), tmp_path, finals)).environments
+    n_missing = {agent.agent: agent.n_missing for agent in environment.agents}
+    n_failed = {name: (each.n_failed, each.n) for name, each in environment.failures.items()}
+    assert n_missing == {"qlearning": 1, "sarsa": 0}
+    assert n_failed == {"qlearning": (1, 12), "sarsa": (0, 13)}
+    (pair,) = environment.pairs
+    assert pair.verdict == "undecided"  # by their means
 
 
 def test_what_is_within_reach_goes_by_the_lower_end_of_a_bracket(tmp_path):
@@ -281,25 +252,22 @@ def test_what_is_within_reach_goes_by_the_lower_end_of_a_bracket(tmp_path):
     assert environment.margin == pytest.approx(0.02 * 400)
     assert environment.threshold == 475, "the environment's own"
     assert environment.agents[1].score.mean.point == pytest.approx(380 / 500)
-    text = said(analyse(results))
-    assert "the optimum is 420 to 520 (bracketed)" in text
-    assert "sarsa has MORE THAN ANY POLICY CAN REACH, 520: the environment is not" in text
-    assert environment.optimum_is_proven
+    assert environment.impossible == ("sarsa",)
+    assert (environment.optimum_is_proven, environment.optima) == (True, {})
     results.summary["optimum_is_proven"] = False  # as on Acrobot
-    told = said(analyse(results))
-    assert "the optimum is 420 to 520 (bracketed; the upper end is not proven)" in told
-    assert "SAME ENVIRONMENT" not in told
     results.summary.loc[results.summary["agent"] == "sarsa", "optimum"] = 700.0
-    told = "NOT PLAY THE SAME ENVIRONMENT: the optimum is 520 for qlearning and 700 for sarsa."
-    assert told in said(analyse(results))
+    (environment,) = analyse(results).environments
+    assert not environment.optimum_is_proven
+    assert environment.optima == {"qlearning": 520.0, "sarsa": 700.0}
 
 
 def test_an_environment_without_a_known_optimum(tmp_path):
     finals = {"qlearning": [480] * 4, "sarsa": [100, 120, 99, 98]}
-    analysis = analyse(results_of(study_of(environments=[POLE]), tmp_path, finals))
-    assert said(analysis).startswith("So far: qlearning (480 [")
-    assert "reaches a return of 475 and keeps it to the end in 4 of 4 runs" in said(analysis)
-    (environment,) = analysis.environments
+    (environment,) = analyse(
+        results_of(study_of(environments=[POLE]), tmp_path, finals)
+    ).environments
+    assert environment.threshold == 475
+    assert environment.agents[0].steps_to_stay.share_reached.point == 1
     assert (environment.optimum, environment.margin, environment.exact) == (None, 0.0, False)
     assert environment.agents[0].score is None
 

@@ -4,13 +4,10 @@ Workers are processes of their own, with another search path or another folder t
 """
 
 import contextlib
-import json
 import os
-import shutil
 import subprocess
 import sys
 import time
-from dataclasses import asdict, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -21,13 +18,10 @@ from distributed import LocalCluster
 import compare
 from experiments.cluster import cluster_launcher
 from experiments.cluster.schedulers import SchedulerAddress
-from experiments.cluster.sent_code import SentCode, UnfitError, differences, versions
 from experiments.launching import execute
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from pipeline.loaded_code import files_in_settings, recorded_code
-from pipeline.settings.hyperparams import split
 from pipeline.user_modules import UserModule, import_typed
 
 ROOT = Path(compare.__file__).parent
@@ -118,49 +112,6 @@ def stale_distribution(folder, name, number):
     return folder
 
 
-def test_other_contents_at_the_modules_place_are_not_used(tmp_path, scheduler):
-    mine = tmp_path / "mine"
-    write_module(mine, "five_sent", 1)
-    modules = import_typed([str(mine / "five_sent.py")])
-    runs = runs_of(tmp_path / "study", modules, "five_sent-v0")
-    wanted = recorded_code(modules)
-    SentCode.of(runs[0].spec)  # as at the beginning of a study
-    write_module(mine, "five_sent", 7)  # then somebody changes them
-    write_module(tmp_path / "path", "five_sent", 7)
-    with worker(scheduler, tmp_path / "w", tmp_path / "path"):
-        assert done(scheduler, tmp_path / "study", runs) == ([5.0, 5.0], [])
-    for run in runs:
-        info = run.run.read_info()
-        assert {name: info[name] for name in wanted} == wanted
-        assert sorted(info["module_digests"]) == ["five_sent.py", "five_sent_reward.py"]
-        assert "REWARD = 1.0" in (run.path / "modules" / "five_sent_reward.py").read_text()
-
-
-def test_a_worker_that_has_imported_other_contents_for_an_earlier_study(
-    tmp_path, scheduler, monkeypatch
-):
-    modules = {}
-    for name, reward in (("old", 7), ("new", 1)):  # each as a driver of its own
-        write_module(tmp_path / name, "five_anew", reward)
-        monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
-        for imported in ("five_anew", "five_anew_reward"):
-            monkeypatch.delitem(sys.modules, imported, raising=False)
-        modules[name] = import_typed([str(tmp_path / name / "five_anew.py")])
-        runs = runs_of(tmp_path / name / "study", modules[name], "five_anew-v0")
-        assert SentCode.of(runs[0].spec).modules[0].digests
-        monkeypatch.undo()
-    raw = runs[0].spec.saved_hyperparams
-    item = {"algo": "qlearning", "env_id": "five_anew-v0", "hyperparams": raw}
-    warm_ups = json.dumps([{**item, "modules": [asdict(modules["old"][0])]}])
-    with worker(scheduler, tmp_path / "w"):
-        for name, reward in (("old", 7.0), ("new", 1.0), ("old", 7.0)):
-            root = tmp_path / name / str(reward)
-            runs = runs_of(root, modules[name], "five_anew-v0")
-            assert done(scheduler, root, runs, warm_ups) == ([5 * reward] * 2, [])
-            warm_ups = "[]"
-            shutil.rmtree(root)
-
-
 def test_unfit_workers_are_set_aside_until_a_fit_one_comes(tmp_path, scheduler, monkeypatch):
     """Where nobody else is left the study ends; those who wait get the worker that comes."""
     stale = stale_distribution(tmp_path / "path", "scipy", "1.16.0")
@@ -209,68 +160,3 @@ def test_an_installed_module_of_other_contents_is_not_used(tmp_path, scheduler, 
     assert found == [5.0, 5.0]
     assert len(said) <= 1  # it may have had no order
     assert all("the module five_found has other contents" in line for line in said)
-
-
-# --- A worker that is asked to end, as by a queue before it kills a job, leaves in good order.
-
-LEAVING = """
-import multiprocessing, os, pathlib, signal, time
-import gymnasium as gym
-from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-
-class Leaving(FrozenLakeEnv):
-    def __init__(self, marks, **kwargs):
-        super().__init__(**kwargs)
-        self.marks = pathlib.Path(marks)
-
-    def reset(self, **kwargs):
-        parent, n_marks = multiprocessing.parent_process(), len(list(self.marks.iterdir()))
-        if parent is not None and n_marks < 3:
-            (self.marks / str(n_marks)).touch()
-            os.kill(parent.pid, signal.SIGTERM)
-            time.sleep(60)
-        return super().reset(**kwargs)
-
-gym.register("Leaving-v0", Leaving, max_episode_steps=20)
-"""
-
-
-def test_workers_that_are_asked_to_end_are_no_loss_however_many(tmp_path, scheduler):
-    (tmp_path / "leaving_lake.py").write_text(LEAVING)
-    (tmp_path / "marks").mkdir()
-    modules = import_typed([str(tmp_path / "leaving_lake.py")])
-    runs = runs_of(tmp_path / "study", modules, "Leaving-v0", marks=str(tmp_path / "marks"))
-    with worker(scheduler, tmp_path / "w"):
-        assert len(done(scheduler, tmp_path / "study", runs[:1])[0]) == 1
-    assert len(list((tmp_path / "marks").iterdir())) == 3
-
-
-# --- What is compared.
-
-
-def test_differences_are_told_by_name():
-    mine = versions()
-    assert differences(mine, mine) == ""
-    theirs = {**mine, "scipy": "1.16", "other": "1"}
-    del theirs["numpy"]
-    assert differences(mine, theirs) == (
-        f"numpy is missing instead of {mine['numpy']}, other 1 instead of none, "
-        f"scipy 1.16 instead of {mine['scipy']}"
-    )
-
-
-def test_files_in_settings_are_compared(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    log = tmp_path / "log.csv"
-    log.write_text("1")
-    spec = runs_of(tmp_path)[0].spec
-    raw = {**spec.saved_hyperparams, "env_kwargs": {"a": [str(log)], "b": {"c": "log.csv"}}}
-    spec = replace(spec, hyperparams=split(raw), saved_hyperparams=raw)
-    assert files_in_settings(spec) == [str(log), "log.csv"]
-    code = SentCode.of(spec)
-    code.check_files(tmp_path)
-    with pytest.raises(UnfitError, match="cannot be read"):
-        code.check_files(tmp_path / "elsewhere")
-    log.write_text("23")
-    with pytest.raises(UnfitError, match="other contents"):
-        code.check_files(tmp_path)

@@ -54,30 +54,21 @@ MISTAKES = [
     (BASE + "seeds: 1\nseeds: 2\n", 4, "key 'seeds' appears twice"),
     (BASE + "\nseeds: many\n", 4, "seeds must be a whole number, not 'many'"),
     (BASE + "seeds: 0\n", 3, "seeds must be at least 1, not 0"),
-    (BASE + "seeds: {first: -1}\n", 3, "first must be at least 0, not -1"),
     (BASE + "seeds: {last: 3}\n", 3, "unknown key 'last'"),
-    (BASE + "seeds: [1, 2]\n", 3, "seeds"),
     (BASE + "metric: finl\n", 3, "did you mean 'final'?"),
     (BASE + "margin: -0.1\n", 3, "margin must be at least 0, not -0.1"),
     (BASE + "run_timeout: -1\n", 3, "run_timeout must be a time"),
-    (BASE + "run_memory: 4\n", 3, "run_memory must be a size"),
     (BASE + "settings: 3\n", 3, "settings must map names to values"),
-    (BASE + "quick: {seed: 1}\n", 3, "unknown key 'seed'"),
     (BASE + "quick:\n  budget: 0\n", 4, "above 0 and up to 1"),
     (BASE + "n_timesteps: 5\nn_episodes: 5\n", 4, "give n_timesteps or n_episodes, not both"),
     (TAXI + "agents:\n  sarsa:\n    n_timesteps: 5\n    n_episodes: 5\n", 5, "not both"),
     (BASE + "sweep:\n  gamma: []\n", 4, "gamma must be a list of values, not []"),
-    (BASE + "sweep: [0.9]\n", 3, "sweep must map names to values"),
     (TAXI + "agents: [dqn, dqn]\n", 2, "agents names one of them twice"),
-    (TAXI + "agents:\n", 2, "at least one name"),
     ("agents: [dqn]\n", 1, "environments must list at least one name"),
     (TAXI + "agents:\n  - algo: dqn\n", 2, "agents must list names, or map them to settings"),
-    (TAXI + "agents:\n  dqn: 3\n", 3, "dqn must map names to values"),
     (TAXI + "agents:\n  mine:\n    algo: [dqn]\n", 4, "unknown agent"),
     (TAXI + "agents: [sarsa, qlerning]\n", 2, "'qlerning': did you mean 'qlearning'?"),
-    (TAXI + "agents:\n  mine:\n    gamma: 0.9\n    algo: saarsa\n", 5, "did you mean 'sarsa'?"),
     (TAXI + "agents:\n  dqn:\n    conf_file: no.yml\n", 4, "conf_file: there is no file "),
-    (TAXI + "agents:\n  dqn: {conf_file: [a]}\n", 3, "conf_file must be a text"),
     (TAXI + "agents: {dqn: {conf_file: lakes.yml, tuned: false}}\n", 2, "contradict each other"),
     ("agents: [dqn]\nenvironments:\n  lake: {id: 3}\n", 3, "id must be a text"),
     ("agents: [dqn]\nenvironments: {ice: {id: FrozenLak-v1}}\n", 2, "mean 'FrozenLake-v1'"),
@@ -345,12 +336,9 @@ UNTRAINABLE = [
 @pytest.mark.parametrize(("algo", "settings", "complaint"), UNTRAINABLE)
 def test_what_cannot_be_trained_is_refused_beforehand(tmp_path, algo, settings, complaint):
     agents = AgentSpec("good", "sarsa"), AgentSpec("bad", algo, settings, where="lakes.yml:7")
-    for order, n_seeds in ((agents, 1), (agents[::-1], 2)):
-        study = study_of(*order, n_seeds=n_seeds)
-        with pytest.raises(UserError, match=rf"^lakes\.yml:7: .*{complaint}"):
-            check_settings(study, plan(study, tmp_path))
-    good = study_of(agents[0])
-    check_settings(good, plan(good, tmp_path))
+    study = study_of(*agents, n_seeds=2)
+    with pytest.raises(UserError, match=rf"^lakes\.yml:7: .*{complaint}"):
+        check_settings(study, plan(study, tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -446,7 +434,6 @@ DQN, PPO, RANDOM, TABLE = (AgentSpec(name, name) for name in ("dqn", "ppo", "ran
 PLAIN_DQN = replace(DQN, tuned=False, settings={"policy": "MlpPolicy", "n_timesteps": 100})
 SHORT = replace(DQN, settings={"n_timesteps": 9})
 MINE = AgentSpec("mine", "dqn", {"gamma": 0.9})
-OWN_PLACE = replace(DQN, settings={"env_kwargs": {"is_slippery": False}})
 
 
 def place(env_id, settings=None, **kwargs):
@@ -460,10 +447,8 @@ ELSEWHERE = "the settings of dqn were tuned with other arguments of the environm
 # Agents, environments, the first seed and how many there are, and what is said of them.
 SEEDS = [
     ((DQN, PPO, RANDOM), [TUNED], (0, 10), f"the shipped settings of dqn and ppo {THESE}"),
-    ((DQN, PPO, RANDOM), [TUNED], (1000, 10), NOTHING),
     ((DQN, PPO), [TUNED], (8, 10), "settings of dqn and ppo were tuned on 8 to 9 of"),
     ((PPO,), [TUNED], (3, 1), "the shipped settings of ppo were tuned on it"),
-    ((PPO,), [TUNED], (33, 1), "nothing was tuned on it"),
     # The constructor's defaults were tuned on nothing, and a budget is no tuning.
     ((PLAIN_DQN,), [TUNED], (0, 10), NOTHING),
     ((SHORT,), [TUNED], (0, 10), f"shipped settings of dqn {THESE}"),
@@ -471,14 +456,11 @@ SEEDS = [
     ((MINE,), [TUNED], (1000, 10), f"nothing is known to have been tuned on these; {NOT_KNOWN}"),
     # Other arguments of the environment make it another.
     ((DQN,), [SLIPPERY], (1000, 10), f": {ELSEWHERE}"),
-    ((RANDOM,), [SLIPPERY], (0, 10), NOTHING),
     ((DQN,), [SLIPPERY, TUNED], (0, 10), f"settings of dqn {THESE}; {ELSEWHERE}"),
-    ((OWN_PLACE,), [TUNED], (0, 10), f": {ELSEWHERE}"),
     ((DQN,), [place(USUAL, slip=0.0)], (0, 10), f"the shipped settings of dqn {THESE}"),
     ((DQN,), [place("RandomWarehouse-v0", size=10)], (0, 10), f"settings of dqn {THESE}"),
     ((DQN,), [place(USUAL, AS_IT_COMES)], (0, 10), f": {ELSEWHERE}"),
-    # A table has no such changes in its settings; and one environment may have two names.
-    ((TABLE,), [place(USUAL, AS_IT_COMES)], (0, 10), f"of sarsa {THESE}"),
+    # One environment may have two names.
     ((TABLE,), [place("CliffWalking-v1", is_slippery=True)], (0, 10), f"of sarsa {THESE}"),
 ]
 
