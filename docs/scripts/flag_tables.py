@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from importlib import import_module
 
 
@@ -17,6 +18,7 @@ def flags_block(command: str) -> str:
         names = action.option_strings or [""]
         typed = ", ".join(f"`{f'{name} {value}'.strip()}`" for name in names)
         told = parser._get_formatter()._expand_help(action) if action.help else ""
+        told = re.sub(r"(?<![\w-])--?[a-z][a-z-]*", r"`\g<0>`", told)  # Sphinx joins dashes
         cells = (cell.replace("|", "\\|") for cell in (typed, told))
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
