@@ -95,6 +95,7 @@ TRAININGS = [
     row(LEFT_RIGHT, "ppo", 1500, {**SMALL, **COMPILED, "normalize": True}, log_interval=3),
     row(LEFT_RIGHT, "a2c", 1500, {"n_envs": 1}, log_interval=-1),
     row(LEFT_RIGHT, "dqn", 600, {**EAGER, "n_steps": 3}, log_interval=-1),
+    row(GRID, "a2c", 1500, {"n_envs": 2, "n_steps": 3, **COMPILED}, log_interval=-1),
 ]
 
 
