@@ -278,9 +278,11 @@ def prepared(spec, console=None):
         ("qlearning", LAKE, {"engine": "compiled"}, None, "overestimation"),
         ("sarsa", LAKE, {"engine": "interpreted"}, 100, "q_error"),
         ("actor_critic", LAKE, {}, 100, "v_error"),
+        ("dqn", LAKE, {**EAGER, "engine": "library"}, 100, "overestimation"),
         ("dqn", LAKE, {**EAGER, "engine": "compiled"}, 100, "overestimation"),
         ("ppo", LAKE, LIBRARY, 70, "gradient_cosine"),
         ("ppo", LAKE, COMPILED, None, "gradient_cosine"),
+        ("a2c", LAKE, {"n_envs": 2, "n_steps": 7, "engine": "library"}, 100, "gae_bias"),
         ("ppo_mask", WAREHOUSE, PPO, 100, "gradient_snr"),
     ],
 )
