@@ -36,7 +36,7 @@ golden: $(STAMP) ## Tell what is produced differently than tests/golden/golden.j
 size: $(STAMP) ## Count lines and files against the limits in CONTRIBUTING.md
 	@$(BIN)/python docs/scripts/sizes.py
 
-peers: $(STAMP) ## Set up rl_zoo3, which tests and a benchmark need, in .venv/peers
+peers: $(STAMP) ## Set up rl_zoo3, which tests need, in .venv/peers
 	@$(BIN)/python tests/peers/peer_environment.py
 
 lint: style types types-elsewhere ## Check style, formatting, types and import contracts
