@@ -1,4 +1,4 @@
-"""Subclasses of the library's agents, each with the fault that ``FAULTS`` names."""
+"""Subclasses of the library's agents and of ours, each with the fault that ``FAULTS`` names."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.utils import explained_variance
 from torch.nn.functional import mse_loss
 
+from agents.tabular.one_step import QLearning
+
 
 class DQNSharesMemory(DQN):
     """Has one memory for all agents of the class, as a mutable default would make it."""
@@ -22,6 +24,24 @@ class DQNSharesMemory(DQN):
         self.replay_buffer = self.memories.get(key)
         super()._setup_model()
         self.memories[key] = self.replay_buffer
+
+
+class DQNNeverCopies(DQN):
+    """Its target network stays as it began."""
+
+    def _on_step(self) -> None:
+        tau, self.tau = self.tau, 0.0
+        super()._on_step()
+        self.tau = tau
+
+
+class DQNAlwaysCopies(DQN):
+    """Its target network follows at each training."""
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """After copying."""
+        self.q_net_target.load_state_dict(self.q_net.state_dict())
+        super().train(gradient_steps, batch_size)
 
 
 class DQNWithoutOptimizer(DQN):
@@ -108,6 +128,16 @@ class PPOTraces(PPO):
         super().__init__(*args, **kwargs)
 
 
+class ForgetfulQLearning(QLearning):
+    """Its table is not in the file."""
+
+    def get_parameters(self) -> dict[str, Any]:
+        """With an empty table."""
+        parameters = super().get_parameters()
+        table = parameters["policy"]["q_tables"]
+        return {**parameters, "policy": {**parameters["policy"], "q_tables": th.zeros_like(table)}}
+
+
 class ForgetfulPPO(PPO):
     """Its learning rate's schedule is not in the file."""
 
@@ -116,6 +146,9 @@ class ForgetfulPPO(PPO):
 
 
 FAULTS = {
+    "DQNNeverCopies": "target-never-copied",
+    "DQNAlwaysCopies": "target-always-copied",
+    "ForgetfulQLearning": "zip-forgets-tables",
     "DQNSharesMemory": "shared-buffer",
     "DQNWithoutOptimizer": "zip-forgets-optimizer",
     "PPOEntropy": "entropy-sign",

@@ -45,7 +45,10 @@ def test_faults_of_tables_are_named_and_right_ones_pass(name):
         ("PPORatio", "ppo", probes.probe_ratio),
         ("PPOTraces", None, probes.probe_traces),
         ("PPOEntropy", None, probes.probe_entropy),
+        ("DQNNeverCopies", None, probes.probe_discount),
+        ("DQNAlwaysCopies", "dqn", probes.probe_target_network),
         ("ForgetfulPPO", None, probes.probe_files),
+        ("ForgetfulQLearning", None, probes.probe_files),
         ("DQNSharesMemory", "dqn", probes.probe_seeds),
     ],
 )
