@@ -116,7 +116,8 @@ INTERPRETED = {  # reason: environment, settings, callback
 
 
 @pytest.mark.parametrize("reason", INTERPRETED)
-def test_what_is_interpreted_and_why(reason):
+def test_what_is_interpreted_and_why(reason, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # checkpoints make their folder
     make_env, *rest = INTERPRETED[reason]
     settings, callback = (*rest, *({}, None)[len(rest) :])
     env, callback = make_env(), callback and callback()
