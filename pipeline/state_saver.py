@@ -76,7 +76,6 @@ class StateSaver(BlockCallback):
         self.acts = True  # at the next safe moment, unless an engine has heard that it need not
         note = {} if self.state is None else self.state.note
         self.n_saved = int(note.get("number", 0))
-        self.begun = note.get("begun")  # the agent's steps before this run
         self.time_before = WorkTime(
             float(note.get("seconds", 0.0)), float(note.get("cpu_seconds", 0.0))
         )
@@ -111,7 +110,6 @@ class StateSaver(BlockCallback):
             self._act()
 
     def _on_training_start(self) -> None:
-        self.begun = self.model.num_timesteps if self.begun is None else self.begun
         self.steps_at_save = self.model.num_timesteps
         self.saved_at, self.started = time.monotonic(), WorkTime.now()
 
@@ -189,7 +187,6 @@ class StateSaver(BlockCallback):
             "log_folder": _log_folder(self.model),
             "files": positions,
             "steps": self.model.num_timesteps,
-            "begun": self.begun,
             **self.taken.as_data(),
             "pause": self.pause,
             "spec": settings_digest(self.run.recorded_spec()),
@@ -385,10 +382,10 @@ class IterationLogger(Logger):
 
 
 def iterations_before(model: BaseAlgorithm, note: dict[str, Any]) -> int:
-    """Iterations before a saved state, for algorithms that count from 1 at each `learn`."""
+    """Iterations before a saved state where `learn` counts from 1; ask before the model learns."""
     if not isinstance(model, OnPolicyAlgorithm):
         return 0
-    return int(note["steps"] - note.get("begun", 0)) // (model.n_steps * model.n_envs)
+    return int(note["steps"] - model.num_timesteps) // (model.n_steps * model.n_envs)
 
 
 def default_log_interval(model: BaseAlgorithm) -> int:

@@ -15,11 +15,10 @@ import socket
 import ssl
 import subprocess
 import sys
-import time
 import warnings
 import zipfile
 from concurrent.futures import CancelledError
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -70,7 +69,7 @@ from experiments.run_in_child import do_run
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import digests
 from pipeline.errors import UserError
-from pipeline.loaded_code import DISTRIBUTIONS, files_in_settings, recorded_code
+from pipeline.loaded_code import DISTRIBUTIONS, files_in_settings
 from pipeline.locks import mark
 from pipeline.settings.hyperparams import split
 from pipeline.user_modules import import_typed
@@ -738,111 +737,7 @@ def test_a_cluster_does_what_this_machine_does_whatever_dies(tmp_path, monkeypat
         assert done("apart") == (here, {})
 
 
-# --- Workers with other code: processes of their own, with another search path than the driver.
-
-# Five steps: the return is five times the reward, which a module beside it says.
-MODULE = """
-import gymnasium as gym
-from {helper} import REWARD
-
-class Five(gym.Env):
-    observation_space = gym.spaces.Discrete(1)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {{}}
-
-    def step(self, action):
-        return 0, REWARD, False, False, {{}}
-
-if "{name}-v0" not in gym.registry:
-    gym.register("{name}-v0", Five, max_episode_steps=5)
-"""
-
-
-def write_module(folder, name, reward):
-    folder.mkdir(parents=True, exist_ok=True)
-    helper = f"{name}_reward"
-    (folder / f"{name}.py").write_text(MODULE.format(helper=helper, name=name))
-    (folder / f"{helper}.py").write_text(f"REWARD = {reward:.1f}\n")
-
-
-@pytest.fixture
-def scheduler():
-    with LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=50) as cluster:
-        yield cluster
-
-
-@contextlib.contextmanager
-def worker(scheduler, folder, *paths):
-    """A worker that searches modules in these folders first; ends with the ``with`` statement."""
-    folder.mkdir()
-    words = f"-m distributed.cli.dask_worker {scheduler.scheduler_address} --nworkers 1"
-    words += f" --nthreads 1 --no-dashboard --local-directory {folder}"
-    n_before = len(scheduler.scheduler.workers)
-    process = subprocess.Popen(
-        [sys.executable, *words.split()],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*paths, ROOT)))},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        until = time.monotonic() + 120
-        while len(scheduler.scheduler.workers) == n_before and time.monotonic() < until:
-            time.sleep(0.05)
-        yield
-    finally:
-        process.terminate()
-        process.wait(60)
-
-
-def mean_returns(runs):
-    return [run.run.read_info()["final"]["mean_return"] for run in runs]
-
-
-def test_runs_load_what_was_sent_whatever_lies_there_or_was_imported(
-    tmp_path, scheduler, monkeypatch
-):
-    place = {"five": ("five_sent-v0", {})}
-    modules, recorded = {}, {}
-    for name, reward in (("old", 7), ("new", 1)):  # each as a driver of its own
-        write_module(tmp_path / name, "five_sent", reward)
-        monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
-        for imported in ("five_sent", "five_sent_reward"):
-            monkeypatch.delitem(sys.modules, imported, raising=False)
-        modules[name] = import_typed([str(tmp_path / name / "five_sent.py")])
-        recorded[name] = recorded_code(modules[name])
-        (run, _) = runs_of(tmp_path, modules[name], place)
-        assert SentCode.of(run.spec).modules[0].digests  # as at the beginning of a study
-        monkeypatch.undo()
-    # Then somebody changes one, and the worker finds others by itself.
-    write_module(tmp_path / "new", "five_sent", 9)
-    write_module(tmp_path / "path", "five_sent", 9)
-    item = {
-        "algo": "qlearning",
-        "env_id": "five_sent-v0",
-        "hyperparams": run.spec.saved_hyperparams,
-    }
-    warm_ups = json.dumps([{**item, "modules": [asdict(modules["old"][0])]}])
-    where = SchedulerAddress(scheduler.scheduler_address)
-    with worker(scheduler, tmp_path / "w", tmp_path / "path"):
-        for name, reward in (("old", 7.0), ("new", 1.0)):
-            root = tmp_path / "studies" / name
-            root.mkdir(parents=True)
-            runs = runs_of(root, modules[name], place)
-            launchers = partial(
-                cluster_launcher.cluster_launcher, where, root, "c", warm_ups=warm_ups
-            )
-            assert execute(runs, root, launchers, lambda *_: None) == []
-            assert mean_returns(runs) == [5 * reward] * 2
-            warm_ups = "[]"
-            for run in runs:
-                info = run.run.read_info()
-                assert {key: info[key] for key in recorded[name]} == recorded[name]
-                copy = (run.path / "modules" / "five_sent_reward.py").read_text()
-                assert copy == f"REWARD = {reward:.1f}\n"
+# --- Files that settings name.
 
 
 def test_files_in_settings_are_compared(tmp_path, monkeypatch):

@@ -4,10 +4,12 @@ Workers are processes of their own, with another search path or another folder t
 """
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -18,10 +20,12 @@ from distributed import LocalCluster
 import compare
 from experiments.cluster import cluster_launcher
 from experiments.cluster.schedulers import SchedulerAddress
+from experiments.cluster.sent_code import SentCode
 from experiments.launching import execute
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
+from pipeline.loaded_code import recorded_code
 from pipeline.user_modules import UserModule, import_typed
 
 ROOT = Path(compare.__file__).parent
@@ -93,7 +97,7 @@ def worker(scheduler, folder, *paths, cwd=None):
 def done(scheduler, root, runs, warm_ups="[]"):
     """The mean returns of the runs, and what was said."""
     said = []
-    root.mkdir(exist_ok=True)
+    root.mkdir(parents=True, exist_ok=True)
     there = SchedulerAddress(scheduler.scheduler_address)
     launchers = partial(
         cluster_launcher.cluster_launcher, there, root, "c", warm_ups=warm_ups, tell=said.append
@@ -160,3 +164,39 @@ def test_an_installed_module_of_other_contents_is_not_used(tmp_path, scheduler, 
     assert found == [5.0, 5.0]
     assert len(said) <= 1  # it may have had no order
     assert all("the module five_found has other contents" in line for line in said)
+
+
+def test_runs_load_what_was_sent_whatever_lies_there_or_was_imported(
+    tmp_path, scheduler, monkeypatch
+):
+    modules, recorded = {}, {}
+    for name, reward in (("old", 7), ("new", 1)):  # each as a driver of its own
+        write_module(tmp_path / name, "five_sent", reward)
+        monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
+        for imported in ("five_sent", "five_sent_reward"):
+            monkeypatch.delitem(sys.modules, imported, raising=False)
+        modules[name] = import_typed([str(tmp_path / name / "five_sent.py")])
+        recorded[name] = recorded_code(modules[name])
+        (run, _) = runs_of(tmp_path, modules[name], "five_sent-v0")
+        assert SentCode.of(run.spec).modules[0].digests  # as at the beginning of a study
+        monkeypatch.undo()
+    # Then somebody changes one, and the worker finds others by itself.
+    write_module(tmp_path / "new", "five_sent", 9)
+    write_module(tmp_path / "path", "five_sent", 9)
+    item = {
+        "algo": "qlearning",
+        "env_id": "five_sent-v0",
+        "hyperparams": run.spec.saved_hyperparams,
+    }
+    warm_ups = json.dumps([{**item, "modules": [asdict(modules["old"][0])]}])
+    with worker(scheduler, tmp_path / "w", tmp_path / "path"):
+        for name, reward in (("old", 7.0), ("new", 1.0)):
+            root = tmp_path / "studies" / name
+            runs = runs_of(root, modules[name], "five_sent-v0")
+            assert done(scheduler, root, runs, warm_ups) == ([5 * reward] * 2, [])
+            warm_ups = "[]"
+            for run in runs:
+                info = run.run.read_info()
+                assert {key: info[key] for key in recorded[name]} == recorded[name]
+                copy = (run.path / "modules" / "five_sent_reward.py").read_text()
+                assert copy == f"REWARD = {reward:.1f}\n"

@@ -37,6 +37,7 @@ from pipeline.unfinished_runs import (
 )
 from pipeline.user_modules import import_typed
 
+TINY = {"n_envs": 2, "n_steps": 3}  # rollouts, of which a block has many
 COMPILED = {"engine": "compiled"}
 GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
 WAREHOUSE, ARMS, LINEAR = "Warehouse-v0", "BernoulliBandit-v0", "LinearBandit-v0"
@@ -95,7 +96,7 @@ TRAININGS = [
     row(LEFT_RIGHT, "ppo", 1500, {**SMALL, **COMPILED, "normalize": True}, log_interval=3),
     row(LEFT_RIGHT, "a2c", 1500, {"n_envs": 1}, log_interval=-1),
     row(LEFT_RIGHT, "dqn", 600, {**EAGER, "n_steps": 3}, log_interval=-1),
-    row(GRID, "a2c", 1500, {"n_envs": 2, "n_steps": 3, **COMPILED}, log_interval=-1),
+    row(GRID, "a2c", 1500, {**COMPILED, **TINY}, log_interval=30, trained_agent=200),
 ]
 
 
@@ -233,7 +234,7 @@ def test_the_result_is_that_of_an_undisturbed_run(
 ):
     if "trained_agent" in more:
         begun = spec_of(tmp_path / "first", env_id, algo, more["trained_agent"], settings)
-        more = {"trained_agent": carried_out(begun).run.model_path}
+        more = {**more, "trained_agent": carried_out(begun).run.model_path}
     whole = carried_out(spec_of(tmp_path / "whole", env_id, algo, steps, settings, **more))
     spec = spec_of(tmp_path / "parts", env_id, algo, steps, settings, **more)
     run = cut_off(spec, monkeypatch)
