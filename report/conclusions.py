@@ -1,4 +1,4 @@
-"""What a study has shown, in sentences: in a line, pair by pair, and how soon."""
+"""The conclusions of a study as sentences: who is best, pair by pair, and how soon."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ from verdicts import PairComparison
 
 
 def pairs_both_ways(environment: EnvironmentAnalysis) -> dict[tuple[str, str], PairComparison]:
-    """By first and second agent every pair, as each of the two sees it."""
+    """Every pair in both orders, by first and second agent."""
     seen = [one for pair in environment.pairs for one in (pair, pair.swapped())]
     return {(one.first, one.second): one for one in seen}
 
 
 def oriented_pairs(environment: EnvironmentAnalysis) -> list[PairComparison]:
-    """The pairs, each seen from the agent that is better, where one is."""
+    """The pairs, each with the better agent first if one is better."""
     return [pair.swapped() if pair.verdict == "worse" else pair for pair in environment.pairs]
 
 
 def pair_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
-    """The verdicts on means, those with the same first agent and verdict in one sentence.
+    """The verdicts on means, one sentence for each first agent and verdict.
 
-    Then those on typical runs, where they say something else.
+    Then the verdicts on medians (typical runs) that differ from those on means.
     """
     too_few = study.n_seeds < environment.fewest
     equal = [
@@ -79,7 +79,7 @@ def pair_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[s
 
 
 def _equal_best(environment: EnvironmentAnalysis) -> list[str]:
-    """The agents, two or more, that none is better than and that are equal: the first line's."""
+    """The two or more agents that share the first place as equivalent; empty if there are none."""
     ahead = not_behind([agent.agent for agent in environment.agents], environment.pairs)
     pairs = [p for p in environment.pairs if {p.first, p.second} <= set(ahead)]
     are_equal = all(pair.verdict == "equivalent" for pair in pairs)
@@ -87,12 +87,12 @@ def _equal_best(environment: EnvironmentAnalysis) -> list[str]:
 
 
 def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    """How many seeds the agents were to have."""
+    """The planned numbers of seeds of the agents, in words."""
     return seeds(*(environment.seeds.values() or [study.n_seeds]))
 
 
 def _on_equivalent(environment: EnvironmentAnalysis, group: Sequence[str]) -> str:
-    """Who is equivalent, in what, and what so few runs leave open."""
+    """Which agents are equivalent, within what margin, and what unseen runs may change."""
     within = _within(environment)
     pairs = [p for p in environment.pairs if p.first in group and p.second in group]
     if all(pair.certain for pair in pairs):
@@ -107,7 +107,7 @@ def _on_equivalent(environment: EnvironmentAnalysis, group: Sequence[str]) -> st
 
 
 def _within(environment: EnvironmentAnalysis) -> str:
-    """The margin, in scores or else in the unit of the figures."""
+    """The margin of equivalence in words, in scores or else in the unit of the figures."""
     margin, ends = environment.margin, environment.ends
     if environment.is_score:
         margin /= ends.high - ends.low
@@ -115,7 +115,7 @@ def _within(environment: EnvironmentAnalysis) -> str:
 
 
 def _unseen(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
-    """How many further runs may be unlike those that were seen: right in 95 of 100 studies."""
+    """The upper 95 % confidence bound on the share of further runs unlike all runs so far."""
     names = {name for pair in pairs for name in (pair.first, pair.second)}
     n_runs = [agent.n_runs for agent in environment.agents if agent.agent in names]
     n = min([*n_runs, *(pair.n_seeds for pair in pairs)])
@@ -123,9 +123,9 @@ def _unseen(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -
 
 
 def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
-    """Agents of which every two are equivalent, in groups that hold all such pairs.
+    """Groups of agents in which every two are equivalent; each equivalent pair is in a group.
 
-    Those that are so with a condition stand apart from those that are without.
+    Conditional and unconditional verdicts form separate groups.
     """
     names = [agent.agent for agent in environment.agents]
     pairs = pairs_both_ways(environment)
@@ -149,13 +149,13 @@ def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
 
 
 def amounts(environment: EnvironmentAnalysis, *shares: float) -> list[float]:
-    """Differences in scores, or else in the unit of the figures."""
+    """Shares of the scale, converted to scores or else to the unit of the figures."""
     span = 1.0 if environment.is_score else environment.ends.high - environment.ends.low
     return [share * span for share in shares]
 
 
 def _lead_of(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
-    """The agent behind, by how much, and who failed, but of an agent most of whose runs did."""
+    """The agent behind, by how much, and failed runs, unless most runs of their agent failed."""
     counts = {name: environment.failures.get(name) for name in (pair.first, pair.second)}
     few = [name for name, count in counts.items() if count and 2 * count.n_failed <= count.n]
     failed = failed_runs(environment, few)
@@ -168,7 +168,7 @@ def _lead_of(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
 
 
 def _condition(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
-    """As long as what the leads hold."""
+    """The condition on further runs under which the leads hold."""
     most = min(pair.mean.most_outside for pair in pairs)
     return (
         f"as long as fewer than {100 * most:.2g} % of further runs lie outside of those that were "
@@ -177,7 +177,7 @@ def _condition(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]
 
 
 def _on_typical_runs(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Where the typical runs say something else than the means."""
+    """The verdicts on medians that differ from those on means."""
     medians = {agent.agent: agent.metric.median.point for agent in environment.agents}
     for pair in environment.pairs:
         if pair.typical in ("undecided", pair.verdict) or pair.certain:
@@ -202,14 +202,14 @@ def _how_open(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
 
 
 def _shown_with(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
-    """With how many seeds pairs were judged, where a study has grown until they were decided."""
+    """The number of seeds behind the pairs, in a study that adds seeds until they are decided."""
     if environment.look.design is None:
         return ""
     return f", with {seeds(*(pair.n_seeds for pair in pairs))}"
 
 
 def failed_runs(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
-    """Of agents, those of which runs failed, and how many; empty where none did."""
+    """How many runs of each agent failed; empty if none did."""
     counts = {name: environment.failures.get(name) for name in names}
     return enumeration(
         [
@@ -221,7 +221,7 @@ def failed_runs(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
 
 
 def on_unreliable(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Who fails more often, but for agents that are worse anyhow."""
+    """Which agent fails more often than another, unless its mean is shown to be worse, too."""
     worse = {
         (p.second, p.first)
         for p in oriented_pairs(environment)
@@ -240,7 +240,7 @@ def on_unreliable(environment: EnvironmentAnalysis) -> Iterable[str]:
 
 
 def speed_sentences(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """How many runs come to stay above the threshold, from when on, and who does so sooner."""
+    """How many runs reach the threshold and stay there, from which step, and who is sooner."""
     told = [
         (agent.agent, agent.steps_to_stay.share_reached, agent.steps_to_stay.median.point)
         for agent in environment.agents
@@ -263,7 +263,7 @@ def speed_sentences(environment: EnvironmentAnalysis) -> Iterable[str]:
 
 
 def _on_ratios(environment: EnvironmentAnalysis, fastest: str) -> Iterable[str]:
-    """Who needs how many times the steps of the fastest, where that is shown."""
+    """By what factor agents need more steps than the fastest, if that is shown."""
     slower = []
     for pair in environment.speeds:
         if pair.sooner != fastest:
@@ -288,20 +288,20 @@ def _goal(environment: EnvironmentAnalysis) -> str:
     return f"a return of {number(threshold)}"
 
 
-# What a study has shown on an environment: in a line, pair by pair, and what else there is.
+# The conclusion on an environment: the lead (a line on who is best), the pairs, and notes.
 
-MOST_FIGURES = 3  # agents whose figures stand in a line
+MOST_FIGURES = 3  # the largest number of agents with figures in the lead
 
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What the runs on an environment say."""
+    """The sentences on an environment."""
 
-    lead: str  # who is best, and how that stands to the optimum
+    lead: str  # who is best, and how far below the optimum
     pairs: tuple[str, ...]  # every verdict, with figures; several in a sentence
-    failed: str  # whose runs failed, to stand beside verdicts that are shown as signs; may be empty
-    # Failures, how soon agents arrive, training on variants, what is missing, what failed agents
-    # do instead, and how often the runs have been looked at.
+    failed: str  # whose runs failed, to show beside the matrix of verdicts; may be empty
+    # Failures, how soon agents arrive, training on variants, missing runs, what failed agents
+    # do instead, and the number of looks.
     notes: tuple[str, ...]
 
     @property
@@ -442,7 +442,7 @@ def _is_open(environment: EnvironmentAnalysis) -> bool:
 
 
 def _leads_so_far(environment: EnvironmentAnalysis, ahead: Sequence[str]) -> Iterable[str]:
-    """Whom the first agent leads as far as was seen, of those that are not shown to be behind."""
+    """Which agent leads all others that are not shown to be behind, under a condition."""
     pairs = [p for p in oriented_pairs(environment) if {p.first, p.second} <= set(ahead)]
     for name in ahead:
         led = [p for p in pairs if p.first == name and p.verdict == "better"]
@@ -452,7 +452,7 @@ def _leads_so_far(environment: EnvironmentAnalysis, ahead: Sequence[str]) -> Ite
 
 
 def _all_alike(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    """That all runs of all agents have the same figure: a fact, and no verdict."""
+    """The sentence for runs that all have the same figure: a fact, no verdict."""
     names = [agent.agent for agent in environment.agents]
     n = min(agent.n_runs for agent in environment.agents)
     who = "Both agents" if len(names) == 2 else f"All {len(names)} agents"
@@ -469,7 +469,7 @@ def _all_alike(study: StudySpec, environment: EnvironmentAnalysis) -> str:
 
 
 def _so_far(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    """The means of runs that are too few to claim anything."""
+    """The means so far, where runs are too few for any claim."""
     figures = _figures(study, environment, environment.agents[:MOST_FIGURES])
     needed = [p.seeds_needed for p in environment.pairs if p.seeds_needed is not None]
     n = seeds_of(study, environment)
@@ -486,7 +486,7 @@ def _figures(
     agents: Sequence[AgentAnalysis],
     last: str = " and ",
 ) -> str:
-    """Of each agent its own mean."""
+    """Each agent with its mean."""
     told = [f"{agent.agent} ({_mean(study, environment, agent)})" for agent in agents]
     return last.join([", ".join(told[:-1]), told[-1]] if len(told) > 1 else told)
 
@@ -528,13 +528,13 @@ def _extreme(study: StudySpec) -> str:
 
 
 def _equal_to(top: AgentAnalysis, environment: EnvironmentAnalysis) -> list[str]:
-    """The agents whose mean is that of the first."""
+    """The agents whose mean equals that of ``top``."""
     value = top.metric.mean.point
     return [a.agent for a in environment.agents if math.isclose(a.metric.mean.point, value)]
 
 
 def _where_the_median_differs(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Who comes first by the median, where that is not who does by the mean."""
+    """Which agent is first by the median, if another is first by the mean."""
     sign = -1 if study.metric in COSTS else 1
     medians = {agent: sign * agent.metric.median.point for agent in environment.agents}
     by_mean = environment.agents[0]
@@ -554,7 +554,7 @@ def _where_the_median_differs(study: StudySpec, environment: EnvironmentAnalysis
 
 
 def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
-    """Whether the typical run of every agent is no better than acting at random."""
+    """Whether no median exceeds the best random or constant policy by more than the margin."""
     baseline, optimum = environment.baseline, environment.optimum
     if study.metric not in ON_THE_SCALE or baseline is None or optimum is None:
         return False
@@ -564,7 +564,7 @@ def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
 
 
 def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """That agents do not play the same environment, since one's settings change it."""
+    """A warning if the settings of an agent change the environment, and so the optimum."""
     if environment.optima:
         each = [f"{number(optimum)} for {name}" for name, optimum in environment.optima.items()]
         yield (
@@ -574,26 +574,26 @@ def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
 
 
 def _on_the_hidden(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """By what observations the optimum is reached, and what agents could do that see the state."""
+    """Under partial observability: what the optimum is based on, and that of the full state."""
     words = scale_words(environment.full_optimum, environment.measured_by)
     if words:
         yield f"{words[0].upper()}{words[1:]}."
 
 
 def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Agents whose returns are above what no policy exceeds."""
+    """Agents whose returns exceed the upper bound on the optimum."""
     names, most = environment.impossible, environment.optimum
     if names:
         verb = "has" if len(names) == 1 else "have"
         yield (
             f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, {number(most)}: the "
-            "environment is not the one that the bracket is of, or the bracket is wrong"
-            f"{'.' if environment.optimum_is_proven else ', whose upper end is not proven.'}"
+            "bracket belongs to another environment, or is wrong"
+            f"{'.' if environment.optimum_is_proven else '; its upper end is not proven.'}"
         )
 
 
 def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
-    """That returns of training cannot be compared, where the verdicts are about them."""
+    """Agents trained on a variant of the environment, if the verdicts are on training returns."""
     names = [agent.agent for agent in environment.agents if agent.on_variant]
     if names and study.metric in OF_TRAINING:
         verb = "was" if len(names) == 1 else "were"
@@ -606,7 +606,7 @@ def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable
 def on_changes(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
     """Which agents were trained on a changed environment, and what was changed: one sentence.
 
-    Of several environments it says which; those with the same changes stand together.
+    It names the environments if there are several, and groups agents with the same changes.
     """
     found: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for environment in environments:
@@ -619,7 +619,7 @@ def on_changes(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
 
 
 def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """How often the runs have been looked at, where that is more than once, and at what level."""
+    """Which look at the runs this is, if not the first, and the level of its claims."""
     look = environment.look
     level = f"{100 * look.level:.2g} %"
     if look.design is not None:

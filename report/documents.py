@@ -32,26 +32,26 @@ from report.words import (
     seeds,
 )
 
-# The languages by the suffix of their files, which their templates have too.
+# A markup is named by the suffix of its files and of its templates.
 Markup = Literal["md", "tex"]
 MARKUPS: tuple[Markup, ...] = get_args(Markup)
 
 PLAIN_NAME = re.compile(r"[\w.=+-]+")
 
 
-# Text in which nothing is markup.
+# Escaping of plain text.
 
-# What Markdown would read: not underscores inside words, nor brackets that are no link.
+# What Markdown takes for markup: no underscores inside words, no brackets without a link.
 _MARKUP = re.compile(r"[\\`*<>|~&]|(?<!\w)_|_(?!\w)|\](?=[(\[:])|^[#+-]")
 
 
 def name_of(label: str) -> str:
-    """A label in Markdown: as code where it is a plain name, else as text."""
+    """A label in Markdown: code if it is a plain name, else escaped text."""
     return f"`{label}`" if PLAIN_NAME.fullmatch(label) else markdown_text(label)
 
 
 def markdown_text(text: str) -> str:
-    """Text in which Markdown finds no markup."""
+    """Escape a text for Markdown, on one line."""
     return _MARKUP.sub(lambda found: "\\" + found[0], " ".join(visible(text).split()))
 
 
@@ -82,23 +82,23 @@ _GREEK = (
     "ALPHA BETA GAMMA DELTA EPSILON ZETA ETA THETA KAPPA LAMDA MU NU XI PI RHO SIGMA TAU PHI CHI "
     "PSI OMEGA"
 )
-_NOT_IN_OT1 = "ÐÞðþ«»"  # of Latin-1, all of which pdfLaTeX has with other fonts alone
+_NOT_IN_OT1 = "ÐÞðþ«»"  # Latin-1 characters that pdfLaTeX prints in other font encodings only
 _BEFORE_A_NUMBER = re.compile(r"(?<![\w.)\]}-])-(?=[\d.∞])")
-# Two hyphens or commas become one sign. At the start of a row or an item brackets and asterisks
-# would be read as an argument of its command.
+# LaTeX joins two hyphens, commas or apostrophes into one character. At the start of a row or an
+# item it reads a bracket or an asterisk as an argument of the command before.
 _LIGATURES = re.compile(r"(?<=-)(?=-)|(?<=,)(?=,)|(?<=')(?=')")
 _COMMAND_ARGUMENT = re.compile(r"^[\[*]")
 
 
 def latex_text(text: str) -> str:
-    """Text in which LaTeX finds no command, as any engine sets it that knows its letters."""
+    """Escape a text for LaTeX, on one line; the engine must know its letters."""
     line = _BEFORE_A_NUMBER.sub(_MINUS, " ".join(visible(text).split()))
     line = _LIGATURES.sub("\0", _COMMAND_ARGUMENT.sub(lambda found: f"\0{found[0]}", line))
     return "".join("{}" if sign == "\0" else _SIGNS.get(sign) or _letter(sign) for sign in line)
 
 
 def _letter(sign: str) -> str:
-    """A small Greek letter by its command, and whatever else as it is."""
+    """The LaTeX command of a small Greek letter; any other character unchanged."""
     greek, _, name = unicodedata.name(sign, "").partition(" SMALL LETTER ")
     if greek != "GREEK" or name not in _GREEK.split():
         return sign
@@ -131,13 +131,13 @@ def _templates(markup: Markup) -> Environment:
     return environment
 
 
-# A study as Markdown or LaTeX, to stand in a page or a paper: verdicts, failures and cost.
+# A study as Markdown or LaTeX: verdicts, failures and cost.
 
 NOTHING = "-"
 
 
 class Cell(NamedTuple):
-    """A figure in a table, and notes behind it, in which ± alone is markup, for LaTeX."""
+    """A table cell: a figure and the notes after it, where LaTeX needs markup for ± only."""
 
     figure: str
     is_bold: bool = False
@@ -153,7 +153,7 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What a table says, in plain text."""
+    """The content of a table, in plain text."""
 
     headings: list[str]
     rows: list[Row]
@@ -161,7 +161,7 @@ class Table(NamedTuple):
 
 
 def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
-    """The whole study: what seeds it has, the headline, and for each environment the verdicts."""
+    """The whole study: its seeds, the headline table, and each environment's verdicts."""
     study = analysis.study
     template = _templates(markup).get_template(f"verdicts.{markup}")
     content = template.render(
@@ -191,7 +191,7 @@ def table_as(markup: Markup, table: Table) -> str:
 
 
 def headline(analysis: StudyAnalysis) -> Table:
-    """Agents by environments, and what the marks in the table mean."""
+    """The table of agents by environments; its caption explains the marks."""
     environments = analysis.environments
     changed = {a.agent for one in environments for a in one.agents if a.changes}
     found = [_cells(analysis, environment) for environment in environments]
@@ -248,9 +248,9 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
 
 
 def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, str]:
-    """Each agent's place by its mean: ``best``, ``open`` or ``behind``.
+    """Each agent's standing by its mean: ``best``, ``open`` (undecided) or ``behind``.
 
-    Empty where no agent has learnt anything, or there is no figure.
+    Empty if no agent has learnt anything, or there is no figure.
     """
     known = [a.agent for a in environment.agents if not math.isnan(a.judged.point)]
     if none_has_learnt(study, environment):
@@ -290,7 +290,7 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
 
 
 def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
-    """By agent and environment, the median over runs; only where all of them were measured."""
+    """Median CPU seconds of a run by agent and environment, if all their runs were measured."""
     table = results.summary
     found = {}
     for (agent, environment), rows in table.groupby(["agent", "environment"], sort=False):
@@ -308,12 +308,12 @@ def duration(time: float) -> str:
     return f"{round(time, digits):,.{max(digits, 0)}f} s"
 
 
-# A study as files: comma-separated values, and verdicts for a page or a paper.
+# A study as files: comma-separated values, and verdicts as Markdown and LaTeX.
 
 
 def write_tables(results: StudyResults) -> list[Path]:
     """Write ``summary.csv``, a row for each run, and ``curves.csv.gz``, all learning curves."""
-    # For the last per cent of the size the default level of compression takes half of the time.
+    # The default compression level takes twice the time to save one more per cent of the size.
     rows: Any = {"mode": "wb", "index": False, "lineterminator": "\n"}
     summary, curves = results.root / "summary.csv", results.root / "curves.csv.gz"
     with replacing(summary) as file:
@@ -326,7 +326,7 @@ def write_tables(results: StudyResults) -> list[Path]:
 
 
 def _rows_of(curve: Curve) -> str:
-    """A curve as pandas writes it, which would take five times as long."""
+    """The CSV rows of a curve: the text that pandas writes, in a fifth of the time."""
     labels = io.StringIO()
     order = [name for name in CURVE_COLUMNS if name in curve.labels]
     csv.writer(labels, lineterminator="").writerow(curve.labels[name] for name in order)
@@ -336,7 +336,7 @@ def _rows_of(curve: Curve) -> str:
 
 
 def write_verdicts(analysis: StudyAnalysis, command: str) -> list[Path]:
-    """Write ``verdicts.md`` and ``verdicts.tex``: what the study has shown, to be pasted."""
+    """Write ``verdicts.md`` and ``verdicts.tex``: the study's verdicts, to paste into a text."""
     written = []
     for markup in MARKUPS:
         written.append(analysis.results.root / f"verdicts.{markup}")

@@ -57,21 +57,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-# The look of a study's figures, and how one becomes files.
+# The style of a study's figures, and how they are saved.
 #
-# A figure is as wide as the text of a page, so that it is printed as it is drawn. Words that would
-# be wider than what they belong to go over several lines.
+# A figure is as wide as the text of a page, so that it is printed unscaled. Long labels wrap.
 
-# What Matplotlib calls Plotly's line styles.
+# Matplotlib's names for Plotly's line styles.
 _LINE_STYLES: Mapping[Dash, str] = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":"}
 
-REFERENCE = "0.35"  # the grey of lines that are no agent's
-MOST_BANDS = 4  # of one figure: more lie over each other until none can be told apart
+REFERENCE = "0.35"  # the grey of reference lines
+MOST_BANDS = 4  # the largest number of shaded intervals in a figure: more would hide each other
 
 # Inches.
 WIDTH, HEIGHT = 6.5, 2.7  # of a row of panels
-_BESIDE, _BELOW = 0.85, 0.8  # what numbers and words take of a panel
-_END = 1.5  # of the names beside the ends of lines
+_BESIDE, _BELOW = 0.85, 0.8  # space for tick labels and axis labels of a panel
+_END = 1.5  # width of the names beside the ends of lines
 _LINE = 0.14  # from one line of small print to the next
 
 _SMALL, _PLAIN, _TITLE = 8, 9, 9.5
@@ -83,7 +82,7 @@ _FONTS: Any = {
     "ytick.labelsize": _SMALL,
     "legend.fontsize": _SMALL,
     "svg.fonttype": "none",
-    "pdf.fonttype": 42,  # what publishers take
+    "pdf.fonttype": 42,  # TrueType, which publishers ask for
 }
 FORMATS = ("png", "svg", "pdf")
 
@@ -96,24 +95,24 @@ def line_style(mark: Mark) -> dict[str, Any]:
 
 
 def fill_band(axes: Axes, band: Curve, mark: Mark, alpha: float = 0.2) -> None:
-    """Shade what lies between the ends of a curve's interval."""
+    """Shade the interval of a curve."""
     style = {"color": COLOURS[mark.colour], "alpha": alpha, "linewidth": 0}
     axes.fill_between(band.x, band.low, band.high, **style)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class FigureFiles:
-    """The files that figures become."""
+    """Saves figures as files."""
 
-    folder: Path  # where
-    formats: Sequence[str] = FORMATS[:2]  # which: "png", "svg", "pdf"
-    written: list[Path] = field(default_factory=list)  # those that there are by now
+    folder: Path  # of the files
+    formats: Sequence[str] = FORMATS[:2]  # among "png", "svg", "pdf"
+    written: list[Path] = field(default_factory=list)  # the files so far
 
     @contextmanager
     def figure(
         self, name: str, n_columns: int = 1, n_rows: int = 1, height: float = HEIGHT
     ) -> Iterator[Sequence[Axes]]:
-        """Axes row by row, ``height`` inches each, written under that name in the end."""
+        """Yield axes row by row, ``height`` inches each; on exit save the figure as ``name``."""
         with mpl.rc_context(_FONTS):
             # The resolution is that of the PNG; the other formats have none.
             canvas = Figure(figsize=(WIDTH, height * n_rows), dpi=300, layout="constrained")
@@ -126,12 +125,12 @@ class FigureFiles:
                 self.written.append(self.folder / f"{name}.{form}")
                 with replacing(self.written[-1]) as file:
                     write(canvas, form, file)
-                # The other files look as the first: finding places for all takes longest.
+                # The other formats keep the layout of the first: computing it takes longest.
                 canvas.set_layout_engine("none")
 
 
 def write(canvas: Figure, form: str, file: BinaryIO) -> None:
-    """Write a figure by its backend; `savefig` would draw twice, the first time for places."""
+    """Write a figure by its backend; `savefig` would draw twice, first for the layout."""
     backend = import_module(f"matplotlib.backends.backend_{'agg' if form == 'png' else form}")
     undated = {"svg": {"metadata": {"Date": None}}, "pdf": {"metadata": {"CreationDate": None}}}
     getattr(backend.FigureCanvas(canvas), f"print_{form}")(file, **undated.get(form, {}))
@@ -144,7 +143,7 @@ def width_of(text: str, size: float = _SMALL) -> float:
 
 
 def wrapped(text: str, width: float, size: float = _SMALL) -> str:
-    """The text in lines of at most ``width`` inches; a dollar sign in it begins no formula."""
+    """Wrap a text into lines of at most ``width`` inches, and escape dollar signs."""
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".lstrip()
@@ -162,7 +161,7 @@ def wrapped(text: str, width: float, size: float = _SMALL) -> str:
 def lettering(
     axes: Axes, *, title: str = "", x: str = "", y: str = "", beside: float = _BESIDE
 ) -> None:
-    """Title and names of the axes; ``beside`` is what stands left of the axes, in inches."""
+    """Set the title and the axis labels; ``beside`` is the space left of the axes, in inches."""
     figure, spec = _figure_of(axes), axes.get_subplotspec()
     n_rows, n_columns = (1, 1) if spec is None else spec.get_gridspec().get_geometry()
     y = wrapped(y, max(figure.get_figheight() / n_rows - _BELOW, 1.0), _PLAIN)
@@ -180,14 +179,14 @@ def _figure_of(axes: Axes) -> Figure:
 
 
 def band_words(n_curves: int) -> str:
-    """What the bands of so many curves are."""
+    """The legend's entry for the shaded intervals of ``n_curves`` curves."""
     return (
         "95 % interval" if n_curves <= MOST_BANDS else f"95 % interval, of the first {MOST_BANDS}"
     )
 
 
 def shared_legend(*places: Axes, band: str = "") -> None:
-    """Below the whole figure, which becomes higher by it, the names of what the axes show."""
+    """Add one legend for all axes below the figure, and make the figure higher for it."""
     named = [axes.get_legend_handles_labels() for axes in places]
     found = {name: handle for some in named for handle, name in zip(*some, strict=True)}
     if not found:
@@ -206,9 +205,9 @@ def shared_legend(*places: Axes, band: str = "") -> None:
 
 
 def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
-    """Names beside the ends of lines, of which all have been drawn; ``ends``: name, x, y, colour.
+    """Write names beside the ends of lines, after all are drawn; ``ends``: name, x, y, colour.
 
-    An arrow stands after the name of a line that has left the axes.
+    An arrow after a name says that its line ends above the axes.
     """
     low, high = axes.get_ylim()
     names = [wrapped(f"{name} ↑" if y > high else name, _END) for name, _, y, _ in ends]
@@ -243,10 +242,10 @@ def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> Non
 
 
 def _apart(wanted: Sequence[float], sizes: Sequence[float]) -> list[float]:
-    """Middles between 0 and 1 near those wanted, so that no two of these sizes overlap."""
+    """Centres in [0, 1] near the wanted ones, so that no labels of these sizes overlap."""
 
     def span(group: list[int]) -> tuple[float, float]:
-        # Where the sizes of a group lie one on the other, near what all of them want.
+        # Bottom and top of a stack of labels, near the mean of their wanted centres.
         total = sum(sizes[k] for k in group)
         middle = float(np.mean([wanted[k] for k in group]))
         bottom = min(max(middle - total / 2, 0.0), 1 - total)
@@ -267,13 +266,13 @@ def _apart(wanted: Sequence[float], sizes: Sequence[float]) -> list[float]:
     return places
 
 
-# Figures of bandits, in the forms that the textbooks have.
+# Figures of bandits, in the forms of the textbooks.
 
 Marks = Mapping[str, Mark]
 Line = tuple[str, Ints, Floats, Mapping[str, str]]  # name, x, y, style
 
 _PULLS = f"pulls {LOG}"
-UPRIGHT = 6  # arms whose names have room side by side
+UPRIGHT = 6  # the largest number of names that fit side by side
 
 
 def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks: Marks) -> None:
@@ -300,10 +299,10 @@ def _draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
 
 
 def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> None:
-    """Cumulative regret on a logarithmic axis of pulls, with what theory says of it."""
+    """Cumulative regret on a logarithmic axis of pulls, with the bounds from theory."""
     axes.set_xscale("log")
     lines: list[Line] = []
-    # The interval of the mean, then the spread of runs, as far as the bands are few.
+    # The interval of the mean and the spread of runs, or fewer bands where agents are many.
     kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
     for agent, pulls in series.pulls.items():
         lines.append((agent, pulls.pulls, mean_regret(pulls).y, line_style(marks[agent])))
@@ -313,7 +312,7 @@ def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> Non
     title = f"{place}: mean of {series.n_runs:,} runs{words[len(kinds)]}"
     highest = max(axes.dataLim.y1, *(np.nanmax(y) for _, _, y, _ in lines))
     if series.bounds is not None:
-        # A bound far above is cut; and one that never learns leaves the others some height.
+        # A bound far above is cut, and an agent that never learns does not flatten the rest.
         bounds, shown = series.bounds, series.bounds.auer <= 1.5 * highest
         for name, x, y, dash in (
             ("Auer's bound for UCB1", bounds.pulls[shown], bounds.auer[shown], "--"),
@@ -327,7 +326,7 @@ def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> Non
 
 
 def draw_simple_regret(axes: Axes, series: PullSeries, marks: Marks) -> None:
-    """What recommending the arm pulled most so far falls short of the best one by."""
+    """Simple regret: the best mean reward less that of the arm pulled most so far."""
     axes.set_xscale("log")
     found = series.pulls.items()
     known = [(a, p) for a, p in found if np.isfinite(p.simple_regret).any()]
@@ -337,7 +336,7 @@ def draw_simple_regret(axes: Axes, series: PullSeries, marks: Marks) -> None:
 
 
 def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
-    """By context, how often each arm was pulled, and what its mean was taken for."""
+    """By context, each arm's share of the pulls, and the final estimates of its mean."""
     places = np.arange(len(arms.names))
     width = 0.8 / len(arms.shares)
     for index, (agent, shares) in enumerate(arms.shares.items()):
@@ -361,7 +360,7 @@ def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
 
 
 def draw_belief(panels: Sequence[Axes], belief: Belief) -> None:
-    """What an agent believed of each arm in its first run, panels of moments for each context."""
+    """An agent's posterior of each arm in its first run, a panel per context and moment."""
     n_moments, n_contexts, n_arms, _ = belief.densities.shape
     for panel, axes in enumerate(panels):
         context, moment = divmod(panel, n_moments)
@@ -383,17 +382,17 @@ def draw_belief(panels: Sequence[Axes], belief: Belief) -> None:
 _AXES = {"step": "environment steps", "episode": "episodes"}
 
 ON_VARIANT = "trained on a variant of the environment"
-CIRCLES_APART = 0.12  # of the length of the diagonal
-NAMES = 2.1  # inches of the names of agents beside their runs
-LONGEST = 20  # letters of a value there
-MOST_TICKS = 8  # values of a parameter that the axis names
-FEW = 3  # names in one line of a legend
-FAR = 10  # times the least of some values, the largest makes their axis logarithmic
+CIRCLES_APART = 0.12  # of the diagonal of the axes
+NAMES = 2.1  # inches, the width of the names of agents beside their runs
+LONGEST = 20  # letters of a value on an axis
+MOST_TICKS = 8  # the largest number of values of a parameter with a tick each
+FEW = 3  # the largest number of names in a legend's entry
+FAR = 10  # from this ratio of the largest to the smallest value, an axis is logarithmic
 BLOCKS = {"average": "-", "minimum": ":", "maximum": "--"}
 
 
 def panels(curves: Mapping[str, LearningCurves]) -> list[tuple[str, str]]:
-    """Which curves a figure has, by which axis: evaluations by step, training by episode."""
+    """The kind of curve and the x axis of each panel: evaluations by step, training by episode."""
     both = (("evaluation", "step"), ("training", "episode"))
     return [(kind, by) for kind, by in both if curves[kind].by_axis[by]]
 
@@ -404,16 +403,16 @@ def draw_learning_curves(
     environment: EnvironmentAnalysis,
     marks: Marks,
 ) -> None:
-    """Axes for each of the `panels`; intervals of the first agents, which are the best."""
+    """Draw each of the `panels` on its axes, with intervals for the first (best) agents."""
     title = f"{environment.environment}: "
     for place, (kind, by) in zip(places, panels(curves), strict=True):
         found = curves[kind]
-        # Before the lines: limits are chosen on the scale that there is.
+        # Before the lines, because the limits depend on the scale.
         words = _set_scale(place, found.linear_up_to)
         _draw_curves(place, found.by_axis[by], marks)
         for agent, curve in found.by_axis[by].items():
             if agent in found.on_variant:
-                # Circles along the curve, which tell it from the others without colour.
+                # Circles mark the curve of a variant without colour.
                 colour = COLOURS[marks[agent].colour]
                 (circles,) = place.plot(curve.x, curve.y, "o", ms=5, mfc="white", color=colour)
                 circles.set_markevery(CIRCLES_APART)
@@ -428,7 +427,7 @@ def draw_learning_curves(
         place.xaxis.set_major_formatter(EngFormatter(sep=""))
         title = ""
     if curves["training"].on_variant:
-        # The legend below tells what the circles are.
+        # The legend's entry for the circles.
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
     shared_legend(*places, band=band_words(len(environment.agents)))
 
@@ -436,7 +435,7 @@ def draw_learning_curves(
 def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
     """Curves, the first ones with their intervals."""
     for place, (agent, curve) in enumerate(curves.items()):
-        marker = "o" if len(curve.x) == 1 else ""  # which has no length
+        marker = "o" if len(curve.x) == 1 else ""  # a single point draws no line
         style = line_style(marks[agent])
         axes.plot(curve.x, curve.y, label=agent, linewidth=1.5, marker=marker, **style)
         if place < MOST_BANDS:
@@ -444,13 +443,13 @@ def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
 
 
 def _set_scale(axes: Axes, linear_up_to: float | None) -> str:
-    """Make the upright axis logarithmic beyond a value, if any; what the axis's name says then."""
+    """Make the y axis logarithmic beyond ``linear_up_to``, if given; return words for its label."""
     if linear_up_to is None:
         return ""
     axes.set_yscale("symlog", linthresh=linear_up_to)
     axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
     axes.yaxis.set_minor_locator(NullLocator())
-    # With the minus sign that Matplotlib's own axes have.
+    # With the minus sign of Matplotlib's own axes.
     signed = FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
     axes.yaxis.set_major_formatter(signed)
     return f" (log scale beyond ±{number(linear_up_to)})"
@@ -507,7 +506,7 @@ def draw_runs(
 def draw_sweeps(
     axes: Axes, sweeps: Mapping[str, Sweep], environment: EnvironmentAnalysis, metric: str
 ) -> None:
-    """What the verdicts are about against the one parameter that agents were swept over."""
+    """The metric by the swept parameter, for agents swept over one parameter."""
     names = list(dict.fromkeys(sweep.parameter for sweep in sweeps.values()))
     values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
     words = _set_scale_of_values(axes, values)
@@ -541,7 +540,7 @@ def draw_sweeps(
 
 
 def _set_scale_of_values(axes: Axes, values: Floats) -> str:
-    """Make the axis of a parameter logarithmic where its values go far; what its name says then."""
+    """Make the x axis logarithmic if values span a ratio of `FAR`; return words for its label."""
     least = float(values[values > 0].min(initial=np.inf))
     if values.min() < 0 or values.max() < FAR * least:
         return ""
@@ -608,19 +607,19 @@ def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
     shared_legend(axes, band=band_words(len(curves)))
 
 
-# Which figures a study has, and the files that they become.
+# Which figures a study has, and their files.
 
-# More agents than this make no readable lines; a study of parameters shows them by parameter.
+# The lines of more agents are unreadable; a sweep shows its agents by parameter instead.
 MOST_LINES = 14
-MOST_IN_PAIRS = 8  # panels that have a page in two columns; more stand in three
+MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
 
 
 def write_figures(
     series: StudySeries, episodes_table: pd.DataFrame | None, tell: Tell = tell_nobody
 ) -> list[Path]:
-    """Draw all figures that the study has the runs for, into its folder ``figures``; its files.
+    """Draw all figures that the study's runs allow into its folder ``figures``; return the files.
 
-    ``episodes_table`` is that of `report.series`, or None for no such figure.
+    ``episodes_table`` is the result of `report.series.episodes_table`, or None for no such figure.
     """
     files = FigureFiles(series.analysis.results.root / "figures", series.analysis.study.figures)
     files.folder.mkdir(exist_ok=True)

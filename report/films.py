@@ -1,6 +1,6 @@
-"""Films of agents: an episode of each run's final agent, and of training as it explored.
+"""Films of agents: an episode of each run's final agent, and of its exploration in training.
 
-They take the libraries, which a study's own process does without: it has `films_of` done aside.
+Filming loads PyTorch. A study's own process does not: it calls `films_of` in a child process.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ TRAINING_STEPS = 500  # fifty seconds
 COLOURS = 128
 MAX_SIDE = 320  # pixels of a picture's longer side
 MAX_BYTES = 300_000  # of a film
-MAX_FIGURE = 1e300  # in the caption
+MAX_FIGURE = 1e300  # largest number in a caption
 
 
 def films_of(runs: Sequence[PlannedRun]) -> list[Path | None]:
-    """The film of each run, see `film_of`; those that are not there yet are made."""
+    """The film of each run, made if it is missing, see `film_of`."""
     return [film_of(run) for run in runs]
 
 
 def film_of(planned: PlannedRun) -> Path | None:
-    """The film of a run's final agent, a GIF kept in the run folder for the next page.
+    """The film of a run's final agent: a GIF, cached in the run folder.
 
-    How the episode went is in a JSON file beside it. None where the environment cannot be drawn.
+    A JSON file beside it has the episode's return and length. None if filming fails.
     """
     path = planned.path / FILM
     if not has_film(planned):
@@ -66,11 +66,11 @@ def film_of(planned: PlannedRun) -> Path | None:
 
 
 def has_film(planned: PlannedRun) -> bool:
-    """Whether the film of a run and how it went lie in its folder, as this module leaves them."""
+    """Whether a valid film of a run and its JSON file are in the run folder."""
     path = planned.path / FILM
     try:
         episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
-        # Films are no part of the run, so that it has no digest of them.
+        # A film is not part of the run, which has no digest of it: check the content.
         with Image.open(io.BytesIO(read_file(path, 2 * MAX_BYTES)), formats=["GIF"]) as picture:
             is_small = max(picture.size) <= MAX_SIDE
             picture.load()
@@ -83,12 +83,12 @@ def has_film(planned: PlannedRun) -> bool:
 
 
 def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
-    """The frames of an episode, and how it went."""
+    """The frames of an episode, and its return and length (None if it did not end)."""
     from pipeline.evaluation.sampled import evaluation_seed
     from pipeline.models.choose import model_of_run
     from pipeline.playing import film_episode
 
-    # Pictures alone: no display is needed, nor looked for.
+    # Draw without a display.
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with _loaded(model_of_run(planned.run.model_path, planned.spec, planned.run)) as (model, env):
         env.seed(evaluation_seed(planned.seed, 3))
@@ -114,9 +114,9 @@ def _loaded(chosen: ChosenModel) -> Iterator[tuple[Any, Any]]:
 
 
 def _shrunk(frames: list[Any]) -> list[Any]:
-    """The frames, small and in few colours that they share.
+    """The frames, scaled down and with one palette for all.
 
-    What does not move then looks the same in all of them, and takes no room in the film.
+    A pixel that does not change is then the same in all frames, and takes no space in the film.
     """
     factor = -(-max(frames[0].shape[:2]) // MAX_SIDE)
     pictures = [Image.fromarray(frame).reduce(factor) for frame in frames]
@@ -129,8 +129,8 @@ def _shrunk(frames: list[Any]) -> list[Any]:
 def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[Path], list[str]]:
     """Film an episode at each checkpoint of the first run of every agent, into ``films``.
 
-    The agent acts as it did in training, exploration included. A film that is younger than its
-    checkpoint is left as it is. For runs that cannot be filmed, the reason is returned too.
+    The agent acts as it did in training, exploration included. A film newer than its checkpoint
+    is kept. Returns the films, and a reason for each run that cannot be filmed.
     """
     paths: list[Path] = []
     refused: list[str] = []

@@ -21,16 +21,16 @@ class Cell:
     """One cell."""
 
     text: str  # the figure
-    value: float | None  # what it is sorted by; None puts it last
-    note: str = ""  # what the page has below it in small print
-    in_line: str = ""  # what the terminal has in place of the text, where it has something else
-    aside: str = ""  # what the page says where the pointer rests on it
-    # Low end, point and high end, each between 0 and 1, of a bar to draw; or None.
+    value: float | None  # the sort key; None sorts last
+    note: str = ""  # small print below it on the page
+    in_line: str = ""  # the terminal's text, if it differs
+    aside: str = ""  # its tooltip on the page
+    # Low end, point and high end of a bar to draw, each between 0 and 1; or None.
     bar: tuple[float, float, float] | None = None
 
 
 def bar(score: Estimate) -> tuple[float, float, float]:
-    """Low end, point and high end of a score, cut to what lies between 0 and 1."""
+    """Low end, point and high end of a score, clipped to [0, 1]."""
     low, high = (score.low, score.high) if score.has_interval else (score.point, score.point)
     return (_share(low), _share(score.point), _share(high))
 
@@ -50,7 +50,7 @@ def estimate_cell(estimate: Estimate) -> Cell:
 
 
 def threshold_cell(stays: ThresholdSummary | None) -> Cell | None:
-    """From when on the median run stays at the threshold, and how many runs do."""
+    """When the median run reaches the threshold to stay, and the share of runs that do."""
     if stays is None:
         return None
     median, share = stays.median.point, stays.share_reached.point
@@ -70,7 +70,7 @@ Order = Literal["ascending", "descending"]
 
 @dataclass(frozen=True)
 class Row:
-    """What a row of the ranking is about: an agent on an environment."""
+    """A row of the ranking: an agent on an environment."""
 
     agent: AgentAnalysis
     environment: EnvironmentAnalysis
@@ -79,14 +79,14 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column. A heading that is empty leaves it out there."""
+    """One column, left out of the page or the terminal if its heading there is empty."""
 
-    cell: Callable[[Row], Cell | None]  # what it says on an agent; None where it does not apply
+    cell: Callable[[Row], Cell | None]  # its cell in a row; None if it does not apply
     page: str = ""  # its heading on the page
-    help: str = ""  # what stands below that heading; ``{threshold}`` is the environment's
+    help: str = ""  # small print below that heading; ``{threshold}`` is the environment's
     terminal: str = ""  # its heading in the terminal
-    # What the terminal explains below the table, likewise; ``{variants}`` explains the mark of
-    # agents that were trained on a variant of the environment.
+    # Its explanation below the table in the terminal, also with ``{threshold}``; ``{variants}``
+    # explains the mark of agents that were trained on a variant of the environment.
     caption: str = ""
     # The order that puts the best first; None for that of the study's metric.
     best_first: Order | None = None
@@ -118,7 +118,7 @@ def _gap(row: Row) -> Cell | None:
     if optimum is None:
         return None
     at_least = row.environment.optimum_at_least
-    # Of a bracket the gap's interval goes from the lower end to the upper one.
+    # If the optimum is bracketed, the gap's interval covers both ends of the bracket.
     low, high = (optimum if at_least is None else at_least) - final.high, optimum - final.low
     return estimate_cell(replace(final, point=optimum - final.point, low=low, high=high))
 
@@ -174,7 +174,7 @@ def _spread(pulls: PullStatistics) -> Cell:
 
 
 def _by_pulls(cell: Callable[[PullStatistics], Cell]) -> Callable[[Row], Cell | None]:
-    """A cell of bandits alone."""
+    """A cell for bandits only."""
     return lambda row: None if row.pulls is None else cell(row.pulls)
 
 

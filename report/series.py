@@ -1,4 +1,4 @@
-"""The numbers that figures show, computed once for those on paper and those on the page."""
+"""The numbers in the figures, computed once for paper and for the page."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from verdicts import Estimate
 
 # One colour and one line style for each agent, the same in every figure of a study.
 
-# Okabe and Ito's colours, told apart by colour-blind readers too. The page's style sheet has them
-# as well, with others for a dark theme.
+# Okabe and Ito's palette, which is safe for colour-blind readers. The page's style sheet repeats
+# it, and has another one for the dark theme.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 Dash = Literal["solid", "dash", "dashdot", "dot"]
-# Seven colours and four line styles go round together: neighbours differ in both, so that lines are
-# told apart in grey too, and 28 agents have marks of their own.
+# Seven colours and four line styles repeat together: neighbours differ in both, so lines differ in
+# greyscale, too, and 28 agents have distinct marks.
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
 
 
@@ -46,10 +46,10 @@ class Mark:
     """How an agent is drawn."""
 
     label: str  # the agent's
-    colour: int  # the place of its colour in `COLOURS`
-    dash: Dash  # its line style, as Plotly calls it
-    # How often the colours have been gone through before: the page gives the dot beside a name
-    # another shape each time.
+    colour: int  # the index of its colour in `COLOURS`
+    dash: Dash  # Plotly's name for its line style
+    # The index of the shape of the dot beside its name on the page: the number of times that the
+    # colours have repeated before, modulo 4.
     shape: int = 0
 
 
@@ -68,7 +68,7 @@ def agent_marks(study: StudySpec) -> dict[str, Mark]:
 KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
 
-# Returns that are so many times larger than what matters flatten a linear axis.
+# Returns this many times larger than the optimum flatten a linear axis.
 DWARFED = 10
 
 
@@ -90,8 +90,8 @@ class LearningCurves:
     by_axis: Mapping[str, Mapping[str, Curve]]
     # Where a symmetric logarithmic axis of returns ceases to be linear; None for a linear axis.
     linear_up_to: float | None
-    # Agents whose returns are of a variant of the environment, so that they are not to be held
-    # against the optimum.
+    # Agents with returns on a variant of the environment, which cannot be compared with the
+    # optimum.
     on_variant: tuple[str, ...] = ()
 
 
@@ -120,7 +120,7 @@ def _curve(runs: Sequence[Any], by: str) -> Curve | None:
     try:
         found = mean_curve(runs, by)
     except ValueError:
-        return None  # a clock that was set back has made wall times fall
+        return None  # the clock was set back, so wall times decrease
     if found is None:
         return None
     points, band = found
@@ -130,8 +130,8 @@ def _curve(runs: Sequence[Any], by: str) -> Curve | None:
 def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | None:
     """Where a symmetric logarithmic axis ceases to be linear; None where a linear axis shows all.
 
-    It is the optimum's magnitude or, where that is not known, the largest of the returns that the
-    curves end with. The curves are in the order of time, each of shape (n_points,).
+    It is the optimum's magnitude or, if that is unknown, the largest magnitude in the last quarter
+    of the curves, but at least 1. Each curve is in order of time, of shape (n_points,).
     """
     known = [finite for curve in curves if len(finite := curve[np.isfinite(curve)])]
     if not known:
@@ -166,28 +166,28 @@ def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
     return grouped.agg(average="mean", minimum="min", maximum="max").reset_index()
 
 
-# What Thompson sampling believes of its arms, as densities to draw.
+# The posteriors of Thompson sampling, as densities to draw.
 
 N_POINTS = 241
 
 
 @dataclass(frozen=True)
 class Belief:
-    """What an agent believed of the arms in its first run."""
+    """The posteriors of an agent for the arms' mean rewards, in its first run."""
 
     agent: str  # its label
-    moments: Ints  # after how many pulls, shape (n_moments,)
-    points: Floats  # mean rewards that the densities are given at, shape (n_points,)
+    moments: Ints  # numbers of pulls, shape (n_moments,)
+    points: Floats  # mean rewards at which the densities are evaluated, shape (n_points,)
     densities: Floats  # shape (n_moments, n_contexts, n_arms, n_points)
-    # By context and arm; None for an agent that knows no contexts.
+    # By context and arm; None for an agent that ignores contexts.
     true_means: list[list[float | None]]
 
 
 def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Belief:
-    """The densities of an agent's beliefs, at all moments that were kept."""
+    """The densities of an agent's posteriors, at all recorded moments."""
     spec = next(planned.spec for planned in results.planned if planned.agent == agent)
     means = statistics.true_means
-    # Parameters: of a normal distribution mean and standard deviation, of a Beta distribution both.
+    # Parameters: mean and standard deviation of a normal, alpha and beta of a Beta distribution.
     if spec.hyperparams.algorithm.get("likelihood") == "gaussian":
         family, low, high = stats.norm, means.min() - 2, means.max() + 2
     else:
@@ -204,7 +204,7 @@ def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Bel
     )
 
 
-# What is known of the regret of bandit agents beforehand.
+# Bounds from theory on the regret of bandit agents.
 
 
 def auer_bound(means: ArrayLike, pulls: ArrayLike) -> Floats:
@@ -220,9 +220,9 @@ def auer_bound(means: ArrayLike, pulls: ArrayLike) -> Floats:
 
 
 def lai_robbins_slope(means: ArrayLike) -> float:
-    """How fast the regret on Bernoulli arms must grow with the logarithm of the pulls, in the end.
+    """Lower bound on the growth of the regret per logarithm of the pulls, for Bernoulli arms.
 
-    The bound is asymptotic: after a finite number of pulls an agent may lie below it.
+    The bound is asymptotic: after a finite number of pulls the regret may be below it.
 
     Args:
         means: of the arms, shape (n_arms,), strictly between 0 and 1.
@@ -245,9 +245,9 @@ def best_of_normals(n: int) -> float:
 
 
 def best_expected_reward(env: gym.Env[object, object]) -> float | None:
-    """The highest expected reward of a pull, over contexts and whatever is drawn at reset.
+    """The highest expected reward of a pull, averaged over contexts and over draws at reset.
 
-    None where it moves with time, or has no simple form.
+    None if it drifts with time, or has no closed form.
     """
     bandit = env.unwrapped
     if getattr(bandit, "drift_std", 0.0) > 0:
@@ -263,7 +263,7 @@ def best_expected_reward(env: gym.Env[object, object]) -> float | None:
     return float(np.asarray(weights) @ np.asarray(means).max(axis=1))
 
 
-# What agents make of a bandit: regrets by pull, where pulls went, what is believed.
+# The results of agents on a bandit: regret by pull, shares of the pulls, posteriors.
 
 SPREAD = f"{QUANTILES[-1] - QUANTILES[0]:.0%}"  # of the runs lie between the outer quantiles
 
@@ -272,7 +272,7 @@ Pulls = Mapping[str, PullStatistics]
 
 @dataclass(frozen=True)
 class RegretBounds:
-    """What theory says of the regret, each of shape (n_points,)."""
+    """Bounds on the regret from theory, each of shape (n_points,)."""
 
     pulls: Ints
     auer: Floats
@@ -283,24 +283,24 @@ class RegretBounds:
 class ArmSeries:
     """Arms in the order of contexts, each array of shape (n_contexts * n_arms,)."""
 
-    names: list[str]  # what the arms are called
+    names: list[str]  # of the arms
     means: Floats  # their true mean rewards
-    # By agent, the share of the pulls in the context that went to them.
+    # By agent, each arm's share of the pulls in its context.
     shares: Mapping[str, Floats]
-    # By agent that has some, final estimates of the means, mean and standard deviation over runs.
+    # By agent with estimates of the means: mean and standard deviation over runs, at the end.
     estimates: Mapping[str, tuple[Floats, Floats]]
 
 
 @dataclass(frozen=True)
 class PullSeries:
-    """What there is to draw of a bandit."""
+    """The numbers to draw for a bandit."""
 
     pulls: Pulls  # figures by pull of each agent, the best first
-    best: float | None  # the highest expected reward of a pull, where it is known
-    # For a single row of Bernoulli arms that stay as they are; else None.
+    best: float | None  # the highest expected reward of a pull, if known
+    # For Bernoulli arms without contexts that are the same in all runs; else None.
     bounds: RegretBounds | None
     arms: ArmSeries | None  # None where arms differ between runs
-    beliefs: tuple[Belief, ...]  # of the agents that have some
+    beliefs: tuple[Belief, ...]  # of the agents with posteriors
 
     @property
     def n_runs(self) -> int:
@@ -309,7 +309,7 @@ class PullSeries:
 
 
 def pull_series(results: StudyResults, environment: EnvironmentAnalysis) -> PullSeries | None:
-    """What there is to draw of an environment; None where it is no bandit."""
+    """The numbers to draw for a bandit; None for another environment."""
     label = environment.environment
     pulls = {
         agent.agent: results.pulls[agent.agent, label]
@@ -335,14 +335,14 @@ def mean_regret(statistics: PullStatistics) -> Curve:
 
 
 def regret_of_runs(statistics: PullStatistics) -> Curve:
-    """Cumulative regret: the median run between the outer quantiles."""
+    """Cumulative regret: the median over runs, and the outer quantiles as its interval."""
     low, *_, high = statistics.cumulative_regret_quantiles
     median = statistics.cumulative_regret_quantiles[QUANTILES.index(0.5)]
     return Curve(statistics.pulls.astype(np.float64), median, low, high)
 
 
 def regret_bounds(env: gym.Env[Any, Any], statistics: PullStatistics) -> RegretBounds | None:
-    """What theory says beforehand, where its conditions hold."""
+    """The bounds on the regret from theory; None if their conditions do not hold."""
     bandit: Any = env.unwrapped
     means, pulls = statistics.true_means, statistics.pulls
     if bandit.kind != "clicks" or len(means) != 1 or means.max() == means.min():
@@ -352,7 +352,7 @@ def regret_bounds(env: gym.Env[Any, Any], statistics: PullStatistics) -> RegretB
 
 
 def arm_series(known: Pulls) -> ArmSeries | None:
-    """Shares and estimates of agents on arms that all runs share; None without such an agent."""
+    """Shares and estimates of arms that are the same in all runs; None if there are none."""
     if not known:
         return None
     means = next(iter(known.values())).true_means
@@ -376,26 +376,26 @@ def arm_series(known: Pulls) -> ArmSeries | None:
     )
 
 
-# What each run has come to, and the means with their intervals.
+# The metric of each run, and the means with their intervals.
 
-LEAST_VALUES = 3  # of a parameter, for a figure of it
+LEAST_VALUES = 3  # the smallest number of values of a parameter for a figure
 
 
 @dataclass(frozen=True)
 class AgentRuns:
-    """The runs of an agent that have a figure."""
+    """The metric of an agent's runs."""
 
     agent: str  # its label
-    mean: Estimate  # their mean with its interval
-    seeds: Ints  # which runs, shape (n_runs,)
-    values: Floats  # what they have come to, likewise
+    mean: Estimate  # the mean over runs with its interval
+    seeds: Ints  # of the runs, shape (n_runs,)
+    values: Floats  # of the metric, finite, shape (n_runs,)
 
 
 @dataclass(frozen=True)
 class Sweep:
     """Means by the one parameter that an agent was swept over."""
 
-    parameter: str  # what it is called on an axis
+    parameter: str  # its symbol, for an axis
     means: Curve  # by its value, with their intervals
     labels: tuple[str, ...]  # of the agents in that order
 
@@ -404,15 +404,15 @@ class Sweep:
 class Grid:
     """Means by the two parameters that an agent was swept over."""
 
-    # What they are called on axes: the one that goes down and the one across.
+    # Their symbols, for the axes: the parameter of the rows and that of the columns.
     parameters: tuple[str, str]
-    down: list[str]  # their values
-    across: list[str]
+    down: list[str]  # values of the rows' parameter
+    across: list[str]  # values of the columns' parameter
     means: Floats  # shape (down, across), NaN where there is no run
-    labels: list[list[str]]  # of the agents there; empty where there is none
+    labels: list[list[str]]  # of the agents in the cells; empty where there is none
 
     def shares(self, *, is_cost: bool) -> Floats:
-        """How far each mean is on the way from the worst to the best: 0 to 1."""
+        """Each mean scaled to [0, 1], from the worst mean to the best."""
         known = self.means[np.isfinite(self.means)]
         low, high = known.min(initial=np.inf), known.max(initial=-np.inf)
         shares = (self.means - low) / (high - low if high > low else 1.0)
@@ -420,7 +420,7 @@ class Grid:
 
 
 def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> list[AgentRuns]:
-    """The runs on an environment, by what the verdicts are about; the best agent first."""
+    """The metric of each run on an environment; the best agent first."""
     values = values_over_seeds(results, environment.environment, results.study.metric)
     found = []
     for agent in environment.agents:
@@ -431,7 +431,7 @@ def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> list[
 
 
 def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Sweep]:
-    """By agent that was swept over one parameter, the means in the order of its values."""
+    """The means of each agent swept over one parameter, in the order of its values."""
     found: dict[str, Sweep] = {}
     means = {agent.agent: agent.metric.mean for agent in environment.agents}
     for (group, name), members in _groups(agents, environment, 1).items():
@@ -445,7 +445,7 @@ def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dic
 
 
 def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Grid]:
-    """By agent that was swept over two parameters, the means over the values of both."""
+    """The means of each agent swept over two parameters, by the values of both."""
     found: dict[str, Grid] = {}
     means = {agent.agent: agent.metric.mean for agent in environment.agents}
     for (group, *names), members in _groups(agents, environment, 2).items():
@@ -461,7 +461,7 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
 
 
 def with_best_mean(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
-    """Those of these agents that have the best mean."""
+    """Which of these agents have the best mean."""
     means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in labels}
     best = next(iter(means.values()), math.nan)
     return [label for label, mean in means.items() if math.isclose(mean, best)]
@@ -470,7 +470,7 @@ def with_best_mean(environment: EnvironmentAnalysis, labels: Sequence[str]) -> l
 def _groups(
     agents: Sequence[AgentSpec], environment: EnvironmentAnalysis, n_parameters: int
 ) -> dict[tuple[str, ...], list[AgentSpec]]:
-    """By label and parameters of each sweep over so many, its agents that have a mean there."""
+    """The agents with a mean here in each sweep over ``n_parameters``, by label and parameters."""
     groups: dict[tuple[str, ...], list[AgentSpec]] = {}
     there = {agent.agent for agent in environment.agents}
     for spec in agents:
@@ -479,15 +479,15 @@ def _groups(
     return groups
 
 
-# All numbers that the figures of a study show: drawn on paper and on the page from the same.
+# All numbers in the figures of a study, the same for paper and for the page.
 
 
 @dataclass(frozen=True)
 class EnvironmentSeries:
-    """What there is to draw of an environment."""
+    """The numbers to draw for an environment."""
 
     environment: EnvironmentAnalysis  # how the agents did on it
-    # By kind; on bandits None, which have theirs by pull.
+    # By kind; None for bandits, whose curves are by pull.
     curves: Mapping[str, LearningCurves] | None
     runs: Sequence[AgentRuns]  # the best agent first
     pulls: PullSeries | None  # on bandits; else None
@@ -497,7 +497,7 @@ class EnvironmentSeries:
 
 @dataclass(frozen=True)
 class StudySeries:
-    """What there is to draw of a study."""
+    """The numbers to draw for a study."""
 
     analysis: StudyAnalysis  # the study
     marks: Mapping[str, Mark]  # how each agent is drawn

@@ -39,7 +39,7 @@ LEGEND = (
 
 
 def sign(pair: PairComparison) -> str:
-    """The verdict on a pair in a sign, in brackets where it has a condition."""
+    """The verdict on a pair as a sign, in brackets if it is conditional."""
     return f"({SIGNS[pair.verdict]})" if pair.is_conditional else SIGNS[pair.verdict]
 
 
@@ -50,7 +50,7 @@ def phrase(pair: PairComparison) -> str:
 
 
 def says_more(environment: EnvironmentAnalysis) -> bool:
-    """Whether there is more to be seen than a sentence says: three agents or more, and verdicts."""
+    """Whether to show a matrix of verdicts: for three agents or more, if a pair is decided."""
     decided = [pair for pair in environment.pairs if pair.verdict != "undecided"]
     return len(environment.agents) > 2 and bool(decided)
 
@@ -59,7 +59,7 @@ def says_more(environment: EnvironmentAnalysis) -> bool:
 
 MOST_AGENT_WIDTH = 20
 UNBOUNDED = 10_000  # columns
-# Where a table is wider than the terminal it goes without these, in this order; the page has all.
+# Columns to drop, in this order, while a table is wider than the terminal; the page has all.
 FIRST_LEFT_OUT = (
     *("training", "IQM", "solved", "stays from"),
     *("simple regret", "reward", "CPU time", "score", "best arm"),
@@ -67,7 +67,7 @@ FIRST_LEFT_OUT = (
 
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
-    """Print a table for each environment and what it says in words, then what seeds these are."""
+    """Print a table and a conclusion for each environment, then a sentence on the seeds."""
     for sentence in overall_sentences(analysis):
         console.print()
         console.print(sentence, highlight=False)
@@ -81,7 +81,7 @@ def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
 
 
 def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
-    """The verdict in a line, the pairs as a matrix where they are many, and what else there is."""
+    """Print the lead, the pairs (as a matrix for three agents or more), and the notes."""
     said = conclusion(study, environment)
     told: list[str | Table] = [said.lead]
     if says_more(environment):
@@ -136,7 +136,7 @@ def _print_ranking(
 def _print_fitting(
     console: Console, title: str, columns: Sequence[Column], rows: Sequence[Row]
 ) -> list[str]:
-    """Print a table with as many columns as there is room for; the headings of the others."""
+    """Print a table with the columns that fit; return the headings of the others."""
     shown = filled(columns, rows)
     left_out: list[str] = []
     there = [column.terminal for column, _ in shown]
@@ -151,7 +151,7 @@ def _print_fitting(
 def _table(title: str, shown: Sequence[tuple[Column, list[Cell]]], rows: Sequence[Row]) -> Table:
     table = Table(title=title, title_justify="left")
     names = [row.agent.marked for row in rows]
-    # Longer names go over several lines.
+    # Longer names wrap.
     width = min(max(map(len, names)), MOST_AGENT_WIDTH)
     table.add_column("agent", overflow="fold", min_width=width, max_width=MOST_AGENT_WIDTH)
     for column, _ in shown:
@@ -228,7 +228,7 @@ def _width(console: Console, table: Table) -> int:
 
 # ``compare.py --logged``: policies on a log as a table, and what it says in words.
 
-# Where an estimate rests on fewer pulls, its interval is hardly one.
+# With a smaller effective sample size, the interval of an estimate is unreliable.
 FEW_PULLS = 100
 SHORT, MOST_DECIMALS = 3, 6
 
@@ -244,8 +244,8 @@ def _off_policy_table(comparison: Comparison) -> Table:
     data = comparison.data
     table = Table(
         title=f"{data.source}: {len(data):,} pulls, {data.n_arms} arms",
-        caption="mean reward a pull, ± half the 95 % interval; effective: pulls of its own that "
-        "the log is worth; differences below: 95 % intervals that hold together",
+        caption="mean reward a pull, ± half the 95 % interval; effective: effective sample size "
+        "in pulls; differences below: simultaneous 95 % intervals",
         title_justify="left",
         caption_justify="left",
     )
@@ -261,10 +261,10 @@ def _off_policy_table(comparison: Comparison) -> Table:
 
 
 def sentences(comparison: Comparison) -> list[str]:
-    """Doubly robust: each policy asked about against the best alternative, and among themselves.
+    """Doubly robust: each given policy against the best alternative and the best given policy.
 
-    Which alternative and which policy is best the same log has said. So the intervals are such as
-    hold together for all pairs that could have been picked.
+    The best are chosen on the same log. So the intervals are simultaneous over all pairs that could
+    have been chosen.
     """
     given = [row for row in comparison.rows if row.is_given]
     alternatives = [row for row in comparison.rows if not row.is_given]
@@ -312,7 +312,7 @@ def shown(estimate: Estimate) -> str:
 
 
 def _decimals(estimate: Estimate) -> int:
-    """As many as give half the interval two significant digits."""
+    """The number of decimals that gives half the interval two significant digits."""
     half = (estimate.high - estimate.low) / 2
     if not half > 0:
         return SHORT

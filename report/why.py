@@ -1,4 +1,4 @@
-"""What is said of an explanation: where an agent loses return, in at most twelve lines."""
+"""An explanation in words: where an agent loses return, in at most twelve lines."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ MOST_STATES = 3
 
 
 def why_lines(explained: Explanation) -> list[str]:
-    """How episodes end, the gap and its parts, the gap in the agent's own objective, and where."""
+    """How episodes end, the gap and its parts, the gap in the agent's own objective, its states."""
     if explained.is_optimal:
-        return [f"optimal: it returns {explained.value:.6g}, and nobody can have more"]
+        return [f"optimal: it returns {explained.value:.6g}, and no policy returns more"]
     gap, optimum = explained.gap, explained.optimum
     told = [
         explained.ending,
@@ -46,16 +46,16 @@ def why_lines(explained: Explanation) -> list[str]:
 
 @dataclass(frozen=True)
 class Why:
-    """What is said of one run."""
+    """The explanation of one run."""
 
     lines: list[str]
     proposal: str | None  # a change that may help, as ``explain.py --test`` takes it
 
 
 def whys_of(runs: Sequence[tuple[TrainSpec, Path]]) -> list[Why | None]:
-    """What is said of each run, of which the zip is named; None where its gap cannot be split.
+    """Explain each run, given its spec and model zip; None where its gap cannot be split.
 
-    For a process of its own: this loads PyTorch.
+    Call this in a child process: it loads PyTorch.
     """
     return [_why_of(spec, path) for spec, path in runs]
 
@@ -79,7 +79,7 @@ def _is_shown(part: Part, gap: float) -> bool:
 
 
 def _state(state: StateLoss, gap: float) -> str:
-    """What is lost in one state, and what the agent knows of it."""
+    """The loss in one state, and the agent's estimates of its actions' values."""
     share = f"{state.loss / gap:.0%} of the gap"
     text = f"  {state.name}: {share}, {state.visits:.3g} visits an episode; "
     text += f"it does {state.action}, where {state.best} is best"
@@ -104,11 +104,11 @@ def _repairs(explained: Explanation) -> str:
 
 
 def parting_lines(parting: Parting) -> list[str]:
-    """Where two agents first do something different, and what that costs, the dearest first."""
+    """Where two agents first act differently and what that costs, the largest loss first."""
     better, worse = parting.names
     difference = f"{better} returns {parting.difference:.4g} more than {worse}"
     if not parting.places:
-        return [f"{difference}: their policies are the same wherever they come"]
+        return [f"{difference}: their policies are the same in every state that they visit"]
     told = [f"{difference}; they part in {parting.met:.1%} of the episodes, first at"]
     return told + [
         f"  {place.name}: in {place.met:.1%} of the episodes, worth {place.gain:.4g}; "
@@ -130,7 +130,7 @@ def course_lines(course: Mapping[int, Explanation]) -> list[str]:
 
 
 def tried_lines(tried: Sequence[Tried], as_it_is: str) -> list[str]:
-    """What each change came to over its seeds, the best first; and that this is no verdict."""
+    """The returns of each change over its seeds, the best first, and that this is no verdict."""
     width = max(len(one.change) for one in tried)
     told = []
     for one in tried:

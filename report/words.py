@@ -1,4 +1,4 @@
-"""Figures as a reader wants them, and sentences on seeds and looks."""
+"""Numbers as text, and sentences on seeds and looks."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def interval_alone(estimate: Estimate) -> str:
 
 
 def optimum_words(optimum: float | None, at_least: float | None, is_proven: bool = True) -> str:
-    """The optimum; where it is bracketed, its ends with as many digits as tell them apart."""
+    """The optimum, or both ends of its bracket, with three decimals where they look equal."""
     if at_least is None or optimum is None:
         return number(optimum)
     ends = [number(at_least), number(optimum)]
@@ -70,13 +70,13 @@ def optimum_words(optimum: float | None, at_least: float | None, is_proven: bool
 
 
 def scale_words(full_optimum: float | None, measured_by: str | None) -> str:
-    """By what the best policy goes, and the optimum by the state; empty if observations tell it."""
+    """Under partial observability: what the optimum is based on, and that of the full state."""
     if full_optimum is None:
         return ""
     goes_by = "all that it has observed" if measured_by == "memory" else "what it observes now"
     return (
-        f"observations hide the state: the optimum, one for all agents here, is that of an agent "
-        f"that goes by {goes_by}; one that saw the state could have {number(full_optimum)}"
+        f"observations hide the state: the optimum, the same for all agents, is that of an agent "
+        f"that acts on {goes_by}; one that saw the state could have {number(full_optimum)}"
     )
 
 
@@ -86,13 +86,13 @@ def enumeration(words: Sequence[str]) -> str:
 
 
 def seeds(*counts: int) -> str:
-    """So many seeds, or from so many to so many."""
+    """A number of seeds, or a range of numbers."""
     least, most = min(counts), max(counts)
     return f"{'' if least == most else f'{least:,} to '}{most:,} seed{'s' if most != 1 else ''}"
 
 
 def ordinal(n: int) -> str:
-    """Which of several, in a word where there is a short one."""
+    """The ordinal of a number, as a word up to the ninth."""
     if n <= len(_ORDINALS):
         return _ORDINALS[n - 1]
     ending = "th" if 10 < n % 100 < 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
@@ -125,7 +125,7 @@ def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
 
 
 def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str) -> list[str]:
-    """Those that were tuned on the same of the seeds in one clause."""
+    """One clause for each set of seeds: whose settings were tuned on them."""
     groups: dict[Seeds, list[str]] = {}
     for name, shared in found.items():
         if shared:
@@ -147,7 +147,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Whole numbers, those that follow each other as a span: "0 to 4, 7"."""
+    """Integers as text, with consecutive ones as a span: "0 to 4, 7"."""
     ordered = sorted(numbers)
     ends = [one for one, two in pairwise(ordered) if two != one + 1] + ordered[-1:]
     starts = ordered[:1] + [two for one, two in pairwise(ordered) if two != one + 1]
@@ -155,7 +155,7 @@ def spans(numbers: Iterable[int]) -> str:
     return ", ".join(f"{low} to {high}" if low != high else str(low) for low, high in pairs)
 
 
-# How often the runs on an environment have been looked at, and with which seeds.
+# Looks (analyses of the runs on an environment so far), and their seeds.
 
 
 def look_sentences(looks: Looks) -> list[str]:

@@ -1,8 +1,8 @@
 """A study as one self-contained page: `write_report`.
 
-A page is a list of sections. Each is a function that looks at a study and returns a `Section`, or
-None where it has nothing to show; its template lies in ``templates/<name>.html``, and
-what makes it move, if anything does, in ``templates/<name>.js``.
+A page is a list of sections. Each is made by a function that takes a `Report` and returns a
+`Section`, or None if there is nothing to show. The section's template is
+``templates/<name>.html``; its script, if it has one, is ``templates/<name>.js``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from report.page.frame import (
     templates,
 )
 
-# A new kind of section is such a function, named here.
+# To add a section, list its function here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     result_sections.verdict,
     result_sections.overview,
@@ -44,7 +44,7 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
 
 
 def write_report(report: Report, path: Path) -> None:
-    """Write the page of a study, one file that needs nothing else and no network."""
+    """Write the page of a study: one self-contained file, which needs no network."""
     sections = []
     for place, make in enumerate(SECTIONS, start=1):
         report.tell(f"section {place} of {len(SECTIONS)}")
@@ -81,7 +81,7 @@ def render(report: Report, sections: list[Section]) -> str:
 
 
 def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
-    """What the scripts work with, by the name of its element."""
+    """The data of the scripts, by the name of the HTML element that holds it."""
     page = {
         "agents": list(report.series.marks.values()),
         "environments": [

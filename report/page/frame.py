@@ -26,19 +26,19 @@ from report.ranking import bar
 from report.series import StudySeries
 from report.words import interval_alone, number, optimum_words, scale_words, score_number
 
-# From data to text that a browser can be handed: templates, JSON, inline scripts.
+# Data as text for a browser: templates, JSON, inline scripts.
 
 _WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
 
 STYLES = ("parts.css", "page.css", "paper.css")
-# Scripts that sections build on, before their own.
+# Scripts that the sections use, loaded before their own.
 SHARED = ("core.js", "exports.js", "figures.js", "tables.js")
 
 SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
 
 
 def templates(folder: str = "") -> Environment:
-    """The templates, those of a folder first; whatever they are filled with is escaped."""
+    """The templates, those in ``folder`` first; they escape all values."""
     paths = [f"templates/{folder}", "templates"]
     environment = Environment(
         loader=ChoiceLoader([PackageLoader("report.page", path) for path in paths]),
@@ -71,7 +71,7 @@ def rounded(number: float) -> float | None:
 
 
 def plain(value: Any, of_float: Callable[[float], Any] = rounded) -> Any:
-    """The value as JSON knows it, and what ``of_float`` makes of its floats."""
+    """Convert a value to JSON's types, and its floats by ``of_float``."""
     if isinstance(value, float):
         return of_float(value)
     if isinstance(value, np.ndarray | np.generic):
@@ -86,17 +86,17 @@ def plain(value: Any, of_float: Callable[[float], Any] = rounded) -> Any:
 
 
 def as_json(value: Any, of_float: Callable[[float], Any] = rounded) -> str:
-    """The value as `plain` makes it, in as few letters as can be."""
+    """Compact JSON of a value converted by `plain`."""
     return json.dumps(plain(value, of_float), separators=(",", ":"), allow_nan=False)
 
 
 def data_uri(kind: str, content: bytes) -> str:
-    """A file inside the page, of a MIME type."""
+    """A file as a data URI; ``kind`` is its MIME type."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def packed(text: str) -> str:
-    """A text as letters that take a third of its room: gzip in base64."""
+    """A text compressed by gzip and encoded in base64: a third of its size."""
     return base64.b64encode(gzip.compress(text.encode("utf-8"), mtime=0)).decode("ascii")
 
 
@@ -114,7 +114,7 @@ def script_hash(text: str) -> str:
 
 
 def page_frame(scripts: Sequence[str]) -> dict[str, str]:
-    """What a page with figures has: styles, its own scripts and others, the policy for these."""
+    """Styles, scripts, and their content security policy, for a page with figures."""
     from plotly.offline import get_plotlyjs
 
     early, start = template_file("theme.js"), template_file("start.js")
@@ -130,7 +130,7 @@ def page_frame(scripts: Sequence[str]) -> dict[str, str]:
 
 
 def breakable(label: str) -> Markup:
-    """A label that may go over several lines where its words end: "Frozen|Lake8x8-|v1"."""
+    """A label that may wrap where its words end: "Frozen|Lake8x8-|v1"."""
     return Markup("<wbr>").join(_WORD_ENDS.split(label))
 
 
@@ -149,18 +149,18 @@ class LearningPage:
     agent: str  # its label
     environment: str  # that of the environment
     seed: int  # of the training
-    place: str  # the file, seen from the folder of the study; empty where there is none
+    place: str  # path of the file, relative to the study's folder; empty if there is none
     words: str  # what it shows, or why there is none
     size: int = 0  # of the file, in bytes
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a page is made from."""
+    """The input of a study's page."""
 
-    series: StudySeries  # the numbers that its figures show
+    series: StudySeries  # the numbers in its figures
     command: str  # the command that reproduces the study
-    tell: Tell = tell_nobody  # told how far the slow parts are
+    tell: Tell = tell_nobody  # receives the progress of the slow parts
     # The pages that play trainings, where they were asked for.
     learning: Sequence[LearningPage] = ()
 
@@ -174,13 +174,13 @@ class Report:
 class Section:
     """One part of the page."""
 
-    name: str  # that of its template and script, and its anchor
+    name: str  # of its template, its script and its anchor
     title: str  # its heading
-    context: Mapping[str, Any] = field(default_factory=dict)  # what its template is filled with
-    # What its script works with, to be written as JSON; None where there is no such thing.
+    context: Mapping[str, Any] = field(default_factory=dict)  # the variables of its template
+    # The data of its script, to write as JSON; None if there are none.
     data: Any = None
-    # Likewise what it works with on each environment, in their order, read when that is chosen;
-    # None for one that it has nothing on.
+    # The script's data for each environment, in their order, parsed when that is chosen; None
+    # where there are none.
     places: Sequence[Any] = ()
     # Whether it shows the environment that is chosen at the top of the page. Its template marks
     # what belongs to environment i by ``data-environment="i"``.
@@ -188,7 +188,7 @@ class Section:
 
 
 def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
-    """By environment, the first finished run of each agent; a batch leaves no agent."""
+    """By environment, the first finished run of each agent; no batches, which save no agent."""
     first: dict[tuple[str, str], PlannedRun] = {}
     for run in analysis.results.in_folders:
         if not run.is_batch:

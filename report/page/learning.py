@@ -52,7 +52,7 @@ from safe_files.files import NO_LIMIT, UnsafeFileError, hold, read_file
 
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
-    """The words that depend on what is shown, by the names that the template has for them."""
+    """The template's variables whose words depend on the data."""
     note = ""
     if data["kind"] == "maps":
         unit, stride = data["unit"], data["stride"]
@@ -60,7 +60,7 @@ def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
         if stride > 1:
             extent += f", one in {stride:,} of which is shown"
         if unit == "update":
-            note = "an update: all that is learnt from one rollout, at the end of it"
+            note = "an update: all learning from one rollout, at its end"
         return {"kind": f"from {unit} to {unit}", "extent": extent, "note": note}
     n_steps = len(data["steps"]["timesteps"])
     n_episodes = int(np.count_nonzero(data["moves"]["end"]))
@@ -80,15 +80,15 @@ def _count(number: int, word: str) -> str:
     return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
 
 
-# What the page plays, as data: the steps, where states lie on a map, and what actions are called.
+# The page's data: the steps, the positions of states on a map, and the names of actions.
 #
-# Numbers are written with all their digits: what the page shows is what the agent computed.
+# Numbers keep all their digits, so the page shows what the agent computed.
 
 
 def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
-    """At most so many steps of an agent that learns in tables.
+    """At most ``most_steps`` steps of a tabular agent.
 
-    Of the first episodes they are the first, else the last, since there the return has risen.
+    They are the first ones if the first episodes were asked for, else the last: the return rises.
     """
     begin, end = recorder.window()
     if recorder.n_episodes:
@@ -96,12 +96,12 @@ def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
     else:
         begin = max(begin, end - most_steps)
     steps = recorder.steps.rows[begin:end]
-    # The tables as they were before the first of the steps.
+    # The tables before the first of the steps.
     tables = {name: recorder.initial[name].copy() for name in recorder.names}
     earlier = recorder.changes.rows[recorder.changes.rows["step"] < begin]
     for number, table in enumerate(tables.values()):
         moved = earlier[earlier["table"] == number]
-        table.reshape(-1)[moved["entry"]] = moved["after"]  # of several the last
+        table.reshape(-1)[moved["entry"]] = moved["after"]  # the last change of an entry holds
     return {
         "kind": "steps",
         "tables": [_table(name, table) for name, table in tables.items()],
@@ -115,7 +115,7 @@ def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
 
 
 def _between(rows: NDArray[np.void], begin: int, end: int) -> NDArray[np.void]:
-    """Those of some steps, of which the first has the number 0."""
+    """The rows of steps ``begin`` to ``end`` (exclusive), with steps numbered from 0."""
     chosen = rows[(rows["step"] >= begin) & (rows["step"] < end)].copy()
     chosen["step"] -= begin
     return chosen
@@ -133,9 +133,9 @@ def _table(name: str, values: Floats) -> dict[str, Any]:
 
 
 def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
-    """What an agent did in every state as it learnt, and what each state was worth then.
+    """An agent's policy, and the policy's value in every state, in the course of training.
 
-    Of ``stride`` updates or evaluations one is shown, and the last in any case.
+    Every ``stride``-th update or evaluation is shown, and the last in any case.
     """
     evaluator, rows = recorder.evaluator, recorder.moments.rows
     is_shown = rows["number"] % stride == 0
@@ -159,7 +159,7 @@ def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
 
 
 def place_data(spec: TrainSpec, recorder: TableRecorder | MapRecorder) -> dict[str, Any]:
-    """Where states lie, and what actions are called."""
+    """The layout of the states, and the names of the actions."""
     layout, n_states, n_actions = None, 0, 0
     if isinstance(recorder, MapRecorder):
         model, layout = recorder.evaluator.model, recorder.evaluator.layout
@@ -184,7 +184,7 @@ def place_data(spec: TrainSpec, recorder: TableRecorder | MapRecorder) -> dict[s
 
 
 def exactly(number: float) -> float | str | None:
-    """A number to its last digit, null for nan, and infinity as a word."""
+    """A number for JSON with all its digits; None for NaN, a word for infinity."""
     if math.isnan(number):
         return None
     if math.isinf(number):
@@ -193,7 +193,7 @@ def exactly(number: float) -> float | str | None:
 
 
 def _layout_of(env: Any, n_states: int) -> GridLayout | None:
-    """The map, where the agent observes the number of the state."""
+    """The map, if the agent observes the number of the state; else None."""
     layout = grid_layout(env)
     if layout is None or layout.n_states != n_states:
         return None
@@ -211,9 +211,9 @@ SCRIPTS = ("replay", "board", "readout", "curves", "steps", "maps", "player")
 def write_learning_page(
     spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path, title: str = ""
 ) -> str:
-    """Write the page of a training; in words what it shows.
+    """Write the page of a training; return what it shows, in words.
 
-    It is called ``title``, or by default after agent and environment.
+    The default title names the agent and the environment.
     """
     place = place_data(spec, recorder)
     title = title or f"{spec.algo} on {spec.env_id}"
@@ -228,13 +228,13 @@ def write_learning_page(
 
 @cache
 def page_version() -> str:
-    """A digest of all that a page is made of but the data."""
+    """A digest of a page without its data: template, scripts and styles."""
     words = {"title": "", "seed": 0, "kind": "", "extent": "", "note": ""}
     return sha256(_render(words, {}).encode()).hexdigest()
 
 
 def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]]:
-    """What was kept, then three quarters or half of that, and so on as long as there is any."""
+    """The recorded data, then ever less: 3/4 of the steps, or half of the maps, and so on."""
     if isinstance(recorder, MapRecorder):
         recorder.finish()
         stride = recorder.stride
@@ -264,7 +264,7 @@ def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     )
 
 
-# Pages of learning in the folder of a study, each with a note of what it was made from.
+# Learning pages in the folder of a study, each with a note of digests of its inputs.
 
 FOLDER = "learning"
 LONGEST_WORDS = 300
@@ -277,7 +277,7 @@ def page_path(root: Path, run: PlannedRun) -> Path:
 
 
 def kept_page(root: Path, run: PlannedRun) -> LearningPage | None:
-    """The page of a run that an earlier command has left; None if it is none of this very run."""
+    """The cached page of a run; None if it is missing, or was made from other inputs."""
     path = page_path(root, run)
     try:
         content = read_file(path, 2 * MOST_BYTES)
@@ -293,7 +293,7 @@ def kept_page(root: Path, run: PlannedRun) -> LearningPage | None:
 
 
 def _made_from(run: PlannedRun, content: bytes) -> dict[str, str]:
-    """What decides what a page shows; the agent is empty where its run recorded no digests."""
+    """The digests that a cached page must match; the agent's is empty if its run recorded none."""
     digests = run.run.files.digests or {}
     return {
         "agent": digests.get(run.run.model_path.name, ""),
@@ -307,19 +307,19 @@ def _page(root: Path, run: PlannedRun, words: str, content: bytes) -> LearningPa
     return LearningPage(run.agent, run.environment, run.seed, place, words, len(content))
 
 
-# The first training of each agent of a study, done again to be played.
+# The first training of each agent of a study, repeated to be recorded.
 
-BATCH = "its runs were done as one batch, which leaves no agent"
+BATCH = "its runs were done as one batch, which saves no agent"
 WITHOUT_STATES = StateKeeping(SaveInterval(is_off=True))
 
 
 def write_first_pages(
     analysis: StudyAnalysis, n_workers: int, tell: Tell = tell_nobody
 ) -> list[LearningPage]:
-    """Write a page for the first run of each agent, into ``learning``; those that fit stay.
+    """Write a page for the first run of each agent, into ``learning``; valid cached pages stay.
 
-    ``n_workers`` trainings are done at once, each in a child process. Of agents that cannot be
-    shown, what is returned has the reason.
+    ``n_workers`` trainings run at once, each in a child process. For an agent that cannot be
+    shown, the returned page has the reason.
     """
     root, study = analysis.results.root, analysis.study
     runs = [run for group in first_runs(analysis) for run in group]
@@ -369,7 +369,7 @@ def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
 
 
 def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:
-    """Train in ``folder`` and write the page of it; what that shows, in words."""
+    """Train again in ``folder``, compare with the run, write the page; return what it shows."""
     hold(path.parents[2])  # the study
     import_again(planned.spec.user_modules)
     spec = replace(planned.spec, log_folder=folder, tensorboard_log=None, watch_learning=path)

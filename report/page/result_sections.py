@@ -45,9 +45,9 @@ class SmallFigure(NamedTuple):
     """The curves of an environment."""
 
     name: str  # the environment's
-    what: str  # what goes upwards
-    lines: Mapping[str, str]  # by agent, corners of its line as SVG takes them
-    optimum: float | None  # how far from the top it lies; None where it is not known or not shown
+    what: str  # the label of the y axis
+    lines: Mapping[str, str]  # by agent, the points of its SVG polyline
+    optimum: float | None  # its distance from the top; None if it is unknown or not shown
 
 
 def overview(report: Report) -> Section | None:
@@ -80,7 +80,7 @@ def _small_figure(one: EnvironmentSeries) -> SmallFigure:
     last = max((float(curve.x[-1]) for curve in curves.values()), default=1.0) or 1.0
 
     def down(height: float) -> float:
-        # How far below the top, with room for the width of a line.
+        # The distance from the top, with a margin for the width of a line.
         return 4 + (HEIGHT - 8) * (high - height) / ((high - low) or 1.0)
 
     lines = {
@@ -96,7 +96,7 @@ def _small_figure(one: EnvironmentSeries) -> SmallFigure:
 
 
 def _compressed(values: Floats, linear: float | None) -> Floats:
-    """Heights on an axis that is logarithmic beyond ``linear``, as the large figure has it."""
+    """Heights on an axis that is logarithmic beyond ``linear``, as in the large figure."""
     if linear is None:
         return values
     size = np.maximum(np.abs(values) / linear, 1e-300)
@@ -104,7 +104,7 @@ def _compressed(values: Floats, linear: float | None) -> Floats:
 
 
 def verdict(report: Report) -> Section | None:
-    """For each environment a line, the pairs as a matrix, and folded the rest."""
+    """For each environment the lead, the pairs as a matrix or sentences, and the notes."""
     study, environments = report.analysis.study, report.series.environments
     metric = METRIC_WORDS[study.metric]
     cards = [
@@ -131,7 +131,7 @@ def verdict(report: Report) -> Section | None:
 
 
 def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
-    """By agent, what its figure shows: means by parameter, and which are the best of all."""
+    """By sweep, the means by parameter, and which of them are the best of all sweeps."""
     best = with_best_mean(
         one.environment, [at for sweep in one.sweeps.values() for at in sweep.labels]
     )
@@ -168,7 +168,7 @@ def ranking(report: Report) -> Section | None:
 
 
 def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Any]:
-    """The ranking, the table below it, and what there is to say of training."""
+    """The ranking, the table of other returns below it, and a sentence on changed training."""
     rows = [Row(agent, environment) for agent in environment.agents]
     has_others = any(agent.stochastic or agent.discounted for agent in environment.agents)
     return {
@@ -179,7 +179,7 @@ def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, An
 
 
 def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
-    """Headings, and by agent the cells below them."""
+    """The headings, and each agent's cells."""
     shown = filled(columns, rows)
     threshold = number(rows[0].environment.threshold) if rows else ""
     return {
@@ -197,13 +197,13 @@ def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> 
     }
 
 
-STAGES = (0.1, 0.25, 0.5, 1.0)  # shares of an agent's training that the table has a column for
+STAGES = (0.1, 0.25, 0.5, 1.0)  # shares of an agent's training with a column in the table
 
 
 def curves(report: Report) -> Section | None:
-    """The curves of every environment, kind and axis, as the script chooses among them.
+    """The curves of every environment, kind and axis; the script chooses among them.
 
-    Bandits have theirs by pull, in a section of their own.
+    Bandits have a section of their own, with curves by pull.
     """
     curves = [one.curves for one in report.series.environments]
     if not (report.analysis.results.has_curves and any(curves)):
@@ -212,7 +212,7 @@ def curves(report: Report) -> Section | None:
     context = {
         "has_curves": [item is not None for item in curves],
         "stages": STAGES,
-        # For those who cannot see the figure.
+        # For readers who cannot see the figure.
         "tables": [
             [(agent, [_at(curve, share) for share in STAGES]) for agent, curve in of_agents.items()]
             for of_agents in by_step
@@ -222,12 +222,12 @@ def curves(report: Report) -> Section | None:
 
 
 def _at(curve: Curve, share: float) -> dict[str, float]:
-    """The point of a curve that lies nearest to a share of its way."""
+    """The point of a curve nearest to this share of its range of x."""
     nearest = np.abs(curve.x - share * curve.x[-1]).argmin()
     return {name: values[nearest] for name, values in vars(curve).items()}
 
 
-# A page with more runs than this of each agent shows their means alone.
+# With more runs of an agent than this, the page shows only their mean.
 MOST_DOTS = 300
 
 
@@ -258,7 +258,7 @@ def comparison(report: Report) -> Section | None:
 
 
 def _runs(agent: AgentRuns) -> dict[str, Any]:
-    """The mean, and each run where they are not too many to be told apart."""
+    """The mean, and each run unless there are too many to see."""
     shown = slice(0 if len(agent.values) > MOST_DOTS else None)
     runs = {"seeds": agent.seeds[shown], "runs": agent.values[shown]}
     return {"agent": agent.agent, **vars(agent.mean), **runs}
@@ -299,13 +299,13 @@ def watching(report: Report) -> Section | None:
     return Section("watching", "See it learn", {"pages": report.learning}, by_environment=True)
 
 
-# What a reader needs to do the study again: settings as run, seeds, looks, versions, failures.
+# What a reader needs to repeat the study: settings as run, seeds, looks, versions, failures.
 
 ABSENT = "-"
 
 
 def settings(report: Report) -> Section | None:
-    """Settings by environment, and what holds for the whole study."""
+    """Settings by environment; command, seeds, versions and missing runs of the whole study."""
     results, environments = report.analysis.results, report.analysis.environments
     done = list(results.infos())
     infos = [info for *_, info in done]
@@ -328,7 +328,7 @@ def settings(report: Report) -> Section | None:
 
 
 def _settings_table(runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
-    """The agents, and by setting its value for each of them and whether these differ."""
+    """The agents, and for each setting its values by agent and whether these differ."""
     columns: dict[str, dict[str, str]] = {}
     for agent in dict.fromkeys(agent for agent, _ in runs):
         columns[agent] = _column([info for one, info in runs if one == agent])
@@ -352,7 +352,7 @@ def _column(infos: list[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """What the runs were done with, by its name; several where runs differ, none of old runs."""
+    """Versions or parts of the machine by name, all distinct values joined; old runs have none."""
     found: dict[str, set[str]] = {}
     for info in infos:
         for name, value in info.get(what, {}).items():
@@ -361,9 +361,9 @@ def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
-    """Runs that are not there, those of an agent with one reason together.
+    """Missing runs, grouped by agent, environment and reason.
 
-    The reason is the last line of what they left, the details all that the last of them left.
+    The reason is the last line of a run's record of failure; the details are all of the last one.
     """
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
     damaged = {one.planned.path: one.reason for one in results.left_out}

@@ -34,13 +34,13 @@ COMPLETE, PRUNED, FAILED = "judged on all seeds", "ended early", "failed"
 
 @dataclass(frozen=True)
 class Trials:
-    """What a tuning has tried."""
+    """The trials of a tuning."""
 
-    record: Mapping[str, Any]  # what the tuning wrote down, see `tuning.retesting`
+    record: Mapping[str, Any]  # the record of the tuning, see `tuning.retesting`
 
     @cached_property
     def ended(self) -> list[Mapping[str, Any]]:
-        """The trials that have ended, in their order, as they stand there."""
+        """The trials that have ended, in the order of the record."""
         return [t for t in self.record["trials"] if t["state"] in {"complete", "pruned", "fail"}]
 
     @property
@@ -50,12 +50,12 @@ class Trials:
 
     @property
     def judged(self) -> list[Mapping[str, Any]]:
-        """Those with a figure on one seed at least."""
+        """The trials with a figure on at least one seed."""
         return [trial for trial in self.ended if trial["value"] is not None and trial["figures"]]
 
     @property
     def best_first(self) -> list[Mapping[str, Any]]:
-        """Those that have all their seeds, the best first, and then the others."""
+        """The trials judged on all seeds, the best first, and then the others."""
         whole = [trial for trial in self.judged if kind(trial) == COMPLETE]
         whole.sort(key=lambda trial: trial["value"], reverse=not self.is_cost)
         whole.sort(key=self._steps_at_optimum)
@@ -67,7 +67,7 @@ class Trials:
         return sum(steps) / len(steps) if is_optimal else math.inf
 
     def distributions(self) -> dict[str, BaseDistribution]:
-        """What each parameter was drawn from."""
+        """The distribution of each parameter."""
         from optuna.distributions import json_to_distribution
 
         space = (self.record.get("asked") or {}).get("search_space", {})
@@ -82,12 +82,11 @@ def kind(trial: Mapping[str, Any]) -> str:
 
 
 def importances(trials: Trials) -> dict[str, float]:
-    """How much of what makes a trial one of the best tenth each parameter explains.
+    """The importance of each parameter for whether a trial is in the best tenth.
 
-    Trials that were ended early count too, by the seeds that they had: those that were not are few,
-    and good all of them.
+    Trials that ended early count too, by their seeds so far: the others are few, and all good.
 
-    The shares sum to 1, the largest first; there are none where trials are too few or all alike.
+    The shares sum to 1, the largest first; empty if trials are too few or all alike.
 
     Source: PED-ANOVA, Watanabe et al. (2023), "PED-ANOVA: Efficiently quantifying hyperparameter
     importance in arbitrary subspaces", IJCAI, as Optuna computes it.
@@ -109,7 +108,7 @@ def importances(trials: Trials) -> dict[str, float]:
         )
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     with warnings.catch_warnings():
-        # Of parameters that few trials have; the page says that few trials say little.
+        # The warning is of parameters that few trials have; the page says that itself.
         warnings.filterwarnings("ignore", "Some regimes for parameter")
         found = optuna.importance.get_param_importances(study, evaluator=evaluator)
     return {name: share for name, share in found.items() if share > 0}
@@ -117,15 +116,15 @@ def importances(trials: Trials) -> dict[str, float]:
 
 # The numbers behind the figures.
 
-# The share of trials below the axis of values: what decides lies between the others and the best.
+# The share of the worst trials that the axis of values may cut off, to show the best apart.
 _BELOW = 0.25
-# Lines of as many strengths as ranks are told apart by.
+# The number of groups of ranks, each drawn with its own opacity.
 _GROUPS = 5
 _ABSENT = object()
 
 
 def history(trials: Trials) -> dict[str, Any]:
-    """Value by trial, the best so far, and what the shipped settings have."""
+    """The value of each trial, the best so far, and the value of the shipped settings."""
     best, steps = None, []
     better = min if trials.is_cost else max
     for trial in trials.ended:
@@ -161,10 +160,10 @@ def _text(trial: Mapping[str, Any]) -> str:
 
 
 def _edge(trials: Trials) -> float | None:
-    """Where the axis of values ends on the side of the worst; None where all are shown.
+    """The worst value on the axis of values; None if the axis shows all values.
 
-    It holds the best three quarters of the trials that were judged on all seeds, or else of all
-    trials, and the shipped settings, if these need no more room than they have.
+    It shows the best three quarters of the trials judged on all seeds, or else of all trials. It
+    includes the shipped settings unless these would more than double it.
     """
     sign = -1.0 if trials.is_cost else 1.0
     values = [
@@ -204,7 +203,7 @@ def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
 
 
 def _place(ends: BaseDistribution, value: Any) -> float | None:
-    """Where a value lies between the ends, from 0 to 1; None for a parameter that is not there."""
+    """A value's position between the ends, from 0 to 1; None if the trial lacks the parameter."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     if value is _ABSENT:
@@ -230,13 +229,13 @@ def _said(value: Any) -> str:
     return number(value) if is_number else setting(value)
 
 
-# The tables: what changed, and the cost.
+# The tables: changed settings, and the cost.
 
 LEFT_OUT = "-"
 
 
 class Change(NamedTuple):
-    """A setting that the winner has otherwise than what shipped, as a file has them."""
+    """A setting that differs between the winner and the shipped settings, as in a YAML file."""
 
     name: str
     shipped: str
@@ -244,7 +243,7 @@ class Change(NamedTuple):
 
 
 def changes(trials: Trials, winner: int) -> list[Change]:
-    """What a trial has otherwise than the settings that the search began with."""
+    """The settings of a trial that differ from those that the search began with."""
     settings = {trial["number"]: trial["settings"] or {} for trial in trials.ended}
     before, after = (
         {name: setting(value) for name, value in settings.get(number, {}).items()}
@@ -258,7 +257,7 @@ def changes(trials: Trials, winner: int) -> list[Change]:
 
 
 def cost(trials: Trials) -> list[tuple[str, str]]:
-    """What the search took."""
+    """The cost of the search."""
     record = trials.record
     kinds = Counter(kind(trial) for trial in trials.ended)
     n_runs = sum(len(trial["figures"]) for trial in trials.ended)
@@ -293,12 +292,12 @@ def _duration(seconds: float | None) -> str:
 
 
 def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = "") -> None:
-    """Write the page of a tuning, one file that needs nothing else and no network.
+    """Write the page of a tuning: one self-contained file, which needs no network.
 
     Args:
-        record: what the tuning wrote down, see `tuning.retesting`.
+        record: the record of the tuning, see `tuning.retesting`.
         path: the file, which is replaced.
-        retest_page: the page of the re-test as seen from there; empty where there is none.
+        retest_page: link from there to the page of the re-test; empty if there is none.
     """
     trials = Trials(record)
     shares = importances(trials)
@@ -333,7 +332,7 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
 def _sections(
     trials: Trials, shares: Mapping[str, float], winner: Mapping[str, Any] | None
 ) -> list[Section]:
-    """What the page has, with the numbers of the figures."""
+    """The sections of the page, with the data of their figures."""
     sections = [
         Section("verdict", "What was found"),
         Section("history", "History", data=history(trials)),

@@ -28,7 +28,7 @@ from report.why import whys_of
 from report.words import number
 from safe_files.files import NO_LIMIT, read_file
 
-# What agents make of bandits: rewards and regrets by pull, where pulls went, what is believed.
+# Bandits: rewards and regret by pull, shares of the pulls, posteriors.
 
 MOST_ARMS = 40  # over all contexts, in a table or in a figure
 
@@ -51,7 +51,7 @@ def bandits(report: Report) -> Section | None:
 
 
 def context_tables(pulls: Pulls) -> list[dict[str, Any]]:
-    """Where the pulls went by context; none where true means differ between runs."""
+    """Shares of the pulls by context; empty if true means differ between runs."""
     known = {agent: p for agent, p in pulls.items() if p.true_means.size}
     if not known:
         return []
@@ -98,13 +98,13 @@ def _bandit_data(series: PullSeries) -> dict[str, Any]:
     }
 
 
-# Where the median run of each agent loses what it stays behind the optimum.
+# Where the median run of each agent loses return.
 
-MOST_EXPLAINED = 8  # agents of an environment, each of which is loaded and asked
+MOST_EXPLAINED = 8  # the largest number of agents per environment, because each is loaded
 
 
 def why(report: Report) -> Section | None:
-    """What is said of each agent's median run; None where no gap can be split."""
+    """The explanation of each agent's median run; None if no gap can be split."""
     analysis = report.analysis
     chosen = [_median_runs(analysis, one)[:MOST_EXPLAINED] for one in analysis.environments]
     asked = [(run.spec, run.run.model_path) for runs in chosen for run in runs]
@@ -117,7 +117,7 @@ def why(report: Report) -> Section | None:
 
 
 def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> list[PlannedRun]:
-    """The exactly evaluated run of each agent whose final return is the median, or below it."""
+    """Each agent's run with the (lower) median final return among its exactly evaluated runs."""
     table = analysis.results.summary
     here = (table["environment"] == environment.environment) & table["exact"].astype(bool)
     runs: dict[tuple[str, str], dict[int, PlannedRun]] = {}
@@ -134,7 +134,7 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
     return found
 
 
-# How far values, advantages and gradients lie from the exact ones, of runs with `diagnose`.
+# Errors of values, advantages and gradients, in runs with `diagnose`.
 
 
 def diagnosis(report: Report) -> Section | None:
@@ -180,7 +180,7 @@ def _compared(
 
 MAX_MAPS = 40  # of a run: more than a slider needs
 MIN_MAPS = 2  # the first and the last
-# Figures of a page, values and actions of all maps, which environments share; each takes 4 bytes.
+# The most values and actions on a page, shared by its environments; each takes 4 bytes.
 MAX_FIGURES = 200_000
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -208,7 +208,7 @@ def _policy_data(
     ]
     if not runs:
         return None
-    # Those of one seed together, and the best agent first.
+    # By seed, the best agent first.
     runs.sort(key=lambda run: (run.seed, order.index(run.agent)))
     env = make_single_env(runs[0].spec)
     try:
@@ -226,7 +226,7 @@ def _policy_data(
         "matters": _digits(model.reachable),
         "optimum": {
             "values": optimum["optimal_values"],
-            # Bit a of a state's number says that action a is optimal there.
+            # Bit a of a state's number is set if action a is optimal there.
             "actions": (optimum["optimal_actions"] << np.arange(len(layout.moves))).sum(axis=1),
         },
         "runs": [
@@ -245,9 +245,9 @@ def _policy_data(
 def _read_maps(
     runs: Sequence[PlannedRun], layout: GridLayout, room: int
 ) -> dict[tuple[str, int], Arrays]:
-    """The maps by agent and seed, of the first seed and as many others as there is room for."""
+    """The maps by agent and seed: of the first seed, and of as many others as fit."""
     n_agents = sum(run.seed == runs[0].seed for run in runs)
-    # Of the first seed all agents, if at few moments.
+    # All agents of the first seed fit, if necessary with few moments.
     n_maps = min(max(room // (2 * layout.n_states * n_agents), MIN_MAPS), MAX_MAPS)
     maps: dict[tuple[str, int], Arrays] = {}
     figures = 0
@@ -268,20 +268,20 @@ def _read_maps(
 
 
 def _digits(numbers: NDArray[Any]) -> str:
-    """Numbers below ten as one text, which takes the least room."""
+    """Numbers below ten as one text, which is shortest."""
     return "".join(map(str, numbers.astype(np.int64).tolist()))
 
 
 # An episode of each agent as an animated picture inside the page.
 
 MOST_FILMED = 8  # agents of an environment, the best of them
-ALL_BYTES = 1_000_000  # of the films of a page, a third more as text
+ALL_BYTES = 1_000_000  # of the films of a page, before base64
 
 
 def played_episodes(report: Report) -> Section | None:
     """The films of each environment; None where nothing can be drawn."""
     groups: list[list[dict[str, Any]]] = []
-    contents: dict[bytes, int] = {}  # and their places on the page, which agents of one route share
+    contents: dict[bytes, int] = {}  # of each film its place on the page; equal films share one
     without_room: list[list[str]] = []
     ranked = first_runs(report.analysis)
     to_film = [run for runs in ranked for run in runs[:MOST_FILMED]]
@@ -296,7 +296,7 @@ def played_episodes(report: Report) -> Section | None:
             if path is None:
                 continue
             content = read_file(path, NO_LIMIT)
-            # What an environment does not take is left to the next ones.
+            # Space that an environment does not use is left to the next ones.
             room = ALL_BYTES * n_done // len(ranked) - sum(map(len, contents))
             if content in contents or len(content) <= room:
                 place = contents.setdefault(content, len(contents))
@@ -312,7 +312,7 @@ def played_episodes(report: Report) -> Section | None:
 
 
 def _film(path: Path, content: bytes) -> dict[str, Any]:
-    """The first frame as a data URI, its size in pixels, and how the episode went."""
+    """The first frame as a data URI, its size in pixels, and a caption with the return."""
     still = io.BytesIO()
     with Image.open(io.BytesIO(content)) as picture:
         width, height = picture.size

@@ -55,7 +55,7 @@ def parts_of(found):
 def test_an_optimal_agent_has_nothing_to_explain():
     found = explained("qlearning", "FrozenLake-v1", LAKE, with_values(0.95))
     assert found.is_optimal
-    assert why_lines(found) == ["optimal: it returns 1, and nobody can have more"]
+    assert why_lines(found) == ["optimal: it returns 1, and no policy returns more"]
 
 
 def test_one_wrong_action_is_named_with_what_mending_it_regains():

@@ -297,10 +297,10 @@ GROWN = Standing(2, 0.015, 0.015, Design(QUESTION, (5, 8, 12), {}, 0))
         ({"failures": FEW, "unreliable": (("a", "b"),)},
          ["a fails more often than b (6 of 10 runs against 0 of 10)."]),
         ({"full_optimum": 110.0, "measured_by": "memory"},
-         [("Observations hide the state: the optimum, one for all agents here, is that of an agent "
-           "that goes by all that it has observed; one that saw the state could have 110.")]),
+         [("Observations hide the state: the optimum, the same for all agents, is that of an agent "
+           "that acts on all that it has observed; one that saw the state could have 110.")]),
         ({"optimum": 101.0, "impossible": ("a",)}, [("a has MORE THAN ANY POLICY CAN REACH, "
-          "101: the environment is not the one that the bracket is of, or the bracket is wrong.")]),
+          "101: the bracket belongs to another environment, or is wrong.")]),
         ({"missing": {"a": 1, "b": 4}}, ["1 of 4 runs of a is missing.",
                                          "No run of b has finished."]),
         ({"missing": {"a": 2}, "seeds": {"a": 9}}, ["2 of 9 runs of a are missing."]),

@@ -148,14 +148,14 @@ def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
         ">rate 0.1, kind null, steps 3<",
         "<small>it broke</small>",
         "python tune.py &lt;script&gt;",
-        "What the winner has otherwise",
+        "Changed settings of the winner",
     ):
         assert part in text
     assert re.findall(r'(?:src|href)="(?!#|data:|retest/)[^"]*"', text) == []
     none = {"winner": None, "winner_file": None, "reason": "all were worse"}
     text, _ = page(retest=tuning_record["retest"] | none)
     assert "No winner: all were worse." in text
-    assert "What the winner has otherwise" not in text
+    assert "Changed settings of the winner" not in text
     text, sections = page(trials=[], retest=None)
     assert "There has been no re-test yet" in text
     assert sections == ["verdict", "history", "cost", "trials"]

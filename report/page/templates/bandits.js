@@ -6,7 +6,7 @@ report.section("bandits", (root, _, current) => {
   const { isShown } = report.legend(root.querySelector(".legend"), redraw);
   const agents = (items) => Object.entries(items).filter(([label]) => isShown(label));
 
-  // A figure that is there where `has` says so of the environment.
+  // A figure for the environments where `has` is true.
   const figure = (name, has, build) => {
     const element = root.querySelector(`#${name}`);
     redraws.push(report.figure(element, () => build(current()), () => current() !== null && has(current())));
@@ -60,7 +60,7 @@ report.section("bandits", (root, _, current) => {
   };
   figure("pull-regret", () => true, ({ curves, bounds }) => {
     const shown = agents(curves).map(([label, curve]) => [label, curve.regret[chosen("pull-spread")]]);
-    // More bands than these lie over each other until none can be told apart.
+    // More bands than these would hide each other.
     const isFew = shown.length <= 4;
     const highest = Math.max(1, ...shown.flatMap(([, curve]) => (isFew ? curve.high : curve.y)));
     // An agent that never learns would leave no height for the others.

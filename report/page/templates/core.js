@@ -1,8 +1,8 @@
 "use strict";
 
-// What all sections use: their data, the environment that is chosen, the theme, agents' colours.
+// Shared by all sections: their data, the chosen environment, the theme, agents' colours.
 const report = (() => {
-  // Data are parsed when they are asked for: a page may hold those of a hundred curves.
+  // Data are parsed on first use: a page may hold those of a hundred curves.
   const known = new Map();
   const read = (name) => {
     if (!known.has(name)) {
@@ -33,8 +33,8 @@ const report = (() => {
     get environment() {
       return environment;
     },
-    // Calls `start` with a section's element, its data, and what gives those of the environment
-    // that is chosen, if the page has that section.
+    // If the page has the section, calls `start` with its element, its data, and a function that
+    // returns the data of the chosen environment.
     section(name, start) {
       const root = document.getElementById(name);
       if (root !== null) start(root, read(name), () => read(`${name}-${environment}`));

@@ -18,14 +18,14 @@ report.section("curves", (root, _, place) => {
   const build = () => {
     const [kind, by, across] = ["kind", "by", "across"].map(chosen);
     const { by_axis: byAxis, linear_up_to: linear, on_variant: onVariant } = place()[kind];
-    // Nobody is to read returns of a variant against the optimum of the environment itself.
+    // Returns on a variant cannot be compared with the optimum of the environment itself.
     const judged = report.page.environments[report.environment];
     const environment = onVariant.length ? { ...judged, optimum: null, optimum_at_least: null, baseline: null } : judged;
     const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
     const height = symlog?.height ?? ((value) => value);
     const curves = Object.entries(byAxis[by]).filter(([label]) => isShown(label));
     detail.textContent = onVariant.length
-      ? `Circles: trained on a variant of the environment, so that the optimum is none of theirs: ${onVariant.join(", ")}.`
+      ? `Circles: trained on a variant of the environment, to which the optimum does not apply: ${onVariant.join(", ")}.`
       : "";
     return {
       traces: curves.flatMap(([label, curve]) => report.band(label, curve, height, {}, noteOf(label))),

@@ -1,9 +1,9 @@
-// What a reader takes along: figures as pictures with title and legend, tables as CSV.
+// Exports: figures as pictures with title and legend, tables as CSV.
 (() => {
   const slug = (text) => text.trim().toLowerCase().replace(/[^\p{L}\p{N}.]+/gu, "-").replace(/^-|-$/g, "");
   const visible = (element) => element.textContent.replace(/\s+/g, " ").trim();
 
-  // The section's heading, with the environment that is chosen.
+  // The section's heading, with the chosen environment.
   const heading = (element) => {
     const title = element.closest("section").querySelector("h2");
     const place = title.querySelector(".where:not([hidden])");
@@ -24,7 +24,7 @@
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   };
 
-  // The figure as on the page, with what stands around it there.
+  // The figure as on the page, with its title and legend.
   report.picture = async (plot, format) => {
     const { width, height } = plot.getBoundingClientRect();
     const named = plot.data.filter((trace) => trace.name);
@@ -53,7 +53,7 @@
     report.download(name, blob);
   };
 
-  // A table as comma-separated values: what stands in small print has a column of its own.
+  // A table as comma-separated values: small print has a column of its own.
   const own = (cell) => visible({ textContent: [...cell.childNodes].filter((node) => node.nodeName !== "SMALL" && isHeard(node)).map((node) => node.textContent).join("") });
   const small = (cell) => (cell.querySelector("small") ? visible(cell.querySelector("small")) : "");
   const quoted = (text) => {

@@ -40,8 +40,8 @@
   );
   report.drawAll = () => figures.forEach((figure) => figure.draw());
 
-  // Draws what `build` returns, traces and layout, into the element, and again after each change.
-  // Where there is nothing to draw the figure is hidden. Returns what draws it anew.
+  // Draws the traces and layout that `build` returns into the element, and again after each change.
+  // Hides the figure if there is nothing to draw. Returns a function that redraws it.
   report.figure = (element, build, isThere = () => true) => {
     let isNear = false;
     let isStale = true;
@@ -109,7 +109,7 @@
   };
 
   // The interval of a curve as a surface, and the curve itself.
-  // Where `note` says something of the curve, circles along it say that there is something to say.
+  // A curve with a `note` has circles along it.
   report.band = (label, curve, height, line = {}, note = "") => {
     const colour = report.colour(label);
     const seen = curve.x.map((_, i) => i).filter((i) => curve.low[i] !== null);
@@ -144,8 +144,8 @@
       ? `optimum ${report.number(optimum)}`
       : `optimum between ${report.number(least)} and ${report.number(optimum)}${isProven ? "" : " (not proven)"}`;
 
-  // The optimum and the best random or constant policy as lines: across, or upright where the middle of the
-  // horizontal axis is given, so that their names fall inside the figure and on no other name.
+  // The optimum and the best random or constant policy as lines: horizontal, or vertical if the middle of the
+  // x axis is given, which puts their names inside the figure and not over each other.
   report.references = (environment, height, middle = null) =>
     [
       { name: optimumName(environment), value: environment.optimum, dash: "solid", isUpper: true },
@@ -197,8 +197,8 @@
     return { height, ticks };
   };
 
-  // Buttons that hide and show agents, with what `noteOf` says of each. Returns whether one is
-  // shown, and what fills the legend anew.
+  // Buttons that hide and show agents, with the note of `noteOf`. Returns functions that tell
+  // whether an agent is shown, and that fill the legend again.
   report.legend = (root, redraw, noteOf = () => "") => {
     const hidden = new Set();
     const fill = () => {

@@ -5,8 +5,8 @@
   const sections = [...document.querySelectorAll("section[data-places]")];
   let sheets = null;
 
-  // A section as it stands, without what moves: buttons of one name would take the choice from those
-  // on the screen. Ids would be there twice, by which drawings refer to their own parts.
+  // A static copy of a section, without controls: radio buttons of one name would uncheck those on the
+  // screen. Ids, by which drawings refer to their own parts, are renamed so that none is there twice.
   const still = (section, place) => {
     const sheet = section.cloneNode(true);
     sheet.querySelectorAll(".controls").forEach((controls) => controls.remove());

@@ -1,6 +1,6 @@
 "use strict";
 
-// Plotly and the data lie in the page packed. The page's own scripts come after them.
+// Plotly and the data are compressed in the page. The page's own scripts run after them.
 (async () => {
   const content = (name) => document.getElementById(name).textContent;
   const run = (text) => {

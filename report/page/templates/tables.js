@@ -1,5 +1,5 @@
-// Tables that are sorted by the button in a heading, first with the best on top and then the other
-// way round; what has no value stays last.
+// The button in a heading sorts its table, first with the best on top and then in reverse; rows
+// without a value stay last.
 for (const table of document.querySelectorAll("table.sortable")) {
   const headings = [...table.tHead.rows[0].cells];
 

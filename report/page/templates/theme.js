@@ -10,7 +10,7 @@ const theme = (() => {
   try {
     choice = localStorage.getItem("theme") ?? "auto";
   } catch {
-    // A browser may keep nothing for pages from files.
+    // A browser may refuse storage to pages from files.
   }
 
   const apply = () => {

@@ -1,4 +1,4 @@
-// Means by a swept parameter, and all verdicts, to be taken along.
+// Means by a swept parameter, and the export of all verdicts.
 report.section("verdict", (root, { files, metric, sweeps }) => {
   root.querySelectorAll(".plot").forEach((element) => {
     const curves = Object.entries(sweeps[element.dataset.card]);

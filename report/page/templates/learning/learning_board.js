@@ -8,8 +8,8 @@ const drawn = (name, attributes, text) => {
   return element;
 };
 
-// The map, or where there is none the states in rows, numbered. Cells are kept, and changed where
-// they differ from what they show.
+// The map or, without one, the numbered states in rows. Cells are reused: a draw updates only what
+// has changed.
 const boardOf = (data, low, high) => {
   const { layout } = data;
   const width = layout === null ? Math.max(Math.min(data.n_states, Math.max(10, Math.ceil(Math.sqrt(data.n_states)))), 1) : layout.rows[0].length;
@@ -46,7 +46,7 @@ const boardOf = (data, low, high) => {
     const length = Math.hypot(...move);
     return [move[1] / length, move[0] / length];
   };
-  // From edge to edge, or from the middle where there are several.
+  // Across the cell, or from its middle if there are several arrows.
   const arrowTo = (action, _, all) => {
     const to = direction(action);
     if (to === null) return layout === null ? "" : "M0.5 0.5h0.001";
@@ -57,7 +57,7 @@ const boardOf = (data, low, high) => {
   };
   const share = (value) => (high > low ? Math.round(100 * Math.min(Math.max((value - low) / (high - low), 0), 1)) : 50);
 
-  // `look(state)` says what a state is worth and which actions are best there.
+  // `look(state)` returns the value of a state and its best actions.
   const draw = (layer, look) => {
     cells.forEach((cell, number) => {
       const letter = letterOf(number, layer);
@@ -80,7 +80,7 @@ const boardOf = (data, low, high) => {
     const corner = (side) => `${0.5 + 0.5 * dx - side * 0.5 * dy} ${0.5 + 0.5 * dy + side * 0.5 * dx}`;
     return `M0.5 0.5L${corner(1)}L${corner(-1)}Z`;
   };
-  // What has moved in a step, and where the agent went.
+  // The entries that a step changed, and the agent's path.
   const mark = (layer, moved, paths) => {
     marks.replaceChildren();
     for (const { state, action, isUp } of moved) {

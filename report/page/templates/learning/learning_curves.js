@@ -18,7 +18,7 @@ const curveOf = (title, points) => {
   const caption = made("p");
   const present = made("span");
   caption.append(made("span", `${title} (${shown(low)} to ${shown(high)})`), present);
-  // The last point that is there already.
+  // Show the last point up to the present moment.
   const go = (x) => {
     now.setAttribute("x1", 1000 * x);
     now.setAttribute("x2", 1000 * x);

@@ -1,6 +1,6 @@
 "use strict";
 
-// What a page of maps shows: one before the training, and one after each update or evaluation.
+// A page of maps: one before the training, and one after each update or evaluation.
 const mapShow = (data) => {
   const { moments, unit } = data;
   const { timesteps } = moments;
@@ -11,10 +11,10 @@ const mapShow = (data) => {
   const board = boardOf(data, low, high);
   document.getElementById("board-figure").hidden = !data.is_drawn;
   document.getElementById("board").append(board.svg);
-  document.getElementById("legend").textContent = `${data.layout === null ? "Numbers: the action that the agent takes in each state, a square" : "Arrows: what the agent does in each cell"}. Colour: the expected return of that policy from there on, computed from the model of the environment (from ${shown(low)}${least < low ? " and below" : ""} to ${shown(high)}). Framed: where it does something else than before.`;
+  document.getElementById("legend").textContent = `${data.layout === null ? "Each square is a state; number: the agent's action there" : "Arrows: the agent's action in each cell"}. Colour: the expected return of that policy from there on, computed from the model of the environment (from ${shown(low)}${least < low ? " and below" : ""} to ${shown(high)}). Framed: where the action has changed.`;
   const [begin, end] = [timesteps[0], Math.max(timesteps.at(-1), timesteps[0] + 1)];
   const place = (position) => (timesteps[position] - begin) / (end - begin);
-  // Of what an agent has: its word here, and the name under which its logger has it.
+  // For each figure of an agent: its word here, its column, and its name in the logger.
   const figures = [
     ["Return of the policy, computed", "return", null],
     ["Return of the last training episodes, mean", "training_return", null],
@@ -25,7 +25,7 @@ const mapShow = (data) => {
     ["Loss of entropy", "entropy_loss", data.logged.entropy_loss],
   ].filter(([, name]) => moments[name].some((value) => value !== null));
   const curves = figures.map(([word, name]) => curveOf(word, moments[name].map((value, i) => [place(i), value]))).filter((curve) => curve !== null);
-  // Where prizes belong to the state, a map for each set of them that episodes can come to.
+  // If prizes belong to the state, a map for each set of collected prizes that episodes can reach.
   const nCells = data.layout === null ? data.n_states : data.n_states / data.layout.layers.length;
   const layers = (data.layout?.layers ?? [[]]).flatMap((cells, layer) => {
     const isReached = moments.values[0].slice(layer * nCells, (layer + 1) * nCells).some((value) => value !== null);

@@ -35,7 +35,7 @@ const start = (data) => {
   };
   const run = () => {
     clearInterval(timer);
-    // Beyond what a screen draws, several steps at once.
+    // Above 30 steps a second, several steps at once.
     const each = Math.max(Math.round(Number(speed.value) / 30), 1);
     timer = setInterval(() => {
       go(position + each);
@@ -101,7 +101,7 @@ const start = (data) => {
   document.addEventListener("keydown", (event) => {
     const action = keys[event.key];
     if (action === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
-    // A list goes by its own keys, and so does a button that is pressed by the space bar.
+    // A list has keys of its own, and the space bar presses a button that has the focus.
     if (event.target.closest("select") !== null || (event.key === " " && event.target.closest("button") !== null)) return;
     event.preventDefault();
     action(event);
@@ -115,7 +115,7 @@ const start = (data) => {
   go(0);
 };
 
-// JSON knows no infinite numbers, which a table that diverges comes to.
+// JSON has no infinite numbers, but a table that diverges has.
 const INFINITE = new Map([["Infinity", Infinity], ["-Infinity", -Infinity]]);
 const read = (text) => (text.includes('Infinity"') ? JSON.parse(text, (_, value) => INFINITE.get(value) ?? value) : JSON.parse(text));
 

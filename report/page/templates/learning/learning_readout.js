@@ -39,7 +39,7 @@ const ENDS = ["", " (the episode ends)", " (time limit)"];
 const signed = (value) => (value > 0 ? `+${shown(value)}` : shown(value));
 const sense = (value) => (value === null || value === 0 ? "" : value > 0 ? "td-up" : "td-down");
 
-// What was done and learnt in a step of one environment, or of each.
+// The move and the update of a step, in one environment or in each.
 const stepFacts = (moves, changes, board) => {
   if (moves.length > 1) {
     const head = ["environment", "state", "action", "reward", "target", "TD error"];
@@ -60,15 +60,15 @@ const stepFacts = (moves, changes, board) => {
     ...(move.obs < 0 ? [] : [["state", `${board.name(move.obs)} → ${board.name(move.next_obs)}`]]),
     ["action", board.action(move.action)],
     ["reward", shown(move.reward) + ENDS[move.end]],
-    ["target", move.target === null ? "not told" : shown(move.target, 6)],
-    ["TD error", move.td_error === null ? "not told" : signed(move.td_error), sense(move.td_error)],
+    ["target", move.target === null ? "unknown" : shown(move.target, 6)],
+    ["TD error", move.td_error === null ? "unknown" : signed(move.td_error), sense(move.td_error)],
   ];
   if (changes.length === 1) facts.push(["entry", `${shown(only.before, 6)} → ${shown(only.after, 6)}`, sense(only.after - only.before)]);
-  else facts.push(["entries moved", String(changes.length)]);
+  else facts.push(["entries changed", String(changes.length)]);
   return listOf(facts);
 };
 
-// Rows of the tables: of the states that a step was about, or that were seen last.
+// Rows of the tables: those of the step's states, and of the states seen last.
 const rowsOf = (data, replay, board, states, changes) => {
   const head = ["", ...data.actions.map((_, action) => board.action(action))];
   const rows = [];

@@ -1,6 +1,6 @@
 "use strict";
 
-// A number with so many significant digits; "–" for none.
+// A number with this many significant digits; "–" for none.
 const shown = (value, digits = 4) => {
   if (value === null || value === undefined) return "–";
   if (!Number.isFinite(value)) return Number.isNaN(value) ? "nan" : value > 0 ? "∞" : "−∞";
@@ -11,7 +11,7 @@ const shown = (value, digits = 4) => {
 // Outside of tables, null stands for what is missing; in a table, for a number that is NaN.
 const entries = (values) => Float64Array.from(values, (value) => value ?? NaN);
 
-// The tables after any number of steps: changes are put in place going forwards, and taken back.
+// The tables after any number of steps: going forwards applies changes, going back undoes them.
 const replayOf = (data) => {
   const { step, table, entry } = data.changes;
   const after = entries(data.changes.after);
@@ -24,12 +24,12 @@ const replayOf = (data) => {
   step.forEach((number) => (first[number + 1] += 1));
   for (let k = 0; k < nSteps; k++) first[k + 1] += first[k];
 
-  // States of the table that the agent acts on, and what is highest and lowest ever in it.
+  // The table that the agent acts on, and the highest and lowest state value at any time.
   const [nStates, nActions] = [data.n_states, data.actions.length];
   const before = new Float64Array(after.length);
   const main = tables[0].values;
   const copies = Math.max(Math.round(main.length / (nStates * nActions)), 1);
-  // What the agent acts on: the mean of its tables.
+  // The agent acts on the mean of its tables.
   const value = (state, action) => {
     let sum = 0;
     for (let t = 0; t < copies; t++) sum += main[(t * nStates + state) * nActions + action];
@@ -41,7 +41,7 @@ const replayOf = (data) => {
     const actions = values.flatMap((one, action) => (one === highest ? [action] : []));
     return { value: highest, actions: actions.length === nActions ? [] : actions };
   };
-  // The range of what states are worth at any time, as far as it is numbers.
+  // The range of the finite state values at any time.
   let [low, high] = [Infinity, -Infinity];
   const look = (state) => {
     const { value: highest } = best(state);

@@ -1,6 +1,6 @@
 "use strict";
 
-// What a page of steps shows: `n` positions, of which 0 is before the first step.
+// A page of steps: positions 0 to `n`, where 0 is before the first step.
 const stepShow = (data) => {
   const replay = replayOf(data);
   const board = boardOf(data, replay.low, replay.high);
@@ -10,7 +10,7 @@ const stepShow = (data) => {
   const names = Object.keys(moves);
   const movesIn = (number) =>
     number < 0 ? [] : Array.from({ length: nEnvs }, (_, i) => Object.fromEntries(names.map((name) => [name, moves[name][number * nEnvs + i]])));
-  // Where an episode begins, and where much is learnt: the largest twentieth.
+  // Where episodes begin, and where learning is largest: the top twentieth of steps.
   const starts = [];
   const sizes = new Float64Array(n);
   const tells = moves.td_error.some((error) => error !== null);
@@ -21,7 +21,7 @@ const stepShow = (data) => {
     }
     if (!tells) for (const { before, after } of replay.changesIn(k)) sizes[k] = Math.max(sizes[k], Math.abs(after - before));
   }
-  // What is no number has gone further than any that is.
+  // NaN counts as larger than any number.
   for (let k = 0; k < n; k++) if (Number.isNaN(sizes[k])) sizes[k] = Infinity;
   const sorted = sizes.slice().sort();
   const large = Math.max(sorted[Math.floor(0.95 * n)] ?? 0, Number.MIN_VALUE);
@@ -35,8 +35,8 @@ const stepShow = (data) => {
   if (data.is_drawn) document.getElementById("board").append(board.svg);
   const scale = `from ${shown(replay.low)} to ${shown(replay.high)}`;
   document.getElementById("legend").textContent = data.layout === null
-    ? `Each square is a state; colour and number: value and number of the action that the table holds for the best (${scale}). Framed: what has just moved.`
-    : `Colour: the highest value that the table holds for a cell (${scale}). Arrows: the actions of that value. Framed: what has just moved, up in green, down in orange.`;
+    ? `Each square is a state; colour and number: value and number of the table's greedy action (${scale}). Framed: what has just changed.`
+    : `Colour: the highest value in the table for a cell (${scale}). Arrows: the actions of that value. Framed: what has just changed, up in green, down in orange.`;
 
   const returns = [];
   moves.end.forEach((end, i) => {

@@ -1,6 +1,6 @@
 // The figures of a tuning's page.
 
-// A name on several lines, which end where its words do.
+// A name on several lines, broken after its words.
 const inLines = (name) => {
   const lines = [""];
   for (const word of name.split(/(?<=[_.])/)) {
@@ -67,7 +67,7 @@ report.section("parallel", (root, data) => {
     const rest = data.axes.slice(n).map((axis) => axis.name);
     root.querySelector(".detail").textContent = rest.length ? `Not drawn: ${rest.join(", ")}.` : "";
     const axes = data.axes.slice(0, n);
-    // Lines that share a word lie beside each other.
+    // Lines with the same value are drawn side by side.
     const height = (line, i) => (line.at[i] === null ? BELOW : line.at[i]) + 0.015 * (((line.number * 7) % 5) - 2);
     const trace = (lines, style) => ({
       mode: "lines",
