@@ -1,4 +1,4 @@
-"""The commands: their flags, what they do, and what they print; ``main`` is all under one name."""
+"""The commands: flags, actions and output; ``main`` is the entry point of ``yardstick``."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ def main() -> NoReturn:
     """``yardstick``: run the command that the first argument names, and exit with its code."""
     try:
         from commands.cli import COMMANDS, NAME, run_command
-    except KeyboardInterrupt:  # before there is anything to be stopped
+    except KeyboardInterrupt:  # before anything has begun
         raise SystemExit(130) from None
 
     command = sys.argv[1] if len(sys.argv) > 1 else ""
     if command not in COMMANDS:
         _explain()
-    # From here on it is as if the command had been called by a name of its own.
+    # From here on the command has the name that a script of its own would have.
     sys.argv = [f"{NAME} {command}", *sys.argv[2:]]
     run_command(partial(_carry_out, command))
 
 
 def _carry_out(command: str) -> int:
-    """Do what the command does; the others' flags are not even looked at."""
+    """Import the command's module only, and run its main function."""
     if command in ("pack", "inspect"):
         from commands import share
 
@@ -35,7 +35,7 @@ def _carry_out(command: str) -> int:
 
 
 def _explain() -> NoReturn:
-    """Print the help or the version, or what is wrong with the first argument."""
+    """Print the help, the version, or an error message on the first argument."""
     from importlib.metadata import version
 
     from commands.cli import COMMANDS, NAME, OneLineParser

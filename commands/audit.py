@@ -1,4 +1,4 @@
-"""``audit.py``: its flags, the algorithm that they mean, and what is printed of the audit."""
+"""``audit.py``: its flags, the algorithm they select, and the output of the audit."""
 
 from __future__ import annotations
 
@@ -64,15 +64,15 @@ def build_parser() -> argparse.ArgumentParser:
     choices = ("discrete", "box")
     add("--observations", choices=choices, help=spaces.format("it observes: numbers or vectors"))
     add("--actions", choices=choices, help=spaces.format("it does: one of two, or a number"))
-    seeds = "seeds for a probe that finds something with the first one; most decide (default: 3)"
+    seeds = "seeds of a probe that is not passed on the first one; most decide (default: 3)"
     add("--seeds", type=whole_number(1, 100), default=3, metavar="N", help=seeds)
     add("--first-seed", type=FIRST_SEED, default=0, metavar="SEED", help="the first seed (0)")
-    add("--json", type=filled, metavar="FILE", help="also write what was found there")
+    add("--json", type=filled, metavar="FILE", help="also write the findings to this file")
     return parser
 
 
 def main() -> int:
-    """Parse the arguments and audit; the exit code."""
+    """Parse the arguments and audit; return the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
         target = None if args.json is None else Path(args.json)
@@ -102,7 +102,7 @@ def main() -> int:
 
 
 def _subject(args: argparse.Namespace) -> Subject:
-    """The algorithm that the arguments mean."""
+    """The algorithm that the arguments select."""
     from pipeline.agent_settings import with_engine
     from pipeline.settings.values import parse_assignments
     from pipeline.user_modules import import_typed
@@ -143,7 +143,7 @@ class _one_thread:  # noqa: N801 (used as a function)
 
 
 def finding_lines(finding: Finding) -> Sequence[str]:
-    """A line for a probe; where something is wrong, what was measured below it."""
+    """A line for a probe, with its finding if it is neither ok nor a fault."""
     head = f"  {finding.probe:<36}{WORDS[finding.state]}"
     if finding.state in ("fault", "ok"):
         return [head]

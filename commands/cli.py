@@ -1,4 +1,4 @@
-"""What all commands share: parsing flags, one-line errors, exit codes, and standard output."""
+"""Shared by all commands: parsing flags, one-line errors, exit codes, and standard output."""
 
 from __future__ import annotations
 
@@ -36,32 +36,32 @@ if TYPE_CHECKING:
 
 MISTAKE = 2  # exit code
 
-# The command that installing the project brings, and its own commands: the scripts of a checkout.
+# The installed command, and its subcommands: those are scripts in a checkout.
 NAME = "yardstick"
 
 COMMANDS = {
     "train": "train an agent on an environment",
     "enjoy": "watch a trained agent",
-    "explain": "say where an agent loses what it stays behind the optimum",
-    "shaping": "say what other rewards in training cost, and whether they change the optimum",
+    "explain": "say where an agent loses return against the optimum",
+    "shaping": "say whether other rewards in training change the optimum, and what they cost",
     "compare": "compare agents over seeds, and write a page",
     "tune": "search for an agent's settings, and test them on other seeds",
     "audit": "say whether an algorithm is right, or which fault it has",
-    "pack": "make a finished run, or a study, a zip for others, with a card",
-    "inspect": "say what a model file holds, and run nothing of it",
+    "pack": "pack a finished run or a study for others, with a card",
+    "inspect": "say what a model file contains, without running any of it",
 }
 
 
-# --- how the commands are called ------------------------------------------------------------------
+# --- names of the commands ------------------------------------------------------------------------
 
 
 def program_name() -> str:
-    """The name of the running command, which its own messages begin with."""
+    """The name of the running command, which begins its messages."""
     return os.path.basename(sys.argv[0])  # noqa: PTH119  # a name, not a path
 
 
 def called_as(command: str) -> str:
-    """How the user calls one of the commands: by the installed name, or as a script."""
+    """A command as the user types it: by the installed name, or as a script."""
     program = sys.argv[0]
     if program.startswith(f"{NAME} "):
         return f"{NAME} {command}"
@@ -71,7 +71,7 @@ def called_as(command: str) -> str:
 
 
 def as_called(examples: str) -> str:
-    """Examples that are written as for a checkout, as the user calls the commands."""
+    """Rewrite examples for a checkout to the names that the user types."""
     for command in COMMANDS:
         examples = examples.replace(f"python {command}.py", called_as(command))
     return examples
@@ -88,19 +88,19 @@ def command_line() -> str:
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """An argument parser whose complaints are one line and name the nearest flag."""
+    """An argument parser with one-line errors that name the nearest flag."""
 
-    # What `parse_known_args` made of the rest, for the hints about what it could not place.
+    # The parsed arguments, for hints about an unknown one.
     _placed: argparse.Namespace | None = None
 
     def __init__(self, epilog: str, **kwargs: Any) -> None:
         kwargs.setdefault("prog", program_name())
         kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
-        # Without abbreviations: --seed for --seeds would mean something else, and be taken.
+        # No abbreviations: --seed would be taken for --seeds, which means something else.
         super().__init__(allow_abbrev=False, epilog=as_called(epilog), **kwargs)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse what is known, and keep it."""
+        """Parse the known arguments, and keep the result for hints."""
         self._placed, rest = super().parse_known_args(args, namespace)
         return self._placed, rest
 
@@ -117,7 +117,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(MISTAKE, f"{self.prog}: error: {message} (see --help)\n")
 
 
-# --- hints about flags that there are not ---------------------------------------------------------
+# --- hints about unknown flags --------------------------------------------------------------------
 
 
 _SEARCH = "hyperparameters are not searched for here, but by the command tune: see tune --help"
@@ -128,7 +128,7 @@ _SEARCH_FLAGS += ["--optimization-log-path", "--study-name", "--max-total-trials
 _WANDB_FLAGS = ["--track", "--wandb-project-name", "--wandb-entity", "--wandb-group"]
 _WANDB_FLAGS += ["-tags", "--wandb-tags"]
 
-# Flags of rl_zoo3's train and enjoy that are not here, and why.
+# Flags of rl_zoo3's train and enjoy that do not exist here, and why.
 INSTEAD: Mapping[str, str] = {
     **dict.fromkeys(_SEARCH_FLAGS, _SEARCH),
     "--n-evaluations": "they are not counted here: give the steps between them, --eval-freq",
@@ -138,7 +138,7 @@ INSTEAD: Mapping[str, str] = {
     "--truncate-last-trajectory": "it cannot be changed: it is always true, the library's default",
 }
 
-# Flags of ours, and what people type for them; the first that the command has is named.
+# Our flags, and words that people type for them; a hint names the first flag the command has.
 _TYPED_FOR: Mapping[str, str] = {
     "--algo": "algorithm agent model agents algorithms",
     "--algos": "agents algorithms algorithm agent model",
@@ -169,9 +169,9 @@ _CONSTRUCTOR = re.compile(
 
 
 def hint(words: Sequence[str], flags: Iterable[str], algos: Sequence[str]) -> str:
-    """What to do about a flag that there is not, in a sentence; empty where nothing is near.
+    """A hint about an unknown flag, in a sentence; empty if no flag or setting is similar.
 
-    ``words`` are what the parser could not place, the flag first; ``algos`` the agents typed.
+    ``words`` are the unknown arguments, the flag first; ``algos`` are the agents typed.
     """
     flags = list(flags)
     flag, _, value = "".join(words[:1]).partition("=")
@@ -197,7 +197,7 @@ def hint(words: Sequence[str], flags: Iterable[str], algos: Sequence[str]) -> st
 
 
 def _hyperparameter(name: str, algos: Sequence[str]) -> str:
-    """The hyperparameter that ``name`` is, or is another name of; empty for none."""
+    """The hyperparameter with this name, or with this as another name; empty for none."""
     from agents import ALGORITHMS, load_algorithm
     from pipeline.settings.hyperparams import SPECIAL_KEYS
     from pipeline.settings.values import RANGES
@@ -215,10 +215,10 @@ def _hyperparameter(name: str, algos: Sequence[str]) -> str:
 
 
 def constructor_arguments() -> set[str]:
-    """Arguments of the agents' constructors, read from their sources: to import all takes seconds.
+    """Arguments of the agents' constructors, read from source: importing all takes seconds.
 
-    A constructor is an agent's if it begins with ``policy``, as Stable-Baselines3's do, or hands
-    on what it is given.
+    A constructor counts as an agent's if its first argument is ``policy``, as in
+    Stable-Baselines3, or ``*args``.
     """
     names = set()
     for package in ("agents", "stable_baselines3", "sb3_contrib"):
@@ -230,7 +230,7 @@ def constructor_arguments() -> set[str]:
     return names - SET_BY_FLAGS - {"args", "kwargs"}
 
 
-# --- what flags take ------------------------------------------------------------------------------
+# --- readers of values ----------------------------------------------------------------------------
 
 LARGEST = 10**12
 LONGEST_FOLDER_NAME = 200  # bytes
@@ -242,7 +242,7 @@ def whole_number(
 ) -> Callable[[str], int]:
     """A reader of whole numbers for argparse: ``100000``, ``100_000`` or ``1e5``.
 
-    Beside those from ``least`` to ``most`` it takes the keys of ``besides``, which says what for.
+    It accepts numbers from ``least`` to ``most``, and the keys of ``besides`` (with meanings).
     """
     meanings = besides or {}
 
@@ -260,15 +260,15 @@ def whole_number(
 
 
 def _whole(text: str) -> int | None:
-    """The number, cut off beyond anything that a flag takes; None where it is no whole one."""
+    """The integer, clipped beyond the range of all flags; None if it is no whole number."""
     try:
-        # Exact, where the detour by way of a float would not be.
+        # A Decimal is exact, unlike a float.
         number = Decimal(text)
     except decimal.InvalidOperation:
         return None
     if not number.is_finite():
         return None
-    # Before it is made an int: 1e999999999 has a billion digits.
+    # Clip before the conversion to int: 1e999999999 has a billion digits.
     number = max(min(number, Decimal(LARGEST + 1)), Decimal(-LARGEST - 1))
     return int(number) if number == number.to_integral_value() else None
 
@@ -289,7 +289,7 @@ def number_at_least_zero(text: str) -> float:
 
 
 def quantity(read: Callable[[str], Amount]) -> Callable[[str], Amount]:
-    """A reader of amounts with units, of one that raises ValueError; for argparse."""
+    """Turn a reader of amounts with units that raises ValueError into one for argparse."""
 
     def read_flag(text: str) -> Amount:
         try:
@@ -313,7 +313,7 @@ def folder_name(text: str) -> str:
         raise argparse.ArgumentTypeError(f"must be the name of one folder, not {shown(text)}")
     if portable_name(text, LONGEST_FOLDER_NAME) != text:
         raise argparse.ArgumentTypeError(
-            f"must be a name that every system takes, not {shown(text)}"
+            f"must be a name that every system allows, not {shown(text)}"
         )
     return text
 
@@ -351,13 +351,13 @@ FIRST_SEED = whole_number(0, 2**31)
 
 
 def assignments() -> Mapping[str, Any]:
-    """What flags take that assign values; each has a list of its own, or args.yml has anchors."""
+    """Options of flags that assign values; each with its own list, or args.yml gets anchors."""
     return {"nargs": "+", "default": [], "metavar": "KEY:VALUE"}
 
 
 _MODULES: Mapping[str, Any] = {"nargs": "+", "type": filled, "default": [], "metavar": "MODULE"}
 
-# Flags that several commands have: their names, what they take, and what is said of them.
+# Flags that several commands have: their names, argparse options, and help.
 SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
     ("-params --hyperparams", assignments(), ""),
     ("-conf --conf-file", {"type": filled, "metavar": "YAML"}, "hyperparameters from another file"),
@@ -393,7 +393,7 @@ SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
     (
         "--insecure-cluster",
         {"action": "store_true"},
-        "also on a cluster without TLS: anybody who can connect to it can run code",
+        "allow a cluster without TLS, where anybody who can connect can run code",
     ),
     (
         "--run-timeout",
@@ -403,13 +403,13 @@ SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
     (
         "--run-memory",
         {"type": RUN_MEMORY, "metavar": "SIZE"},
-        "end a run that takes more, e.g. 4GB",
+        "end a run that uses more, e.g. 4GB",
     ),
 )
 
 
 def add_shared(group: argparse._ActionsContainer, *flags: str, **changes: Any) -> None:
-    """Add flags that several commands have, in which this one may change something."""
+    """Add shared flags; ``changes`` are argparse options that differ in this command."""
     for flag in flags:
         names, options, words = next(each for each in SHARED if flag in each[0].split())
         group.add_argument(*names.split(), **{"help": words, **options, **changes})
@@ -425,7 +425,7 @@ def check_tensorboard(wanted: object) -> None:
 
 
 def check_device(device: str) -> None:
-    """Raise `UserError` if PyTorch has no such device; the library would silently take the CPU."""
+    """Raise `UserError` if PyTorch lacks the device; the library would silently use the CPU."""
     if device in ("auto", "cpu"):
         return
     import torch as th
@@ -445,10 +445,10 @@ def check_device(device: str) -> None:
 def run_command(main: Callable[[], int]) -> NoReturn:
     """Run a command's ``main`` and exit with its code.
 
-    A mistake of the user's, or a file system that refuses, ends in one line on stderr and exit
-    code 2. A reader of the output who goes away is no mistake: see `Output`.
+    A mistake of the user, or an error of the file system, ends in one line on stderr and exit
+    code 2. A closed pipe of the output is no mistake: see `Output`.
     """
-    # On Windows, standard output that goes to a file or a pipe has the encoding of the country.
+    # On Windows, standard output to a file or a pipe has the local encoding.
     codecs.register_error(NAME, _plain)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors=NAME)
@@ -456,16 +456,16 @@ def run_command(main: Callable[[], int]) -> NoReturn:
     sys.excepthook = _tell_unforeseen
     codes: list[int] = []
     before = n_stops()
-    atexit.register(_leave, codes)  # before the libraries', so that it is called after them
+    atexit.register(_leave, codes)  # first, so that it is called after the libraries' handlers
     try:
         with standard_streams() as output:
             code = _exit_code(main)
             if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
                 code = code or MISTAKE
-    except KeyboardInterrupt:  # one more, while the last word was being said
+    except KeyboardInterrupt:  # another one, during the last message
         code = exit_code(SIGINT)
-    # What is left to do would tell of one in a traceback. Not now: who calls this in a process of
-    # their own, as tests do, have it for longer.
+    # At exit an interrupt would print a traceback. The signals get their default action at exit
+    # only, because a caller such as a test may keep the process.
     atexit.register(default_for_signals)
     if n_stops() > before:
         codes.append(code)
@@ -473,7 +473,7 @@ def run_command(main: Callable[[], int]) -> NoReturn:
 
 
 def _leave(codes: list[int]) -> None:
-    """Leave at once where a signal asked for it: to take the libraries down costs a second."""
+    """Exit at once after a signal: to shut the libraries down takes a second."""
     if codes:
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
@@ -510,7 +510,7 @@ def _exit_code(main: Callable[[], int]) -> int:
 
 
 def exit_code(number: int | None) -> int:
-    """The exit code that shells give a process that a signal has ended; None stands for Ctrl-C."""
+    """The exit code that shells give a process ended by a signal; None means Ctrl-C."""
     return 128 + (number or SIGINT)
 
 
@@ -521,52 +521,52 @@ def _warning(
     lineno: int,
     line: str | None = None,
 ) -> str:
-    """A library's warning in one line, as mistakes are told: what it quotes may be a stranger's."""
+    """A library's warning in one line, with control characters of quoted texts made visible."""
     text = one_line(message) if isinstance(message, Warning) else message
-    text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # Gymnasium's warnings bring colours of their own
+    text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # Gymnasium's warnings contain colour codes
     return f"{program_name()}: warning: {visible(text)}\n"
 
 
 def _tell_unforeseen(kind: type[BaseException], error: BaseException, trace: Any) -> None:
-    """A traceback, which may quote a stranger's texts too."""
+    """Print a traceback, with control characters of quoted texts made visible."""
     sys.stderr.write(visible("".join(traceback.format_exception(kind, error, trace))))
 
 
 # --- standard output and error --------------------------------------------------------------------
 
-# What stands for signs that a terminal's encoding lacks; a question mark for all others.
+# Replacements of characters that a terminal's encoding lacks; all others become a question mark.
 PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
 PLAIN |= {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa"}
 
 
 def _plain(error: UnicodeError) -> tuple[str, int]:
-    """Simplify signs that the encoding lacks; for `codecs.register_error`."""
+    """Replace characters that the encoding lacks; for `codecs.register_error`."""
     assert isinstance(error, UnicodeEncodeError)
     signs = error.object[error.start : error.end]
     return "".join(PLAIN.get(sign, "?") for sign in signs), error.end
 
 
 class Output:
-    """A standard stream, and what happens once it takes nothing more.
+    """A standard stream that handles failed writes.
 
-    The file below is replaced then, so that the interpreter's last flush does not complain either.
+    After a failure the file below it is the null device, so the interpreter's last flush works.
     """
 
     def __init__(self, stream: TextIO, *, goes_on: bool) -> None:
         self._stream = stream
-        self.goes_on = goes_on  # lose what cannot be written, and go on
+        self.goes_on = goes_on  # drop the output after a failure instead of raising
         self.failure: OSError | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write; if the reader has gone, as ``head`` does, and the work was for him, exit."""
+        """Write; a closed pipe, as by ``head``, ends the command unless ``goes_on``."""
         self._attempt(self._stream.write, text)
         return len(text)
 
     def flush(self) -> None:
-        """Hand on what was written; what is raised is as in `write`."""
+        """Flush; failures are handled as in `write`."""
         self._attempt(self._stream.flush)
 
     def _attempt(self, action: Any, *args: str) -> None:
@@ -584,7 +584,7 @@ class Output:
 
     def _give_up(self, error: OSError) -> None:
         self.failure = error
-        # Anything may stand in for a standard stream, also what has no file below.
+        # A replacement of a standard stream may have no file below.
         with contextlib.suppress(OSError, ValueError, AttributeError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
@@ -596,7 +596,7 @@ class Output:
 
 @contextlib.contextmanager
 def standard_streams() -> Iterator[Output]:
-    """Put an `Output` in the place of both standard streams; yields that of standard output."""
+    """Replace both standard streams by an `Output`; yield that of standard output."""
     _open_closed_ones()
     before = sys.stdout, sys.stderr
     output = Output(sys.stdout, goes_on=False)
@@ -608,21 +608,21 @@ def standard_streams() -> Iterator[Output]:
 
 
 def go_on_unread() -> None:
-    """From now on the work counts, and not what is printed of it."""
+    """Go on working from now on, even if the output can no longer be written."""
     if isinstance(sys.stdout, Output):
         sys.stdout.goes_on = True
 
 
 def _open_closed_ones() -> None:
-    """Open the standard streams that this process was started without, on nothing.
+    """Open missing standard streams of this process on the null device.
 
-    Otherwise the next file that is opened would get their number, and what is printed.
+    Otherwise the next opened file would get their file descriptor, and the printed output.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free file descriptor
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123  # until the exit

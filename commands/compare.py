@@ -1,4 +1,4 @@
-"""``compare.py``: its flags, what it does with a study, and what it prints of it."""
+"""``compare.py``: its flags, the steps of a study, and its output."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ The same command again does the missing runs, and no others.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The flags; those of single runs mean what they mean to the command train."""
+    """The flags; those of single runs have the same meaning as in train."""
     parser = OneLineParser(
         description="Compare agents on environments over seeds: tables, figures, and a page.",
         epilog=EPILOG,
@@ -104,8 +104,8 @@ def build_parser() -> argparse.ArgumentParser:
     add(
         "--as-it-comes",
         action="store_true",
-        help="train every agent on the environment as it comes, without what settings change in "
-        "training alone (train_env_kwargs, train_env_wrapper)",
+        help="train every agent on the environment as it comes, without the changes that settings "
+        "make in training only (train_env_kwargs, train_env_wrapper)",
     )
     add_shared(parser, "--gym-packages")
     quick = "few seeds and a small budget, for a first look"
@@ -120,7 +120,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--replace", action="store_true", help=replaced)
     kept = "keep all run folders, or figures and few folders: the best, median and worst (all)"
     add("--keep", choices=("all", "figures"), help=kept)
-    again = "make the folders of these runs again, of which figures were kept"
+    again = "make the folders of these runs again, after --keep figures"
     add("--make-again", nargs="+", default=[], metavar="AGENT:SEED", help=again)
 
     _add_output_flags(parser)
@@ -133,7 +133,7 @@ def build_parser() -> argparse.ArgumentParser:
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("judgement and output")
     add = group.add_argument
-    add("--metric", help="what verdicts are about: final, best, area, regret, ...")
+    add("--metric", help="the figure that verdicts compare: final, best, area, regret, ...")
     margin = "difference within which agents count as equivalent"
     add("--margin", type=number_at_least_zero, help=margin)
     add("--episodes-table", type=COUNT, metavar="N", help="average, min, max of every N episodes")
@@ -156,11 +156,11 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add("--no-report", action="store_true", help="only tables: no figures and no page")
 
 
-# --- what is done ---------------------------------------------------------------------------------
+# --- the steps of a study -------------------------------------------------------------------------
 
 
 def main() -> int:
-    """Parse the arguments and do what they ask for; the exit code."""
+    """Parse the arguments and compare; return the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
         if args.logged or args.policy:
@@ -169,7 +169,7 @@ def main() -> int:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    """Do a study, as the only one that does."""
+    """Do a study under the lock of its folder."""
     study = study_spec(args)
     from experiments.child_processes import end_server
     from experiments.looks import read_looks
@@ -197,7 +197,7 @@ def _compare(args: argparse.Namespace) -> int:
                 return make_again(context, study, to_make_again)
             if args.until_decided:
                 return _grow_study(args, study, context)
-            read_looks(root)  # so that it is known how often the study was looked at
+            read_looks(root)  # fails early if the record of looks cannot be read
             if args.repair:
                 repair(console, study, planned, context.store)
             _prepare(study, planned, context, args.replace)
@@ -208,7 +208,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 
 def results_of(study: StudySpec, context: RunContext) -> StudyResults:
-    """Do the runs of a study that are missing, as the only one that does, and read them."""
+    """Do the missing runs of a study under the lock of its folder, and read all results."""
     from experiments.child_processes import end_server
     from experiments.launching import EarlyResults
     from experiments.plan import plan
@@ -231,7 +231,7 @@ def results_of(study: StudySpec, context: RunContext) -> StudyResults:
 def _prepare(
     study: StudySpec, planned: Sequence[PlannedRun], context: RunContext, replaces: bool = False
 ) -> None:
-    """Make sure that the runs can be done, before any is; and load the libraries for them."""
+    """Check that the runs can be done before the first begins, and load the libraries."""
     with doing(context.console, "looking for runs that are there") as activity, loading_libraries():
         from experiments.child_processes import do_aside
         from experiments.plan import check_settings
@@ -253,7 +253,7 @@ def _prepare(
 
 
 def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], float]]:
-    """On which engines the missing runs of networks will train, and what each run takes."""
+    """The engines of the missing runs of networks, in words, and the expected seconds of a run."""
     from pipeline.train_spec import NETWORKS
 
     missing: dict[tuple[str, str], list[PlannedRun]] = {}
@@ -280,7 +280,7 @@ def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], 
 
 
 def run_study(context: RunContext, study: StudySpec, planned: Sequence[PlannedRun]) -> int:
-    """Do a study as planned, and judge it; the exit code, 0 if all runs are there and sound."""
+    """Do a study as planned, and judge it; return 0 if all runs are finished and undamaged."""
     from experiments.launching import EarlyResults
 
     early = EarlyResults(study)
@@ -291,7 +291,7 @@ def run_study(context: RunContext, study: StudySpec, planned: Sequence[PlannedRu
 def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext) -> int:
     """Do a study with more and more seeds until every pair is decided, and judge it at the end.
 
-    How many seeds there are at each look is settled before the first.
+    The numbers of seeds of all looks are fixed before the first look.
     """
     from experiments.growing import counts_of, grown, remember, settled_looks
     from experiments.looks import read_looks
@@ -308,7 +308,7 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
     remember(context.root, read_looks(context.root), looks)  # before the first run is done
     results, steps, failures = look_by_look(context, study, counts)
     code = conclude(context, results, failures, {each.environment: each.standing for each in steps})
-    # How many runs it took, beside a design that gives every agent all seeds.
+    # The number of runs, compared with a design that gives every agent all seeds.
     counts = counts_of(study, read_looks(context.root))
     most = max((step.design.sizes[-1] for step in steps), default=0)
     undecided = [
@@ -328,9 +328,9 @@ def look_by_look(
     counts: Mapping[tuple[str, str], int],
     is_enough: Callable[[StudyResults, Sequence[Step]], bool] = lambda results, steps: False,
 ) -> tuple[StudyResults, list[Step], list[RunFailure]]:
-    """Do the runs of one planned look after another, until nobody lacks seeds or it is enough.
+    """Do the runs of one planned look after another, until no agent needs seeds or ``is_enough``.
 
-    ``counts`` are the seeds of the first of these looks, by agent and environment.
+    ``counts`` are the numbers of seeds of the first look, by agent and environment.
     """
     from experiments.growing import grown, take_planned_looks
     from experiments.launching import EarlyResults
@@ -338,7 +338,7 @@ def look_by_look(
 
     failures: list[RunFailure] = []
     said: set[tuple[str, int]] = set()
-    with context.held():  # from one look to the next
+    with context.held():  # keep the launcher open from one look to the next
         while True:
             now = grown(study, counts)
             planned = plan(now, context.root, counts)
@@ -359,7 +359,7 @@ def look_by_look(
 
 
 def _on_look(step: Step, *, is_over: bool) -> str:
-    """What a look has decided, and who gets more seeds."""
+    """The result of a look: the number of decided pairs, and which agents get more seeds."""
     from report.words import enumeration, seeds
 
     growth, sizes = step.growth, step.design.sizes
@@ -381,9 +381,9 @@ def do_missing(
     early: EarlyResults,
     given_up: Collection[Path] = (),
 ) -> list[RunFailure]:
-    """Do the runs that are missing, but for those whose folders are given up; which failed.
+    """Do the missing runs, except those with folders in ``given_up``; return the failures.
 
-    Each is read as soon as it has ended.
+    Each run is read as soon as it has ended.
     """
     from experiments.launching import execute
     from experiments.run_folders import move_replaced_aside
@@ -395,7 +395,7 @@ def do_missing(
     moved, place = move_replaced_aside(apart, root)
     if place is not None:
         runs = "1 run that is" if len(moved) == 1 else f"{len(moved)} runs that are"
-        say(console, f"{runs} done again: what was there is in {place} now")
+        say(console, f"{runs} done again: the old folders are in {place} now")
     missing = [run for run in apart if run.is_to_do and run.path not in given_up]
     there = {id(run) for run in apart}
     done = [run for run in planned if id(run) not in there or run.is_finished]
@@ -433,7 +433,7 @@ def do_missing(
 def read(
     context: RunContext, study: StudySpec, planned: Sequence[PlannedRun], early: EarlyResults
 ) -> StudyResults:
-    """Read the runs that there are, but for those that were read early."""
+    """Read the finished runs, except those that were read early."""
     with doing(context.console, "reading the results") as activity:
         from experiments.results import read_results
 
@@ -447,9 +447,9 @@ def conclude(
     failures: Sequence[RunFailure],
     looks: Mapping[str, Standing] | None = None,
 ) -> int:
-    """Judge the runs that there are, and say which are missing and why; the exit code.
+    """Judge the finished runs, and say which are missing and why; return the exit code.
 
-    ``looks`` are those that have been taken, by environment; None for one that is taken now.
+    ``looks`` are looks already taken, by environment; None to take one now.
     """
     from experiments.results import mixed_versions
 
@@ -529,7 +529,7 @@ def _judge(
 def _draw(
     context: RunContext, analysis: StudyAnalysis, blocks: pd.DataFrame | None, activity: Activity
 ) -> list[Path]:
-    """Figures and the page; the files."""
+    """Draw the figures and write the page; return the files."""
     activity.now("working out the curves")
     from report.figures import write_figures
     from report.page import write_report
@@ -552,43 +552,43 @@ def _draw(
     return [*files, *pages, page]
 
 
-# --- where runs are done --------------------------------------------------------------------------
+# --- execution of runs ----------------------------------------------------------------------------
 
 
 @dataclass
 class RunContext:
-    """What the runs of a study or a search have in common: where they are done, and by what."""
+    """Shared by the runs of a study or a search: folder, command, limits, workers or cluster."""
 
-    root: Path  # the folder of what is done
-    command: str  # as run folders note it
-    limits: RunLimits  # what each run may take
+    root: Path  # the folder of the study
+    command: str  # recorded in run folders
+    limits: RunLimits  # of time and memory of each run
     console: Console
     with_page: bool = True  # draw the figures and write the page, beside the tables
     n_workers: int = 1  # processes that may work on this machine at once
     cluster: Cluster | None = None
     address: str = ""  # of the cluster, as it was typed
-    # Seconds of a run by agent and environment, where something is known of them.
+    # Expected seconds of a run by agent and environment, where known.
     expected: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    _warm_ups: str = "[]"  # what the cluster's workers compile once
+    _warm_ups: str = "[]"  # trainings that the cluster's workers compile once, as JSON
     store: FigureStore | None = None  # the runs that are in files instead of folders
     _held: ExitStack | None = None
-    _launcher: Launcher | None = None  # what is held
+    _launcher: Launcher | None = None  # the one kept open by `held`
 
     @property
     def words(self) -> str:
-        """Where runs are done, in words."""
+        """The number of workers or the cluster, in words."""
         here = f"{self.n_workers} at once"
         return here if self.cluster is None else f"on the cluster {self.address}"
 
     def not_stored(self, planned: Sequence[PlannedRun]) -> list[PlannedRun]:
-        """Those of these runs that are not in files instead of folders."""
+        """Those of these runs that are not in the store."""
         return [run for run in planned if self.store is None or not self.store.holds(run)]
 
     def get_ready(self, planned: Sequence[PlannedRun]) -> None:
-        """Start what runs are forked from here; what they compile is compiled once.
+        """Start the server that runs are forked from, with warm-ups that compile code once.
 
-        Only users' own modules are compiled so. The server imports the libraries while this process
-        does.
+        Only users' own modules need warm-ups. The server imports the libraries in parallel with
+        this process.
         """
         from experiments.child_processes import start_server
 
@@ -604,13 +604,13 @@ class RunContext:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Leave the place open between two uses, until the ``with`` statement ends."""
+        """Keep the launcher open between two uses, until the ``with`` statement ends."""
         with ExitStack() as self._held:
             yield
         self._held = self._launcher = None
 
     def launchers(self) -> AbstractContextManager[Launcher]:
-        """Open the place where runs are done."""
+        """Open a launcher, or reuse the one that `held` keeps open."""
         if self._held is None:
             return self._opened()
         if self._launcher is None:
@@ -633,7 +633,7 @@ class RunContext:
 def run_context(
     args: argparse.Namespace, root: Path, command: str, limits: RunLimits, console: Console
 ) -> RunContext:
-    """What the flags ask for."""
+    """The context that the flags ask for."""
     context = RunContext(root, command, limits, console, with_page=not args.no_report)
     if args.cluster is None:
         if args.insecure_cluster:
@@ -657,7 +657,7 @@ def run_context(
 
 
 def give_way() -> None:
-    """Stop, since the study's folder is another driver's, or gone."""
+    """Stop, because another process has taken over the study's folder, or it is gone."""
     from experiments.child_processes import stop_all
 
     stop_all()
@@ -668,7 +668,7 @@ def give_way() -> None:
 
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
-    """The study that the arguments mean, with what they change in it."""
+    """The study that the arguments select, with their changes."""
     from experiments.study import METRICS, StudySpec, find_study, read_study
     from pipeline.user_modules import import_typed
 
@@ -691,7 +691,7 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         raise UserError("give a study file, or --env and --algos, not both")
     else:
         study = read_study(find_study(args.study))
-    # A flag that has the name of a field goes there as it is, where it is given.
+    # A flag with the name of a field sets that field, if it is given.
     named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
     names = tuple(module.name for module in modules)
     changes = {**named, "n_seeds": args.seeds, "gym_packages": names, "user_modules": modules}
@@ -732,7 +732,7 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
 
 
 def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
-    """The files of ``--conf-file``, by the agents' names in the table of agents."""
+    """The files of ``--conf-file``, by the names of agents in the registry."""
     algos = list(dict.fromkeys(agent.algo for agent in study.agents))
     files: dict[str, Path] = {}
     for word in words:
@@ -754,7 +754,7 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
 
 
 def typed_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """The settings that the flags of a study, or of a search, give every agent."""
+    """The settings that the flags of a study or a search give to every agent."""
     from experiments.study import layered
     from pipeline.settings.values import parse_assignments
 
@@ -784,14 +784,11 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     return replace(study, agents=agents)
 
 
-# --- policies on logged pulls ---------------------------------------------------------------------
-
-
-# --- what a person watching sees: one table that moves, or a line now and then --------------------
+# --- progress: a live table, or a line now and then -----------------------------------------------
 
 
 class StudyProgress(LiveProgress):
-    """How far the runs of a study are, by agent and environment."""
+    """The progress of a study's runs, by agent and environment."""
 
     def __init__(
         self,
@@ -832,17 +829,17 @@ class StudyProgress(LiveProgress):
             self.look()
 
     def look(self) -> None:
-        """Show how far it is; from the first look on, runs are under way."""
+        """Show the progress; the first call also starts the estimate of the remaining time."""
         self.left.start(time.monotonic(), self.n_workers)
         super().look()
 
     @property
     def n_workers(self) -> int:
-        """How many runs are done at once."""
+        """The number of runs at once."""
         return 1 if self._launcher is None else self._launcher.n_workers
 
     def note_refusal(self, run: PlannedRun) -> None:
-        """Say once for each environment why its own model is not used, where that is so."""
+        """Say once for each environment why its own model is refused, if it is."""
         refusal = run.run.read_info().get("model_refused")
         if isinstance(refusal, str) and run.environment not in self._refused:
             self._refused.add(run.environment)
@@ -854,7 +851,7 @@ class StudyProgress(LiveProgress):
         return self.n_ended >= self.n_missing
 
     def figures(self) -> str:
-        """How many runs have ended, and how long the others may take."""
+        """The number of ended runs, and an estimate of the remaining time."""
         seconds = time.monotonic() - self.started
         text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
         if 0 < self.n_ended < self.n_missing:
@@ -865,7 +862,7 @@ class StudyProgress(LiveProgress):
         return f"{text}, {n_failed} failed" if n_failed else text
 
     def picture(self) -> Table:
-        """The same by agent and environment."""
+        """The progress by agent and environment, as a table."""
         from rich.progress_bar import ProgressBar
         from rich.table import Table
         from rich.text import Text

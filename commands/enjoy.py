@@ -1,4 +1,4 @@
-"""``enjoy.py``: its flags, the model that they mean, and what a person sees of it."""
+"""``enjoy.py``: its flags, the model they select, and how it is shown."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ examples:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The flags; where rl_zoo3 has one, with its name and meaning."""
+    """The flags, with the names and meanings that rl_zoo3 gives them."""
     parser = OneLineParser(
         description="Play a trained agent and print the returns of its episodes.",
         epilog=EPILOG,
@@ -92,17 +92,17 @@ def build_parser() -> argparse.ArgumentParser:
     add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
     add("--reward-log", metavar="DIR", help="also write the returns there, as Monitor's CSV files")
     add("--verbose", type=VERBOSITY, default=1, help="0 for no output (default: 1)")
-    add("--norm-reward", action="store_true", help="returns of rewards as training normalised them")
+    add("--norm-reward", action="store_true", help="returns of normalised rewards, as in training")
     add_shared(group, "--env-kwargs", "--gym-packages")
-    # Flags of rl_zoo3's that have nothing to do here: `_check_playing` says so of -P; what
-    # --custom-objects asks for is always done.
+    # Flags of rl_zoo3 without an effect: `check_playing` refuses -P; loading always does what
+    # --custom-objects asks for.
     parser.add_argument("-P", "--progress", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--custom-objects", action="store_true", help=argparse.SUPPRESS)
     return parser
 
 
 def add_model_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags that say which agent is meant."""
+    """Add the flags that select an agent."""
     add = parser.add_argument
     zipped = "path of a model zip, a run folder or a pack (default: a run is looked for)"
     add("model", nargs="?", help=zipped)
@@ -126,11 +126,11 @@ def add_model_flags(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--device", "--num-threads")
 
 
-# --- what is done ---------------------------------------------------------------------------------
+# --- main -----------------------------------------------------------------------------------------
 
 
 def main() -> int:
-    """Parse the arguments and play; the exit code."""
+    """Parse the arguments and play; return the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
         from commands.terminal import TextConsole
@@ -149,7 +149,7 @@ def main() -> int:
 
 
 def check_playing(args: argparse.Namespace) -> None:
-    """Refuse what cannot be done, in one line that says what can."""
+    """Raise `UserError` for flags that do not fit together."""
     if args.progress:
         raise UserError("-P: there is no bar; each episode is printed as it ends")
     if args.fps is not None and args.render != "ansi":
@@ -189,9 +189,9 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
 
 
 def found_model(console: Console, wanted: ModelRequest, stack: ExitStack) -> ChosenModel:
-    """Find the model and say where it is; the libraries that play it are loaded with it.
+    """Find the model, print its place, and load the libraries that play it.
 
-    A pack stays unpacked until the stack is closed.
+    A pack stays unpacked until ``stack`` is closed.
     """
     from commands.terminal import say
     from pipeline.models.choose import find_model, with_statistics
@@ -211,7 +211,7 @@ def found_model(console: Console, wanted: ModelRequest, stack: ExitStack) -> Cho
     place = typed if wanted.zipped_in is not None else found.path
     say(console, f"{found.spec.algo} on {found.spec.env_id}: {place}")
     with doing(console, "loading the libraries"), loading_libraries():
-        # All that plays, so that nothing is loaded in the middle of it.
+        # Load all libraries now, so that playing does not pause for them.
         return with_statistics(found, wanted.statistics)
 
 
@@ -219,7 +219,7 @@ def found_model(console: Console, wanted: ModelRequest, stack: ExitStack) -> Cho
 
 
 def render_mode(args: argparse.Namespace) -> RenderMode | None:
-    """What the environment is to draw: films need pictures, and a window needs a display."""
+    """The render mode: films need ``rgb_array``, and ``human`` by default needs a display."""
     if args.record is not None:
         return "rgb_array"
     if args.render == "none" or (args.render is None and args.n_envs > 1):
@@ -233,7 +233,7 @@ def render_mode(args: argparse.Namespace) -> RenderMode | None:
 
 
 def play(console: Console, chosen: ChosenModel, args: argparse.Namespace) -> None:
-    """Play episodes, show or film them, and print their returns and what the policy is worth."""
+    """Play episodes, show or film them, and print their returns and the policy's exact return."""
     import torch as th
 
     from envs.layout import action_names
@@ -289,7 +289,7 @@ def play(console: Console, chosen: ChosenModel, args: argparse.Namespace) -> Non
 def print_returns(
     console: Console, spec: TrainSpec, show: _Show | LiveShow, *, are_normalised: bool = False
 ) -> None:
-    """Print the returns' mean, and how they stand to the optimum, where that is bracketed."""
+    """Print the mean return, and compare it with the optimum if a bracket of it is known."""
     if not show.returns:
         console.print("no episode came to its end: raise --n-timesteps")
         return
@@ -310,14 +310,14 @@ def print_returns(
 
 
 def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: bool) -> None:
-    """Say what the policy is worth, where that can be computed."""
+    """Print the expected return of the policy, if it can be computed."""
     from commands.terminal import describe, print_refusal
     from pipeline.evaluation.exact import exact_evaluator, model_refusal
     from pipeline.evaluation.histories import by_histories, world_of_memory
     from pipeline.evaluation.policies import why_not_exact
     from pipeline.signs_of_life import doing
 
-    with doing(console, "working out what the policy is worth"):
+    with doing(console, "computing the policy's expected return"):
         world = world_of_memory(spec, model) if deterministic else None
         if world is not None:
             remembering = by_histories(spec, model, world)
@@ -337,14 +337,14 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
         try:
             evaluation = evaluator(model, deterministic)
         except (TypeError, ValueError):
-            # The probabilities that the agent samples its actions from are not known.
+            # The agent's action probabilities are not known.
             return
     console.print(describe(evaluation))
 
 
 @dataclass
 class _Show:
-    """Prints or keeps what is drawn, as it comes, and tells how far the playing is."""
+    """Prints or keeps the frames as they come, and reports progress."""
 
     activity: Activity
     mode: RenderMode | None
@@ -357,11 +357,11 @@ class _Show:
     n_left_out: int = 0  # pictures
 
     def shown(self) -> AbstractContextManager[None]:
-        # Pictures of letters show by themselves that something goes on.
+        # Frames as text show progress by themselves.
         return nullcontext() if self.mode == "ansi" else self.activity.shown()
 
     def before_step(self, obs: Any, actions: Any) -> None:
-        """Nothing: what is drawn is shown afterwards."""
+        """Do nothing: frames are shown after the step."""
 
     def after_step(self, done: bool) -> None:
         self.steps += 1
@@ -393,21 +393,21 @@ class _Show:
         self.activity.say(f"episode {len(self.returns)}: return {total_return:.2f}, {length} steps")
 
 
-# --- one picture of letters that is drawn anew in its place ---------------------------------------
+# --- a live picture in the terminal ---------------------------------------------------------------
 
 
-# In letters: a bar, a number such as -1.235e-05 or "probability", and what lies beside the map.
+# Widths in characters: a bar, a number such as -1.235e-05 or "probability", the table, the gap.
 BAR = 12
 NUMBER = 11
 FIGURES_WIDTH = 36
 GAP = 3
-# In lines: what is above the map, what is above the figures, and one for the cursor.
+# In lines: the title above the map, the heading of the table, and one for the cursor.
 HEADINGS = 3
 MOST_ACTIONS = 20
 
 
 class LiveShow:
-    """Draws what the environment shows, with what the agent makes of its actions beside it."""
+    """Draws the environment as text, beside the agent's values or probabilities of actions."""
 
     def __init__(
         self,
@@ -421,7 +421,7 @@ class LiveShow:
 
         from pipeline.playing import Repetition
 
-        self.taker = taker  # hands over what the environment draws
+        self.taker = taker  # takes the environment's frames
         self.returns: list[float] = []
         self.lengths: list[int] = []
         self._model = model
@@ -437,11 +437,11 @@ class LiveShow:
         """Draw while the ``with`` statement runs; the last picture stays."""
         with self._live:
             yield
-            if self._step:  # else the end of an episode is shown
+            if self._step:  # at 0 the end of an episode is shown already
                 self._draw(self.taker.take(done=False), None, None)
 
     def before_step(self, obs: Any, actions: Any) -> None:
-        """Draw where the agent is, and what it is about to do."""
+        """Draw the state and the chosen action."""
         import numpy as np
 
         from pipeline.evaluation.policies import action_figures
@@ -449,7 +449,7 @@ class LiveShow:
         frames = self.taker.take(done=False)
         if frames and self._repetition.goes_on(frames[-1]):
             if not self._is_left_out:
-                self._say(f"step {self._step}: it repeats itself, and is not shown any more")
+                self._say(f"step {self._step}: the frames repeat, and are no longer shown")
             self._is_left_out = True
             return
         self._is_left_out = False
@@ -459,7 +459,7 @@ class LiveShow:
         time.sleep(self._pause)
 
     def after_step(self, done: bool) -> None:
-        """Draw where an episode has ended."""
+        """Draw the last state of an episode."""
         self._step += 1
         if done:
             self._draw(self.taker.take(done=True), None, None)
@@ -468,7 +468,7 @@ class LiveShow:
             self._repetition.forget()
 
     def after_episode(self, total_return: float, length: int) -> None:
-        """Say above the picture how an episode went."""
+        """Print an episode's return and length above the picture."""
         self.returns.append(total_return)
         self.lengths.append(length)
         self._say(f"episode {len(self.returns)}: return {total_return:.2f}, {length} steps")
@@ -518,8 +518,8 @@ def figures_table(
 ) -> Table:
     """A row for each action, with a bar between the lowest and the highest; the chosen one marked.
 
-    Columns are as wide whatever they hold, so that nothing moves but what changes. Where there is
-    no room for all actions, the first are shown, and the chosen one.
+    Columns have fixed widths, so that the table does not move. If not all actions fit, the table
+    has the first ones and the chosen one.
     """
     import numpy as np
     from rich.cells import cell_len

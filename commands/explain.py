@@ -1,4 +1,4 @@
-"""``explain.py``: where an agent loses what it stays behind the optimum."""
+"""``explain.py``: where an agent loses return against the optimum."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ examples:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The flags: those of enjoy.py that say which agent, and what to do with it."""
+    """The flags: those of enjoy.py that select an agent, and those of the explanation."""
     parser = OneLineParser(
-        description="Say where an agent loses what it stays behind the optimum, exactly.",
+        description="Say where an agent loses return against the optimum, exactly.",
         epilog=EPILOG,
     )
     add_model_flags(parser)
     group = parser.add_argument_group("explaining")
     add = group.add_argument
-    test = "train four seeds with this change (KEY:VALUE ...) and four without; several changes "
-    test += "may be tried by giving the flag again; without a change, a small table of them"
+    test = "train four seeds with this change (KEY:VALUE ...) and four without; repeat the flag "
+    test += "to try several changes; without a change, a few common ones are tried"
     add("--test", nargs="*", action="append", metavar="KEY:VALUE", help=test)
     other = "another agent on the same environment: where the two first differ, and what it costs"
     add("--against", type=filled, metavar="MODEL", help=other)
     add("--map", type=filled, metavar="FILE", help="draw the cost of each cell, as .png")
-    add("--course", action="store_true", help="the same of each checkpoint of the run")
-    add("--json", type=filled, metavar="FILE", help="write the explanation there too")
+    add("--course", action="store_true", help="also split the gap of each checkpoint of the run")
+    add("--json", type=filled, metavar="FILE", help="also write the explanation to this file")
     add_shared(group, "--env-kwargs", "--gym-packages", "--jobs")
     parser.set_defaults(seed=0)
     return parser
 
 
 def main() -> int:
-    """Parse the arguments and explain; the exit code."""
+    """Parse the arguments and explain; return the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes(), ExitStack() as stack:
         from commands.terminal import TextConsole, say
@@ -87,21 +87,21 @@ def main() -> int:
 
 @dataclass(frozen=True)
 class Asked:
-    """An agent that can be asked what it does in every state."""
+    """An agent to explain, with the exact evaluator of its environment."""
 
     chosen: ChosenModel
     evaluator: ExactEvaluator
     agent: BaseAlgorithm
 
     def explanation(self) -> Explanation:
-        """Where it loses what it stays behind the optimum."""
+        """Where the agent loses return against the optimum."""
         from diagnosis.explanation import explanation
 
         return explanation(self.chosen.spec, self.agent, self.evaluator)
 
 
 def _asked(console: Console, wanted: ModelRequest, stack: ExitStack) -> Asked:
-    """Find and load an agent, and work out the optimum of its environment."""
+    """Find and load an agent, and compute the optimum of its environment."""
     from pipeline.signs_of_life import doing
 
     chosen = found_model(console, _median_run(wanted), stack)
@@ -117,7 +117,7 @@ def _asked(console: Console, wanted: ModelRequest, stack: ExitStack) -> Asked:
 
 
 def _median_run(wanted: ModelRequest) -> ModelRequest:
-    """The request with a study's folder replaced by its run of median return, or the one below."""
+    """The request, with a study's folder replaced by its run of (lower) median return."""
     if wanted.path is None or not (table := wanted.path / "summary.csv").is_file():
         return wanted
     import pandas as pd
@@ -151,7 +151,7 @@ def _loaded(chosen: ChosenModel, stack: ExitStack) -> BaseAlgorithm:
 
 
 def _compare(console: Console, one: Asked, other: Asked) -> dict[str, Any]:
-    """Say where two agents first do something different; the same as JSON."""
+    """Print where two agents first act differently; return the same as JSON data."""
     from commands.terminal import say
     from diagnosis.explanation import parting
     from report.why import parting_lines
@@ -165,7 +165,7 @@ def _compare(console: Console, one: Asked, other: Asked) -> dict[str, Any]:
 
 
 def _course(console: Console, one: Asked, stack: ExitStack, last: Explanation) -> list[Any]:
-    """Print the parts of the gap at each checkpoint; the same as JSON."""
+    """Print the parts of the gap at each checkpoint; return the same as JSON data."""
     from commands.terminal import say
     from pipeline.models.choose import model_of_run
     from report.why import course_lines
@@ -190,7 +190,7 @@ def _course(console: Console, one: Asked, stack: ExitStack, last: Explanation) -
 def _test(
     console: Console, args: argparse.Namespace, one: Asked, explained: Explanation
 ) -> list[Any]:
-    """Train four seeds as it is and with each change, and say which is best; the same as JSON."""
+    """Train four seeds without and with each change, and print the best; return JSON data."""
     from commands.compare import RunContext, results_of
     from commands.terminal import say
     from experiments.interventions import AS_IT_IS, intervention_study, tried, usual_changes
@@ -214,7 +214,7 @@ def _test(
 
 
 def _draw(console: Console, one: Asked, explained: Explanation, path: Path) -> None:
-    """Draw what each cell costs."""
+    """Draw the cost of each cell."""
     from commands.terminal import say
     from pipeline.evaluation.value_maps import map_refusal, value_map
     from pipeline.map_pictures import draw_cost_map

@@ -1,4 +1,4 @@
-"""Makes folders of stored runs again, and moves damaged ones aside."""
+"""Repeats stored runs to make their folders again, and moves damaged folders aside."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
 
 
 class Context(Protocol):
-    """What is needed here of `commands.compare.RunContext`."""
+    """The members of `commands.compare.RunContext` that this module uses."""
 
     root: Path
     console: Console
     store: FigureStore | None
 
     def get_ready(self, planned: Sequence[PlannedRun]) -> None:
-        """Start what runs are forked from."""
+        """Start the server that runs are forked from."""
 
     def launchers(self) -> AbstractContextManager[Launcher]:
-        """Open the place where runs are done."""
+        """Open a launcher of runs."""
 
 
 def keep_few(
     context: Context, results: StudyResults
 ) -> tuple[StudyResults, list[RunFailure], bool]:
-    """Have folders of few stored runs; also which failed, and whether all others are the same."""
+    """Make the folders of the few runs to keep; also failures, and whether no result differs."""
     from experiments.analysis import runs_to_keep
 
     if not results.stored:
@@ -57,7 +57,7 @@ def _do_again(
 ) -> tuple[list[RunFailure], bool]:
     """Make folders of stored runs again where they are missing or damaged.
 
-    A run that comes out otherwise than the first time is moved aside, and told.
+    A run with another result than the first time is moved aside, with a message.
     """
     from experiments.launching import execute
     from experiments.results import read_run
@@ -93,12 +93,12 @@ def _do_again(
 
 
 def _otherwise(run: PlannedRun) -> Path:
-    """Where the folder of a run is that came out differently than the first time."""
+    """The folder of a run whose repetition had another result."""
     return run.path.with_name(f"{run.path.name}.otherwise")
 
 
 def make_again(context: Context, study: StudySpec, runs: Sequence[PlannedRun]) -> int:
-    """Make the folders of stored runs again, the same to the bit; the exit code."""
+    """Make the folders of stored runs again, bit for bit; return the exit code."""
     assert context.store is not None
     for run in runs:
         if not (context.store.holds(run) or run.is_finished):
@@ -134,7 +134,7 @@ def repair(
     planned: Sequence[PlannedRun],
     store: FigureStore | None = None,
 ) -> None:
-    """Move the folders of damaged runs, and damaged files of runs, aside, and say so."""
+    """Move folders of damaged runs and damaged files of runs aside, with a message each."""
     with doing(console, "looking for damaged runs") as activity:
         from experiments.run_folders import move_damaged_aside
 

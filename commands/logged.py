@@ -11,7 +11,7 @@ from pipeline.signs_of_life import doing
 
 
 def compare_on_log(args: argparse.Namespace) -> int:
-    """Judge the policies of ``--policy`` on the log of ``--logged``; the exit code."""
+    """Judge the policies of ``--policy`` on the log of ``--logged``; return the exit code."""
     from pipeline.user_modules import import_typed
 
     if not (args.logged and args.policy):

@@ -1,4 +1,4 @@
-"""``shaping.py``: whether rewards of training change what is optimal, and what that costs."""
+"""``shaping.py``: whether rewards in training change the optimal policies, and at what cost."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mdp.transition_model import TransitionModel
     from pipeline.train_spec import TrainSpec
 
-# States that are named of those in which other actions are best.
+# The largest number of states printed in which other actions are best.
 MOST_STATES = 3
 # Returns that differ by less, relative to the optimum, are equal.
 ROUNDING = 1e-9
@@ -40,7 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The flags."""
     parser = OneLineParser(
         description="Say whether training on other rewards changes the optimal policies, and what "
-        "that costs, exactly. Default: what the settings of an agent change in training.",
+        "that costs, exactly. Default: the rewards that an agent's settings change in training.",
         epilog=EPILOG,
     )
     add = parser.add_argument
@@ -50,18 +50,18 @@ def build_parser() -> argparse.ArgumentParser:
     kwargs = "arguments of the environment in training, in place of those in the settings"
     add("--train-env-kwargs", **assignments(), help=kwargs)
     wrapper = "a wrapper of the environment in training, with arguments (KEY:VALUE ...), in place "
-    wrapper += "of those in the settings; give the flag again for one around it"
+    wrapper += "of those in the settings; repeat the flag to add a wrapper around it"
     metavar = ("NAME", "KEY:VALUE")
     add("--wrapper", nargs="+", action="append", default=[], metavar=metavar, help=wrapper)
     add("--gamma", type=float, help="discount (default: the agent's)")
     add_shared(parser, "--hyperparams", help="hyperparameters to change, e.g. gamma:0.9")
     add_shared(parser, "--conf-file", "--gym-packages")
-    add("--json", type=filled, metavar="FILE", help="write what was found there too")
+    add("--json", type=filled, metavar="FILE", help="also write the result to this file")
     return parser
 
 
 def main() -> int:
-    """Parse the arguments and say what the rewards of training change; the exit code."""
+    """Parse the arguments and print the effect of the training rewards; return the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
         from commands.terminal import TextConsole, say
@@ -85,11 +85,11 @@ def main() -> int:
     return 0
 
 
-# --- what is asked --------------------------------------------------------------------------------
+# --- input ----------------------------------------------------------------------------------------
 
 
 def _spec(args: argparse.Namespace) -> TrainSpec:
-    """The settings of the agent, with what is changed in training."""
+    """The settings of the agent, with the changes in training."""
     from pipeline.agent_settings import check_algorithm, resolved_spec, training_follows
     from pipeline.environments import check_env_id, with_maps_read
     from pipeline.settings.hyperparams import override, read_hyperparams
@@ -114,12 +114,12 @@ def _spec(args: argparse.Namespace) -> TrainSpec:
     spec = resolved_spec(raw, algo=args.algo, env_id=args.env, seed=0, gym_packages=packages)
     for key in ("normalize", "vec_env_wrapper"):
         if getattr(spec.hyperparams, key):
-            raise UserError(f"{key}: what it makes of rewards has no model that could be compared")
+            raise UserError(f"{key}: the rewards that it makes have no model to compare")
     return spec
 
 
 def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
-    """The discount: the flag's, or that of the settings, or the default of the agent's class."""
+    """The discount of the flag, else of the settings, else the default of the agent's class."""
     found = spec.hyperparams.algorithm.get("gamma") if args.gamma is None else args.gamma
     if found is None:
         from agents import load_algorithm
@@ -133,20 +133,20 @@ def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
 
 
 def _model(spec: TrainSpec, env: gym.Env[Any, Any]) -> TransitionModel:
-    """The model of an environment with its wrappers; UserError where it is not known."""
+    """The model of an environment with its wrappers; `UserError` if it is not known."""
     from envs.known_models import model_check, transition_model, unknown_wrapper
 
     model = transition_model(env)
     if model is not None:
         return model
     if (wrapper := unknown_wrapper(env)) is not None:
-        raise UserError(f"what {wrapper} makes of the model is not known, so it cannot be compared")
+        raise UserError(f"the effect of {wrapper} on the model is not known: nothing to compare")
     check = model_check(env)
     reason = None if check is None else check.refusal
     raise UserError(reason or f"the model of {spec.env_id} is not known, so there is no optimum")
 
 
-# --- what is found --------------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -156,10 +156,10 @@ class Compared:
     env: gym.Env[Any, Any]  # in which policies are judged
     model: TransitionModel
     horizon: int
-    effects: dict[float, Effect]  # by discount, the last one without and under the time limit
+    effects: dict[float, Effect]  # by discount; the last one undiscounted, under the time limit
 
     def lines(self) -> Iterator[str]:
-        """What there is to say."""
+        """The comparison in words."""
         optimum = self.effects[1.0].optimum
         for discount, found in self.effects.items():
             of = f"{int(found.differs.sum()):,} of {int(self.model.reachable.sum()):,} states"
@@ -177,14 +177,14 @@ class Compared:
                     told = "best is {}, with the changes {}; {}".format(*sets, told)
                 yield f"  {place['state']}: {told}"
             if not found.is_same and not met:
-                yield "  nothing is lost wherever policies come that are optimal with the changes"
+                yield "  nothing is lost in states that optimal policies with the changes reach"
             yield f"  {_cost(found, optimum)}"
         for discount, found in self.effects.items():
             if discount < 1:
                 yield _potential(found)
 
     def places(self, found: Effect) -> list[dict[str, Any]]:
-        """The states with other best actions, those first where most return is lost."""
+        """The states with other best actions, the largest loss of return first."""
         import numpy as np
 
         from envs.layout import action_names, grid_layout, state_name
@@ -211,7 +211,7 @@ class Compared:
         ]
 
     def as_data(self) -> dict[str, Any]:
-        """The same as JSON."""
+        """The comparison as JSON data."""
         objectives = [
             {
                 "discount": discount,
@@ -234,7 +234,7 @@ class Compared:
 
 
 def _compared(spec: TrainSpec, env: gym.Env[Any, Any], discount: float) -> Compared:
-    """Plan in both models."""
+    """Compute optimal policies of both models; `UserError` if they cannot be compared."""
     from envs.known_models import time_limit
     from mdp.shaping import discounted_effect, effect_under_limit
     from pipeline.environments import make_single_env
@@ -254,7 +254,7 @@ def _compared(spec: TrainSpec, env: gym.Env[Any, Any], discount: float) -> Compa
 
 
 def _cost(found: Effect, optimum: float) -> str:
-    """What optimal policies return as evaluations judge them, with and without the changes."""
+    """The undiscounted returns of optimal policies, with and without the changes."""
     near = ROUNDING * max(1.0, abs(optimum))
 
     def span(best: float, worst: float, form: str = ".6g") -> str:
@@ -270,7 +270,7 @@ def _cost(found: Effect, optimum: float) -> str:
 
 
 def _potential(found: Effect) -> str:
-    """Whether the rewards were changed by a potential."""
+    """Whether the change of rewards is a potential difference (Ng, Harada and Russell, 1999)."""
     if found.factor is None or found.potential is None:
         return "the changed rewards are not the original ones plus the difference of a potential"
     factor = "" if found.factor == 1 else f"{found.factor:.6g} x "

@@ -1,4 +1,4 @@
-"""``yardstick pack`` and ``yardstick inspect``: what goes to others, and what came from them.
+"""``yardstick pack`` makes packs for others, and ``yardstick inspect`` checks files of others.
 
 From a checkout: ``python -m commands.share pack logs/ppo/Warehouse-v0_1`` and
 ``python -m commands.share inspect model.zip``.
@@ -20,14 +20,14 @@ SUSPICIOUS = 1  # exit code
 
 ABOUT_PACKS = """\
 The pack of a run holds the model, its settings and statistics, pictures, a film if a .gif or .mp4
-lies in the run folder, what came out, modules of yours that it needs, and the digest of each file.
-That of a study holds its page, tables, figures and settings, and the packs of its runs. Paths of
+is in the run folder, the results, modules of yours that it needs, and the digest of each file. The
+pack of a study holds its page, tables, figures and settings, and the packs of its runs. Paths of
 this machine are left out.
 """
 
 
 def pack() -> int:
-    """Pack a finished run, or a study, for others, or check a pack; the exit code."""
+    """Pack a finished run or a study for others, or check a pack; return the exit code."""
     parser = OneLineParser(
         description="Pack a finished run, or a study, for others, with a card.",
         epilog=ABOUT_PACKS,
@@ -65,7 +65,7 @@ def pack() -> int:
 
 
 def _pack(path: Path, target: Path | None, tell: Callable[[str], None]) -> None:
-    """Pack a run or a study, and say how it is played on any machine."""
+    """Pack a run or a study, and print the command that plays it on any machine."""
     from pipeline.model_card import to_type
     from pipeline.models.find import run_in
     from pipeline.packs import default_target, is_study, pack, pack_study
@@ -95,7 +95,7 @@ def _pack(path: Path, target: Path | None, tell: Callable[[str], None]) -> None:
 
 
 def inspect() -> int:
-    """Print what a model file holds, and what in it is suspicious; the exit code."""
+    """Print the contents of a model file and what is suspicious; return the exit code."""
     parser = OneLineParser(
         description="Print what a model zip contains and what is suspicious. Nothing in it is run.",
         epilog="Exit code: 0 if nothing is suspicious, 1 if something is, 2 if it is no model.",

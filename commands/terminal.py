@@ -1,4 +1,4 @@
-"""Where the commands print to, and what several of them say: progress, evaluations, engines."""
+"""Output shared by the commands: consoles, progress, evaluations and engines in words."""
 
 from __future__ import annotations
 
@@ -40,43 +40,43 @@ UNBOUNDED = 10_000  # columns
 
 
 class TextConsole(Console):
-    """A console that shows what control characters there are in a text, and obeys none of them.
+    """A console that shows control characters in a text instead of obeying them.
 
-    Labels, titles and names come from files, so Rich's markup, which can crash or make links of
-    them, is text too. What moves the cursor or sets a colour is Rich's own: see ``style``.
+    Labels, titles and names come from files, so Rich's markup in them is plain text, too: it could
+    crash, or make links. Cursor movements and colours come only from Rich itself: see ``style``.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, **options)
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """As Rich does; into a file or a pipe no line is broken, so that `grep` finds it whole."""
+        """Print as Rich does, but break no line in a file or a pipe, so that `grep` finds it."""
         if not self.is_terminal and all(isinstance(item, str) for item in objects):
             options.setdefault("soft_wrap", True)
         super().print(*objects, **options)
 
     def on_broken_pipe(self) -> None:
-        """Leave it to `commands.cli.Output`; Rich would keep silent from then on.
+        """Leave a closed pipe to `commands.cli.Output`; Rich would be silent from then on.
 
-        Where a thread was told that says how far things are, the main thread would not learn of it.
+        If the thread that prints progress found the closed pipe, the main thread would not know.
         """
         raise BrokenPipeError
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """As Rich does, of the text made visible, so that it is measured as it is shown."""
+        """As Rich does, with control characters made visible, so that the width is right."""
         return super().render_str(visible(text), **options)
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """As Rich does, the text of every segment made visible, whatever it comes from."""
+        """As Rich does, with control characters made visible in every segment."""
         for segment in super().render(renderable, options):
             text, style, control = segment
             yield segment if control else Segment(visible(text), style)
 
 
 def table_console(*, highlight: bool = True) -> Console:
-    """A console as wide as the terminal; of 80 columns, or `COLUMNS`, in a file or a pipe."""
+    """A console as wide as the terminal; in a file or a pipe, of `COLUMNS` or 80 columns."""
     console = TextConsole(highlight=highlight)
     if console.is_terminal:
         return console
@@ -84,7 +84,7 @@ def table_console(*, highlight: bool = True) -> Console:
 
 
 def print_rows(console: Console, table: Table) -> None:
-    """Print a table without lines: into a file or a pipe each row as a line, however long."""
+    """Print a table without borders; in a file or a pipe each row is one line, however long."""
     if console.is_terminal:
         console.print(table, highlight=False)
         return
@@ -95,18 +95,18 @@ def print_rows(console: Console, table: Table) -> None:
 
 
 def say(console: Console, line: str, style: str | None = None) -> None:
-    """Print a line as it is, however long."""
+    """Print a line without breaking it, however long."""
     console.print(line, style=style, highlight=False, soft_wrap=True)
 
 
 def print_refusal(console: Console, refusal: str | None) -> None:
-    """Say why the environment's own model is not used, where that is so."""
+    """Say why the environment's own model is refused, if it is."""
     if refusal is not None:
         say(console, f"{refusal}; figures are sampled")
 
 
 class LiveProgress(ABC):
-    """Shows how far something is while its ``with`` statement runs."""
+    """Shows progress while its ``with`` statement runs."""
 
     def __init__(self, console: Console) -> None:
         from rich.live import Live
@@ -119,7 +119,7 @@ class LiveProgress(ABC):
         self._launcher: Launcher | None = None
 
     def watching(self, launchers: Launchers) -> Launchers:
-        """The same launchers, of which is shown what there is to say while one is open."""
+        """The same launchers, with the words of the open one shown in the progress."""
 
         @contextlib.contextmanager
         def watched() -> Iterator[Launcher]:
@@ -131,16 +131,16 @@ class LiveProgress(ABC):
 
     @property
     def place_words(self) -> str:
-        """What there is to say of where runs are done, to go on a line with it; mostly nothing."""
+        """The launcher's words, to append to a line; mostly empty."""
         words = self._launcher.words if self._launcher is not None else ""
         return f", {words}" if words else ""
 
     @abstractmethod
     def figures(self) -> str:
-        """How far it is, in a line."""
+        """The progress in a line."""
 
     def picture(self) -> RenderableType:
-        """The same where it can move."""
+        """The progress for a live display."""
         return Text(self.figures())
 
     @property
@@ -169,7 +169,7 @@ class LiveProgress(ABC):
             self.say(f"{self.figures()}; the same command continues")
 
     def look(self) -> None:
-        """Show how far it is, also while nothing ends."""
+        """Show the progress; called at intervals, too."""
         if self.live is not None:
             self.live.update(self.picture(), refresh=True)
         elif self.silence.is_too_long and not self.is_over:
@@ -210,7 +210,7 @@ def describe_others(others: OtherReturns) -> str:
 
 
 def describe_measured(evaluation: Evaluation) -> str:
-    """How the return stands to the optimum; empty where that is neither known nor bracketed."""
+    """The return compared with the optimum; empty if the optimum is neither known nor bracketed."""
     yardstick, value = evaluation.yardstick, evaluation.mean_return
     if yardstick is None:
         return ""
@@ -230,20 +230,20 @@ def describe_measured(evaluation: Evaluation) -> str:
     text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"
     if evaluation.beats_optimum:
         text += (
-            ". THIS IS MORE THAN ANY POLICY CAN REACH: the environment is not the one that the "
-            "bracket is of, or the bracket is wrong"
+            ". THIS IS MORE THAN ANY POLICY CAN REACH: the bracket belongs to another environment, "
+            "or is wrong"
         )
-        text += "" if yardstick.is_proven else ", whose upper end is not proven"
+        text += "" if yardstick.is_proven else "; its upper end is not proven"
     return text
 
 
 def _score(yardstick: Yardstick, value: float) -> str:
-    """Rounded down: 1 is the optimum and nothing less."""
+    """The score, rounded down: only the optimum is 1."""
     return f"{math.floor(100 * yardstick.score(value) + 1e-6) / 100:.2f}"
 
 
 def episodes(n: int) -> str:
-    """So many episodes."""
+    """A number of episodes in words."""
     return f"{n:,} episode{'s' if n != 1 else ''}"
 
 
@@ -258,7 +258,7 @@ HOW_NOT_TO_BE_ASKED = (
 
 
 def about(seconds: float) -> str:
-    """A time that is known to a factor of two."""
+    """A time that is known up to a factor of two."""
     if seconds < 1:
         return "less than 1 s"
     if seconds < 120:
@@ -271,13 +271,13 @@ def about(seconds: float) -> str:
 def training_line(
     outlook: EngineOutlook | None, model: BaseAlgorithm, callback: BaseCallback
 ) -> str:
-    """The line of one training; empty where there is nothing to say of its engine."""
+    """The line on the engine of one training; empty if there is nothing to say."""
     from stable_baselines3.common.callbacks import CallbackList
 
     from agents.common.callbacks import members, unknown_callbacks
     from agents.networks.engine_setting import machine_pace
 
-    # Callbacks of the user's own that must be asked after each step.
+    # The user's own callbacks that must be called after each step.
     told = [each for each in members(callback) if not isinstance(each, CallbackList)]
     theirs = [each for each in told if not type(each).__module__.startswith("pipeline.")]
     asked = [name for each in theirs for name in unknown_callbacks(each)]
@@ -307,7 +307,7 @@ def training_line(
 
 
 def _words(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> str:
-    """An engine, what it takes, and why it is not another."""
+    """An engine, its expected time, and the reason why it is not another."""
     name = str(plan).partition(":")[0] if plan.is_compiled else LIBRARY
     reason = plan.in_python or plan.reason
     return f"{name}{_takes(plan, outlook, pace, unit)}{': ' if reason else ''}{reason}"
@@ -325,7 +325,7 @@ def _takes(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> 
 
 
 def seconds_of(plan: EnginePlan, outlook: EngineOutlook) -> float:
-    """What a training takes where the constants were measured; 0 where nobody knows."""
+    """Seconds of a training on the machine of the measured constants; 0 if unknown."""
     if outlook.work is None:
         return 0.0
     if not plan.is_compiled:
@@ -334,9 +334,9 @@ def seconds_of(plan: EnginePlan, outlook: EngineOutlook) -> float:
 
 
 def study_line(planned: Sequence[tuple[str, EngineOutlook, int]]) -> str:
-    """The line of many trainings; empty where there are none with networks.
+    """The line on the engines of many trainings; empty if none has networks.
 
-    Planned are labels of agents, the outlooks of their runs, and how many runs each stands for.
+    ``planned`` has labels of agents, the outlooks of their runs, and the numbers of their runs.
     """
     from agents.networks.engine_setting import machine_pace
 
@@ -360,7 +360,7 @@ def study_line(planned: Sequence[tuple[str, EngineOutlook, int]]) -> str:
 
 
 def _together(trainings: Sequence[tuple[EngineOutlook, EnginePlan, int]], pace: float) -> str:
-    """What they take together; empty where nobody knows it of one."""
+    """The expected time of all trainings together; empty if that of one is unknown."""
     if any(outlook.work is None for outlook, _, _ in trainings):
         return ""
     seconds = sum(seconds_of(plan, outlook) * n for outlook, plan, n in trainings)
@@ -368,7 +368,7 @@ def _together(trainings: Sequence[tuple[EngineOutlook, EnginePlan, int]], pace: 
 
 
 def search_line(algo: str, search: EngineOutlook | None, retest: EngineOutlook | None) -> str:
-    """The line of a search and its re-test, of one run each; empty where both are the same."""
+    """The line on the engines of a search and its re-test, for one run; empty without outlooks."""
     if search is None or retest is None:
         return ""
     from agents.networks.engine_setting import machine_pace
@@ -380,5 +380,5 @@ def search_line(algo: str, search: EngineOutlook | None, retest: EngineOutlook |
     again = _words(retest.plan, retest, pace, "a run")
     return (
         f"search: {searched}; re-test: {again}, in which train runs {algo}; "
-        "--engine auto re-tests compiled, for who trains so"
+        "--engine auto re-tests compiled, if you train with it"
     )

@@ -1,4 +1,4 @@
-"""``train.py``: its flags, what they ask for, and what is printed before and after a training."""
+"""``train.py``: its flags, the training they ask for, and the output before and after it."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ if TYPE_CHECKING:
 
 WATCHED = whole_number(1, besides={0: "those of the first 5,000 steps"})
 
-# The flags of an interrupted run, by the names of their values: no run folder keeps them.
+# The flags for interrupted runs, by the names of their values: run folders do not record them.
 RESUMING = ("resume", "resume_or_start", "save_state_every", "keep_state")
 
-# What may be given beside --resume: how it is shown, kept and imported, and not what is done.
+# Flags allowed beside --resume: those of output, states and imports, none of the training itself.
 _BESIDE_RESUME = {"resume", "save_state_every", "keep_state", "log_folder", "gym_packages"}
 _BESIDE_RESUME |= {"verbose", "progress", "list"}
 
@@ -115,7 +115,7 @@ def build_parser() -> argparse.ArgumentParser:
     n_envs = "environments to evaluate on (10)"
     add("--n-eval-envs", type=COUNT, default=10, metavar="N", help=n_envs)
     add("--save-freq", type=INTERVAL, default=-1, metavar="N", help="steps between checkpoints")
-    add("--save-replay-buffer", action="store_true", help="save it too, if the agent has one")
+    add("--save-replay-buffer", action="store_true", help="save the replay buffer, if there is one")
     add_shared(group, "--log-folder", default="logs", help="folder of all runs (logs)")
     add("-uuid", "--uuid", action="store_true", help="add a unique id to the run folder's name")
     add("-tb", "--tensorboard-log", default="", metavar="DIR", help="write TensorBoard logs there")
@@ -130,10 +130,10 @@ def build_parser() -> argparse.ArgumentParser:
         "--watch-learning",
         type=filled,
         metavar="FILE",
-        help="write a page (.html) that plays the training: each update of a table, or what a "
-        "network does in each state, at every evaluation",
+        help="write a page (.html) that plays the training: each update of a table, or a network's "
+        "action in each state, at every evaluation",
     )
-    watched = "the first episodes of a table (default: the steps in which its policy gets better)"
+    watched = "first episodes of a table to play (default: the steps in which its policy improves)"
     add("--watch-episodes", type=WATCHED, default=0, metavar="N", help=watched)
 
     add = parser.add_argument_group("continuing an interrupted run").add_argument
@@ -163,11 +163,11 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-# --- what is done ---------------------------------------------------------------------------------
+# --- main -----------------------------------------------------------------------------------------
 
 
 def main() -> int:
-    """Parse the arguments and do what they ask for; the exit code."""
+    """Parse the arguments and train, resume or list; return the exit code."""
     args = build_parser().parse_args()
     with stops_noticed() as stop, exits_as_mistakes():
         if args.list:
@@ -196,8 +196,8 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     go_on_unread()
     console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
     print_header(console, spec)
-    # What is called here says for itself where it can be stopped; between its parts a stop would
-    # leave a run folder that nobody works on.
+    # The called functions decide where they can be stopped; a stop between them would leave a run
+    # folder without an owner.
     with stop.held():
         with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
@@ -225,14 +225,14 @@ def _carried_out(training: Training, console: Console, stop: StopRequest) -> int
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 
-# --- going on with a run that was cut off ---------------------------------------------------------
+# --- continuing an interrupted run ----------------------------------------------------------------
 
 
 def _resumed(args: argparse.Namespace) -> tuple[Run, TrainSpec]:
-    """The run that ``--resume`` means, and what it is to train."""
+    """The run that ``--resume`` selects, and its spec."""
     parser = build_parser()
     for action in parser._actions:
-        action.default = argparse.SUPPRESS  # so that what is typed is there, also where it is that
+        action.default = argparse.SUPPRESS  # so that only typed flags remain, also typed defaults
     typed = vars(parser.parse_args())
     allowed = _BESIDE_RESUME | (set() if args.resume else {"algo", "env"})
     for action in parser._actions:
@@ -254,7 +254,7 @@ def _resumed(args: argparse.Namespace) -> tuple[Run, TrainSpec]:
 
 
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
-    """Carry out the rest of a run, from its newest state on; the exit code."""
+    """Continue a run from its newest saved state; return the exit code."""
     from commands.terminal import TextConsole, say
     from pipeline.runs import at_work_on, check_left, remove_states
     from pipeline.signs_of_life import doing
@@ -271,7 +271,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
         with stop.waiting(0.0):
             lock.enter_context(at_work_on(run, tell))
         if is_finished(run):
-            if not args.keep_state:  # of a process that was killed just before it did that
+            if not args.keep_state:  # left by a process that was killed just before removing them
                 remove_states(run.state_path)
             console.print(f"{run.path} is finished already", highlight=False)
             return 0
@@ -322,7 +322,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
         from pipeline.models.choose import agent_to_continue
 
         trained_agent = agent_to_continue(Path(args.trained_agent))
-    # A flag that has the name of a field goes there as it is.
+    # A flag with the name of a field sets that field.
     names = {key.name for key in fields(TrainSpec)} - {"hyperparams"}
     named = {name: getattr(args, name) for name in names if name in args}
     changed = {
@@ -345,7 +345,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
 
 
 def _page_path(args: argparse.Namespace) -> Path | None:
-    """Where the page is to be written that shows the learning; None where none is asked for."""
+    """The path of the page for ``--watch-learning``, checked; None without the flag."""
     from tempfile import TemporaryFile
 
     if args.watch_learning is None:
@@ -368,7 +368,7 @@ def _page_path(args: argparse.Namespace) -> Path | None:
 
 
 def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str] | None]:
-    """The file's entry for the environment, changed as the command line says; and what gave way."""
+    """The file's entry with the changes of the command line, and notes on dropped settings."""
     from pipeline.agent_settings import training_follows, with_engine
     from pipeline.settings.hyperparams import NoEntryError, override, read_hyperparams
     from pipeline.settings.values import parse_assignments
@@ -395,11 +395,11 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     return training_follows(override(entry, changes), {**changes, **typed})
 
 
-# --- what is printed ------------------------------------------------------------------------------
+# --- output ---------------------------------------------------------------------------------------
 
 
 def print_header(console: Console, spec: TrainSpec) -> None:
-    """Say what is about to be trained, and with which hyperparameters."""
+    """Print the agent, the environment, the budget and the hyperparameters."""
     from rich.text import Text
 
     budget = spec.hyperparams.n_timesteps or spec.hyperparams.n_episodes or 0
@@ -415,7 +415,7 @@ def print_header(console: Console, spec: TrainSpec) -> None:
             continue
         text = str(value)  # a whole map would fill the screen
         text = f"{key}={text if len(text) <= 200 else f'{text[:200]}...'}"
-        where = "in training alone" if key in ("train_env_kwargs", "train_env_wrapper") else ""
+        where = "in training only" if key in ("train_env_kwargs", "train_env_wrapper") else ""
         notes = "; ".join(filter(None, (where, _schedule_in_words(value), origins.get(key))))
         if notes:
             explained.append(f"{text} ({notes})")
@@ -426,7 +426,7 @@ def print_header(console: Console, spec: TrainSpec) -> None:
 
 
 def _is_choice(algo: str, policy: str) -> bool:
-    """Whether an agent has other policies too: tables and bandits of this project have one each."""
+    """Whether an agent has other policies, too: our tables and bandits have one each."""
     from agents import ALGORITHMS
 
     is_ours = algo in ALGORITHMS and ALGORITHMS[algo].entry_point.startswith("agents.")
@@ -434,7 +434,7 @@ def _is_choice(algo: str, policy: str) -> bool:
 
 
 def _schedule_in_words(value: object) -> str:
-    """What ``exp_0.3_0.05`` means; empty for what is no schedule."""
+    """A schedule such as ``exp_0.3_0.05`` in words; empty for any other value."""
     from pipeline.settings.values import parse_schedule
 
     if not isinstance(value, str):
@@ -449,7 +449,7 @@ def _schedule_in_words(value: object) -> str:
 
 
 def print_engine(console: Console, training: Training) -> None:
-    """Say on which engine it will run, and what that takes."""
+    """Print the engine of the training, and its expected time."""
     from commands.terminal import say, training_line
     from pipeline.preparation import engine_outlook
 
@@ -460,7 +460,7 @@ def print_engine(console: Console, training: Training) -> None:
 
 
 def print_result(console: Console, training: Training, outcome: Outcome) -> None:
-    """Say what came out, and if the agent has failed, what it does instead and what to try."""
+    """Print the results, and if the agent has failed, what it does instead and what to try."""
     print_outcome(console, training.spec, outcome)
     if outcome.final is None or console.quiet:
         return
@@ -477,7 +477,7 @@ def print_result(console: Console, training: Training, outcome: Outcome) -> None
 
 
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
-    """Say what came out and where the files lie."""
+    """Print the results and the run folder."""
     from rich.table import Table
 
     from commands.terminal import describe, describe_others, episodes, print_rows, say
@@ -511,7 +511,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     for row in rows:
         table.add_row(*row)
     print_rows(console, table)
-    # On one line, however long: it is there to be copied.
+    # On one line, however long, so that it can be copied.
     width = max(len(label) for label, _ in rows) + 2
     say(console, f"{'watch':<{width}}{watch_command(spec, outcome.run)}")
 
@@ -535,13 +535,13 @@ def describe_pulls(pulls: PullSummary) -> str:
 
 
 def watch_command(spec: TrainSpec, run: Run) -> str:
-    """The command that plays the agent of a run, as it can be typed where the run was begun."""
+    """The command that plays a run's agent, for the working directory of the training."""
     from pipeline.runs import numbered_runs
     from pipeline.user_modules import as_flag
 
     command: list[str] = []
     numbers = [number for number, _ in numbered_runs(run.path.parent, run.env_name)]
-    if numbers.count(run.number) > 1:  # told apart by their unique suffixes alone
+    if numbers.count(run.number) > 1:  # only their unique suffixes differ
         command.append(str(run.path))
     else:
         command += ["--algo", spec.algo, "--env", spec.env_id]
@@ -554,7 +554,7 @@ def watch_command(spec: TrainSpec, run: Run) -> str:
 
 @contextmanager
 def telling_what_is_kept(run: Run) -> Iterator[None]:
-    """Let the line about a run that fails end with the models that its folder keeps."""
+    """Append to the error of a failed run which models its folder keeps."""
     try:
         yield
     except UserError as error:
@@ -569,9 +569,9 @@ def telling_what_is_kept(run: Run) -> Iterator[None]:
 
 @contextmanager
 def writing_watched(console: Console, training: Training) -> Iterator[None]:
-    """Write the page that plays the training afterwards, where one was asked for.
+    """Write the page that plays the training afterwards, if it was asked for.
 
-    One that fails is shown as far as it came: how a table diverges is worth a look.
+    A failed training is shown up to its failure: it may show how a table diverges.
     """
     try:
         yield
@@ -599,7 +599,7 @@ def _write_watched(console: Console, training: Training) -> None:
 
 
 def print_lists() -> None:
-    """Print the table of agents, and a row for each environment that one has settings for."""
+    """Print the agents, the environments with settings for some agent, and how hard these are."""
     import gymnasium as gym
     from rich.table import Table
 
@@ -643,7 +643,7 @@ def print_lists() -> None:
 
 
 def _hardness_table() -> Table:
-    """How hard the environments are whose model is known, as the pages say it."""
+    """Measures of the difficulty of environments with known models, as in their docs."""
     from rich.table import Table
 
     import envs

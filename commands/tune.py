@@ -1,4 +1,4 @@
-"""``tune.py``: its flags, a search from the first trial to the winner, and what it prints."""
+"""``tune.py``: its flags, a search from the first trial to the winner, and its output."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ The same command again continues the search; several at once share the work.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The flags; those of runs mean what they mean to train and compare, the others to rl_zoo3."""
+    """The flags; those of runs are as in train and compare, many others as in rl_zoo3."""
     parser = OneLineParser(
         description="Search for an agent's hyperparameters: judge each setting over several seeds, "
         "run the best again on other seeds, and save a setting that is better there.",
@@ -166,8 +166,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--storage",
         type=filled,
         metavar="WHERE",
-        help="where trials are: journal:FILE, sqlite:///FILE, postgresql://..., grpc://HOST:PORT "
-        "(default: a SQLite file in the search's folder)",
+        help="storage of the trials: journal:FILE, sqlite:///FILE, postgresql://..., "
+        "grpc://HOST:PORT (default: a SQLite file in the search's folder)",
     )
     add(
         *("--name", "--study-name"),
@@ -188,17 +188,17 @@ def build_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="only tables: no figures and no page",
     )
-    # Who comes from rl_zoo3 types it; what it asks for is what this command is.
+    # Accepted because users of rl_zoo3 type it; this command always does what it asks for.
     optimize = ("-optimize", "--optimize-hyperparameters")
     parser.add_argument(*optimize, action="store_true", help=argparse.SUPPRESS)
     return parser
 
 
-# What is done.
+# Search and re-test.
 
 
 def main() -> int:
-    """Parse the arguments and do what they ask for; the exit code."""
+    """Parse the arguments, search and re-test; return the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
         return _tune(args)
@@ -214,7 +214,7 @@ def _tune(args: argparse.Namespace) -> int:
     console.print(tuning.study.title, style="bold", highlight=False)
     root = Path(args.log_folder) / tuning.study.name
     try:
-        # Every run folder notes the command, which is no place for a password.
+        # Run folders record the command, so it must not contain a password.
         command = without_secret(command_line())
         limits = RunLimits(tuning.study.run_timeout, tuning.study.run_memory)
         context = run_context(args, root, command, limits, console)
@@ -244,7 +244,7 @@ def _tune(args: argparse.Namespace) -> int:
 
 
 def _search(context: RunContext, opened: OpenTuning, deadline: float) -> None:
-    """Do trials until there are enough, beginning no run behind ``deadline``."""
+    """Do trials until there are enough; begin no run after ``deadline`` (monotonic seconds)."""
     from experiments.run_folders import remove_dead_drafts
     from tuning.searching import Search
 
@@ -259,11 +259,11 @@ def _search(context: RunContext, opened: OpenTuning, deadline: float) -> None:
     with progress, progress.watching(context.launchers)() as launcher:
         Search(opened, launcher, progress, deadline).run()
     if queue.is_done():
-        remove_dead_drafts(opened.root)  # of runs that nobody asks for any more
+        remove_dead_drafts(opened.root)  # of runs that are no longer needed
 
 
 def _retest(context: RunContext, opened: OpenTuning) -> int:
-    """Run the best again, and write down what won; the exit code."""
+    """Run the best settings again, and write the winner; return the exit code."""
     from pipeline.locks import folder_lock
     from tuning.retesting import FOLDER, WINNER, best_trials, chosen_for_retest, write_winner
 
@@ -283,7 +283,7 @@ def _retest(context: RunContext, opened: OpenTuning) -> int:
         winner = next((c for c in candidates if outcome.winner and c.number == won), None)
         path = None
         if winner is None:
-            (opened.root / WINNER).unlink(missing_ok=True)  # of a search that has gone on since
+            (opened.root / WINNER).unlink(missing_ok=True)  # from before the search went on
         else:
             n_trials = opened.queue.n_trials
             path = write_winner(tuning, opened.root, outcome, winner.entry, n_trials)
@@ -306,7 +306,7 @@ def _retest(context: RunContext, opened: OpenTuning) -> int:
 def _retested(
     context: RunContext, opened: OpenTuning, ranked: list[Candidate], candidates: list[Candidate]
 ) -> tuple[int, Outcome]:
-    """The exit code, and what the re-test shows."""
+    """Do the re-test; return the exit code and the outcome."""
     from experiments.analysis import analyse
     from experiments.growing import first_counts, remember, settled_looks, take_looks
     from experiments.launching import EarlyResults
@@ -322,7 +322,7 @@ def _retested(
         settled = settled_looks(study, context.root, tuning.max_retest_seeds)
         remember(context.root, read_looks(context.root), settled)  # before the first run is done
         context.get_ready(planned)
-        # From the first look on, so that what is done already may be found to be enough.
+        # From the first look on, because finished runs may already be enough.
         counts = first_counts(study, settled)
         results, steps, failures = look_by_look(context, study, counts, is_settled)
         looks = {step.environment: step.standing for step in steps}
@@ -338,7 +338,7 @@ def _retested(
 
 
 def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None) -> None:
-    """Write the record, and the page of it."""
+    """Write the record of the search, and its page."""
     from tuning.retesting import FOLDER, RECORD, write_record
 
     record = write_record(opened, outcome, context.command)
@@ -357,7 +357,7 @@ def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None
 
 
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
-    """The tuning that the arguments mean."""
+    """The tuning that the arguments ask for."""
     from agents import ALGORITHMS
     from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name
     from pipeline.agent_settings import with_engine
@@ -396,7 +396,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         run_timeout=args.run_timeout,
         run_memory=args.run_memory,
     )
-    # A flag that has the name of a field goes there as it is.
+    # A flag with the name of a field sets that field.
     named = {key.name: getattr(args, key.name) for key in fields(TuningSpec) if key.name in args}
     named["search_space"] = None if args.search_space is None else Path(args.search_space)
     tuning = TuningSpec(**named, study=study, figure=args.metric or AUTO)
@@ -406,11 +406,11 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     return tuning
 
 
-# What is printed.
+# Output.
 
 
 def print_opened(context: RunContext, opened: OpenTuning) -> None:
-    """Say what there is to do, and on which engines."""
+    """Print the number of trials, seeds and free settings, and the engines."""
     from pipeline.train_spec import NETWORKS
     from tuning.retesting import unproven_mark
     from tuning.suggesting import planned_run, shipped_run
@@ -446,7 +446,7 @@ _STATES = {"COMPLETE": "judged to the end", "PRUNED": "ended early", "FAIL": "fa
 
 
 def print_search(console: Console, opened: OpenTuning) -> None:
-    """Say what the search has cost, and what it has found."""
+    """Print the cost of the search, and whether several settings reach the optimum."""
     from tuning.trial_storage import FAILURE, figures_of, seconds_of
 
     trials, tuning = opened.queue.trials(), opened.tuning
@@ -463,8 +463,8 @@ def print_search(console: Console, opened: OpenTuning) -> None:
         f"{duration(seconds)} of processor time",
     )
     if (n := opened.n_at_optimum) > 1:
-        text = f"{n} settings have the optimum on all seeds, so that their scores cannot tell them "
-        text += "apart: they are ranked by steps to the threshold"
+        text = f"{n} settings have the optimum on all seeds, so their scores are tied: they are "
+        text += "ranked by steps to the threshold"
         if opened.is_saturated and not opened.queue.is_done():
             text += "; the search ends here, since more trials cannot score more (--metric steps "
             text += "searches for the fastest)"
@@ -472,7 +472,7 @@ def print_search(console: Console, opened: OpenTuning) -> None:
 
 
 def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> None:
-    """Print what the re-test shows: a table, and what follows from it."""
+    """Print the table of the re-test, the optimism of the search, and why nothing won."""
     from rich.table import Table
 
     held_out = outcome.held_out
@@ -501,14 +501,14 @@ def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> Non
         say(console, f"no winner: {outcome.reason}; they stay as they are")
 
 
-# What a person watching sees: a line that moves, or one now and then.
+# Progress: a live line, or a line now and then.
 
-# To read all trials takes time, where there are many.
+# Reading many trials takes time.
 SECONDS_BETWEEN_QUESTIONS = 5.0
 
 
 class TuningProgress(LiveProgress):
-    """How far a search is, and the best that was found."""
+    """The progress of a search, and its best trial."""
 
     def __init__(
         self,
@@ -520,7 +520,7 @@ class TuningProgress(LiveProgress):
     ) -> None:
         super().__init__(console)
         self.n_trials, self.is_cost = n_trials, is_cost
-        # What trials were judged that have ended, by number; None for those ended early.
+        # The values of ended trials by number; None for those without a value (ended early).
         self._ended, self._asked_at = ended, time.monotonic()
         self.values = ended()
         self.n_before = len(self.values)
@@ -534,7 +534,7 @@ class TuningProgress(LiveProgress):
         self.look()
 
     def trial_ended(self, number: int, value: float | None, reason: str) -> None:
-        """Count a trial that has ended; one that is the best so far gets a line that stays."""
+        """Count a trial that has ended, and print a line if it failed or is the best so far."""
         best = self.best()
         self.values[number] = value
         if reason:
@@ -546,13 +546,13 @@ class TuningProgress(LiveProgress):
         return value < other if self.is_cost else value > other
 
     def best(self) -> tuple[int, float] | None:
-        """The best trial and what it was judged; None before there is any."""
+        """The number and the value of the best trial; None before there is any."""
         judged = [(number, value) for number, value in self.values.items() if value is not None]
         sign = 1 if self.is_cost else -1
         return min(judged, key=lambda each: (sign * each[1], each[0]), default=None)
 
     def figures(self) -> str:
-        """How many trials have ended, the best of them, and how long the others may take."""
+        """The number of ended trials, the best one, and an estimate of the remaining time."""
         seconds = time.monotonic() - self.started
         ended, new = len(self.values), len(self.values) - self.n_before
         runs = "1 run" if self.n_runs == 1 else f"{self.n_runs} runs"

@@ -174,7 +174,7 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(
     assert (code, "6 runs, 0 of them there already" in out) == (0, True)
     assert not set(records(study).values()) & set(first.values())
     place = study / "replaced" / "1"
-    assert f"6 runs that are done again: what was there is in {place.relative_to(folder)}" in out
+    assert f"6 runs that are done again: the old folders are in {place.relative_to(folder)}" in out
     place.rename(place.parent / "runs")
     assert records(place.parent) == first
 

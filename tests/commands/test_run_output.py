@@ -125,7 +125,7 @@ HEADERS = [
     ("qlearning", {"learning_rate": "exp_0.3_0.05"},
      ["n_timesteps=9", "learning_rate=exp_0.3_0.05 (falls exponentially from 0.3 to 0.05)"]),
     ("qlearning", {"train_env_kwargs": {"slip": 0.1}},
-     ["n_timesteps=9", "train_env_kwargs={'slip': 0.1} (in training alone)"]),
+     ["n_timesteps=9", "train_env_kwargs={'slip': 0.1} (in training only)"]),
     # Long ones are cut short.
     ("dqn", {"env_wrapper": "S" * 201}, [f"env_wrapper={'S' * 200}...  n_timesteps=9"]),
 ]  # fmt: skip
@@ -194,7 +194,7 @@ LINES = [
       "about 30 s; x: compiled, about 6 s of processor time in 4 runs")),
     (lambda: search_line("ppo", SEARCHED, RETESTED),
      (f"search: compiled, about 2 s of processor time a run; re-test: {LOOP}, about 24 s a run, "
-      "in which train runs ppo; --engine auto re-tests compiled, for who trains so")),
+      "in which train runs ppo; --engine auto re-tests compiled, if you train with it")),
     (lambda: search_line("ppo", SEARCHED, SEARCHED),
      "search and re-test: compiled, about 2 s of processor time a run"),
 ]  # fmt: skip

@@ -112,11 +112,11 @@ def test_wrappers_in_order_and_the_agents_own_discount(shape):
 REFUSED = {
     "--env CartPole-v1": "the model of CartPole-v1 is not known",
     "--env FrozenLake-v1 --wrapper gymnasium.wrappers.NormalizeReward": (
-        "gymnasium.wrappers.stateful_reward.NormalizeReward makes of the model is not known"
+        "the effect of gymnasium.wrappers.stateful_reward.NormalizeReward on the model is not known"
     ),
     "--env Warehouse-v0 --wrapper envs.wrappers.ScaleReward scal:2": "scal",
     "--env Warehouse-v0 --gamma 1.5": "--gamma: a discount from 0 to 1 is needed, not 1.5",
-    "--env FrozenLake-v1 -params normalize:true": "normalize: what it makes of rewards",
+    "--env FrozenLake-v1 -params normalize:true": "normalize: the rewards that it makes",
     "--env FrozenLake-v1 --train-env-kwargs map_name:8x8": (
         "64 states and 4 actions cannot be compared with 16 states and 4 actions"
     ),
