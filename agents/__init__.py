@@ -1,7 +1,7 @@
-"""The learners, each a Stable-Baselines3 algorithm, and the one table of their names.
+"""The agents, each a Stable-Baselines3 algorithm, and the registry of their names.
 
-Importing this package loads neither torch nor Stable-Baselines3: names can be listed, and spaces
-compared, before anything heavy is paid for.
+Importing this package loads neither torch nor Stable-Baselines3, so that names can be listed and
+spaces compared quickly.
 """
 
 from agents.registry import ALGORITHMS, AlgorithmEntry, fitting_algorithms, load_algorithm, register

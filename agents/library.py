@@ -27,18 +27,18 @@ from agents.networks.q_learning import CompiledQLearning
 from envs.wrappers import INFO_KEY
 from mdp.transition_model import Bools
 
-# From observations of shape (batch, ...) to the values that targets are made of.
+# From observations of shape (batch, ...) to the action values in targets.
 NextValues = Callable[[th.Tensor], th.Tensor]
 
 
 class MaskedReplayBuffer(ReplayBuffer):
-    """Keeps with each transition what the state allows that it leads to.
+    """Stores with each transition the action mask of its next state.
 
-    The masks lie beside the actions in the same array, so that both are drawn together.
+    The masks are in the same array as the actions, so that both are sampled together.
     """
 
     action_space: spaces.Discrete
-    sampled_masks: th.Tensor  # of the batch that was drawn last, bool of shape (batch, n_actions)
+    sampled_masks: th.Tensor  # of the last sampled batch, bool of shape (batch, n_actions)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -47,7 +47,7 @@ class MaskedReplayBuffer(ReplayBuffer):
         self.actions = np.zeros(shape, dtype=self.actions.dtype)
 
     def __getstate__(self) -> dict[str, Any]:
-        # The masks of a batch are of that batch alone.
+        # The masks of a batch are only valid for that batch.
         return {name: value for name, value in vars(self).items() if name != "sampled_masks"}
 
     def add(
@@ -59,10 +59,10 @@ class MaskedReplayBuffer(ReplayBuffer):
         done: NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        """Keep a step of every environment, whose ``infos`` hold the masks."""
+        """Store a step of every environment, with the masks in ``infos``."""
         everything = np.ones(self.action_dim - 1, dtype=np.bool_)
         masks = [
-            # Nothing follows a termination, and nothing is asked for there.
+            # After a termination the mask is not used.
             everything if ended and not info.get("TimeLimit.truncated", False) else info[INFO_KEY]
             for ended, info in zip(done, infos, strict=True)
         ]
@@ -79,14 +79,14 @@ class MaskedReplayBuffer(ReplayBuffer):
 
 
 class DQN(CompiledQLearning):
-    """Stable-Baselines3's DQN; with ``mask_actions`` among the actions that are allowed.
+    """Stable-Baselines3's DQN, with optional action masks (``mask_actions``).
 
-    Masks then hold in exploration, in the greedy choice, and in the maximum of the target, for
-    which they are kept with the transitions. Without, it is the library's agent in everything, and
-    so are its model files. Arguments are those of `stable_baselines3.DQN` and:
+    Masks apply to exploration, to the greedy choice, and to the maximum of the target, for which
+    the replay buffer stores them. Without masks, the agent and its model files are the same as the
+    library's. Arguments are those of `stable_baselines3.DQN` and:
 
     Args:
-        mask_actions: whether masks count. The environment has to tell them by ``action_masks()``
+        mask_actions: whether to use masks. The environment must provide them by ``action_masks()``
             and by ``info["action_mask"]``: `envs.wrappers.ActionMasks` does both.
 
     Raises:
@@ -154,22 +154,22 @@ class DQN(CompiledQLearning):
         deterministic: bool = False,
         action_masks: Any = None,
     ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
-        """The greedy action, or an exploring one unless ``deterministic``, as the library has it.
+        """The greedy action, or an exploring one unless ``deterministic``, as in the library.
 
         Args:
             observation: one, or several along the first axis.
-            state: handed back.
+            state: returned unchanged.
             episode_start: not used.
-            deterministic: the greedy action.
+            deterministic: take the greedy action.
             action_masks: the allowed actions, bool of shape (n, n_actions), or (n_actions,) for one
-                observation; all where it is left out.
+                observation; default: all actions.
         """
         if action_masks is None:
             return super().predict(observation, state, episode_start, deterministic)
         masks = np.atleast_2d(np.asarray(action_masks, dtype=np.bool_))
         self.policy.set_training_mode(False)
         obs, is_batch = self.policy.obs_to_tensor(observation)
-        # One toss for all observations, as in the library.
+        # One random number for all observations, as in the library.
         if not deterministic and np.random.rand() < self.exploration_rate:  # noqa: NPY002
             actions = self._random_actions(masks)
         else:
@@ -180,7 +180,7 @@ class DQN(CompiledQLearning):
 
     def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
         target_network = self.q_net_target
-        # The library maximises over the columns of what this returns.
+        # The library takes the maximum over the columns of this function's result.
         self.q_net_target = self._next_values(target_network)  # type: ignore[assignment]
         try:
             super()._train_in_python(gradient_steps, batch_size)
@@ -188,24 +188,24 @@ class DQN(CompiledQLearning):
             self.q_net_target = target_network
 
     def _next_values(self, target: QNetwork) -> NextValues:
-        """What a target's maximum goes over: the target network's values of allowed actions."""
+        """The values in a target's maximum: the target network's values of allowed actions."""
         return lambda next_obs: self._among_allowed(target(next_obs))
 
     def _among_allowed(self, next_values: th.Tensor) -> th.Tensor:
-        """Minus infinity for what the states that a batch leads to do not allow."""
+        """Replace the values of actions that a batch's next states forbid by minus infinity."""
         if not self.mask_actions:
             return next_values
         assert isinstance(self.replay_buffer, MaskedReplayBuffer)
         return masked(next_values, self.replay_buffer.sampled_masks)
 
     def _excluded_save_params(self) -> list[str]:
-        # A file without masks is one of the library's; with them, the buffer's class follows.
+        # Without masks the file is the library's; with them, they determine the buffer's class.
         left_out = "replay_buffer_class" if self.mask_actions else "mask_actions"
         return [*super()._excluded_save_params(), left_out]
 
 
 def masked(values: th.Tensor, masks: th.Tensor) -> th.Tensor:
-    """Minus infinity where the mask is False; both of shape (n, n_actions)."""
+    """The values, with minus infinity where the mask is False; both of shape (n, n_actions)."""
     return values.masked_fill(~masks, -th.inf)
 
 
@@ -217,7 +217,7 @@ def double_q_values(online: NextValues, target: QNetwork, next_obs: th.Tensor) -
 
 
 class DoubleDQN(DQN):
-    """Double DQN (van Hasselt, Guez and Silver, 2016): DQN but for its target.
+    """Double DQN (van Hasselt, Guez and Silver, 2016): DQN with another target.
 
     Arguments are those of `agents.library.DQN`; ``engine`` is ``"auto"`` by default.
     """
@@ -228,7 +228,7 @@ class DoubleDQN(DQN):
         super().__init__(*args, engine=engine, **kwargs)
 
     def _next_values(self, target: QNetwork) -> NextValues:
-        # One column, so that there is nothing left to choose from.
+        # One column, so that the library's maximum has no effect.
         online: NextValues = lambda next_obs: self._among_allowed(self.q_net(next_obs))  # noqa: E731
         return lambda next_obs: double_q_values(online, target, next_obs)
 
@@ -236,11 +236,11 @@ class DoubleDQN(DQN):
 class DeepQLearning(CompiledQLearning):
     """Deep Q-learning with experience replay as first published (Mnih et al., 2013).
 
-    DQN without what was added to it later: the target comes from the network that learns, as it is
-    at that very update, and the loss is the squared error, where Stable-Baselines3's DQN has a
-    lagging copy and Huber's loss. Arguments are those of `stable_baselines3.DQN` and ``engine`` of
+    DQN without later additions: the target comes from the online network at the same update, and
+    the loss is the squared error, while Stable-Baselines3's DQN has a target network and Huber's
+    loss. Arguments are those of `stable_baselines3.DQN` and ``engine`` of
     `agents.networks.engine_setting.CompiledNetworks`, which is ``"auto"`` by default;
-    ``target_update_interval`` is without effect.
+    ``target_update_interval`` has no effect.
     """
 
     target_kind = "online"

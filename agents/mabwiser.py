@@ -1,4 +1,4 @@
-"""MABWiser's bandits behind the interface of ours, to compare with (extra ``bandits``)."""
+"""MABWiser's bandits with the interface of our own, for comparison (extra ``bandits``)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from mdp.transition_model import Floats, Ints
 
 # MABWiser's bandits as policies.
 #
-# MABWiser 2.7.4 keeps its state in Python objects and refuses to predict before it has seen a
-# reward. Here the state travels as one tensor, since a model file holds no pickle, and random
-# numbers come from a generator that is handed in.
+# MABWiser 2.7.4 keeps its state in Python objects, and cannot predict before its first reward. Here
+# the state is saved as one tensor, because a model file contains no pickle, and the caller passes
+# the random number generator.
 
 
 class MABWiserPolicy(TablePolicy):
@@ -69,12 +69,12 @@ class MABWiserPolicy(TablePolicy):
 
     @property
     def is_contextual(self) -> bool:
-        """Whether it looks at the context."""
+        """Whether it uses the context."""
         return bool(self.mab.is_contextual)
 
     @property
     def parts(self) -> Floats:
-        """A row of numbers for each arm, shape (arms, ...); what `_extra_state` holds."""
+        """The state: a row of numbers for each arm, shape (arms, ...)."""
         inside = self.mab._imp
         if self.is_contextual:
             models = [inside.arm_to_model[arm] for arm in self.mab.arms]
@@ -90,14 +90,14 @@ class MABWiserPolicy(TablePolicy):
         return int(self.mab.predict(*given))
 
     def learn(self, arm: int, reward: float, context: Floats) -> None:
-        """Hand the library one reward."""
+        """Let the library learn from one reward."""
         given = (context[None],) if self.is_contextual else ()
         learn = self.mab.partial_fit if self.fitted else self.mab.fit
         learn([arm], [reward], *given)
         self.fitted = True
 
     def judged(self, contexts: Floats) -> Floats:
-        """What the arms are taken to be worth, shape (n, arms)."""
+        """The estimated mean reward of each arm, shape (n, arms)."""
         scores = np.zeros((len(contexts), len(self.mab.arms)))
         if not self.fitted:
             return scores
@@ -113,7 +113,7 @@ class MABWiserPolicy(TablePolicy):
     def _predict(
         self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
     ) -> th.Tensor:
-        """The first of the best arms; shapes (n,) or (n, d) to (n,)."""
+        """The first of the best arms, shape (n,), for observations of shape (n,) or (n, d)."""
         assert isinstance(observation, th.Tensor)
         contexts = features(self.observation_space, observation.numpy())
         return th.from_numpy(self.judged(contexts).argmax(axis=1))
@@ -123,7 +123,7 @@ class MABWiserPolicy(TablePolicy):
         return th.from_numpy(self.parts) if self.fitted else th.zeros(0, dtype=th.float64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        """Copy the state of another policy of the kind."""
+        """Copy the state of another policy of this kind."""
         if len(state) == 0:
             return
         if len(state) != len(self.mab.arms):
@@ -149,17 +149,17 @@ class MABWiserPolicy(TablePolicy):
 
 SUMS = ("arm_to_sum", "arm_to_count", "arm_to_expectation")
 
-# The library's learning policies that agents take, and those of a model file.
+# The library's learning policies that agents may use, also those in a model file.
 KINDS = ("EpsilonGreedy", "LinUCB", "ThompsonSampling", "UCB1")
 
 
 class MABWiserAgent(BanditAlgorithm):
-    """The base of the agents that MABWiser learns and chooses for.
+    """The base of the agents that learn and choose by MABWiser.
 
     Args:
         policy: ``"MABWiserPolicy"``.
         env: environment with `Discrete` actions, the arms, or its id.
-        tie_breaking: ``"first"``, which is what the library does.
+        tie_breaking: ``"first"``, as in the library.
         kwargs: as in `BanditAlgorithm`.
     """
 
@@ -178,7 +178,7 @@ class MABWiserAgent(BanditAlgorithm):
         super().__init__(policy, env, tie_breaking=tie_breaking, **kwargs)
 
     def _library_settings(self) -> dict[str, float]:
-        """What the library's learning policy is made with."""
+        """Arguments of the library's learning policy."""
         return {}
 
     def _check_arguments(self) -> None:
@@ -206,7 +206,7 @@ class MABWiserAgent(BanditAlgorithm):
         return features(self.observation_space, obs)
 
     def _first_pull(self) -> int | None:
-        """An arm to pull before the library is asked, which it cannot be without a reward."""
+        """An arm to pull instead of the library's choice, which needs a reward first."""
         return None if self.policy.fitted else 0
 
     def _choose(  # type: ignore[override]  # the library knows no masks
@@ -226,7 +226,7 @@ class MABWiserEpsilonGreedy(MABWiserAgent):
     Args:
         policy: ``"MABWiserPolicy"``.
         env: as in `MABWiserAgent`.
-        exploration_initial_eps: epsilon, which stays.
+        exploration_initial_eps: epsilon, which is constant.
         kwargs: as in `MABWiserAgent`.
     """
 
@@ -256,7 +256,7 @@ class MABWiserUCB1(MABWiserAgent):
     Args:
         policy: ``"MABWiserPolicy"``.
         env: as in `MABWiserAgent`.
-        c: how much to explore, the library's alpha.
+        c: degree of exploration, the library's alpha.
         kwargs: as in `MABWiserAgent`.
     """
 
@@ -281,7 +281,7 @@ class MABWiserUCB1(MABWiserAgent):
         return {"alpha": self.c}
 
     def _first_pull(self) -> int | None:
-        """An arm not tried yet: the library would take its reward for 0 and leave it."""
+        """An untried arm: the library would take its mean reward for 0 and neglect it."""
         counts = self.policy.mab._imp.arm_to_count
         return next((arm for arm in self.policy.mab.arms if counts[arm] == 0), None)
 
@@ -293,14 +293,14 @@ class MABWiserThompson(MABWiserAgent):
     """
 
     kind = "ThompsonSampling"
-    rewards_known = BINARY  # others would make its Beta distributions wrong without a word
+    rewards_known = BINARY  # other rewards would silently make its Beta distributions wrong
     statistics = ("arm_to_success_count", "arm_to_fail_count")
 
 
 class MABWiserLinUCB(MABWiserAgent):
     """MABWiser's LinUCB; contexts that are numbers become one-hot.
 
-    The ridge is 1: with another one, the library is wrong about arms not tried.
+    The ridge is 1: with another one, the library is wrong about untried arms.
 
     Args:
         policy: ``"MABWiserPolicy"``.

@@ -1,7 +1,7 @@
-"""Agents that know the transition model and plan: the best that others can become.
+"""Agents that plan on the known transition model, as an upper bound for the others.
 
-They are trained by planning. `learn` then plays their policy, so that callbacks, Monitor and logger
-see what they see of any other agent.
+`learn` plans first. It then plays the policy, so that callbacks, Monitor and logger get the same
+calls as from any other agent.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ActionTablePolicy(TablePolicy):
 
     # Int64 of shape (m, S): with 1, 2, ... steps left; with more than m, the last row.
     actions: th.Tensor
-    horizon: th.Tensor  # steps of an episode, int64 of shape (); only looked at where m is above 1
+    horizon: th.Tensor  # steps of an episode, int64 of shape (); only used if m is above 1
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class ActionTablePolicy(TablePolicy):
         self.register_buffer("horizon", th.tensor(1))
 
     def set_actions(self, actions: NDArray[np.integer[Any]], horizon: int) -> None:
-        """Put a plan in place: actions of shape (m, S) and the number of steps of an episode."""
+        """Set the plan: actions of shape (m, S) and the number of steps of an episode."""
         self.actions = th.from_numpy(actions.astype(np.int64))
         self.horizon = th.tensor(horizon)
 
@@ -66,12 +66,12 @@ class ActionTablePolicy(TablePolicy):
         return len(self.actions) == 1
 
     def actions_after(self, obs: Ints, steps: Ints) -> Ints:
-        """What to do in ``obs`` after ``steps`` steps of the episode, all of shape (n,)."""
+        """The actions in ``obs`` after ``steps`` steps of the episode, all of shape (n,)."""
         steps_left = np.clip(int(self.horizon) - steps, 1, len(self.actions))
         return np.asarray(self.actions.numpy()[steps_left - 1, obs])
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over a plan of any number of steps."""
+        """Load a plan of any number of steps."""
         if "actions" in state_dict:
             n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
             plan = state_dict["actions"]
@@ -96,12 +96,12 @@ class PlanningAgent(OnlineAlgorithm):
         env: environment whose transition model is known, or its id.
         gamma: discount factor of the planning; by default 1 for the optimum under the time
             limit, and 0.99 for the others.
-        mask_actions: plan among the actions alone that the environment allows in each state.
+        mask_actions: plan with only those actions that the environment allows in each state.
         kwargs: as in `OnlineAlgorithm`.
 
     Raises:
-        ValueError: if ``gamma`` lies outside [0, 1]; by `learn`, if the model is not known, or
-            the masks are to count and are not.
+        ValueError: if ``gamma`` is outside [0, 1]; by `learn`, if the model is not known, or
+            the masks are needed and not known.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
@@ -136,7 +136,7 @@ class PlanningAgent(OnlineAlgorithm):
         super()._run(total_timesteps, callback, log_interval)
 
     def plan(self) -> None:
-        """Work out the policy from the transition model of the environment."""
+        """Compute the policy from the transition model of the environment."""
         assert self.env is not None
         name, vec_env = type(self).__name__, self.env.unwrapped
         if not isinstance(vec_env, DummyVecEnv):
@@ -155,7 +155,7 @@ class PlanningAgent(OnlineAlgorithm):
         by_state, horizon = self._plan(model, time_limit(env), mask)
         actions = np.zeros((len(by_state), int(self.observation_space.n)), dtype=np.int64)  # type: ignore[attr-defined]
         actions[:, observations] = by_state
-        # As with a natural in Blackjack, which looks as any other 21 does.
+        # E.g. in Blackjack a natural looks like any other 21.
         if (actions[:, observations] != by_state)[:, model.reachable].any():
             raise ValueError(f"{name} needs observations that tell the states apart")
         self.policy.set_actions(actions, horizon)
@@ -201,7 +201,7 @@ class PlanningAgent(OnlineAlgorithm):
 class ValueIteration(PlanningAgent):
     """Greedy in the optimal values without a time limit (Sutton and Barto, section 4.4).
 
-    Without a discount, ways that lead to the goal sooner or later are all alike.
+    Without a discount, shorter and longer ways to the goal may have the same value.
     """
 
     default_gamma = 0.99
@@ -211,9 +211,9 @@ class ValueIteration(PlanningAgent):
 
 
 class PolicyIteration(PlanningAgent):
-    """The same plan by policies: each is evaluated exactly, then made greedy (section 4.3).
+    """Policy iteration: evaluate a policy exactly, make it greedy, repeat (section 4.3).
 
-    It takes few rounds, each of which solves a linear system: for up to some ten thousand states.
+    It takes few rounds, each of which solves a linear system: for up to about 10,000 states.
     """
 
     default_gamma = 0.99
@@ -223,7 +223,7 @@ class PolicyIteration(PlanningAgent):
 
 
 class Optimal(PlanningAgent):
-    """The optimum under the time limit, whose actions may depend on the time that is left."""
+    """The optimum under the time limit; its actions may depend on the steps left."""
 
     default_gamma = 1.0
 

@@ -1,4 +1,4 @@
-"""Augmented random search, under the same callbacks as every other agent."""
+"""Augmented random search, with the callbacks of every other agent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from agents.common.callbacks import tell_safe_moment
 
 
 class _TrainingStoppedError(Exception):
-    """A callback asks for the end, in the midst of a candidate's episodes."""
+    """A callback stops the training, during a candidate's episodes."""
 
     def __init__(self, callback: BaseCallback) -> None:
         super().__init__()
@@ -20,15 +20,15 @@ class _TrainingStoppedError(Exception):
 
 
 class ARS(sb3_contrib.ARS):
-    """Augmented random search (Mania, Guy and Recht, 2018), as sb3-contrib has it.
+    """Augmented random search (Mania, Guy and Recht, 2018) of sb3-contrib.
 
-    Arguments are those of `sb3_contrib.ARS`. What differs lies around the algorithm: callbacks are
-    told what each step brought, are called once for it and can end the training; an agent that was
-    loaded goes on from its weights, where ``zero_policy`` is off too; its schedules go on as well.
+    Arguments are those of `sb3_contrib.ARS`. The algorithm is the same. Callbacks get the results
+    of each step, are called once per step, and can stop the training. A loaded agent continues from
+    its weights, also without ``zero_policy``, and continues its schedules.
     """
 
     _last_dones: Any = None
-    # Its rollouts begin in the midst of an update, whose directions are drawn by then.
+    # Its rollouts begin in the middle of an update, after its directions have been drawn.
     tells_safe_moments = True
 
     def _do_one_update(self, callback: BaseCallback, async_eval: Any) -> None:
@@ -36,7 +36,7 @@ class ARS(sb3_contrib.ARS):
         super()._do_one_update(callback, async_eval)
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
-        """As `sb3_contrib.ARS.learn`, but for callbacks that ask for the end."""
+        """As `sb3_contrib.ARS.learn`, but callbacks can stop the training."""
         try:
             return super().learn(total_timesteps, *args, **kwargs)
         except _TrainingStoppedError as stopped:
@@ -60,11 +60,11 @@ class ARS(sb3_contrib.ARS):
             raise _TrainingStoppedError(callback)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # What a callback or an earlier training changed about the total counts here too.
+        # Use the total as changed by a callback or an earlier training.
         super()._update_current_progress_remaining(num_timesteps, self._total_timesteps)
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """As in the library; the search goes on around what was set."""
+        """As in the library; the search continues from the new parameters."""
         super().set_parameters(*args, **kwargs)
         self.weights = parameters_to_vector(self.policy.parameters()).detach()  # type: ignore[assignment]
 

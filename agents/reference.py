@@ -1,4 +1,4 @@
-"""Agents that do not learn: what the others must beat."""
+"""Agents that do not learn, as baselines for the others."""
 
 from __future__ import annotations
 

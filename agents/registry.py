@@ -1,4 +1,4 @@
-"""The table of agents: names, classes, the spaces that they take; users can add to it."""
+"""The registry of agents: names, classes and supported spaces; users can add to it."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ class AlgorithmEntry:
     """One agent that can be trained.
 
     Attributes:
-        entry_point: where the class lives, as ``"module:Class"``; imported only when needed.
-        summary: what the agent is, in a few words.
-        observations: names of the Gymnasium spaces that it can observe; none for any space, and
-            the class itself says what it cannot do.
+        entry_point: the class, as ``"module:Class"``; imported only when needed.
+        summary: the agent in a few words.
+        observations: names of the Gymnasium spaces that it can observe; empty for any space, which
+            the class itself must check.
         actions: names of the Gymnasium spaces that it can act in, likewise.
-        observation_shape: the one observation shape that it understands, or None for any.
-        for_bandits: whether it looks no further than the next reward.
-        needs_masks: whether the environment must say which actions are valid.
-        has_memory: whether it acts by what it observed before, too.
+        observation_shape: the only observation shape that it supports, or None for any.
+        for_bandits: whether it considers only the next reward.
+        needs_masks: whether the environment must provide action masks.
+        has_memory: whether its actions depend on earlier observations, too.
         package: the import name of an optional package that it needs, or None.
         extra: the extra of this distribution that installs that package.
-        engines: words for its argument ``engine``, the default first; one or none where there is
-            no such argument, since it has one engine alone.
+        engines: values of its argument ``engine``, the default first; one or none if it has only
+            one engine and no such argument.
     """
 
     entry_point: str
@@ -50,23 +50,23 @@ class AlgorithmEntry:
 
     @property
     def family(self) -> str:
-        """The folder or file of `agents` that the class lives in; empty where it is elsewhere."""
+        """The folder or file of `agents` with the class; empty if it is elsewhere."""
         package, *below = self.entry_point.partition(":")[0].split(".")
         return below[0] if package == "agents" and below else ""
 
     @property
     def is_installed(self) -> bool:
-        """Whether the package that the agent needs is there."""
+        """Whether the package that the agent needs is installed."""
         return self.package is None or importlib.util.find_spec(self.package) is not None
 
     @property
     def install_command(self) -> str:
-        """What to type where that package is missing."""
+        """The command that installs this package."""
         what = f"'rl-yardstick[{self.extra}]'" if self.extra else self.package
         return f"pip install {what}"
 
     def misfit(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> str:
-        """Say why the agent cannot work with these spaces; empty where it can."""
+        """The reason why the agent cannot work with these spaces; empty if it can."""
         for space, known, role in (
             (observation_space, self.observations, "observes"),
             (action_space, self.actions, "acts in"),
@@ -84,7 +84,7 @@ class AlgorithmEntry:
         return ""
 
     def env_misfit(self, env: gym.Env[Any, Any]) -> str:
-        """Say why the agent cannot work with the environment; empty where it can."""
+        """The reason why the agent cannot work with the environment; empty if it can."""
         from envs.wrappers import has_masks
 
         if self.for_bandits and not is_bandit(env):
@@ -104,7 +104,7 @@ def is_bandit(env: gym.Env[Any, Any]) -> bool:
     return isinstance(env.unwrapped, Bandit)
 
 
-# Which agents there are: names, classes, and the spaces that they take.
+# The agents: names, classes and supported spaces.
 
 DISCRETE = ("Discrete",)
 LINEAR_INPUTS = ("Box", "Discrete")
@@ -255,7 +255,7 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "ppo_lstm": _contrib(
         "sb3_contrib:RecurrentPPO",
         "PPO with a memory",
-        # As it is in sb3-contrib 2.9, which fails on the other spaces.
+        # sb3-contrib 2.9 fails on the other spaces.
         ("Box", "Discrete", "MultiDiscrete"),
         ("Box", "Discrete", "MultiBinary", "Dict"),
         has_memory=True,
@@ -306,21 +306,21 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
 
 
 def register(name: str, entry_point: str, **fields: Any) -> None:
-    """Add an agent of your own to the table, under which the commands find it.
+    """Add an agent of your own to the registry, so that the commands find it.
 
-    Nothing is imported: call it where your module is imported, before its heavy imports if it has
-    any. Doing so twice changes nothing.
+    Nothing is imported: call it when your module is imported, before any slow imports. A second
+    call with the same arguments has no effect.
 
     Args:
-        name: what ``--algo`` is to say.
-        entry_point: where the class lives, a subclass of `BaseAlgorithm`: ``"module:Class"``.
+        name: the value of ``--algo``.
+        entry_point: the class, a subclass of `BaseAlgorithm`, as ``"module:Class"``.
         fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
             class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
             ``for_bandits``, ``needs_masks``, ``has_memory``, ``package``, ``extra`` and
-            ``engines``, which are read off the class where they are left out.
+            ``engines``, which is read from the class by default.
 
     Raises:
-        ValueError: if the name is taken, or an argument is none that an entry can have.
+        ValueError: if the name is taken, or a field does not exist or has an invalid value.
     """
     if not re.fullmatch(r"[A-Za-z0-9]\w*([.-]\w+)*", name, re.ASCII):
         raise ValueError(f"the name of an agent holds letters, digits and _, not {name!r}")
@@ -358,7 +358,7 @@ def load_algorithm(name: str) -> type[BaseAlgorithm]:
     Raises:
         KeyError: if there is no agent of that name.
         ModuleNotFoundError: if the optional package that it needs is missing.
-        ValueError: if there is no such class, or it is no algorithm of Stable-Baselines3's kind.
+        ValueError: if there is no such class, or it is no subclass of `BaseAlgorithm`.
     """
     from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -377,13 +377,13 @@ def fitting_algorithms(
     bandit: bool = False,
     masks: bool = False,
 ) -> list[str]:
-    """Names of the agents that can work with these spaces, in the order of the table.
+    """Names of the agents that can work with these spaces, in the order of the registry.
 
     Args:
-        observation_space: what is observed.
-        action_space: what can be done.
+        observation_space: the environment's observation space.
+        action_space: the environment's action space.
         bandit: whether the environment is a bandit.
-        masks: whether the environment says which actions are valid.
+        masks: whether the environment provides action masks.
     """
     return [
         name

@@ -30,18 +30,18 @@ from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from agents.compiled.worlds import NotCompilable
 from mdp.transition_model import Bools, Floats, Ints
 
-# What the policies of bandit agents share: they pull the arm that they judge best.
+# The base of the policies of bandit agents: they pull the arm with the highest score.
 
 
 class ArmPolicy(MaskBufferPolicy):
-    """Pulls the first of the arms judged best, of those that were allowed where masks are kept."""
+    """Pulls the first arm of the highest score, among the allowed ones if masks are kept."""
 
     @abstractmethod
     def judged(self, observations: NDArray[Any]) -> Floats:
-        """What each arm is judged by at each of n observations, shape (n, arms)."""
+        """The score of each arm at each of n observations, shape (n, arms)."""
 
     def kept_masks(self, observations: Ints) -> Bools:
-        """What was allowed last at observations of shape (n,), everything where none was met."""
+        """The last masks seen at observations of shape (n,), all arms where none was seen."""
         outside = observations[(observations < 0) | (observations >= len(self.masks))]
         if outside.size:
             raise ValueError(f"context {outside[0]} is not in Discrete({len(self.masks)})")
@@ -49,9 +49,9 @@ class ArmPolicy(MaskBufferPolicy):
         return np.asarray(masks | ~masks.any(axis=1, keepdims=True))
 
     def best_arms(self, observations: NDArray[Any], masks: Bools) -> Ints:
-        """The first of the best arms of those in ``masks``, of shape (n, arms)."""
+        """The first of the best arms among those in ``masks``, of shape (n, arms)."""
         judged = self.judged(observations)
-        # Among the allowed alone: an arm may be judged to be worth minus infinity.
+        # Among the allowed arms only: the score of an arm may be minus infinity.
         allowed = [np.flatnonzero(mask) for mask in masks]
         best = [arms[row[arms].argmax()] for arms, row in zip(allowed, judged, strict=True)]
         return np.array(best, dtype=np.int64)
@@ -59,7 +59,7 @@ class ArmPolicy(MaskBufferPolicy):
     def _predict(
         self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
     ) -> th.Tensor:
-        """The first of the best arms; an observation of each to shape (n,)."""
+        """The first of the best arms for each observation, shape (n,)."""
         assert isinstance(observation, th.Tensor)
         observations = observation.numpy()
         if len(self.masks):
@@ -80,7 +80,7 @@ UNBOUNDED_KINDS = ("gaussian", "linear")
 
 
 class BanditArguments(LearningArguments, total=False):
-    """What the constructors of agents hand on that go by masks; see `BanditAlgorithm`."""
+    """Arguments that constructors of agents with masks pass on; see `BanditAlgorithm`."""
 
     mask_actions: bool
 
@@ -88,37 +88,37 @@ class BanditArguments(LearningArguments, total=False):
 class Pull(NamedTuple):
     """A pull and its reward, kept until the feedback is due."""
 
-    context: Any  # what the arm was chosen in: a row of the tables, or a list of features
-    arm: int  # what was pulled
-    reward: float  # what it gave
-    probability: float  # how likely the choice was, for the rules that need to know; else 1
-    # The arms that were allowed, a bool for each; None for agents that do not go by masks.
+    context: Any  # a row of the tables, or a list of features
+    arm: int
+    reward: float
+    probability: float  # of the choice, for rules that need it; else 1
+    # The arms that were allowed, a bool for each; None for agents without masks.
     mask: list[bool] | None = None
 
 
 class BanditAlgorithm(LearningAlgorithm):
-    """Learns which arm is best in a context, as if what it does changed nothing later.
+    """Learns which arm is best in a context, as if actions did not affect later contexts.
 
-    Where the environment's ``info`` says ``feedback_due: False``, rewards are kept until it says
-    ``True``, and learnt from then in their order; pulls that it says were not ``matched`` by a log
-    are not learnt from.
+    While the environment's ``info`` has ``feedback_due: False``, rewards are kept; at ``True`` the
+    agent learns from them in order. It ignores pulls with ``matched: False``, which are not in a
+    log.
 
     Args:
         policy: name of the policy.
         env: environment with `Discrete` actions, the arms, or its id.
         learning_rate: step size, for agents that have one.
         mask_actions: choose among the arms that the environment allows at each pull, and learn as
-            if there were no others. It says so by a method `action_masks()`, which may go by more
+            if there were no others. The environment's method `action_masks()` may depend on more
             than the context.
         kwargs: as in `LearningAlgorithm`.
 
     Raises:
-        ValueError: if an argument lies outside its range, or a space or a reward does not fit; if
-            masks are asked for and the environment or the agent has no use for them, or one is
-            malformed or allows nothing.
+        ValueError: if an argument is outside its range, or a space or a reward does not fit; with
+            ``mask_actions``, if the environment has no masks, the agent does not support them, or
+            a mask is malformed or allows no arm.
     """
 
-    rewards_known: str = ANY  # which the agent can learn from: `ANY`, `UNIT` or `BINARY`
+    rewards_known: str = ANY  # rewards that the agent can learn from: `ANY`, `UNIT` or `BINARY`
 
     _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
 
@@ -143,7 +143,7 @@ class BanditAlgorithm(LearningAlgorithm):
             self._check_masks()
 
     def _check_masks(self) -> None:
-        """Refuse masks that the environment does not tell, or the agent does not go by."""
+        """Raise ValueError if the environment has no masks, or the agent does not support them."""
         if "masks" not in inspect.signature(self._choose).parameters:
             raise ValueError(f"mask_actions: {type(self).__name__} chooses among all arms")
         if self.env is not None:
@@ -164,13 +164,13 @@ class BanditAlgorithm(LearningAlgorithm):
         return int(cast(spaces.Discrete, self.action_space).n)
 
     def check_reward(self, reward: float) -> None:
-        """Refuse a reward that the agent cannot learn from."""
+        """Raise ValueError for a reward that the agent cannot learn from."""
         known = self.rewards_known
         if not (known == ANY or reward in (0.0, 1.0) or (known == UNIT and 0.0 <= reward <= 1.0)):
             raise ValueError(f"{self._misfit()}, not {reward:g}")
 
     def check_kinds(self, env: VecEnv) -> None:
-        """Refuse, before the first pull, environments that are known to give other rewards."""
+        """Raise ValueError for environments that are known to give unsuitable rewards."""
         if self.rewards_known == ANY or not env.has_attr("kind"):
             return
         if set(env.get_attr("kind")) & set(UNBOUNDED_KINDS):
@@ -183,15 +183,15 @@ class BanditAlgorithm(LearningAlgorithm):
 
     @abstractmethod
     def _contexts(self, obs: NDArray[Any]) -> Any:
-        """What arms are chosen in, one for each of the observations, shape (n, ...)."""
+        """The context of each observation, shape (n, ...)."""
 
     @abstractmethod
     def _choose(
         self, contexts: Any, rng: np.random.Generator, masks: Bools | None = None
     ) -> tuple[Ints, Floats]:
-        """An arm for each context and how likely it was, shapes (n,).
+        """An arm for each context and the probability of the choice, shapes (n,).
 
-        Masks, of shape (n, arms), say among which. A class that takes none is refused with masks.
+        ``masks`` of shape (n, arms) has the allowed arms; a class may leave the argument out.
         """
 
     @abstractmethod
@@ -225,12 +225,12 @@ class BanditAlgorithm(LearningAlgorithm):
 
     @property
     def _policy_masks(self) -> Bools:
-        """What was allowed last in each context, of no rows where contexts are vectors."""
+        """The last masks seen in each context; no rows if contexts are vectors."""
         return cast(ArmPolicy, self.policy).masks
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Bools | None = None) -> None:
         super()._update_info_buffer(infos, dones)
-        # What an environment says of a pull decides what is learnt from it.
+        # Kept for `_learn_from`, which reads ``matched`` and ``feedback_due``.
         self._infos = infos
 
     def _learn_from(self, transitions: Transitions) -> None:
@@ -261,10 +261,10 @@ class BanditAlgorithm(LearningAlgorithm):
 
         Takes one observation or an array of n, and returns an action or n of them, and ``state``;
         ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape (n, arms)
-        say what is allowed; without them it is what was allowed last in the context.
+        are the allowed arms; the default is the last mask seen in the context.
 
         Raises:
-            ValueError: if there are masks and the agent does not go by them, or none and it does.
+            ValueError: if masks are given without ``mask_actions``, or are missing and needed.
         """
         if action_masks is not None and not self.mask_actions:
             raise ValueError("action_masks: the agent was made without mask_actions")
@@ -284,7 +284,7 @@ class BanditAlgorithm(LearningAlgorithm):
         return actions.reshape(shape), state
 
     def _masks_at(self, obs: NDArray[Any], n: int, told: Any) -> Bools:
-        """The arms to choose among at ``n`` observations, told or kept, shape (n, arms)."""
+        """The given or kept masks at ``n`` observations, shape (n, arms)."""
         if told is None and not len(self._policy_masks):
             raise ValueError("mask_actions: predict needs action_masks where contexts are vectors")
         if told is None:
@@ -305,7 +305,7 @@ class BanditAlgorithm(LearningAlgorithm):
 class RuleBandit(BanditAlgorithm):
     """Chooses and learns by compiled rules.
 
-    `choose_arm`, `context_row`, `learn_from_reward` and `choose_allowed` are each family's own.
+    Subclasses set `choose_arm`, `context_row`, `learn_from_reward` and `choose_allowed`.
     """
 
     act = act_in_context
@@ -314,7 +314,7 @@ class RuleBandit(BanditAlgorithm):
 
     @abstractmethod
     def _rows(self, agent: Any, contexts: Any) -> tuple[Ints, int]:
-        """In which rows the agent looks up these contexts, shape (n,), and how many there are."""
+        """The agent's rows for these contexts, shape (n,), and the number of all rows."""
 
     def _choose(
         self, contexts: Any, rng: np.random.Generator, masks: Bools | None = None

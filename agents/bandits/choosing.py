@@ -16,8 +16,8 @@ from mdp.transition_model import Bools, Floats, Ints
 
 # Agents that keep a score for each arm in each context: choosing an arm, learning from its reward.
 #
-# Compiled functions, shared by the interpreted and the compiled loop. What an algorithm adds is
-# `choose_arm` and `learn_from_pull`, and `choice_probability` where its update asks for it.
+# Compiled functions, shared by the interpreted and the compiled loop. An algorithm defines
+# `choose_arm` and `learn_from_pull`, and `choice_probability` if its update needs it.
 
 # A pull and its reward, kept until the feedback is due.
 PULL = np.dtype(
@@ -25,7 +25,7 @@ PULL = np.dtype(
         ("row", np.int64),  # the context
         ("arm", np.int64),
         ("reward", np.float64),
-        ("probability", np.float64),  # how likely the choice was, where the update asks for it
+        ("probability", np.float64),  # of the choice, if the update needs it
     ],
     align=True,
 )
@@ -33,20 +33,20 @@ PULL = np.dtype(
 
 @by_type
 def masked_count(tables: Any) -> int:
-    """Number of the rewards of arms in the context that are left out of the tables."""
+    """Number of rewards of masked arms in the context, which are not in the tables."""
     raise CompiledOnlyError
 
 
 @by_type
 def masked_sum(tables: Any) -> float:
-    """Sum of the rewards of arms in the context that are left out of the tables."""
+    """Sum of the rewards of masked arms in the context, which are not in the tables."""
     raise CompiledOnlyError
 
 
 class ScoreTables(NamedTuple):
-    """What an agent knows; each of shape (contexts, arms)."""
+    """The knowledge of an agent; each array of shape (contexts, arms)."""
 
-    scores: Floats  # what it judges arms by: a value, a posterior mean, a preference, a log-weight
+    scores: Floats  # values, posterior means, preferences or log-weights of the arms
     sums: Floats  # sum of the rewards
     counts: Ints  # number of the rewards
 
@@ -64,24 +64,24 @@ class ScoreTables(NamedTuple):
 class Feedback(NamedTuple):
     """Pulls that wait for their feedback."""
 
-    pulls: NDArray[Any]  # room for them, records of type `PULL`, shape (capacity,)
-    waiting: Ints  # how many there are, shape (1,)
+    pulls: NDArray[Any]  # buffer of records of type `PULL`, shape (capacity,)
+    waiting: Ints  # the number of pulls in it, shape (1,)
 
 
 class ScoreAgent(NamedTuple):
-    """An agent as compiled functions see it."""
+    """An agent for compiled functions."""
 
-    settings: Any  # a record of the type that its class has
-    tables: Any  # what it knows, `ScoreTables` or `AllowedTables`
-    feedback: Feedback  # pulls that are not learnt from yet
-    arms: Floats  # room for a number for each arm, shape (arms,)
-    draws: Floats  # room for the random numbers of a choice, shape (2,)
+    settings: Any  # a record of its class's type
+    tables: Any  # its knowledge, `ScoreTables` or `AllowedTables`
+    feedback: Feedback  # pulls that wait for their feedback
+    arms: Floats  # scratch: a number for each arm, shape (arms,)
+    draws: Floats  # scratch: the random numbers of a choice, shape (2,)
     rng: Any  # a handle of its generator
 
 
 @by_type
 def context_row(agent: Any, env: Any) -> int:
-    """The row in which the agent looks up the context that the environment shows."""
+    """The agent's row for the present context of the environment."""
     raise CompiledOnlyError
 
 
@@ -93,7 +93,7 @@ def choose_arm(agent: Any, row: int, progress: Any) -> int:
 
 @by_type
 def choice_probability(agent: Any, row: int, arm: int) -> float:
-    """How likely the choice of ``arm`` was."""
+    """The probability of choosing ``arm``."""
     raise CompiledOnlyError
 
 
@@ -106,34 +106,34 @@ def learn_from_reward(agent: Any, pull: Any, progress: Any) -> None:
 def choose_allowed(
     agent: Any, row: int, mask: Bools, room: AllowedRoom, progress: Any
 ) -> tuple[int, float]:
-    """One of the arms of ``mask`` in the context ``row``, and how likely it was."""
+    """One of the arms of ``mask`` in the context ``row``, and the probability of the choice."""
     raise CompiledOnlyError
 
 
 @by_type
 def learn_from_pull(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """Learn from a record of type `PULL`, whose reward is counted in already."""
+    """Learn from a record of type `PULL`, after its reward has been added to the tables."""
 
 
 @by_type
 def before_counting(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """Learn what has to be learnt before the reward is counted in."""
+    """The part of learning that comes before the reward is added to the tables."""
 
 
 @inlined
 def no_probability(agent: ScoreAgent, row: int, arm: int) -> float:
-    """The update does not ask for it."""
+    """The update does not need the probability."""
     return 1.0
 
 
 @inlined
 def nothing_before(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """The update needs the reward counted in."""
+    """All of the update comes after the reward is added to the tables."""
 
 
 @inlined
 def total_count(tables: Any, row: int) -> int:
-    """Rewards seen in a context, those of masked arms among them."""
+    """Number of rewards seen in a context, including those of masked arms."""
     total = masked_count(tables)
     for arm in range(tables.counts.shape[1]):
         total += tables.counts[row, arm]
@@ -142,7 +142,7 @@ def total_count(tables: Any, row: int) -> int:
 
 @inlined
 def mean_reward(tables: Any, row: int) -> float:
-    """Average of all rewards seen in a context, at least one."""
+    """Average of all rewards seen in a context; there must be at least one."""
     total = masked_sum(tables)
     for arm in range(tables.sums.shape[1]):
         total += tables.sums[row, arm]
@@ -151,13 +151,13 @@ def mean_reward(tables: Any, row: int) -> float:
 
 @inlined
 def row_of_scores(agent: ScoreAgent, env: Any) -> int:
-    """Each context has a row, unless they are ignored."""
+    """Each context has a row; all have row 0 if contexts are ignored."""
     return 0 if agent.settings.ignore_context else int(env.obs)
 
 
 @inlined
 def count_and_learn(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """Count a reward in, and learn from it."""
+    """Add a reward to the tables, and learn from it."""
     before_counting(agent, pull, progress)
     agent.tables.counts[pull.row, pull.arm] += 1
     agent.tables.sums[pull.row, pull.arm] += pull.reward
@@ -166,7 +166,7 @@ def count_and_learn(agent: ScoreAgent, pull: Any, progress: Any) -> None:
 
 @inlined
 def act_in_context(agent: Any, env: Any, progress: Any) -> None:
-    """Pull an arm in the context that the environment shows, and keep the pull."""
+    """Pull an arm in the present context of the environment, and keep the pull."""
     pull = agent.feedback.pulls[agent.feedback.waiting[0]]
     pull.row = context_row(agent, env)
     env.action = choose_arm(agent, pull.row, progress)
@@ -176,7 +176,7 @@ def act_in_context(agent: Any, env: Any, progress: Any) -> None:
 
 @inlined
 def learn_from_feedback(agent: Any, envs: Any, progress: Any) -> None:
-    """Keep the reward; learn from all pulls that wait where their feedback comes in."""
+    """Keep the reward; when feedback is due, learn from all waiting pulls."""
     feedback, env = agent.feedback, envs[0]
     feedback.pulls[feedback.waiting[0]].reward = env.reward
     feedback.waiting[0] += 1
@@ -191,9 +191,9 @@ def learn_from_feedback(agent: Any, envs: Any, progress: Any) -> None:
 def choose_arms(
     agent: Any, rows: Ints, n_rows: int, progress: Any, arms: Ints, probabilities: Floats
 ) -> int:
-    """Fill in an arm for each of the contexts ``rows``, and how likely it was; shapes (n,).
+    """Fill in an arm for each of the contexts ``rows``, and its probability; shapes (n,).
 
-    Returns -1, or the place of a context that has no row, before which it stops.
+    Returns -1, or the index of the first context without a row, where it stops.
     """
     for i in range(len(rows)):
         if not 0 <= rows[i] < n_rows:
@@ -230,13 +230,13 @@ def learn_one(agent: Any, pull: Any, progress: Any) -> None:
 
 # Scores of the arms that the environment allows.
 #
-# A rule is handed a smaller bandit: a copy of what the agent knows of the allowed arms in the
-# present context, and of no others. So no rule needs a line for masks, and where all arms are
-# allowed it does the same to the bit. Agents that do not go by masks never come here.
+# A rule gets a smaller bandit: a copy of the agent's knowledge of the allowed arms in the present
+# context. So no rule needs code for masks, and if all arms are allowed the result is the same bit
+# for bit. Agents without masks do not use this.
 
 
 class AllowedTables(NamedTuple):
-    """What an agent knows of the allowed arms in one context; arrays of shape (1, n)."""
+    """An agent's knowledge of the allowed arms in one context; arrays of shape (1, n)."""
 
     scores: Floats
     sums: Floats
@@ -246,17 +246,17 @@ class AllowedTables(NamedTuple):
 
     @inlined
     def masked_count(self) -> int:
-        """Rewards of the masked arms."""
+        """Number of the rewards of the masked arms."""
         return self.other_count
 
     @inlined
     def masked_sum(self) -> float:
-        """Their sum."""
+        """Sum of the rewards of the masked arms."""
         return self.other_sum
 
 
 class AllowedRoom(NamedTuple):
-    """Where a smaller bandit is put together."""
+    """Buffers for the smaller bandit."""
 
     scores: Floats  # shape (1, arms)
     sums: Floats  # shape (1, arms)
@@ -265,7 +265,7 @@ class AllowedRoom(NamedTuple):
 
 
 def allowed_room(n_arms: int) -> AllowedRoom:
-    """Room for bandits of up to ``n_arms``."""
+    """Buffers for smaller bandits of up to ``n_arms``."""
     shape, whole = (1, n_arms), np.int64
     return AllowedRoom(
         np.empty(shape), np.empty(shape), np.empty(shape, whole), np.empty(n_arms, whole)
@@ -274,7 +274,7 @@ def allowed_room(n_arms: int) -> AllowedRoom:
 
 @inlined
 def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom) -> AllowedTables:
-    """What is known of the arms of ``mask`` in the context ``row``, copied."""
+    """A copy of the knowledge of the arms of ``mask`` in the context ``row``."""
     n, other_count, other_sum = 0, 0, 0.0
     for arm in range(len(mask)):
         if mask[arm]:
@@ -294,7 +294,7 @@ def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom
 def choose_by_allowed_scores(
     agent: ScoreAgent, row: int, mask: Bools, room: AllowedRoom, progress: Any
 ) -> tuple[int, float]:
-    """What the rule chooses in the smaller bandit."""
+    """The rule's choice in the smaller bandit, and its probability."""
     known = allowed_tables(agent.tables, row, mask, room)
     numbers = agent.arms[: known.scores.shape[1]]
     smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
@@ -327,14 +327,14 @@ def learn_one_allowed(
 
 # Agents with a linear model of each arm's reward in the context.
 #
-# Each arm's ridge regression keeps the matrix A = ridge I + sum x x' as its factors L D L', which a
-# new context changes by a rank-one update that cannot lose positive definiteness (Gill, Golub,
-# Murray and Saunders, 1974, method C1). What an algorithm adds is `bonus`, and `pick` where it does
-# not take the best.
+# Each arm's ridge regression keeps the matrix A = ridge I + sum x x' as its factors L D L'. A new
+# context changes them by a rank-one update that keeps A positive definite (Gill, Golub, Murray and
+# Saunders, 1974, method C1). An algorithm defines `bonus`, and `pick` if it does not take the best
+# arm.
 
 
 class Regressions(NamedTuple):
-    """What an agent knows."""
+    """The knowledge of a linear agent."""
 
     factors: Floats  # D on the diagonal and L below it, shape (arms, features, features)
     moments: Floats  # sum of reward times context, shape (arms, features)
@@ -343,23 +343,23 @@ class Regressions(NamedTuple):
 
 
 class LinearAgent(NamedTuple):
-    """An agent as compiled functions see it."""
+    """A linear agent for compiled functions."""
 
-    settings: Any  # a record of the type that its class has
-    models: Regressions  # what it knows
-    feedback: Feedback  # pulls that are not learnt from yet
-    contexts: Floats  # of those pulls, or of those to be chosen, shape (capacity, features)
-    context: Floats  # what the environment shows, shape (features,)
-    numbers: Ints  # which model is that of the k-th arm, shape (arms,)
-    arms: Floats  # room for a number for each arm, shape (arms,)
-    features: Floats  # room for a number for each feature, shape (features,)
-    draws: Floats  # room for the random numbers of a choice, shape (2,)
+    settings: Any  # a record of its class's type
+    models: Regressions  # its knowledge
+    feedback: Feedback  # pulls that wait for their feedback
+    contexts: Floats  # of these pulls, or of choices to make, shape (capacity, features)
+    context: Floats  # the present one of the environment, shape (features,)
+    numbers: Ints  # the model's index of the k-th arm, shape (arms,)
+    arms: Floats  # scratch: a number for each arm, shape (arms,)
+    features: Floats  # scratch: a number for each feature, shape (features,)
+    draws: Floats  # scratch: the random numbers of a choice, shape (2,)
     rng: Any  # a handle of its generator
 
 
 @by_type
 def bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
-    """What is added to the predicted reward before the best arm is taken."""
+    """The bonus added to the predicted reward before the best arm is chosen."""
     raise CompiledOnlyError
 
 
@@ -371,7 +371,7 @@ def pick(agent: LinearAgent, progress: Any) -> int:
 
 @inlined
 def best_arm(agent: LinearAgent, progress: Any) -> int:
-    """A best arm, whichever of several the draw falls on."""
+    """An arm of the highest score; the draw breaks ties."""
     return greedy_action(agent.arms, agent.draws[0] * agent.settings.tie_scale)
 
 
@@ -411,7 +411,7 @@ def choose_by_model(agent: LinearAgent, row: int, progress: Any) -> int:
 
 @inlined
 def add_context(models: Regressions, arm: int, context: Floats, rest: Floats) -> None:
-    """Make the factors those of A + x x'; ``rest`` is room for a number for each feature."""
+    """Update the factors to those of A + x x'; ``rest`` is scratch of shape (features,)."""
     factors = models.factors
     for i in range(len(context)):
         rest[i] = context[i]
@@ -430,7 +430,7 @@ def add_context(models: Regressions, arm: int, context: Floats, rest: Floats) ->
 
 @inlined
 def solve(models: Regressions, arm: int) -> None:
-    """Make the coefficients those of A^-1 times the moments."""
+    """Set the coefficients to A^-1 times the moments."""
     factors, solution = models.factors, models.coefficients
     n_features = solution.shape[1]
     for i in range(n_features):
@@ -456,7 +456,7 @@ def learn_by_model(agent: LinearAgent, pull: Any, progress: Any) -> None:
 
 @inlined
 def row_of_vector(agent: LinearAgent, env: Any) -> int:
-    """Each pull that waits has a row: the environment goes on to another context before that."""
+    """The row of a new pull; its context is copied there until its feedback comes in."""
     row = agent.feedback.waiting[0]
     for i in range(len(agent.context)):
         agent.contexts[row, i] = agent.context[i]
@@ -467,7 +467,7 @@ def row_of_vector(agent: LinearAgent, env: Any) -> int:
 def choose_by_allowed_models(
     agent: LinearAgent, row: int, mask: Bools, room: AllowedRoom, progress: Any
 ) -> tuple[int, float]:
-    """One of the arms of ``mask``; each has a model of its own, so that nothing is copied."""
+    """One of the arms of ``mask``, and 1; each arm has its own model, so nothing is copied."""
     n = 0
     for arm in range(len(mask)):
         if mask[arm]:

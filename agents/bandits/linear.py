@@ -1,4 +1,4 @@
-"""Contextual agents with a linear model of each arm: LinUCB and its kin."""
+"""Contextual agents with a linear model of each arm: LinUCB and similar ones."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from agents.compiled.generators import generator_of, handles_of
 from machine_code.compiling import inlined
 from mdp.transition_model import Floats, Ints
 
-# The policy of agents with a linear model of each arm's reward: all that they know, in buffers.
+# The policy of agents with a linear model of each arm's reward: their knowledge, in buffers.
 
 
 class LinearBanditPolicy(ArmPolicy):
@@ -82,7 +82,7 @@ class LinearBanditPolicy(ArmPolicy):
 
 
 def number_of_features(space: spaces.Space[Any]) -> int:
-    """Length of the vectors that `features` makes."""
+    """Length of the vectors that `features` returns."""
     return int(space.n) if isinstance(space, spaces.Discrete) else int(space.shape[0])  # type: ignore[index]
 
 
@@ -99,7 +99,7 @@ def features(space: spaces.Space[Any], observations: NDArray[Any]) -> Floats:
 
 
 class LinearArguments(BanditArguments, total=False):
-    """What the constructors of these agents take; see `LinearBanditAgent`."""
+    """Arguments of these agents' constructors; see `LinearBanditAgent`."""
 
     ridge: float
 
@@ -112,7 +112,7 @@ def no_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
 
 @inlined
 def confidence_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
-    """So many standard deviations of the prediction."""
+    """``alpha`` standard deviations of the prediction."""
     return float(agent.settings.alpha * deviation(agent, arm, context))
 
 
@@ -120,8 +120,8 @@ def confidence_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
 def sampled_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
     """A draw from the posterior of the prediction, less its mean.
 
-    One context is scored, so that a normal number for each arm's mean reward does what a draw of
-    all its coefficients would.
+    For a single context, one normal number per arm has the same distribution as a prediction from
+    a draw of all its coefficients.
     """
     noise = agent.settings.alpha * generator_of(agent.rng).standard_normal()
     return float(noise * deviation(agent, arm, context))
@@ -142,7 +142,7 @@ class LinearBanditAgent(RuleBandit):
     Args:
         policy: ``"LinearBanditPolicy"``.
         env: environment with `Box` observations of shape (d,) or `Discrete` ones, or its id.
-        ridge: what the regressions start from, on the diagonal, above 0.
+        ridge: regularisation: the diagonal of each regression matrix at the start, above 0.
         kwargs: as in `BanditAlgorithm`.
     """
 
@@ -151,7 +151,7 @@ class LinearBanditAgent(RuleBandit):
     }
     policy: LinearBanditPolicy
 
-    # What the training loops call; `bonus` is each algorithm's own.
+    # Called by the training loops; each algorithm defines `bonus`.
     choose_arm = choose_by_model
     context_row = row_of_vector
     learn_from_reward = learn_by_model
@@ -187,7 +187,7 @@ class LinearBanditAgent(RuleBandit):
         capacity: int = 1,
         context: Floats | None = None,
     ) -> LinearAgent:
-        """The agent as compiled functions see it."""
+        """The agent for compiled functions."""
         n_features = number_of_features(self.observation_space)
         return LinearAgent(
             self.settings()[0],
@@ -252,7 +252,7 @@ class LinThompson(LinUCB):
     Args:
         policy: ``"LinearBanditPolicy"``.
         env: as in `LinearBanditAgent`.
-        alpha: scales the posterior's standard deviation; right is that of the rewards' noise.
+        alpha: factor of the posterior's standard deviation; correct is the noise's of the rewards.
         kwargs: as in `LinearBanditAgent`.
     """
 

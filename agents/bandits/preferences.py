@@ -24,7 +24,7 @@ from agents.compiled.generators import generator_of
 from machine_code.compiling import inlined
 from mdp.transition_model import Floats
 
-# What agents share whose scores are preferences or log-weights, and no estimates of rewards.
+# The base of agents whose scores are preferences or log-weights instead of estimates of rewards.
 
 
 @inlined
@@ -36,7 +36,7 @@ def softmax(tables: ScoreTables, row: int, probabilities: Floats) -> None:
 
 
 class PreferenceBandit(TableBandit):
-    """An agent whose scores are no estimates of rewards."""
+    """An agent whose scores are not estimates of rewards."""
 
     def estimates(self, tables: ScoreTables) -> Floats:
         """Average rewards, nan where there is none, shapes (..., contexts, arms)."""
@@ -48,7 +48,7 @@ class PreferenceBandit(TableBandit):
         return action_probabilities(BOLTZMANN, scores, 1.0, random_ties=False)
 
 
-# Agents that draw arms by preferences, which are no estimates of rewards: gradient ascent.
+# The gradient bandit.
 
 
 @inlined
@@ -64,7 +64,7 @@ def choose_by_preference(agent: ScoreAgent, row: int, progress: Any) -> int:
 def gradient_step(agent: ScoreAgent, pull: Any, progress: Any) -> None:
     """Move the preferences (Sutton and Barto, section 2.8).
 
-    The baseline is the average of the rewards before this one, and this one at the very first.
+    The baseline is the average of the rewards before this one; for the first it is that reward.
     """
     tables = agent.tables
     baseline = 0.0
@@ -90,8 +90,8 @@ class GradientBandit(PreferenceBandit):
         policy: ``"BanditPolicy"``.
         env: as in `TableBandit`.
         learning_rate: step size, constant or scheduled.
-        baseline: compare a reward with the average of those before it, as the book's second edition
-            has it (its drafts included the reward itself); else with 0.
+        baseline: compare a reward with the average of those before it, as in the book's second
+            edition (its drafts included the reward itself); else with 0.
         kwargs: as in `TableBandit`.
     """
 
@@ -126,7 +126,7 @@ def exp3_probabilities(agent: ScoreAgent, row: int) -> None:
 
 @inlined
 def draw_by_weight(agent: ScoreAgent, row: int, progress: Any) -> int:
-    """An arm by its probability."""
+    """Draw an arm by the probabilities."""
     uniform = generator_of(agent.rng).random()
     exp3_probabilities(agent, row)
     return drawn_action(agent.arms, uniform)
@@ -134,14 +134,14 @@ def draw_by_weight(agent: ScoreAgent, row: int, progress: Any) -> int:
 
 @inlined
 def probability_of(agent: ScoreAgent, row: int, arm: int) -> float:
-    """How likely the choice of ``arm`` is."""
+    """The probability of choosing ``arm``."""
     exp3_probabilities(agent, row)
     return float(agent.arms[arm])
 
 
 @inlined
 def raise_weight(agent: ScoreAgent, pull: Any, progress: Any) -> None:
-    """Add the reward to the log-weight, the more the less likely its arm was."""
+    """Add the importance-weighted reward (reward / probability) to the arm's log-weight."""
     share = agent.settings.mixing * pull.reward
     agent.tables.scores[pull.row, pull.arm] += share / (pull.probability * len(agent.arms))
 

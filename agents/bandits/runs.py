@@ -32,7 +32,7 @@ from envs.wrappers import ActionMasks
 from machine_code.compiling import inlined
 from mdp.transition_model import Bools, Floats, Ints
 
-# Bandits as compiled code sees them, and a pull of an arm.
+# Bandits for compiled code, and a pull of an arm.
 #
 # A `BanditModel` makes the same draws from the environment's generator, in the same order, as the
 # environments in `envs.bandits` do.
@@ -72,14 +72,14 @@ def expect(model: BanditModel) -> float:
 
 @inlined
 def feedback_is_due(model: BanditModel, pulls: int) -> bool:
-    """Whether the rewards of the latest pulls come in after ``pulls`` pulls."""
+    """Whether the feedback of the latest pulls is due after ``pulls`` pulls."""
     at_the_end = pulls == model.pulls or (model.time_limit > 0 and pulls == model.time_limit)
     return pulls % model.batch_size == 0 or at_the_end
 
 
 @inlined
 def pull_click(model: BanditModel, arm: int, rng: np.random.Generator) -> float:
-    """Reward 0 or 1; one random number decides on it and on the next context."""
+    """Reward 0 or 1; one random number decides on the reward and the next context."""
     n_contexts = model.means.shape[0]
     old, outcome, uniform = model.row[0], 0, rng.random()
     for k in range(2 * n_contexts):
@@ -94,7 +94,7 @@ def pull_click(model: BanditModel, arm: int, rng: np.random.Generator) -> float:
 
 @inlined
 def pull_noisy(model: BanditModel, arm: int, rng: np.random.Generator) -> float:
-    """The expected reward with normal noise, in single precision as vector environments have it."""
+    """The expected reward with normal noise, in single precision as in vector environments."""
     reward = model.expected[arm] + model.reward_std * rng.standard_normal()
     if model.kind == LINEAR:
         for i in range(len(model.vector)):
@@ -108,19 +108,19 @@ def pull_noisy(model: BanditModel, arm: int, rng: np.random.Generator) -> float:
 class BanditModel(NamedTuple):
     """A bandit within an episode. Arrays that its kind does not need hold one number."""
 
-    kind: int  # which dynamics
-    batch_size: int  # pulls between two times at which feedback comes in
-    pulls: int  # after how many it comes in anyway
-    time_limit: int  # after how many the episode ends, and it comes in too; 0 for never
+    kind: int  # `CLICKS`, `GAUSSIAN` or `LINEAR`
+    batch_size: int  # pulls from one feedback to the next
+    pulls: int  # after this number of pulls feedback is due in any case
+    time_limit: int  # pulls after which the episode ends, and feedback is due; 0 for never
     reward_std: float  # standard deviation of the noise on a reward
-    drift_std: float  # standard deviation of what is added to all means after each pull
+    drift_std: float  # standard deviation of the noise added to all means after each pull
     means: Floats  # expected rewards, shape (contexts, arms); changed in place where they drift
     # Cumulative probabilities of reward and next context, shape (contexts, arms, 2 contexts).
     outcomes: Floats
     arm_parameters: Floats  # of linear rewards, shape (arms, features)
     row: Ints  # the present context, shape (1,); changed in place
     vector: Floats  # the present context as features, shape (features,); changed in place
-    expected: Floats  # room for a number for each arm, shape (arms,)
+    expected: Floats  # scratch: expected rewards now, shape (arms,)
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
@@ -138,13 +138,13 @@ class BanditModel(NamedTuple):
 
     @inlined
     def reset(self, env: Any, handle: Any) -> None:
-        """Do nothing: a model is one episode, and the environment itself draws the next."""
+        """Do nothing: a model is one episode; the environment itself draws the next one."""
 
 
 class PullRecord(NamedTuple):
-    """What happens at each pull; all of shape (pulls,), filled in by the loop."""
+    """The record of each pull; all but `episodes` of shape (pulls,), filled in by the loop."""
 
-    episodes: NDArray[Any]  # room for the one episode that ends
+    episodes: NDArray[Any]  # buffer for the one episode that ends
     arms: NDArray[np.int16]
     rewards: NDArray[np.float32]
     regrets: Floats
@@ -152,7 +152,7 @@ class PullRecord(NamedTuple):
 
     @inlined
     def note_step(self, env: Any, i: int, step: int) -> None:
-        """Write down the pull at which the episode is."""
+        """Record the latest pull of the episode."""
         pull = env.elapsed - 1
         self.contexts[pull] = env.obs
         self.arms[pull] = env.action
@@ -161,11 +161,11 @@ class PullRecord(NamedTuple):
 
     @inlined
     def note_progress(self, progress: Any, step: int) -> None:
-        """Pulls are all that is written down."""
+        """Do nothing: only pulls are recorded."""
 
 
 def check_bandit(env: gym.Env[Any, Any]) -> None:
-    """Make sure that there is compiled code for the environment and all its wrappers."""
+    """Raise `NotCompilable` if the environment or a wrapper has no compiled counterpart."""
     while isinstance(env, gym.Wrapper):
         if not isinstance(env, _HARMLESS_WRAPPERS):
             raise NotCompilable(f"{type(env).__name__} may change what the environment does")
@@ -175,7 +175,7 @@ def check_bandit(env: gym.Env[Any, Any]) -> None:
 
 
 def bandit_model(env: gym.Env[Any, Any]) -> BanditModel:
-    """The episode that has just begun in ``env``, which `check_bandit` has passed."""
+    """The episode that has just begun in ``env``, which must have passed `check_bandit`."""
     bandit: Any = env.unwrapped
     kind = _KINDS[type(bandit)]
     nothing = np.zeros((1, 1))
@@ -198,7 +198,7 @@ def bandit_model(env: gym.Env[Any, Any]) -> BanditModel:
     )
 
 
-# What many independent runs of one agent on one bandit came to.
+# The results of many independent runs of one agent on one bandit.
 
 
 @dataclass(frozen=True)
@@ -206,19 +206,18 @@ class BatchResult:
     """A row for each run, a column for each pull."""
 
     seeds: Ints  # of the runs, shape (n_runs,)
-    arms: NDArray[np.int16]  # what was pulled, int16 of shape (n_runs, pulls)
-    rewards: NDArray[np.float32]  # what it gave, float32 of shape (n_runs, pulls)
+    arms: NDArray[np.int16]  # int16 of shape (n_runs, pulls)
+    rewards: NDArray[np.float32]  # float32 of shape (n_runs, pulls)
     # Best expected reward less that of the arm, at each pull, float64 of shape (n_runs, pulls).
     regrets: Floats
-    # What the arm was chosen in, int32 of shape (n_runs, pulls); None where there is but one
-    # context, or contexts are vectors.
+    # Int32 of shape (n_runs, pulls); None if there is only one context, or contexts are vectors.
     contexts: NDArray[np.int32] | None = None
     # Of the mean rewards at the end, shape (n_runs, contexts, arms), nan where the agent has none;
-    # None for agents that keep no table.
+    # None for agents without a table.
     estimates: Floats | None = None
     # Of linear agents at the end, shape (n_runs, arms, features); None for others.
     coefficients: Floats | None = None
-    moments: tuple[int, ...] = ()  # after how many pulls posteriors are kept
+    moments: tuple[int, ...] = ()  # numbers of pulls after which posteriors are recorded
     # Of Thompson sampling, shape (n_runs, moments, contexts, arms, 2): parameters of the Beta
     # distribution, or mean and standard deviation; None for others.
     posteriors: Floats | None = None
@@ -231,8 +230,8 @@ class BatchResult:
 
 # Thousands of independent runs of one agent, each a fresh agent and one episode.
 #
-# A run with seed s does, bit for bit, what ``Agent(env=Monitor(gym.make(env_id)), seed=s)`` does in
-# ``learn(pulls)``.
+# A run with seed s is bit for bit the same as ``learn(pulls)`` of
+# ``Agent(env=Monitor(gym.make(env_id)), seed=s)``.
 
 DEFAULT_MOMENTS = (10, 100, 1000)
 
@@ -249,16 +248,17 @@ def run_batch(
     """Run the agent once for each seed.
 
     Args:
-        algorithm: a bandit agent's name in the table of agents, or its class.
+        algorithm: a bandit agent's name in the registry, or its class.
         kwargs: arguments of its constructor, without environment and seed.
         env_id: a bandit.
         env_kwargs: its arguments.
         seeds: of the runs; each seeds an agent and its environment.
-        pulls: pulls of a run, at most an episode, which is the default.
-        moments: after how many pulls Thompson sampling's posteriors are kept, beside the last.
+        pulls: pulls of a run, at most those of an episode (the default).
+        moments: numbers of pulls after which Thompson sampling's posteriors are recorded, beside
+            the end.
 
     Raises:
-        NotCompilable: saying why, where there is no compiled copy; `run_one_by_one` does it then.
+        NotCompilable: with the reason, if there is no compiled copy; use `run_one_by_one` then.
         ValueError: if an argument does not fit.
     """
     cls = load_algorithm(algorithm) if isinstance(algorithm, str) else algorithm
@@ -292,7 +292,7 @@ def checked_pulls(env: gym.Env[Any, Any], pulls: int | None) -> int:
 
 
 class Runs:
-    """All runs of a batch, with room for what comes of them."""
+    """All runs of a batch, with arrays for their results."""
 
     def __init__(
         self,
@@ -326,7 +326,7 @@ class Runs:
         self.start = self._start_of_training()
 
     def _start_of_training(self) -> np.ndarray[Any, np.dtype[np.void]]:
-        """How far a training is at its first pull."""
+        """The progress record of a training at its first pull."""
         progress = self.agent.progress()
         progress["total_timesteps"], progress["remaining"] = self.n_pulls, 1.0
         for name, schedule in self.agent.schedules().items():
@@ -334,7 +334,7 @@ class Runs:
         return np.asarray(progress)
 
     def run(self, index: int) -> None:
-        """One run, in blocks that end at the moments."""
+        """Do one run, in blocks that end at the moments."""
         seed = int(self.seeds[index])
         self.env.reset(seed=seed)
         self.agent.env = None
@@ -370,7 +370,7 @@ class Runs:
         return self.agent.compiled_agent(rng, ScoreTables(**known), self.capacity)
 
     def result(self) -> BatchResult:
-        """What came of all runs."""
+        """The results of all runs."""
         n_contexts = self.env.unwrapped.n_contexts  # type: ignore[attr-defined]
         estimates = coefficients = posteriors = None
         if isinstance(self.agent, LinearBanditAgent):
@@ -394,14 +394,14 @@ class Runs:
         )
 
 
-# What happens at each pull of a training, of whatever agent, on a bandit.
+# The record of each pull of any agent's training on a bandit.
 
 
 class PullLog(BaseCallback):
-    """Keeps each pull as the environments tell of it, in about 25 bytes.
+    """Records each pull from the environments' ``info``, in about 25 bytes.
 
-    Where an environment does not know what its arms are worth, figures are nan and no arm counts as
-    optimal.
+    If an environment does not know the expected rewards of its arms, these and the regrets are nan,
+    and no arm counts as optimal.
     """
 
     def __init__(self) -> None:
@@ -436,7 +436,7 @@ class PullLog(BaseCallback):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All pulls so far."""
         n_envs = self.training_env.num_envs
-        # Ctrl-C may come when some columns have the newest pull and others not yet.
+        # After Ctrl-C, only some columns may have the newest pull.
         n_pulls = min(map(len, self._columns.values())) // n_envs
         arrays: dict[str, NDArray[Any]] = {
             name: np.array(column[: n_pulls * n_envs]).reshape(n_pulls, n_envs).T
@@ -458,10 +458,10 @@ def run_one_by_one(
     seeds: Iterable[int],
     pulls: int | None = None,
 ) -> BatchResult:
-    """What `agents.bandits.runs.run_batch` does, step by step, for any agent that fits.
+    """The same as `run_batch`, step by step, for any agent that fits.
 
-    Arguments as there; agents of Stable-Baselines3 want ``policy`` among theirs. Posteriors are not
-    kept.
+    Arguments as there; agents of Stable-Baselines3 need ``policy`` in ``kwargs``. Posteriors are
+    not recorded.
     """
     cls = load_algorithm(algorithm) if isinstance(algorithm, str) else algorithm
     numbers = list(seeds)
@@ -497,7 +497,7 @@ def _run(
         n_pulls = checked_pulls(env, pulls)
         agent = cls(env=env, seed=seed, **kwargs)
         agent.learn(n_pulls, callback=log)
-        # Agents that collect whole rollouts go on beyond what was asked for.
+        # Agents that collect whole rollouts take more steps than asked for.
         run = {name: array[0, :n_pulls] for name, array in log.arrays().items()}
     finally:
         env.close()
@@ -507,7 +507,7 @@ def _run(
 
 
 def _knowledge(agent: Any) -> dict[str, Any]:
-    """What a bandit agent thinks of the arms at the end."""
+    """A bandit agent's final estimates and coefficients."""
     if isinstance(agent, TableBandit):
         return {"estimates": agent.estimates(agent.policy.tables)}
     if isinstance(agent, LinearBanditAgent):

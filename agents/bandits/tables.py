@@ -30,16 +30,16 @@ from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import StepSize
 from mdp.transition_model import Floats, Ints
 
-# The policy of agents that keep a score for each arm: all that they know, in buffers.
+# The policy of agents that keep a score for each arm: their knowledge, in buffers.
 
 
 class BanditPolicy(ArmPolicy):
     """Pulls the arm of the highest score in the context.
 
-    The tables are buffers, so that they travel in the ``policy.pth`` of a model file.
+    The tables are buffers, so that a model file's ``policy.pth`` contains them.
     """
 
-    scores: th.Tensor  # what the agent judges arms by, float64 of shape (C, A)
+    scores: th.Tensor  # of the arms, float64 of shape (C, A)
     sums: th.Tensor  # sum of the rewards, float64 of shape (C, A)
     counts: th.Tensor  # number of the rewards, int64 of shape (C, A)
 
@@ -84,23 +84,23 @@ def mean_rewards(sums: Floats, counts: Ints) -> Floats:
     return means
 
 
-# What the agents share that keep a score for each arm in each context.
+# The base of agents that keep a score for each arm in each context.
 
 
 class TableArguments(BanditArguments, total=False):
-    """What the constructors of these agents take; see `TableBandit`."""
+    """Arguments of these agents' constructors; see `TableBandit`."""
 
     ignore_context: bool
 
 
 class TableBandit(RuleBandit):
-    """An agent with a score for each arm in each context, run for each context on its own.
+    """An agent with a score for each arm in each context; contexts are independent.
 
     Args:
         policy: ``"BanditPolicy"``.
         env: environment with `Discrete` observations, the contexts, or its id.
         learning_rate: step size, for agents that have one.
-        ignore_context: one row for all contexts: what a pooled A/B test does.
+        ignore_context: use one row for all contexts, as a pooled A/B test does.
         kwargs: as in `BanditAlgorithm`.
     """
 
@@ -109,7 +109,7 @@ class TableBandit(RuleBandit):
     parameters = {"ignore_context": np.bool_}  # noqa: RUF012
     initial_score: float = 0.0  # of every arm
 
-    # What the training loops call; `choose_arm` and `learn_from_pull` are each algorithm's own.
+    # Called by the training loops; each algorithm defines `choose_arm` and `learn_from_pull`.
     context_row = row_of_scores
     learn_from_reward = count_and_learn
     choose_allowed = choose_by_allowed_scores
@@ -145,7 +145,7 @@ class TableBandit(RuleBandit):
     def compiled_agent(
         self, rng: np.random.Generator, tables: ScoreTables | None = None, capacity: int = 1
     ) -> ScoreAgent:
-        """The agent as compiled functions see it."""
+        """The agent for compiled functions."""
         return ScoreAgent(
             self.settings()[0],
             tables or self.policy.tables,
@@ -175,5 +175,5 @@ class TableBandit(RuleBandit):
             learn_one_allowed(agent, record, mask, allowed_room(self.n_arms), progress)
 
     def estimates(self, tables: ScoreTables) -> Floats:
-        """What the agent takes the arms' mean rewards for, shapes (..., contexts, arms)."""
+        """The agent's estimates of the arms' mean rewards, shapes (..., contexts, arms)."""
         return tables.scores

@@ -56,7 +56,7 @@ def update_mean(agent: ScoreAgent, pull: Any, progress: Any) -> None:
 
 
 class Thompson(TableBandit):
-    """Thompson sampling: pulls an arm as often as it is likely to be the best (Thompson, 1933).
+    """Thompson sampling: pulls an arm with the probability that it is best (Thompson, 1933).
 
     Args:
         policy: ``"BanditPolicy"``.
@@ -104,12 +104,12 @@ class Thompson(TableBandit):
 
     @property
     def is_gaussian(self) -> bool:
-        """Whether rewards are taken to have normal noise."""
+        """Whether rewards are assumed to have normal noise."""
         return self.likelihood == "gaussian"
 
     @property
     def rewards_known(self) -> str:  # type: ignore[override]
-        """Those of a coin, unless they have normal noise."""
+        """0 or 1 for a Bernoulli likelihood, any reward for a normal one."""
         return ANY if self.is_gaussian else BINARY
 
     @property
@@ -137,7 +137,7 @@ class Thompson(TableBandit):
         check_above_zero(settings_of(self, *names))
 
     def posterior(self, tables: ScoreTables) -> Floats:
-        """What the agent believes of each arm's mean reward.
+        """The posterior of each arm's mean reward.
 
         Args:
             tables: sums and counts, of shape (...).

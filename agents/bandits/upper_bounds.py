@@ -18,7 +18,7 @@ from agents.compiled.generators import generator_of
 from agents.compiled.loop import CompiledOnlyError, by_type
 from machine_code.compiling import inlined
 
-# What agents share that pull the arm of the highest upper confidence bound.
+# The base of agents that pull the arm of the highest upper confidence bound.
 
 
 @by_type
@@ -29,7 +29,7 @@ def upper_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float
 
 @inlined
 def highest_bound(agent: ScoreAgent, row: int, progress: Any) -> int:
-    """An arm of the highest bound, which is infinite for those not tried."""
+    """An arm of the highest bound; the bound of an untried arm is infinite."""
     uniform = generator_of(agent.rng).random()
     pulls = total_count(agent.tables, row)
     for arm in range(len(agent.arms)):
@@ -50,7 +50,7 @@ def average_rewards(agent: ScoreAgent, pull: Any, progress: Any) -> None:
 
 
 class UpperBoundBandit(TableBandit):
-    """Pulls each arm once, and then the one of the highest bound; `upper_bound` is its own."""
+    """Pulls each arm once, then the one of the highest bound; subclasses set `upper_bound`."""
 
     choose_arm = highest_bound
     learn_from_pull = average_rewards
@@ -88,7 +88,7 @@ class UCB(UpperBoundBandit):
         env: as in `TableBandit`.
         variant: ``"ucb1"``: mean + c sqrt(2 ln t / n) after t pulls; ``"sutton_barto"``: mean +
             c sqrt(ln t / n) at the t-th pull.
-        c: how much to explore; by default 1 for UCB1 and 2 for Sutton and Barto's.
+        c: degree of exploration; by default 1 for UCB1 and 2 for Sutton and Barto's.
         kwargs: as in `TableBandit`.
     """
 
@@ -114,7 +114,7 @@ class UCB(UpperBoundBandit):
 
     @property
     def width(self) -> float:
-        """How much to explore."""
+        """The degree of exploration ``c``, or its default."""
         default = 2.0 if self.is_textbook else 1.0
         return default if self.c is None else self.c
 
@@ -124,7 +124,7 @@ class UCB(UpperBoundBandit):
         check_at_least(0, settings_of(self, "c"))
 
 
-# Upper confidence bounds by the divergence of coins.
+# Upper confidence bounds by the divergence of Bernoulli distributions.
 
 MAX_NEWTON_STEPS = 60
 PRECISION = 1e-13
@@ -133,7 +133,7 @@ LAST_BELOW_ONE = 1.0 - 2.0**-53
 
 @inlined
 def bernoulli_kl(p: float, q: float) -> float:
-    """Kullback-Leibler divergence from a coin of probability ``p`` to one of ``q`` in (0, 1)."""
+    """Kullback-Leibler divergence of Bernoulli(``p``) from Bernoulli(``q``), ``q`` in (0, 1)."""
     divergence = 0.0
     if p > 0.0:
         divergence += p * math.log(p / q)
@@ -147,7 +147,7 @@ def kl_upper_bound(p: float, budget: float) -> float:
     """The highest q with kl(p, q) <= ``budget``, for ``p`` in [0, 1].
 
     Newton's method from above: the divergence is convex in q, so that the steps never cross the
-    solution, and Pinsker's inequality gives where to start.
+    solution. Pinsker's inequality gives the starting point.
     """
     if budget <= 0.0 or p >= 1.0:
         return p
@@ -178,9 +178,9 @@ def kl_ucb_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> floa
 
 
 class KLUCB(UpperBoundBandit):
-    """Upper confidence bounds by the divergence of coins (Garivier and Cappe, 2011).
+    """Upper confidence bounds by the divergence of Bernoulli distributions.
 
-    Each arm is pulled once before any bound counts. Rewards lie between 0 and 1.
+    Each arm is pulled once first. Rewards must be in [0, 1]. Source: Garivier and Cappe (2011).
 
     Args:
         policy: ``"BanditPolicy"``.

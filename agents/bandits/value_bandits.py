@@ -67,7 +67,7 @@ class ValueBandit(TableBandit):
         return self.initial_q
 
     def action_probabilities(self, observations: NDArray[Any]) -> Floats:
-        """What the exploring policy does now at each of n observations, shape (n, arms)."""
+        """The exploring policy's present probabilities at each of n observations, (n, arms)."""
         values, ties = self.policy.judged(observations), self.tie_breaking == "random"
         rate = self.exploration_rate
         return action_probabilities(self.strategy, values, rate, random_ties=ties)

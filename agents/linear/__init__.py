@@ -1,1 +1,1 @@
-"""Agents on sums of weights of tiles, a table among them: action values and policy gradients."""
+"""Linear agents on tile coding or tables: action values and policy gradients."""

@@ -31,31 +31,30 @@ from agents.networks.network_worlds import AFTER, BEFORE, move_on
 from machine_code.compiling import called
 from mdp.transition_model import Floats
 
-# Semi-gradient control: action values as sums of weights, moved towards bootstrapped targets.
+# Semi-gradient control: action values are sums of weights, moved towards bootstrapped targets.
 #
-# It is temporal-difference learning of `agents.tabular`, with the sums in place of a table's
-# entries;
-# where each observation is a tile of its own, it is that to the bit. Termination is folded into the
-# discount, which is 0 then, so that a truncated episode still bootstraps. What an algorithm adds is
-# `next_value`, and `commit` where it decides on its next action before the update.
+# It is the temporal-difference learning of `agents.tabular`, with sums instead of table entries. If
+# each observation is a tile of its own, both are the same bit for bit. After termination the
+# discount is 0; a truncated episode still bootstraps. An algorithm defines `next_value`, and
+# `commit` if it chooses its next action before the update.
 #
 # Source: Sutton and Barto (2nd edition), section 10.1 (SARSA) and chapter 11 (Q-learning).
 
 
 @by_type
 def next_value(agent: LinearAgent, env: Any, progress: Any) -> float:
-    """What follows the step; ``agent.room.sums`` holds the values of the next actions."""
+    """The value of the next state; ``agent.room.sums`` has the values of the next actions."""
     raise CompiledOnlyError
 
 
 @by_type
 def commit(agent: LinearAgent, env: Any, progress: Any) -> None:
-    """Decide on ``env.next_action`` where the update needs it."""
+    """Choose ``env.next_action`` before the update, if the update needs it."""
 
 
 @called
 def no_commitment(agent: LinearAgent, env: Any, progress: Any) -> None:
-    """The next action is chosen when it is due."""
+    """Do nothing: the next action is chosen when it is due."""
 
 
 @called
@@ -113,7 +112,7 @@ class SemiGradientAlgorithm(TileAlgorithm):
         kwargs: as in `TileAlgorithm`.
     """
 
-    # What the training loops call; `next_value` is each algorithm's own.
+    # Called by the training loops; each algorithm defines `next_value`.
     choose_by_sums = choose_epsilon_greedily
     learn_from_step = semi_gradient_learning
     commit = no_commitment
@@ -170,8 +169,8 @@ def best_next_value(agent: LinearAgent, env: Any, progress: Any) -> float:
 class SemiGradientQ(SemiGradientAlgorithm):
     """Semi-gradient Q-learning (Sutton and Barto, chapter 11).
 
-    Off-policy, bootstrapping, and a function of features: the three together may diverge, as
-    Baird's counterexample does (section 11.2).
+    It may diverge, because it combines off-policy learning, bootstrapping and function
+    approximation (the deadly triad), as in Baird's counterexample (section 11.2).
     """
 
     next_value = best_next_value
@@ -182,7 +181,7 @@ class SemiGradientQ(SemiGradientAlgorithm):
 
 @called
 def commit_to_next_action(agent: LinearAgent, env: Any, progress: Any) -> None:
-    """Choose what to do next; nothing where nothing follows."""
+    """Choose the next action, unless the episode has terminated."""
     env.next_action = 0
     if not env.terminated:
         look(agent, env, AFTER, agent.room.next_tiles)
@@ -198,8 +197,8 @@ def committed_value(agent: LinearAgent, env: Any, progress: Any) -> float:
 class SemiGradientSARSA(SemiGradientAlgorithm):
     """Episodic semi-gradient SARSA (Sutton and Barto, section 10.1).
 
-    It commits to its next action before the update that uses it. Where an episode is truncated, it
-    chooses an action in the last state for the target alone.
+    It commits to its next action before the update that uses it. If an episode is truncated, it
+    chooses an action in the last state for the target only.
     """
 
     commit = commit_to_next_action

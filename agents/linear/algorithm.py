@@ -99,7 +99,7 @@ class TilePolicy(TablePolicy):
     def _predict(
         self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
     ) -> th.Tensor:
-        """The first of the best actions; an observation of each to shape (n,)."""
+        """The first of the best actions for each observation, shape (n,)."""
         assert isinstance(observation, th.Tensor)
         return th.from_numpy(self.sums(observation.numpy()).argmax(axis=1))
 
@@ -108,7 +108,7 @@ NUMBERED_ENV = env_dtype(("number", np.int64))
 
 
 class TileWorkspace(Workspace):
-    """A workspace with an agent, whose weights are worked on in place."""
+    """A workspace with an agent, whose weights are changed in place."""
 
     def __init__(self, agent: LinearAgent, space: spaces.Space[Any], n: int) -> None:
         super().__init__(n, NUMBERED_ENV)
@@ -119,14 +119,14 @@ class TileWorkspace(Workspace):
         self.agent = agent._replace(seen=self.seen)
 
     def act(self, observations: Any) -> Ints:
-        """An action for each observation, the one that was committed to where there is one."""
+        """An action for each observation: the one committed to, if there is one."""
         self.seen.before[:] = vectors_of(self.space, observations)
         act_in_all(self.agent, self.envs, self.progress[0])
         actions: Ints = self.fields["action"].copy()
         return actions
 
     def learn(self, transitions: Transitions) -> float:
-        """Learn from a step of each environment, and return the mean absolute error."""
+        """Learn from a step of each environment, and return the mean absolute TD error."""
         self.seen.before[:] = vectors_of(self.space, transitions.obs)
         self.seen.after[:] = vectors_of(self.space, transitions.next_obs)
         self.fields["action"][:] = transitions.actions
@@ -136,7 +136,7 @@ class TileWorkspace(Workspace):
 
 
 class TileEngine(CompiledEngine):
-    """One call of ``learn`` on the compiled loop, in a world that `network_world` has made."""
+    """One call of ``learn`` on the compiled loop, in a world made by `network_world`."""
 
     def __init__(
         self,
@@ -175,13 +175,13 @@ class TilePlayer(NamedTuple):
 
     @called
     def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Nothing is learnt; the next observations are there."""
+        """Learn nothing; move on to the next observations."""
         for i in range(len(envs)):
             move_on(self.seen, envs[i])
 
 
 class TileArguments(CommonArguments, total=False):
-    """What the constructors of these agents hand on; see `TileAlgorithm`."""
+    """Arguments that these agents' constructors pass on; see `TileAlgorithm`."""
 
     gamma: float
     n_tilings: int
@@ -192,27 +192,27 @@ class TileArguments(CommonArguments, total=False):
 
 
 class TileAlgorithm(WorkspaceAlgorithm):
-    """Learns weights of tiles: those of a tile coder, or a table's where observations are numbers.
+    """Learns weights of tiles: by tile coding, or as a table if observations are numbers.
 
     Args:
         policy: ``"TilePolicy"``.
-        env: environment with `Discrete` actions, and observations in a `Box` of shape (d,), which
-            count in single precision, or in a `Discrete` space; or its id.
+        env: environment with `Discrete` actions, and observations in a `Box` of shape (d,), read in
+            single precision, or in a `Discrete` space; or its id.
         learning_rate: step size, constant or scheduled. It is divided by the number of tilings, so
             that 1 moves a sum all the way to its target; the book's alpha is this quotient.
         tie_breaking: as in `LearningAlgorithm`.
         gamma: discount factor.
-        n_tilings: number of tilings. This and the next three are for a `Box`; of `Discrete`
-            observations each number is a tile of its own.
+        n_tilings: number of tilings. This and the next three are for a `Box`; each number of a
+            `Discrete` space is a tile of its own.
         n_tiles: tiles of each tiling in each dimension, a number or a list of d.
-        low: where tiles begin, a number or a list of d; None, there too, for the space's own bound.
-        high: where they end, likewise. What lies outside counts as lying on the edge.
-        engine: as in `TabularAlgorithm`; compiled are environments with a known model, CartPole and
-            MountainCar.
+        low: where tiles begin, a number or a list of d; None for the space's own bound.
+        high: where they end, likewise. Values outside count as lying on the bound.
+        engine: as in `TabularAlgorithm`; environments with a known model, CartPole and MountainCar
+            can be compiled.
         kwargs: as in `OnlineAlgorithm`.
 
     Raises:
-        ValueError: if an argument lies outside its range, a space does not fit, a dimension has no
+        ValueError: if an argument is outside its range, a space does not fit, a dimension has no
             bounds, or there would be too many weights.
     """
 
@@ -279,14 +279,14 @@ class TileAlgorithm(WorkspaceAlgorithm):
 
     @abstractmethod
     def _probabilities(self, sums: Floats) -> Floats:
-        """How likely actions are by sums of shape (n, A), likewise."""
+        """The probabilities of actions for sums of shape (n, A), same shape."""
 
     def _memory_record(self) -> Any:
-        """What compiled functions are handed besides the weights, in the memory of the agent."""
+        """Further state for compiled functions, in the memory of the agent."""
         return ()
 
     def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> LinearAgent:
-        """The agent as compiled functions see it, its weights in the memory of its policy."""
+        """The agent for compiled functions, with its weights in the memory of its policy."""
         tiles = self.policy.tiles
         here, ahead = np.empty((2, tiles.n_tilings), dtype=np.int64)
         room = Room(np.empty(len(tiles.dimensions)), here, ahead, np.empty(self.n_actions))
@@ -301,7 +301,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         )
 
     def greedy_player(self, seen: Any) -> TilePlayer:
-        """What plays as `predict` does on compiled environments, whose observations are read so."""
+        """A player with the same actions as `predict` on compiled environments."""
         agent = self.compiled_agent(self.rng, seen)
         return TilePlayer(agent.weights, agent.tiles, agent.seen, agent.room)
 
@@ -322,7 +322,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
-        """The action of the highest sum, or one as in training unless ``deterministic``.
+        """The action of the highest sum, or an exploring one unless ``deterministic``.
 
         Takes one observation or an array of n, and returns an action or n of them, and ``state``;
         ``episode_start`` is not used.
@@ -332,7 +332,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         return self._exploring_actions(observation), state
 
     def action_probabilities(self, observations: NDArray[Any] | None = None) -> Floats:
-        """What the policy does now that training acts by, shape (n, A).
+        """The present probabilities of the policy that acts in training, shape (n, A).
 
         Args:
             observations: n of them; by default all numbers of a `Discrete` space.

@@ -26,7 +26,7 @@ from envs.known_models import time_limit
 from machine_code.compiling import called
 from mdp.transition_model import Floats, Ints
 
-# Policies that draw actions by a softmax of preferences, and steps along their gradient.
+# Softmax policies on preferences, and steps along their gradient.
 #
 # With binary features, the gradient of ln pi(a) by the weights of action b at an active tile is
 # 1 - pi(b) for b = a, and -pi(b) else.
@@ -70,7 +70,7 @@ def move_state_value(weights: Floats, tiles: Ints, step: float) -> None:
 
 
 class SoftmaxArguments(TileArguments, total=False):
-    """What the constructors of these agents hand on; see `SoftmaxAlgorithm`."""
+    """Arguments that these agents' constructors pass on; see `SoftmaxAlgorithm`."""
 
     initial_preferences: float | Sequence[float]
     gamma_power: bool
@@ -80,12 +80,12 @@ class SoftmaxAlgorithm(TileAlgorithm):
     """A policy gradient on preferences that are sums of weights over active tiles.
 
     Args:
-        policy: ``"TilePolicy"``; greedy means the action that is most probable.
+        policy: ``"TilePolicy"``; its greedy action is the most probable one.
         env: as in `TileAlgorithm`.
         learning_rate: step size of the policy, as in `TileAlgorithm`.
         initial_preferences: each action's preference at the start, a number or a list of A.
-        gamma_power: weigh what is learnt about the policy at step t of an episode by gamma to the
-            power t, as the book's pseudocode does; many programs leave that out.
+        gamma_power: multiply the policy's update at step t of an episode by gamma to the power t,
+            as in the book's pseudocode; many programs leave this out.
         kwargs: as in `TileAlgorithm`.
     """
 
@@ -123,11 +123,10 @@ class SoftmaxAlgorithm(TileAlgorithm):
 
 
 class Critic(NamedTuple):
-    """What the agent keeps besides its preferences."""
+    """The state of the agent besides its preferences."""
 
     values: Floats  # weights of the state values, shape (tiles,)
-    # Gamma to the power of the steps of the episode under way in each of n environments, shape
-    # (n,).
+    # Gamma to the power of the steps so far in the episodes of n environments, shape (n,).
     discounts: Floats
 
 
@@ -148,7 +147,7 @@ def actor_critic_step(agent: LinearAgent, env: Any, progress: Any, discount: flo
 
 @called
 def actor_critic_learning(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """The updates in order."""
+    """Update for each environment in order."""
     total_error, discounts = 0.0, agent.memory.discounts
     for i in range(len(envs)):
         env = envs[i]
@@ -162,14 +161,14 @@ def actor_critic_learning(agent: LinearAgent, envs: Any, progress: Any) -> None:
 class ActorCritic(SoftmaxAlgorithm):
     """One-step actor-critic, episodic (Sutton and Barto, section 13.5).
 
-    The TD error of a learnt state value moves that value, and the policy's preferences. Where an
-    episode terminates, nothing follows; where it is truncated, the value of the last state does.
+    The TD error of a learnt state value moves that value, and the policy's preferences. If an
+    episode is truncated, the target bootstraps from its last state.
 
     Args:
         policy: ``"TilePolicy"``.
         env: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
-        value_step_size: step size of the state values, divided by the number of tilings likewise.
+        value_step_size: step size of the state values, also divided by the number of tilings.
         kwargs: as in `SoftmaxAlgorithm`.
     """
 
@@ -211,23 +210,23 @@ class ActorCritic(SoftmaxAlgorithm):
 Baseline = Literal["none", "value"]
 
 FIRST_CAPACITY = 64
-# Eight bytes each: steps that are kept times tilings, over all environments.
+# Eight bytes each: stored steps times tilings, over all environments.
 MOST_KEPT = 50_000_000
 
 
 class KeptEpisodes(NamedTuple):
-    """What the agent keeps besides its preferences: the episodes under way in n environments."""
+    """The state of the agent besides its preferences: current episodes of n environments."""
 
     values: Floats  # weights of the state values, shape (tiles,); of shape (0,) without a baseline
-    lengths: Ints  # steps that are kept, shape (n,)
+    lengths: Ints  # numbers of stored steps, shape (n,)
     tiles: Ints  # active tiles of the observations, shape (n, capacity, n_tilings)
-    actions: Ints  # what was done, shape (n, capacity)
-    rewards: Floats  # what it gave, shape (n, capacity); the returns, once the episode is over
+    actions: Ints  # shape (n, capacity)
+    rewards: Floats  # shape (n, capacity); replaced by the returns when the episode is over
 
 
 @called
 def keep_step(agent: LinearAgent, env: Any, i: int) -> None:
-    """Note the step that environment ``i`` has taken."""
+    """Store the last step of environment ``i``."""
     kept, room = agent.memory, agent.room
     t = kept.lengths[i]
     look(agent, env, BEFORE, room.tiles)
@@ -248,7 +247,7 @@ def make_returns(rewards: Floats, n_steps: int, gamma: float, following: float) 
 
 @called
 def reinforce_step(agent: LinearAgent, i: int, t: int, step: float) -> float:
-    """Learn from step ``t`` of a finished episode, and return by how much it beat the baseline."""
+    """Learn from step ``t`` of a finished episode; return its return less the baseline."""
     kept, room, settings = agent.memory, agent.room, agent.settings
     for k in range(len(room.tiles)):
         room.tiles[k] = kept.tiles[i, t, k]
@@ -281,7 +280,7 @@ def learn_from_episode(agent: LinearAgent, env: Any, progress: Any, i: int) -> N
 
 @called
 def learn_at_ends(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """Keep all steps, and learn from the episodes that have ended."""
+    """Store all steps, and learn from the episodes that have ended."""
     for i in range(len(envs)):
         env = envs[i]
         keep_step(agent, env, i)
@@ -294,22 +293,22 @@ class Reinforce(SoftmaxAlgorithm):
     """REINFORCE, Monte Carlo policy gradient (Williams, 1992; Sutton and Barto, 13.3 and 13.4).
 
     It learns at the end of an episode, step by step from the first one on. The return of a
-    truncated episode ends where the episode does, and goes on with the value of its last state
-    where ``baseline`` is ``"value"``.
+    truncated episode ends at the truncation; with the baseline ``"value"`` it bootstraps from the
+    last state.
 
     Args:
         policy: ``"TilePolicy"``.
         env: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
-        baseline: what returns are compared with: ``"none"``, or ``"value"``, a learnt state value.
-        value_step_size: step size of that value, divided by the number of tilings likewise.
+        baseline: subtracted from returns: ``"none"``, or ``"value"``, a learnt state value.
+        value_step_size: step size of that value, also divided by the number of tilings.
         kwargs: as in `SoftmaxAlgorithm`.
     """
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
     learn_from_step = learn_at_ends
 
-    # An agent that is loaded begins new episodes.
+    # A loaded agent begins new episodes.
     _kept = ("_lengths", "_kept_tiles", "_kept_actions", "_kept_rewards")
     _rebuilt = (*SoftmaxAlgorithm._rebuilt, *_kept)
 
@@ -337,7 +336,7 @@ class Reinforce(SoftmaxAlgorithm):
 
     @property
     def values_states(self) -> bool:  # type: ignore[override]
-        """Whether the policy holds weights of state values."""
+        """Whether the policy has weights of state values."""
         return self.baseline == "value"
 
     def _begin_episodes(self) -> None:
@@ -346,7 +345,7 @@ class Reinforce(SoftmaxAlgorithm):
         self._keep_up_to(FIRST_CAPACITY)
 
     def _keep_up_to(self, n_steps: int) -> None:
-        """Make room for so many steps of each episode, with what is kept so far."""
+        """Enlarge the buffers to ``n_steps`` steps of each episode, keeping stored steps."""
         n_tilings, n_envs = self.policy.tiles.n_tilings, self.n_envs
         shapes = (n_envs, n_steps, n_tilings), (n_envs, n_steps), (n_envs, n_steps)
         for name, shape in zip(self._kept[1:], shapes, strict=True):

@@ -17,23 +17,22 @@ from agents.networks.network_worlds import BEFORE, observe
 from machine_code.compiling import called, kernel
 from mdp.transition_model import Floats, Ints
 
-# Tile coding: an observation as the tiles that it lies in, one of each of several tilings.
+# Tile coding: an observation has one active tile in each of several tilings.
 #
-# A tiling cuts the space between ``low`` and ``high`` into tiles of equal width. Another one is
-# displaced by a share of a tile that differs between the dimensions: tiling t by (1, 3, 5, ...) t /
-# n tiles, where n tilings there are, and whole tiles left out. To cover the space all the same it
-# has a tile more in each dimension. Tiles are numbered; nothing is hashed. A number that stands for
-# itself, as a state of a table, is a dimension with one tiling of tiles of width 1.
+# A tiling cuts the space between ``low`` and ``high`` into tiles of equal width. Tiling t of n is
+# displaced by (1, 3, 5, ...) t / n tiles, a different share in each dimension, modulo one tile. To
+# cover the space, displaced tilings have one more tile in each dimension. Tiles are numbered;
+# nothing is hashed. A state of a table is a dimension with one tiling of tiles of width 1.
 #
 # Source: Sutton and Barto (2nd edition), section 9.5.4.
 
-# How tiles lie along a dimension; one array is compiled sooner than four.
+# The tiles along a dimension; one array compiles faster than four.
 DIMENSION = np.dtype(
     [
         ("low", np.float64),  # where tiles begin
-        ("steps", np.float64),  # steps of one n-th of a tile in a unit of the observation
-        ("n_steps", np.int64),  # such steps between low and high
-        ("stride", np.int64),  # by how much a tile's number grows from one to the next
+        ("steps", np.float64),  # steps (of 1/n tile each) per unit of the observation
+        ("n_steps", np.int64),  # steps between low and high
+        ("stride", np.int64),  # difference of the numbers of neighbouring tiles
     ],
     align=True,
 )
@@ -44,19 +43,19 @@ class Tiles(NamedTuple):
 
     dimensions: NDArray[np.void]  # records of type `DIMENSION`, shape (d,)
     n_tilings: int  # number n of tilings
-    n_in_tiling: int  # tiles of each of them
+    n_in_tiling: int  # number of tiles in each tiling
 
     @property
     def n_tiles(self) -> int:
-        """Tiles of all tilings."""
+        """Number of tiles in all tilings."""
         return self.n_tilings * self.n_in_tiling
 
 
 @called
 def active_tiles(tiles: Tiles, vector: Floats, active: Ints) -> None:
-    """Fill in the tile of each tiling that a vector lies in.
+    """Fill in the active tile of each tiling for a vector.
 
-    What lies outside of the bounds, or is no number, counts as lying on them.
+    Values outside the bounds count as lying on the bound, and nan as the lower bound.
     """
     for tiling in range(len(active)):
         active[tiling] = tiling * tiles.n_in_tiling
@@ -86,8 +85,8 @@ def tiles_of_all(tiles: Tiles, vectors: Floats) -> Ints:
 
 
 def tiles_between(low: Floats, tiles_per_unit: Floats, counts: Ints, n_tilings: int) -> Tiles:
-    """Tilings of a space."""
-    # What is displaced covers the space with a tile more.
+    """The tilings of a space from ``low`` on, with ``counts`` tiles in each dimension."""
+    # Displaced tilings need one more tile to cover the space.
     sizes = [int(count) + (n_tilings > 1) for count in counts]
     dimensions = np.zeros(len(sizes), dtype=DIMENSION)
     dimensions["low"] = low
@@ -97,11 +96,11 @@ def tiles_between(low: Floats, tiles_per_unit: Floats, counts: Ints, n_tilings: 
     return Tiles(dimensions, n_tilings, math.prod(sizes))
 
 
-# What settings say of tile coding, checked, and observations as it reads them.
+# Tilings from settings, which are checked, and observations as vectors.
 
 # Eight bytes each.
 MOST_WEIGHTS = 20_000_000
-# Environments say that there is no bound by infinity, or by the largest number there is.
+# Environments without bounds have infinity or the largest number as a bound.
 UNBOUNDED = float(np.finfo(np.float32).max)
 
 Bound = float | Sequence[float | None] | None
@@ -118,16 +117,16 @@ def make_tiles(
     """The tilings of an observation space.
 
     Args:
-        space: `Box` of shape (d,); or `Discrete`, each number of which is a tile, whatever the
-            other arguments are.
+        space: `Box` of shape (d,); or `Discrete`, where each number is a tile, whatever the other
+            arguments are.
         n_tilings: number of tilings.
-        n_tiles: tiles between low and high, for all dimensions or for each.
-        low: where tiles begin, likewise; None for the space's own bound.
+        n_tiles: tiles between low and high, one number or one for each dimension.
+        low: where tiles begin, one number or one for each dimension; None for the space's bound.
         high: where they end, likewise.
-        n_actions: weights that each tile is to have.
+        n_actions: weights of each tile.
 
     Raises:
-        ValueError: if a bound is missing or out of order, a number is not whole or too small, or
+        ValueError: if a bound is missing or out of order, a number is no integer or too small, or
             there would be too many weights.
     """
     if isinstance(space, spaces.Discrete):
@@ -147,7 +146,7 @@ def make_tiles(
 
 
 def vectors_of(space: spaces.Space[Any], observations: Any) -> Floats:
-    """Observations as `Tiles` read them, those of a `Box` in single precision."""
+    """Observations as vectors for `Tiles`, shape (n, d); a `Box` in single precision."""
     given = np.asarray(observations)
     if not isinstance(space, spaces.Discrete):
         assert space.shape is not None
@@ -203,15 +202,15 @@ def _whole_number(name: str, value: Any) -> int:
 
 # Agents whose values or preferences are sums of weights: one for each active tile and action.
 #
-# Compiled functions, shared by the interpreted and the compiled training loop. What an algorithm
-# adds is how it chooses among the sums, and how it learns. Step sizes are divided by the number of
-# tilings, so that a step size of 1 moves a sum all the way to its target.
+# Compiled functions, shared by the interpreted and the compiled training loop. An algorithm defines
+# how to choose by the sums, and how to learn. Step sizes are divided by the number of tilings, so
+# that a step size of 1 moves a sum all the way to its target.
 #
 # Source: Sutton and Barto (2nd edition), sections 9.4 and 9.5.4.
 
 
 class Room(NamedTuple):
-    """Where numbers are worked out; what it holds between two calls means nothing."""
+    """Scratch arrays, without meaning between two calls."""
 
     vector: Floats  # an observation, shape (d,)
     tiles: Ints  # the active tiles of an observation, shape (n_tilings,)
@@ -220,20 +219,20 @@ class Room(NamedTuple):
 
 
 class LinearAgent(NamedTuple):
-    """An agent as compiled functions see it."""
+    """An agent for compiled functions."""
 
-    settings: Any  # a record of the type that its class has
+    settings: Any  # a record of its class's type
     # Of action values or preferences, in the memory of its policy, shape (tiles, A).
     weights: Floats
-    memory: Any  # what else it keeps; each algorithm has a type of its own for that
+    memory: Any  # further state; each algorithm has its own type
     tiles: Tiles  # how observations become tiles
     seen: Any  # how observations are read from the environments' records
-    room: Room  # for its work
+    room: Room  # scratch arrays
     rng: Any  # a handle of its generator
 
 
 class HandedVectors(NamedTuple):
-    """Observations that the interpreted loop hands over, of environments that know their number."""
+    """Observations that the interpreted loop passes, by the number of the environment."""
 
     before: Floats  # the observations before the step, shape (n, d)
     after: Floats  # those after it, before any reset, shape (n, d)
@@ -246,7 +245,7 @@ class HandedVectors(NamedTuple):
 
     @called
     def move_on(self, env: Any) -> None:
-        """The interpreted loop does that."""
+        """Do nothing: the interpreted loop moves on by itself."""
 
 
 @by_type
@@ -257,7 +256,7 @@ def choose_by_sums(agent: LinearAgent, progress: Any) -> int:
 
 @called
 def look(agent: LinearAgent, env: Any, moment: int, tiles: Ints) -> None:
-    """Fill in the tiles that are active at that moment of the environment's last step."""
+    """Fill in the tiles that are active at this moment of the environment's last step."""
     observe(agent.seen, env, moment, agent.room.vector)
     active_tiles(agent.tiles, agent.room.vector, tiles)
 
@@ -288,14 +287,14 @@ def add_up(agent: LinearAgent, tiles: Ints) -> None:
 
 @called
 def choose(agent: LinearAgent, tiles: Ints, progress: Any) -> int:
-    """An action where these tiles are active."""
+    """Choose an action in a state with these active tiles."""
     add_up(agent, tiles)
     return choose_by_sums(agent, progress)
 
 
 @called
 def act_on_tiles(agent: LinearAgent, env: Any, progress: Any) -> None:
-    """Do what was committed to, or choose."""
+    """Take the action that the agent has committed to, or choose one."""
     env.action = env.next_action
     env.next_action = UNDECIDED
     if env.action == UNDECIDED:

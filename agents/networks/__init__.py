@@ -1,1 +1,1 @@
-"""Multilayer perceptrons as compiled code: how they are evaluated, differentiated and trained."""
+"""Multilayer perceptrons as compiled code: forward pass, gradients and training."""

@@ -1,7 +1,7 @@
-"""Compiled environments as networks see them.
+"""The observations of compiled environments, as inputs of networks.
 
-Environments keep numbers of states; CartPole and MountainCar, whose states nobody counts, keep
-vectors. Networks and their buffers want rows. Which kind applies is looked up by type
+Environments keep numbers of states; CartPole and MountainCar, with infinitely many states, keep
+vectors. Networks and their buffers need rows. Functions are chosen by type
 (`agents.compiled.loop`).
 """
 
@@ -27,23 +27,23 @@ BEFORE, AFTER = range(2)
 
 @by_type
 def observe(seen: Any, env: Any, moment: int, row: Any) -> None:
-    """Write what the environment showed at that moment of its last step into ``row``."""
+    """Write the observation at this moment of the environment's last step into ``row``."""
 
 
 @by_type
 def move_on(seen: Any, env: Any) -> None:
-    """Let the present observation be the one that the next action is chosen for."""
+    """Make the new observation the one that the next action is chosen for."""
 
 
 @inlined
 def number_at(env: Any, moment: int) -> int:
-    """The number that stands for the observation."""
+    """The number of the observation."""
     return int(env.obs if moment == BEFORE else env.next_obs)
 
 
 @inlined
 def look(seen: Any, env: Any, moment: int, inputs: Inputs, one_hot: int) -> None:
-    """Let the first row of a network's inputs be what the environment showed at that moment."""
+    """Write the observation at this moment into the first row of a network's inputs."""
     if one_hot:
         inputs.indices[0] = number_at(env, moment)
     else:
@@ -52,7 +52,7 @@ def look(seen: Any, env: Any, moment: int, inputs: Inputs, one_hot: int) -> None
 
 @inlined
 def show(inputs: Inputs, i: int, row: Any, one_hot: int) -> None:
-    """Put a row of a buffer into the i-th of a network's inputs."""
+    """Write a row of a buffer into the i-th row of a network's inputs."""
     if one_hot:
         inputs.indices[i] = int(row[0])
     else:
@@ -61,7 +61,7 @@ def show(inputs: Inputs, i: int, row: Any, one_hot: int) -> None:
 
 
 class Numbers(NamedTuple):
-    """Observations are numbers, which networks see as one-hot vectors."""
+    """Observations are numbers, which networks get as one-hot vectors."""
 
     n: int  # how many there are
 
@@ -79,7 +79,7 @@ class Numbers(NamedTuple):
 class StateVectors(NamedTuple):
     """Observations are vectors, one for each state of a known model."""
 
-    table: Singles  # what is observed in each state, shape (S, d)
+    table: Singles  # the observation of each state, shape (S, d)
 
     @inlined
     def observe(self, env: Any, moment: int, row: Any) -> None:
@@ -112,21 +112,21 @@ class OwnVectors(NamedTuple):
             env.vector[j] = env.new_vector[j]
 
 
-# What acting leaves for learning.
+# Fields that acting fills in for learning.
 _ESTIMATES = (("value", np.float64), ("log_probability", np.float64))
 
 _FINITE_ENV = env_dtype(("state", np.int64), *_ESTIMATES)
 
 
 class InFull(NamedTuple):
-    """CartPole or MountainCar, showing its state."""
+    """CartPole or MountainCar, with its state as the observation."""
 
     time_limit: int  # steps after which an episode is truncated, or 0 for never
-    dynamics: CartPole | MountainCar  # what moves it
+    dynamics: CartPole | MountainCar  # its compiled dynamics
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
-        """Push as ``env.action`` says."""
+        """Take ``env.action``."""
         step(self.dynamics, env, handle)
         show_state(self.dynamics, env, env.next_vector)
         show_state(self.dynamics, env, env.new_vector)
@@ -145,7 +145,7 @@ def show_state(world: Any, env: Any, vector: Any) -> None:
 
 @lru_cache(maxsize=4)
 def _record_in_full(names: tuple[str, ...]) -> np.dtype[np.void]:
-    """The record of an environment with a state of these numbers, which networks see."""
+    """The record type of an environment with a state of these numbers, also as vectors."""
     vectors: Any = [
         (name, np.float32, (len(names),)) for name in ("vector", "next_vector", "new_vector")
     ]
@@ -153,7 +153,7 @@ def _record_in_full(names: tuple[str, ...]) -> np.dtype[np.void]:
 
 
 def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
-    """The compiled counterpart of environments, and how networks see it."""
+    """The compiled counterpart of environments, and how to read its observations."""
     world = compile_envs(vec_env)
     space = vec_env.observation_space
     if isinstance(space, spaces.Discrete):
@@ -168,7 +168,7 @@ def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
 
 
 class NetworkEnvStates(EnvStates):
-    """Environments of a training whose observations networks see."""
+    """The states of a training's environments, with observations for networks."""
 
     def __init__(self, vec_env: Any, world: Any, seen: Any) -> None:
         self.seen = seen
@@ -178,7 +178,7 @@ class NetworkEnvStates(EnvStates):
         super().__init__(vec_env, world, kind)
 
     def observations(self, records: Any, prefix: str) -> Any:
-        """What is shown now (no prefix), before (``next_``) or after a reset (``new_``)."""
+        """The observations now (no prefix), before (``next_``) or after a reset (``new_``)."""
         if isinstance(self.seen, Numbers):
             return records[f"{prefix}obs"].copy()
         if isinstance(self.seen, OwnVectors):
@@ -188,7 +188,7 @@ class NetworkEnvStates(EnvStates):
         return self.seen.table[records[f"{prefix}obs"]].reshape(len(records), *shape)
 
     def take_observations(self, last_obs: Any) -> None:
-        """Let the records begin with these observations, shape (n, ...)."""
+        """Set the records to these observations, shape (n, ...)."""
         if isinstance(self.seen, Numbers):
             self.records["obs"] = last_obs
         elif isinstance(self.seen, OwnVectors):
@@ -198,7 +198,7 @@ class NetworkEnvStates(EnvStates):
                 record["obs"] = self._state_of(shown.ravel(), int(record["state"]))
 
     def _state_of(self, shown: Any, state: int) -> int:
-        """The state that looks like that: the present one, or one that the agent has stayed at."""
+        """A state with this observation: ``state`` if it fits, else the first one that does."""
         table = self.seen.table
         if np.array_equal(table[state], shown):
             return state
@@ -206,6 +206,6 @@ class NetworkEnvStates(EnvStates):
 
 
 def network_playground(vec_env: VecEnv) -> tuple[Any, NetworkEnvStates, Any]:
-    """Environments to evaluate networks or tiles on: compiled, their states, how they are seen."""
+    """Environments to evaluate on: compiled, their states, and how to read observations."""
     world, seen = network_world(vec_env)
     return world, NetworkEnvStates(vec_env, world, seen), seen

@@ -1,7 +1,7 @@
-"""Networks that act on compiled environments, learning nothing.
+"""Networks that act on compiled environments without learning.
 
-Compiled sums are rounded in another order than PyTorch's. Where two actions are so close that this
-could decide, the library's `predict` does: what is played is what it would have played.
+Compiled sums are rounded in another order than PyTorch's. If two actions are so close that rounding
+could decide, the library's `predict` chooses, so that the actions are the same as the library's.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from agents.networks.perceptron import (
 from agents.networks.torch_bridge import FlatTensors, Network, Reference, address_of, call
 from machine_code.compiling import inlined, kernel
 
-# By so much, relative to what is added up for an output, the best has to be ahead: ten times what
-# rounding made of 64 to 400 units. And by so much at least, since PyTorch compares probabilities.
+# The best output must be ahead by this share of the sum of magnitudes (ten times the rounding error
+# with 64 to 400 units), and by at least this much, because PyTorch compares probabilities.
 CLEARLY, AT_LEAST = 4e-6, 1e-6
 
 _ASKED = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_double)
@@ -41,9 +41,9 @@ class GreedyNetwork(NamedTuple):
 
     layers: Layers  # its shape
     flat: Singles  # its parameters
-    single: Inputs  # one observation, to act on
-    single_outputs: Singles  # for what is put out for it
-    ask: np.uintp  # the address of what says the action where two are close
+    single: Inputs  # buffer for one observation
+    single_outputs: Singles  # buffer for its outputs
+    ask: np.uintp  # the address of the function that chooses if two actions are close
 
 
 @kernel
@@ -53,7 +53,7 @@ def choose_surely(network: Any, _: float, __: float) -> int:
     outputs = last_outputs(network.layers, network.single_outputs, 1)[0]
     best, unsure = first_best(outputs), _unsure(network, outputs)
     for k in range(len(outputs)):
-        # Numbers that are none are not ahead either.
+        # With nan the comparison is False, too.
         if k != best and not outputs[best] - outputs[k] > unsure:
             return call(network.ask, network, 0.0, 0.0)
     return best
@@ -61,7 +61,7 @@ def choose_surely(network: Any, _: float, __: float) -> int:
 
 @inlined
 def _unsure(network: Any, outputs: Singles) -> float:
-    """Up to which difference rounding may decide between two outputs."""
+    """The largest difference of two outputs at which rounding may decide."""
     layers, last, most = network.layers, len(network.layers.sizes) - 2, 0.0
     weights = weights_of(layers, network.flat, last)
     for k in range(len(outputs)):
@@ -75,13 +75,13 @@ def _unsure(network: Any, outputs: Singles) -> float:
 
 
 class AskingNetwork(Reference):
-    """A reference to a `GreedyNetwork`, which asks ``predict`` where two actions are close."""
+    """A reference to a `GreedyNetwork`, which calls ``predict`` if two actions are close."""
 
     def __init__(self, layers: Layers, flat: Singles, predict: Callable[[Inputs], int]) -> None:
         self.predict = predict
-        # What `predict` has raised, which cannot pass through compiled code.
+        # Exceptions of `predict`, which cannot pass through compiled code.
         self.errors: list[BaseException] = []
-        # Compiled code does not keep it alive.
+        # Kept here, because compiled code does not keep it alive.
         self._called = _ASKED(self._answer)
         ask = np.uintp(ctypes.cast(self._called, ctypes.c_void_p).value or 0)
         inputs, outputs = make_inputs(layers, 1), make_outputs(layers, 1)
@@ -98,7 +98,7 @@ class AskingNetwork(Reference):
 
 
 class NetworkPlayer(NamedTuple):
-    """The agent as the compiled loop calls it."""
+    """The agent for the compiled loop."""
 
     network: Any  # an `AskingNetwork`
     seen: Any  # how observations are read, of `agents.networks.network_worlds`
@@ -112,18 +112,18 @@ class NetworkPlayer(NamedTuple):
 
     @inlined
     def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Nothing is learnt; the next observations are there."""
+        """Learn nothing; move on to the next observations."""
         for i in range(len(envs)):
             move_on(self.seen, envs[i])
 
     def check(self) -> None:
-        """Raise what the library's `predict` has raised."""
+        """Raise the exception of the library's `predict`, if there was one."""
         if errors := self.network.errors:
             raise errors.pop()
 
 
 def network_player(network: Network, seen: Any, predict: Callable[[Inputs], int]) -> NetworkPlayer:
-    """A network as it is now, whose parameters are copied."""
+    """A player with a copy of a network's present parameters."""
     tensors = FlatTensors([network])
     with th.no_grad():
         for parameter, place in tensors.places:
