@@ -1,4 +1,4 @@
-"""Trains an agent of the library on the compiled loop, and keeps the rest from noticing."""
+"""Trains an agent of the library on the compiled loop, with the library's callbacks and logs."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ from agents.networks.torch_bridge import FlatTensors, Reference, SharedOptimizer
 
 
 class RolloutEvents:
-    """What the callbacks of a training are told of its rollouts, which blocks may pass over."""
+    """Calls the rollout methods of a training's callbacks; a block may span several rollouts."""
 
     def __init__(self, agent: Any, callback: BaseCallback) -> None:
         self.agent = agent
         asked = [member for member in members(callback) if type(member) is not CallbackList]
-        # Where one acts on rollouts, blocks have to end with them.
+        # For callbacks that act on rollouts, blocks must end with a rollout.
         self.of_rollouts = [member for member in asked if heeds_rollouts(member)]
         self.of_blocks = [member for member in asked if not heeds_rollouts(member)]
 
     @property
     def are_waited_for(self) -> bool:
-        """Whether a callback acts at the end of this rollout, before it is learnt from."""
+        """Whether a callback acts at the end of this rollout, before the agent learns from it."""
         return any(
             not isinstance(member, BlockCallback) or member.wants_rollout_end()
             for member in self.of_rollouts
         )
 
     def begin(self) -> None:
-        """A block begins, and perhaps a rollout; a run that was cut off goes back to its state."""
+        """Signal the start of a block, and of a rollout if one begins; resumed runs restore now."""
         for member in self.of_blocks:
             member.on_rollout_start()
         if not self.agent.is_within_rollout:
@@ -57,34 +57,34 @@ class RolloutEvents:
                 member.on_rollout_start()
 
     def end(self) -> None:
-        """A rollout ends, before it is learnt from."""
+        """Signal the end of a rollout, before the agent learns from it."""
         for member in self.of_rollouts:
             member.on_rollout_end()
 
     def end_block(self) -> None:
-        """A block ends, and has been learnt from."""
+        """Signal the end of a block, after the agent has learnt from it."""
         for member in self.of_blocks:
             member.on_rollout_end()
 
 
-# An address that is filled in once there is a reference to what it belongs to.
+# A placeholder of an address, until there is a reference to the learner.
 NOWHERE = np.uintp(0)
 
 
 class NetworkTraining:
-    """An agent of the library in training, whose networks lie in the memory of compiled code.
+    """An agent of the library in training, with its networks in the memory of compiled code.
 
-    What `QTraining` and `PolicyTraining` share, who make the learner.
+    The base of `QTraining` and `PolicyTraining`, which make the learner.
     """
 
-    held: Any  # the agent as compiled functions see it
+    held: Any  # the learner for compiled functions
     learner: Reference  # the same by reference
 
     def __init__(self, agent: Any, seen: Any) -> None:
         self.agent = agent
-        self.seen = seen  # how its networks see compiled environments
-        self.waits = False  # whether rollouts wait for `learn_from_rollout`, and not in the loop
-        # A handle does not keep it alive.
+        self.seen = seen  # how to read observations of compiled environments
+        self.waits = False  # whether to learn by `learn_from_rollout` instead of in the loop
+        # Kept here, because its handle does not keep it alive.
         self.generator = agent.rng
         self.networks, lagging = agent.shared_networks(seen)
         self.trained, self.lagging = FlatTensors(self.networks), FlatTensors(lagging)
@@ -96,23 +96,23 @@ class NetworkTraining:
         self.shown = np.zeros((agent.n_envs, width))
 
     def close(self) -> None:
-        """Let networks and optimizer have memory of their own again."""
+        """Give networks and optimizer their own memory again."""
         for part in (self.trained, self.lagging, self.optimizer):
             part.give_back()
 
     def begin(self, held: Any, improve: Callable[[Any, float, float], int]) -> None:
-        """Take the learner, and the compiled function by which it learns from a minibatch."""
+        """Set the learner, and its compiled function that learns from a minibatch."""
         self.held = held
         self.learner = Reference(held)
         self.hold(improve=address_of(improve, self.learner))
 
     def hold(self, **parts: Any) -> None:
-        """Put other parts in the place of the learner's."""
+        """Replace parts of the learner."""
         self.held = self.held._replace(**parts)
         self.learner.hold(self.held)
 
     def read_tensors(self) -> None:
-        """Go on with the weights and the optimizer that a callback may have put there."""
+        """Use weights and an optimizer that a callback may have replaced."""
         self.trained.take_over()
         self.lagging.take_over()
         try:
@@ -123,18 +123,18 @@ class NetworkTraining:
             self.hold(optimizer=optimizer)
 
     def read_generator(self) -> None:
-        """Draw from the agent's generator, which a callback may have replaced."""
+        """Use the agent's generator, which a callback may have replaced."""
         if self.agent.rng is not self.generator:
             self.generator = self.agent.rng
             self.held.rng[:] = handles_of([self.generator])
 
     def show(self, observations: Any) -> None:
-        """Take observations of environments in Python, of as many numbers as there is room for."""
+        """Copy and check observations of environments in Python."""
         self.shown[:] = np.reshape(observations, self.shown.shape)
         self.check_numbers(self.shown)
 
     def check_numbers(self, shown: Any) -> None:
-        """Refuse numbers of states outside their space, where no weights are."""
+        """Raise ValueError for numbers of states outside their space."""
         if isinstance(self.seen, Numbers) and not (shown.min() >= 0 and shown.max() < self.seen.n):
             wrong = int(shown[(shown < 0) | (shown >= self.seen.n)][0])
             raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
@@ -146,14 +146,14 @@ class NetworkTraining:
 
 
 def record_of(kind: np.dtype[np.void], **values: Any) -> Any:
-    """A record, alone in an array."""
+    """An array of shape (1,) with one record."""
     records = np.zeros(1, dtype=kind)
     for name, value in values.items():
         records[name] = value
     return records
 
 
-# Between two blocks signals are seen to, and displays move.
+# Between two blocks Python handles signals, and displays are updated.
 SECONDS_PER_BLOCK = 0.2
 
 
@@ -177,7 +177,7 @@ class NetworkEngine(CompiledEngine):
         self.steps_at_once = 1
         self.has_begun = False
         self.in_loop = training.in_loop()
-        # Where rollouts are of a fixed length, episodes to train for do not move schedules.
+        # With rollouts of a fixed length, a budget of episodes does not change schedules.
         self.total_timesteps = training.agent._total_timesteps
         super().__init__(training.agent, world, callback, log_interval)
 
@@ -195,7 +195,7 @@ class NetworkEngine(CompiledEngine):
         return self.in_loop
 
     def _is_over(self, total_timesteps: int) -> bool:
-        # As in the library, what is being collected is collected to its end.
+        # As in the library, the current rollout is collected to its end.
         return bool(self.training.until_end(total_timesteps) <= 0)
 
     def _run_block(self, total_timesteps: int) -> bool:
@@ -218,7 +218,7 @@ class NetworkEngine(CompiledEngine):
         self._note_speed(n_steps, time.perf_counter() - began)
         episodes = Episodes.of(self.log.episodes[: progress["logged_episodes"]])
         if not self._tell(episodes, n_steps):
-            # As in the library, the last step is not learnt from, nor what belongs to it.
+            # As in the library, the agent does not learn from the last step and its rollout.
             self.training.give_up_rollout()
             return False
         self._learn_from_last(episodes, n_steps)
@@ -227,7 +227,7 @@ class NetworkEngine(CompiledEngine):
 
     def _learn_from_last(self, episodes: Episodes, n_steps: int) -> None:
         training, progress = self.training, self.progress[0]
-        training.waits = self.rollouts.are_waited_for  # perhaps only since its last step
+        training.waits = self.rollouts.are_waited_for  # may have changed at the last step
         if not training.waits:
             training.before_training(self.log_interval)
         learn_from_last_step(self._learner(), self.envs, progress)
@@ -246,7 +246,7 @@ class NetworkEngine(CompiledEngine):
 
     def _begin_rollout(self) -> None:
         if not self.has_begun:
-            # Callbacks have been told already.
+            # Callbacks have been called already.
             self.has_begun = True
         elif wants_position(self.callback):
             self._write()
@@ -256,7 +256,7 @@ class NetworkEngine(CompiledEngine):
             self.rollouts.begin()
 
     def _steps_allowed(self, total_timesteps: int) -> Horizon:
-        """How far to go until somebody has to be asked."""
+        """The number of steps and episodes until a callback or the log is due."""
         agent = self.agent
         ahead, log = horizon(self.callback), self.training.until_log(self.log_interval)
         left = self.training.until_end(total_timesteps)
@@ -266,7 +266,7 @@ class NetworkEngine(CompiledEngine):
         return Horizon(max(steps, 1), min(ahead.episodes, log.episodes, over.episodes))
 
     def _note_speed(self, n_steps: int, seconds: float) -> None:
-        """Adapt how many steps a block may have; results do not depend on that."""
+        """Adapt the maximal length of a block; results do not depend on it."""
         fitting = n_steps * SECONDS_PER_BLOCK / max(seconds, 1e-6)
         self.steps_at_once = max(1, min(int(fitting), 4 * self.steps_at_once))
 

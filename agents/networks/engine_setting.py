@@ -1,4 +1,4 @@
-"""The argument ``engine`` of the library's agents: what it covers, costs and does."""
+"""The argument ``engine`` of the library's agents: its conditions, its costs, its effect."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ from agents.networks.playing import NetworkPlayer, network_player
 from agents.networks.torch_bridge import Network, check_optimizer, in_rows
 from machine_code.cache import is_compiled_before
 
-# Which trainings of the library's agents have a compiled counterpart.
+# Conditions for compiled trainings of the library's agents.
 
 
 def check_agent(agent: Any) -> None:
-    """Make sure that compiled functions do all that an agent of the library does."""
+    """Raise `NotCompilable` if compiled functions cannot do all that an agent does."""
     if not type(agent).__module__.startswith("agents."):
         raise NotCompilable(f"{type(agent).__name__} may do things in Python of its own")
     _check_spaces(agent)
@@ -70,49 +70,49 @@ def _check_spaces(agent: Any) -> None:
         raise NotCompilable(f"observations are of {observations.dtype}")
 
 
-# What a training of networks takes, in the library's loop and in compiled code.
+# The expected time of a training of networks, in the library's loop and in compiled code.
 #
-# For ``engine: auto`` this decides which of them runs. It goes by the settings alone, never by the
-# machine or by what has been compiled before: the two draw other random numbers, so the same
-# settings and the same seed must always choose the same one.
+# It decides for ``engine: auto`` which of them runs. It depends on the settings only, not on the
+# machine or the cache of compiled code: the two draw different random numbers, so the same settings
+# and the same seed must always choose the same one.
 
 # Processor seconds, measured on one core with one thread; `machine_pace` compares other machines.
 # Of the library's loop:
-CALL = 0.3e-3  # choosing actions for all environments, and keeping what comes of them
+CALL = 0.3e-3  # choosing actions for all environments, and storing the transitions
 ENV_STEP = 0.05e-3  # a step of one environment in Python, Monitor on
-UPDATE = {"q": 0.8e-3, "policy": 1.0e-3}  # learning from a minibatch: so much in any case,
-UPDATE_LAYER = {"q": 0.3e-3, "policy": 0.7e-3}  # for each layer,
-UPDATE_WEIGHT = 2.2e-10  # and for each weight and row of the minibatch
-# Of compiled code, the environment too:
+UPDATE = {"q": 0.8e-3, "policy": 1.0e-3}  # learning from a minibatch: a constant part,
+UPDATE_LAYER = {"q": 0.3e-3, "policy": 0.7e-3}  # plus this for each layer,
+UPDATE_WEIGHT = 2.2e-10  # plus this for each weight and row of the minibatch
+# Of compiled code with a compiled environment:
 COMPILED_STEP = 1.5e-6
-COMPILED_ROW = 0.15e-6  # a row of a minibatch: so much in any case,
-COMPILED_WEIGHT = 1.2e-10  # and for each weight, but those of one-hot observations
-# Of compiled code with the environment in Python, for each call of it and in the environment:
+COMPILED_ROW = 0.15e-6  # a row of a minibatch: a constant part,
+COMPILED_WEIGHT = 1.2e-10  # plus this for each weight, without those of one-hot observations
+# Of compiled code with the environment in Python, for each call:
 BRIDGE_CALL = 0.05e-3
 # Of compiling, once on a machine for all trainings of a kind.
 COMPILING = 9.0
 
-# What compiling must save, against the library's loop: as much as half of what it takes. Whoever
-# trains a second time has it back then.
+# The time that compiled code must save against the library's loop: about half of the time of
+# compiling, which is then recovered with the second training.
 WORTH_COMPILING = 5.0
-# Where a budget counts episodes, their length is guessed.
+# The assumed length of an episode, for budgets in episodes.
 STEPS_OF_EPISODE = 100
 
-PACE_AT_HOME = 3.9e-3  # of `machine_pace`'s work, where the others were measured
+PACE_AT_HOME = 3.9e-3  # of `machine_pace`'s work, on the machine of the measurements
 
 
 @dataclass(frozen=True)
 class Work:
     """The work of a training."""
 
-    kind: Literal["q", "policy"]  # ``"q"`` or ``"policy"``, which is a network of values too
+    kind: Literal["q", "policy"]  # ``"q"``, or ``"policy"`` (with a value network, too)
     n_steps: float  # environment steps, over all environments
     n_envs: int  # environments at once
-    n_updates: float  # minibatches that are learnt from
+    n_updates: float  # minibatches to learn from
     batch_size: float  # rows of a minibatch
     n_layers: int  # of one network
     n_weights: int  # of all networks that learn
-    n_dense_weights: int  # of them, those that are multiplied where observations are one-hot
+    n_dense_weights: int  # the same without weights of one-hot observations
 
     @property
     def library_seconds(self) -> float:
@@ -123,14 +123,14 @@ class Work:
 
     @property
     def compiled_seconds(self) -> float:
-        """The same in compiled code, without compiling."""
+        """Processor seconds in compiled code, without compiling."""
         row = COMPILED_ROW + COMPILED_WEIGHT * self.n_dense_weights
         step = COMPILED_STEP + COMPILED_WEIGHT * self.n_dense_weights
         return self.n_steps * step + self.n_updates * self.batch_size * row
 
     @property
     def bridged_seconds(self) -> float:
-        """The same with the environment in Python."""
+        """Processor seconds in compiled code with the environment in Python."""
         in_python = self._n_calls * BRIDGE_CALL + self.n_steps * ENV_STEP
         return self.compiled_seconds + in_python
 
@@ -153,7 +153,7 @@ def work_of(
     n_updates: float,
     batch_size: float,
 ) -> Work:
-    """The work of perceptrons; other arguments are attributes of `Work`."""
+    """The work of a training of these networks; other arguments are attributes of `Work`."""
     linears = [[m for m in net.modules() if isinstance(m, nn.Linear)] for net in networks]
     n_weights = sum(layer.weight.numel() for layers in linears for layer in layers)
     is_one_hot = isinstance(observations, spaces.Discrete)
@@ -164,17 +164,17 @@ def work_of(
     )
 
 
-# The function whose machine code is there once a training of the kind has been compiled.
+# The function that is compiled last in a training of each kind.
 _LAST_COMPILED = {"q": "learn_from_minibatch", "policy": "learn_from_rollout_minibatch"}
 
 
 def compiling_seconds(work: Work) -> float:
-    """How long compiling will take on this machine: 0 where its result is in the cache."""
+    """Seconds of compiling on this machine: 0 if the result is in the cache."""
     return 0.0 if is_compiled_before(_LAST_COMPILED[work.kind]) else COMPILING
 
 
 def machine_pace() -> float:
-    """How long this machine takes, relative to the one where the constants were measured."""
+    """The time that this machine takes, relative to the machine of the measurements."""
     rows, weights = th.ones(64, 64), th.full((64, 64), 1 / 64)
     taken = []
     with th.no_grad():
@@ -186,19 +186,19 @@ def machine_pace() -> float:
     return statistics.median(taken) / PACE_AT_HOME
 
 
-# The argument ``engine`` of the library's agents, and what it does to their training.
+# The argument ``engine`` of the library's agents, and its effect on training.
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
 TOO_SHORT = "so short a training is not worth compiling"
-# Where PyTorch's ``_disable_dynamo`` keeps a method that the compiler leaves alone.
+# The attribute in which PyTorch's ``_disable_dynamo`` keeps a method excluded from its compiler.
 _KEPT_OUT = "__dynamo_disable"
 
 
 def do_without_torch_compiler() -> None:
     """Let optimizers be made, saved and loaded without importing PyTorch's compiler.
 
-    Their methods import it at their first call, to keep it out of them; that takes a second. As
-    long as nobody else has imported it there is nothing to keep out. ``step`` imports it anyway.
+    At the first call their methods import the compiler, only to exclude themselves from it, which
+    takes a second. That is needless until something else imports it. ``step`` imports it anyway.
     """
     for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
         method = getattr(getattr(Optimizer, name), "__wrapped__", None)
@@ -221,10 +221,10 @@ class EnginePlan:
     """Which engine a training runs on, and why."""
 
     is_compiled: bool  # whether networks act and learn in compiled code
-    reason: str = ""  # why they do not although that would do; empty where nobody asked for it
-    # The compiled environments, and how networks see them; None where they run in Python.
+    reason: str = ""  # why they do not, if that was asked for
+    # The compiled environments, and how to read their observations; None if they run in Python.
     world: tuple[Any, Any] | None = None
-    in_python: str = ""  # why they do; empty where they do not, or nothing is compiled
+    in_python: str = ""  # why only the environments run in Python; else empty
 
     def __str__(self) -> str:
         if not self.is_compiled:
@@ -238,16 +238,16 @@ class CompiledNetworks(BaseAlgorithm):
     """An agent of the library that can train on compiled code.
 
     Args:
-        engine: ``"library"`` trains in the library's own loop; ``"compiled"`` in compiled code, the
-            environment too where its model is known, to the same results but for rounding and
-            random numbers, and is refused where that cannot be; ``"auto"`` compiles where it can
-            and the training is long enough, by `agents.networks.engine_setting.Work`, which goes by
-            settings and budget alone.
+        engine: ``"library"`` trains in the library's own loop. ``"compiled"`` trains in compiled
+            code (also the environment if its model is known), with the same results except for
+            rounding and random numbers; ValueError if that is impossible. ``"auto"`` compiles if it
+            can and the training is long enough, by `agents.networks.engine_setting.Work`, which
+            depends on settings and budget only.
         args: the library's arguments.
         kwargs: likewise.
 
     Attributes:
-        engine_in_use: what the last training ran on, and why.
+        engine_in_use: the engine of the last training, and the reason.
     """
 
     __signature__: ClassVar[inspect.Signature]
@@ -256,7 +256,7 @@ class CompiledNetworks(BaseAlgorithm):
     # A `QTraining` or a `PolicyTraining`.
     training_kind: ClassVar[Any]
 
-    # Of the training under way.
+    # Of the current training.
     excluded_from_states = ("_training", "_sharing")
     _own: ClassVar[tuple[str, ...]] = ("engine", "engine_in_use", "rng", "_training", "_sharing")
 
@@ -274,12 +274,12 @@ class CompiledNetworks(BaseAlgorithm):
         super().__init__(*args, **kwargs)
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Seed the library's generators, and that of compiled code."""
+        """Seed the library's generators, and the generator of compiled code."""
         super().set_random_seed(seed)
         (self.rng,) = np.random.default_rng(seed).spawn(1)
 
     def _check_compilable(self) -> None:
-        """Raise `NotCompilable` where compiled code does not do all that the agent does."""
+        """Raise `NotCompilable` if compiled code cannot do all that the agent does."""
         check_agent(self)
         self._check_own()
         check_optimizer(self.policy.optimizer)
@@ -287,14 +287,14 @@ class CompiledNetworks(BaseAlgorithm):
 
     @abstractmethod
     def _check_own(self) -> None:
-        """Raise `NotCompilable` for what this kind of agent cannot have."""
+        """Raise `NotCompilable` for settings of this kind of agent that are not supported."""
 
     @abstractmethod
     def shared_networks(self, seen: Any) -> tuple[list[Network], list[Network]]:
-        """The networks that learn, the acting one first, and their lagging copies."""
+        """The networks that learn, the acting one first, and their target networks."""
 
     def greedy_player(self, seen: Any) -> NetworkPlayer:
-        """What plays as `predict` does on compiled environments; ``seen`` reads observations."""
+        """A player with the actions of `predict` on compiled environments, read by ``seen``."""
         space, policy = self.observation_space, self.policy
         policy.set_training_mode(False)  # as `predict` does at each call
 
@@ -312,7 +312,7 @@ class CompiledNetworks(BaseAlgorithm):
         return [self.lr_schedule]
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
-        """Train as the library's ``learn`` does, on the engine that was asked for."""
+        """Train as the library's ``learn`` does, on the engine of the settings."""
         library: Any = super()
         given = inspect.signature(library.learn).bind(total_timesteps, *args, **kwargs)
         given.apply_defaults()
@@ -332,7 +332,7 @@ class CompiledNetworks(BaseAlgorithm):
     def engine_plan(
         self, total_timesteps: int, callback: Any, engine: NetworkEngineChoice | None = None
     ) -> EnginePlan:
-        """Which engine `learn` would run on, and why."""
+        """The engine that `learn` would use, and the reason."""
         engine = self.engine if engine is None else engine
         if engine == "library":
             return EnginePlan(is_compiled=False)
@@ -357,7 +357,7 @@ class CompiledNetworks(BaseAlgorithm):
 
     @abstractmethod
     def _work_of(self, n_steps: float) -> Work:
-        """The work of a training of so many steps."""
+        """The work of a training of ``n_steps`` steps."""
 
     @contextmanager
     def _learning_compiled(self) -> Iterator[None]:
@@ -372,16 +372,16 @@ class CompiledNetworks(BaseAlgorithm):
                 self._training, self._sharing = None, False
 
     def _shared_training(self) -> Any:
-        """The training under way, which begins with the first rollout.
+        """The current training, made at the first rollout.
 
-        Not before: a run that was cut off goes back to its last state there.
+        Not before, because an interrupted run restores its last state there.
         """
         if self._training is None:
             self._training = self.training_kind(self, self._seen_in_python())
         return self._training
 
     def _world_for(self, callback: Any) -> tuple[Any, Any]:
-        """The environments as compiled code, and how networks see them."""
+        """The environments as compiled code, and how to read their observations."""
         known = isinstance(callback, BaseCallback | list | None)
         unknown = unknown_callbacks(CallbackList(_each(callback))) if known else ["a function"]
         if unknown:
@@ -413,14 +413,14 @@ class CompiledNetworks(BaseAlgorithm):
         )
         callback.on_training_start(locals(), globals())
         if self.num_timesteps < total_timesteps:
-            # A run that was cut off goes back to its last state here.
+            # An interrupted run restores its last state here.
             RolloutEvents(self, callback).begin()
             with one_thread(), closing(self.training_kind(self, seen)) as training:
                 NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
         callback.on_training_end()
 
     def get_parameters(self) -> dict[str, dict[str, Any]]:
-        """As the library's, also in the middle of a training."""
+        """As in the library, also during a training."""
         return {name: in_rows(state) for name, state in super().get_parameters().items()}
 
     def _excluded_save_params(self) -> list[str]:
@@ -428,7 +428,7 @@ class CompiledNetworks(BaseAlgorithm):
 
 
 def _each(callback: Any) -> list[BaseCallback]:
-    """The callbacks in what `learn` takes as ``callback``; a function is none of them."""
+    """The callbacks in the argument ``callback`` of `learn`, without functions."""
     if isinstance(callback, BaseCallback):
         return members(callback)
     return [each for one in callback for each in members(one)] if isinstance(callback, list) else []

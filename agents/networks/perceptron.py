@@ -17,9 +17,9 @@ from threadpoolctl import ThreadpoolController
 from machine_code.compiling import internal, vectorised, view
 from mdp.transition_model import Ints
 
-# Products of matrices in single precision, by the BLAS that SciPy brings: Numba's own `numpy.dot`
-# counts references, which compiled loops here do without. BLAS counts by columns, so it is handed
-# the transposed problem: the rows of one matrix are its columns.
+# Products of matrices in single precision, by SciPy's BLAS: Numba's own `numpy.dot` counts
+# references, which compiled loops here avoid. BLAS stores matrices by columns, so it gets the
+# transposed problem: the rows of a matrix are its columns.
 
 Singles = NDArray[np.float32]
 
@@ -31,14 +31,14 @@ TRANSPOSED = ord("T")
 
 @cache
 def _controller() -> ThreadpoolController:
-    # SciPy's BLAS is there by now: it has been asked for its address.
+    # SciPy's BLAS is loaded by now, because `sgemm_address` has been called.
     return ThreadpoolController()
 
 
 def one_thread() -> AbstractContextManager[Any]:
-    """Let BLAS work in one thread for a while.
+    """Limit BLAS to one thread within a ``with`` statement.
 
-    Matrices are too small for more to pay, and with several the last bits depend on their number.
+    The matrices are too small for several threads, whose number would change the last bits.
     """
     sgemm_address()
     limited: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
@@ -46,7 +46,7 @@ def one_thread() -> AbstractContextManager[Any]:
 
 
 def sgemm_address() -> np.uintp:
-    """Where BLAS's routine lies in this process, for compiled functions to call."""
+    """The address of BLAS's routine in this process, for compiled functions."""
     return np.uintp(get_cython_function_address("scipy.linalg.cython_blas", "sgemm"))
 
 
@@ -66,7 +66,7 @@ def _sgemm(
     product: Any,
     product_stride: Any,
 ) -> Any:
-    """BLAS's ``sgemm``, without the factors: all it is given are addresses of numbers."""
+    """BLAS's ``sgemm`` with factors 1 and 0; it takes all arguments by address."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         address, first_kind, second_kind, *numbers = arguments
@@ -105,7 +105,7 @@ def _sgemm(
     )
 
 
-# Numba takes the first argument away, which type checkers cannot see.
+# Numba removes the first argument, which type checkers cannot see.
 _call: Any = _sgemm
 
 
@@ -132,13 +132,13 @@ def multiply(
     )
 
 
-# Activation functions in single precision, and their derivatives, which outputs alone decide.
+# Activation functions in single precision, and their derivatives as functions of the outputs.
 
 IDENTITY, RELU, TANH = range(3)
 
-# Coefficients of a rational function of x squared, from the highest power on, as Eigen's
-# `generic_fast_tanh_float` has them: within a few units in the last place, and without a call, so
-# that many numbers are worked out at once.
+# Coefficients of a rational function of x squared, from the highest power on, from Eigen's
+# `generic_fast_tanh_float`: within a few units in the last place, and without a function call, so
+# that it can be vectorised.
 _NUMERATOR = (
     np.float32(-2.76076847742355e-16),
     np.float32(2.00018790482477e-13),
@@ -162,7 +162,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 @internal
 def tanh(x: Any) -> Any:
     """The hyperbolic tangent of a single-precision number."""
-    # What is not a number stays that.
+    # nan stays nan.
     x = _BOUND if x > _BOUND else x
     x = -_BOUND if x < -_BOUND else x
     square = x * x
@@ -176,7 +176,7 @@ def tanh(x: Any) -> Any:
 
 @vectorised
 def activate(rows: Singles, bias: Singles, kind: int) -> None:
-    """Add the bias to each row, shape (n, d), and apply the function of that kind."""
+    """Add the bias to each row, shape (n, d), and apply the activation function ``kind``."""
     for i in range(len(rows)):
         row = rows[i]
         if kind == RELU:
@@ -193,7 +193,7 @@ def activate(rows: Singles, bias: Singles, kind: int) -> None:
 
 @vectorised
 def pull_back(errors: Singles, outputs: Singles, kind: int) -> None:
-    """Turn derivatives by the outputs into those by the inputs, in place, shape (n, d)."""
+    """Turn derivatives by outputs into derivatives by inputs, in place, shape (n, d)."""
     for i in range(len(errors)):
         error, output = errors[i], outputs[i]
         if kind == RELU:
@@ -206,9 +206,9 @@ def pull_back(errors: Singles, outputs: Singles, kind: int) -> None:
 
 # A multilayer perceptron and its gradient, with all parameters in one flat vector.
 #
-# Weights of a layer lie as (inputs, outputs), the transpose of PyTorch's: of an input that is
-# one-hot a row is all that has to be read. What layers put out lies in one array as well, a layer
-# after the other, so that nothing is allocated while training.
+# Weights of a layer are stored as (inputs, outputs), the transpose of PyTorch's, so that a one-hot
+# input only reads one row. The outputs of all layers are in one array, one layer after the other,
+# so that training allocates nothing.
 #
 # Source: Goodfellow, Bengio and Courville, Deep Learning (2016), algorithms 6.3 and 6.4.
 
@@ -217,23 +217,23 @@ class Layers(NamedTuple):
     """The shape of a perceptron of L layers."""
 
     sizes: Ints  # number of inputs, then of outputs of each layer, shape (L + 1,)
-    weights_at: Ints  # where the weights of each layer begin in the flat vector, shape (L,)
-    biases_at: Ints  # where its biases do, shape (L,)
-    outputs_at: Ints  # where its outputs begin in an array of outputs, for each row, shape (L,)
-    activation: int  # what follows each layer but the last: `IDENTITY`, `RELU` or `TANH`
-    one_hot: int  # 1 where inputs are numbers that stand for one-hot vectors
+    weights_at: Ints  # start of each layer's weights in the flat vector, shape (L,)
+    biases_at: Ints  # start of each layer's biases, shape (L,)
+    outputs_at: Ints  # start of each layer's outputs in an array of outputs, per row, shape (L,)
+    activation: int  # after each layer but the last: `IDENTITY`, `RELU` or `TANH`
+    one_hot: int  # 1 if inputs are indices of one-hot vectors, else 0
     sgemm: np.uintp  # the address of BLAS's routine
 
 
 class Inputs(NamedTuple):
-    """Rows that a perceptron is evaluated on."""
+    """Input rows of a perceptron."""
 
     vectors: Singles  # shape (n, sizes[0]); not read with one-hot inputs
-    indices: Ints  # the numbers that stand for one-hot vectors, shape (n,)
+    indices: Ints  # of one-hot vectors, shape (n,)
 
 
 def make_inputs(layers: Layers, n: int) -> Inputs:
-    """Room for ``n`` rows."""
+    """A buffer for ``n`` input rows."""
     width = 1 if layers.one_hot else int(layers.sizes[0])
     return Inputs(np.zeros((n, width), np.float32), np.zeros(n, np.int64))
 
@@ -254,18 +254,18 @@ def make_layers(sizes: Sequence[int], start: int, activation: int, *, one_hot: b
 
 
 def n_parameters(layers: Layers) -> int:
-    """How many numbers the perceptron takes in the flat vector."""
+    """The number of the perceptron's parameters in the flat vector."""
     return int(np.sum((layers.sizes[:-1] + 1) * layers.sizes[1:]))
 
 
 def make_outputs(layers: Layers, n: int) -> Singles:
-    """Room for all that the layers put out for ``n`` rows."""
+    """A buffer for the outputs of all layers for ``n`` rows."""
     return np.zeros(n * int(layers.sizes[1:].sum()), np.float32)
 
 
 @view
 def weights_of(layers: Layers, flat: Singles, layer: int) -> Singles:
-    """The weights of a layer, shape (inputs, outputs), in the memory of the flat vector."""
+    """A view of the weights of a layer in the flat vector, shape (inputs, outputs)."""
     n_in, n_out = layers.sizes[layer], layers.sizes[layer + 1]
     begin = layers.weights_at[layer]
     return flat[begin : begin + n_in * n_out].reshape((n_in, n_out))
@@ -273,14 +273,14 @@ def weights_of(layers: Layers, flat: Singles, layer: int) -> Singles:
 
 @view
 def biases_of(layers: Layers, flat: Singles, layer: int) -> Singles:
-    """The biases of a layer, shape (outputs,)."""
+    """A view of the biases of a layer, shape (outputs,)."""
     begin = layers.biases_at[layer]
     return flat[begin : begin + layers.sizes[layer + 1]]
 
 
 @view
 def outputs_of(layers: Layers, outputs: Singles, layer: int, n: int) -> Singles:
-    """What a layer puts out for ``n`` rows, shape (n, outputs)."""
+    """A view of the outputs of a layer for ``n`` rows, shape (n, outputs)."""
     width = layers.sizes[layer + 1]
     begin = n * layers.outputs_at[layer]
     return outputs[begin : begin + n * width].reshape((n, width))
@@ -288,13 +288,13 @@ def outputs_of(layers: Layers, outputs: Singles, layer: int, n: int) -> Singles:
 
 @view
 def last_outputs(layers: Layers, outputs: Singles, n: int) -> Singles:
-    """What the perceptron puts out for ``n`` rows, shape (n, sizes[-1])."""
+    """A view of the perceptron's outputs for ``n`` rows, shape (n, sizes[-1])."""
     return outputs_of(layers, outputs, len(layers.sizes) - 2, n)
 
 
 @vectorised
 def forward(layers: Layers, flat: Singles, inputs: Inputs, n: int, outputs: Singles) -> None:
-    """Evaluate the perceptron on the first ``n`` rows; `last_outputs` has what comes out."""
+    """Evaluate the perceptron on the first ``n`` rows; `last_outputs` returns the result."""
     below = inputs.vectors[:n]
     n_layers = len(layers.sizes) - 1
     for layer in range(n_layers):
@@ -326,9 +326,9 @@ def backward(
     errors: Singles,
     gradient: Singles,
 ) -> None:
-    """Write the gradient, given what `forward` left and the derivatives by the last outputs.
+    """Write the gradient, from the outputs of `forward` and the derivatives by the last outputs.
 
-    The derivatives are `last_outputs` of ``errors``, the rest of which is for work.
+    The derivatives are `last_outputs` of ``errors``; the rest of ``errors`` is scratch.
     """
     for layer in range(len(layers.sizes) - 2, -1, -1):
         error = outputs_of(layers, errors, layer, n)
@@ -359,7 +359,7 @@ def _sum_rows(rows: Singles, total: Singles) -> None:
 
 @vectorised
 def _add_rows(rows: Singles, indices: Ints, totals: Singles) -> None:
-    """Add each row to the one of the totals that its index names, all others being zero."""
+    """Set ``totals`` to zero, then add each row to the total of its index."""
     totals[:] = 0
     for i in range(len(rows)):
         row, total = rows[i], totals[indices[i]]
@@ -367,30 +367,30 @@ def _add_rows(rows: Singles, indices: Ints, totals: Singles) -> None:
             total[j] += row[j]
 
 
-# Steps of gradient descent as PyTorch's optimizers take them, on flat vectors.
+# The steps of PyTorch's optimizers, on flat vectors.
 #
 # Sources: Kingma and Ba (2015) for Adam, Loshchilov and Hutter (2019) for AdamW; Tieleman and
-# Hinton (2012) for RMSprop, with TensorFlow's place of epsilon as Stable-Baselines3 has it;
-# Pascanu, Mikolov and Bengio (2013) for clipping.
+# Hinton (2012) for RMSprop, also with epsilon as in TensorFlow and Stable-Baselines3; Pascanu,
+# Mikolov and Bengio (2013) for clipping.
 
 ADAM, ADAMW, RMSPROP, RMSPROP_TENSORFLOW = range(4)
 
-# Moments of units that are dead would come so close to zero that processors take a hundred cycles
-# for each operation on them. What lies below counts as zero; what is not a number stays that.
+# Moments of dead units would become subnormal numbers, on which operations take a hundred cycles.
+# Magnitudes below these count as zero; nan stays nan.
 _TINY, _TINY_SQUARE = np.float32(1e-17), np.float32(1e-36)
 
 
 class Optimizer(NamedTuple):
-    """An optimizer and what it remembers."""
+    """An optimizer and its state."""
 
     kind: int  # `ADAM`, `ADAMW`, `RMSPROP` or `RMSPROP_TENSORFLOW`
     momentum: float  # Adam's beta_1
     smoothing: float  # Adam's beta_2, RMSprop's alpha
     epsilon: float  # keeps divisors from zero
-    weight_decay: float  # towards zero: as a part of the gradient, or with `ADAMW` beside it
+    weight_decay: float  # added to the gradient, or decoupled from it with `ADAMW`
     mean: Singles  # running mean of gradients, as long as the parameters
-    mean_square: Singles  # of their squares
-    n_steps: Singles  # steps taken so far, alone in an array, in single precision as PyTorch has it
+    mean_square: Singles  # running mean of their squares
+    n_steps: Singles  # steps so far, shape (1,), in single precision as in PyTorch
 
 
 @vectorised

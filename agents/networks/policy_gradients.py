@@ -1,4 +1,4 @@
-"""PPO and A2C on compiled code: rollouts, updates, and the agents that train so."""
+"""PPO and A2C on compiled code: rollouts, updates, and the base of these agents."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from agents.networks.torch_bridge import Network, Reference, address_of, call, n
 from machine_code.compiling import called, inlined, kernel
 from mdp.transition_model import Bools, Ints
 
-# The softmax distribution over actions that a network's outputs stand for.
+# The softmax distribution over actions, from a network's outputs (logits).
 
 
 @inlined
 def log_normalizer(logits: Singles) -> float:
-    """Logarithm of the sum of exponentials, shape (n,) in."""
+    """The logarithm of the sum of exponentials of logits, shape (n,)."""
     top = logits[0]
     for k in range(1, len(logits)):
         top = max(top, logits[k])
@@ -70,7 +70,7 @@ def draw(logits: Singles, uniform: float) -> int:
 
 @inlined
 def fill_probabilities(logits: Singles, normalizer: float, probabilities: Any) -> float:
-    """Work out all probabilities, shape (n,); the entropy in nats is returned."""
+    """Fill in all probabilities, shape (n,); return the entropy in nats."""
     entropy = 0.0
     for k in range(len(logits)):
         logarithm = float(logits[k]) - normalizer
@@ -98,11 +98,11 @@ def turn_into_slopes(
         probabilities[k] = np.float32(slope + by_log if k == action else slope)
 
 
-# The library's rollout buffer, whose own arrays are used: advantages, and minibatches of it.
+# The library's rollout buffer, whose arrays are used directly: advantages and minibatches.
 
 
 class Rollout(NamedTuple):
-    """The library's rollout buffer but for observations: T steps of E environments."""
+    """The library's rollout buffer without observations: T steps of E environments."""
 
     actions: Ints  # shape (T, E, 1)
     rewards: Singles  # shape (T, E)
@@ -110,16 +110,16 @@ class Rollout(NamedTuple):
     values: Singles  # of the observations, shape (T, E)
     log_probs: Singles  # of the actions, shape (T, E)
     advantages: Singles  # shape (T, E)
-    returns: Singles  # what the values are to be, shape (T, E)
+    returns: Singles  # targets of the values, shape (T, E)
 
 
 class RolloutMemory(NamedTuple):
-    """What minibatches are taken from, by reference."""
+    """The rollout buffer and the minibatch, to pass by reference."""
 
     observations: Any  # shape (T, E, d); numbers of states have d = 1
     rollout: Rollout  # the rest of the buffer
     order: Ints  # numbers of the rollout's steps, shuffled, shape (T * E,)
-    batch: Any  # what is filled, a `RolloutMinibatch`
+    batch: Any  # a `RolloutMinibatch` to be filled
     one_hot: int  # whether observations are numbers of states
 
 
@@ -172,7 +172,7 @@ def shuffle(numbers: Ints, handle: Any) -> None:
 
 @kernel
 def pick_steps(memory: Any, begin: float, n: float) -> int:
-    """Copy ``n`` steps of the rollout into the minibatch, in its order from ``begin`` on."""
+    """Copy ``n`` steps of the rollout into the minibatch, in ``memory.order`` from ``begin`` on."""
     rollout, batch, first = memory.rollout, memory.batch, int(begin)
     n_envs = rollout.rewards.shape[1]
     for k in range(int(n)):
@@ -189,12 +189,12 @@ def pick_steps(memory: Any, begin: float, n: float) -> int:
 
 # One step of proximal policy optimisation on a minibatch.
 #
-# A2C is the same with one minibatch of the whole rollout and nothing clipped (Huang et al., 2022):
-# the ratio of probabilities is 1 then.
+# A2C is the same with one minibatch of the whole rollout and no clipping (Huang et al., 2022),
+# because the ratio of probabilities is 1.
 #
 # Source: Schulman et al. (2017), in the form of Stable-Baselines3.
 
-# What the library's log has of a minibatch.
+# Figures of a minibatch for the library's log.
 LOSSES = np.dtype(
     [
         ("policy_gradient", np.float64),
@@ -210,21 +210,21 @@ LOSSES = np.dtype(
 
 
 class RolloutMinibatch(NamedTuple):
-    """Steps that are learnt from at once."""
+    """A minibatch of B steps."""
 
     states: Inputs  # observations, of B rows
     actions: Ints  # shape (B,)
     log_probs: Singles  # of the actions when they were taken, shape (B,)
     advantages: Singles  # shape (B,)
-    returns: Singles  # what the values are to be, shape (B,)
-    values: Singles  # what they were, shape (B,)
+    returns: Singles  # targets of the values, shape (B,)
+    values: Singles  # at the time of the rollout, shape (B,)
 
 
 @kernel
 def learn_from_rollout_minibatch(learner: Any, n_rows: float, learning_rate: float) -> int:
     """Take one step of gradient descent on the first ``n_rows`` rows of `learner.batch`.
 
-    0 is returned where the policy has moved too far already, and nothing was done; otherwise 1.
+    Returns 0, without a step, if the policy has moved too far already (``target_kl``); else 1.
     """
     batch, rules, losses = learner.batch, learner.rules[0], learner.losses[0]
     n = int(n_rows)
@@ -266,7 +266,7 @@ def standardize(numbers: Singles) -> None:
 
 @called
 def _policy_errors(learner: Any, n: int, clip_range: float) -> None:
-    """Write the loss's derivatives by the logits, and note what the policy adds to it."""
+    """Write the loss's derivatives by the logits, and record the policy's part of the loss."""
     batch, losses = learner.batch, learner.losses[0]
     logits = last_outputs(learner.policy, learner.policy_outputs, n)
     slopes = last_outputs(learner.policy, learner.policy_errors, n)
@@ -281,7 +281,7 @@ def _policy_errors(learner: Any, n: int, clip_range: float) -> None:
         ratio = math.exp(log_ratio)
         bounded = min(max(ratio, 1 - clip_range), 1 + clip_range)
         gain = min(advantage * ratio, advantage * bounded)
-        # Past its bound a ratio counts no further, unless it has to come back.
+        # A ratio beyond its bound has no gradient, unless the gradient would move it back.
         moves = ratio == bounded or advantage * ratio < advantage * bounded
         by_log = -advantage * ratio / n if moves else 0.0
         entropy = fill_probabilities(row, normalizer, slopes[i])
@@ -295,7 +295,7 @@ def _policy_errors(learner: Any, n: int, clip_range: float) -> None:
 
 @called
 def _value_errors(learner: Any, n: int, clip_range_vf: float) -> None:
-    """Write the loss's derivatives by the values, and note what these add to it."""
+    """Write the loss's derivatives by the values, and record their part of the loss."""
     batch, losses = learner.batch, learner.losses[0]
     values = last_outputs(learner.value, learner.value_outputs, n)
     slopes = last_outputs(learner.value, learner.value_errors, n)
@@ -309,13 +309,13 @@ def _value_errors(learner: Any, n: int, clip_range_vf: float) -> None:
         losses.value += error * error / n
 
 
-# Policy optimisation as the compiled loop runs it, in the order of events of Stable-Baselines3.
+# Policy optimisation on the compiled loop, in the order of events of Stable-Baselines3.
 
-# Settings, under the library's names where it has one.
+# Settings, with the library's names if they exist there.
 RULES = np.dtype(
     [
-        ("gamma", np.float64),  # for what episodes lose that are cut off
-        ("buffer_gamma", np.float64),  # for advantages, which the library works out in its buffer
+        ("gamma", np.float64),  # for bootstrapping truncated episodes
+        ("buffer_gamma", np.float64),  # for advantages, which the library computes in its buffer
         ("gae_lambda", np.float64),
         ("ent_coef", np.float64),
         ("vf_coef", np.float64),
@@ -323,65 +323,65 @@ RULES = np.dtype(
         ("target_kl", np.float64),  # infinite for none
         ("normalize_advantage", np.bool_),
         ("n_epochs", np.int64),
-        ("waits", np.bool_),  # for callbacks, before it learns from a rollout
+        ("waits", np.bool_),  # for callbacks, before learning from a rollout
         ("clip_range", SCHEDULE),
         ("clip_range_vf", SCHEDULE),
     ],
     align=True,
 )
 
-# How far the training is.
+# The progress of the training.
 PLACE = np.dtype(
     [
         ("step", np.int64),  # of the rollout
         ("n_rollouts", np.int64),
-        ("n_updates", np.int64),  # epochs, as the library counts them
-        ("remaining", np.float64),  # share of the training that was left at the last one
-        ("clip_range", np.float64),  # how far ratios of probabilities may move
-        ("clip_range_vf", np.float64),  # how far values may
+        ("n_updates", np.int64),  # epochs, as in the library
+        ("remaining", np.float64),  # share of the training left at the last rollout
+        ("clip_range", np.float64),  # for ratios of probabilities
+        ("clip_range_vf", np.float64),  # for changes of values
         ("policy_gradient", np.float64),  # means over the last training
         ("value", np.float64),
         ("entropy", np.float64),
         ("clipped", np.float64),
         ("kl", np.float64),  # over its last epoch
-        ("explained", np.float64),  # share of the returns' variance, by the values before it
-        ("expected", np.float64),  # value of the observation that was looked at last
-        ("log_probability", np.float64),  # of the action that was drawn last
+        ("explained", np.float64),  # explained variance of the returns by the values before it
+        ("expected", np.float64),  # value of the last evaluated observation
+        ("log_probability", np.float64),  # of the last drawn action
     ],
     align=True,
 )
 
 
 class PolicyLearner(NamedTuple):
-    """Networks of action probabilities and of values, as compiled functions see them."""
+    """Networks of action probabilities and of values for compiled functions."""
 
-    rules: NDArray[np.void]  # a record of type `RULES`, alone in an array
-    place: NDArray[np.void]  # one of type `PLACE`, likewise
-    losses: NDArray[np.void]  # one of type `LOSSES`, likewise
-    policy: Layers  # the shape of the one network
-    value: Layers  # the shape of the other
+    rules: NDArray[np.void]  # a record of type `RULES`, shape (1,)
+    place: NDArray[np.void]  # a record of type `PLACE`, shape (1,)
+    losses: NDArray[np.void]  # a record of type `LOSSES`, shape (1,)
+    policy: Layers  # the shape of the policy network
+    value: Layers  # the shape of the value network
     flat: Singles  # the parameters of both
-    gradient: Singles  # for work, as long
-    optimizer: Optimizer  # what moves the parameters
-    rollout: Rollout  # what has been done, and come of it
-    pick: np.uintp  # the address of `pick_steps`, which goes by the type of observations
-    memory: np.uintp  # that of what it takes steps from
+    gradient: Singles  # scratch, as long
+    optimizer: Optimizer  # of the parameters
+    rollout: Rollout  # the rollout buffer
+    pick: np.uintp  # the address of `pick_steps` for the type of observations
+    memory: np.uintp  # the address of the `RolloutMemory`
     starts: Singles  # whether the present observations begin episodes, shape (E,)
-    last_values: Singles  # values of what the rollout ends with, shape (E,)
+    last_values: Singles  # values of the observations after the rollout, shape (E,)
     improve: np.uintp  # the address of `learn_from_rollout_minibatch`
     order: Ints  # numbers of the rollout's steps, to be shuffled, shape (T * E,)
     batch: RolloutMinibatch  # the minibatch
-    policy_outputs: Singles  # for what the network puts out for the minibatch
-    policy_errors: Singles  # for derivatives
+    policy_outputs: Singles  # buffer for outputs of the policy network
+    policy_errors: Singles  # buffer for derivatives
     value_outputs: Singles  # as for the policy
     value_errors: Singles  # as for the policy
-    single: Inputs  # one observation, to act on
-    rng: NDArray[np.void]  # a handle of the agent's generator, alone in an array
+    single: Inputs  # buffer for one observation
+    rng: NDArray[np.void]  # a handle of the agent's generator, shape (1,)
 
 
 @kernel
 def evaluate(learner: Any, _: float, __: float) -> int:
-    """Put the value of the observation in ``learner.single`` into ``place.expected``."""
+    """Store the value of the observation in ``learner.single`` in ``place.expected``."""
     forward(learner.value, learner.flat, learner.single, 1, learner.value_outputs)
     values = last_outputs(learner.value, learner.value_outputs, 1)
     learner.place[0].expected = float(values[0, 0])
@@ -390,7 +390,7 @@ def evaluate(learner: Any, _: float, __: float) -> int:
 
 @kernel
 def choose_randomly(learner: Any, _: float, __: float) -> int:
-    """An action for the observation in ``learner.single``, whose value and chance are noted."""
+    """An action for the observation in ``learner.single``; stores value and log-probability."""
     evaluate(learner, 0.0, 0.0)
     forward(learner.policy, learner.flat, learner.single, 1, learner.policy_outputs)
     logits = last_outputs(learner.policy, learner.policy_outputs, 1)[0]
@@ -401,7 +401,7 @@ def choose_randomly(learner: Any, _: float, __: float) -> int:
 
 @kernel
 def train(learner: Any, remaining: float, learning_rate: float) -> int:
-    """Learn from the whole rollout as often as there are epochs."""
+    """Learn from the whole rollout in each epoch; return the number of minibatches."""
     place, rules = learner.place[0], learner.rules[0]
     place.step, place.remaining = 0, remaining
     place.n_rollouts += 1
@@ -426,7 +426,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
 
 @inlined
 def learn_for_an_epoch(learner: Any, learning_rate: float) -> tuple[int, bool]:
-    """Learn from all of the rollout once: how many minibatches; False once it has gone too far."""
+    """Learn from the rollout once; return the number of minibatches, and False at `target_kl`."""
     place, losses = learner.place[0], learner.losses[0]
     n_steps, size = len(learner.order), len(learner.batch.actions)
     place.kl, n_batches, goes_on = 0.0, 0, True
@@ -447,19 +447,19 @@ def learn_for_an_epoch(learner: Any, learning_rate: float) -> tuple[int, bool]:
 
 
 class PolicyAgent(NamedTuple):
-    """The agent as the compiled loop calls it."""
+    """The agent for the compiled loop."""
 
     learner: Any  # a reference to a `PolicyLearner`
-    memory: Any  # one to the `RolloutMemory` that it learns from
+    memory: Any  # a reference to its `RolloutMemory`
     seen: Any  # how observations are read, of `agents.networks.network_worlds`
     choose: np.uintp  # the address of `choose_randomly`
-    evaluate: np.uintp  # that of `evaluate`
-    estimate: np.uintp  # that of `estimate_advantages`
-    train: np.uintp  # that of `train`
+    evaluate: np.uintp  # the address of `evaluate`
+    estimate: np.uintp  # the address of `estimate_advantages`
+    train: np.uintp  # the address of `train`
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
-        """Draw an action, and note how likely it was and what is expected."""
+        """Draw an action, and store its log-probability and the value."""
         look(self.seen, env, BEFORE, self.learner.single, self.learner.policy.one_hot)
         env.action = call(self.choose, self.learner, 0.0, 0.0)
         env.value = self.learner.place[0].expected
@@ -467,7 +467,7 @@ class PolicyAgent(NamedTuple):
 
     @inlined
     def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Write the step down, and train at the end of the rollout."""
+        """Store the step, and train at the end of the rollout."""
         learner = self.learner
         for i in range(len(envs)):
             note_step(self, envs[i], i)
@@ -483,7 +483,7 @@ class PolicyAgent(NamedTuple):
 
 @inlined
 def value_at(agent: PolicyAgent, env: Any, moment: int) -> float:
-    """The value of what an environment showed at that moment."""
+    """The value of an environment's observation at this moment."""
     learner = agent.learner
     look(agent.seen, env, moment, learner.single, learner.policy.one_hot)
     call(agent.evaluate, learner, 0.0, 0.0)
@@ -492,7 +492,7 @@ def value_at(agent: PolicyAgent, env: Any, moment: int) -> float:
 
 @inlined
 def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
-    """Write down the step of environment ``i``."""
+    """Store the step of environment ``i``."""
     learner = agent.learner
     rollout, step = learner.rollout, learner.place[0].step
     observe(agent.seen, env, BEFORE, agent.memory.observations[step, i])
@@ -502,7 +502,7 @@ def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
     rollout.episode_starts[step, i] = learner.starts[i]
     reward = np.float32(env.reward)
     if env.done and not env.terminated:
-        # The episode was cut off: what would have come is a part of the reward.
+        # The episode was truncated: add the discounted value of its last state to the reward.
         gamma = np.float32(learner.rules[0].gamma)
         reward += gamma * np.float32(value_at(agent, env, AFTER))
     rollout.rewards[step, i] = reward
@@ -511,7 +511,7 @@ def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
 
 @kernel
 def act_on_rows(learner: Any, shown: Any, actions: Ints) -> None:
-    """Choose actions, shape (E,), for observations of shape (E, d), and note their likelihood."""
+    """Choose and store actions, shape (E,), for observations of shape (E, d)."""
     rollout, place = learner.rollout, learner.place[0]
     step = place.step
     for i in range(len(actions)):
@@ -525,24 +525,24 @@ def act_on_rows(learner: Any, shown: Any, actions: Ints) -> None:
 
 @kernel
 def evaluate_rows(learner: Any, shown: Any, values: Singles) -> None:
-    """Work out the values, shape (n,), of observations of shape (n, d)."""
+    """Fill in the values, shape (n,), of observations of shape (n, d)."""
     for i in range(len(values)):
         show(learner.single, 0, shown[i], learner.policy.one_hot)
         evaluate(learner, 0.0, 0.0)
         values[i] = np.float32(learner.place[0].expected)
 
 
-# How far a number may move that nothing bounds.
+# The clip range for no clipping.
 UNBOUNDED = 1e30
 
-# Rollouts that a block may hold where nothing is logged.
+# The largest number of rollouts in a block if nothing is logged.
 _MOST_ROLLOUTS = 10_000
 
 
 class PolicyTraining(NetworkTraining):
-    """PPO or A2C in training; of its networks the first gives action probabilities."""
+    """PPO or A2C in training; the first of its networks gives action probabilities."""
 
-    # The library's rollouts take what remains from the steps to do.
+    # As in the library, a budget of episodes does not affect the schedules.
     heeds_budgets = False
 
     def __init__(self, agent: Any, seen: Any) -> None:
@@ -608,13 +608,13 @@ class PolicyTraining(NetworkTraining):
         )
 
     def _bound_now(self, schedule: Schedule | None) -> ScheduleRow:
-        """The present value of a bound's schedule, as a constant one."""
+        """The present value of a clip range's schedule, as a constant schedule."""
         if schedule is None:
             return _bound(None)
         return _bound(FloatSchedule(schedule(self.agent._current_progress_remaining)))
 
     def read_settings(self) -> None:
-        """Take over what a callback has changed."""
+        """Read settings that a callback may have changed."""
         self.read_generator()
         self.read_tensors()
         self.held.rules[:] = self._rules(_bound)
@@ -622,7 +622,7 @@ class PolicyTraining(NetworkTraining):
     def _rollout(self) -> Rollout:
         buffer = self.agent.rollout_buffer
         if buffer.generator_ready:
-            # The library has flattened it for its own minibatches.
+            # The library has flattened the buffer for its own minibatches.
             buffer.reset()
         return Rollout(
             buffer.actions,
@@ -635,21 +635,21 @@ class PolicyTraining(NetworkTraining):
         )
 
     def in_loop(self) -> PolicyAgent:
-        """The agent as the compiled loop calls it."""
+        """The agent for the compiled loop."""
         functions = (choose_randomly, evaluate, estimate_advantages, train)
         addresses = (address_of(function, self.learner) for function in functions)
         return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
 
     def schedules(self) -> dict[str, Schedule]:
-        """What compiled code works out after each step, by the names in its record."""
+        """The schedules that compiled code evaluates after each step, by name in its record."""
         return {"learning_rate": self.agent.lr_schedule}
 
     def take_over_progress(self, remaining: float) -> None:
-        """Let the agent know how much of the training remained at the end of the last rollout."""
+        """Set the agent's share of the training that remained after the last rollout."""
         self.agent._current_progress_remaining = float(self.place["remaining"][0])
 
     def give_up_rollout(self) -> None:
-        """Forget how much was collected since the last training."""
+        """Reset the counts of steps and rollouts."""
         self.place["step"] = self.place["n_rollouts"] = 0
 
     def read(self) -> None:
@@ -671,49 +671,49 @@ class PolicyTraining(NetworkTraining):
         buffer.pos = len(buffer.rewards) if buffer.full else int(place["step"])
 
     def until_end(self, total_timesteps: int) -> int:
-        """As everywhere, but to the end of the last rollout."""
+        """As in the base class, but to the end of the last rollout."""
         begun, whole = int(self.place["step"][0]), int(self.agent.n_steps)
         return -(-(begun + super().until_end(total_timesteps)) // whole) * whole - begun
 
     def until_log(self, log_interval: int | None) -> Horizon:
-        """When something is logged next."""
+        """The steps until the next log record."""
         in_rollout = self.agent.n_steps - int(self.place["step"][0])
         if log_interval is None:
             return Horizon()
         iteration = int(self.place["n_rollouts"][0]) + 1
-        # By asking, as a training that was resumed has an interval that counts on.
+        # Searched for, because the interval of a resumed training continues its count.
         for n_more in range(_MOST_ROLLOUTS):
             if (iteration + n_more) % log_interval == 0:
                 break
-        # What is logged then is of the training before, which has to be told by itself.
+        # That log record is of the training before, which must end a block.
         return Horizon(in_rollout + max(n_more - 1, 0) * self.agent.n_steps)
 
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
-        """Nothing: it logs by rollouts."""
+        """Do nothing: this agent logs by rollouts."""
 
     @property
     def is_rollout_over(self) -> bool:
-        """Whether a rollout waits to be learnt from, also where nothing is due yet."""
+        """Whether a rollout is complete."""
         return bool(self.place["step"][0] == self.agent.n_steps)
 
     def until_rollout_end(self) -> Horizon:
-        """When a rollout ends that is to wait."""
+        """The steps until the end of the rollout, if it waits for callbacks."""
         in_rollout = self.agent.n_steps - int(self.place["step"][0])
         return Horizon(in_rollout) if self.waits else Horizon()
 
     def learn_from_rollout(self, remaining: float) -> None:
-        """Learn from the rollout that waits, with that share of the training left."""
+        """Learn from the complete rollout; ``remaining`` is the share of the training left."""
         train(self.learner, remaining, float(self.agent.lr_schedule(remaining)))
 
     def before_training(self, log_interval: int | None) -> None:
-        """Log as the library does, at the end of a rollout and before what is learnt from it."""
+        """Log as the library does, at the end of a rollout and before learning from it."""
         iteration = int(self.place["n_rollouts"][0]) + 1
         ends = self.place["step"][0] >= self.agent.n_steps - 1
         if ends and log_interval is not None and iteration % log_interval == 0:
             self.agent.dump_logs(iteration)
 
     def train(self) -> None:
-        """Learn from the rollout, where environments are Python's."""
+        """Learn from the rollout, with environments in Python."""
         agent = self.agent
         self.read_tensors()
         self.place["n_updates"] = agent._n_updates
@@ -724,7 +724,7 @@ class PolicyTraining(NetworkTraining):
         self.record()
 
     def record(self) -> None:
-        """Hand what the last training has given to the agent's logger."""
+        """Record the last training in the agent's logger; ValueError if losses are nan."""
         agent, place = self.agent, self.place[0]
         if place["n_rollouts"] == self.recorded:
             return
@@ -750,7 +750,7 @@ class PolicyTraining(NetworkTraining):
             log.record("train/clip_range_vf", agent.clip_range_vf(remaining))
 
     def collect_rollout(self, env: VecEnv, callback: BaseCallback) -> bool:
-        """Fill the rollout buffer, once callbacks have been told that it begins."""
+        """Fill the rollout buffer, after callbacks have been told of its start; False to stop."""
         agent, held, buffer = self.agent, self.held, self.agent.rollout_buffer
         agent.collected = 0
         self.read()
@@ -776,7 +776,7 @@ class PolicyTraining(NetworkTraining):
         return True
 
     def _act(self, step: int) -> Any:
-        """Actions for the present observations, written down with what belongs to them."""
+        """Actions for the present observations, stored in the rollout with their values."""
         actions = np.zeros(self.agent.n_envs, np.int64)
         self.place["step"] = step
         self.read_generator()
@@ -800,7 +800,7 @@ class PolicyTraining(NetworkTraining):
         }
 
     def _cut_off(self, dones: Bools, infos: list[dict[str, Any]]) -> Singles:
-        """Discounted values of what would have followed episodes out of time, shape (E,)."""
+        """Discounted values of the last states of truncated episodes, else 0, shape (E,)."""
         lost = np.zeros(len(dones), np.float32)
         values = np.zeros(1, np.float32)
         shown = self.shown[:1]
@@ -808,30 +808,30 @@ class PolicyTraining(NetworkTraining):
             if infos[i].get("TimeLimit.truncated", False):
                 shown[:] = np.reshape(infos[i]["terminal_observation"], (1, -1))
                 self.check_numbers(shown)
-                self.trained.take_over()  # a callback has been asked since the agent acted
+                self.trained.take_over()  # a callback has been called since the agent acted
                 evaluate_rows(self.learner, shown, values)
                 lost[i] = np.float32(self.agent.gamma) * values[0]
         return lost
 
 
 def _bound(schedule: Schedule | None) -> ScheduleRow:
-    """The schedule of a bound as compiled code reads it."""
+    """The schedule of a clip range for compiled code."""
     return compiled_schedule(FloatSchedule(UNBOUNDED) if schedule is None else schedule)
 
 
 class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
-    """What PPO and A2C share; `CompiledNetworks` says what the argument ``engine`` does."""
+    """The base of PPO and A2C; see `CompiledNetworks` for the argument ``engine``."""
 
     training_kind = PolicyTraining
     _own = (*CompiledNetworks._own, "collected")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.collected = 0  # steps of the rollout that the compiled loop has under way
+        self.collected = 0  # steps so far of the current rollout in the compiled loop
         super().__init__(*args, **kwargs)
 
     @property
     def minibatch_size(self) -> int | None:
-        """Steps that are learnt from at once; None for all of a rollout."""
+        """Steps in a minibatch; None for a whole rollout."""
         return getattr(self, "batch_size", None)
 
     @property

@@ -1,4 +1,4 @@
-"""Deep Q-learning on compiled code: minibatches, updates, and the agents that train so."""
+"""Deep Q-learning on compiled code: minibatches, updates, and the base of its agents."""
 
 from __future__ import annotations
 
@@ -36,50 +36,50 @@ from agents.networks.torch_bridge import Network, Reference, address_of, call, n
 from machine_code.compiling import called, inlined, kernel
 from mdp.transition_model import Floats, Ints
 
-# Minibatches out of the library's replay buffer, in whose own arrays transitions lie.
+# Minibatches from the library's replay buffer, whose arrays are used directly.
 #
 # With n-step returns as in `stable_baselines3.common.buffers.NStepReplayBuffer`: rewards are summed
-# until the episode ends, or the newest transition is reached. What VecNormalize shows otherwise
-# lies there as it was, and is shown by the statistics of the moment, as in the library.
+# until the episode ends, or the newest transition is reached. As in the library, the buffer stores
+# unnormalised data, and VecNormalize's present statistics normalise a minibatch.
 
 
 class Replay(NamedTuple):
     """Transitions of E environments in rings of N places."""
 
     observations: Any  # shape (N, E, d); numbers of states have d = 1
-    next_observations: Any  # what followed, before any reset, likewise
+    next_observations: Any  # before any reset, same shape
     actions: Ints  # shape (N, E, 1)
     rewards: Singles  # shape (N, E)
     dones: Singles  # 1 where the episode ended, shape (N, E)
-    timeouts: Singles  # 1 where it ended by its time limit alone, shape (N, E)
+    timeouts: Singles  # 1 where only the time limit ended it, shape (N, E)
 
 
 class Minibatch(NamedTuple):
-    """Transitions that are learnt from at once."""
+    """A minibatch of B transitions."""
 
     states: Inputs  # observations, of B rows
-    next_states: Inputs  # what followed
+    next_states: Inputs  # next observations, of B rows
     actions: Ints  # shape (B,)
     rewards: Singles  # discounted sums of the rewards in between, shape (B,)
-    discounts: Singles  # factor of the value of what followed, 0 where nothing does, shape (B,)
+    discounts: Singles  # factors of the next values, 0 after a termination, shape (B,)
 
 
 class Memory(NamedTuple):
-    """What minibatches are drawn from, by reference."""
+    """The replay buffer and the minibatch, to pass by reference."""
 
     replay: Replay  # the transitions
-    batch: Minibatch  # what is filled
-    place: NDArray[np.void]  # says where the next transition will lie, and whether the ring is full
-    rules: NDArray[np.void]  # with the discount factor, the steps and what VecNormalize does
-    centre: Floats  # what it takes from observations, shape (d,)
-    spread: Floats  # what it divides them by, shape (d,)
-    rng: NDArray[np.void]  # a handle of the agent's generator, alone in an array
+    batch: Minibatch  # to be filled
+    place: NDArray[np.void]  # has the index of the next transition, and whether the ring is full
+    rules: NDArray[np.void]  # has the discount factor, the steps and VecNormalize's settings
+    centre: Floats  # VecNormalize's mean of observations, shape (d,)
+    spread: Floats  # VecNormalize's divisor of observations, shape (d,)
+    rng: NDArray[np.void]  # a handle of the agent's generator, shape (1,)
     one_hot: int  # whether observations are numbers of states
 
 
 @inlined
 def clipped(number: float, bound: float) -> float:
-    """The number within plus and minus the bound; nan stays nan."""
+    """The number clipped to [-bound, bound]; nan stays nan."""
     if number > bound:
         return bound
     return -bound if number < -bound else number
@@ -108,7 +108,7 @@ def reward_of(memory: Memory, at: int, env: int) -> Any:
 
 @kernel
 def draw_minibatch(memory: Any, _: float, __: float) -> int:
-    """Fill the minibatch with transitions drawn with replacement; their number is returned."""
+    """Fill the minibatch with transitions drawn with replacement; return their number."""
     replay, batch, place = memory.replay, memory.batch, memory.place[0]
     rules, rng = memory.rules[0], memory.rng[0]
     n_places, n_envs = replay.rewards.shape
@@ -138,7 +138,7 @@ def draw_minibatch(memory: Any, _: float, __: float) -> int:
 #
 # Sources: Mnih et al. (2013 and 2015), van Hasselt, Guez and Silver (2016).
 
-# What the value of the next state is taken from.
+# The source of the next state's value.
 TARGET_NETWORK, DOUBLE, ONLINE_NETWORK = range(3)
 
 
@@ -146,7 +146,7 @@ TARGET_NETWORK, DOUBLE, ONLINE_NETWORK = range(3)
 def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
     """Take one step of gradient descent on `learner.batch`.
 
-    The loss before it is added to ``place.losses``: Huber's, or half the squared error.
+    Adds the loss before the step to ``place.losses``: Huber's, or half the squared error.
     """
     layers, batch, rules = learner.layers, learner.batch, learner.rules[0]
     n = len(batch.actions)
@@ -155,7 +155,7 @@ def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
     next_values = last_outputs(layers, learner.next_outputs, n)
     preferred = next_values
     if rules.target_kind == DOUBLE:
-        # Overwritten below, once the choice has been made.
+        # `learner.outputs` is overwritten below, after the choice.
         forward(layers, learner.flat, batch.next_states, n, learner.outputs)
         preferred = last_outputs(layers, learner.outputs, n)
     for i in range(n):
@@ -187,34 +187,34 @@ def _errors(learner: Any, n: int, largest: float) -> float:
         error = float(values[i, batch.actions[i]] - batch.rewards[i])
         slope = min(max(error, -largest), largest)
         errors[i, batch.actions[i]] = np.float32(slope / n)
-        # Half the square up to the largest slope, and a straight line from there on.
+        # Half the square up to the largest slope, linear beyond.
         loss += slope * (error - slope / 2)
     return loss / n
 
 
 @called
 def follow(target: Singles, flat: Singles, tau: float) -> None:
-    """Move the target network towards the one that learns, by the share ``tau``."""
+    """Move the target network towards the online network by the share ``tau``."""
     for i in range(len(flat)):
         target[i] = target[i] * np.float32(1 - tau) + np.float32(tau) * flat[i]
 
 
-# Deep Q-learning as the compiled loop runs it, in the order of events of Stable-Baselines3.
+# Deep Q-learning on the compiled loop, in the order of events of Stable-Baselines3.
 
-# Settings, under the library's names where it has one.
+# Settings, with the library's names if they exist there.
 RULES = np.dtype(
     [
         ("gamma", np.float64),
         ("tau", np.float64),
         ("max_grad_norm", np.float64),
-        ("largest_error", np.float64),  # from which on the loss is a straight line
+        ("largest_error", np.float64),  # beyond this error the loss is linear
         ("target_kind", np.int64),
         ("n_steps", np.int64),
-        ("handles_timeouts", np.bool_),  # as episodes that would have gone on
+        ("handles_timeouts", np.bool_),  # bootstrap after a time limit
         ("learning_starts", np.int64),
         ("train_freq", np.int64),
-        ("counts_episodes", np.bool_),  # rather than steps, for train_freq
-        ("waits", np.bool_),  # for callbacks, before it learns from a rollout
+        ("counts_episodes", np.bool_),  # instead of steps, for train_freq
+        ("waits", np.bool_),  # for callbacks, before learning from a rollout
         ("gradient_steps", np.int64),
         ("target_interval", np.int64),  # in steps of all environments
         ("normalises_observations", np.bool_),  # by VecNormalize
@@ -226,7 +226,7 @@ RULES = np.dtype(
     align=True,
 )
 
-# How far the training is.
+# The progress of the training.
 PLACE = np.dtype(
     [
         ("position", np.int64),  # of the next transition in the ring
@@ -236,12 +236,12 @@ PLACE = np.dtype(
         ("collected_episodes", np.int64),
         ("n_updates", np.int64),
         ("exploration_rate", np.float64),
-        ("decided_at", np.int64),  # the time step that `explores` is for
+        ("decided_at", np.int64),  # the time step of `explores`
         ("explores", np.bool_),
         ("losses", np.float64),  # sum over the last training
         ("n_losses", np.int64),
-        ("learning_rate", np.float64),  # of that training
-        ("is_over", np.bool_),  # the rollout, which waits to be learnt from
+        ("learning_rate", np.float64),  # of the last training
+        ("is_over", np.bool_),  # whether the rollout is complete, and the agent can learn from it
         ("n_due", np.int64),  # the number of minibatches to learn from then
     ],
     align=True,
@@ -249,25 +249,25 @@ PLACE = np.dtype(
 
 
 class QLearner(NamedTuple):
-    """A network of action values as compiled functions see it, by reference."""
+    """A network of action values for compiled functions, to pass by reference."""
 
-    rules: NDArray[np.void]  # a record of type `RULES`, alone in an array
-    place: NDArray[np.void]  # one of type `PLACE`, likewise
+    rules: NDArray[np.void]  # a record of type `RULES`, shape (1,)
+    place: NDArray[np.void]  # a record of type `PLACE`, shape (1,)
     layers: Layers  # the shape of the network
     flat: Singles  # its parameters
-    target: Singles  # those of its lagging copy
-    gradient: Singles  # for work, as long
-    optimizer: Optimizer  # what moves the parameters
-    draw: np.uintp  # the address of `draw_minibatch`, which goes by the type of observations
-    memory: np.uintp  # that of what it draws from
+    target: Singles  # the parameters of the target network
+    gradient: Singles  # scratch, as long
+    optimizer: Optimizer  # of the parameters
+    draw: np.uintp  # the address of `draw_minibatch` for the type of observations
+    memory: np.uintp  # the address of the `Memory`
     improve: np.uintp  # the address of `learn_from_minibatch`
     batch: Minibatch  # the minibatch
-    outputs: Singles  # for what the network puts out for the minibatch
-    next_outputs: Singles  # for what is put out for its next states
-    errors: Singles  # for derivatives
-    single: Inputs  # one observation, to act on
-    single_outputs: Singles  # for what is put out for it
-    rng: NDArray[np.void]  # a handle of the agent's generator, alone in an array
+    outputs: Singles  # buffer for outputs on the minibatch
+    next_outputs: Singles  # buffer for outputs on its next states
+    errors: Singles  # buffer for derivatives
+    single: Inputs  # buffer for one observation
+    single_outputs: Singles  # buffer for its outputs
+    rng: NDArray[np.void]  # a handle of the agent's generator, shape (1,)
 
 
 @kernel
@@ -279,7 +279,7 @@ def choose_greedily(learner: Any, _: float, __: float) -> int:
 
 @kernel
 def train(learner: Any, n_updates: float, learning_rate: float) -> int:
-    """Learn from ``n_updates`` minibatches, whose number is returned."""
+    """Learn from ``n_updates`` minibatches; return their number."""
     place = learner.place[0]
     place.losses, place.n_losses, place.learning_rate = 0.0, int(n_updates), learning_rate
     for _ in range(int(n_updates)):
@@ -290,17 +290,17 @@ def train(learner: Any, n_updates: float, learning_rate: float) -> int:
 
 
 class QAgent(NamedTuple):
-    """The agent as the compiled loop calls it."""
+    """The agent for the compiled loop."""
 
     learner: Any  # a reference to a `QLearner`
-    memory: Any  # one to the `Memory` that it learns from
+    memory: Any  # a reference to its `Memory`
     seen: Any  # how observations are read, of `agents.networks.network_worlds`
     choose: np.uintp  # the address of `choose_greedily`
-    train: np.uintp  # that of `train`
+    train: np.uintp  # the address of `train`
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
-        """Choose randomly or greedily; one coin decides for all environments."""
+        """Choose randomly or greedily; one random number decides for all environments."""
         learner = self.learner
         place = learner.place[0]
         if place.decided_at != progress.num_timesteps:
@@ -314,7 +314,7 @@ class QAgent(NamedTuple):
 
     @inlined
     def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Store the transitions, and train where it is time to."""
+        """Store the transitions, and train if it is due."""
         n_done = 0
         for i in range(len(envs)):
             store(self, envs[i], i)
@@ -330,7 +330,7 @@ class QAgent(NamedTuple):
 
 @inlined
 def explores(learner: Any, num_timesteps: int) -> bool:
-    """Whether the next actions are random; tosses a coin once the warm-up is over."""
+    """Whether the next actions are random: always in the warm-up, then by the exploration rate."""
     if num_timesteps < learner.rules[0].learning_starts:
         return True
     return bool(next_uniform(learner.rng[0]) < learner.place[0].exploration_rate)
@@ -338,7 +338,7 @@ def explores(learner: Any, num_timesteps: int) -> bool:
 
 @inlined
 def random_action(learner: Any) -> int:
-    """Any of the actions, each as likely as the others."""
+    """A uniformly random action."""
     return int(next_uniform(learner.rng[0]) * learner.layers.sizes[-1])
 
 
@@ -356,7 +356,7 @@ def act_on_rows(learner: Any, shown: Any, num_timesteps: int, actions: Ints) -> 
 
 @inlined
 def store(agent: QAgent, env: Any, i: int) -> None:
-    """Write down the step of environment ``i``."""
+    """Store the step of environment ``i``."""
     replay, position = agent.memory.replay, agent.learner.place[0].position
     observe(agent.seen, env, BEFORE, replay.observations[position, i])
     observe(agent.seen, env, AFTER, replay.next_observations[position, i])
@@ -369,7 +369,7 @@ def store(agent: QAgent, env: Any, i: int) -> None:
 
 @inlined
 def count_step(agent: QAgent, exploration_rate: float, n_done: int) -> None:
-    """Count a step of every environment, and move the target network where it is time to."""
+    """Count a step of every environment, and update the target network if it is due."""
     learner = agent.learner
     place, rules = learner.place[0], learner.rules[0]
     place.position += 1
@@ -385,7 +385,7 @@ def count_step(agent: QAgent, exploration_rate: float, n_done: int) -> None:
 
 @inlined
 def updates_due(learner: Any, num_timesteps: int, n_envs: int) -> int:
-    """How many minibatches to learn from now: 0 unless enough has been collected."""
+    """The number of minibatches to learn from now: 0 unless enough has been collected."""
     place, rules = learner.place[0], learner.rules[0]
     collected = place.collected_episodes if rules.counts_episodes else place.collected
     place.is_over = collected >= rules.train_freq
@@ -398,14 +398,14 @@ def updates_due(learner: Any, num_timesteps: int, n_envs: int) -> int:
     return int(n_steps if rules.gradient_steps < 0 else rules.gradient_steps)
 
 
-# What the agents' `target_kind` says.
+# By the agents' `target_kind`.
 _TARGETS = {"double_q": DOUBLE, "online": ONLINE_NETWORK, "target": TARGET_NETWORK}
 
 
 class QTraining(NetworkTraining):
     """DQN, double DQN or deep Q-learning in training."""
 
-    heeds_budgets = True  # a number of episodes to train for moves the schedules
+    heeds_budgets = True  # a budget of episodes affects the schedules
 
     def __init__(self, agent: Any, seen: Any) -> None:
         super().__init__(agent, seen)
@@ -481,20 +481,20 @@ class QTraining(NetworkTraining):
         )
 
     def in_loop(self) -> QAgent:
-        """The agent as the compiled loop calls it."""
+        """The agent for the compiled loop."""
         learner = self.learner
         choose, learn = (address_of(function, learner) for function in (choose_greedily, train))
         return QAgent(learner, self.memory, self.seen, choose, learn)
 
     def schedules(self) -> dict[str, Schedule]:
-        """What compiled code works out after each step, by the names in its record."""
+        """The schedules that compiled code evaluates after each step, by name in its record."""
         return {
             "exploration": self.agent.exploration_schedule,
             "learning_rate": self.agent.lr_schedule,
         }
 
     def read_settings(self) -> None:
-        """Take over what a callback has changed."""
+        """Read settings that a callback may have changed."""
         self.read_generator()
         self.read_tensors()
         self.held.rules[:] = self._rules()
@@ -505,11 +505,11 @@ class QTraining(NetworkTraining):
             memory.spread[:] = np.sqrt(env.obs_rms.var + env.epsilon).ravel()
 
     def take_over_progress(self, remaining: float) -> None:
-        """Let the agent know how much of the training remains, after each step."""
+        """Set the agent's remaining share of the training, after each step."""
         self.agent._current_progress_remaining = remaining
 
     def give_up_rollout(self) -> None:
-        """Forget how much was collected since the last training."""
+        """Reset the counts of steps and episodes since the last training."""
         self.place["collected"] = self.place["collected_episodes"] = 0
 
     def read(self) -> None:
@@ -530,7 +530,7 @@ class QTraining(NetworkTraining):
         agent.collected = (int(place["collected"]), int(place["collected_episodes"]))
 
     def until_end(self, total_timesteps: int) -> int:
-        """As everywhere, but until it would be time to train."""
+        """As in the base class, but until the next training is due."""
         left, place, rules = super().until_end(total_timesteps), self.place[0], self.held.rules[0]
         begun, whole = int(place["collected"]), int(rules["train_freq"])
         if rules["counts_episodes"]:
@@ -538,13 +538,13 @@ class QTraining(NetworkTraining):
         return -(-(begun + left) // whole) * whole - begun
 
     def until_log(self, log_interval: int | None) -> Horizon:
-        """When something is logged next."""
+        """The steps or episodes until the next log record."""
         if log_interval is None:
             return Horizon()
         return Horizon(episodes=log_interval - self.agent._episode_num % log_interval)
 
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
-        """Let the agent know of episodes that have ended, and log where it is time to."""
+        """Count episodes that have ended, and log if it is due."""
         agent = self.agent
         agent.logger.record("rollout/exploration_rate", agent.exploration_rate)
         for _ in range(n_episodes):
@@ -553,7 +553,7 @@ class QTraining(NetworkTraining):
                 agent.dump_logs()
 
     def act(self, learning_starts: int) -> Ints:
-        """Actions for the agent's present observations, where environments are Python's."""
+        """Actions for the agent's present observations, with environments in Python."""
         self.read()
         self.read_generator()
         self.trained.take_over()
@@ -564,7 +564,7 @@ class QTraining(NetworkTraining):
         return actions
 
     def train(self, n_updates: int) -> None:
-        """Learn from minibatches of the replay buffer, where environments are Python's."""
+        """Learn from minibatches of the replay buffer, with environments in Python."""
         self.read()
         self.read_settings()
         agent = self.agent
@@ -574,15 +574,15 @@ class QTraining(NetworkTraining):
         self._record_training()
 
     def before_training(self, log_interval: int | None) -> None:
-        """Nothing: it logs by episodes."""
+        """Do nothing: this agent logs by episodes."""
 
     @property
     def is_rollout_over(self) -> bool:
-        """Whether a rollout waits to be learnt from, also where nothing is due yet."""
+        """Whether a rollout is complete, even if no minibatches are due yet."""
         return bool(self.place["is_over"][0])
 
     def until_rollout_end(self) -> Horizon:
-        """When a rollout ends that is to wait."""
+        """The steps or episodes until the end of the rollout, if it waits for callbacks."""
         place, rules = self.place[0], self.held.rules[0]
         if not self.waits:
             return Horizon()
@@ -591,13 +591,13 @@ class QTraining(NetworkTraining):
         return Horizon(int(rules["train_freq"] - place["collected"]))
 
     def learn_from_rollout(self, remaining: float) -> None:
-        """Learn from the rollout that waits, with that share of the training left."""
+        """Learn from the complete rollout; ``remaining`` is the share of the training left."""
         n_due, self.place["is_over"] = int(self.place["n_due"][0]), False
         if n_due:
             train(self.learner, float(n_due), float(self.agent.lr_schedule(remaining)))
 
     def record(self) -> None:
-        """Hand what the last training has given to the agent's logger."""
+        """Record the last training in the agent's logger."""
         self.agent.logger.record("rollout/exploration_rate", self.agent.exploration_rate)
         self._record_training()
 
@@ -613,7 +613,7 @@ class QTraining(NetworkTraining):
 
 
 def normalising_rules(env: VecNormalize | None) -> dict[str, Any]:
-    """What VecNormalize does to observations and rewards, as settings in a record of `RULES`."""
+    """The settings of VecNormalize, as fields of a record of `RULES`."""
     if env is None:
         return {}
     return {
@@ -626,13 +626,13 @@ def normalising_rules(env: VecNormalize | None) -> dict[str, Any]:
 
 
 class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
-    """What DQN and its kin share; `CompiledNetworks` says what the argument ``engine`` does."""
+    """The base of DQN and its variants; see `CompiledNetworks` for the argument ``engine``."""
 
     training_kind = QTraining
-    # Where the value of the next state is taken from: the lagging copy, the same for the action
-    # that the online network prefers, or the online network.
+    # The source of the next state's value: the target network, the target network at the online
+    # network's best action, or the online network.
     target_kind: ClassVar[Literal["target", "double_q", "online"]] = "target"
-    largest_error: ClassVar[float] = 1.0  # from where on the loss is no longer a square
+    largest_error: ClassVar[float] = 1.0  # beyond this error the loss is linear
 
     _training: QTraining | None
     _own = (*CompiledNetworks._own, "collected")
@@ -692,12 +692,12 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
             self._training.check_numbers(replay_buffer.next_observations[replay_buffer.pos - 1])
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
+        """Take ``gradient_steps`` steps on batches of ``batch_size`` from the replay buffer."""
         if self._sharing:
             self._shared_training().train(gradient_steps)
         else:
             self._train_in_python(gradient_steps, batch_size)
 
     def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
-        """The same in the library's way, or the agent's own."""
+        """Train with PyTorch, as the library or the agent itself does."""
         super().train(gradient_steps, batch_size)

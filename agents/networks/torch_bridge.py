@@ -1,4 +1,4 @@
-"""From PyTorch's networks and optimizers to compiled code, which works in their memory."""
+"""Shares the memory of PyTorch's networks and optimizers with compiled code."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from machine_code.compiling import internal
 
 _ACTIVATIONS: dict[type[nn.Module], int] = {nn.Identity: IDENTITY, nn.ReLU: RELU, nn.Tanh: TANH}
 
-# Settings of optimizers that compiled steps do not have, as they have to be.
+# The values that settings of optimizers must have if compiled steps do not support them.
 _PLAIN = {"amsgrad": False, "maximize": False, "momentum": 0, "centered": False}
 _OPTIMIZERS = {th.optim.Adam, th.optim.AdamW, th.optim.RMSprop, RMSpropTFLike}
 
@@ -63,9 +63,9 @@ class Network:
 
 
 def network_of(modules: Iterable[nn.Module], start: int, *, one_hot: bool) -> Network:
-    """The perceptron that linear layers with one activation function in between make.
+    """The perceptron of these modules: linear layers with one activation function in between.
 
-    Its parameters begin at ``start`` of the flat vector. NotCompilable for anything else.
+    Its parameters begin at ``start`` of the flat vector. Raises NotCompilable for other modules.
     """
     linears: list[nn.Linear] = []
     functions: list[int] = []
@@ -88,7 +88,7 @@ def network_of(modules: Iterable[nn.Module], start: int, *, one_hot: bool) -> Ne
 
 
 def check_optimizer(optimizer: th.optim.Optimizer) -> None:
-    """Make sure that compiled steps are those of the optimizer; NotCompilable says why not."""
+    """Raise `NotCompilable` if compiled steps would differ from those of the optimizer."""
     if type(optimizer) not in _OPTIMIZERS:
         raise NotCompilable(f"its optimizer is {type(optimizer).__name__}, not Adam or RMSprop")
     if len(optimizer.param_groups) != 1:
@@ -103,16 +103,16 @@ def check_optimizer(optimizer: th.optim.Optimizer) -> None:
         raise NotCompilable("its parameters are not in single precision")
 
 
-# While an agent trains, its tensors look into flat vectors, so that callbacks see at any time what
-# has been learnt, and what they change counts. Afterwards the tensors have memory of their own
-# again, laid out as PyTorch does it.
+# While an agent trains, its tensors are views of flat vectors, so callbacks can read and change
+# the parameters at any time. Afterwards the tensors have their own memory again, in PyTorch's
+# layout.
 
-# What an optimizer's group holds that compiled steps go by.
+# The settings of an optimizer's group that compiled steps use.
 _SETTINGS = ("betas", "alpha", "eps", "weight_decay", "decoupled_weight_decay")
 
 
 class FlatTensors:
-    """A flat vector for the parameters of networks, and for each its part, in its shape."""
+    """A flat vector of networks' parameters, with a view of it for each parameter."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         self.vector: Singles = np.zeros(sum(n_parameters(n.layers) for n in networks), np.float32)
@@ -120,26 +120,26 @@ class FlatTensors:
         begin = 0
         for parameter in (p for network in networks for p in network.parameters):
             end = begin + parameter.numel()
-            # Compiled code has weights as (inputs, outputs).
+            # Compiled code stores weights as (inputs, outputs).
             turned = self.vector[begin:end].reshape(tuple(parameter.shape)[::-1])
             self.places.append((parameter, th.from_numpy(turned.T)))
             begin = end
 
     def take_over(self) -> None:
-        """Move parameters into the vector that lie elsewhere, as after a callback replaced them."""
+        """Move parameters into the vector, e.g. after a callback has replaced them."""
         for parameter, place in self.places:
             if parameter.data_ptr() != place.data_ptr():
                 place.copy_(parameter.data)
                 parameter.data = place
 
     def give_back(self) -> None:
-        """Give the parameters memory of their own again."""
+        """Give the parameters their own memory again."""
         for parameter, _ in self.places:
             parameter.data = parameter.data.clone(memory_format=th.contiguous_format)
 
 
 class SharedOptimizer:
-    """What the optimizer of a policy remembers of the networks' parameters, in flat vectors."""
+    """The state of a policy's optimizer for the networks' parameters, in flat vectors."""
 
     def __init__(self, policy: Any, networks: Sequence[Network]) -> None:
         self.policy = policy
@@ -148,9 +148,9 @@ class SharedOptimizer:
         self._share()
 
     def current(self) -> Optimizer:
-        """The optimizer as compiled code sees it; another one where somebody has changed it.
+        """The optimizer for compiled code; a new one if it has been changed or replaced.
 
-        NotCompilable if it has become one that compiled code does not know.
+        Raises NotCompilable if compiled code does not support the new one.
         """
         if self._made_from() != self.made_from:
             self.give_back()
@@ -166,7 +166,7 @@ class SharedOptimizer:
         n_steps = np.zeros(1, np.float32)
         if self.parameters[0] in known:
             n_steps[0] = float(known[self.parameters[0]]["step"])
-        # As the library has it: the mean of squares begins with ones there.
+        # As in the library, the mean of squares of RMSpropTFLike begins with ones.
         begins = th.tensor(1.0 if kind == RMSPROP_TENSORFLOW else 0.0)
         for name, tensors in means.items():
             for parameter, place in tensors.places:
@@ -190,7 +190,7 @@ class SharedOptimizer:
         self.made_from = self._made_from()
 
     def _made_from(self) -> tuple[Any, ...]:
-        """What changes once another state is loaded, or another optimizer is used."""
+        """A key that changes when another state is loaded, or another optimizer is used."""
         optimizer = self.policy.optimizer
         group = optimizer.param_groups[0]
         settings = [group.get(name) for name in _SETTINGS]
@@ -204,7 +204,7 @@ class SharedOptimizer:
         return id(optimizer), settings, memory, trained
 
     def give_back(self) -> None:
-        """Give its state memory of its own again; no state, where it has taken no step."""
+        """Give its state its own memory again; without a step, it has no state."""
         known: Any = self.optimizer.state
         kind, _ = _kind(self.optimizer)
         remembered = [parameter for parameter in self.parameters if parameter in known]
@@ -215,7 +215,7 @@ class SharedOptimizer:
 
 
 def in_rows(state: Any) -> Any:
-    """What a ``state_dict`` holds, with tensors that lie in memory as the library lays them out."""
+    """A copy of a ``state_dict`` with contiguous tensors, as in the library."""
     if isinstance(state, dict):
         copied = copy(state)
         copied.update({name: in_rows(value) for name, value in state.items()})
@@ -224,7 +224,7 @@ def in_rows(state: Any) -> Any:
 
 
 def _own_memory(state: dict[str, Any], kind: int) -> dict[str, Any]:
-    """What an optimizer knows of a parameter, as PyTorch would have it in memory."""
+    """A copy of an optimizer's state of a parameter, in PyTorch's memory layout."""
     copied = {
         name: value.clone(memory_format=th.contiguous_format)
         if isinstance(value, th.Tensor)
@@ -237,7 +237,7 @@ def _own_memory(state: dict[str, Any], kind: int) -> dict[str, Any]:
 
 
 def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:
-    """What the optimizer is here, and what PyTorch calls the means that it keeps."""
+    """The kind of the optimizer here, and PyTorch's names of its running means."""
     if isinstance(optimizer, th.optim.Adam):
         decoupled = optimizer.param_groups[0]["decoupled_weight_decay"]
         return ADAMW if decoupled else ADAM, ("exp_avg", "exp_avg_sq")
@@ -246,13 +246,13 @@ def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:
     return RMSPROP, ("square_avg",)
 
 
-# Named tuples and functions that compiled functions are handed by address.
+# Named tuples and functions that compiled functions get by address.
 #
-# LLVM optimises a function anew as a part of each that calls it, and Numba hands a named tuple on
-# as all the numbers that its arrays are described by. With a learner of thirty arrays, four calls
-# below the loop, compiling takes the better part of a minute. A reference is one address: compiled
-# functions read ``reference.name`` from there, as they would from the tuple. What learning comes to
-# lies behind an address as well, so that it is compiled by itself, and once for all environments.
+# LLVM optimises a function again in each of its callers, and Numba passes a named tuple as all the
+# numbers that describe its arrays. With a learner of thirty arrays, four calls below the loop,
+# compiling takes almost a minute. A reference is one address: compiled functions read
+# ``reference.name`` from there, as from the tuple. Learning functions are called by address, too,
+# so that they are compiled separately, and once for all environments.
 ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
 
 # Numba ships no types.
@@ -260,33 +260,33 @@ typeof: Any = _typeof
 _typed_unbox: Any = unbox
 _typed_getattr: Any = lower_getattr_generic
 
-# All that is in a tuple is made of these.
+# All parts of a tuple consist of words of this many bytes.
 WORD = 8
 
 
 class Reference:
-    """A named tuple of arrays and numbers, to be handed on by address."""
+    """A named tuple of arrays and numbers, to pass by address."""
 
     def __init__(self, held: Any) -> None:
-        self.held = held  # the same; its arrays live as long as the reference
+        self.held = held  # the tuple; its arrays live as long as the reference
         self._words = np.array(list(_words(held)), dtype=np.int64)
-        self.address = int(self._words.ctypes.data)  # where compiled functions find it
-        # To find it takes Numba longer than most functions that a reference is handed to.
+        self.address = int(self._words.ctypes.data)  # for compiled functions
+        # Stored, because `typeof` takes longer than most functions that get a reference.
         self.kind = ReferenceType(typeof(held))  # Numba's type of the reference
 
     def hold(self, held: Any) -> None:
-        """Refer to another tuple of the same kind from now on, at the same address."""
+        """Refer to another tuple of the same kind, at the same address."""
         self.held = held
         self._words[:] = list(_words(held))
 
 
 def _words(value: Any) -> Iterator[int]:
-    """What Numba keeps of a value in memory."""
+    """The words of a value in Numba's memory layout."""
     if isinstance(value, tuple):
         for part in value:
             yield from _words(part)
     elif isinstance(value, np.ndarray):
-        # Nobody counts references here.
+        # The first two words are zero: references are not counted here.
         yield from (0, 0, value.size, value.itemsize, value.ctypes.data)
         yield from value.shape
         yield from value.strides
@@ -299,7 +299,7 @@ def _words(value: Any) -> Iterator[int]:
 
 
 def _n_words(kind: Any) -> int:
-    """How many words Numba keeps of a value of that type."""
+    """The number of words of a value of this type in Numba's memory layout."""
     if hasattr(kind, "instance_class"):
         return sum(_n_words(part) for part in kind.types)
     return 5 + 2 * int(kind.ndim) if hasattr(kind, "ndim") else 1
@@ -310,7 +310,7 @@ class ReferenceType(types.Type):
 
     def __init__(self, content: Any) -> None:
         self.content = content
-        self.types = (content,)  # the same, for what looks into the parts of types
+        self.types = (content,)  # for code that inspects the parts of types
         super().__init__(name=f"Reference({content})")
 
 
@@ -352,7 +352,7 @@ def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any
 
 
 def address_of(function: Any, reference: Reference) -> np.uintp:
-    """Where the machine code of a compiled function lies, for `call`."""
+    """The address of a compiled function's machine code, for `call`."""
     arguments = reference.kind, types.float64, types.float64
     code = function.get_compile_result(types.int64(*arguments))
     name = code.fndesc.llvm_cfunc_wrapper_name
@@ -372,12 +372,12 @@ def _call(typing_context: Any, address: Any, reference: Any, first: Any, second:
     return types.int64(types.uintp, reference, types.float64, types.float64), build
 
 
-# Numba takes the first argument away, which type checkers cannot see.
+# Numba removes the first argument, which type checkers cannot see.
 _call_address: Any = _call
 
 
 @internal
 def call(address: Any, reference: Any, first: float, second: float) -> int:
-    """Call what `address_of` has found, with a reference or the address of one."""
+    """Call the function at an address of `address_of`, with a reference or its address."""
     result: int = _call_address(address, reference, first, second)
     return result

@@ -1,4 +1,4 @@
-"""The base of the tabular agents: their arguments, masks and memory, how they act and learn."""
+"""The base of the tabular agents: arguments, masks, memory, acting and learning."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
 class TableWorkspace(Workspace):
-    """A workspace with an agent, whose tables are worked on in place.
+    """A workspace with an agent, whose tables are changed in place.
 
-    The masks say what the environment allows at each observation; of no rows they allow everything.
+    ``masks`` has the allowed actions at each observation; without rows all actions are allowed.
     """
 
     def __init__(self, agent: TabularAgent, masks: Bools, rng: np.random.Generator, n: int) -> None:
         super().__init__(n)
-        self.rng = rng  # the handle does not keep it alive
-        # In the order that `act_in_all` and `learn_from_all` take them in.
+        self.rng = rng  # kept here, because its handle does not keep it alive
+        # The arguments of `act_in_all` and `learn_from_all`, in order.
         self.arrays = (
             np.array([agent.settings]),
             self.envs,
@@ -81,14 +81,14 @@ class TableWorkspace(Workspace):
         self._chosen: Ints | None = None
 
     def _check(self, field: str, outside: int) -> None:
-        """Refuse an observation without a row in the tables, unless ``outside`` is -1."""
+        """Raise ValueError for an observation without a row, unless ``outside`` is -1."""
         if outside >= 0:
             n_states = self.arrays[3].shape[1]
             obs = self.fields[field][outside]
             raise ValueError(f"observation {obs} is not in Discrete({n_states}), the agent's space")
 
     def act(self, obs: Any) -> Ints:
-        """An action for each observation, the one that was committed to where there is one."""
+        """An action for each observation: the one committed to, if there is one."""
         fields = self.fields
         fields["obs"][:] = obs
         self._check("obs", act_in_all(*self.arrays))
@@ -100,7 +100,7 @@ class TableWorkspace(Workspace):
         """Learn from a step of each environment, and return the mean absolute TD error."""
         fields = self.fields
         if transitions.actions is not self._chosen:
-            # Not what `act` has just chosen, whose observations and actions are there already.
+            # After `act`, its observations and actions are in the records already.
             fields["obs"][:] = transitions.obs
             fields["action"][:] = transitions.actions
         fields["next_obs"][:] = transitions.next_obs
@@ -110,7 +110,7 @@ class TableWorkspace(Workspace):
 
 
 class MaskedArguments(CommonArguments, total=False):
-    """What the constructors of tabular agents hand on; see `TabularAlgorithm`."""
+    """Arguments that constructors of tabular agents pass on; see `TabularAlgorithm`."""
 
     mask_actions: bool
 
@@ -118,10 +118,10 @@ class MaskedArguments(CommonArguments, total=False):
 class TabularAlgorithm(WorkspaceAlgorithm):
     """Temporal-difference control on a table of action values.
 
-    An algorithm may remember more than its tables: a NamedTuple of arrays from `_make_memory`,
-    which compiled functions are handed as ``agent.memory`` and change in place. What belongs to
-    episodes under way has a row for each environment. The memory is not part of a model file: what
-    is learnt for good belongs into buffers of the policy, which `_memory_in_use` may put beside it.
+    An algorithm may have a memory besides its tables: a NamedTuple of arrays from `_make_memory`,
+    which compiled functions get as ``agent.memory`` and change in place. Arrays for current
+    episodes have a row for each environment. A model file does not contain the memory: permanent
+    knowledge must be in buffers of the policy, which `_memory_in_use` may add to the memory.
 
     Args:
         policy: ``"QTablePolicy"``.
@@ -129,7 +129,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N(s, a).
         gamma: discount factor.
         exploration: ``"epsilon_greedy"``; ``"boltzmann"`` (softmax of value / temperature); or
-            ``"gaussian_noise"`` (greedy in value + noise_std / (episode + 1) * normal noise, the
+            ``"gaussian_noise"`` (greedy in value + noise_std / (episode + 1) * normal noise, with
             episodes counted over all environments).
         exploration_fraction: share of training over which epsilon falls.
         exploration_initial_eps: epsilon at the start.
@@ -141,24 +141,24 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         initial_q: value of every entry of the table at the start; high values are optimistic.
         initial_q_std: standard deviation of normal noise on the entries at the start.
         skip_terminal_update: learn nothing from the step that terminates an episode, a common
-            omission in hand-written programs, here to reproduce their results.
-        engine: ``"compiled"`` trains on a compiled copy of the environments, to the same bits and
-            a hundred times faster, and is refused where there is none; ``"interpreted"`` calls
-            them step by step; ``"auto"`` compiles where it can.
+            mistake in hand-written programs, to reproduce their results.
+        engine: ``"compiled"`` trains on a compiled copy of the environments, with bit-identical
+            results and a hundred times faster; ValueError if there is none. ``"interpreted"``
+            calls them step by step; ``"auto"`` compiles if it can.
         policy_kwargs: further arguments of the policy.
         mask_actions: choose among the actions that the environment allows, and bootstrap from
-            those that it allows next. It says so by a method `action_masks()`, which has to go by
-            the observation alone. At an observation that was never met all actions count.
+            those allowed next. The environment's method `action_masks()` must depend on the
+            observation only. At an observation never visited, all actions are allowed.
         kwargs: as in `OnlineAlgorithm`.
 
     Attributes:
-        masks_are_known: whether the policy holds the masks of all states.
+        masks_are_known: whether the policy has the masks of all states.
         last_steps: a record for each environment, with target and TD error of its last update.
 
     Raises:
-        ValueError: if an argument lies outside its range, a space does not fit, or masks are asked
-            for and the environment has none; while learning, if a mask is malformed, allows
-            nothing, or differs from another one of the same observation.
+        ValueError: if an argument is outside its range, a space does not fit, or the environment
+            has no masks for ``mask_actions``; while learning, if a mask is malformed, allows no
+            action, or differs from an earlier one of the same observation.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
@@ -166,7 +166,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     n_tables: ClassVar[int] = 1
     parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
 
-    # What the training loops call; `next_value` is each algorithm's own.
+    # Called by the training loops; each algorithm defines `next_value`.
     act = act_on_values
     learn_from_step = td_learning
     commit = no_commitment
@@ -255,10 +255,10 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             return FloatSchedule(self.noise_std)
         return epsilon_schedule(self)
 
-    # What compiled functions are handed.
+    # Arguments of compiled functions.
 
     def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
-        """The agent as compiled functions see it, its tables in the memory of its policy."""
+        """The agent for compiled functions, with its tables in the memory of its policy."""
         self._check_tables()
         self._check_memory()
         policy = self.policy
@@ -276,7 +276,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         )
 
     def _check_tables(self) -> None:
-        """Refuse tables that compiled code would read beside, naming the right shape."""
+        """Raise ValueError for tables of a wrong shape, which compiled code does not check."""
         sizes = cast(Any, (self.observation_space, self.action_space))
         shape = (self.n_tables, *(int(space.n) for space in sizes))
         found = tuple(self.policy.q_tables.shape), tuple(self.policy.visit_counts.shape)
@@ -288,15 +288,15 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             raise ValueError(f"unknown exploration strategy {self.strategy}")
 
     def _make_memory(self) -> tuple[Any, ...]:
-        """A memory of nothing, for ``n_envs`` environments."""
+        """An empty memory for ``n_envs`` environments."""
         return ()
 
     def _memory_in_use(self) -> tuple[Any, ...]:
-        """What compiled functions are handed; their algorithm's memory, unless it says more."""
+        """The memory for compiled functions; a subclass may add to it."""
         return self._memory
 
     def _check_memory(self) -> None:
-        """Refuse a memory that compiled code would read beside, naming the array."""
+        """Raise ValueError for a memory of wrong shapes, which compiled code does not check."""
         expected: Any = self._make_memory()
         if type(self._memory) is not type(expected):
             raise ValueError(f"the agent's memory must be a {type(expected).__name__}")
@@ -310,12 +310,12 @@ class TabularAlgorithm(WorkspaceAlgorithm):
                 )
 
     def greedy_player(self, seen: Any) -> Plan:
-        """What plays as `predict` does on compiled environments, which show numbers."""
+        """A player with the greedy actions of `predict` on compiled environments."""
         numbers = np.arange(self.policy.q_tables.shape[1])
         return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
 
     def exploring_player(self, seen: Any) -> Explorer:
-        """What plays as `predict` does that explores, and draws from the same generator."""
+        """A player with the exploring actions of `predict`, drawn from the same generator."""
         return Explorer(self.compiled_agent(self.predict_rng), self.progress())
 
     # Training.
@@ -351,7 +351,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         return {**super().__getstate__(), "last_steps": None}
 
     def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
-        """Go on from where the compiled loop is."""
+        """Take over the records of the compiled loop."""
         super().take_over(envs, progress)
         self.last_steps = envs
 
@@ -365,7 +365,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         workspace: TableWorkspace | None = self._in_use
         if workspace is None or workspace.rng is not self.rng:
             return super()._choose_actions()
-        # Brought up to date when the agent learnt last: episodes have been counted since then.
+        # The workspace is up to date since the last learning, except for ended episodes.
         workspace.episodes[0] = self._episode_num
         return workspace.act(self._last_obs)
 
@@ -381,14 +381,14 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     @property
     def asks_for_masks(self) -> bool:
-        """Whether the environments have to be asked at each step."""
+        """Whether to ask the environments for masks at each step."""
         return self.mask_actions and not self.masks_are_known
 
     def _note_next_masks(self, transitions: Transitions) -> None:
-        """Keep what may be done where the step has led.
+        """Store the masks of the states after the step.
 
-        By now a finished environment has been reset. Of the state in which an episode was cut off,
-        ``info`` may tell; else what was seen there before counts.
+        A finished environment has been reset by now. For the last state of a truncated episode,
+        the mask is in ``info``, or else the one stored before is used.
         """
         assert self.env is not None
         going_on = np.flatnonzero(~transitions.dones)
@@ -402,7 +402,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
                 masks = checked_masks([self._infos[i][INFO_KEY]], obs, n_actions)
                 self.policy.note_masks(obs, masks)
 
-    # What the agent does, and how much it explores.
+    # Prediction and exploration.
 
     def predict(
         self,
@@ -412,11 +412,11 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         deterministic: bool = False,
         action_masks: Any = None,
     ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
-        """The greedy action, or an exploring one unless ``deterministic``, as DQN has it.
+        """The greedy action, or an exploring one unless ``deterministic``, as in DQN.
 
         Takes one state index or an array of shape (n,), and returns actions of the same shape and
         ``state``; ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape
-        (n, A) count here in place of those that the agent has kept.
+        (n, A) replace the masks that the agent has stored.
         """
         if deterministic and action_masks is None:
             return super().predict(observation, state, episode_start, deterministic)
@@ -428,19 +428,19 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     @property
     def strategy(self) -> int:
-        """How the agent explores around its values, one of `agents.common.exploration`."""
+        """The exploration strategy, a number of `agents.common.exploration`."""
         return STRATEGIES[self.exploration]
 
     @property
     def exploration_rate(self) -> float:
-        """How much the agent explores now: epsilon, temperature or standard deviation."""
+        """The present exploration rate: epsilon, temperature or standard deviation."""
         rate = super().exploration_rate
         if self.exploration == "gaussian_noise":
             return rate / (self._episode_num + 1)
         return rate
 
     def action_probabilities(self) -> Floats:
-        """What the exploring policy does now, shape (S, A).
+        """The present probabilities of the exploring policy, shape (S, A).
 
         Raises:
             ValueError: for Gaussian noise, whose probabilities have no closed form.
@@ -458,7 +458,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         super()._record_training()
 
     def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
-        """As above; Gaussian noise falls with the episodes."""
+        """As in the base class, but Gaussian noise decreases with the episodes."""
         columns = super().log_columns(records)
         if self.exploration == "gaussian_noise":
             rates = records["exploration"] / (records["episodes"] + 1)

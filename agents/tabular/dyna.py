@@ -23,32 +23,32 @@ from machine_code.compiling import inlined
 from mdp.transition_model import Bools, Floats, Ints
 from safe_files.files import MAX_ARCHIVE_BYTES
 
-# What an agent has seen of its environment: the last outcomes of each pair of state and action.
+# The learnt model of the environment: the last outcomes of each pair of state and action.
 #
 # Compiled functions. A pair is the number ``obs * A + action``.
 
 
 class LearntModel(NamedTuple):
-    """The last K outcomes of each pair, each as likely as the others."""
+    """The last K outcomes of each pair, with equal probabilities."""
 
-    next_obs: Ints  # where they led, shape (S, A, K)
-    rewards: Floats  # what they earned, shape (S, A, K)
+    next_obs: Ints  # shape (S, A, K)
+    rewards: Floats  # shape (S, A, K)
     terminated: Bools  # whether they ended the episode, shape (S, A, K)
-    counts: Ints  # how many there have been, those that were dropped included, shape (S, A)
-    # Those that planning draws from, in the order in which they were met, shape (S * A,).
+    counts: Ints  # number of all outcomes, including dropped ones, shape (S, A)
+    # The pairs that planning draws from, in the order of their first visit, shape (S * A,).
     pairs: Ints
-    n_pairs: Ints  # how many these are, shape (1,)
+    n_pairs: Ints  # the number of these pairs, shape (1,)
 
 
 @inlined
 def n_kept(model: Any, obs: int, action: int) -> int:
-    """How many outcomes of a pair the model holds."""
+    """The number of outcomes of a pair in the model."""
     return int(min(model.counts[obs, action], model.next_obs.shape[2]))
 
 
 @inlined
 def note_outcome(model: Any, env: Any) -> None:
-    """Keep the environment's last step, in place of the oldest of its pair if there is no room."""
+    """Store the environment's last step; a full pair loses its oldest outcome."""
     place = model.counts[env.obs, env.action] % model.next_obs.shape[2]
     model.next_obs[env.obs, env.action, place] = env.next_obs
     model.rewards[env.obs, env.action, place] = env.reward
@@ -58,22 +58,22 @@ def note_outcome(model: Any, env: Any) -> None:
 
 @inlined
 def add_pair(model: Any, obs: int, action: int) -> None:
-    """Let planning draw a pair from now on."""
-    if model.n_pairs[0] < len(model.pairs):  # whatever a file says
+    """Add a pair to those that planning draws from."""
+    if model.n_pairs[0] < len(model.pairs):  # also with numbers from a damaged file
         model.pairs[model.n_pairs[0]] = obs * model.counts.shape[1] + action
         model.n_pairs[0] += 1
 
 
-# The policy of agents on tables that learn a model: its model file holds that too.
+# The policy of tabular agents that learn a model, which their model file contains, too.
 
-# What is kept has to fit into a model file that is read again, with a little besides.
+# The largest size of the arrays, so that a model file can be read again.
 MOST_BYTES = MAX_ARCHIVE_BYTES * 15 // 16
 
 
 class ModelPolicy(QTablePolicy):
-    """Greedy in a table, with what was learnt of the environment beside it."""
+    """Greedy in a table, with a learnt model of the environment beside it."""
 
-    model_type: ClassVar[Any] = LearntModel  # the NamedTuple of arrays that the model is
+    model_type: ClassVar[Any] = LearntModel  # the model's NamedTuple of arrays
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class ModelPolicy(QTablePolicy):
         return {**super()._sizes(), "outcomes_kept": self.outcomes_kept}
 
     def keep_outcomes(self, n: int) -> None:
-        """Make room for ``n`` outcomes of each pair, and forget others where n changes."""
+        """Allocate the model for ``n`` outcomes of each pair; if n changes, it starts empty."""
         most = self._most_outcomes()
         if n > most:
             raise ValueError(
@@ -106,7 +106,7 @@ class ModelPolicy(QTablePolicy):
                 self.register_buffer(f"model_{name}", th.from_numpy(array))
 
     def _most_outcomes(self) -> int:
-        """How many outcomes of each pair a model file has room for."""
+        """The largest number of outcomes of each pair that fits into a model file."""
         n_states, n_actions = self.visit_counts.shape[1:]
         with_one, with_two = (
             n_states * sum(a.nbytes for a in self._nothing_learnt(1, n_actions, n).values())
@@ -116,7 +116,7 @@ class ModelPolicy(QTablePolicy):
         return max(1 + int((MOST_BYTES - tables - with_one) // (with_two - with_one)), 0)
 
     def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
-        """The arrays of a model, by name, before anything was seen."""
+        """The arrays of an empty model, by name."""
         shape = n_states, n_actions, n
         return {
             "next_obs": np.zeros(shape, dtype=np.int64),
@@ -128,7 +128,7 @@ class ModelPolicy(QTablePolicy):
         }
 
     def _places(self, n_states: int, n_pairs: int) -> Mapping[str, tuple[int, int]]:
-        """Which arrays hold numbers of states, of pairs or of places: the least, and the end."""
+        """The range (least, end) of arrays with indices of states, pairs or places."""
         return {
             "next_obs": (0, n_states),
             "pairs": (0, n_pairs),
@@ -138,13 +138,13 @@ class ModelPolicy(QTablePolicy):
 
     @property
     def model(self) -> Any:
-        """What was learnt, as arrays that share the memory of the policy."""
+        """The model, as arrays that share the memory of the policy."""
         buffers: Any = self._buffers
         names: tuple[str, ...] = self.model_type._fields
         return self.model_type(*(buffers[f"model_{name}"].numpy() for name in names))
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over a table and a model."""
+        """Load a table and a model."""
         held = state_dict.get("model_next_obs")
         if getattr(held, "ndim", 0) == 3 and held.shape[2] != self.outcomes_kept:
             raise ValueError(
@@ -156,7 +156,7 @@ class ModelPolicy(QTablePolicy):
         return result
 
     def check_shapes(self) -> None:
-        """Refuse arrays of other shapes, which compiled code would read beside."""
+        """Raise ValueError for arrays of wrong shapes, which compiled code does not check."""
         n_states, n_actions = self.visit_counts.shape[1:]
         expected = self._nothing_learnt(n_states, n_actions, self.outcomes_kept)
         for name, like in expected.items():
@@ -168,7 +168,7 @@ class ModelPolicy(QTablePolicy):
                 )
 
     def check_places(self) -> None:
-        """Refuse a model that points beside its tables."""
+        """Raise ValueError for a model with indices out of range."""
         n_states, n_actions = self.visit_counts.shape[1:]
         for name, (least, end) in self._places(n_states, n_states * n_actions).items():
             numbers = getattr(self.model, name)
@@ -176,17 +176,17 @@ class ModelPolicy(QTablePolicy):
                 raise ValueError(f"holds no model for these observations and actions: model_{name}")
 
 
-# What tabular agents share that learn a model of their environment.
+# The base of tabular agents that learn a model of their environment.
 
 MOST_PLANNING = 10**6  # updates after one step
 
 
 class ModelKeeper(TabularAlgorithm):
-    """Hands the model in its policy to compiled functions as ``agent.memory``."""
+    """Passes the model in its policy to compiled functions as ``agent.memory``."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": ModelPolicy}
     policy: ModelPolicy
-    outcomes_kept: int = 1  # how many outcomes of each pair of state and action the model holds
+    outcomes_kept: int = 1  # number of outcomes in the model for each pair of state and action
 
     def _make_policy(self) -> QTablePolicy:
         policy = super()._make_policy()
@@ -207,19 +207,19 @@ class ModelKeeper(TabularAlgorithm):
 
 @by_type
 def remember(agent: TabularAgent, env: Any) -> None:
-    """Let the model know the environment's last step."""
+    """Update the model with the environment's last step."""
     raise CompiledOnlyError
 
 
 @by_type
 def imagined_reward(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
-    """What planning takes for the reward where the model says ``reward``."""
+    """The reward in planning, given the model's ``reward``."""
     raise CompiledOnlyError
 
 
 @inlined
 def remember_outcome(agent: TabularAgent, env: Any) -> None:
-    """Keep the outcome; planning draws from what was tried."""
+    """Store the outcome; planning draws from tried pairs."""
     if agent.memory.counts[env.obs, env.action] == 0:
         add_pair(agent.memory, env.obs, env.action)
     note_outcome(agent.memory, env)
@@ -227,21 +227,21 @@ def remember_outcome(agent: TabularAgent, env: Any) -> None:
 
 @inlined
 def remembered_reward(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
-    """The reward that there was."""
+    """The model's reward."""
     return reward
 
 
 @inlined
 def imagine_step(agent: TabularAgent, progress: Any) -> None:
-    """Learn from what the model says of a pair that is drawn at random.
+    """Learn from the model's outcome of a random pair.
 
-    What is left of the number that draws the pair draws one of its outcomes.
+    The remainder of the random number that draws the pair draws one of its outcomes.
     """
     settings, tables, model = agent.settings, agent.tables, agent.memory
     drawn = next_uniform(agent.rng) * model.n_pairs[0]
     pair = model.pairs[int(drawn)]
     obs, action = pair // tables.values.shape[2], pair % tables.values.shape[2]
-    # What was never tried is taken to lead nowhere and to earn nothing.
+    # The model of an untried pair: it stays in its state, with reward 0.
     reward, next_obs, goes_on = 0.0, obs, True
     if model.counts[obs, action] > 0:
         k = int((drawn - int(drawn)) * n_kept(model, obs, action))
@@ -271,13 +271,13 @@ def learn_and_plan(agent: TabularAgent, envs: Any, progress: Any) -> None:
 
 
 class DynaQ(ModelKeeper, QLearning):
-    """Q-learning that learns from remembered steps as well (Sutton and Barto, section 8.2).
+    """Q-learning with planning on a learnt model (Sutton and Barto, section 8.2).
 
-    After each step it does ``planning_steps`` updates more, on pairs of state and action that are
-    drawn, each as likely as the others, from those that were tried. (The book draws the state
-    first.) The book's model holds the last outcome of a pair, which is all where nothing is random;
-    elsewhere ``outcomes_kept`` lets it hold more, of which an update draws one. Without planning
-    this is Q-learning, to the last bit.
+    After each step it does ``planning_steps`` more updates, on pairs of state and action drawn
+    uniformly from those that were tried. (The book draws the state first.) The book's model has the
+    last outcome of a pair, which is enough in deterministic environments; for stochastic ones,
+    ``outcomes_kept`` stores more outcomes, of which an update draws one. Without planning this is
+    Q-learning, bit for bit.
 
     Updates by planning are not counted: ``"sample_average"`` is 1/N after N real visits.
 
@@ -310,7 +310,7 @@ class DynaQ(ModelKeeper, QLearning):
 
 
 class DatedModel(NamedTuple):
-    """A model that knows how old its outcomes are."""
+    """A model with the times of its outcomes."""
 
     next_obs: Ints
     rewards: Floats
@@ -318,13 +318,13 @@ class DatedModel(NamedTuple):
     counts: Ints
     pairs: Ints
     n_pairs: Ints
-    tried_at: Ints  # the time when a pair was tried last, 0 for never, shape (S, A)
+    tried_at: Ints  # time of the last try of a pair, 0 for never, shape (S, A)
     time: Ints  # steps of all environments so far, shape (1,)
 
 
 @inlined
 def remember_outcome_and_time(agent: TabularAgent, env: Any) -> None:
-    """Keep the outcome and its time; planning draws from all actions of the states met."""
+    """Store the outcome and its time; planning draws from all actions of visited states."""
     model = agent.memory
     seen = 0
     for action in range(model.counts.shape[1]):
@@ -340,7 +340,7 @@ def remember_outcome_and_time(agent: TabularAgent, env: Any) -> None:
 
 @inlined
 def reward_for_trying(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
-    """The reward, and a bonus for what was not tried for long."""
+    """The reward, plus a bonus that grows with the time since the last try."""
     idle = agent.memory.time[0] - agent.memory.tried_at[obs, action]
     return float(reward + agent.settings.kappa * math.sqrt(idle))
 
@@ -359,12 +359,12 @@ class DatedModelPolicy(ModelPolicy):
 
 
 class DynaQPlus(DynaQ):
-    """Dyna-Q that is curious about what may have changed (Sutton and Barto, section 8.3).
+    """Dyna-Q with an exploration bonus, for changing environments (Sutton and Barto, section 8.3).
 
-    In planning, a pair that was not tried for t steps earns ``kappa`` * sqrt(t) more. Planning
-    considers all actions of the states met, and takes those never tried to lead back to where they
-    were taken and to earn nothing (the book's footnote). The values hold the bonus, so that they
-    overestimate, and a greedy policy may stray: the less, the smaller ``kappa``.
+    In planning, a pair that was not tried for t steps gets a bonus of ``kappa`` * sqrt(t). Planning
+    uses all actions of visited states; the model of an untried pair is that it stays in its state
+    with reward 0 (the book's footnote). The values include the bonus, so they overestimate, and the
+    greedy policy may be worse: the less, the smaller ``kappa``.
 
     Time is counted in steps of all environments together.
 

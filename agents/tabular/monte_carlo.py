@@ -26,18 +26,18 @@ from agents.tabular.updates import TabularAgent, act_on_values, choose, move_tow
 from machine_code.compiling import inlined
 from mdp.transition_model import Floats, Ints
 
-# Whole episodes, kept until they end and learnt from then.
+# Whole episodes, stored until the agent learns from them at their end.
 #
 # Source: Sutton and Barto (2nd edition), chapter 5.
 
 
 class EpisodeRecords(NamedTuple):
-    """The episodes under way."""
+    """The current episodes."""
 
     states: Ints  # shape (n_envs, longest_episode)
-    actions: Ints  # what was done there, shape (n_envs, longest_episode)
-    rewards: Floats  # what that earned, shape (n_envs, longest_episode)
-    probabilities: Floats  # how probable the policy thought it, shape (n_envs, longest_episode)
+    actions: Ints  # shape (n_envs, longest_episode)
+    rewards: Floats  # shape (n_envs, longest_episode)
+    probabilities: Floats  # of the actions, by the policy, shape (n_envs, longest_episode)
     lengths: Ints  # number of steps so far, shape (n_envs,)
 
 
@@ -49,7 +49,7 @@ def learn_episode(agent: TabularAgent, env: Any, progress: Any, i: int, length: 
 
 @inlined
 def record_and_learn(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
-    """Write down the step, and learn once the episode is over or fills the record."""
+    """Store the step, and learn when the episode is over or fills the record."""
     records = agent.memory
     place = records.lengths[i]
     records.states[i, place] = env.obs
@@ -64,17 +64,16 @@ def record_and_learn(agent: TabularAgent, env: Any, progress: Any, i: int) -> fl
 
 
 class RecordAlgorithm(EpisodicAlgorithm):
-    """Learns from whole episodes, once they are over.
+    """Learns from whole episodes, when they are over.
 
-    Where an episode is truncated, the rest of its return is not known: the value of the state that
-    it was cut off in stands for it. An episode of more than ``longest_episode`` steps counts as
-    truncated there, and what follows as another.
+    The return of a truncated episode bootstraps from the value of its last state. An episode is
+    treated as truncated after ``longest_episode`` steps, and its rest as another episode.
 
     Args:
         policy: as in `TabularAlgorithm`.
         env: as in `TabularAlgorithm`.
-        learning_rate: as in `TabularAlgorithm`; the textbook averages.
-        longest_episode: steps of an episode that are remembered, at least 1.
+        learning_rate: as in `TabularAlgorithm`; the textbook's is ``"sample_average"``.
+        longest_episode: maximal number of stored steps of an episode, at least 1.
         kwargs: as in `TabularAlgorithm`.
     """
 
@@ -102,7 +101,7 @@ class RecordAlgorithm(EpisodicAlgorithm):
         return EpisodeRecords(states, actions, np.zeros(shape), np.zeros(shape), lengths)
 
 
-# The policy of off-policy Monte Carlo control: action values, and the weights behind them.
+# The policy of off-policy Monte Carlo control: action values, and the sums of their weights.
 
 
 class ImportanceTablePolicy(QTablePolicy):
@@ -126,7 +125,7 @@ class ImportanceTablePolicy(QTablePolicy):
 
 
 class VisitRecords(NamedTuple):
-    """The fields of `EpisodeRecords`, and room for a number for each entry, shape (S, A)."""
+    """The fields of `EpisodeRecords`, and scratch for each entry's first visit, shape (S, A)."""
 
     states: Ints
     actions: Ints
@@ -138,7 +137,7 @@ class VisitRecords(NamedTuple):
 
 @inlined
 def value_where_cut_off(agent: TabularAgent, env: Any, progress: Any) -> float:
-    """The value of what the policy would do next; 0 where nothing follows."""
+    """The value of the policy's next action; 0 after a termination."""
     if env.terminated:
         return 0.0
     env.next_action = choose(agent, env.next_obs, progress)
@@ -147,7 +146,7 @@ def value_where_cut_off(agent: TabularAgent, env: Any, progress: Any) -> float:
 
 @inlined
 def note_first_visits(agent: TabularAgent, i: int, length: int) -> None:
-    """At which step of the episode each of its entries was visited first."""
+    """Fill in the step of each entry's first visit in the episode."""
     records = agent.memory
     for k in range(length - 1, -1, -1):
         records.first_visits[records.states[i, k], records.actions[i, k]] = k
@@ -155,7 +154,7 @@ def note_first_visits(agent: TabularAgent, i: int, length: int) -> None:
 
 @inlined
 def learn_from_visits(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
-    """Move each entry towards the return after its first visit, or after every one."""
+    """Move each entry towards the return after its first visit, or after every visit."""
     records = agent.memory
     later = value_where_cut_off(agent, env, progress)
     note_first_visits(agent, i, length)
@@ -172,12 +171,12 @@ def learn_from_visits(agent: TabularAgent, env: Any, progress: Any, i: int, leng
 class MonteCarlo(RecordAlgorithm):
     """On-policy Monte Carlo control (Sutton and Barto, section 5.4).
 
-    It learns what the exploring policy is worth, at the end of each episode, and explores as its
-    settings say. Exploring starts are the environment's affair: Blackjack has some.
+    It learns the values of the exploring policy, at the end of each episode. Exploring starts are
+    up to the environment: Blackjack has some.
 
     Args:
         args: as in `RecordAlgorithm`.
-        every_visit: learn from every visit of an entry in an episode, not the first alone.
+        every_visit: learn from every visit of an entry in an episode, not only from the first.
         kwargs: as in `RecordAlgorithm`.
     """
 
@@ -195,7 +194,7 @@ class MonteCarlo(RecordAlgorithm):
 
 # Off-policy Monte Carlo control.
 
-# Beyond it the sum of the weights would soon be infinite.
+# With larger weights their sum could become infinite.
 LARGEST_WEIGHT = 1e150
 
 
@@ -212,7 +211,7 @@ class WeightedRecords(NamedTuple):
 
 @inlined
 def act_and_tell(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """Act, and note how probable that was."""
+    """Act, and store the probability of the action."""
     act_on_values(agent, env, progress)
     room = values_at(agent, env.obs, 0)
     env.probability = probability_of(agent, room, env.action, progress)
@@ -220,14 +219,14 @@ def act_and_tell(agent: TabularAgent, env: Any, progress: Any) -> None:
 
 @inlined
 def is_first_best(agent: TabularAgent, state: int, action: int) -> bool:
-    """Whether the action is what `predict` would do."""
+    """Whether the action is the one of `predict`."""
     room = values_at(agent, state, 0)
     return bool(place_of(agent, room, action) == greedy_action(room.values, 0.0))
 
 
 @inlined
 def learn_by_importance(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
-    """Weigh returns by how much more probable they are under the greedy policy."""
+    """Weigh returns by importance sampling ratios of the greedy to the exploring policy."""
     records, values, weight = agent.memory, agent.tables.values, 1.0
     later = 0.0 if env.terminated else highest_value(values_at(agent, env.next_obs, 0).values)
     total_error, n_learnt = 0.0, 0
@@ -251,10 +250,10 @@ def learn_by_importance(agent: TabularAgent, env: Any, progress: Any, i: int, le
 class OffPolicyMonteCarlo(RecordAlgorithm):
     """Off-policy Monte Carlo control by weighted importance sampling (Sutton and Barto, 5.7).
 
-    It learns what the greedy policy is worth while it explores, from the end of each episode back
-    to the last action that the greedy policy would not have taken. Where an episode is truncated,
-    the best value in its last state counts. A weight of more than 1e150 ends the learning from an
-    episode. The sums of the weights are saved with the table.
+    It learns the values of the greedy policy while it explores, from the end of each episode back
+    to the last action that the greedy policy would not have taken. A truncated episode bootstraps
+    from the best value in its last state. A weight above 1e150 ends the learning from an episode.
+    The sums of the weights are saved with the table.
 
     Args:
         args: as in `RecordAlgorithm`; ``learning_rate`` can only be ``"sample_average"``.

@@ -33,7 +33,7 @@ from mdp.transition_model import Floats, Ints
 
 NOTHING_LEARNT = -1.0
 
-# Steps that are remembered of all environments together: some 32 bytes each, in a state too.
+# Stored steps of all environments together: about 32 bytes each, also in a saved state.
 MOST_STEPS = 50_000_000
 
 
@@ -64,7 +64,7 @@ def learning_in_turn(agent: TabularAgent, envs: Any, progress: Any) -> None:
 
 @inlined
 def place_of(agent: TabularAgent, room: Room, action: int) -> int:
-    """Where in the room the value of an action is; -1 where it is not allowed."""
+    """The index of an action's value in the room; -1 if it is not allowed."""
     for k in range(len(room.values)):
         if action_at(agent.tables, room, k) == action:
             return k
@@ -73,7 +73,7 @@ def place_of(agent: TabularAgent, room: Room, action: int) -> int:
 
 @inlined
 def probability_of(agent: TabularAgent, room: Room, action: int, progress: Any) -> float:
-    """How probable the action is under the exploring policy, by the values in the room."""
+    """The probability of the action under the exploring policy, by the values in the room."""
     place = place_of(agent, room, action)
     if place < 0:
         return 0.0
@@ -84,13 +84,13 @@ def probability_of(agent: TabularAgent, room: Room, action: int, progress: Any) 
 
 
 class EpisodicAlgorithm(TabularAlgorithm):
-    """A tabular agent that remembers more of an episode than its last step; see the base class.
+    """A tabular agent that stores more of an episode than its last step; see the base class.
 
-    Several environments share the table and have each a memory of its own. ``skip_terminal_update``
-    is refused: here a reward is learnt from at many steps.
+    Several environments share the table; each has its own memory. ``skip_terminal_update`` is not
+    supported, because the agent learns from a reward at many steps.
 
     Raises:
-        ValueError: as the base class has it, and if ``skip_terminal_update`` is asked for.
+        ValueError: as in the base class, and with ``skip_terminal_update``.
     """
 
     learn_from_step = learning_in_turn
@@ -104,7 +104,7 @@ class EpisodicAlgorithm(TabularAlgorithm):
             )
 
     def _refuse_gaussian_noise(self, role: str) -> None:
-        """Refuse an exploration without probabilities, where they are needed for something."""
+        """Raise ValueError for an exploration without known probabilities, which are needed."""
         if self.exploration == "gaussian_noise":
             raise ValueError(
                 f"{role} needs the probabilities of the actions, which gaussian_noise does not "
@@ -118,18 +118,18 @@ class EpisodicAlgorithm(TabularAlgorithm):
 
 
 class Windows(NamedTuple):
-    """Steps that have not been learnt from yet, a ring for each environment."""
+    """Steps that the agent has not learnt from yet, a ring for each environment."""
 
     states: Ints  # shape (n_envs, n_steps)
-    actions: Ints  # what was done there, shape (n_envs, n_steps)
-    rewards: Floats  # what that earned, shape (n_envs, n_steps)
-    oldest: Ints  # place of the first step in the ring, shape (n_envs,)
+    actions: Ints  # shape (n_envs, n_steps)
+    rewards: Floats  # shape (n_envs, n_steps)
+    oldest: Ints  # index of the first step in the ring, shape (n_envs,)
     lengths: Ints  # number of steps in it, shape (n_envs,)
 
 
 @by_type
 def backed_up(agent: TabularAgent, progress: Any, obs: int, action: int, later: float) -> float:
-    """What a state within the window is worth, if the return after its action is ``later``."""
+    """The backed-up value of a state in the window; ``later`` is the return after its action."""
     raise CompiledOnlyError
 
 
@@ -164,7 +164,7 @@ def learn_oldest(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
 
 @inlined
 def learn_from_window(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
-    """Learn from the step n steps ago, and at the end of an episode from all that are left."""
+    """Learn from the step n steps ago, and at the end of an episode from all remaining steps."""
     windows, n_places = agent.memory, agent.memory.states.shape[1]
     place = (windows.oldest[i] + windows.lengths[i]) % n_places
     windows.states[i, place] = env.obs
@@ -182,15 +182,15 @@ def learn_from_window(agent: TabularAgent, env: Any, progress: Any, i: int) -> f
 
 
 class WindowAlgorithm(EpisodicAlgorithm):
-    """Learns from the rewards of ``n_steps`` steps and from the value of what comes after them.
+    """Learns from the rewards of ``n_steps`` steps, and bootstraps from the state after them.
 
-    Where an episode is truncated, the value of the state that it was cut off in counts.
+    A truncated episode bootstraps from its last state.
 
     Args:
         policy: as in `TabularAlgorithm`.
         env: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`.
-        n_steps: how many rewards a target has, at least 1.
+        n_steps: number of rewards in a target, at least 1.
         kwargs: as in `TabularAlgorithm`.
     """
 
@@ -225,7 +225,7 @@ class WindowAlgorithm(EpisodicAlgorithm):
 def sampled_return(
     agent: TabularAgent, progress: Any, obs: int, action: int, later: float
 ) -> float:
-    """What came after the action that was taken."""
+    """The sampled return after the action."""
     return later
 
 
@@ -253,7 +253,7 @@ def target_mean(agent: TabularAgent, room: Room, progress: Any) -> float:
 
 @inlined
 def target_probability(agent: TabularAgent, room: Room, action: int, progress: Any) -> float:
-    """How probable the action is under the target policy, to which all best actions are one."""
+    """The target policy's probability of the action; the greedy one gives 1 to any best action."""
     if not agent.settings.targets_greedy:
         return probability_of(agent, room, action, progress)
     place = place_of(agent, room, action)
@@ -270,7 +270,7 @@ def target_value_ahead(agent: TabularAgent, env: Any, progress: Any, table: int)
 def tree_backed_up(
     agent: TabularAgent, progress: Any, obs: int, action: int, later: float
 ) -> float:
-    """The mean value, in which the action that was taken counts by what came after it."""
+    """The mean value, with the return after the taken action in place of its value."""
     room = values_at(agent, obs, 0)
     probability = target_probability(agent, room, action, progress)
     surprise = later - agent.tables.values[0, obs, action]
@@ -280,15 +280,14 @@ def tree_backed_up(
 class NStepTreeBackup(WindowAlgorithm):
     """n-step tree backup (Precup et al., 2000; Sutton and Barto, section 7.5).
 
-    Of each state within the window it takes the mean value under the target policy, in which only
-    the action that was taken counts by what came after it. It learns about the target policy
-    whatever is done, without importance sampling. With one step it is Expected SARSA, or, towards
-    the greedy policy, Q-learning.
+    For each state in the window it takes the mean value under the target policy, with the return
+    after the taken action in place of that action's value. So it is off-policy without importance
+    sampling. With one step it is Expected SARSA or, for the greedy target policy, Q-learning.
 
     Args:
         args: as in `WindowAlgorithm`.
-        target_policy: what is learnt about: the ``"exploring"`` policy, by the present epsilon or
-            temperature, or the ``"greedy"`` one.
+        target_policy: the policy whose values it learns: the ``"exploring"`` policy, with the
+            present epsilon or temperature, or the ``"greedy"`` one.
         kwargs: as in `WindowAlgorithm`.
     """
 
@@ -304,7 +303,7 @@ class NStepTreeBackup(WindowAlgorithm):
 
     @property
     def targets_greedy(self) -> bool:
-        """Whether the greedy policy is learnt about."""
+        """Whether the target policy is greedy."""
         return self.target_policy == "greedy"
 
     def _check_arguments(self) -> None:

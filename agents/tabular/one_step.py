@@ -29,7 +29,7 @@ class QLearning(TabularAlgorithm):
 
 @inlined
 def commit_to_next_action(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """Choose what to do next; nothing where nothing follows."""
+    """Choose the next action, unless the episode has terminated."""
     env.next_action = 0
     if not env.terminated:
         env.next_action = choose(agent, env.next_obs, progress)
@@ -44,8 +44,8 @@ def committed_value(agent: TabularAgent, env: Any, progress: Any, table: int) ->
 class SARSA(TabularAlgorithm):
     """SARSA (Rummery and Niranjan, 1994; Sutton and Barto, section 6.4).
 
-    It commits to its next action before the update that uses it. Where an episode is truncated, it
-    chooses an action in the last state for the target alone.
+    It commits to its next action before the update that uses it. If an episode is truncated, it
+    chooses an action in the last state for the target only.
     """
 
     commit = commit_to_next_action
@@ -83,7 +83,7 @@ class ExpectedSARSA(TabularAlgorithm):
 def value_by_the_other_table(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
     """The other table's value of the action that the updated table prefers.
 
-    What is left of the number that chose the table breaks ties.
+    The remainder of the random number that chose the table breaks ties.
     """
     values = agent.tables.values
     uniform = (env.uniform * values.shape[0] - table) * agent.settings.tie_scale

@@ -26,30 +26,30 @@ from agents.tabular.updates import TabularAgent, best_value
 from machine_code.compiling import inlined
 from mdp.transition_model import Bools, Floats, Ints
 
-# What agents share that explore by optimism: a table that begins at the most that can be.
+# The base of agents that explore by optimism: a table that begins at an upper bound.
 
 
 class OptimisticAlgorithm(TabularAlgorithm):
-    """Takes the best action at every step, and what it knows too little of for very good.
+    """Takes the best action at every step, with optimistic values of pairs tried too rarely.
 
-    Nothing is left to chance but ties, so that there is no exploration to set, and the step sizes
-    follow from how often a pair was tried.
+    Only ties are random, so there are no exploration settings. The step sizes depend on how often a
+    pair was tried.
 
     Args:
         policy: ``"QTablePolicy"``.
         env: environment with `Discrete` observations and actions, or its id.
         gamma: discount factor.
-        value_bound: the most that any state can be worth, at which the table begins. By default
-            1 / (1 - gamma), which is right where no reward is above 1. Below what a state is worth
-            it is optimism no more; far above it costs time.
+        value_bound: upper bound on all state values, at which the table begins. By default
+            1 / (1 - gamma), which is right if no reward is above 1. With a bound below a state's
+            value the agent is not optimistic; a bound far above it costs time.
         tie_breaking: as in `LearningAlgorithm`.
         engine: as in `TabularAlgorithm`.
         policy_kwargs: further arguments of the policy.
         kwargs: as in `TabularAlgorithm`.
 
     Raises:
-        ValueError: if an argument lies outside its range, a space does not fit, or ``gamma`` is 1
-            and there is no ``value_bound``.
+        ValueError: if an argument is outside its range, a space does not fit, or ``gamma`` is 1
+            without a ``value_bound``.
     """
 
     parameters = {"highest_worth": np.float64}  # noqa: RUF012
@@ -89,7 +89,7 @@ class OptimisticAlgorithm(TabularAlgorithm):
 
     @property
     def highest_worth(self) -> float:
-        """What no state is worth more than."""
+        """The upper bound on state values: ``value_bound``, or its default."""
         if self.value_bound is None:
             return 1.0 / (1.0 - self.gamma) if self.gamma < 1 else math.inf
         return self.value_bound
@@ -100,7 +100,7 @@ class OptimisticAlgorithm(TabularAlgorithm):
 
 @inlined
 def optimistic_update(agent: TabularAgent, env: Any) -> float:
-    """Move one entry towards its target and a bonus for what is seldom tried; its TD error."""
+    """Move one entry towards its target plus a bonus for rare tries; return its TD error."""
     settings, tables = agent.settings, agent.tables
     tables.visit_counts[0, env.obs, env.action] += 1
     count = tables.visit_counts[0, env.obs, env.action]
@@ -127,26 +127,25 @@ def learn_with_bonus(agent: TabularAgent, envs: Any, progress: Any) -> None:
 class QLearningUCB(OptimisticAlgorithm):
     """Q-learning with a bonus of ``bonus_scale`` / sqrt(N) in the target of a pair's N-th update.
 
-    As Jin and others have it ("Is Q-learning provably efficient?", 2018), next states count for
-    ``value_bound`` at most, and step sizes are (H + 1) / (H + N). As in Dong and others
-    ("Q-learning with UCB exploration is sample efficient for infinite-horizon MDP", 2020), it
-    discounts and has one table for all times. They prove that for rewards in [0, 1], with
-    probability 1 - p, the policy is within epsilon of the best on all steps but
-    O(S A / (epsilon^2 (1 - gamma)^7)), up to logarithms: with a scale of
-    c sqrt(H ln(S A (N + 1) (N + 2) / p)) / (1 - gamma), which is far more than what serves here,
-    and with values that never rise again. For this agent nothing is proven; what it keeps is why
-    that works: a pair looks better than it is until it was tried often, and so does all that leads
-    there.
+    As in Jin et al. ("Is Q-learning provably efficient?", 2018), values of next states are clipped
+    to ``value_bound``, and step sizes are (H + 1) / (H + N). As in Dong et al. ("Q-learning with
+    UCB exploration is sample efficient for infinite-horizon MDP", 2020), there is a discount and
+    one table for all times. Dong et al. prove for rewards in [0, 1] that, with probability 1 - p,
+    the policy is within epsilon of the optimum on all steps but
+    O(S A / (epsilon^2 (1 - gamma)^7)), up to logarithms. Their bonus scale is
+    c sqrt(H ln(S A (N + 1) (N + 2) / p)) / (1 - gamma), far larger than useful here, and their
+    values never increase. Nothing is proven for this agent. It keeps the idea of the proof: a pair
+    looks better than it is until it was tried often, and so do all pairs that lead there.
 
     Args:
         args: as in `OptimisticAlgorithm`.
         bonus_scale: c of the bonus c / sqrt(N).
-        horizon: H of the step sizes: the first estimates are forgotten after some H visits. By
-            default 1 / (1 - gamma); 0 makes the mean of all targets.
+        horizon: H of the step sizes: the first estimates are forgotten after about H visits. By
+            default 1 / (1 - gamma); with 0 an entry is the mean of all its targets.
         kwargs: as in `OptimisticAlgorithm`.
 
     Raises:
-        ValueError: as `OptimisticAlgorithm`, and if ``gamma`` is 1 and there is no ``horizon``.
+        ValueError: as `OptimisticAlgorithm`, and if ``gamma`` is 1 without a ``horizon``.
     """
 
     parameters = {"bonus_scale": np.float64, "steps_remembered": np.float64}  # noqa: RUF012
@@ -176,25 +175,25 @@ class QLearningUCB(OptimisticAlgorithm):
         return self.horizon
 
 
-# What an agent has counted of its environment, and what is best if that is all there is to it.
+# The counts of outcomes, and planning on the model that they make.
 #
-# Compiled functions. What is not known is as good as can be.
+# Compiled functions. Unknown pairs have the highest value.
 
-# Of the largest value: what one sweep after the other goes on changing by rounding.
+# Changes of this share of the largest value are rounding errors, which sweeps never end.
 ROUNDING = 1e-13
 
 
 class CountedModel(NamedTuple):
-    """How often each pair of state and action had which outcome, until it is known."""
+    """The outcomes of each pair of state and action, counted until the pair is known."""
 
-    next_obs: Ints  # the outcomes that differ: where they led, shape (S, A, m)
-    rewards: Floats  # what they earned together, shape (S, A, m)
+    next_obs: Ints  # next states of the distinct outcomes, shape (S, A, m)
+    rewards: Floats  # sums of their rewards, shape (S, A, m)
     terminated: Bools  # whether they ended the episode, shape (S, A, m)
-    tallies: Ints  # how often they were seen, 0 where there is none, shape (S, A, m)
-    counts: Ints  # how often the pair was tried, at most m, shape (S, A)
-    # Those in which something is known, in the order in which it became so, shape (S,).
+    tallies: Ints  # number of times each was seen, 0 for an empty place, shape (S, A, m)
+    counts: Ints  # tries of the pair, at most m, shape (S, A)
+    # States with a known pair, in the order in which they got one, shape (S,).
     states: Ints
-    n_states: Ints  # how many these are, shape (1,)
+    n_states: Ints  # the number of these states, shape (1,)
 
 
 @inlined
@@ -215,7 +214,7 @@ def count_outcome(model: CountedModel, env: Any) -> None:
 
 @inlined
 def known_value(agent: TabularAgent, obs: int, action: int) -> float:
-    """What a known pair is worth by the values of the states that it led to."""
+    """The value of a known pair, from the values of its next states."""
     model = agent.memory
     total = 0.0
     for k in range(model.tallies.shape[2]):
@@ -231,7 +230,7 @@ def known_value(agent: TabularAgent, obs: int, action: int) -> float:
 
 @inlined
 def note_known_state(model: CountedModel, obs: int) -> None:
-    """List a state in which a first pair has become known."""
+    """Add a state to the list when its first pair has become known."""
     n_known = 0
     for action in range(model.counts.shape[1]):
         n_known += model.counts[obs, action] == model.tallies.shape[2]
@@ -242,7 +241,7 @@ def note_known_state(model: CountedModel, obs: int) -> None:
 
 @inlined
 def sweep_states(agent: TabularAgent) -> tuple[float, float]:
-    """Work out all known pairs anew, the latest states first."""
+    """Update all known pairs, the latest states first; return the largest change and value."""
     model, values = agent.memory, agent.tables.values
     change = largest = 0.0
     for i in range(model.n_states[0] - 1, -1, -1):
@@ -258,9 +257,9 @@ def sweep_states(agent: TabularAgent) -> tuple[float, float]:
 
 @inlined
 def replan(agent: TabularAgent) -> None:
-    """Sweep until values are within the tolerance of the model's optimum, or rounding is left.
+    """Sweep until values are within the tolerance of the model's optimum, up to rounding.
 
-    A sweep that changes them by d leaves them within d gamma / (1 - gamma) of it.
+    After a sweep that changes values by at most d, they are within d gamma / (1 - gamma) of it.
     """
     gamma = agent.settings.gamma
     while True:
@@ -313,35 +312,34 @@ class CountedModelPolicy(ModelPolicy):
         return {"next_obs": (0, n_states), "counts": (0, most), "tallies": (0, most), **limits}
 
     def check_places(self) -> None:
-        """Refuse a model that points beside its tables, or whose counts are none."""
+        """Raise ValueError for a model with indices out of range or inconsistent counts."""
         super().check_places()
         if not np.array_equal(self.model.tallies.sum(axis=2), self.model.counts):
             raise ValueError("holds no counts: model_tallies and model_counts disagree")
 
 
 class RMax(ModelKeeper, OptimisticAlgorithm):
-    """R-max (Brafman and Tennenholtz, 2002): what is not known is as good as can be.
+    """R-max (Brafman and Tennenholtz, 2002): optimism about unknown pairs.
 
-    A pair of state and action is known once it was tried ``known_after`` times; from then on its
-    outcomes are taken to be what was seen, and no longer counted. Pairs that are not known are
-    worth ``value_bound`` (in the paper they lead to a state that earns the most for ever). Whenever
-    a pair becomes known, the optimum of that model is worked out anew, by sweeps over the states in
-    which something is known. The agent does what is best in it, and so either earns nearly the most
-    that can be earned, or comes to what it does not know.
+    A pair of state and action is known after ``known_after`` tries; from then on the model has the
+    outcomes seen so far, and counts no more. Unknown pairs have the value ``value_bound`` (in the
+    paper they lead to a state with the highest reward for ever). Whenever a pair becomes known,
+    the agent computes the optimum of the model again, by sweeps over the states with known pairs.
+    The optimal policy of the model either has a nearly optimal return, or reaches an unknown pair.
 
-    With enough tries it is probably approximately correct: of rewards in [0, 1], with probability
-    1 - p, it does worse than within epsilon of the best on at most
+    With enough tries it is probably approximately correct: for rewards in [0, 1], with probability
+    1 - p, its policy is more than epsilon worse than the optimum on at most
     O(S^2 A / (epsilon^3 (1 - gamma)^6)) steps, up to logarithms (Strehl, Li and Littman,
     "Reinforcement learning in finite MDPs: PAC analysis", 2009; Kakade, 2003). The ``known_after``
-    of that proof, in the order of S / (epsilon^2 (1 - gamma)^4), is far more than what serves here.
-    Where nothing is random, one try is enough.
+    of that proof, of the order of S / (epsilon^2 (1 - gamma)^4), is far larger than useful here. In
+    deterministic environments, one try is enough.
 
-    Planning takes the longer the closer ``gamma`` is to 1, and is done once for each pair.
+    Planning is done once for each pair, and takes longer if ``gamma`` is closer to 1.
 
     Args:
         args: as in `OptimisticAlgorithm`.
         known_after: m, the number of tries after which a pair is known.
-        tolerance: how far values may be from the optimum of the model.
+        tolerance: maximal distance of values from the optimum of the model.
         kwargs: as in `OptimisticAlgorithm`.
 
     Raises:
@@ -369,5 +367,5 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
 
     @property
     def outcomes_kept(self) -> int:  # type: ignore[override]
-        """Room for as many outcomes as a pair can have had."""
+        """The largest number of distinct outcomes of a pair."""
         return self.known_after

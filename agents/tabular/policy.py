@@ -1,4 +1,4 @@
-"""The policy of the tabular agents: action values in tables, and what is allowed."""
+"""The policy of the tabular agents: action values in tables, and action masks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mdp.transition_model import Bools, Floats, Ints
 class QTablePolicy(MaskBufferPolicy):
     """Greedy in the mean of one or two tables of action values.
 
-    The tables are float64 buffers, so that they travel in the ``policy.pth`` of a model file and
+    The tables are float64 buffers, so that a model file's ``policy.pth`` contains them, and they
     need neither optimizer nor gradient.
     """
 
@@ -47,7 +47,7 @@ class QTablePolicy(MaskBufferPolicy):
         return np.asarray(self.q_tables.numpy().mean(axis=0))
 
     def note_masks(self, obs: Any, masks: Bools) -> None:
-        """Keep what may be done at observations, which are of shape (n,); masks of shape (n, A)."""
+        """Store the masks, shape (n, A), of observations of shape (n,); ValueError if changed."""
         allowed, obs = self.masks, np.asarray(obs)
         before = allowed[obs]
         changed = before.any(axis=1) & (before != masks).any(axis=1)
@@ -61,7 +61,7 @@ class QTablePolicy(MaskBufferPolicy):
 
     @contextmanager
     def told(self, obs: Ints, masks: Any) -> Iterator[None]:
-        """Within the ``with`` statement these masks count at these observations; none if None."""
+        """Use other masks at these observations within a ``with`` statement; no change if None."""
         if masks is None or not len(self.masks):
             yield
             return
@@ -73,7 +73,7 @@ class QTablePolicy(MaskBufferPolicy):
             self.masks[obs] = kept
 
     def allowed_values(self, obs: Ints) -> Floats:
-        """Action values at some observations, minus infinity where masked, shape (n, A)."""
+        """Action values at n observations, minus infinity where masked, shape (n, A)."""
         values: Floats = self.q_tables.numpy()[:, obs].mean(axis=0)
         if not len(self.masks):
             return values
@@ -83,6 +83,6 @@ class QTablePolicy(MaskBufferPolicy):
     def _predict(
         self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
     ) -> th.Tensor:
-        """The first of the best allowed actions; shapes (n,) to (n,)."""
+        """The first of the best allowed actions for each observation, shape (n,)."""
         obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.allowed_values(obs).argmax(axis=1))

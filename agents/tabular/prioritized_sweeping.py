@@ -13,11 +13,10 @@ from agents.tabular.updates import TabularAgent, best_value
 from machine_code.compiling import inlined
 from mdp.transition_model import Bools, Floats, Ints
 
-# A learnt model that knows what leads to a state, and which pairs are worth updating most.
+# A learnt model with the predecessors of each state, and a priority queue of pairs to update.
 #
 # Compiled functions. A pair is the number ``obs * A + action``. Pairs that lead to the same state
-# are a list, each with the one before and the one behind it; those that are worth updating are a
-# binary heap, each with its place in it.
+# form a doubly linked list; the queue is a binary heap, in which each pair has its place.
 
 NONE = -1
 
@@ -30,29 +29,29 @@ class SweepingModel(NamedTuple):
     terminated: Bools
     counts: Ints
     first_into: Ints  # the first pair that leads to a state, or `NONE`, shape (S,)
-    behind: Ints  # the next one that leads where a pair leads, or `NONE`, shape (S * A,)
-    before: Ints  # the one before it, or `NONE`, shape (S * A,)
+    behind: Ints  # the next pair that leads to the same state, or `NONE`, shape (S * A,)
+    before: Ints  # the previous pair that leads to the same state, or `NONE`, shape (S * A,)
     queue: Ints  # the heap, the most urgent pair first, shape (S * A,)
-    n_queued: Ints  # how many they are, shape (1,)
-    place: Ints  # where in the heap a pair is, or `NONE`, shape (S * A,)
-    urgency: Floats  # how urgent it is, shape (S * A,)
+    n_queued: Ints  # number of pairs in the heap, shape (1,)
+    place: Ints  # index of a pair in the heap, or `NONE`, shape (S * A,)
+    urgency: Floats  # priority of a pair, shape (S * A,)
 
 
 @inlined
 def remember_step(model: SweepingModel, env: Any) -> None:
-    """Keep the environment's last step, and which state its pair leads to."""
+    """Store the environment's last step, and the state to which its pair leads."""
     pair = env.obs * model.counts.shape[1] + env.action
     if model.counts[env.obs, env.action] > 0 and not model.terminated[env.obs, env.action, 0]:
         _unlink(model, pair, model.next_obs[env.obs, env.action, 0])
     note_outcome(model, env)
-    # Nothing follows from the end of an episode, so that nothing changes there.
+    # After a termination the pair leads to no state.
     if not env.terminated:
         _link(model, pair, env.next_obs)
 
 
 @inlined
 def _link(model: SweepingModel, pair: int, obs: int) -> None:
-    """Put a pair first among those that lead to a state."""
+    """Put a pair at the head of the list of pairs that lead to a state."""
     first = model.first_into[obs]
     model.before[pair] = NONE
     model.behind[pair] = first
@@ -80,7 +79,7 @@ def _put(model: SweepingModel, pair: int, place: int) -> None:
 
 @inlined
 def enqueue(model: SweepingModel, pair: int, urgency: float) -> None:
-    """Put a pair into the queue; one that is there already stays at least as urgent as it is."""
+    """Put a pair into the queue; a pair that is there already keeps at least its urgency."""
     place = model.place[pair]
     if place == NONE:
         place = model.n_queued[0]
@@ -111,7 +110,7 @@ def most_urgent(model: SweepingModel) -> int:
 
 @inlined
 def _sink(model: SweepingModel, pair: int, n: int) -> None:
-    """Put a pair where the first of a heap of ``n`` was, or below."""
+    """Sift a pair down from the root of a heap of ``n``."""
     place = 0
     while 2 * place + 1 < n:
         below = 2 * place + 1
@@ -126,7 +125,7 @@ def _sink(model: SweepingModel, pair: int, n: int) -> None:
     _put(model, pair, place)
 
 
-# The policy of prioritised sweeping, whose model file holds what it was about to update.
+# The policy of prioritised sweeping, whose model file contains the queue.
 
 
 class SweepingPolicy(ModelPolicy):
@@ -159,7 +158,7 @@ class SweepingPolicy(ModelPolicy):
         }
 
     def check_places(self) -> None:
-        """Refuse a model that points beside its tables, or whose lists and queue are none."""
+        """Raise ValueError for indices out of range, or inconsistent lists or queue."""
         super().check_places()
         if not _is_queue(self.model):
             raise ValueError("holds no queue: model_queue and model_place disagree")
@@ -170,7 +169,7 @@ class SweepingPolicy(ModelPolicy):
 
 
 def _is_queue(model: SweepingModel) -> bool:
-    """Whether each pair in the queue has its place there, and the others have none."""
+    """Whether ``place`` is correct for pairs in the queue, and `NONE` for the others."""
     queued = model.queue[: int(model.n_queued[0])]
     places = np.full(len(model.queue), NONE)
     places[queued] = np.arange(len(queued))
@@ -178,9 +177,9 @@ def _is_queue(model: SweepingModel) -> bool:
 
 
 def _are_lists(model: SweepingModel) -> bool:
-    """Whether each list is of the pairs that lead to its state, and comes to an end.
+    """Whether each list has exactly the pairs that lead to its state, and is finite.
 
-    That it ends follows from each pair's having one before it, but for the first.
+    It is finite because each pair but the first has a predecessor.
     """
     leads = ((model.counts > 0) & ~model.terminated[..., 0]).ravel()
     goal = np.where(leads, model.next_obs.ravel(), NONE)
@@ -204,7 +203,7 @@ def _are_lists(model: SweepingModel) -> bool:
 
 @inlined
 def expected_error(agent: TabularAgent, pair: int) -> float:
-    """The TD error of a pair, as the model has its outcome."""
+    """The TD error of a pair's outcome in the model."""
     model, values = agent.memory, agent.tables.values
     obs, action = pair // values.shape[2], pair % values.shape[2]
     target = model.rewards[obs, action, 0]
@@ -225,7 +224,7 @@ def notice(agent: TabularAgent, pair: int) -> float:
 
 @inlined
 def sweep(agent: TabularAgent, progress: Any) -> None:
-    """Update the most urgent pair, and queue what leads to its state."""
+    """Update the most urgent pair, and queue the pairs that lead to its state."""
     model, tables = agent.memory, agent.tables
     pair = most_urgent(model)
     obs, action = pair // tables.values.shape[2], pair % tables.values.shape[2]
@@ -240,7 +239,7 @@ def sweep(agent: TabularAgent, progress: Any) -> None:
 
 @inlined
 def sweep_all(agent: TabularAgent, progress: Any) -> None:
-    """As many updates as the settings allow and the queue holds."""
+    """Do ``planning_steps`` updates, or fewer if the queue is empty."""
     for _ in range(agent.settings.planning_steps):
         if agent.memory.n_queued[0] == 0:
             break
@@ -249,7 +248,7 @@ def sweep_all(agent: TabularAgent, progress: Any) -> None:
 
 @inlined
 def remember_and_sweep(agent: TabularAgent, envs: Any, progress: Any) -> None:
-    """For each environment, in order: remember its step, and update what that makes urgent."""
+    """For each environment, in order: store its step, and update the most urgent pairs."""
     total_error = 0.0
     for i in range(len(envs)):
         env = envs[i]
@@ -264,20 +263,20 @@ def remember_and_sweep(agent: TabularAgent, envs: Any, progress: Any) -> None:
 
 
 class PrioritizedSweeping(ModelKeeper):
-    """Updates first what would change most (Sutton and Barto, section 8.4).
+    """Prioritised sweeping: updates pairs with the largest errors first (Sutton and Barto, 8.4).
 
-    A step that surprises is queued by the size of its TD error, and so are the pairs that lead to
-    a state whenever its values change: news of a goal run backwards from it. All updates come
-    from the queue. Its model holds the last outcome of each pair of state and action, which is all
-    where nothing is random; elsewhere values follow whatever happened last. First done by Moore and
-    Atkeson ("Prioritized sweeping", 1993).
+    A step with a large TD error is queued by its size. When values of a state change, the pairs
+    that lead to it are queued, too, so that changes propagate backwards. All updates come from the
+    queue. The model has the last outcome of each pair of state and action, which is enough in
+    deterministic environments; in stochastic ones, values follow the last outcome. Source: Moore
+    and Atkeson ("Prioritized sweeping", 1993).
 
     Updates by planning are not counted: ``"sample_average"`` is 1/N after N real visits.
 
     Args:
         args: as in `TabularAlgorithm`.
-        planning_steps: updates after each step of an environment, at most.
-        threshold: how large an error has to be to be queued.
+        planning_steps: maximal number of updates after each step of an environment.
+        threshold: errors above this are queued.
         kwargs: as in `TabularAlgorithm`.
     """
 

@@ -20,8 +20,8 @@ from mdp.transition_model import Floats, Ints
 
 # Eligibility traces of the entries that an episode has visited, and learning along them.
 #
-# Traces are kept with the step size folded in, which the entry had when it was visited: where step
-# sizes differ, a dutch trace needs that, and where they do not it comes to the same.
+# A stored trace is multiplied by the step size of the entry's visit: with varying step sizes a
+# dutch trace needs that; with a constant one it makes no difference.
 #
 # Source: Sutton and Barto (2nd edition), chapter 12.
 
@@ -29,36 +29,36 @@ TraceType = Literal["accumulating", "replacing", "dutch"]
 ACCUMULATING, REPLACING, DUTCH = 0, 1, 2
 TRACE_TYPES = {"accumulating": ACCUMULATING, "replacing": REPLACING, "dutch": DUTCH}
 
-# A trace below it is forgotten: what it would still move lies below the rounding of most tables.
+# Smaller traces are dropped: their effect is below the rounding error of most tables.
 SMALLEST_TRACE = 1e-12
 
 
 class Traces(NamedTuple):
-    """Entries that have a trace, in no order that means anything."""
+    """Entries with a trace, in arbitrary order."""
 
     states: Ints  # shape (n_envs, S * A)
     actions: Ints  # shape (n_envs, S * A)
     sizes: Floats  # traces times step sizes, shape (n_envs, S * A)
-    lengths: Ints  # how many there are, shape (n_envs,)
-    # What the last step took the value of the present state to be, shape (n_envs,).
+    lengths: Ints  # number of entries, shape (n_envs,)
+    # The next value in the last step's target, shape (n_envs,).
     expected: Floats
 
 
 @by_type
 def trace_kept(agent: TabularAgent, env: Any) -> float:
-    """The share of earlier traces that survives the action: 1, or 0 where it cuts them."""
+    """The factor of earlier traces after the action: 1, or 0 if it cuts them."""
     raise CompiledOnlyError
 
 
 @inlined
 def kept_whole(agent: TabularAgent, env: Any) -> float:
-    """Whatever is done is what is learnt about."""
+    """On-policy methods never cut traces."""
     return 1.0
 
 
 @inlined
 def fade(traces: Traces, i: int, factor: float, state: int, action: int) -> float:
-    """Let all traces fade, forget the smallest, and take one out, which is returned."""
+    """Decay all traces, drop the smallest, and remove and return that of an entry."""
     found, n_left = 0.0, 0
     for k in range(traces.lengths[i]):
         size = traces.sizes[i, k] * factor
@@ -75,7 +75,7 @@ def fade(traces: Traces, i: int, factor: float, state: int, action: int) -> floa
 
 @inlined
 def visited(trace_type: int, size: float, earlier: float) -> float:
-    """The trace of the entry that was just visited, both times its step size."""
+    """The new trace of the visited entry; both traces are multiplied by its step size."""
     if trace_type == REPLACING:
         return size
     if trace_type == DUTCH:
@@ -87,8 +87,8 @@ def visited(trace_type: int, size: float, earlier: float) -> float:
 def learn_along_traces(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
     """Move all entries that have a trace; returns the absolute TD error.
 
-    A dutch trace makes up for what the last step took this one to be worth, and has changed since
-    then: with it the result is that of the online lambda-return (van Seijen et al., 2016).
+    With dutch traces the update corrects for the change in Q(s, a) since the previous step, which
+    makes it equal to the online lambda-return (van Seijen et al., 2016).
     """
     settings, values, traces = agent.settings, agent.tables.values, agent.memory
     value = values[0, env.obs, env.action]
@@ -115,17 +115,17 @@ def learn_along_traces(agent: TabularAgent, env: Any, progress: Any, i: int) -> 
 
 
 class TraceAlgorithm(EpisodicAlgorithm):
-    """Learns from each step about all entries that have led to it, the more recent the more.
+    """Updates after each step all entries that have led to it, by their eligibility traces.
 
-    Where an episode is truncated, the value of the state that it was cut off in counts. An entry
-    whose trace times step size falls below 1e-12 is forgotten.
+    A truncated episode bootstraps from its last state. An entry is dropped when its trace times
+    step size falls below 1e-12.
 
     Args:
         policy: as in `TabularAlgorithm`.
         env: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`; an entry's trace keeps that of its last visit.
-        trace_decay: lambda, in [0, 1]: 0 learns about the last step alone.
-        trace_type: what a visit makes of the trace e that is left of earlier ones:
+        trace_decay: lambda, in [0, 1]; with 0 only the last step's entry is updated.
+        trace_type: the new trace at a visit, given the decayed trace e of earlier visits:
             ``"accumulating"`` e + 1; ``"replacing"`` 1, and the traces of the state's other
             actions stay; ``"dutch"`` e + 1 - learning_rate * e, with the update of true online
             TD(lambda).
@@ -185,25 +185,21 @@ class SARSALambda(TraceAlgorithm):
 
 @inlined
 def note_greediness(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """The greedy policy's probability of the action, while the tables are those it was chosen by.
-
-    All best actions are one to it.
-    """
+    """Store whether the action is a best one (probability 1 or 0), before any table changes."""
     best = highest_value(values_at(agent, env.obs, 0).values)
     env.probability = 1.0 if agent.tables.values[0, env.obs, env.action] == best else 0.0
 
 
 @inlined
 def cut_where_exploring(agent: TabularAgent, env: Any) -> float:
-    """What the greedy policy would not have done says nothing of what led to it."""
+    """Cut the traces after an action that is not greedy."""
     return float(env.probability)
 
 
 class QLambda(TraceAlgorithm):
     """Watkins's Q(lambda) (Watkins, 1989; Sutton and Barto, section 12.10).
 
-    Traces are cut where an action is taken that is none of the best; with ``trace_decay`` 0 it is
-    Q-learning.
+    An action that is not greedy cuts the traces; with ``trace_decay`` 0 it is Q-learning.
     """
 
     commit = note_greediness

@@ -12,14 +12,14 @@ from agents.compiled.worlds import UNDECIDED
 from machine_code.compiling import inlined, kernel
 from mdp.transition_model import Bools, Floats, Ints
 
-# What a tabular agent knows, as compiled functions see it, and room to work with it.
+# The tables of an agent for compiled functions, and scratch arrays.
 
 
 class Room(NamedTuple):
-    """Where numbers are worked out; what it holds between two calls means nothing."""
+    """Scratch arrays, without meaning between two calls."""
 
-    values: Floats  # a number for each action that is allowed, shape (n,)
-    actions: Ints  # which actions these are, in order, shape (n,)
+    values: Floats  # a number for each allowed action, shape (n,)
+    actions: Ints  # these actions, in order, shape (n,)
     draws: Floats  # the random numbers of one choice, shape (draws_per_choice,)
 
 
@@ -31,19 +31,19 @@ def room_at(tables: Any, obs: int, room: Room) -> Room:
 
 @by_type
 def action_at(tables: Any, room: Room, k: int) -> int:
-    """The action whose number is ``room.values[k]``."""
+    """The action of ``room.values[k]``."""
     raise CompiledOnlyError
 
 
 @by_type
 def with_mean_values(tables: Any, obs: int, room: Room) -> Room:
-    """The room, with the means of the tables' values of its actions, to be read and not changed."""
+    """The room, with the means of the tables' values of its actions; do not change them."""
     raise CompiledOnlyError
 
 
 @inlined
 def average_tables(tables: Any, obs: int, room: Room) -> Room:
-    """The room, in which those means are worked out."""
+    """The room, filled with the means of the tables' values of its actions."""
     for k in range(len(room.values)):
         action = action_at(tables, room, k)
         room.values[k] = tables.values[0, obs, action]
@@ -59,9 +59,9 @@ def best_value(tables: Any, obs: int, room: Room) -> float:
 
 
 class Tables(NamedTuple):
-    """What an agent knows, in the memory of its policy, where all actions are allowed.
+    """The tables of an agent, in the memory of its policy, if all actions are allowed.
 
-    `MaskedTables` of no rows mean the same, and cost the compiled loop a sixth of its speed.
+    `MaskedTables` without rows mean the same, but slow the compiled loop by a sixth.
     """
 
     values: Floats  # action values, shape (T, S, A)
@@ -69,34 +69,34 @@ class Tables(NamedTuple):
 
     @inlined
     def room_at(self, obs: int, room: Room) -> Room:
-        """All of it."""
+        """The whole room: all actions are allowed."""
         return room
 
     @inlined
     def action_at(self, room: Room, k: int) -> int:
-        """The k-th of all."""
+        """The k-th action."""
         return k
 
     @inlined
     def with_mean_values(self, obs: int, room: Room) -> Room:
-        """A row of the table as it lies there, where there is only one."""
+        """A view of the table's row if there is one table, else the means."""
         if self.values.shape[0] == 1:
             return Room(self.values[0, obs], room.actions, room.draws)
         return average_tables(self, obs, room)
 
 
 class MaskedTables(NamedTuple):
-    """What an agent knows, and what the environment allows."""
+    """The tables of an agent, and the action masks."""
 
     values: Floats
     visit_counts: Ints
-    # What may be done at each observation, bool of shape (S, A); everything where a row is False,
-    # which means that nothing is known, or where there are no rows.
+    # The allowed actions at each observation, bool of shape (S, A); all actions if a row is all
+    # False (mask unknown), or there are no rows.
     allowed: Bools
 
     @inlined
     def room_at(self, obs: int, room: Room) -> Room:
-        """As much as there are allowed actions, which are listed in it."""
+        """The part of the room for the allowed actions, which it lists."""
         actions, n_allowed = room.actions, 0
         if len(self.allowed) > 0:
             for action in range(len(actions)):
@@ -111,60 +111,59 @@ class MaskedTables(NamedTuple):
 
     @inlined
     def action_at(self, room: Room, k: int) -> int:
-        """The k-th that is allowed."""
+        """The k-th allowed action."""
         return int(room.actions[k])
 
     @inlined
     def with_mean_values(self, obs: int, room: Room) -> Room:
-        """The means, worked out in the room."""
+        """The means of the tables, in the room."""
         return average_tables(self, obs, room)
 
 
 # Acting on a table of action values, and moving its entries towards their targets.
 #
 # Compiled functions, shared by the interpreted and the compiled training loop. An update bootstraps
-# from ``values`` of shape (T, S, A): one table, or two for double Q-learning. Termination is folded
-# into the discount, which is 0 then, so that a truncated episode still bootstraps. What an
-# algorithm adds is `next_value`, and `commit` where it decides on its next action before the
-# update.
+# from ``values`` of shape (T, S, A): one table, or two for double Q-learning. After termination the
+# discount is 0; a truncated episode still bootstraps. An algorithm defines `next_value`, and
+# `commit` if it chooses its next action before the update.
 #
 # Source: Sutton and Barto (2nd edition), chapter 6.
 
 
 class TabularAgent(NamedTuple):
-    """An agent as compiled functions see it."""
+    """An agent for compiled functions."""
 
-    settings: Any  # a record of the type that its class has
-    tables: Any  # what it knows, `Tables` or `MaskedTables`
-    room: Room  # for its work
+    settings: Any  # a record of its class's type
+    tables: Any  # `Tables` or `MaskedTables`
+    room: Room  # scratch arrays
     rng: Any  # a handle of its generator
-    memory: Any  # arrays of its algorithm's own, by name; see `TabularAlgorithm`
+    memory: Any  # further arrays of its algorithm; see `TabularAlgorithm`
 
 
 @by_type
 def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
-    """What follows the step, as the target of the update of ``table`` has it.
+    """The value of the next state in the target of an update of ``table``.
 
-    ``agent.room.values`` holds the values of that table in ``env.next_obs``, of the actions that
-    are allowed there, and ``agent.room.actions`` says which these are; ``env.uniform`` is a number
-    in [0, 1), uniform where there are several tables.
+    ``agent.room.values`` has the values of that table in ``env.next_obs``, for the allowed actions
+    in ``agent.room.actions``; ``env.uniform`` is in [0, 1), a random number if there are several
+    tables.
     """
     raise CompiledOnlyError
 
 
 @by_type
 def commit(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """Decide on ``env.next_action``, or note what else is to be known before any table changes."""
+    """Choose ``env.next_action``, or store anything else that is needed from unchanged tables."""
 
 
 @inlined
 def no_commitment(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """The next action is chosen when it is due."""
+    """Do nothing: the next action is chosen when it is due."""
 
 
 @inlined
 def exploration_rate(agent: TabularAgent, progress: Any) -> float:
-    """How much to explore now: epsilon, temperature or standard deviation."""
+    """The present exploration rate: epsilon, temperature or standard deviation."""
     if agent.settings.strategy == GAUSSIAN_NOISE:
         return float(progress.exploration / (progress.episodes + 1))
     return float(progress.exploration)
@@ -172,7 +171,7 @@ def exploration_rate(agent: TabularAgent, progress: Any) -> float:
 
 @inlined
 def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
-    """An allowed action by the mean of the tables' values."""
+    """Choose an allowed action by the mean of the tables' values."""
     settings, tables = agent.settings, agent.tables
     room = room_at(tables, obs, agent.room)
     if settings.strategy == GAUSSIAN_NOISE:
@@ -191,7 +190,7 @@ def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
 
 @inlined
 def act_on_values(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """Do what was committed to, or choose."""
+    """Take the action that the agent has committed to, or choose one."""
     env.action = env.next_action
     env.next_action = UNDECIDED
     if env.action == UNDECIDED:
@@ -209,7 +208,7 @@ def values_at(agent: TabularAgent, obs: int, table: int) -> Room:
 
 @inlined
 def value_ahead(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
-    """`next_value`, with the room that it needs."""
+    """`next_value`, after filling the room that it needs."""
     room = values_at(agent, env.next_obs, table)
     ahead = TabularAgent(agent.settings, agent.tables, room, agent.rng, agent.memory)
     return float(next_value(ahead, env, progress, table))
@@ -228,7 +227,7 @@ def count_visit(agent: TabularAgent, progress: Any, table: int, obs: int, action
 def move_towards(
     agent: TabularAgent, progress: Any, table: int, obs: int, action: int, target: float
 ) -> float:
-    """Move one entry towards its target, and return by how much it was wrong."""
+    """Move one entry towards its target, and return its error before."""
     values = agent.tables.values
     size = count_visit(agent, progress, table, obs, action)
     error = target - values[table, obs, action]
@@ -269,7 +268,7 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
     progress.mean_td_error = total_error if len(envs) == 1 else total_error / len(envs)
 
 
-# Python hands over arrays one by one, which costs it less than to take tuples of them apart.
+# Python passes arrays one by one, which is faster than unpacking tuples of them.
 
 
 @kernel

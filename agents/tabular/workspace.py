@@ -1,6 +1,6 @@
-"""What agents on tables and on tiles share: they learn from records of their environments.
+"""The base of agents on tables and on tiles, which learn from records of their environments.
 
-Compiled functions read and write these records. In the interpreted loop a `Workspace` holds them.
+Compiled functions read and write these records. In the interpreted loop a `Workspace` has them.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Workspace:
         self.envs = env_records(n, kind)
         self.envs["next_action"] = UNDECIDED
         self.progress = np.zeros(1, dtype=PROGRESS)
-        # Looked up once: finding a field takes longer than filling it.
+        # Looked up once, because finding a field takes longer than filling it.
         self.fields = {name: self.envs[name] for name in kind.names or ()}
-        # What the agent has committed to in each environment, or `UNDECIDED`, shape (n,).
+        # The action committed to in each environment, or `UNDECIDED`, shape (n,).
         self.next_actions: Ints = self.fields["next_action"]
         names = ("exploration", "learning_rate", "episodes", "mean_td_error")
         self.exploration, self.learning_rate, self.episodes, self.mean_td_error = (
@@ -36,14 +36,14 @@ class Workspace:
     def note_progress(
         self, exploration: float, learning_rate: float, episodes: int, mean_td_error: float = 0.0
     ) -> None:
-        """Set how much to explore, the step size, the episodes so far, and the last error."""
+        """Set the exploration rate, the step size, the episodes so far, and the last error."""
         self.exploration[0] = exploration
         self.learning_rate[0] = learning_rate
         self.episodes[0] = episodes
         self.mean_td_error[0] = mean_td_error
 
     def take_outcomes(self, transitions: Transitions) -> None:
-        """Write what the environments' step has brought into their records."""
+        """Write rewards and ends of the environments' step into their records."""
         fields = self.fields
         fields["reward"][:] = transitions.rewards
         fields["terminated"][:] = transitions.terminated
@@ -54,8 +54,8 @@ class WorkspaceAlgorithm(LearningAlgorithm):
     """Acts and learns in a workspace, interpreted, or on the records of the compiled loop.
 
     Attributes:
-        engine_in_use: which loop the last training ran in, and why if it is not the compiled one.
-        mean_td_error: mean absolute error of the last updates.
+        engine_in_use: the loop of the last training, with the reason if it was not compiled.
+        mean_td_error: mean absolute TD error of the last updates.
     """
 
     logs_by_records = True
@@ -67,7 +67,7 @@ class WorkspaceAlgorithm(LearningAlgorithm):
         self.engine_in_use = ""
         self.mean_td_error = 0.0
         self._next_actions: Ints = np.empty(0, dtype=np.int64)
-        self._in_use: Any = None  # the workspace in which the agent has learnt last
+        self._in_use: Any = None  # the workspace of the last learning
         super().__init__(*args, **kwargs)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -77,17 +77,17 @@ class WorkspaceAlgorithm(LearningAlgorithm):
         self._next_actions = np.full(self.n_envs, UNDECIDED)
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
-        """Write what the compiled loop goes on from into its records."""
+        """Write the agent's state into the records of the compiled loop."""
         envs["next_action"] = self._next_actions
         progress["mean_td_error"] = self.mean_td_error
 
     def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
-        """Go on from where the compiled loop is."""
+        """Read the agent's state from the records of the compiled loop."""
         self._next_actions = envs["next_action"].copy()
         self.mean_td_error = float(progress["mean_td_error"][0])
 
     def _present_workspace(self) -> Any:
-        """The one of the training under way, up to date."""
+        """The workspace of the current training, brought up to date."""
         workspace = self._workspace_for(self.rng, self.n_envs)
         self._note_progress(workspace)
         if self._next_actions is not workspace.next_actions:
@@ -110,10 +110,10 @@ class WorkspaceAlgorithm(LearningAlgorithm):
         self._n_updates += self.n_envs
 
     def _exploring_actions(self, observation: Any) -> Ints:
-        """An action for an observation, or n for n of them, chosen as in training.
+        """An exploring action for one observation, or n actions for n observations.
 
         Raises:
-            ValueError: if it is neither.
+            ValueError: for an observation of another shape.
         """
         obs = np.asarray(observation)
         many = is_vectorized_observation(obs, self.observation_space)
