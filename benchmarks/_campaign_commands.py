@@ -1,4 +1,4 @@
-"""The commands that `fault_campaign` disturbs, each with what it needs beforehand."""
+"""The commands that `fault_campaign` disturbs, each with the commands that it needs before."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TRAININGS = (
     ("LinearBandit-v0", "linucb", 10_000, ""),
     ("BernoulliBandit-v0", "mabwiser_ucb1", 3000, ""),
 )
-# With -i, from an agent that was trained with the same settings for a tenth of that.
+# With -i, from an agent that was trained with the same settings for a tenth of the steps.
 CONTINUATIONS = (
     ("Warehouse-v0", "qlearning", 6_000_000, "engine:compiled"),
     ("FrozenLake-v1", "sarsa", 40_000, "engine:interpreted n_envs:3"),
@@ -70,21 +70,21 @@ for seed in range(2):
 
 @dataclass
 class Case:
-    """One command, in peace and disturbed.
+    """One command, undisturbed and disturbed.
 
     In its words ``{logs}`` stands for the folder that it writes to, ``{before}`` for that of the
     commands before it.
 
     Attributes:
-        name: what is shown.
-        folder: of all that belongs to it.
-        words: the command's.
-        before: those of commands that are run once, in peace.
-        begins_with_them: whether it finds in its folder what they have left.
-        is_told: whether it prints what comes out.
-        whole: the files of the undisturbed one.
-        seconds: what that took.
-        counts: what became of the disturbed ones.
+        name: shown in the table.
+        folder: of all its files.
+        words: the command and its arguments.
+        before: commands to run once before, undisturbed.
+        begins_with_them: whether its folder begins with their files.
+        is_told: whether its result is its output.
+        whole: the files of the undisturbed command.
+        seconds: the time of the undisturbed command.
+        counts: signals, and outcomes of disturbed commands.
     """
 
     name: str
@@ -104,12 +104,12 @@ class Case:
         return self.words[0] in ("compare.py", "tune.py") and not self.is_told
 
     def prepare(self) -> None:
-        """Run what comes before it."""
+        """Run the commands before it."""
         for words in self.before:
             self._must(self._started(words, self.folder / "before"))
 
     def run_in_peace(self) -> None:
-        """Run the command undisturbed; the second time counts, when all is compiled."""
+        """Run the command undisturbed, twice; the second time counts, with all code compiled."""
         for name in ("warm", "whole"):
             logs = self.folder_of(name)
             begun = time.monotonic()
@@ -123,13 +123,13 @@ class Case:
             raise SystemExit(f"{self.name}: {self.read_said()}")
 
     def folder_of(self, name: str) -> Path:
-        """A folder for the command to write to, with what it is to find there."""
+        """A folder for the command to write to, with its initial files."""
         if self.begins_with_them:
             shutil.copytree(self.folder / "before", self.folder / name)
         return self.folder / name
 
     def start(self, logs: Path) -> subprocess.Popen[str]:
-        """Start the command in a session of its own, so that what it leaves can be found."""
+        """Start the command in its own session, so that orphaned processes can be found."""
         return self._started(self.words, logs)
 
     def _started(self, words: list[str], logs: Path) -> subprocess.Popen[str]:
@@ -140,7 +140,7 @@ class Case:
         if filled[0].endswith(".py"):
             filled = [str(ROOT / filled[0]), *filled[1:], "-f", str(logs)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-        environment["PYTHONFAULTHANDLER"] = "1"  # what hangs tells where
+        environment["PYTHONFAULTHANDLER"] = "1"  # prints where a process hangs
         with (self.folder / "output").open("a") as output:
             return subprocess.Popen(
                 [sys.executable, *filled],
@@ -153,22 +153,22 @@ class Case:
             )
 
     def read_said(self) -> str:
-        """What was printed since the last look."""
+        """The output since the last call."""
         output = self.folder / "output"
         self.said = output.read_text(encoding="utf-8", errors="replace")
         output.write_text("")
         return self.said
 
     def result(self, logs: Path) -> dict[str, Any]:
-        """What came out, by the names of files."""
+        """The result, by the names of files."""
         found = contents(logs) if logs.exists() else {}
-        # What takes long is told of before the table.
+        # The output before the table is progress.
         table = self.said[self.said.find("┏") :]
         return {**found, "what it said": table} if self.is_told else found
 
 
 def cases(folder: Path) -> list[Case]:
-    """All that are stopped at random moments."""
+    """All commands that are stopped at random moments."""
     found = [
         Case(f"{one[1]} on {one[0]}", folder / f"train-{number}", _training(*one))
         for number, one in enumerate(TRAININGS)

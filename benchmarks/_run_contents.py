@@ -1,4 +1,4 @@
-"""What runs and studies leave, as it is compared: without moments and durations."""
+"""The comparable contents of files of runs and studies: without times and durations."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ import numpy as np
 import torch as th
 
 TIMES = ("seconds", "cpu_seconds")
-# Digests of files with times in them, the settings with the folder's name, and who did it.
+# Also digests of files with times, the settings with the folder's name, and the process.
 NOT_COMPARED = (*TIMES, "began", "date", "ended", "files", "spec", "process", "command", "packed")
 
 
 def contents(logs: Path) -> dict[str, Any]:
-    """What the files of a run or a study say, but for moments and durations; by relative name.
+    """The contents of a run's or a study's files without times and durations, by relative name.
 
-    Into how many folders runs were moved that a study has replaced, is left out.
+    The numbers of the folders with replaced runs of a study are left out of the names.
     """
     files = sorted(path for path in logs.rglob("*") if path.is_file())
     return {_name(path.relative_to(logs)): _content(path) for path in files}
@@ -51,7 +51,7 @@ def _content(path: Path) -> Any:
         return [{k: v for k, v in row.items() if k not in (*TIMES, "path")} for row in rows]
     if path.suffix == ".gif":
         return path.read_bytes()
-    # In what is left stand commands, durations and folders.
+    # Other files contain commands, durations and folders.
     return path.suffix
 
 

@@ -1,14 +1,14 @@
-"""Does what every documented command trains work? Each one over seeds that nothing was tuned on.
+"""Trains what every documented command trains, over seeds that were not used for tuning.
 
     python benchmarks/documented_commands.py --results found.json     # about an hour on one core
     python benchmarks/documented_commands.py --results found.json --only cliff --again
     python benchmarks/documented_commands.py --results found.json --fill
 
 Trainings are collected from the text, see docs/scripts/recommended_commands.py, and done one after
-another in this process, with ``--engine auto`` and the seeds 1000 to 1019; fewer where that many
-take longer than ``--limit`` seconds, and one where an agent plans and draws no numbers. What is
-found is kept in the file at once, and what is in it is not done again. ``--fill`` puts it into
-docs/documented-commands.json, and beside the commands of all pages what they reach.
+another in this process, with ``--engine auto`` and the seeds 1000 to 1019. There are fewer seeds if
+they take longer than ``--limit`` seconds, and one for deterministic planners. Results are saved in
+the file at once, and not done again. ``--fill`` writes them into docs/documented-commands.json, and
+beside the commands of all pages.
 
 With ``PYTHONPATH=OLDER_CHECKOUT`` the same trainings are done with an older version.
 """
@@ -41,7 +41,7 @@ PLANNERS = {"optimal", "value_iteration", "policy_iteration"}
 
 
 def prepared_folder(folder: Path) -> None:
-    """The files that pages tell their readers to make."""
+    """Make the files that pages tell their readers to make."""
     from envs.bandits import log_uniformly
 
     page = (ROOT / "docs" / "own-map.md").read_text(encoding="utf-8")
@@ -55,7 +55,7 @@ def prepared_folder(folder: Path) -> None:
 
 
 def outcome(training: str, seed: int, folder: Path) -> dict[str, Any]:
-    """What one run reaches: its return, its score if there is one, and its processor time."""
+    """The results of one run: its return, its score if there is one, and its processor time."""
     from rich.console import Console
 
     from commands.train import build_parser, train_spec
@@ -84,7 +84,7 @@ def outcome(training: str, seed: int, folder: Path) -> dict[str, Any]:
 
 
 def measure(training: str, limit: float, folder: Path) -> list[dict[str, Any]]:
-    """One run after another, until all seeds are done or they have taken too long."""
+    """Do one run after another, until all seeds are done or the time limit is exceeded."""
     agent = training.split()[3]
     runs: list[dict[str, Any]] = []
     for seed in SEEDS[:1] if agent in PLANNERS else SEEDS:
@@ -95,9 +95,9 @@ def measure(training: str, limit: float, folder: Path) -> list[dict[str, Any]]:
 
 
 def row(training: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Solved, what the median run reaches, and its processor time."""
+    """The number of solved runs, the median result, and the median processor time."""
     solved = n_solved(training, runs)
-    # Beside a constant policy that is optimal too, scores have no size.
+    # If a constant policy is optimal, the score is meaningless.
     no_score = any(abs(r["score"] or 0) > 10 or (_is_optimal(r) and r["score"] <= 0) for r in runs)
     names = ("return", "regret") if no_score else ("score", "return", "regret")
     kind = next((name for name in names if all(run[name] is not None for run in runs)), None)
@@ -116,13 +116,13 @@ def _is_optimal(run: dict[str, Any]) -> bool:
 
 
 def n_solved(training: str, runs: list[dict[str, Any]]) -> int | None:
-    """How many reach 0.9 of the score, or where the optimum is not known, the threshold."""
+    """How many runs reach a score of 0.9 or, if the optimum is not known, the threshold."""
     import gymnasium as gym
 
     import envs  # noqa: F401
 
     if all(run["score"] is not None and not run["bracketed"] for run in runs):
-        # Where the best constant policy is the optimum, the score says nothing.
+        # If the best constant policy is optimal, the score is meaningless.
         return len([r for r in runs if r["score"] >= REACHED or _is_optimal(r)])
     threshold = gym.spec(training.split()[1]).reward_threshold
     if threshold is None or any(run["return"] is None for run in runs):
@@ -131,7 +131,7 @@ def n_solved(training: str, runs: list[dict[str, Any]]) -> int | None:
 
 
 def fill(found: dict[str, Any]) -> None:
-    """Write what was found, for all trainings that are recommended still, and beside commands."""
+    """Write the results of all trainings still recommended, also beside the commands."""
     before = json.loads(RESULTS.read_text(encoding="utf-8"))
     rows = {one: row(one, found[one]) if one in found else before.get(one) for one in trainings()}
     lines = [f"{json.dumps(one)}: {json.dumps(each)}" for one, each in rows.items() if each]
@@ -141,13 +141,13 @@ def fill(found: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Do what is missing, keep it, and fill the page."""
+    """Do missing trainings and save their results, or fill the pages."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--results", type=Path, required=True, metavar="FILE")
     parser.add_argument("--only", default="", metavar="REGEX", help="trainings that match")
-    parser.add_argument("--again", action="store_true", help="also those that are in the file")
+    parser.add_argument("--again", action="store_true", help="also trainings that are in the file")
     parser.add_argument(
         "--limit", type=float, default=120, metavar="S", help="for one training (120)"
     )
@@ -164,7 +164,7 @@ def main() -> None:
         for training in trainings():
             if re.search(args.only, training) and (args.again or training not in found):
                 runs = measure(training, args.limit, Path(name) / "logs")
-                # The file may have grown by another process.
+                # Another process may have added to the file.
                 found = json.loads(results.read_text()) if results.exists() else {}
                 results.write_text(json.dumps({**found, training: runs}, indent=1))
                 print(training, *row(training, runs).values(), sep=" | ", flush=True)

@@ -1,17 +1,17 @@
-"""Trainings and studies that are stopped and killed at random moments, until they are done.
+"""Stops and kills trainings and studies at random moments, until they are done.
 
     python benchmarks/fault_campaign.py --kills 30       # a look, a minute or two
     python benchmarks/fault_campaign.py --kills 1000     # docs/reliability.md: half an hour
 
-Every agent is trained once in peace. Then the same command is started again and again, and gets a
-signal at a moment drawn uniformly from the time that it takes: SIGKILL, SIGTERM, SIGINT, or SIGINT
-twice. When a process has come to the end, its files are held against those of the undisturbed run,
-bit for bit, but for moments and durations. After twenty signals it is left alone. A study is
-treated likewise, the signal going to the driver, to one of its workers, or to all its processes; so
-are filming and judging by a log, which begin anew.
+Every agent is trained once undisturbed. Then the same command is started again and again, and gets
+a signal at a moment drawn uniformly from its duration: SIGKILL, SIGTERM, SIGINT, or SIGINT twice.
+When a process has finished, its files are compared bit for bit with those of the undisturbed run,
+except for times and durations. After twenty signals it is left alone. The same is done with
+studies, where the signal goes to the driver, a worker, or all processes, and with filming and
+judging by a log, which start from the beginning.
 
-Counted are results that differ, files that are damaged, processes that are left, and files that are
-left. All must be none.
+It counts differing results, damaged files, orphaned processes, and files left behind. All counts
+must be 0.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ from _campaign_commands import Case, cases
 
 SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGINT twice")
 TARGETS = ("driver", "worker", "all")
-MOST_STARTS = 200  # of one command: it should have come to its end by then
-MOST_SIGNALS = 20  # that one command gets before it is left alone
-LONGEST = 60  # seconds of a start, beside twenty times as long as in peace
+MOST_STARTS = 200  # of one command, which should be done by then
+MOST_SIGNALS = 20  # to one command, before it is left alone
+LONGEST = 60  # seconds of a start, in addition to twenty times the undisturbed duration
 
 
 def disturbed(case: Case, seed: int) -> int:
-    """Run the command until it is done, with a signal each time; the number of signals.
+    """Run the command until it is done, with a signal each time; return the number of signals.
 
     Args:
         case: the command.
         seed: of the moments.
     """
-    draw = random.Random(f"{case.name} {seed}")  # noqa: S311  # to be repeated, not kept secret
+    draw = random.Random(f"{case.name} {seed}")  # noqa: S311  # reproducible, not secret
     logs = case.folder_of(f"disturbed {seed}")
     signals, kills = 0, case.counts["SIGKILL"]
     for _ in range(MOST_STARTS):
@@ -71,7 +71,7 @@ def disturbed(case: Case, seed: int) -> int:
 
 
 def _ended(case: Case, process: subprocess.Popen[str]) -> int:
-    """The exit code; of a command that hangs, `faulthandler` prints where, and it is killed."""
+    """The exit code; a command that hangs is killed, and `faulthandler` prints where."""
     try:
         return process.wait(LONGEST + 20 * case.seconds)
     except subprocess.TimeoutExpired:
@@ -118,7 +118,7 @@ def _send(pid: int, number: int) -> None:
 
 
 def _group(session: int) -> list[int]:
-    """The processes of a session that are there, zombies not counted."""
+    """The running processes of a session, without zombies."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -131,7 +131,7 @@ def _group(session: int) -> list[int]:
 
 
 def _orphans(session: int) -> int:
-    """How many processes are left some seconds after the one that was started."""
+    """The number of processes still running five seconds after the end of the started one."""
     until = time.monotonic() + 5.0
     while (left := _group(session)) and time.monotonic() < until:
         time.sleep(0.05)
@@ -148,7 +148,7 @@ def _has_traceback(case: Case) -> int:
 
 
 def _judge(case: Case, logs: Path, *, was_killed: bool) -> None:
-    """Hold what the disturbed command has left against the undisturbed one."""
+    """Compare the result of the disturbed command with that of the undisturbed one."""
     case.counts["done"] += 1
     try:
         found = case.result(logs)
@@ -157,7 +157,7 @@ def _judge(case: Case, logs: Path, *, was_killed: bool) -> None:
         print(f"{case.name}: {logs}: {error!r}", file=sys.stderr)
         return
     left, missing = found.keys() - case.whole.keys(), case.whole.keys() - found.keys()
-    if was_killed:  # nothing looks for the draft of a pack that was killed
+    if was_killed:  # the draft of a pack that was killed is never cleaned up
         left = {name for name in left if not re.match(r"\.pack.*\.[0-9a-f]{16}\.tmp", name)}
     differing = [n for n in found.keys() & case.whole.keys() if found[n] != case.whole[n]]
     case.counts["files left"] += len(left)
@@ -186,13 +186,13 @@ def table(found: list[Case]) -> Table:
 
 
 def main() -> int:
-    """Do the campaign; 1 where something is not none."""
+    """Do the campaign; return 1 if a count is not 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--kills", type=int, default=30, help="signals in all, at least")
     parser.add_argument("--jobs", type=int, default=max((os.cpu_count() or 2) // 2, 1))
     parser.add_argument("--only", nargs="+", default=[], help="names of the commands to try")
     args = parser.parse_args()
-    # Whoever is started in the background ignores it, and so would the commands.
+    # A process started in the background ignores SIGINT, and its children would, too.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="fault-campaign-") as folder:
         os.environ["XDG_CONFIG_HOME"] = str(Path(folder) / "config")

@@ -3,8 +3,8 @@ r"""Fills the headline study's tables into README.md and docs/library-vs-hand-ro
     python compare.py studies/library-vs-hand-rolled.yml --first-seed 1000 --name held-out
     python benchmarks/headline.py logs/studies/held-out
 
-Nothing is run: the study is read where it lies, and judged anew. What stands between a pair of
-comments such as ``<!-- headline: held-out -->`` and ``<!-- end -->`` is replaced.
+Nothing is run: the program reads the finished study, and judges it again. It replaces the text
+between pairs of comments such as ``<!-- headline: held-out -->`` and ``<!-- end -->``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BLOCK = re.compile(r"(<!-- headline: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTAL
 
 
 def judged(root: Path) -> StudyAnalysis:
-    """The study in a folder, with the seeds of whatever runs are there."""
+    """The study in a folder, with the seeds of the runs that are there."""
     numbers = [
         int(path.name.rpartition("_")[2]) for path in root.glob("runs/*/*_*") if path.is_dir()
     ]
@@ -46,7 +46,7 @@ def judged(root: Path) -> StudyAnalysis:
 
 
 def filled(page: str, blocks: Mapping[str, str]) -> str:
-    """The page with what stands in its blocks replaced, as far as they are given."""
+    """The page with the given blocks replaced."""
 
     def put(found: re.Match[str]) -> str:
         text = blocks.get(found[2])
@@ -60,7 +60,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("study", type=Path, metavar="FOLDER", help="where the study lies")
+    parser.add_argument("study", type=Path, metavar="FOLDER", help="the study's folder")
     analysis = judged(parser.parse_args().study)
     blocks = {"held-out": table_as("md", headline(analysis))}
     for path in PAGES:

@@ -1,14 +1,14 @@
-"""A study by the real SLURM, on this machine, whose jobs are cancelled, preempted and killed.
+"""A study by the real SLURM on this machine, with jobs cancelled, preempted and killed.
 
     apt-get install slurm-wlm munge                      # Debian: 17 s
     python benchmarks/slurm.py --runs 8 --faults scancel preempt      # a look, a minute or two
     python benchmarks/slurm.py                                        # docs/reliability.md
 
-munge, slurmctld and two slurmd are started in a temporary folder, and end with the command. The
-study's jobs are those of docs/cluster.md, smaller. Faults come one by one as runs are done. Then
-one long run loses its job again and again. In the end every file must say what that of an
-undisturbed study on this machine says, no key may be left, and no output lie in the folder where
-the command was given. The exit code is 1 otherwise.
+The program starts munge, slurmctld and two slurmd in a temporary folder, and stops them at its end.
+The study's jobs are those of docs/cluster.md, but smaller. Faults come one by one while runs are
+done. Then one long run loses its job again and again. In the end every file must be the same as in
+an undisturbed study on this machine, with no keys left, and no job output in the working directory.
+Otherwise the exit code is 1.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class Slurm:
         self.start(name)
 
     def said(self, *words: str) -> str:
-        """What a command of SLURM prints, also where it fails."""
+        """The output of a SLURM command, also if it fails."""
         done = subprocess.run(
             words, env=self.environment, capture_output=True, text=True, check=False, timeout=60
         )
@@ -155,7 +155,7 @@ class Slurm:
         return [line for line in self.said(*words).split() if line.isdecimal()]
 
     def wait(self) -> None:
-        """Wait until both nodes take jobs."""
+        """Wait until both nodes accept jobs; SystemExit after a minute."""
         until = time.monotonic() + 60
         while self.said("sinfo", "-h", "-t", "idle", "-o", "%D", "-p", "normal").strip() != "2":
             if time.monotonic() > until:
@@ -227,9 +227,9 @@ class Study:
     """A command that does a study by SLURM.
 
     Args:
-        cluster: where.
-        folder: where the command is given.
-        words: of the command.
+        cluster: the SLURM cluster.
+        folder: the working directory of the command.
+        words: arguments of the command.
     """
 
     def __init__(self, cluster: Slurm, folder: Path, words: str) -> None:
@@ -253,17 +253,17 @@ class Study:
 
     @property
     def n_done(self) -> int:
-        """How many runs are there."""
+        """The number of finished runs."""
         return sum(1 for _ in self.folder.glob(f"slurm/{self.name}/runs/*/*/run.json"))
 
     @property
     def drafts(self) -> set[str]:
-        """The runs that are under way, or were; by the processes that do them."""
+        """The names of drafts of unfinished runs, one for each process."""
         places = self.folder.glob(f"slurm/{self.name}/.drafts/*/run.json")
         return {path.parent.name for path in places}
 
     def suffer(self, fault: str) -> str:
-        """Do what a fault says; returns what came of it."""
+        """Inject a fault; return what happened."""
         cluster = self.cluster
         if fault == "driver":
             self.process.kill()
@@ -290,7 +290,7 @@ class Study:
 
 
 def disturbed(study: Study, faults: Sequence[tuple[int, str]]) -> None:
-    """Let a study end, with a fault whenever so many runs are done."""
+    """Wait for the end of a study, with faults after given numbers of finished runs."""
     left, until = list(faults), time.monotonic() + MOST_SECONDS
     while study.process.poll() is None and time.monotonic() < until:
         time.sleep(0.1)
@@ -302,7 +302,7 @@ def disturbed(study: Study, faults: Sequence[tuple[int, str]]) -> None:
 
 
 def cancelled(study: Study, n_times: int) -> None:
-    """Let one long run end whose job is cancelled so many times."""
+    """Wait for the end of one long run, and cancel its job ``n_times``."""
     n_left, begun, until = n_times, set[str](), time.monotonic() + MOST_SECONDS
     while study.process.poll() is None and time.monotonic() < until:
         time.sleep(0.5)
@@ -319,7 +319,7 @@ def cancelled(study: Study, n_times: int) -> None:
 
 
 def told(study: Study, folder: Path, n_runs: int) -> bool:
-    """Print what there is and what differs; whether all is as it must be."""
+    """Print the result of a study and its differences; return whether all is correct."""
     where = folder / "slurm" / study.name
     for job_logs in where.glob("jobs"):
         shutil.move(job_logs, folder / f"{study.name}-jobs")
@@ -339,7 +339,7 @@ def told(study: Study, folder: Path, n_runs: int) -> bool:
 
 
 def campaign(folder: Path, args: argparse.Namespace) -> bool:
-    """Do both studies, by SLURM and here."""
+    """Do both studies, by SLURM and locally; return whether all is correct."""
     n_seeds = max(args.runs // 2, 1)
     studies = [(f"{STUDY} --seeds {n_seeds} --no-report --name short", 2 * n_seeds)]
     if args.cancellations:
@@ -375,7 +375,7 @@ def campaign(folder: Path, args: argparse.Namespace) -> bool:
 
 
 def main() -> int:
-    """Do the campaign; 1 where something differs."""
+    """Do the campaign; return 1 if something differs."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--faults", nargs="*", default=FAULTS, choices=sorted({*FAULTS}))

@@ -1,7 +1,7 @@
 """Bandit agents; pulls a second.
 
-Ours go through the environment, Monitor and all; the plain loops and MABWiser are handed rewards
-that NumPy draws, which favours them.
+Our agents use the environment with Monitor; the plain loops and MABWiser get rewards drawn by
+NumPy, which favours them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ MABWISER = {
 
 
 class World:
-    """Rewards as a plain loop draws them."""
+    """Rewards for a plain loop."""
 
     def __init__(self, name: str) -> None:
         self.rng = np.random.default_rng(0)
@@ -58,7 +58,7 @@ class World:
         return float(self.rng.normal(self.means[arm]))
 
     def context(self) -> Any:
-        """Features to choose in."""
+        """The features of a random context."""
         return self.rng.uniform(-1, 1, N_FEATURES)
 
     def pull_in(self, arm: int, context: Any) -> float:
@@ -81,7 +81,7 @@ def interpreted(name: str) -> None:
 
 
 def plain(name: str) -> None:
-    """As written by hand, with NumPy."""
+    """A loop as written by hand, with NumPy."""
     world = World(name)
     rng, n_arms = world.rng, world.n_arms
     values, counts, wins = np.zeros(n_arms), np.zeros(n_arms), np.zeros(n_arms)
@@ -102,7 +102,7 @@ def plain(name: str) -> None:
 
 
 def plain_linucb() -> None:
-    """With the inverse kept by the formula of Sherman and Morrison."""
+    """LinUCB as written by hand, with the inverse updated by Sherman and Morrison's formula."""
     world = World("linucb")
     inverses = np.tile(np.eye(N_FEATURES), (N_ARMS, 1, 1))
     moments = np.zeros((N_ARMS, N_FEATURES))

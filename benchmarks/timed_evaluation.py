@@ -1,7 +1,7 @@
-"""What evaluations, callbacks and logs add to a training; seconds of the processor.
+"""The cost of evaluations, callbacks and logs in a training; seconds of processor time.
 
-The trainings are `train.py`'s, without a flag for evaluation and with a shorter budget, and
-`learn()` with what people put beside it. The first contender is the training alone.
+The trainings are those of `train.py`, without evaluation flags and with a shorter budget, and
+`learn()` with common callbacks and logs. The first contender is the training alone.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ IN_BINS = partial(
 
 
 def typed(words: str, *more: str) -> Contender:
-    """A whole training, as it is typed."""
+    """A whole training of `train.py` with these arguments."""
 
     def measure() -> float:
         with tempfile.TemporaryDirectory() as folder:
@@ -68,7 +68,7 @@ def typed(words: str, *more: str) -> Contender:
 
 
 class EachThousand(BlockCallback):
-    """One that says when it acts."""
+    """A callback that acts every thousand steps."""
 
     every_n_steps = 1000
 
@@ -77,13 +77,13 @@ class EachThousand(BlockCallback):
 
 
 def environments(algo: str, env_id: str, n: int, folder: str | None = None) -> VecEnv:
-    """Those of a training or an evaluation; CartPole in bins for a table."""
+    """Environments of a training or an evaluation; CartPole in bins for a table."""
     in_bins: Any = IN_BINS if (algo, env_id) == ("qlearning", "CartPole-v1") else None
     return make_vec_env(env_id, n, seed=0, wrapper_class=in_bins, monitor_dir=folder)
 
 
 def beside(algo: str, env_id: str, n_envs: int, n_steps: int, name: str) -> float:
-    """What a training takes beside which something is put, once its loop is compiled."""
+    """Seconds of a training with the named callback or log, after its loop is compiled."""
     every = n_steps // 10 // n_envs
     with tempfile.TemporaryDirectory() as folder:
         evaluated = partial(EvalCallback, n_eval_episodes=20, eval_freq=every, verbose=0)
@@ -110,7 +110,7 @@ def beside(algo: str, env_id: str, n_envs: int, n_steps: int, name: str) -> floa
 
 
 def rows(folder: Path) -> Rows:
-    """Trainings with and without their evaluations, and with what stands beside them."""
+    """Trainings with and without evaluations, and with callbacks and logs."""
     made: Rows = {
         f"train.py {words}": {
             "--eval-freq -1 --eval-episodes 1": typed(

@@ -1,6 +1,6 @@
 """Networks on the library's loop and on compiled code; steps a second.
 
-Monitor on, nothing logged, nothing evaluated. What is compiled has been compiled before.
+With Monitor, without logs and evaluations. Code is compiled before the measurement.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ TASKS: dict[str, tuple[str, str, int, dict[str, Any], int, int]] = {
 
 
 class AskedEachStep(BaseCallback):
-    """What keeps an environment from being compiled."""
+    """A callback that keeps an environment from being compiled."""
 
     def _on_step(self) -> bool:
         return True
 
 
 def steps_a_second(task: str, engine: str, callback: BaseCallback | None = None) -> float:
-    """Of a new agent, whose loop has been compiled before."""
+    """Steps a second of a new agent, after its loop has been compiled."""
     name, env_id, n_envs, settings, compiled_steps, other_steps = TASKS[task]
     algorithm: Any = load_algorithm(name)
 
@@ -86,7 +86,7 @@ def steps_a_second(task: str, engine: str, callback: BaseCallback | None = None)
 
 
 def rows(folder: Path) -> Rows:
-    """The library's loop, and ours with all compiled and with the environment left in Python."""
+    """The library's loop, and ours, fully compiled and with the environment in Python."""
     th.set_num_threads(1)
     return {
         task: {

@@ -1,4 +1,4 @@
-"""Planning on random warehouses with slip 0.1, and exact evaluation; seconds of the processor."""
+"""Planning on random warehouses with slip 0.1, and exact evaluation; processor seconds."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ EPISODES = 100
 
 
 def evaluations(env_id: str, *, greedily: bool) -> dict[str, Contender]:
-    """Of Q-learning after 200,000 steps: by episodes, and exactly.
+    """Evaluations of Q-learning after 200,000 steps: by episodes, and exactly.
 
-    Two agents take turns, since the value of the policy that was asked for last is kept.
+    Two agents take turns, because the evaluator caches the value of the last policy.
     """
     entry = {"n_timesteps": STEPS}
     spec = TrainSpec("qlearning", env_id, split(entry), entry, seed=0)

@@ -1,6 +1,6 @@
-"""Whole processes, from their start to their files on disk; seconds of the processor.
+"""Whole processes, from their start to their files on disk; processor seconds.
 
-Counted are all processes that a command starts, also those that nobody waits for.
+All processes that a command starts are counted, also those that it does not wait for.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ IMPORT = {"import stable_baselines3": ("-c", "import stable_baselines3")}
 
 
 def python(*words: str, program: str = sys.executable) -> float:
-    """What a process and all that it has started takes of processors.
+    """The processor seconds of a process and of all processes that it has started.
 
     Raises:
         SystemExit: if the command fails.
@@ -47,7 +47,7 @@ def python(*words: str, program: str = sys.executable) -> float:
             [program, *filled], cwd=ROOT, capture_output=True, text=True, check=False
         )
         with contextlib.suppress(ChildProcessError):
-            while True:  # what the command left behind, which ends by itself
+            while True:  # orphaned processes, which end by themselves
                 os.wait()
     if done.returncode not in (0, 2):  # 2: a refusal
         raise SystemExit(f"{' '.join(words)}:\n{done.stderr}")
@@ -57,14 +57,14 @@ def python(*words: str, program: str = sys.executable) -> float:
 
 
 def ours(command: str) -> Contender:
-    """One of our commands, as typed; runs go into a new folder."""
+    """One of our commands; runs are written to a new folder."""
     script, *words = command.split()
     where = () if "--help" in words or "--list" in words else ("-f", "{folder}")
     return partial(python, script, *words, *where)
 
 
 def study(folder: Path, name: str, content: dict[str, Any]) -> Contender:
-    """A study from a file, with tables alone."""
+    """A study from a file, with tables only."""
     path = folder / f"{name}.yml"
     path.write_text(json.dumps({"title": name, **content}), encoding="utf-8")
     return partial(python, "compare.py", str(path), "--no-report", "-f", "{folder}")
@@ -89,7 +89,7 @@ def sweeps() -> dict[str, Any]:
 
 
 def rows(folder: Path) -> Rows:
-    """Commands beside an import, rl_zoo3's training beside ours, and studies by themselves."""
+    """Commands compared with an import, rl_zoo3's training with ours, and studies alone."""
     # Orphans become this process's children, so that their time is counted.
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     commands = {

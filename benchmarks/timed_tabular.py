@@ -1,8 +1,8 @@
-"""Tabular training, beside loops as they are written by hand; steps a second.
+"""Tabular training, compared with loops written by hand; steps a second.
 
-Ours train inside ``learn()``, with Monitor writing its CSV and a callback that looks at the table
-twenty times. The plain loops are what one writes in Python over Gymnasium, without it, and in
-Numba over arrays; they do without Monitor, callbacks, counts of visits and schedules.
+Our agents train in ``learn()``, with Monitor's CSV and a callback that reads the table twenty
+times. The plain loops are in Python with Gymnasium, in Python without it, and in Numba on arrays;
+they have no Monitor, callbacks, visit counts and schedules.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LARGE = ("envs:RandomWarehouse-v0", {"size": 100})
 
 
 class Evaluation(BlockCallback):
-    """Looks at the table at regular steps, as an evaluation does."""
+    """Reads the table at regular steps, as an evaluation does."""
 
     def __init__(self, every_n_calls: int) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class Evaluation(BlockCallback):
 
 
 def agent(name: str, engine: str, env_id: str, folder: Path, **env_kwargs: Any) -> Any:
-    """An agent that has been compiled, and has the first clumsy episodes behind it."""
+    """An agent after its first training, which compiles its code and has the longest episodes."""
     env = make_vec_env(
         env_id,
         seed=0,
@@ -84,7 +84,7 @@ def agent(name: str, engine: str, env_id: str, folder: Path, **env_kwargs: Any) 
 
 
 def ours(name: str, engine: str, env_id: str, folder: Path, log: int | None = None) -> Contender:
-    """Training as `train.py` does it, without the library's log if ``log`` is None."""
+    """A training as in `train.py`, without the library's log if ``log`` is None."""
     n_steps = COMPILED_STEPS if engine == "compiled" else PYTHON_STEPS
     trained = agent(name, engine, env_id, folder)
     learn = partial(trained.learn, n_steps, log_interval=log)
@@ -92,7 +92,7 @@ def ours(name: str, engine: str, env_id: str, folder: Path, log: int | None = No
 
 
 def loop_over_gymnasium(env_id: str) -> None:
-    """Q-learning as it is written by hand, one step at a time."""
+    """Q-learning as written by hand, one step at a time."""
     env: Any = gym.make(env_id)
     if env_id in WRAPPERS:
         env = WRAPPERS[env_id](env)
@@ -114,7 +114,7 @@ def loop_over_gymnasium(env_id: str) -> None:
 def loop_without_gymnasium(
     table: Any, argmax: Callable[[Any], int], highest: Callable[[Any], float]
 ) -> None:
-    """The same on the warehouse alone; the table is indexed by row, column and action."""
+    """The same for the warehouse only; the table is indexed by row, column and action."""
     grid = [list(row) for row in DEFAULT_MAP]
     moves = [(-1, 0), (1, 0), (0, -1), (0, 1)]
     row, column, elapsed = 9, 0, 0
@@ -138,13 +138,13 @@ def loop_without_gymnasium(
 
 
 def loop_with_arrays() -> None:
-    """With a NumPy table, as it is mostly written."""
+    """With a NumPy table, which is most common."""
     table = np.zeros((10, 10, 4))
     loop_without_gymnasium(table, lambda values: int(np.argmax(values)), np.max)
 
 
 def loop_with_lists() -> None:
-    """With lists, which is the fastest that plain Python does here."""
+    """With lists, the fastest variant in plain Python here."""
     table = [[[0.0] * 4 for _ in range(10)] for _ in range(10)]
     loop_without_gymnasium(table, lambda values: values.index(max(values)), max)
 
@@ -153,7 +153,7 @@ def loop_with_lists() -> None:
 def numba_loop(
     cumulative: Any, nexts: Any, rewards: Any, ends: Any, limit: int, table: Any, n_steps: int
 ) -> None:
-    """Over arrays of shape (S, A, K), from the first state; ties go to the first action."""
+    """Q-learning on arrays of shape (S, A, K), from the first state; first of equal actions."""
     state, elapsed, n_actions = 0, 0, table.shape[1]
     for _ in range(n_steps):
         action = 0
@@ -179,7 +179,7 @@ def numba_loop(
 
 
 def loop_in_numba(env_id: str, **env_kwargs: Any) -> Contender:
-    """The plain loop on an environment's model, compiled; it begins in the start state."""
+    """The compiled plain loop on an environment's model, from its start state."""
     env = gym.make(env_id, **env_kwargs)
     model, limit = transition_model(env), time_limit(env) or 0
     assert model is not None
@@ -198,7 +198,7 @@ def loop_in_numba(env_id: str, **env_kwargs: Any) -> Contender:
 
 
 class Actions(BaseCallback):
-    """Keeps the actions of every step."""
+    """Records the actions of every step."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -222,7 +222,7 @@ class Replay(QLearning):
 
 
 def replays(env_id: str, folder: Path) -> dict[str, Contender]:
-    """Episodes without an agent: stepped alone, and by the training loop around them."""
+    """Episodes without an agent: environment steps alone, and with the training loop."""
     trained, actions = agent("qlearning", "interpreted", env_id, folder), Actions()
     env = trained.env
     env.seed(0)
@@ -247,7 +247,7 @@ def replays(env_id: str, folder: Path) -> dict[str, Contender]:
 
 
 def rows(folder: Path) -> Rows:
-    """Compiled beside plain loops, interpreted beside the environment alone."""
+    """Compiled agents beside plain loops, interpreted agents beside the environment alone."""
     made: Rows = {}
     for env_id in ENVS:
         name = env_id.removeprefix("envs:")

@@ -1,13 +1,13 @@
-"""Times contenders side by side, and writes what comes out where the pages show it.
+"""Times contenders side by side, and publishes the results for the pages.
 
     python benchmarks/timing.py tabular                  # one table, with its own number of rounds
     python benchmarks/timing.py tabular networks --rounds 1 --only FrozenLake
     python benchmarks/timing.py processes --publish      # docs/measured/processes.json
 
-In each round every contender of a row has its turn, so that a machine whose speed changes slows
-all of them down alike. Shown are medians over the rounds, and how many times as fast as the first
-contender of its row each one is. Times are of the processor, where nothing else is said, with one
-thread: what other programs do on the same machine counts as little as it can.
+In each round every contender of a row has its turn, so that changes of the machine's speed affect
+all of them alike. The tables show medians over the rounds, and speeds relative to the first
+contender of the row. Unless stated otherwise, times are processor times with one thread, to reduce
+the influence of other programs.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ ROOT = Path(__file__).resolve().parent.parent
 MEASURED = ROOT / "docs" / "measured"
 TABLES = ("tabular", "networks", "bandits", "evaluation", "planning", "processes")
 
-# One measurement: so many of the table's unit.
+# One measurement, in the table's unit.
 Contender = Callable[[], float]
-# By work, the contenders by name; the first is what the others are compared with.
+# By work, the contenders by name; the others are compared with the first.
 Rows = dict[str, dict[str, Contender]]
 
 
@@ -48,13 +48,13 @@ class Benchmark:
 
     unit: str
     rounds: int
-    rows: Callable[[Path], Rows]  # of a folder for what the work writes
+    rows: Callable[[Path], Rows]  # takes a folder for files that the work writes
     is_speed: bool = True  # more is better
-    warms_up: bool = False  # does a round first that does not count
+    warms_up: bool = False  # does one round first that does not count
 
 
 def speed(work: Callable[[], object], n: int) -> Contender:
-    """A contender that does so many steps or pulls, measured a second of processor time."""
+    """A contender that does ``n`` steps or pulls, measured per second of processor time."""
 
     def measure() -> float:
         started = time.process_time()
@@ -65,7 +65,7 @@ def speed(work: Callable[[], object], n: int) -> Contender:
 
 
 def seconds(work: Callable[[], object], repeats: int = 1) -> Contender:
-    """A contender measured in seconds of processor time, each time for so many repeats."""
+    """A contender measured in seconds of processor time, as a mean over ``repeats``."""
 
     def measure() -> float:
         started = time.process_time()
@@ -77,7 +77,7 @@ def seconds(work: Callable[[], object], repeats: int = 1) -> Contender:
 
 
 def measured(benchmark: Benchmark, rounds: int, only: str) -> dict[str, dict[str, float]]:
-    """Medians by work and contender, of the rows that match."""
+    """Medians by work and contender, of the rows that match ``only``."""
     with tempfile.TemporaryDirectory() as folder:
         rows = {w: of for w, of in benchmark.rows(Path(folder)).items() if re.search(only, w)}
         found: dict[tuple[str, str], list[float]] = {}
@@ -111,7 +111,7 @@ def shown(title: str, benchmark: Benchmark, medians: dict[str, dict[str, float]]
 def publish(
     name: str, benchmark: Benchmark, rounds: int, rows: dict[str, dict[str, float]]
 ) -> None:
-    """Write the medians, and what they were measured with, where docs/benchmarks.md shows them."""
+    """Write the medians, with commit, day and machine, for docs/benchmarks.md."""
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"],
         cwd=ROOT,
@@ -137,7 +137,7 @@ def publish(
 
 
 def main() -> None:
-    """Measure the tables that are named, print them, and publish them where asked to."""
+    """Measure and print the named tables, and publish them with ``--publish``."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

@@ -1,18 +1,18 @@
-"""Trains with the shipped hyperparameters, and says how often that works.
+"""Trains with the shipped hyperparameters, and counts successful runs.
 
     python benchmarks/tuned_settings.py                 # everything, ten seeds: more than an hour
     python benchmarks/tuned_settings.py --algos sarsa qlearning --seeds 3
-    python benchmarks/tuned_settings.py --family        # tables on maps that nobody tuned on
+    python benchmarks/tuned_settings.py --family        # tables on maps not used for tuning
     python benchmarks/tuned_settings.py --family --algos dyna_q --seeds 5
 
-Without ``--family`` the seeds are 0 to n-1 and each run is `train.py` in a process of its own.
-Where the environment's model is known the results are exact; on CartPole, Pendulum and
-MountainCarContinuous they are means of 100 episodes.
+Without ``--family`` the seeds are 0 to n-1 and each run is `train.py` in its own process. If the
+environment's model is known the results are exact; on CartPole, Pendulum and MountainCarContinuous
+they are means of 100 episodes.
 
-With ``--family`` the environments are `FAMILY`, the seeds 1000 to 1000+n-1, and a run has succeeded
-with a score of 0.9, computed exactly. The settings were chosen on other maps, slips, rewards and
-lakes than these, with the seeds 0 to 9. The column "planning" is the score of the best policy under
-the agent's own discount: where that is low no table can be expected to do better.
+With ``--family`` the environments are those of `family`, the seeds are 1000 to 1000+n-1, and a run
+succeeds with an exact score of 0.9. The settings were tuned on other maps, slips, rewards and
+lakes, with the seeds 0 to 9. The column "planning" is the score of the best policy under the
+agent's own discount: if that is low, no table can be expected to do better.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FROZEN_LAKE_OPTIMUM = 0.7442
 
 @dataclass(frozen=True)
 class Goal:
-    """What runs are expected to reach.
+    """The expected results of runs.
 
     Attributes:
         env: the environment.
@@ -73,11 +73,11 @@ GOALS = [
 
 
 def train(goal: Goal, seed: int, folder: Path) -> float:
-    """The mean return of one run at its end; minus infinity where it failed."""
+    """The mean return of one run at its end; minus infinity if it failed."""
     own = folder / f"{goal.algo}-{goal.env}-{seed}"
     command = [sys.executable, str(ROOT / "train.py"), "--env", goal.env, "--algo", goal.algo]
     command += ["--seed", str(seed), "--verbose", "0", "-f", str(own)]
-    # The evaluation at the end is what counts; those on the way take time and change nothing.
+    # Only the final evaluation counts; others take time and do not change the result.
     command += ["--eval-freq", str(10**9)]
     result = subprocess.run(
         command,
@@ -121,7 +121,7 @@ def _rewards(factor: float, shelf: float) -> dict[str, float]:
 
 
 def family() -> dict[str, Member]:
-    """The environments, by what is printed of them."""
+    """The environments by their names in the table."""
     hall = ["G....#...", ".###.#.#.", ".#.....#.", ".#.###.##", "...#....S", ".#...##.."]
     spiral = ["S....", ".###.", ".#G..", ".####", "....."]
     return {
@@ -164,7 +164,7 @@ def family() -> dict[str, Member]:
 
 FIRST_HELD_OUT = 1000
 REACHED = 0.9
-# Where the discount itself costs more than this, what a table has learnt is not what decides.
+# Below this score of planning, the discount costs too much for a judgement of learning.
 PLANNABLE = 0.95
 
 
@@ -184,7 +184,7 @@ def _evaluator(name: str) -> Any:
 
 
 def planning_score(name: str, discount: float) -> float:
-    """What the best policy under the discount scores without it."""
+    """The undiscounted score of the best policy under the discount."""
     from mdp import policy_iteration, policy_return
 
     judge = _evaluator(name)
@@ -194,7 +194,7 @@ def planning_score(name: str, discount: float) -> float:
 
 
 def family_score(name: str, algo: str, seed: int) -> float:
-    """Train a table in this process; the exact score of its greedy policy."""
+    """Train a table in this process; return the exact score of its greedy policy."""
     from agents import load_algorithm
     from pipeline.environments import make_training_env
     from pipeline.preparation import algorithm_kwargs
@@ -210,7 +210,7 @@ def family_score(name: str, algo: str, seed: int) -> float:
 
 
 def judge_family(algos: list[str], n_seeds: int) -> int:
-    """Print how many seeds of each agent succeed on each member; the exit code."""
+    """Print how many seeds of each agent succeed on each member; return the exit code."""
     seeds = range(FIRST_HELD_OUT, FIRST_HELD_OUT + n_seeds)
     reached: dict[str, list[int]] = {algo: [] for algo in algos}
     plannable: list[bool] = []
@@ -244,7 +244,7 @@ def judge_family(algos: list[str], n_seeds: int) -> int:
 
 
 def main() -> int:
-    """Run what was asked for and print a line for each agent and environment; the exit code."""
+    """Do the runs and print a line for each agent and environment; return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -254,7 +254,7 @@ def main() -> int:
     )
     parser.add_argument("--envs", nargs="+", metavar="ID", help="only these environments")
     parser.add_argument("--algos", nargs="+", metavar="NAME", help="only these agents")
-    parser.add_argument("--family", action="store_true", help="tables on maps nobody tuned on")
+    parser.add_argument("--family", action="store_true", help="tables on maps not tuned on")
     args = parser.parse_args()
     if args.family:
         return judge_family(args.algos or list(TABULAR), args.seeds)

@@ -1,19 +1,19 @@
-"""How often a study says something false, how often intervals miss, and what is found.
+"""Error rates of a study's sentences, coverage of its intervals, and power of its verdicts.
 
     nice python benchmarks/verdict_errors.py [TABLE ...] [--studies 1000] [--publish]
 
 Errors: the share of studies with any false sentence, on means, typical runs and failures together,
-by law of scores, number of agents and seeds; the last column looks at 5, 10, 20 and 40 seeds until
-all is decided. A sentence with a condition is false where the condition holds and the claim does
-not. The promise is 5 %, and a look by itself spends all of it here.
+by distribution of scores, number of agents and seeds. The last column is of studies that grow: 5,
+10, 20 and 40 seeds until all is decided. A conditional sentence is false if its condition holds and
+its claim does not. The error rate must be at most 5 %; here one look spends all of it.
 
 Environments: the same for studies of 3 and 10 of them. Paired: runs that share their randomness.
 
-Power: how often the agent that is ahead is found, beside Welch's test, Mann and Whitney's, and
-AdaStop (Mathieu and others, 2023), each with 5 %. Growth: runs that are saved.
+Power: how often the agent ahead is found, compared with Welch's test, the Mann-Whitney test and
+AdaStop (Mathieu et al., 2023), each at 5 %. Growth: saved runs.
 
-Laws after Waudby-Smith and Ramdas (2024) and Learned-Miller and Thomas (2019): equal means, and
-rare failures or successes that few runs show.
+Distributions after Waudby-Smith and Ramdas (2024) and Learned-Miller and Thomas (2019): equal
+means, and rare failures or successes that few runs show.
 """
 
 from __future__ import annotations
@@ -67,38 +67,38 @@ ENDS = Ends(0.0, 1.0)
 SIZES = (3, 5, 8, 10, 20, 50)
 LOOKS = (5, 10, 20, 40)
 LARGE = 200_000
-# What the large sample below leaves open about a share or a mean.
+# The error of a share or a mean of the large sample below.
 SLACK = 0.004
 
 
 @dataclass(frozen=True)
 class Law:
-    """A law of scores between 0 and 1."""
+    """A distribution of scores between 0 and 1."""
 
     draw: Draw
 
     @cached_property
     def known(self) -> Scores:
-        """A large sample in order, from which its mean and shares are known."""
+        """A large sorted sample, for its mean and shares."""
         return np.sort(self.draw(np.random.default_rng(99), LARGE))
 
     @cached_property
     def mean(self) -> float:
-        """What a run scores on average."""
+        """The mean score of a run."""
         return float(self.known.mean())
 
     def share_below(self, score: float) -> float:
-        """The share of runs that score less."""
+        """The share of runs with a lower score."""
         return float(np.searchsorted(self.known, score - 1e-12)) / LARGE
 
     def share_above(self, score: float) -> float:
-        """The share of runs that score more."""
+        """The share of runs with a higher score."""
         return 1 - float(np.searchsorted(self.known, score + 1e-12, side="right")) / LARGE
 
 
 @cache
 def share_won(law: Law, other: Law, lead: float = 0.0) -> float:
-    """How often a run, with so much more, beats one of the other law; ties count half."""
+    """How often a run, with ``lead`` added, beats a run of the other law; ties count half."""
     own = np.random.default_rng(1).choice(law.known, 20_000) + lead
     below = np.searchsorted(other.known, own - 1e-12, side="left")
     up_to = np.searchsorted(other.known, own + 1e-12, side="right")
@@ -106,29 +106,29 @@ def share_won(law: Law, other: Law, lead: float = 0.0) -> float:
 
 
 def normal(mean: float, deviation: float) -> Law:
-    """Normal scores, cut to 0 and 1."""
+    """Normal scores, clipped to [0, 1]."""
     return Law(lambda rng, n: np.clip(rng.normal(mean, deviation, n), 0, 1))
 
 
 def skewed(mean: float, deviation: float, sign: int = 1) -> Law:
-    """Exponential scores, upwards or downwards, cut to 0 and 1."""
+    """Exponential scores, skewed upwards or downwards, clipped to [0, 1]."""
     return Law(
         lambda rng, n: np.clip(mean + sign * deviation * (rng.exponential(size=n) - 1), 0, 1)
     )
 
 
 def heavy(mean: float) -> Law:
-    """Scores with heavy tails, cut to 0 and 1: Student's t with 1.5 degrees of freedom."""
+    """Scores with heavy tails, clipped to [0, 1]: Student's t with 1.5 degrees of freedom."""
     return Law(lambda rng, n: np.clip(mean + 0.03 * rng.standard_t(1.5, n), 0, 1))
 
 
 def coin(share: float) -> Law:
-    """1 in such a share of runs, else 0."""
+    """Bernoulli scores: 1 in this share of runs, else 0."""
     return Law(lambda rng, n: (rng.random(n) < share).astype(np.float64))
 
 
 def failing(share: float, score: float = 0.95, deviation: float = 0.01) -> Law:
-    """About one score, but 0 in such a share of runs."""
+    """Scores near ``score``, but 0 in this share of runs."""
     width = deviation * 12**0.5
 
     def draw(rng: Generator, n: int) -> Scores:
@@ -139,7 +139,7 @@ def failing(share: float, score: float = 0.95, deviation: float = 0.01) -> Law:
 
 
 def steady(score: float) -> Law:
-    """Always the same."""
+    """A constant score."""
     return Law(lambda rng, n: np.full(n, score))
 
 
@@ -148,7 +148,7 @@ def tied(rng: Generator, n: int) -> Scores:
     return rng.choice([0.0, 0.5, 0.9, 1.0], n, p=[0.1, 0.1, 0.2, 0.6])
 
 
-# Two laws of one mean, or that lie just beyond the margin; further agents repeat them.
+# Two laws with the same mean, or just beyond the margin; further agents repeat them.
 FAMILIES: dict[str, tuple[Law, Law]] = {
     "normal": (normal(0.6, 0.06),) * 2,
     "normal, spreads 1 to 5": (normal(0.6, 0.02), normal(0.6, 0.1)),
@@ -173,7 +173,7 @@ FAMILIES: dict[str, tuple[Law, Law]] = {
 }
 
 
-# What is false of a study.
+# False sentences of a study.
 
 
 def false_of_pair(
@@ -194,7 +194,7 @@ def false_of_pair(
     if said.verdict == "equivalent" and abs(apart) > MARGIN + 1e-4:
         pairs = list(zip(laws, runs, strict=True))
         seen = [law.share_below(x.min()) + law.share_above(x.max()) for law, x in pairs]
-        # What further runs do that lie within those that were seen.
+        # The condition holds only if no further run is outside of those seen.
         if not said.is_conditional or max(seen) == 0:
             return "equivalent, if" if said.is_conditional else "equivalent"
     return _false_typical(judged, laws)
@@ -210,7 +210,7 @@ def _false_typical(judged: Judgement, laws: tuple[Law, Law]) -> str:
 
 
 def false_of_failures(laws: Sequence[Law], runs: Sequence[Scores], level: float) -> str:
-    """Which sentence on failures is false; empty where none is."""
+    """Which sentence on failures is false; empty for none."""
     threshold = failure_threshold(0.0, max(float(np.median(each)) for each in runs))
     if np.isnan(threshold):
         return ""
@@ -224,7 +224,7 @@ def false_of_failures(laws: Sequence[Law], runs: Sequence[Scores], level: float)
 
 
 def false_of_study(laws: Sequence[Law], runs: Sequence[Scores], level: float) -> set[str]:
-    """The kinds of sentences that are false of a study with one look."""
+    """The kinds of false sentences of a study with one look."""
     scores = {str(k): each for k, each in enumerate(runs)}
     judged = judge_pairs(scores, MARGIN, level, ends=ENDS)
     share = level_of_claim(level, "means") / len(judged) / (2 if len(laws) > 2 else 1)
@@ -236,7 +236,7 @@ def false_of_study(laws: Sequence[Law], runs: Sequence[Scores], level: float) ->
 
 
 def false_of_grown(laws: Sequence[Law], runs: Sequence[Scores], level: float) -> set[str]:
-    """The same of a study that looks until all is decided."""
+    """The kinds of false sentences of a study that looks until all is decided."""
     scores = {str(k): each for k, each in enumerate(runs)}
     growth = grow(scores, LOOKS, MARGIN, level, ends=ENDS)
     found: set[str] = set()
@@ -264,7 +264,7 @@ def heading(cells: Sequence[object]) -> None:
 
 
 def print_errors(studies: int) -> None:
-    """Studies that say anything false."""
+    """Print the shares of studies with a false sentence."""
     print(
         f"\nStudies with a false sentence, per cent of {studies:,}, the highest of 2, 4 and 10 "
         "agents; of which kind, where over 1; with ten agents a tenth\nas many studies\n"
@@ -296,7 +296,7 @@ def print_errors(studies: int) -> None:
 
 
 def print_environments(studies: int) -> None:
-    """Studies of several environments, and of all of them together, that say anything false."""
+    """Print the shares of studies of several environments with a false sentence."""
     n_agents, n = 4, 10
     print(
         f"\nStudies of {n_agents} agents and {n} seeds with a false sentence on any environment or "
@@ -326,7 +326,7 @@ def print_environments(studies: int) -> None:
 
 
 def _false_together(laws: Sequence[Law], means: dict[str, Scores], level: float) -> set[str]:
-    """The same of the agents' means over environments, without those that have a condition."""
+    """False unconditional verdicts on the agents' means over environments."""
     judged = judge_pairs(means, MARGIN, level, ends=ENDS)
     found = set()
     for (a, b), judgement in judged.items():
@@ -342,7 +342,7 @@ def _false_together(laws: Sequence[Law], means: dict[str, Scores], level: float)
 
 
 def print_paired(studies: int) -> None:
-    """Runs of one seed that share their randomness: false sentences, and the agent found ahead."""
+    """Print errors and power for runs of one seed that share their randomness."""
     print(f"\nShared randomness: false, and found ahead paired and not, per cent of {studies:,}\n")
     heading(["correlation", *(f"{n} seeds" for n in (5, 10, 20))])
     for correlation in (0.0, 0.4, 0.8):
@@ -363,7 +363,7 @@ def print_paired(studies: int) -> None:
 
 
 def print_coverage(studies: int) -> None:
-    """Intervals that hold the truth: of a mean, and of a difference of means."""
+    """Print the coverage of intervals of a mean, and of a difference of means."""
     print(f"\n95 % intervals that hold the truth, lowest of all laws, per cent of {studies:,}\n")
     heading(["interval", *(f"{n} seeds" for n in SIZES)])
     means: dict[int, tuple[float, str]] = {}
@@ -375,7 +375,7 @@ def print_coverage(studies: int) -> None:
                 x, y = first.draw(rng, n), second.draw(rng, n)
                 (low, high), own = mean_interval(y, ALPHA), mean_interval(x, ALPHA)
                 apart = first.mean - second.mean
-                # That of a difference holds what its guards hold, which are computed faster.
+                # The interval of a difference contains these bounds, which are computed faster.
                 least = min(own[0] - y.mean(), x.mean() - high)
                 most = max(own[1] - y.mean(), x.mean() - low)
                 is_held = least <= apart <= most
@@ -402,7 +402,7 @@ POWER: dict[str, tuple[Law, Law]] = {
 
 
 def print_power(studies: int) -> None:
-    """How often the agent with the higher mean is found ahead."""
+    """Print how often the agent with the higher mean is found ahead."""
     tests = "verdict without a condition, verdict, Welch, Mann and Whitney, AdaStop"
     print(f"\nThe agent ahead is found, per cent of {studies:,} studies: {tests}\n")
     sizes = (5, 10, 20, 50)
@@ -446,7 +446,7 @@ def print_power(studies: int) -> None:
 
 
 def adastop(first: Scores, second: Scores, group: int, rng: Generator, n_draws: int = 500) -> bool:
-    """Whether AdaStop tells two agents apart: groups of ``group`` seeds, ALPHA over all of them."""
+    """Whether AdaStop finds a difference, in groups of ``group`` seeds, with ALPHA in all."""
     n_groups = len(first) // group
     grouped = np.stack([first, second]).reshape(2, n_groups, group)
     pooled = grouped.transpose(1, 0, 2).reshape(n_groups, 2 * group)
@@ -457,7 +457,7 @@ def adastop(first: Scores, second: Scores, group: int, rng: Generator, n_draws: 
     permuted, found = np.abs(moved.cumsum(1)), np.abs(observed.cumsum())
     alive = np.ones(n_draws, dtype=bool)
     for k in range(n_groups):
-        # As many of the draws may cross here as the error rate spent so far has left.
+        # The number of draws that may cross here, by the error rate left so far.
         room = int(ALPHA * (k + 1) / n_groups * n_draws) - int((~alive).sum())
         bound = np.sort(permuted[alive, k])[::-1][min(room, alive.sum() - 1)]
         if found[k] > bound + 1e-12:
@@ -480,7 +480,7 @@ GROWN: dict[str, list[Law]] = {
 
 
 def print_growth(studies: int) -> None:
-    """Runs and decided pairs of fixed studies and of those that grow."""
+    """Print runs and decided pairs of fixed and growing studies."""
     print(f"\nMean number of runs, per cent of pairs decided, {studies:,} studies\n")
     fixed, most = (10, 30, 50), (30, 50)
     heading(["scores", *(f"{n} seeds" for n in fixed), *(f"grown to {n}" for n in most)])

@@ -1,4 +1,4 @@
-"""Which agent can be used where: tables made from the registry of agents."""
+"""Tables of the agents and of the spaces that they support, from the registry of agents."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from agents.registry import ALGORITHMS, fitting_algorithms
 
 PAGES = Path(__file__).resolve().parents[1] / "algorithms"
 BOX = spaces.Box(-1, 1, (3,), np.float32)
-# What is observed, what is done, and whether a choice changes nothing but its own reward.
+# Observations and actions in words, and their spaces.
 CASES = (
     ("a number", "a number", spaces.Discrete(4), spaces.Discrete(3)),
     ("a vector or an image", "a number", BOX, spaces.Discrete(3)),
@@ -60,7 +60,7 @@ def agents_block() -> str:
 
 
 def linked(names: list[str]) -> str:
-    """The names of agents, each a link to its page where it has one."""
+    """The names of agents, each a link to its page if there is one."""
     return ", ".join(
         f"[`{name}`](algorithms/{name}.md)" if (PAGES / f"{name}.md").exists() else f"`{name}`"
         for name in names

@@ -1,7 +1,7 @@
 """Checks the links of a site: ``python docs/scripts/check_links.py build/site``.
 
-Every link inside the site has to lead to a file, and to a place in it where it names one. And pages
-may load nothing from elsewhere, so that the site works without a network.
+Every link inside the site must lead to an existing file and, if it names one, to an existing
+anchor. Pages must not load anything from elsewhere, so that the site works without a network.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 LOADED = {"img": "src", "script": "src", "link": "href", "iframe": "src"}
-# Relations of <link> that are told and not loaded.
+# Relations of <link> that browsers do not load.
 TOLD = {"search", "index", "next", "prev", "canonical", "author", "help"}
 
 
 class Page(HTMLParser):
-    """What a page links to, loads, and can be linked at.
+    """The links, loaded files and anchors of a page.
 
     Attributes:
-        links: targets of its links and of what it loads.
-        loaded: those that a browser fetches by itself.
-        places: names that a link can end in.
+        links: targets of its links and of loaded files.
+        loaded: targets that a browser fetches by itself.
+        places: names of its anchors.
     """
 
     def __init__(self, path: Path) -> None:
@@ -50,7 +50,7 @@ def page_at(path: Path) -> Page:
 
 
 def faults(root: Path) -> list[str]:
-    """What is wrong with the links of a site, a line each."""
+    """The broken links and foreign files of a site, a line each."""
     found = []
     for path in sorted(root.rglob("*.html")):
         page = page_at(path)
@@ -62,12 +62,12 @@ def faults(root: Path) -> list[str]:
 
 
 def is_foreign(url: str) -> bool:
-    """Whether a link leads out of the site; one that holds its data leads nowhere."""
+    """Whether a link leads out of the site; a data URI does not."""
     return bool(urlsplit(url).scheme or urlsplit(url).netloc) and not url.startswith("data:")
 
 
 def fault(path: Path, url: str) -> str:
-    """Why a link from a page leads nowhere; empty where it does not."""
+    """Why a link from a page is broken; empty if it is not."""
     if url.startswith("data:"):
         return ""
     parts = urlsplit(url)

@@ -1,4 +1,4 @@
-"""Pieces of the project's own source, as a page shows them."""
+"""Excerpts of the project's own source for the pages."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def definition(text: str, name: str, path: str) -> str:
 
 
 def defined(node: ast.stmt) -> list[str]:
-    """The names that a statement binds, as far as pages ask for them."""
+    """The names that a statement binds, for functions, classes and assignments."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         return [node.name]
     targets = node.targets if isinstance(node, ast.Assign) else []

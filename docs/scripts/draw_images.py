@@ -1,9 +1,9 @@
 """Draws the pictures of README and docs: ``python docs/scripts/draw_images.py``.
 
-Everything in them is made by the version that is checked out: environments are rendered, agents are
-trained and their runs drawn by the code that users run. The picture of a study's page needs
-Chromium, and figures of the headline study need that study: without, they stay as they are. With
-names of pictures, only those are drawn.
+All pictures are made by the version that is checked out: it renders environments, trains agents and
+draws their runs with the code that users run. The picture of a study's page needs Chromium, and the
+figures of the headline study need that study; without these, old pictures are kept. With names of
+pictures as arguments, only these are drawn.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ sys.path[:0] = [str(ROOT), str(DOCS / "_ext")]
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 WIDEST = 560  # pixels, of an environment
-# Figures of the study in docs/library-vs-hand-rolled.md, on the seeds that nothing was tuned on.
+# Figures of the study in docs/library-vs-hand-rolled.md, on seeds that were not used for tuning.
 HEADLINE = {
     "Taxi-v4_learning_curves.png": "taxi-curves.png",
     "FrozenLake8x8-v1_intervals.png": "lake8x8-intervals.png",
@@ -34,7 +34,7 @@ SLIPPERY = ("slip:0.1", "shelf_reward:-5")
 
 
 def main() -> None:
-    """Draw all, or those that are named."""
+    """Draw all pictures, or the named ones."""
     parser = argparse.ArgumentParser(description="Draw the pictures of README and docs.")
     parser.add_argument("names", nargs="*", help=f"of {', '.join(PICTURES)}; all without")
     names = parser.parse_args().names
@@ -68,7 +68,7 @@ def draw_environments() -> None:
 
 
 def draw_warehouse() -> None:
-    """What a short training leaves: a value map on slippery ground, and PPO's learning curve."""
+    """Pictures of short trainings: a value map on slippery ground, and PPO's learning curve."""
     with tempfile.TemporaryDirectory() as folder:
         slippery = ("--env", "Warehouse-v0", "--algo", "qlearning", "--env-kwargs", *SLIPPERY)
         command("train.py", *slippery, "--seed", "0", "-n", "20000", folder=folder)
@@ -79,7 +79,7 @@ def draw_warehouse() -> None:
 
 
 def draw_report() -> None:
-    """The top of the page that a study of a minute ends in, photographed by Chromium."""
+    """The top of the page of a study of one minute, as a screenshot by Chromium."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         print("no Chromium: docs/images/report.png stays as it is")
@@ -99,7 +99,7 @@ def draw_report() -> None:
 
 
 def copy_headline() -> None:
-    """Figures of the headline study, if it lies in logs/studies/held-out; it takes an hour."""
+    """Figures of the headline study, if it is in logs/studies/held-out; it takes an hour."""
     folder = ROOT / "logs" / "studies" / "held-out" / "figures"
     for figure, name in HEADLINE.items():
         if (folder / figure).exists():
@@ -109,14 +109,14 @@ def copy_headline() -> None:
 
 
 def command(script: str, *words: str, folder: str) -> None:
-    """Run one of the project's commands in a folder of its own."""
+    """Run one of the project's commands in a folder."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     line = [sys.executable, str(ROOT / script), *words]
     subprocess.run(line, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
 
 
 def keep(source: str | Path, name: str) -> None:
-    """Put a picture in its place, in a palette of 256 colours."""
+    """Save a picture among the docs' images, in a palette of 256 colours."""
     from PIL import Image
 
     with Image.open(source) as picture:

@@ -1,7 +1,7 @@
-"""What a page says of an environment: worked out from its model and its docstring, never typed.
+"""The facts on an environment for its page, computed from its model and its docstring.
 
-``train.py --list`` shows how hard environments are from ``envs/hardness.json``. After a model has
-changed, this program writes that file anew; else building the pages fails:
+``train.py --list`` reads the difficulty of environments from ``envs/hardness.json``. After a change
+of a model, write that file again by this program; else building the pages fails:
 
     python docs/scripts/environment_facts.py
 """
@@ -49,7 +49,7 @@ HARDNESS_HEADS = (
     *("effective horizon", "random actions to a reward", "to the goal"),
 )
 HARDNESS = Path(envs.__file__).with_name("hardness.json")
-LIMIT = 1000  # what commands take where an environment has none
+LIMIT = 1000  # the commands' time limit for an environment without one
 MOST_REWARDS = 8
 LEFT_OUT = ("Version History",)
 
@@ -60,14 +60,14 @@ def environment_block(env_id: str, *arguments: str) -> str:
 
 
 def docstring_block(env_id: str) -> str:
-    """The docstring of an environment, but for its history."""
+    """The docstring of an environment without its history."""
     entry_point = gym.spec(env_id).entry_point
     assert isinstance(entry_point, str)
     return "\n\n".join(docstring_sections(load_env_creator(entry_point))) + "\n"
 
 
 def facts_block(env_id: str, *arguments: str) -> str:
-    """The picture and the facts alone, of an environment that others document."""
+    """The picture and the facts without a docstring, for environments documented elsewhere."""
     return f"{picture(env_id)}\n\n{facts_table(env_id, *arguments)}\n"
 
 
@@ -77,7 +77,7 @@ def made(env_id: str, *arguments: str) -> gym.Env[Any, Any]:
 
 
 def optima_block(*written: str) -> str:
-    """A row for each environment: a link to its page, its first sentence, its optimum, and chance.
+    """A row for each environment: link, first sentence, optimum, and the return of random actions.
 
     Args:
         written: page and id, as in ``warehouse=Warehouse-v0``.
@@ -96,7 +96,7 @@ def optima_block(*written: str) -> str:
 
 
 def optimum_cell(found: Solution) -> str:
-    """The optimum; where observations hide the state, also what can be reached by these."""
+    """The optimum; under partial observability, also the optima of agents that see observations."""
     said = number(found.optimum)
     if found.by_observation is None:
         return said
@@ -129,7 +129,7 @@ def variants_block(*words: str) -> str:
 
 
 def hardness_block(*ids: str) -> str:
-    """A row for each environment: how hard it is, by its model under its time limit."""
+    """A row for each environment: measures of its difficulty, by its model and time limit."""
     stored = json.loads(HARDNESS.read_text(encoding="utf-8"))
     lines = [f"| id | {' | '.join(HARDNESS_HEADS)} |", f"|---|{'---:|' * len(HARDNESS_HEADS)}"]
     for env_id in ids:
@@ -166,7 +166,7 @@ def hardness_cells(env_id: str) -> dict[str, str]:
 
 @lru_cache
 def hardness(env_id: str) -> Hardness | None:
-    """How hard an environment is under its time limit; None where no model is known."""
+    """The difficulty of an environment under its time limit; None if no model is known."""
     env = made(env_id)
     model, limit = transition_model(env), time_limit(env) or LIMIT
     return None if model is None else hardness_of(model, limit, success_outcomes(env))
@@ -178,7 +178,7 @@ def picture(env_id: str) -> str:
 
 
 def facts_table(env_id: str, *arguments: str) -> str:
-    """Spaces, limit, and what the model says, as a table."""
+    """Spaces, time limit, and figures from the model, as a table."""
     env = made(env_id, *arguments)
     limit = time_limit(env)
     rows = {
@@ -204,7 +204,7 @@ def facts_table(env_id: str, *arguments: str) -> str:
 
 
 def by_observation(scale: HiddenScale | None) -> dict[str, str]:
-    """Rows on what can be reached by observations, if these hide the state."""
+    """A row with the optima of agents that see observations, if these hide the state."""
     if scale is None:
         return {}
     said = " and ".join(observed(scale))
@@ -213,7 +213,7 @@ def by_observation(scale: HiddenScale | None) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Solution:
-    """What follows from a model: the optimum, and what policies earn that see nothing."""
+    """Figures from a model: the optimum, and the returns of constant and random policies."""
 
     optimum: float
     best_constant: float
@@ -223,7 +223,7 @@ class Solution:
 
 @lru_cache
 def solution(env_id: str, *arguments: str) -> Solution | None:
-    """The figures of an environment under its time limit; None where no model is known."""
+    """The figures of an environment under its time limit; None if no model is known."""
     env = made(env_id, *arguments)
     model, limit = transition_model(env), time_limit(env) or LIMIT
     if model is None:
@@ -238,7 +238,7 @@ def solution(env_id: str, *arguments: str) -> Solution | None:
 
 
 def random_actions(found: PolicyReturn) -> str:
-    """How far chance alone gets."""
+    """The results of random actions."""
     said = f"{number(found.expected_return)} in {number(found.expected_length)} steps"
     if found.success_rate is None:
         return said
@@ -246,13 +246,13 @@ def random_actions(found: PolicyReturn) -> str:
 
 
 def is_random(model: TransitionModel) -> bool:
-    """Whether an action can have more than one outcome where it matters."""
+    """Whether an action in a reachable state can have more than one outcome."""
     possible = (model.prob > 0).sum(axis=2)[model.reachable]
     return bool((possible > 1).any())
 
 
 def rewards(model: TransitionModel) -> str:
-    """The rewards there are, or their range."""
+    """The possible rewards, or their range."""
     possible = model.reachable[:, None, None] & (model.prob > 0)
     found = np.unique(np.round(model.reward[possible], 12))
     drawn = " in the mean: they are drawn" if model.reward_variance is not None else ""
@@ -262,7 +262,7 @@ def rewards(model: TransitionModel) -> str:
 
 
 def number(value: float) -> str:
-    """At least four digits, and no more than tell something."""
+    """A number with four significant digits or two decimals; integers with all digits."""
     value = float(value)
     if abs(value - round(value)) < 1e-9:
         return f"{round(value):,}"
@@ -276,7 +276,7 @@ def agents_with_settings(env_id: str) -> str:
 
 
 def docstring_sections(cls: Any) -> list[str]:
-    """A class's docstring, which is Markdown but for the colons before its maps."""
+    """The sections of a class's docstring, with ``::`` before maps replaced for Markdown."""
     text = re.sub(r"::\n", ":\n", inspect.getdoc(cls) or "")
     lead, *sections = re.split(r"(?m)^(?=## )", text.partition("\n")[2].strip())
     kept = [part.strip() for part in sections if part[3:].split("\n")[0] not in LEFT_OUT]

@@ -1,4 +1,4 @@
-"""What benchmarks have measured, from docs/measured, as tables and sentences of pages."""
+"""Results of benchmarks, from docs/measured, as tables and sentences of pages."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def timings_block(path: str) -> str:
-    """A row for each contender, with how many times as fast as the first of its work it is.
+    """A row for each contender, with its speed relative to the first contender of its work.
 
     Args:
-        path: of the file that was published, from the root of the repository.
+        path: of the published file, from the root of the repository.
     """
     found = json.loads((ROOT / path).read_text(encoding="utf-8"))
     lines = [f"| | contender | {found['unit']} | times as fast |", "|---|---|---|---|"]
@@ -33,7 +33,7 @@ def timings_block(path: str) -> str:
 
 
 def measured_block(path: str) -> str:
-    """The sentences and tables that `publish` has kept.
+    """The sentences and tables that `publish` has written.
 
     Args:
         path: of the file, from the root of the repository.
@@ -49,7 +49,7 @@ def _table(rows: list[list[str]]) -> str:
 
 
 def publish(path: Path, text: str) -> None:
-    """Keep Markdown that consists of paragraphs and tables: a row of a table in a line."""
+    """Write Markdown of paragraphs and tables as JSON, with each row of a table on a line."""
     parts: list[str | list[list[str]]] = []
     for block in filter(None, (block.strip() for block in text.split("\n\n"))):
         if block.startswith("|"):

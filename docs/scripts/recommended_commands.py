@@ -1,8 +1,8 @@
-"""The commands that the project's own text recommends, and what the agents reach that they train.
+"""The commands that the project's own text recommends, and the results of their trainings.
 
-Found in README, in the pages and in the docstrings and help texts of the code. A
-training is what ``train.py`` does with such arguments: the agents of a comparison are some, and so
-are the settings that a search begins with.
+The commands are found in README, in the pages, and in docstrings and help texts of the code. A
+training is a call of ``train.py`` with such arguments. A comparison stands for one training per
+agent and environment, and a search for the training with its first settings.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ COMMAND = re.compile(
     r"((?:[^\S\n]+(?!#)[^\s`|#]+)*)"
 )
 TRAIN = "make train"
-# Flags that are no matter of the training, and how many values they have; -1: up to the next flag.
+# Flags that do not affect the training, and their numbers of values; -1: up to the next flag.
 OUTPUT = {"--seed": 1, "--engine": 1, "--watch-learning": -1, "--resume-or-start": 0}
 OUTPUT |= {"--diagnose": 0}
 SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--objective": 1}
@@ -39,12 +39,12 @@ LINE = re.compile(r"^(python (?:train|compare)\.py [^#\n]*?)(?: +#[^\n]*)?$", re
 
 @dataclass(frozen=True)
 class Command:
-    """A command as the text has it.
+    """A command in the text.
 
     Attributes:
         script: ``"train"``, ``"compare"`` or ``"tune"``.
-        words: what follows.
-        places: the files that have it.
+        words: its arguments.
+        places: the files that contain it.
     """
 
     script: str
@@ -55,9 +55,8 @@ class Command:
     def trainings(self) -> list[str]:
         """The trainings that it stands for, as arguments of ``train.py``; none for other commands.
 
-        Commands that need the reader's modules or files of runs are carried out by the tests of
-        their pages, and study files by the tests of studies. ``train.py`` does not train on the
-        environment as it comes.
+        The tests of pages run commands that need the reader's modules or files of runs, and the
+        tests of studies run study files. ``train.py`` has no flag ``--as-it-comes``.
         """
         words = list(self.words)
         needs = {"--list", "--resume", "-i", "--gym-packages", "--conf-file", "--logged"}
@@ -71,7 +70,7 @@ class Command:
 
 
 def _values(words: list[str], flag: str) -> list[str]:
-    """What follows a flag, up to the next one."""
+    """The values of a flag, up to the next flag."""
     if flag not in words:
         return []
     rest = words[words.index(flag) + 1 :]
@@ -80,7 +79,7 @@ def _values(words: list[str], flag: str) -> list[str]:
 
 
 def _without(words: list[str], flags: dict[str, int]) -> list[str]:
-    """The words without some flags and their values."""
+    """The words without these flags and their values."""
     kept = list(words)
     for flag, n in flags.items():
         while flag in kept:
@@ -91,7 +90,7 @@ def _without(words: list[str], flags: dict[str, int]) -> list[str]:
 
 @cache
 def documented() -> tuple[Command, ...]:
-    """All commands of the text, in the order in which they are found; each once."""
+    """All distinct commands of the text, in the order in which they are found."""
     pages = [
         p for p in sorted(ROOT.glob("docs/**/*.md")) if p != PAGE and "decisions" not in p.parts
     ]
@@ -116,7 +115,7 @@ def commands_in(text: str) -> list[Command]:
             script = "train"
         else:
             rest = match[5]
-        if re.search(r"\{\w+\}", rest):  # a program's template, to be filled
+        if re.search(r"\{\w+\}", rest):  # a template in the code
             continue
         words = tuple(shlex.split(rest.rstrip(".,;:)")))
         if words:
@@ -125,7 +124,7 @@ def commands_in(text: str) -> list[Command]:
 
 
 def trainings() -> dict[str, list[str]]:
-    """By training, the files that recommend it."""
+    """The trainings, each with the files that recommend it."""
     found: dict[str, list[str]] = {}
     for command in documented():
         for training in command.trainings:
@@ -136,7 +135,7 @@ def trainings() -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Reached:
-    """How many of how many runs solve it, and what the median run reaches."""
+    """The results of a training: the number of runs that solve it, and the median."""
 
     n_solved: int | None
     n_runs: int
@@ -145,7 +144,7 @@ class Reached:
 
 
 def reached() -> dict[str, Reached]:
-    """What `benchmarks/documented_commands.py` has found, by training."""
+    """The results of `benchmarks/documented_commands.py`, by training."""
     found = {}
     for training, row in json.loads(RESULTS.read_text(encoding="utf-8")).items():
         n_solved, _, n_runs = row["solved"].partition(" of ")
@@ -164,7 +163,7 @@ def trainings_block() -> str:
 
 
 def with_outcomes(text: str) -> str:
-    """A page in which each command in a block says beside it what it reaches, as a comment."""
+    """A page with the result of each command in a code block beside it, as a comment."""
     table = reached()
 
     def line(found: re.Match[str]) -> str:

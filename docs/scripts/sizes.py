@@ -1,8 +1,8 @@
 """Counts lines and files against the limits in CONTRIBUTING.md: ``python docs/scripts/sizes.py``.
 
-The table there under "Size" is the only place where the limits stand. A row names folders, whose
-Python files count, or patterns, in code marks; the row "together" is the sum of those above it.
-Only files under version control count. With ``--check`` it fails where a limit is exceeded.
+The limits are only in the table there under "Size". A row names, in code marks, folders (whose
+Python files count) or patterns; the row "together" is the sum of the rows above it. Only files
+under version control count. With ``--check`` it fails if a limit is exceeded.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Limit(NamedTuple):
 
 
 class Size(NamedTuple):
-    """What there is."""
+    """The size of a part."""
 
     lines: int
     files: int
@@ -63,7 +63,7 @@ def main() -> int:
 
 
 def lengths_of_files(root: Path) -> dict[str, int]:
-    """The lines of each file under version control that can be counted, by its path."""
+    """The number of lines of each Python, Markdown or TOML file under version control, by path."""
     listing = subprocess.run(
         ["git", "ls-files", "-z", "*.py", "*.md", "*.toml"],
         cwd=root,
@@ -104,7 +104,7 @@ def sizes_of(limits: list[Limit], lengths: dict[str, int]) -> list[Size]:
 
 
 def matches(path: str, patterns: tuple[str, ...] | list[str]) -> bool:
-    """Whether a file is in a folder (``mdp/``), or is meant by a pattern (``*.py``)."""
+    """Whether a file is in one of the folders (``mdp/``), or matches a pattern (``*.py``)."""
     for pattern in patterns:
         if pattern.endswith("/"):
             found = path.startswith(pattern) and path.endswith(".py")
