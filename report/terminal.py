@@ -192,7 +192,7 @@ def _bandit_caption(study: StudySpec, left_out: Sequence[str]) -> list[str]:
 
 
 def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
-    """Print the table of `episodes_table`, agents side by side, as many as there is room for."""
+    """Print the table of `episodes_table`, with as many agents side by side as fit."""
     for environment, rows in table.groupby("environment", sort=False):
         title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
         left = list(dict.fromkeys(rows["agent"]))
@@ -226,7 +226,7 @@ def _width(console: Console, table: Table) -> int:
     return Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum
 
 
-# ``compare.py --logged``: policies on a log as a table, and what it says in words.
+# ``compare.py --logged``: policies on a log as a table and in sentences.
 
 # With a smaller effective sample size, the interval of an estimate is unreliable.
 FEW_PULLS = 100
@@ -234,7 +234,7 @@ SHORT, MOST_DECIMALS = 3, 6
 
 
 def print_comparison(console: Console, comparison: Comparison) -> None:
-    """Print the table, what it says in sentences, and the notes."""
+    """Print the table, sentences on it, and the notes."""
     console.print(_off_policy_table(comparison))
     for sentence in [*sentences(comparison), *comparison.notes]:
         console.print(f"  {sentence}")

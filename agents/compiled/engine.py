@@ -90,7 +90,7 @@ def interrupts_held() -> Iterator[Callable[[], bool]]:
             raise waiting[0]
 
 
-# A block takes some hundredths of a second: so long a signal waits.
+# A block takes some hundredths of a second, for which a signal may have to wait.
 MAX_BLOCK_STEPS = 262_144
 
 
@@ -143,7 +143,7 @@ class CompiledEngine:
         return world, EnvStates(cast(DummyVecEnv, vec_env), world), None
 
     def _learner(self) -> Any:
-        """The agent as compiled functions see it, updated after changes by callbacks."""
+        """The agent for compiled functions, updated after changes by callbacks."""
         agent, progress = self.agent, self.progress[0]
         made_from = agent.made_from(agent.rng)
         if made_from != self.made_from:

@@ -153,7 +153,7 @@ def _elapsed_steps(env: gym.Env[Any, Any]) -> int:
 # They equal the episodes of the library's `evaluate_policy`: the same generators, which end in the
 # same state. `EvalCallback`s of a compiled training use them.
 
-# Some hundredths of a second with networks: so long a signal waits.
+# Some hundredths of a second with networks, for which a signal may have to wait.
 STEPS_AT_ONCE = 4096
 
 # The library's warning about an evaluation without Monitor.
@@ -182,7 +182,7 @@ class Plan(NamedTuple):
 
     @inlined
     def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Nothing is learnt; the next observations are there."""
+        """Learn nothing; move on to the next observations."""
         for i in range(len(envs)):
             envs[i].obs = envs[i].new_obs
 
@@ -201,7 +201,7 @@ class Explorer(NamedTuple):
 
     @inlined
     def learn_from_step(self, envs: Any, progress: Any) -> None:
-        """Nothing is learnt; the next observations are there."""
+        """Learn nothing; move on to the next observations."""
         for i in range(len(envs)):
             envs[i].obs = envs[i].new_obs
 
@@ -227,7 +227,7 @@ def play_episodes(
     )
     ended: Any = np.zeros(0, dtype=EPISODE)
     while n_missing := _n_missing(ended["env"], wanted):
-        # Until so many more episodes have ended, some are missing for certain.
+        # At least this many more episodes must end.
         limits = STEPS_AT_ONCE, n_missing, COMPENSATED_SUM
         n_steps = run_block(world, player, states.records, handles, progress[0], log, *limits)
         learn_from_last_step(player, states.records, progress[0])

@@ -222,7 +222,7 @@ class Statistics:
         self.successes = list(agent.ep_success_buffer)
 
     def columns(self, episodes: Episodes, counts: Ints) -> dict[str, list[float]]:
-        """The means after so many of the block's episodes, each of shape (n,)."""
+        """The means after ``counts`` of the block's episodes, each of shape (n,)."""
         means = {
             "rollout/ep_rew_mean": (self.returns, episodes.rounded_returns()),
             "rollout/ep_len_mean": (self.lengths, episodes.lengths),
@@ -431,7 +431,7 @@ def _write_checksum(checksums: Any, room: Bytes, begin: int, end: int) -> None:
 
 
 def time_columns(agent: Any, steps: Ints, times: Ints) -> dict[str, list[int]]:
-    """The log's entries on time, at so many steps of the training."""
+    """The log's entries on time, at these numbers of steps of the training."""
     elapsed = np.maximum((times - agent.start_time) / 1e9, sys.float_info.epsilon)
     speed = (steps - agent._num_timesteps_at_start) / elapsed
     return {

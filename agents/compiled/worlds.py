@@ -106,7 +106,7 @@ PROGRESS = np.dtype(
     align=True,
 )
 
-# What a record of the log is made from: a moment of a block, after what was learnt there.
+# The data of a log record: a moment of a block, after learning.
 RECORD = np.dtype(
     [
         ("step", np.int64),  # of the block

@@ -198,7 +198,7 @@ class NetworkEnvStates(EnvStates):
                 record["obs"] = self._state_of(shown.ravel(), int(record["state"]))
 
     def _state_of(self, shown: Any, state: int) -> int:
-        """A state with this observation: ``state`` if it fits, else the first one that does."""
+        """A state with this observation: ``state`` if its observation fits, else the first such."""
         table = self.seen.table
         if np.array_equal(table[state], shown):
             return state

@@ -66,7 +66,7 @@ def template_file(name: str) -> str:
 
 
 def rounded(number: float) -> float | None:
-    """A number for figures; None in place of what is not finite."""
+    """A number for figures; None if it is not finite."""
     return float(f"{number:.{SIGNIFICANT}g}") if math.isfinite(number) else None
 
 
@@ -200,7 +200,7 @@ def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
 
 
 def layout_data(layout: GridLayout) -> dict[str, Any]:
-    """Where states lie on a map, for scripts."""
+    """The layout of states on a map, for scripts."""
     return {
         "rows": layout.rows,
         "moves": layout.moves,
