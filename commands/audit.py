@@ -64,7 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
     choices = ("discrete", "box")
     add("--observations", choices=choices, help=spaces.format("it observes: numbers or vectors"))
     add("--actions", choices=choices, help=spaces.format("it does: one of two, or a number"))
-    seeds = "seeds of a probe that is not passed on the first one; most decide (default: 3)"
+    seeds = "seeds for a probe that is not ok with the first; the majority decides (default: 3)"
     add("--seeds", type=whole_number(1, 100), default=3, metavar="N", help=seeds)
     add("--first-seed", type=FIRST_SEED, default=0, metavar="SEED", help="the first seed (0)")
     add("--json", type=filled, metavar="FILE", help="also write the findings to this file")

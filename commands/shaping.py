@@ -40,7 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The flags."""
     parser = OneLineParser(
         description="Say whether training on other rewards changes the optimal policies, and what "
-        "that costs, exactly. Default: the rewards that an agent's settings change in training.",
+        "that costs, exactly. Default: the changes that an agent's settings make in training.",
         epilog=EPILOG,
     )
     add = parser.add_argument

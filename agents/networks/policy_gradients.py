@@ -750,7 +750,7 @@ class PolicyTraining(NetworkTraining):
             log.record("train/clip_range_vf", agent.clip_range_vf(remaining))
 
     def collect_rollout(self, env: VecEnv, callback: BaseCallback) -> bool:
-        """Fill the rollout buffer, whose start callbacks know already; False to stop."""
+        """Fill the rollout buffer, after `on_rollout_start`; False once a callback asks to stop."""
         agent, held, buffer = self.agent, self.held, self.agent.rollout_buffer
         agent.collected = 0
         self.read()
