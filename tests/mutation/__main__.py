@@ -26,6 +26,7 @@ from collections import defaultdict
 from itertools import accumulate
 from pathlib import Path
 
+import hypothesis  # noqa: F401  # pytest's plugin imports it, in every child that has not
 import pytest
 from drawing import Mutant, drawn
 from quick import chosen, weights
