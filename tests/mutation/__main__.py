@@ -34,6 +34,7 @@ from quick import chosen, weights
 NOT_COPIED = shutil.ignore_patterns(".*", "logs", "runs", "build", "__pycache__")
 LIBRARIES = "torch._dynamo scipy.stats pandas matplotlib.pyplot gymnasium stable_baselines3 numba"
 OPTIONS = ["-q", "-n", "0", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
+OPTIONS += ["-W", "ignore:Module already imported"]  # before the fork
 # Seconds of processor time after which no further test begins, and more where all is compiled anew.
 # The first round has tests of FIRST seconds. So much after the budget the test that runs hangs.
 BUDGET, COMPILING, FIRST, HANG = 10, 30, 3, 40
