@@ -107,7 +107,7 @@ class Explanation:
     parts: tuple[Part, ...]  #: their losses sum to the gap; empty where they are not known
     states: tuple[StateLoss, ...]  #: the states that lose most, at most 20, the worst first
     n_states: int  #: states in which it loses anything
-    losses: Floats  #: of each state, shape (S,); they sum to the gap
+    losses: Floats  #: the loss in each state, shape (S,); losses sum to the gap
     repairs: tuple[tuple[str, float], ...]  #: state, and return after its and all earlier repairs
     #: the discount of its training, and the gap at the start in that objective
     discount: float | None = None
@@ -161,7 +161,7 @@ class Explanation:
 class _Task(NamedTuple):
     """The objective that the agent was trained for."""
 
-    model: TransitionModel  # of the training environment
+    model: TransitionModel  # the model of the training environment
     discount: float
     epsilon: float  # exploration rate, if the agent learns the values of exploring, else 0
     lived: TransitionModel  # the model with these random actions
@@ -531,7 +531,7 @@ class Parting:
     """Where the policies of two agents first part, the one with the higher return first."""
 
     names: tuple[str, str]
-    difference: float  #: of the returns, at least 0; the gains sum to it
+    difference: float  #: the difference of the returns, at least 0; gains sum to it
     met: float  #: the probability that an episode has a difference
     places: tuple[Place, ...]  #: at most 20, the largest gains or losses first
 

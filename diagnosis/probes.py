@@ -258,7 +258,7 @@ def share_of_action(trained: Trained, action: int) -> float:
     return float((trained.drawn_actions(0, 2000) == action).mean())
 
 
-# --- what is kept ---------------------------------------------------------------------------------
+# --- stored data ----------------------------------------------------------------------------------
 
 
 def probe_age(lab: Lab) -> Iterator[Finding]:

@@ -503,7 +503,7 @@ class TrainedScript(Trained):
         return np.stack([np.asarray(each, dtype=np.float64).reshape(-1) for each in found])
 
 
-# --- what was typed -------------------------------------------------------------------------------
+# --- the command line -----------------------------------------------------------------------------
 
 
 def class_named(name: str) -> type[BaseAlgorithm]:

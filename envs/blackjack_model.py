@@ -19,7 +19,7 @@ from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
 from mdp.transition_model import Floats, Ints, TransitionModel
 
-SIZES = (32, 11, 2)  # of the observation's parts
+SIZES = (32, 11, 2)  # the number of values of each part of the observation
 N_OBSERVED = 32 * 11 * 2
 N_STATES = N_OBSERVED + 11
 STICK, HIT = 0, 1

@@ -109,7 +109,7 @@ class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env: an environment that holds ``P`` and its state ``s`` as Gymnasium's toy_text does.
 
     Attributes:
-        masks: of all states, bool of shape (S, A).
+        masks: the masks of all states, bool of shape (S, A).
 
     Raises:
         ValueError: if it holds no ``P``.

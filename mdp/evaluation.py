@@ -368,7 +368,7 @@ class LimitedEpisodes:
     """The episodes of a policy under a time limit."""
 
     model: TransitionModel  # the decision process
-    policy: Policy  # as `canonical_policy` gives it
+    policy: Policy  # in the form of `canonical_policy`
     horizon: int  # the time limit in steps
 
     def result(

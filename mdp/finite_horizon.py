@@ -1,4 +1,4 @@
-"""The best policy under a time limit: what is best depends on the steps that are left."""
+"""The optimal policy under a time limit, which depends on the number of steps left."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def greedy_repairs(
         model: the decision process.
         policy: in any of its forms.
         horizon: the time limit in steps.
-        split: as `gap_by_state` gives it for this policy.
+        split: the result of `gap_by_state` for this policy.
         most: the largest number of repairs.
     """
     if model.prob.size * horizon > MOST_OUTCOMES_REPAIRED:

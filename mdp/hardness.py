@@ -146,7 +146,7 @@ def hitting_times(model: TransitionModel, target: int) -> Floats:
     return times
 
 
-# Mistakes.
+# Suboptimal actions.
 
 
 def action_gaps(
@@ -179,7 +179,7 @@ def action_gaps(
     return (smallest if np.isfinite(smallest) else None), mean
 
 
-# Chance.
+# Random actions.
 
 
 def random_wait(model: TransitionModel, marked: Bools, horizon: int) -> tuple[float, float]:

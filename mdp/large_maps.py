@@ -19,7 +19,7 @@ from machine_code.compiling import compiled, inlined, kernel
 from mdp.planning import value_iteration
 from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
-# A limit that is far away.
+# A distant limit.
 
 # Backwards from a limit of T steps, planning takes T sweeps over all states. Where every step costs
 # something, the optimum without the limit nearly always equals it to the last digits; the result is
@@ -174,7 +174,7 @@ def moments_by_spreading(
     starts = np.flatnonzero(initial)
     here[: len(starts)] = starts
     over = np.zeros((3, 3))
-    least = SHARE_LEFT_OUT / (n_states * horizon)  # of a state at a step
+    least = SHARE_LEFT_OUT / (n_states * horizon)  # the least probability of a state at a step
     limits = _best_rewards(rows[0], rows[2], rows[3])
     groups = now, later, here, there
     if not _follow(
@@ -308,7 +308,7 @@ def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[floa
     return best_end, best_step
 
 
-# Ways.
+# Deterministic episodes.
 
 # The result of some number of steps from each state, arrays of shape (n + 1,), the last entry for
 # the ended episode: the (discounted) sum of rewards, the number of steps until then or the end,

@@ -27,7 +27,7 @@ from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 MOST_OUTCOMES_CLIMBED = 100_000_000  # for one return; above, there is no search
 MOST_WORK = 100_000_000  # for all returns of the ascents, and again for those of the bounds
 RANDOM_STARTS = 4
-MOST_RETURNS = 100_000  # of the bounds
+MOST_RETURNS = 100_000  # for the bounds
 MOST_FIRM = 256  # deterministic policies; up to this number, all are tried
 # Logit of an almost deterministic policy; ascents start from half of it.
 STEEP = 6.0
@@ -328,7 +328,7 @@ def _best_in_box(values: Floats, low: Floats, high: Floats, is_used: Bools) -> f
         is_used[action] = False
         total += low[action] * values[action]
         left -= low[action]
-    # What is left goes to the best action, as much as the box allows, then to the next.
+    # The rest goes to the best action, as much as the box allows, then to the next best.
     for _ in range(len(values)):
         best = -1
         for action in range(len(values)):

@@ -24,7 +24,7 @@ from verdicts.resampling import (
     percentile_interval,
 )
 
-# As many points as a figure can show.
+# The largest number of points that a figure can show.
 _MOST_POINTS = 500
 
 
@@ -127,8 +127,8 @@ def curve_band(
     Args:
         values: shape (n_seeds, n_points), on a common grid. Non-finite values are left out at
             their point.
-        seed: of the resampling, which draws the same seeds at every point.
-        confidence: of the intervals.
+        seed: the seed of the resampling, which draws the same runs at every point.
+        confidence: the confidence level of the intervals.
         n_resamples: how many resamples they come from.
 
     Raises:
@@ -214,7 +214,7 @@ def summarise_steps(steps: ArrayLike, confidence: float = 0.95) -> ThresholdSumm
     Args:
         steps: the result of ``steps_to_threshold`` for each run, shape (n_seeds,): infinity for a
             run that never reaches the threshold, NaN for a failed run.
-        confidence: of the intervals.
+        confidence: the confidence level of the intervals.
 
     Raises:
         ValueError: for a confidence out of range.
@@ -263,8 +263,8 @@ def performance_profile(
         scores: shape (n_seeds,), or (n_seeds, n_envs) on a scale that the environments share.
             Non-finite scores count as missing; NaN is returned if an environment has no others.
         thresholds: shape (n_thresholds,).
-        seed: of the resampling, of seeds within each environment.
-        confidence: of the intervals, which hold threshold by threshold.
+        seed: the seed of the resampling of runs, separately within each environment.
+        confidence: the confidence level of the intervals, separately for each threshold.
         n_resamples: how many resamples they come from.
 
     Returns:

@@ -28,7 +28,7 @@ Exact = tuple[bool, bool]  # of two agents, whether each is deterministic
 
 # With fewer runs of an agent nothing is claimed about its mean.
 FEWEST_SEEDS = 5
-N_SPLITS = 4000  # of a permutation test; all of them where there are fewer
+N_SPLITS = 4000  # splits of a permutation test; all of them where there are fewer
 # From this many scores of both agents on, Welch's test gives the same result as permutations.
 MOST_PERMUTED = 400
 N_SPACINGS = 4000
@@ -48,7 +48,7 @@ def opposite(verdict: Verdict) -> Verdict:
 class MeanVerdict:
     """A verdict on the means of two agents."""
 
-    verdict: Verdict  #: on the first of the two
+    verdict: Verdict  #: the verdict on the first of the two
     #: Whether it holds only as long as few further runs lie outside the observed range.
     is_conditional: bool = False
 
@@ -136,7 +136,7 @@ def permutation_p_value(first: Floats, second: Floats) -> float:
 
 
 def paired_p_value(first: Floats, second: Floats) -> float:
-    """The same p-value for paired runs: the larger one of the paired t-test and of sign flips.
+    """The same p-value for paired runs: paired t-test and, if all can be tried, sign flips.
 
     Source: Student (1908); Fisher (1935), "The design of experiments", section 21.
     """
@@ -430,7 +430,7 @@ def seeds_needed(
     Args:
         first: scores, shape (n,), at least 2.
         second: likewise.
-        level: of the verdict, on both sides together.
+        level: the two-sided error rate of the verdict.
         margin: the margin of equivalence.
         power: the probability of a verdict.
 

@@ -50,15 +50,15 @@ def fewest_seeds(level: float, n_pairs: int = 1) -> int:
     return fewest_for(level_of_claim(level, "means") / n_pairs)
 
 
-# Verdicts on pairs of agents: on what they earn on average, and on their typical runs.
+# Verdicts on pairs of agents: on their means and on their typical runs.
 
 
 @dataclass(frozen=True)
 class Judgement:
     """Verdicts on the first agent of a pair."""
 
-    mean: MeanVerdict  #: on what they earn on average
-    #: On their typical runs: ``better`` or ``worse`` if a run of one scores higher than one of the
+    mean: MeanVerdict  #: the verdict on the means
+    #: On typical runs: ``better`` or ``worse`` if a run of one scores higher than one of the
     #: other more often than not; ``equivalent`` if neither does by more than the margin.
     typical: Verdict
     #: Whether both agents are deterministic, so that there was nothing to test.
@@ -299,8 +299,8 @@ def probability_of_improvement(
         first: shape (n_seeds,) or (n_seeds, n_envs).
         second: likewise, the same seeds at the same places. A seed counts where neither is NaN;
             infinite scores are compared as any others.
-        seed: of the resampling.
-        confidence: of the interval.
+        seed: the seed of the resampling.
+        confidence: the confidence level of the interval.
         n_resamples: how many resamples it comes from.
 
     Raises:
@@ -375,7 +375,7 @@ class PairComparison:
     #: The difference of the means, as shares of the scale between the ends; the intervals for all
     #: pairs hold together and agree with the verdict.
     mean: MeanDifference
-    typical: Verdict  #: on the typical run of the first; see ``Judgement``
+    typical: Verdict  #: the verdict on typical runs; see ``Judgement``
     #: The probability that a run of the first agent scores higher than one of the second.
     probability_of_improvement: Estimate
     #: Where the means are undecided, the approximate number of seeds that would decide at the next
@@ -431,7 +431,7 @@ def compare_pairs(
     Args:
         scores: by agent, shape (n_seeds,), higher is better. Non-finite scores are missing.
         margin: the largest difference, in the unit of the scores, that does not matter.
-        seed: of the resampling.
+        seed: the seed of the resampling.
         ends: the lowest and the highest score that a run may have; scores beyond an end count as
             that end. None for ``Ends.beyond``.
         paired: whether the agents' runs of one seed share their randomness.
@@ -489,12 +489,12 @@ def describe_pairs(
         margin: the largest difference that does not matter.
         levels: the error rates of the look that judged, and of the next.
         ends: the ends of the scores' scale.
-        seed: of the resampling.
+        seed: the seed of the resampling.
         paired: whether the agents' runs of one seed share their randomness.
         ranks: whether half of the error rate for means was spent on the ranking.
         against: the only agent that the others were compared with; empty for all pairs.
         certain: the deterministic agents.
-        confidence: of the probabilities of improvement.
+        confidence: the confidence level of the probabilities of improvement.
         n_resamples: how many resamples their intervals come from.
     """
     compared = {pair for pair in judged if not against or against in pair}

@@ -45,7 +45,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike, confidence: float = 0
     Args:
         first: shape (n_seeds,).
         second: likewise, the same seeds at the same places. A seed counts where both are finite.
-        confidence: of the interval.
+        confidence: the confidence level of the interval.
 
     Returns:
         The estimate, without interval for fewer than two seeds. Where all differences are equal the

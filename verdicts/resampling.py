@@ -141,8 +141,8 @@ def summarise(
         scores: shape (n_seeds,), or (n_seeds, n_envs) on a scale that the environments share.
             Non-finite scores count as missing. Where an environment has no score at all the
             estimates are NaN: leave it out for every agent, or give failed runs a score.
-        seed: of the resampling.
-        confidence: of the intervals.
+        seed: the seed of the resampling.
+        confidence: the confidence level of the intervals.
         n_resamples: how many resamples they come from; fewer with hundreds of seeds.
 
     Raises:

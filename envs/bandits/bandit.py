@@ -38,7 +38,7 @@ class Tally:
     """Counts and rewards of the pulls of an episode."""
 
     counts: Ints  # the number of pulls, shape (n_contexts, n_arms)
-    sums: Floats  # of their rewards, likewise
+    sums: Floats  # the sums of their rewards, likewise
     last: tuple[int, int, float] | None = None  # context, arm and reward of the latest pull
 
     @classmethod
@@ -227,7 +227,7 @@ class Bandit(ShownEnv):
     the arms in `_true_means`. `gymnasium.make` makes ``pulls`` the time limit.
     """
 
-    kind: str  # of the dynamics, by which compiled copies know them
+    kind: str  # the kind of dynamics, which selects the compiled copy
     context: Any  # what the agent observes before the next pull
 
     def __init__(
@@ -245,7 +245,7 @@ class Bandit(ShownEnv):
         self.batch_size = check_whole_number("batch_size", batch_size, 1, MAX_PULLS)
         self.observation_space = observation_space
         self.action_space = spaces.Discrete(n_arms)
-        self.pulls_done = 0  # of this episode
+        self.pulls_done = 0  # in this episode
         self._tally = Tally.empty(max(self.n_contexts, 1), n_arms)
 
     @property

@@ -278,7 +278,7 @@ def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -
         env: a bandit as `gymnasium.make` returns it; its observations are Discrete, or a Box of
             one axis.
         n: the number of pulls; episodes follow each other where one is too short.
-        seed: of the environment and of the arms.
+        seed: the seed of the environment and of the arms.
         path: the file to write.
     """
     assert isinstance(env.action_space, spaces.Discrete)
