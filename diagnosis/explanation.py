@@ -59,7 +59,7 @@ TIE = 1e-9
 MOST_STATES, MOST_OF_GAP = 3, 0.5
 # The probability of an end from which on it counts as sure.
 SURELY = 0.99
-# Parts and repairs below this share of the gap are not worth a line.
+# Repairs that regain less than this share of the gap are not worth a line.
 WORTH_A_LINE = 0.05
 # The share from which on a change is proposed; parts that more training may reduce, and its factor.
 LARGE = 0.25

@@ -35,7 +35,7 @@ N_SPACINGS = 4000
 # More sorted scores than this are grouped with their neighbours, at the lowest score of the group.
 MOST_SPACINGS = 2000
 SAME = 1e-12  # means closer than this are equal
-ROUNDED = 1e-9  # scores and differences within this of an end or of 0 may be there but for rounding
+ROUNDED = 1e-9  # scores this close to an end count as the end, and such differences as 0
 
 
 def opposite(verdict: Verdict) -> Verdict:
