@@ -44,6 +44,7 @@ lint: style types types-elsewhere ## Check style, formatting, types and import c
 # Apart, so that make -j2 has both halves of what takes long done at once.
 style: $(STAMP)
 	$(BIN)/ruff check .
+	$(BIN)/ruff check --preview --select PLW1514 $(PACKAGES) # Windows does not take text for UTF-8
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
