@@ -332,7 +332,7 @@ class StudyPack:
     """Collects the contents of a study's pack while it is written."""
 
     digests: dict[str, str] = field(default_factory=dict)  # of its files, by name
-    # by agent and environment: record and pack of the first run, and the number of runs
+    # by agent and environment: record and pack name of the first run, and the number of runs
     agents: dict[tuple[str, str], tuple[dict[str, Any], str, int]] = field(default_factory=dict)
     modules: list[str] = field(default_factory=list)  # arguments for the modules of all runs
 

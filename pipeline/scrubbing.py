@@ -37,7 +37,7 @@ _SIGN = rb"[A-Za-z0-9+/]"
 _PACKED = re.compile(rb">(H4sI(?:%b{4})*(?:%b{3}=|%b{2}==)?)<" % (_SIGN, _SIGN, _SIGN))
 _LARGEST = 64 << 20  # bytes
 _SECRET = re.compile(r"passw|secret|token|credential|api_?key", re.IGNORECASE)
-_SHORTEST = 4  # letters of a path to search for: "/" is everywhere
+_SHORTEST = 4  # characters of a path to search for; "/" alone is everywhere
 
 
 def without_places(value: Any) -> Any:

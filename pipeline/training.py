@@ -51,7 +51,7 @@ class Outcome:
     final: Evaluation | None  #: on separate episodes; None if turned off
     best_return: float | None  #: mean return of the best evaluation during training, if any
     best_timesteps: int  #: the time step of that evaluation
-    engine: str | None  #: for tabular agents, whether training was compiled, and if not, why
+    engine: str | None  #: whether training was compiled, and if not, why; None if unknown
     best_episodes: int  #: number of episodes behind the best return; 0 if it is exact
     evaluating: WorkTime  #: the time of all evaluations, including the last one
     evaluation_steps: int  #: environment steps of sampled evaluations
@@ -146,7 +146,7 @@ def _learn(training: Training) -> None:
                 **kwargs,
             )
     except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as e:
-        check_model(training.model)  # PyTorch refuses distributions of nan without the reason
+        check_model(training.model)  # PyTorch's error for nan in distributions is obscure
         blame_settings(spec.algo, training.model, e)
         raise
 
@@ -283,7 +283,7 @@ def draw(training: Training, final: Evaluation | None) -> None:
 
 @exits_as_mistakes()
 def close(training: Training) -> None:
-    """Close all open parts, each one even if another cannot be closed."""
+    """Close all open parts; an error in one does not keep the others open."""
     model = training.model
     with ExitStack() as stack:
         if model.env is not None:

@@ -1,4 +1,4 @@
-"""Finds interrupted runs, and prepares resuming them; imported before PyTorch."""
+"""Finds interrupted runs and prepares to resume them; its import does not load PyTorch."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 if TYPE_CHECKING:
     from pipeline.state_files import SavedState
 
-# Settings that may change when a run resumes, and that its record ignores.
+# Settings that comparisons of specs ignore, and that may change when a run resumes.
 _SHOWN_ONLY = ("verbose", "progress", "log_folder", "gym_packages", "user_modules", "unique_id")
 
 EVENT_FILES = "events.out.tfevents.*"
@@ -49,7 +49,7 @@ class SaveInterval:
     """How often to save the state."""
 
     seconds: float = 0.0  # between two saves; 0: so that saving takes `SHARE_OF_TIME`
-    steps: int = 0  # instead, steps between two saves, counted over all environments
+    steps: int = 0  # steps between two saves instead, counted over all environments
     is_off: bool = False  # saves no state
 
 

@@ -1,4 +1,4 @@
-"""Records a training while it runs, for a page that plays it.
+"""Records a training while it runs, for a page that replays it.
 
 For agents with tables it records each step; for all others, maps of the greedy policy.
 """
@@ -91,7 +91,7 @@ class MapRecorder(BaseCallback):
         self.evaluator = evaluator
         self.moments = GrowingRows(_moment_type(n_states))
         self.most = min(max(MOST_FIGURES // (2 * n_states), FEWEST_MAPS), MOST_MAPS)
-        self.stride = 1  # one map is kept for so many units
+        self.stride = 1  # every ``stride``-th map is kept
         self.n_units = 0
 
     @property
@@ -205,7 +205,7 @@ MOST_MOVES = 20_000
 MOST_CHANGES = 60_000
 MOVES_UNASKED = 5_000
 MOST_ENTRIES = 100_000
-# The search for the rise of the return covers so many steps, and evaluates the policy so often.
+# Limits of the search for the rise of the return, and steps between evaluations of the policy.
 MOVES_SEARCHED = 50_000
 CHANGES_SEARCHED = 1_000_000
 STEPS_BETWEEN_RETURNS = 100
@@ -222,7 +222,7 @@ STEP = np.dtype(
     [
         ("timesteps", np.int64),  # after it, over all environments
         ("exploration", np.float64),
-        ("learning_rate", np.float64),  # nan if it does not come from the schedule
+        ("learning_rate", np.float64),  # nan if it is not from the schedule
     ]
 )
 # One environment's part of a step.
@@ -441,7 +441,7 @@ def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None
         return TableRecorder(spec.watch_episodes, exact if can_be_mapped else None)
     if exact is None or not can_be_mapped or best_actions_of(exact, agent) is None:
         raise UserError(
-            f"--watch-learning shows tables, or what an agent does in up to 2,500 known states: "
+            f"--watch-learning shows tables, or an agent's actions in up to 2,500 known states: "
             f"{spec.algo} on {spec.env_id} has neither"
         )
     tells_updates = isinstance(agent, OnPolicyAlgorithm | OffPolicyAlgorithm)

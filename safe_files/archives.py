@@ -1,6 +1,6 @@
 """Reads members and settings from zips of models, without importing the libraries.
 
-It unpacks no more than the budget of the file allows.
+It unpacks no more bytes than the budget of the file allows.
 """
 
 from __future__ import annotations

@@ -207,7 +207,7 @@ _STORAGE = Name("torch.storage", "TypedStorage")
 
 
 class _TensorReader(Reader):
-    """Reads PyTorch's pickles of protocol 2, whose storages are separate files."""
+    """Reads PyTorch's pickles of protocol 2, with storages in separate files."""
 
     prices = PRICES | {"GLOBAL": 104, "BINPUT": 104, "LONG_BINPUT": 104, "BINPERSID": 320}
 
@@ -429,7 +429,7 @@ def _composed(parts: list[Any]) -> ComposeTransform:
 
 
 def _code(made: Made, build: Build) -> None:
-    """Replace a function that was pickled with its code, as schedules were before version 2.6."""
+    """Refuse a function that was pickled with its code, as schedules were before version 2.6."""
     # The last text among the arguments of the code object is the function's name.
     code = made.args[0] if made.args else None
     texts = [one for one in getattr(code, "args", ()) if isinstance(one, str)]

@@ -1,8 +1,8 @@
 """Loads models of Stable-Baselines3 and sb3-contrib from files of unknown origin.
 
 The library's own `load` gets a new zip with the checked contents, so it has nothing to unpickle.
-`load` would make networks and buffers of any size in the settings, and PyTorch silently converts
-dtypes. So this module checks sizes and dtypes.
+This module also checks sizes and dtypes, because `load` would make networks and buffers of any size
+in the settings, and PyTorch silently converts dtypes.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from pipeline.evaluation.yardstick import Yardstick
 from pipeline.finite_numbers import FinitePlayer, check_numbers
 from pipeline.train_spec import TrainSpec
 
-# A mean so many standard errors above an upper bound is an error.
+# A mean this many standard errors above an upper bound shows that the bound is wrong.
 BEYOND_CHANCE = 6.0
 # Fewer episodes may all have begun in states of high return.
 FEWEST_TO_TELL = 10
@@ -36,13 +36,13 @@ FEWEST_TO_TELL = 10
 
 @dataclass(frozen=True)
 class OtherReturns:
-    """Exact returns of the final agent beside that of its greedy policy; None where not known."""
+    """Further exact returns of the final agent; None where unknown."""
 
-    acts_by: str | None = None  # what it acts by in training, in words: "epsilon 0.01"
-    stochastic_return: float | None = None  # of the policy that it acts by in training
-    discount: float | None = None  # the agent's
+    acts_by: str | None = None  # its policy in training, in words: "epsilon 0.01"
+    stochastic_return: float | None = None  # of its policy in training
+    discount: float | None = None  # the agent's discount
     discounted_return: float | None = None  # of the greedy policy, under that discount
-    discounted_optimum: float | None = None  # the highest; None where the state is hidden
+    discounted_optimum: float | None = None  # of all policies; None if the state is hidden
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Evaluation:
 def evaluate(
     model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int | None, deterministic: bool = True
 ) -> Evaluation:
-    """Play ``n_episodes``, determined by the seed; with seed None, the environments go on."""
+    """Play ``n_episodes``, determined by the seed; with None, environments are not reseeded."""
     successes: list[bool] = []
 
     def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:
@@ -360,8 +360,8 @@ class CompiledCopy:
     """Evaluation environments and their compiled counterpart."""
 
     env: DummyVecEnv
-    world: Any  # what `agents.compiled.loop` steps
-    seen: Any  # how its observations are read
+    world: Any  # the compiled environments, for `agents.compiled.loop`
+    seen: Any  # converts their observations
 
 
 def compiled_copy(env: VecEnv) -> CompiledCopy | None:
@@ -384,7 +384,7 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
 def evaluate_compiled(
     model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
 ) -> Evaluation:
-    """Like `evaluate`, in compiled code; the library decides near ties of a network."""
+    """Like `evaluate`, in compiled code; the library's network decides near ties."""
     from agents.compiled.greedy_play import play_episodes
     from agents.compiled.records import DECIMALS
     from agents.networks.network_worlds import NetworkEnvStates
@@ -393,7 +393,7 @@ def evaluate_compiled(
     env, n_envs = copy.env, copy.env.num_envs
     if seed is not None:
         env.seed(seed)
-    # The same numbers per environment as in `evaluate_policy`.
+    # As many episodes per environment as in `evaluate_policy`.
     wanted = (n_episodes + np.arange(n_envs)) // n_envs
     states = NetworkEnvStates(env, copy.world, copy.seen)
     acting = cast(Any, model).greedy_player(copy.seen)

@@ -112,7 +112,7 @@ def recorded_run(run: Run | None) -> RecordedRun:
 
 @contextmanager
 def _telling_way_out() -> Iterator[None]:
-    """Add to the error about a changed file what the user can do."""
+    """Add advice to the error about a changed file."""
     try:
         yield
     except DamagedFileError as error:

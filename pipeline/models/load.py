@@ -116,7 +116,7 @@ def own_classes(
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
-    # No others, because a file may have parts of a network called with its arguments.
+    # No other classes: a file decides which of them are called, and with which arguments.
     kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = {module.name for module in modules} | {algorithm.__module__}
 
@@ -275,7 +275,7 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
     buffer: Any = model.replay_buffer
     if buffer.n_envs != model.n_envs:
         raise UserError(
-            f"{path} was filled by {buffer.n_envs} environments at once, and cannot be by "
+            f"{path} was filled by {buffer.n_envs} environments at once, and does not fit "
             f"{model.n_envs}: give -params n_envs:{buffer.n_envs}"
         )
     kinds = [(type(one).__name__, getattr(one, "n_steps", 1)) for one in (buffer, wanted)]
@@ -290,7 +290,7 @@ class Statistics:
 
     path: Path  # the file that was read
     settings: Mapping[str, Any]  # arguments of VecNormalize
-    # of observations, or by key; None if observations are not normalised
+    # of observations, by key for Dict spaces; None if observations are not normalised
     observations: RunningMeanStd | dict[str, RunningMeanStd] | None
     returns: RunningMeanStd  # of discounted returns, by which rewards are divided
 
@@ -346,7 +346,7 @@ def take_over(env: VecEnv, statistics: Statistics) -> None:
 
 
 def with_normalised_rewards(env: VecEnv) -> VecEnv:
-    """The environments with normalised rewards, as in training, and returns of these."""
+    """The environments with normalised rewards, as in training; returns are sums of these."""
     from stable_baselines3.common.vec_env import VecMonitor, unwrap_vec_normalize
 
     normalization = unwrap_vec_normalize(env)

@@ -281,7 +281,7 @@ def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, 
 
 
 def _read_tuned_on(entries: Mapping[str, Any], where: str) -> dict[str, tuple[range, ...]]:
-    """Read the seeds of each entry's tuning: ``{first: 0, count: 10}``, or a list of such."""
+    """Read the tuning seeds of each entry: ``{first: 0, count: 10}``, or a list of these."""
     said = entries[TUNED_ON]
     if not isinstance(said, dict):
         raise UserError(f"{where} must map entries to seeds, not be {shown(said)}")
