@@ -133,7 +133,7 @@ def _discount(asked: _Asked) -> Found:
 
 
 def _step_size(asked: _Asked) -> Found:
-    """Compute the schedule of the step size; it stays large in a short training."""
+    """Compute the schedule of the step size; in a short training, it stays large."""
     states, actions = asked.pairs()
     low, high = LAST_STEP_SIZES
     if asked.n_timesteps is None:  # the budget is in episodes
@@ -148,7 +148,7 @@ def _highest_value(asked: _Asked) -> Found:
     model = transition_model(asked.env)
     if model is None:
         raise UserError(f"{asked.where}: auto needs an environment whose model is known")
-    # Unreachable cells count too: finding them would take longer than all the rest here.
+    # Unreachable states count too: excluding them would take longer than all other work here.
     ends = model.terminated & (model.prob > 0)
     if not ends.any():
         raise UserError(f"{asked.where}: auto needs an environment whose episodes can end")

@@ -156,7 +156,7 @@ class ExponentialExploration(BaseCallback):
 
 # --- non-finite numbers end a training ------------------------------------------------------------
 
-# Names under which the library's agents log their losses. Other entries may be nan, for example the
+# The log entries with losses of the library's agents. Other entries may be nan, for example the
 # explained variance of constant returns.
 LOSSES = (
     "train/loss",
@@ -222,7 +222,7 @@ class PullSummary:
     """Summary of the pulls of a training."""
 
     n_pulls: int  # over all environments
-    n_matched: int  # pulls of an arm that the log contained; all pulls without a log
+    n_matched: int  # pulls with a reward in the log; all pulls without a log
     reward: float | None  # mean of the matched pulls; None if no pull matched
     # sum over pulls of the best expected reward minus that of the pulled arm; None if expected
     # rewards are unknown, as with a log
@@ -265,7 +265,7 @@ SECONDS_BETWEEN_WRITES = 1.0
 
 
 class EvaluationCallback(EvalCallback):
-    """An `EvalCallback` with a given evaluation function, and files that are never half-written.
+    """An `EvalCallback` with a given evaluation function and atomically written files.
 
     It writes ``evaluations.npz`` and ``best_model.zip`` with its VecNormalize statistics. It
     triggers the same callbacks and log entries as its base class.
@@ -316,7 +316,7 @@ class EvaluationCallback(EvalCallback):
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether evaluations during training are wanted."""
+        """Whether evaluations during training are requested."""
         return self.eval_freq > 0 or self.eval_episode_freq > 0
 
     def _init_callback(self) -> None:

@@ -33,7 +33,7 @@ LOCK = ".lock"  # of the running process
 STATE_FOLDER = "state"  # saved states, which are not part of a run's results
 VERSION_FIELD = "record_version"
 VERSION = 2  # of records with digests; earlier records had no such field
-# States of a run that has no digests yet.
+# States of a run without digests.
 _UNDER_WAY = ("running", "failed")
 LARGEST_RECORD = 64 << 20  # bytes
 LARGEST_READ = 2 << 30  # bytes, of a file that is read as a whole

@@ -1,4 +1,4 @@
-"""Classifies failures of a run: by the machine, the user's code, or a library.
+"""Classifies failures of a run by their cause: the machine, the user's code, or a library.
 
 The machine runs out of a resource; the user's code raises SystemExit; a library fails. Commands
 load this module before their first output, so it imports little.

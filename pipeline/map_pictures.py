@@ -43,7 +43,7 @@ class Policy:
 
     layout: GridLayout
     layer: int  # the set of collected prizes
-    matters: Bools  # the reachable states
+    matters: Bools  # the cells to draw values and actions in
     visited: Bools  # the cells that the policy reaches from the start
     differs: Bools  # where agent and optimum differ
     values: Floats  # expected return from each cell on
@@ -352,7 +352,7 @@ def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, lis
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
     panels = figure.subplots(n_rows, n_columns, squeeze=False)
     longest = max(layout.n_rows, layout.n_columns)
-    # Labels take more time than all the rest.
+    # Drawing labels takes more time than everything else.
     step = next(step for step in (1, 2, 5, 10, longest) if longest <= MAX_TICKS * step)
     for number, axes in enumerate(panels.flat):
         named = number % n_columns == 0

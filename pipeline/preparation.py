@@ -157,7 +157,7 @@ def prepare(
 
 @contextmanager
 def _library_errors_in_one_line() -> Iterator[None]:
-    """Turn the library's errors about settings into one line."""
+    """Turn the library's errors about settings into errors of one line."""
     try:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:

@@ -42,8 +42,8 @@ from pipeline.user_modules import UserModule
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
 FIRST_COST = 0.05  # seconds; assumed before the first save
-# A run that was cut off may be cut off again soon, and must make progress each time: its pauses
-# begin short and double, so that at least half of the work since then is saved.
+# An interrupted run may soon be interrupted again, and must make progress each time: the pauses
+# between its saves begin short and double, so that at least half of its new work is saved.
 SHORTEST_PAUSE = 0.1
 
 
@@ -52,7 +52,7 @@ class StateSaver(BlockCallback):
 
     Both happen at a safe moment: after the last update and before the environments step. The state
     consists of the agent with its environments, all callbacks with their evaluation environments,
-    the user's modules, and the generators that libraries share.
+    the user's modules, and the global random generators.
     """
 
     takes_blocks = True
@@ -70,7 +70,7 @@ class StateSaver(BlockCallback):
         self.modules = modules  # the user's
         self.told: set[str] = set()
         self.interval = keeping.interval
-        self.tell = tell  # receives one line on why no state is saved
+        self.tell = tell  # prints a line on why no state is saved
         self.state = keeping.state  # the state to resume from
         self.is_off = keeping.interval.is_off
         self.acts = True  # at the next safe moment; False after `wants_position` returned False
@@ -272,7 +272,7 @@ _OF_THIS_PROCESS = (
 )
 
 
-# --- the global generators of libraries ---
+# --- the global random generators ---
 
 
 def generator_states() -> dict[str, Any]:

@@ -50,10 +50,10 @@ class TrainSpec:
     progress: bool = False  #: draw a live bar wherever the output goes
     gym_packages: tuple[str, ...] = ()  #: modules of the user, whose classes settings may name
     user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
-    unique_id: bool = False  #: give the folder a name that is unique over all machines
+    unique_id: bool = False  #: give the folder a globally unique name
     pictures: bool = True  #: draw the learning curve and other pictures into the run folder
     diagnose: bool = False  #: compare values and gradients with exact ones at evaluations
-    watch_learning: Path | None = None  #: file of a page that plays the training step by step
+    watch_learning: Path | None = None  #: file of a page that replays the training step by step
     watch_episodes: int = 0  #: episodes on that page, for agents with tables; 0: automatic
     #: the origin of values that are not in the entry: ``"auto: 1 - 1/(2 x time limit ..."``
     origins: dict[str, str] | None = None

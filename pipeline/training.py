@@ -47,15 +47,15 @@ class Outcome:
     run: Run  #: its folder
     state: str  #: ``"finished"`` or ``"interrupted"``
     n_steps: int  #: environment steps done
-    taken: WorkTime  #: their time, with evaluations, but without compiling, which happens once
-    final: Evaluation | None  #: on separate episodes; None if turned off
+    taken: WorkTime  #: the time of training and its evaluations, without compiling
+    final: Evaluation | None  #: the final evaluation; None if turned off or interrupted
     best_return: float | None  #: mean return of the best evaluation during training, if any
     best_timesteps: int  #: the time step of that evaluation
     engine: str | None  #: whether training was compiled, and if not, why; None if unknown
-    best_episodes: int  #: number of episodes behind the best return; 0 if it is exact
+    best_episodes: int  #: the number of episodes of that evaluation; 0 if it is exact
     evaluating: WorkTime  #: the time of all evaluations, including the last one
     evaluation_steps: int  #: environment steps of sampled evaluations
-    pulls: PullSummary | None = None  #: on bandits, figures on the pulls of training
+    pulls: PullSummary | None = None  #: on bandits, the summary of the training pulls
 
 
 def train(
@@ -252,7 +252,7 @@ def _drawn(training: Training, state: str, outcome: Outcome, activity: Activity)
 
 @contextmanager
 def _stoppable(state: str) -> Iterator[None]:
-    """Let a signal end the block: at once, or some time after a signal has ended training."""
+    """Let a signal end the block at once, or after a time limit if one has ended training."""
     seconds_left = SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0
     with current().waiting(seconds_left), exits_as_mistakes():
         yield

@@ -40,7 +40,7 @@ EVENT_FILES = "events.out.tfevents.*"
 MONITOR_FILES = "[0-9]*.monitor.csv"
 _PIECE = 1 << 20  # bytes
 
-# A file's length in bytes and their checksum.
+# A length in bytes, and the checksum of these bytes of a file.
 Position = tuple[int, int]
 
 
@@ -48,7 +48,7 @@ Position = tuple[int, int]
 class SaveInterval:
     """How often to save the state."""
 
-    seconds: float = 0.0  # between two saves; 0: so that saving takes `SHARE_OF_TIME`
+    seconds: float = 0.0  # between two saves; 0: saving takes `SHARE_OF_TIME`
     steps: int = 0  # steps between two saves instead, counted over all environments
     is_off: bool = False  # saves no state
 
@@ -60,7 +60,7 @@ class StateKeeping:
     interval: SaveInterval = SaveInterval()
     state: SavedState | None = None  # the state to resume from
     goes_on: bool = False  # uses the run folder of an earlier process, maybe without a state
-    was_cut_off: bool = False  # an earlier process died: save sooner
+    was_cut_off: bool = False  # an earlier process was interrupted: save sooner
     stays: bool = False  # keeps the state of a finished run
 
 

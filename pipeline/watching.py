@@ -129,7 +129,7 @@ class MapRecorder(BaseCallback):
         if policy is None:
             return
         agent: Any = self.model
-        # From the schedule, because the agent's rate is set at the first step.
+        # From the schedule, because the agent's own rate is set only at the first step.
         schedule = getattr(agent, "exploration_schedule", lambda progress: math.nan)
         log = agent.logger.name_to_value if self.n_units else {}
         returns = [episode["r"] for episode in agent.ep_info_buffer or ()]
@@ -155,7 +155,7 @@ class EvaluationMaps(MapRecorder):
 
 
 class UpdateMaps(MapRecorder, BlockCallback):
-    """Records a map after every update, at the start of rollouts, which engines can compile."""
+    """Records a map after every update, at the start of rollouts, which can stay compiled."""
 
     unit = "update"
 
@@ -200,7 +200,7 @@ def _moment_type(n_states: int) -> np.dtype[np.void]:
 
 # --- steps ----------------------------------------------------------------------------------------
 
-# The capacity of a page of three megabytes, and the default.
+# Limits for a page of three megabytes; MOVES_UNASKED applies without ``--watch-episodes``.
 MOST_MOVES = 20_000
 MOST_CHANGES = 60_000
 MOVES_UNASKED = 5_000
@@ -377,7 +377,7 @@ class TableRecorder(BlockCallback):
         return len(self.steps) >= STEPS_BETWEEN_RETURNS * risen + STEPS_AROUND
 
     def window(self) -> tuple[int, int]:
-        """The first and last step to show: whole episodes around the rise of the greedy return."""
+        """The steps to show, [first, end): whole episodes around the rise of the greedy return."""
         n, n_envs = len(self.steps), self.model.n_envs
         returns = np.array(self._greedy_returns)
         if self.exact is None or not len(returns):

@@ -43,7 +43,7 @@ def read_members(
     budget: Budget | None = None,
     most: int = MAX_MEMBERS,
 ) -> dict[str, bytes]:
-    """Read the members of a zip, by name: only the expected ones, if given, and at most so many."""
+    """Read at most ``most`` members of a zip, by name; refuses names that are not expected."""
     budget = budget or Budget(len(content))
     with opened_zip(content, budget) as archive:
         infos = archive.infolist()

@@ -59,7 +59,7 @@ class Budget:
         self.left = _FREE_BYTES + _TIMES * n_bytes
 
     def charge(self, n_bytes: int) -> None:
-        """Charge so many bytes."""
+        """Charge ``n_bytes``; raises UnsafeFileError if they are not left."""
         self.left -= n_bytes
         if self.left < 0:
             raise UnsafeFileError(
@@ -88,7 +88,7 @@ def memory_bytes() -> int:
 # A file to read: a path, or a stream of bytes that were read already.
 Source = Path | str | io.BufferedIOBase
 
-# Each is 0 if the system lacks it. With NONBLOCK, opening a pipe does not wait for its other end.
+# Each flag is 0 if the system lacks it. With NONBLOCK, opening a pipe does not wait for a writer.
 _BYTES = getattr(os, "O_BINARY", 0)
 _ALWAYS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | _BYTES
 NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BYTES  # fails if the name exists, even as a link
@@ -163,7 +163,7 @@ def open_number(path: Path, flags: int) -> int:
 
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[io.BufferedReader]:
-    """Open a regular file of at most so many bytes; checks the file that it has opened.
+    """Open a regular file of at most ``limit`` bytes; checks the file that it has opened.
 
     Refuses pipes and devices, which could be endless, and files behind a link in a held
     folder.
@@ -196,7 +196,7 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def content_of(source: Source, limit: int) -> bytes:
-    """Read a whole regular file or stream of at most so many bytes."""
+    """Read a whole regular file or stream of at most ``limit`` bytes."""
     if not isinstance(source, io.BufferedIOBase):
         return read_file(Path(source), limit)
     content = source.read(limit + 1)

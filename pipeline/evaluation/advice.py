@@ -29,7 +29,7 @@ from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.train_spec import TrainSpec
 
 SOLVED = 0.5  # planning must reach this score for a recommendation
-NEAR_OPTIMUM = 0.01  # of the optimum
+NEAR_OPTIMUM = 0.01  # relative to the optimum
 # The value of the start, divided by the value of standing still.
 NEAR_STANDING_STILL = 0.8
 # Training steps per pair of state and action: the least (FAR: if gamma is raised), and the advice.

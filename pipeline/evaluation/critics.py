@@ -437,7 +437,7 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
 # too low for training steps. No clock is used, so the same seed gives the same file.
 SHARE = 0.1
 SECONDS_IN_ANY_CASE = 5e-3
-SECONDS_OF_NETWORKS = 2e-2  # likewise
+SECONDS_OF_NETWORKS = 2e-2  # the same for networks
 
 
 def seconds_per_step(model: BaseAlgorithm) -> float:

@@ -68,7 +68,7 @@ MOST_OUTCOMES_OF_OTHERS = 600_000_000
 # second), and the score below which there is a note.
 MOST_OUTCOMES_PLANNED = 250_000
 LOW_SCORE = 0.95
-# The most cached evaluators of plain runs, and the most states of their models. Caching lets runs in
+# The most cached evaluators of plain runs, and the most states of their models. By caching, runs in
 # one process compute the optimum once; larger models would need too much memory.
 MOST_KEPT = 8
 MOST_STATES_KEPT = 20_000

@@ -88,7 +88,7 @@ class Evaluation:
 
     @property
     def beats_optimum(self) -> bool:
-        """Whether the mean exceeds the upper bound of all policies by more than chance.
+        """Whether the mean is significantly above the upper bound of the optimum.
 
         If so, the bracket is wrong, or belongs to another environment.
         """
@@ -200,7 +200,7 @@ class Shares(NamedTuple):
     """Evaluation steps per training step."""
 
     usual: float  # for every training
-    at_first: float  # for short trainings, until the steps reach `STEPS_AT_FIRST`
+    at_first: float  # for short trainings, up to `STEPS_AT_FIRST` evaluation steps
 
 
 # Chosen by the time of an evaluation step relative to a training step, so that evaluations take at
@@ -241,7 +241,7 @@ def allowed_steps(n_trained: float, shares: Shares) -> float:
     return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
 
-# The final evaluation gets the rest, even if the others exceeded their share.
+# Of the allowed steps; the final evaluation gets the rest, but at least the other half.
 PART_DURING_TRAINING = 1 / 2
 
 # Episodes of an evaluation: first this many, then more until the standard error is small.
@@ -261,7 +261,7 @@ class SampledEvaluator:
         self.yardstick = yardstick or bracketed_yardstick(spec)
         self.seed = spec.seed
         self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
-        # Explicit settings of when or how long to evaluate take precedence.
+        # Explicit intervals or numbers of episodes take precedence over the limit.
         self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
         self.training_steps = spec.hyperparams.n_timesteps
         self.training_episodes = spec.hyperparams.n_episodes
@@ -351,7 +351,7 @@ def is_sure(evaluation: Evaluation, precision: float) -> bool:
 
 
 def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
-    """How many environments to play at once: at most one for each episode."""
+    """The number of parallel evaluation environments: at most one for each episode."""
     return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
 
 

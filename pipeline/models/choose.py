@@ -68,8 +68,8 @@ class ModelRequest:
     env_id: str | None = None
     log_folder: Path = Path("logs")  # the folder above all runs
     run_number: int = 0  # number of the run; 0 for the newest, -1 for one without a number
-    # the model at the end of training, the best one, the last checkpoint, or the checkpoint after
-    # so many steps
+    # the model at the end of training, the best one, the last checkpoint, or the checkpoint after a
+    # number of steps
     which: Which = "final"
     # a file of VecNormalize statistics, instead of those beside the model
     statistics: Path | None = None
@@ -135,7 +135,7 @@ def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
     try:
         run = Run.find(request.log_folder, algo, env_id, request.run_number)
     except UserError:
-        # An unknown agent or environment is a better reason than a missing run.
+        # An error about an unknown agent or environment says more than one about a missing run.
         check_algorithm(algo)
         check_env_id(env_id)
         raise

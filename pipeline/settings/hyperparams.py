@@ -19,7 +19,7 @@ from pipeline.errors import UserError, did_you_mean, shown
 from pipeline.settings.values import check_arguments, check_range, coerce, contains_name
 from pipeline.settings.yaml import read_yaml, settings_bytes
 
-# Constructor arguments that have another source, and its name.
+# Constructor arguments that a flag or another key sets, and its name.
 _SET_ELSEWHERE = {
     "action_noise": "noise_type and noise_std",
     "env": "--env",
