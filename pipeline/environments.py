@@ -266,7 +266,7 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
         key = error.args[0] if error.args else None
         name = next((name for name, value in kwargs.items() if value is key or value == key), None)
         if name is None:
-            return UserError(f"{env_id}: its key {shown(key)} does not exist")
+            return UserError(f"{env_id}: it looks up {shown(key)}, which does not exist")
         # The known values are the keys of a table in its module that contains the default.
         default = parameters[name].default if name in parameters else None
         module = sys.modules.get(getattr(creator, "__module__", ""), object)

@@ -67,7 +67,7 @@ def check_secrets(settings: Any, place: str = "hyperparams") -> None:
         for key, value in settings.items():
             if isinstance(value, str) and value and _SECRET.search(str(key)):
                 what = f"{place}.{key} looks like a secret, and a pack holds all settings"
-                how = "train without it (an environment variable is in no run)"
+                how = "train without it (environment variables are not recorded)"
                 raise UserError(f"{what}: {how}")
             check_secrets(value, f"{place}.{key}")
     elif isinstance(settings, list | tuple):

@@ -107,7 +107,7 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
         raise UserError(f"the run needs --gym-packages {' '.join(missing)}: type it again")
     raw = data["hyperparams"]
     if not isinstance(raw, dict) or environment_name(str(data["env_id"])) != run.env_name:
-        what = "its hyperparameters or its names are not ours"
+        what = "its hyperparameters or its environment are invalid"
         raise UserError(f"{run.info_path} is damaged: {what}")
     return replace(
         TrainSpec.of_data({**data, "user_modules": ()}),

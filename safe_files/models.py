@@ -276,7 +276,7 @@ def _check_sizes(settings: Mapping[str, Any], budget: Budget) -> None:
     for names in _BUFFERS:
         values = [settings.get(name, 1) for name in names]
         if not all(isinstance(value, int) and 0 < value <= MAX_ROWS for value in values):
-            raise UnsafeFileError(f"has {' and '.join(names)} out of all proportion", names[0])
+            raise UnsafeFileError(f"has {' and '.join(names)} outside the allowed range", names[0])
         size = math.prod(values) * n_bytes
         if size > memory_bytes():
             raise UnsafeFileError(

@@ -88,7 +88,7 @@ class Made:
     @property
     def name(self) -> str:
         """The name of its class or function, without arguments, which could be endless."""
-        return self.maker.name if isinstance(self.maker, Name) else "a call of what a call returns"
+        return self.maker.name if isinstance(self.maker, Name) else "the result of another call"
 
 
 class Reader(pickle._Unpickler):

@@ -123,7 +123,7 @@ def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
     if isinstance(agent, PlanningAgent):
         return "a planner's values are exact already"
     if not isinstance(getattr(agent, "gamma", None), int | float):
-        return f"{spec.algo} has no discount, and so no values to compare"
+        return f"{spec.algo} has no discount, so there are no values to compare"
     if is_wrapped_as_vector(spec):
         return "a VecEnv wrapper changes what the agent sees"
     with closing(make_single_env(spec, training=True)) as env:

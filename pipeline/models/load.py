@@ -166,11 +166,11 @@ def load_model(
     except Exception as error:  # a file of another agent can fail anywhere in the library
         key, way_out = getattr(error, "key", None), ""
         if key in _CLASS_KEYS:
-            way_out = "; a class of yours is admitted where you name its module"
+            way_out = "; to admit a class of yours, name its module"
             way_out += ": --gym-packages MODULE"
         elif key in algorithm_parameters(algorithm):
             value = "3e-4" if key == "learning_rate" else "VALUE"
-            way_out = f"; train.py -i goes on with another: -params {key}:{value}"
+            way_out = f"; train.py -i continues with another value: -params {key}:{value}"
         what = f"{file.path} cannot be loaded as a {algo} agent: {one_line(error)}"
         raise UserError(f"{what}{way_out}") from error
 
@@ -238,9 +238,9 @@ def load_to_play(
     saved, given = map(_shown_space, spaces)
     if saved != given and saved is not None:
         raise UserError(
-            f"{file.path} was trained on observations of {saved}, and the environment as it is "
-            f"made here gives {given}: args.yml and config.yml beside the zip would say how it was "
-            "made there, or --env-kwargs"
+            f"{file.path} was trained on observations of {saved}, but the environment here gives "
+            f"{given}: put the run's args.yml and config.yml beside the zip, or give the right "
+            "--env-kwargs"
         )
     unused = ConstantSchedule(0.0)
     replaced: dict[str, Any] = {

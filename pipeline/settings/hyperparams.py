@@ -145,7 +145,7 @@ def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
         if not (isinstance(name, str) and is_right):
             raise UserError(
                 f"{where} must be the dotted name of a class, or that name with its arguments "
-                f"indented below it, or a list of such; not {shown(item)}"
+                f"indented below it, or a list of these; not {shown(item)}"
             )
         found.append(ComponentSpec(name, kwargs))
     return tuple(found)
