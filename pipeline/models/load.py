@@ -238,7 +238,7 @@ def load_to_play(
     saved, given = map(_shown_space, spaces)
     if saved != given and saved is not None:
         raise UserError(
-            f"{file.path} was trained on observations of {saved}, but the environment here gives "
+            f"{file.path} was trained on observations of {saved}, and the environment here gives "
             f"{given}: put the run's args.yml and config.yml beside the zip, or give the right "
             "--env-kwargs"
         )
