@@ -319,7 +319,7 @@ def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any
 def _naming(
     settings: Mapping[str, Any], argument: str, env_id: str, kind: type[gym.Env[Any, Any]]
 ) -> list[str]:
-    """The keys of environment arguments with this argument as a text; empty for other kinds."""
+    """The keys with a text for this argument; empty if the environment is not of this kind."""
     given = {key: settings.get(key) for key in _ENV_KWARGS}
     named = [
         key

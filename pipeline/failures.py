@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.errors import UserError, one_line
 from pipeline.stopping import Stopped, current
 
-# Messages of PyTorch's allocator, the dynamic linker and Python's threads, which lack a class.
+# Messages of errors without their own class: PyTorch's allocator, dynamic linker, Python's threads.
 _SIGNS = {
     "can't allocate memory": "memory",
     "cannot allocate memory": "memory",

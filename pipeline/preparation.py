@@ -287,7 +287,7 @@ def _exact_evaluator(
 ) -> tuple[ExactEvaluator | None, Yardstick | None]:
     """Make the exact evaluator, if the environment's model is known and the agent permits it.
 
-    If only the agent does not permit it, return None and the yardstick.
+    If `obstacle` or `why_not_exact` prevents it, return None and the yardstick.
     """
     exact = None if has_memory(model) else evaluator_of(spec)
     if exact is None:

@@ -43,7 +43,7 @@ def read_members(
     budget: Budget | None = None,
     most: int = MAX_MEMBERS,
 ) -> dict[str, bytes]:
-    """Read at most ``most`` members of a zip, by name; refuses names that are not expected."""
+    """Read at most ``most`` members of a zip, by name; refuses names outside ``expected``."""
     budget = budget or Budget(len(content))
     with opened_zip(content, budget) as archive:
         infos = archive.infolist()

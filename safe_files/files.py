@@ -59,7 +59,7 @@ class Budget:
         self.left = _FREE_BYTES + _TIMES * n_bytes
 
     def charge(self, n_bytes: int) -> None:
-        """Charge ``n_bytes``; raises UnsafeFileError if they are not left."""
+        """Charge ``n_bytes``; raises UnsafeFileError if fewer are left."""
         self.left -= n_bytes
         if self.left < 0:
             raise UnsafeFileError(

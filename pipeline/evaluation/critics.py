@@ -417,7 +417,7 @@ def minibatches(agent: Any, estimates: Floats, seed: int) -> list[tuple[Ints, Fl
 
 
 def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> Floats:
-    """The gradient of all parameters for each of n weights (states, A), shape (n, parameters)."""
+    """Gradients in the parameters for n sets of weights (n, states, A), shape (n, parameters)."""
     told = {} if world.masks is None else {"action_masks": world.masks[shown]}
     tensor, _ = policy.obs_to_tensor(world.observations[shown])
     logs = policy.get_distribution(tensor, **told).distribution.logits
@@ -433,8 +433,8 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
 
 # --- how often to compare -------------------------------------------------------------------------
 
-# The share of training time for comparisons, by the estimates below: too high for comparisons and
-# too low for training steps. No clock is used, so the same seed gives the same file.
+# The share of training time for comparisons, by the estimates below: high ones for comparisons, low
+# ones for training steps. No clock is used, so the same seed gives the same file.
 SHARE = 0.1
 SECONDS_IN_ANY_CASE = 5e-3
 SECONDS_OF_NETWORKS = 2e-2  # the same for networks

@@ -42,7 +42,7 @@ class OtherReturns:
     stochastic_return: float | None = None  # of its policy in training
     discount: float | None = None  # the agent's discount
     discounted_return: float | None = None  # of the greedy policy, under that discount
-    discounted_optimum: float | None = None  # of all policies; None if the state is hidden
+    discounted_optimum: float | None = None  # under that discount; None if the state is hidden
 
 
 @dataclass(frozen=True)
