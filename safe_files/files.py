@@ -88,7 +88,7 @@ def memory_bytes() -> int:
 # A file to read: a path, or a stream of bytes that were read already.
 Source = Path | str | io.BufferedIOBase
 
-# Each flag is 0 if the system lacks it. With NONBLOCK, opening a pipe does not wait for a writer.
+# Each is 0 if the system lacks it. With NONBLOCK, opening a pipe does not wait for its other end.
 _BYTES = getattr(os, "O_BINARY", 0)
 _ALWAYS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | _BYTES
 NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BYTES  # fails if the name exists, even as a link
