@@ -1,4 +1,4 @@
-"""One run: from a specification to a finished run folder, and playing trained agents."""
+"""Trains an agent from a specification to a finished run folder, and plays trained agents."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def loading_libraries() -> Iterator[None]:
-    """Import without the garbage collector, which takes a fifth of it; freeze all objects."""
+    """Import without garbage collection, a fifth of the time; then exempt all objects from it."""
     was_on = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""Checks that an agent fits an environment, and computes settings that say ``auto``."""
+"""Checks that an agent fits an environment, and computes the values of ``auto``."""
 
 from __future__ import annotations
 
@@ -74,18 +74,17 @@ def check_fit(spec: TrainSpec) -> None:
         raise UserError(f"{spec.algo} does not fit {spec.env_id}: {misfit}; {others}")
 
 
-# --- what the word ``auto`` stands for ------------------------------------------------------------
+# --- the values of ``auto`` -----------------------------------------------------------------------
 #
-# A number that suits one map does not suit another, so an entry with ``auto`` is valid for a family
-# of environments. Agents, engines and model files get only numbers. `TrainSpec.origins` records how
-# each number was computed.
+# The best values depend on the environment; an entry with ``auto`` suits a family of environments.
+# Agents, engines and model files get only computed values; `TrainSpec.origins` has their formulas.
 
 AUTO = "auto"
-# Training steps for each pair of observation and action if the setting is just ``auto``, and the
-# smallest number of pairs that counts: exploring a small map takes time too.
+# For a plain ``auto``: training steps per pair of state and action, and the least number of pairs,
+# because exploring a small map takes time too.
 STEPS_PER_PAIR = 2500
 FEWEST_PAIRS = 100
-# A step size of 1 / n averages over about the last n visits; its start, and bounds of its end.
+# Step sizes: 1 / n averages over about the last n visits; the first one; bounds of the last one.
 VISITS_AVERAGED = 10
 FIRST_STEP_SIZE = 0.3
 LAST_STEP_SIZES = (0.003, 0.05)
@@ -101,11 +100,11 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class _Asked:
-    """A setting that says ``auto``."""
+    """A setting with the value ``auto``."""
 
-    env: gym.Env[Any, Any]  # the environment that the agent is judged on
-    amount: str  # the number after the word, as in ``auto_1000``; empty if there is none
-    n_timesteps: int | None  # of the training, where that is known already
+    env: gym.Env[Any, Any]  # the evaluation environment
+    amount: str  # the number in ``auto_1000``; empty for a plain ``auto``
+    n_timesteps: int | None  # training steps, if already known
     where: str  # begins every error message
 
     def pairs(self) -> tuple[int, int]:
@@ -126,7 +125,7 @@ def _budget(asked: _Asked) -> Found:
 
 
 def _discount(asked: _Asked) -> Found:
-    """Compute gamma: a reward one whole episode ahead still counts 0.6."""
+    """Compute gamma: a reward one time limit ahead has the weight 0.6."""
     limit = time_limit(asked.env)
     if limit is None:
         raise UserError(f"{asked.where}: auto needs an environment with a time limit")
@@ -134,10 +133,10 @@ def _discount(asked: _Asked) -> Found:
 
 
 def _step_size(asked: _Asked) -> Found:
-    """Compute the schedule of the step size; it stays large in a short training."""
+    """Compute the schedule of the step size; in a short training, it stays large."""
     states, actions = asked.pairs()
     low, high = LAST_STEP_SIZES
-    if asked.n_timesteps is None:  # counted in episodes
+    if asked.n_timesteps is None:  # the budget is in episodes
         return Found(f"exp_{FIRST_STEP_SIZE:g}_{high:g}", "auto")
     last = min(max(VISITS_AVERAGED * states * actions / asked.n_timesteps, low), high)
     how = f"auto: ends at {VISITS_AVERAGED} x states x actions / steps, within {low} and {high}"
@@ -149,7 +148,7 @@ def _highest_value(asked: _Asked) -> Found:
     model = transition_model(asked.env)
     if model is None:
         raise UserError(f"{asked.where}: auto needs an environment whose model is known")
-    # Unreachable cells count too: finding them would take longer than all the rest here.
+    # Unreachable states count too: excluding them would take longer than all other work here.
     ends = model.terminated & (model.prob > 0)
     if not ends.any():
         raise UserError(f"{asked.where}: auto needs an environment whose episodes can end")
@@ -172,7 +171,7 @@ def _scale(rewards: NDArray[np.floating[Any]]) -> Found:
 
 
 def _lowest_reward(rewards: NDArray[np.floating[Any]]) -> Found:
-    """Compute the bound on costs: a network that meets large costs first learns to stand still."""
+    """Compute the lower bound of rewards: large costs would teach a network to stand still."""
     highest, lowest = float(rewards.max()), float(rewards.min())
     if highest <= 0 or -highest / 10 < lowest:
         return Found(lowest, f"{lowest:g}, the lowest reward")
@@ -207,7 +206,7 @@ def _wrappers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, 
 
 
 def without_auto(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry without settings that say ``auto``."""
+    """The entry without settings that are ``auto``."""
     return {key: value for key, value in entry.items() if _word(key, value) is None}
 
 
@@ -223,7 +222,7 @@ def training_follows(
     gone = {key: variant[key] for key in asked if key in variant and key not in own}
     told = ", ".join(f"{key}: {value}" for key, value in gone.items() if value != asked[key])
     kept = {key: value for key, value in variant.items() if key not in gone}
-    how = f"without {told}, since what is asked for of the environment holds in training too"
+    how = f"without {told}, because typed env_kwargs apply to training too"
     return {**entry, "train_env_kwargs": kept}, {"train_env_kwargs": how} if told else None
 
 
@@ -233,15 +232,15 @@ def resolved_spec(
     origins: Mapping[str, str] | None = None,
     **fields: Any,
 ) -> TrainSpec:
-    """Make a spec with a number in place of each ``auto``.
+    """Make a spec with a computed value in place of each ``auto``.
 
-    - ``gamma: auto`` is 1 - 1/(2 x time limit) of the environment that the agent is judged on.
+    - ``gamma: auto`` is 1 - 1/(2 x time limit of evaluations).
     - ``n_timesteps: auto_K`` is K steps for each pair of state and action, for at least 100 pairs;
       ``auto`` is ``auto_2500``.
-    - ``learning_rate: auto`` falls from 0.3 to ten pairs by the steps, within 0.003 and 0.05.
+    - ``learning_rate: auto`` falls from 0.3 to 10 x pairs / steps, within 0.003 and 0.05.
     - ``initial_q: auto`` and ``value_bound: auto`` are the highest reward that ends an episode.
-    - ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1 by the largest reward of training,
-      in absolute value; ``min_reward: auto`` is minus a tenth of the highest reward.
+    - In ``train_env_wrapper``, ``scale: auto`` is 1 / the largest absolute reward of training;
+      ``min_reward: auto`` is the lowest reward, but at least -1/10 of a positive highest reward.
 
     ``where`` begins every error message; ``fields`` are the other fields of `TrainSpec`.
     """

@@ -46,7 +46,7 @@ from pipeline.train_spec import TrainSpec
 
 
 class Checkpoint(BlockCallback):
-    """Saves the agent at some moments, as ``rl_model_<steps>_steps.zip``.
+    """Base class of checkpoints: saves the agent as ``rl_model_<steps>_steps.zip``.
 
     It also saves VecNormalize statistics, under the file name of `CheckpointCallback`, and
     optionally the replay buffer.
@@ -120,7 +120,7 @@ class ExponentialExploration(BaseCallback):
     """Multiplies DQN's epsilon by a constant factor at each gradient update.
 
     Args:
-        initial_eps: epsilon before the first update, in [0, 1] like the others.
+        initial_eps: epsilon before the first update; all arguments are in [0, 1].
         final_eps: the lower bound of epsilon.
         decay: the factor.
     """
@@ -137,10 +137,10 @@ class ExponentialExploration(BaseCallback):
                 raise ValueError(f"{name} must lie between 0 and 1, not {value}")
 
     def check_model(self, model: BaseAlgorithm) -> None:
-        """Refuse agents whose exploration this callback cannot change."""
+        """Raise ValueError for agents other than DQN and its subclasses."""
         if not isinstance(model, DQN):
             name = type(model).__name__
-            raise ValueError(f"ExponentialExploration is for DQN and its kin, not for {name}")
+            raise ValueError(f"ExponentialExploration is for DQN and subclasses, not for {name}")
 
     def _on_rollout_start(self) -> None:
         updates = self.model._n_updates
@@ -154,9 +154,9 @@ class ExponentialExploration(BaseCallback):
         return True
 
 
-# --- a number that is not finite ends a training --------------------------------------------------
+# --- non-finite numbers end a training ------------------------------------------------------------
 
-# Names under which the library's agents log their losses. Other entries may be nan, for example the
+# The log entries with losses of the library's agents. Other entries may be nan, for example the
 # explained variance of constant returns.
 LOSSES = (
     "train/loss",
@@ -222,12 +222,12 @@ class PullSummary:
     """Summary of the pulls of a training."""
 
     n_pulls: int  # over all environments
-    n_matched: int  # pulls of an arm that the log contained; all pulls without a log
+    n_matched: int  # pulls with a reward in the log; all pulls without a log
     reward: float | None  # mean of the matched pulls; None if no pull matched
-    # Sum of the best expected reward minus that of the arm; None if the expected rewards are
-    # unknown, as with a log.
+    # sum over pulls of the best expected reward minus that of the pulled arm; None if expected
+    # rewards are unknown, as with a log
     regret: float | None
-    optimal: float | None  # share of best arms among the last pulls; None likewise
+    optimal: float | None  # share of best arms among the last pulls; None as for ``regret``
 
 
 def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
@@ -265,7 +265,7 @@ SECONDS_BETWEEN_WRITES = 1.0
 
 
 class EvaluationCallback(EvalCallback):
-    """An `EvalCallback` with a given evaluation function, and files that are never half-written.
+    """An `EvalCallback` with a given evaluation function and atomically written files.
 
     It writes ``evaluations.npz`` and ``best_model.zip`` with its VecNormalize statistics. It
     triggers the same callbacks and log entries as its base class.
@@ -292,7 +292,7 @@ class EvaluationCallback(EvalCallback):
         self.evaluator = evaluator
         self.value_maps = value_maps
         self.critics = critics  # with ``--diagnose``
-        self.during = during  # shows what goes on while an evaluation runs
+        self.during = during  # shows the activity during evaluations
         self.episodes_seen = 0
         self.last_evaluation: Evaluation | None = None
         self.best_timesteps = 0
@@ -316,7 +316,7 @@ class EvaluationCallback(EvalCallback):
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether evaluations during training are wanted."""
+        """Whether evaluations during training are requested."""
         return self.eval_freq > 0 or self.eval_episode_freq > 0
 
     def _init_callback(self) -> None:
@@ -415,7 +415,7 @@ class EvaluationCallback(EvalCallback):
 
 
 def _table(rows: list[list[Any]]) -> NDArray[Any]:
-    """Rows as one array, shorter ones repeated; rl_zoo3's plots need at least two columns."""
+    """Rows as one array, shorter rows repeated; rl_zoo3's plots need at least two columns."""
     width = max(math.lcm(*map(len, rows)), 2)
     return np.array([row * (width // len(row)) for row in rows])
 
@@ -455,7 +455,7 @@ def evaluation_intervals(
     if spec.eval_freq is not None:
         return (max(spec.eval_freq // n_envs, 1), 0) if spec.eval_freq > 0 else (0, 0)
     if is_judged_by_regret:
-        # An evaluation episode may have other arms, and says less than the pulls of training.
+        # Evaluation episodes may have other arms, so training pulls are more informative.
         return 0, 0
     if spec.hyperparams.n_timesteps is not None:
         return max(spec.hyperparams.n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1), 0

@@ -53,7 +53,7 @@ MOST_POWERS = 12  # powers of ten on an axis
 
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
-    """Steps over all environments until the end of each training episode, and its return."""
+    """For each training episode, its last step counted over all environments, and its return."""
     contents = [read_file(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
     rows = [
         np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
@@ -62,8 +62,7 @@ def read_monitors(folder: Path) -> tuple[Floats, Floats]:
     ]
     if not rows:
         return np.empty(0), np.empty(0)
-    # The environments of a run step together: when one environment has done so many steps, all
-    # have.
+    # The environments step together, so all have done the same number of steps.
     steps = np.concatenate([len(contents) * np.cumsum(table[:, 1]) for table in rows])
     returns = np.concatenate([table[:, 0] for table in rows])
     order = np.argsort(steps, kind="stable")
@@ -140,7 +139,7 @@ def _places(figure: Figure, *, apart: bool) -> tuple[Axes, Axes]:
         return axes, axes
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     upper.set_ylabel("return of an episode")
-    lower.set(xlabel="environment steps", ylabel="return there")
+    lower.set(xlabel="environment steps", ylabel="training return")
     lower.set_title("training, on a variant of the environment", loc="left", fontsize=10)
     return upper, lower
 
@@ -180,7 +179,7 @@ def draw_learning_curve(
     for axes in dict.fromkeys((judged, trained)):
         _style(axes)
     if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
-        # At the bottom, where it covers no episode.
+        # Below the axes, where the legend covers no points.
         legend = figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
         for handle in legend.legend_handles:
             if isinstance(handle, Line2D) and handle.get_color() == GREY:
@@ -214,7 +213,7 @@ MEANINGS = {
     "gradient_snr": "gradient: signal-to-noise ratio",
 }
 
-# What of ``diagnosis.csv`` is drawn in one panel, by the words beside its axis.
+# The columns of ``diagnosis.csv`` in each panel, by the panel's axis label.
 PANELS = {
     "error of values": ("v_error", "v_error_visited", "q_error", "q_error_visited"),
     "error of advantages": ("advantage_error", "advantage_error_visited"),
@@ -229,7 +228,7 @@ LINES = {"bias": "bias between actions", "offset": "bias of the state", "std": "
 
 
 def read_diagnosis(content: bytes) -> dict[str, Floats]:
-    """The columns of a ``diagnosis.csv``, NaN where there is no figure."""
+    """The columns of a ``diagnosis.csv``, NaN for empty cells."""
     names, *rows = csv.reader(content.decode().splitlines())
     table = [[float(cell or "nan") for cell in row] for row in rows]
     return dict(zip(names, np.array(table).T, strict=True))
@@ -284,7 +283,7 @@ def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> Non
         _draw(panels[2], np.cumsum(regrets), ORANGE)
         panels[2].set(ylabel="cumulative regret")
     for axes in panels:
-        axes.set_xlabel("pulls" if kept.all() else "pulls that the log holds")
+        axes.set_xlabel("pulls" if kept.all() else "pulls in the log")
         _style(axes)
     figure.suptitle(title, x=0.01, ha="left")
     fix_layout(figure)

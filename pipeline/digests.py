@@ -1,8 +1,8 @@
 """Records SHA-256 digests of a run's files in ``run.json`` (``files``), and checks them.
 
 The entry of ``run.json`` itself is the digest of its other contents, as JSON without spaces and
-with sorted keys. A file that is not listed is the user's own. Runs of earlier versions have neither
-this field nor ``record_version``, which a run writes first: their files are not checked.
+with sorted keys. Files without a digest are the user's own. Runs of earlier versions have neither
+this field nor ``record_version``, which is written at the start: their files are not checked.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ LOCK = ".lock"  # of the running process
 STATE_FOLDER = "state"  # saved states, which are not part of a run's results
 VERSION_FIELD = "record_version"
 VERSION = 2  # of records with digests; earlier records had no such field
-# States of a run that has no digests yet.
+# States of a run without digests.
 _UNDER_WAY = ("running", "failed")
 LARGEST_RECORD = 64 << 20  # bytes
-LARGEST_READ = 2 << 30  # bytes, of a file that is read at once
+LARGEST_READ = 2 << 30  # bytes, of a file that is read as a whole
 _PIECE = 1 << 20  # bytes
-_DEEPEST_RECORD = 100  # lists and objects inside each other
+_DEEPEST_RECORD = 100  # nested lists and objects
 
 MOST_ARRAYS = 1000  # in an archive
 _KINDS = "biuf"  # booleans, integers, floats
@@ -86,7 +86,7 @@ class RecordedFiles:
 
     def _recorded(self, path: Path) -> str | None:
         """The recorded digest of a file; None if there is none, or the file is not the run's."""
-        # Does not follow a link that someone put in the file's place.
+        # Resolves only the folder, because the file itself may be somebody's link.
         if self.digests is None:
             return None
         if path.is_relative_to(self.folder):
@@ -167,7 +167,7 @@ def _as_damage(path: Path) -> Iterator[None]:
         raise DamagedFileError(path, str(error).removeprefix(f"{path} ")) from error
 
 
-# The packages that make the objects of a training, and its records.
+# The packages that define the objects and records of a training.
 OF_TRAINING = ("safe_files", "machine_code", "mdp", "envs", "agents", "pipeline")
 
 

@@ -24,11 +24,11 @@ from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
 from safe_files.files import memory_bytes
 
-# If neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
-# policy that moves in a circle would never end.
+# The time limit of evaluations if neither environment nor hyperparameters set one: a greedy policy
+# that moves in a circle would never end an episode.
 EVALUATION_TIME_LIMIT = 1000
 
-# Exceptions of environments that are made with wrong arguments.
+# Exceptions that environments raise for wrong arguments.
 _OF_ARGUMENTS = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 MISTAKES = (*_OF_ARGUMENTS, AssertionError, OSError, ImportError, MemoryError, gym.error.Error)
 
@@ -127,7 +127,7 @@ def usual_kwargs(env_id: str) -> dict[str, Any]:
 
 
 def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> Wrap | None:
-    """The named wrappers as one function, or None; masks, for agents that need them, outermost."""
+    """One function for all wrappers, with masks outermost for agents that need them; or None."""
     from pipeline.settings.components import wrapper_factory
 
     named = {"env_wrapper": spec.hyperparams.env_wrapper}
@@ -145,7 +145,7 @@ def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> 
 
         wraps.append(with_masks)
     elif spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks:
-        # Without masks, `pipeline.agent_settings` names the agents that would fit.
+        # Without masks, `check_fit` raises the error, which names fitting agents.
         wraps.append(lambda env: ActionMasks(env) if has_masks(env) else env)
     if not wraps:
         return None
@@ -227,7 +227,7 @@ def _make_vec_env(
         wrapper_class=wrap_elsewhere if spec.vec_env == "subproc" else wrapper,
         vec_env_cls=getattr(vec_env, TRAINING_VEC_ENVS[spec.vec_env if training else "dummy"]),
     )
-    with ExitStack() as undo:  # what cannot be wrapped as settings say is closed again
+    with ExitStack() as undo:  # closes the environments if wrapping fails
         undo.callback(env.close)
         wrappers = spec.hyperparams.vec_env_wrapper
         wrap = vec_wrapper_factory(wrappers, spec.gym_packages, folder=monitor_folder)
@@ -266,7 +266,7 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
         key = error.args[0] if error.args else None
         name = next((name for name, value in kwargs.items() if value is key or value == key), None)
         if name is None:
-            return UserError(f"{env_id}: it looks for {shown(key)}, which is not there")
+            return UserError(f"{env_id}: it looks up {shown(key)}, which does not exist")
         # The known values are the keys of a table in its module that contains the default.
         default = parameters[name].default if name in parameters else None
         module = sys.modules.get(getattr(creator, "__module__", ""), object)
@@ -281,7 +281,7 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
 
 @contextmanager
 def lacking_packages_told(env_id: str) -> Iterator[None]:
-    """Report a package that an environment lacks, in one line; rendering may find it only later."""
+    """Turn the error for a missing package into one line; it may appear only at rendering."""
     try:
         yield
     except gym.error.DependencyNotInstalled as error:
@@ -298,7 +298,7 @@ _ENV_KWARGS = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 
 
 def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Hyperparameters of a grid world with the rows of each map in place of its file's path."""
+    """The hyperparameters with the rows of each grid world map in place of its file path."""
     named = _naming(settings, "desc", env_id, GridWorld)
     try:
         read = {
@@ -310,7 +310,7 @@ def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Hyperparameters of a ReplayBandit with absolute paths of its logs."""
+    """The hyperparameters with absolute paths of the logs of a ReplayBandit."""
     named = _naming(settings, "log", env_id, ReplayBandit)
     paths = {key: str(Path(settings[key]["log"]).absolute()) for key in named}
     return {**settings, **{key: {**settings[key], "log": path} for key, path in paths.items()}}
@@ -319,7 +319,7 @@ def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any
 def _naming(
     settings: Mapping[str, Any], argument: str, env_id: str, kind: type[gym.Env[Any, Any]]
 ) -> list[str]:
-    """The keys whose environment arguments give this argument as a text."""
+    """The keys with a text for this argument; empty if the environment is not of this kind."""
     given = {key: settings.get(key) for key in _ENV_KWARGS}
     named = [
         key

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 _SHORT_LIST = 12
 
-# Other names of hyperparameters whose spelling is too different to be found by similarity.
+# Other names of hyperparameters, too different in spelling to be found by similarity.
 OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("lr", "alpha", "step_size", "eta"), ("learning_rate",)),
     **dict.fromkeys(
@@ -43,7 +43,7 @@ _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
 
 
-# Control characters except line ends and tabs; characters that change the writing direction; and
+# Control characters except line feeds and tabs; characters that change the writing direction; and
 # surrogates, which no file can contain.
 _OBEYED = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"

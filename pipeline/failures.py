@@ -1,4 +1,4 @@
-"""Classifies failures of a run: by the machine, the user's code, or a library.
+"""Classifies failures of a run by their cause: the machine, the user's code, or a library.
 
 The machine runs out of a resource; the user's code raises SystemExit; a library fails. Commands
 load this module before their first output, so it imports little.
@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.errors import UserError, one_line
 from pipeline.stopping import Stopped, current
 
-# PyTorch's allocator, the dynamic linker, and Python's threads have no own exception class.
+# Messages of errors without their own class: PyTorch's allocator, dynamic linker, Python's threads.
 _SIGNS = {
     "can't allocate memory": "memory",
     "cannot allocate memory": "memory",
@@ -60,7 +60,7 @@ def exits_as_mistakes() -> Iterator[None]:
     except OwnExit:
         raise
     except (SystemExit, KeyboardInterrupt) as error:
-        # With `stops_noticed`, or handlers of others, Ctrl-C raises no bare KeyboardInterrupt.
+        # With `stops_noticed` or other handlers, Ctrl-C raises no plain KeyboardInterrupt.
         if isinstance(error, KeyboardInterrupt) and (
             isinstance(error, Stopped)
             or current().number is not None

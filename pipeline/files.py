@@ -31,7 +31,7 @@ _DEVICE = re.compile(r"(con|prn|aux|nul|(con(in|out)\$)|(com|lpt)[0-9¹²³]) *(
 # Errors while writing for which the system does not name the file.
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.EIO)})
 
-# Errors from other users' parent folders, and file systems that cannot flush folders.
+# Errors for parent folders of other users, and for file systems that cannot flush folders.
 _CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
 
 _SYNCED_AT_ONCE = 8
@@ -107,7 +107,7 @@ def settle(folder: Path) -> None:
 
 
 def sync(*paths: Path) -> None:
-    """Flush files and folders to disk; faster for many at once."""
+    """Flush files and folders to disk, several at once."""
     from concurrent.futures import ThreadPoolExecutor  # half of this module's import time
 
     with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:

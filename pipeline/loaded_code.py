@@ -1,8 +1,8 @@
 """The code that a run loads beside this project: installed distributions and the user's modules.
 
-A run records both in ``run.json``, and a worker of a cluster must have the same. A run loads the
-distributions that this project requires, with those that they require in turn, and likewise those
-that the user's modules import. All of them count, also if this run does not use each.
+A run records both in ``run.json``, and a worker of a cluster must have the same. The distributions
+are the requirements of this project and the imports of the user's modules, each with its own
+requirements, whether or not the run uses them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _REQUIRED = re.compile(r"^Requires-Dist:(.*)$", re.MULTILINE | re.IGNORECASE)
 
 @cache
 def distributions(*more: str) -> dict[str, str]:
-    """The versions of what this project and ``more`` require, by name, as far as installed."""
+    """The versions of this project, ``more`` and all their requirements, by name, if installed."""
     found: dict[str, str] = {}
     to_do, seen = [*_ROOTS, *more], set[tuple[str, frozenset[str]]]()
     while to_do:
@@ -65,9 +65,9 @@ def _installed(name: str) -> Distribution | None:
 
 
 def _requirements(installed: Distribution, extras: frozenset[str]) -> Iterator[str]:
-    """What a distribution requires; other markers do not matter, because only installed ones count.
+    """The requirements of a distribution; evaluates only the marker ``extra``.
 
-    Parsing the whole of a file takes five times as long.
+    Other markers do not matter, because only installed distributions count.
     """
     text = installed.read_text("METADATA") or installed.read_text("PKG-INFO") or ""
     for line in _REQUIRED.findall(text.partition("\n\n")[0]):
@@ -100,7 +100,7 @@ def _by_module() -> Mapping[str, tuple[str, ...]]:
 
 
 def digests_of_module(module: UserModule) -> dict[str, str]:
-    """The digests of a module's files and of those that it imports from beside it, by name."""
+    """The digests of a module's files and of its imports from the same folder, by name."""
     return {name: digest_of(path) for name, path in files_of(module).items()}
 
 
@@ -129,6 +129,6 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def digest_of_lines(versions: Mapping[str, str]) -> str:
-    """16 hexadecimal digits that stand for names and versions."""
+    """A digest of names and versions: 16 hexadecimal digits."""
     lines = "\n".join(f"{name} {version}" for name, version in sorted(versions.items()))
     return hashlib.sha256(lines.encode()).hexdigest()[:16]

@@ -47,7 +47,7 @@ _SECONDS_OF_AN_INSTANT = 5.0
 
 
 def mark() -> dict[str, Any]:
-    """The identity of this process as JSON; None for parts that the platform does not report."""
+    """The identity of this process as JSON; fields that the platform does not report are None."""
     pid, machine, namespace = os.getpid(), _first_line(*_MACHINES), None
     with contextlib.suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")  # noqa: PTH115  # it leads to no path
@@ -80,7 +80,7 @@ def is_alive(record: object) -> bool | None:
     if record.get("namespace") != own["namespace"]:
         return None
     began = _ticks_at_begin(pid)
-    if began is None or record.get("began") is None:  # gone, or hidden from this user
+    if began is None or record.get("began") is None:  # process gone, or hidden from this user
         return _has_process(pid)
     return began == record.get("began")
 
@@ -277,7 +277,7 @@ def _appears(path: Path, content: str) -> bool:
         return False
     except FileNotFoundError:
         if path.parent.is_dir():
-            return False  # the owner of the lock has removed the draft
+            return False  # the lock's owner has removed the temporary file
         raise
     except OSError:  # a file system without links: the lock is briefly empty
         try:
@@ -322,7 +322,7 @@ def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object])
                 has_said = True
             time.sleep(_SECONDS_BETWEEN_LOOKS)
     except FileNotFoundError:
-        pass  # it has just ended
+        pass  # the owner has just ended
     return False
 
 

@@ -43,10 +43,10 @@ class Policy:
 
     layout: GridLayout
     layer: int  # the set of collected prizes
-    matters: Bools  # where the agent may have to act
+    matters: Bools  # the cells to draw values and actions in
     visited: Bools  # the cells that the policy reaches from the start
     differs: Bools  # where agent and optimum differ
-    values: Floats  # expected return from there on
+    values: Floats  # expected return from each cell on
     actions: Bools  # the actions to draw, shape (cells, A)
 
     def places(self, chosen: Bools) -> tuple[Ints, Ints]:
@@ -234,7 +234,7 @@ def shade(colour: Colour) -> tuple[float, float, float]:
 # Pale enough for dark arrows and numbers; darker means better, also in print and without colours.
 VALUE_COLOURS = ("#FFFBD6", "#D3ECC0", "#8FD0C0", "#55B0CC", "#4A97CF")
 MAX_LAYERS = 4
-LEAST_SHARE = 0.5  # per cent of the gap, from which on a cost is written into its cell
+LEAST_SHARE = 0.5  # per cent of the gap; cells with a lower cost stay empty
 MAX_TICKS = 6
 DIM = "#777777"
 MARGIN = 1.3  # inches, for title, legend and colour bar
@@ -278,7 +278,7 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
 
     Args:
         path: the file.
-        title: of the picture.
+        title: the title of the picture.
         found: the map of the agent.
         losses: the loss in each state, in return per episode, shape (S,).
     """
@@ -294,7 +294,7 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
     cost_colours = LinearSegmentedColormap.from_list("costs", COST_COLOURS)
     figure, pairs = _panels(found.layout, len(layers), cell)
     pairs[0][0].set_title(f"agent: return {found.initial @ found.values:,.5g}", fontsize=10)
-    pairs[0][1].set_title(f"what its actions cost: {losses.sum():,.4g} in all", fontsize=10)
+    pairs[0][1].set_title(f"loss of its actions: {losses.sum():,.4g} in total", fontsize=10)
     for pair, layer in zip(pairs, layers, strict=True):
         if found.layout.prizes:
             pair[0].set_ylabel(layer_name(found.layout, layer))
@@ -352,14 +352,14 @@ def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, lis
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
     panels = figure.subplots(n_rows, n_columns, squeeze=False)
     longest = max(layout.n_rows, layout.n_columns)
-    # Labels take more time than all the rest.
+    # Drawing labels takes more time than everything else.
     step = next(step for step in (1, 2, 5, 10, longest) if longest <= MAX_TICKS * step)
     for number, axes in enumerate(panels.flat):
         named = number % n_columns == 0
         axes.set(
             xlim=(-0.5, layout.n_columns - 0.5), ylim=(layout.n_rows - 0.5, -0.5), aspect="equal"
         )
-        # Counted from 1, as in all output.
+        # Rows and columns are counted from 1, as in all output.
         for axis, length in ((axes.xaxis, layout.n_columns), (axes.yaxis, layout.n_rows)):
             shown = range(step - 1, length if named or axis is axes.xaxis else 0, step)
             axis.set_ticks(shown, [str(place + 1) for place in shown])
@@ -411,7 +411,7 @@ def _legend(found: ValueMap, scale: Normalize) -> Iterator[Artist]:
     differs = f"not an optimal action ({found.differs.sum()} of {found.matters.sum()} states)"
     yield Patch(facecolor="none", edgecolor=ORANGE, linewidth=2, label=differs)
     if is_below(found.values[found.matters], scale).any():
-        label = "worth less than the scale shows"
+        label = "value below the scale"
         yield Patch(facecolor=shade(BELOW), edgecolor=shade(BELOW_HATCH), hatch="////", label=label)
     letters = set("".join(found.layout.rows))
     words = {GOAL: "goal", TRAP: "trap", WALL: "wall", PRIZE: "prize", **found.layout.names}

@@ -65,7 +65,7 @@ def contents(folder: Path) -> dict[str, bytes]:
         raise UserError(f"{folder} does not say what was trained: it is no run of ours")
     info = run.read_info()
     if info.get("state") != FINISHED:
-        raise UserError(f"{folder} is {info.get('state')}, and a pack is of a finished run")
+        raise UserError(f"{folder} is {info.get('state')}: only finished runs can be packed")
     check_secrets(info["spec"]["hyperparams"])
     try:
         record = record_to_tell(info)
@@ -132,7 +132,7 @@ def pack(run_folder: Path, target: Path) -> Path:
     for name in files:
         check_name(name)
     if len(files) > _MOST:
-        raise UserError(f"{run_folder} has modules of more files than a pack holds, {_MOST:,}")
+        raise UserError(f"{run_folder} has too many modules: a pack holds at most {_MOST:,} files")
     if is_zip:
         with replacing(target) as file:
             file.write(zipped(dict(sorted(files.items()))))
@@ -332,7 +332,7 @@ class StudyPack:
     """Collects the contents of a study's pack while it is written."""
 
     digests: dict[str, str] = field(default_factory=dict)  # of its files, by name
-    # by agent and environment: record and pack of the first run, and the number of runs
+    # by agent and environment: record and pack name of the first run, and the number of runs
     agents: dict[tuple[str, str], tuple[dict[str, Any], str, int]] = field(default_factory=dict)
     modules: list[str] = field(default_factory=list)  # arguments for the modules of all runs
 

@@ -28,7 +28,7 @@ RenderMode = Literal["human", "ansi", "rgb_array"]
 # In these modes, an environment returns frames instead of showing them.
 KEPT_MODES: tuple[RenderMode, ...] = ("ansi", "rgb_array")
 
-# After so many known frames in a row, an episode counts as repeating itself.
+# After this many known frames in a row, an episode counts as repeating itself.
 FRAMES_OF_A_REPETITION = 20
 
 
@@ -133,7 +133,7 @@ class FrameTaker:
         self._first_of_next: list[Any] = []
 
     def take(self, done: bool) -> list[Any]:
-        """The frames since the last call; keeps the first frame of the next episode back."""
+        """The frames since the last call, except the first frame of the next episode."""
         drawn: list[Any] = self._first_of_next + self.env.env_method("render")[0]
         self._first_of_next = [drawn.pop()] if done else []
         return drawn

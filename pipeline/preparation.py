@@ -87,7 +87,7 @@ from pipeline.watching import EvaluationMaps, Watch, watch_of
 if TYPE_CHECKING:
     from agents.networks.engine_setting import EnginePlan, Work
 
-# A budget in episodes has no number of steps; this one is never reached.
+# The number of steps for a budget in episodes; never reached.
 UNBOUNDED_TIMESTEPS = 10**12
 NEW = StateKeeping()
 
@@ -157,7 +157,7 @@ def prepare(
 
 @contextmanager
 def _library_errors_in_one_line() -> Iterator[None]:
-    """Turn the library's errors about settings into one line."""
+    """Turn the library's errors about settings into errors of one line."""
     try:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
@@ -226,7 +226,7 @@ def _set_up(
     )
     saver = StateSaver(run, keeping, partial(_say, console), spec.user_modules)
     pulls = None
-    if is_bandit and getattr(model, "engine", None) == "compiled":  # which stops at no pull
+    if is_bandit and getattr(model, "engine", None) == "compiled":  # it does not stop at pulls
         _say(console, "engine: compiled keeps no pulls, so that regret is not known")
     elif is_bandit:
         pulls = PullRecorder(run.path)
@@ -234,8 +234,8 @@ def _set_up(
     shows_evaluations = isinstance(watch, EvaluationMaps)
     if shows_evaluations:
         evaluation.callback = watch
-    # In this order: a number that is not finite is never stored, and no other callback sees a
-    # moment before the training returns to its saved state.
+    # In this order: numbers are checked before anything is stored, and a saved state is restored
+    # before any other callback acts.
     first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
     others = [*filter(None, [pulls, critics, None if shows_evaluations else watch]), evaluation]
     if spec.hyperparams.n_episodes is not None:
@@ -287,7 +287,7 @@ def _exact_evaluator(
 ) -> tuple[ExactEvaluator | None, Yardstick | None]:
     """Make the exact evaluator, if the environment's model is known and the agent permits it.
 
-    And the yardstick, if it does not.
+    If `obstacle` or `why_not_exact` prevents it, return None and the yardstick.
     """
     exact = None if has_memory(model) else evaluator_of(spec)
     if exact is None:
@@ -295,7 +295,7 @@ def _exact_evaluator(
     obstacle = exact.obstacle(model)
     if reason := obstacle or why_not_exact(model, exact.observations):
         _say(console, f"evaluations are sampled, not exact: {reason}")
-        # A stranger's agent that cannot be asked for all states may remember what it saw.
+        # A user's agent that cannot be queried in all states may have memory.
         if exact.scale is not None and not obstacle:
             return None, exact.scale.yardstick(with_memory=True)
         return None, exact.yardstick
@@ -314,7 +314,7 @@ def _exact_evaluator(
 def _critics(
     spec: TrainSpec, model: BaseAlgorithm, run: Run, console: Console, *, is_evaluated: bool
 ) -> CriticRecorder | None:
-    """Make what ``--diagnose`` asks for, or say why there is none."""
+    """Make the recorder of ``--diagnose``, or print why there is none."""
     if not spec.diagnose:
         return None
     found = recorder_of(run.diagnosis_path, spec, model, is_evaluated=is_evaluated)
@@ -377,7 +377,7 @@ def _model(
     taken = {name: value for name, value in given.items() if name in parameters}
     if "seed" not in taken:
         set_random_seed(spec.seed)
-    # The type checker knows only the arguments of the base class, which has more.
+    # For the type checker: the base class has other arguments.
     model: BaseAlgorithm = cast(Any, algorithm)(env=env, **taken, **kwargs)
     for name in common.keys() - taken.keys():
         setattr(model, name, common[name])

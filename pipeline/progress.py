@@ -43,7 +43,7 @@ class ProgressDisplay(BlockCallback):
         self.has_begun = False
         self.updated = 0.0
         self.tenths_shown = 0
-        # Times with the share done, at least a thousandth apart.
+        # Pairs of time and share done; shares are at least a thousandth apart.
         self.marks: list[tuple[float, float]] = []
         self.figures = ""
         self.activity = ""

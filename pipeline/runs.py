@@ -80,7 +80,7 @@ FINISHED = "finished"
 INTERRUPTED = "interrupted"
 FAILED = "failed"
 
-# Values of ``state`` in ``run.json`` after the end of a run.
+# Fields of ``run.json`` that are written at the end of a run.
 _OF_END = ("state", "reason", "stopped_by", "n_timesteps", "seconds", "cpu_seconds", FIELD)
 _BEST = ("best_mean_return", "best_timesteps", "best_episodes", "evaluation_steps")
 OUTCOME = (*_OF_END, "final", *_BEST, "engine", "regret", "pulls")
@@ -137,7 +137,7 @@ class Run:
     def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
         """Find a run by number; 0: the newest, -1: the one without a number.
 
-        The latter is in ``<log folder>/<algo>/``; 0 finds it too if there is no other run.
+        The run without a number is in ``<log folder>/<algo>/``; if it is the only one, 0 finds it.
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
@@ -262,7 +262,7 @@ class Run:
     def end(self, **fields: Any) -> None:
         """Write ``run.json``, the last file of a run, with the digests of all other files."""
         (self.path / ROOM).unlink(missing_ok=True)
-        for draft in drafts_in(self.path):  # of an unfinished file
+        for draft in drafts_in(self.path):  # temporary files of interrupted writes
             draft.unlink(missing_ok=True)
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
 
@@ -400,7 +400,7 @@ _CLAIM = re.compile(r"\.(.+)\.[0-9a-f]{16}\.tmp")
 
 
 def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
-    """Remove drafts of killed runs, and runs that were killed before their first step."""
+    """Remove temporary files of killed runs, and runs that were killed before their first step."""
     parent, env_name = log_folder / algo, environment_name(env_id)
     names = {path: env_name for _, path in numbered_runs(parent, env_name)}
     for path in list(parent.glob(".*.tmp")):  # without a number yet

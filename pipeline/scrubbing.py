@@ -37,7 +37,7 @@ _SIGN = rb"[A-Za-z0-9+/]"
 _PACKED = re.compile(rb">(H4sI(?:%b{4})*(?:%b{3}=|%b{2}==)?)<" % (_SIGN, _SIGN, _SIGN))
 _LARGEST = 64 << 20  # bytes
 _SECRET = re.compile(r"passw|secret|token|credential|api_?key", re.IGNORECASE)
-_SHORTEST = 4  # letters of a path to search for: "/" is everywhere
+_SHORTEST = 4  # characters of a path to search for; "/" alone is everywhere
 
 
 def without_places(value: Any) -> Any:
@@ -67,7 +67,7 @@ def check_secrets(settings: Any, place: str = "hyperparams") -> None:
         for key, value in settings.items():
             if isinstance(value, str) and value and _SECRET.search(str(key)):
                 what = f"{place}.{key} looks like a secret, and a pack holds all settings"
-                how = "train without it (an environment variable is in no run)"
+                how = "train without it (environment variables are not recorded)"
                 raise UserError(f"{what}: {how}")
             check_secrets(value, f"{place}.{key}")
     elif isinstance(settings, list | tuple):

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-# Where output is lines, a shorter activity is not reported.
+# Without a terminal, shorter activities are not reported.
 SECONDS_BEFORE_A_LINE = 5.0
 SECONDS_BETWEEN_LINES = 10.0
 

@@ -42,8 +42,8 @@ from pipeline.user_modules import UserModule
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
 FIRST_COST = 0.05  # seconds; assumed before the first save
-# A run that was cut off may be cut off again soon, and must make progress each time: its pauses
-# begin short and double, so that at least half of the work since then is saved.
+# An interrupted run may soon be interrupted again, and must make progress each time: the pauses
+# between its saves begin short and double, so that at least half of its new work is saved.
 SHORTEST_PAUSE = 0.1
 
 
@@ -52,7 +52,7 @@ class StateSaver(BlockCallback):
 
     Both happen at a safe moment: after the last update and before the environments step. The state
     consists of the agent with its environments, all callbacks with their evaluation environments,
-    the user's modules, and the generators that libraries share.
+    the user's modules, and the global random generators.
     """
 
     takes_blocks = True
@@ -70,10 +70,10 @@ class StateSaver(BlockCallback):
         self.modules = modules  # the user's
         self.told: set[str] = set()
         self.interval = keeping.interval
-        self.tell = tell  # receives one line on why no state is saved
+        self.tell = tell  # prints a line on why no state is saved
         self.state = keeping.state  # the state to resume from
         self.is_off = keeping.interval.is_off
-        self.acts = True  # at the next safe moment, unless an engine has heard that it need not
+        self.acts = True  # at the next safe moment; False after `wants_position` returned False
         note = {} if self.state is None else self.state.note
         self.n_saved = int(note.get("number", 0))
         self.time_before = WorkTime(
@@ -121,7 +121,7 @@ class StateSaver(BlockCallback):
         return True
 
     def _act(self) -> None:
-        # Else the environments' states are not written: what has come since then has to wait.
+        # After `wants_position` returned False, the environments are not up to date: saving waits.
         if self.acts:
             self._restore_or_save()
         self.acts = True
@@ -181,7 +181,7 @@ class StateSaver(BlockCallback):
         positions = log_positions(self.run.path, _log_folder(self.model))
         content = pickled(self._roots(), _OF_THIS_PROCESS)
         for lost in content.lost:
-            self._tell_once(f"{lost} is not kept: a run that goes by it may differ after --resume")
+            self._tell_once(f"{lost} is not kept: a run that uses it may differ after --resume")
         note = {
             "folder": self._folder_names(),
             "log_folder": _log_folder(self.model),
@@ -226,7 +226,7 @@ class StateSaver(BlockCallback):
             if state.is_of_these_sources and not isinstance(error, NotFittingError):
                 raise
             raise UserError(
-                f"{self.run.state_path} does not fit what the run's settings make today: "
+                f"{self.run.state_path} does not fit the training that its settings make now: "
                 f"{one_line(error)}; remove it to begin the run again"
             ) from error
         logger = self.model.logger
@@ -272,7 +272,7 @@ _OF_THIS_PROCESS = (
 )
 
 
-# --- the global generators of libraries ---
+# --- the global random generators ---
 
 
 def generator_states() -> dict[str, Any]:
@@ -341,13 +341,13 @@ def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
 
 
 def _values(holder: ModuleType | type) -> dict[str, Any]:
-    """The data in a module or class: no code, and nothing of Python's own."""
+    """The data in a module or class: no code, and no attributes of Python itself."""
     return {
         name: value
         for name, value in vars(holder).items()
         if not name.startswith(("__", "_abc_"))
         and not isinstance(value, _CODE)
-        # Of a class, no methods and similar members, but its caches.
+        # In a class: no methods or other descriptors, but their caches.
         and not (
             isinstance(holder, type)
             and hasattr(type(value), "__get__")
@@ -382,7 +382,7 @@ class IterationLogger(Logger):
 
 
 def iterations_before(model: BaseAlgorithm, note: dict[str, Any]) -> int:
-    """Iterations before a saved state where `learn` counts from 1; ask before the model learns."""
+    """Iterations of an on-policy agent before a saved state; call this before `learn`."""
     if not isinstance(model, OnPolicyAlgorithm):
         return 0
     return int(note["steps"] - model.num_timesteps) // (model.n_steps * model.n_envs)

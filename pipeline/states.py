@@ -1,7 +1,7 @@
 """Pickles the state of a running training, and restores it into a newly built training.
 
 - Objects of the process (log files, threads, windows, the run) are not pickled. The state records
-  their place in the training, and uses the object at that place of the newly built training.
+  their place in the training; restoring takes the object at that place of the new training.
 - Attributes of agent, environments, buffers and callbacks are filled into the newly built ones,
   because running functions refer to these objects.
 - The memory of arrays and tensors is stored beside the pickle, without a copy; objects that
@@ -54,7 +54,7 @@ _EXCLUDED = {
 }
 # Compiled functions, windows and their clocks, progress bars, row writers: rebuilt when needed.
 _MADE_ANEW = ("numba", "llvmlite", "pygame", "_csv", "moviepy", "tensorboard", "rich", "tqdm")
-# Exceptions among these, which contain data.
+# Exceptions from `_MADE_ANEW` with data, which are pickled.
 _HOLDING_DATA = ("numba.typed", "numba.experimental", "_csv.reader")
 _GAME_DATA = ("Rect", "FRect", "Vector2", "Vector3", "Color", "Mask", "PixelArray", "BufferProxy")
 # Handles of things outside this process, which cannot be copied.
@@ -64,7 +64,7 @@ _OUTSIDE = (
     "multiprocessing.connection._ConnectionBase",
     "tempfile.TemporaryDirectory",
 )
-# Shared generators of libraries: each must be the same object again, not a copy.
+# Global generators of libraries: restored as the same objects, not as copies.
 _SHARED: dict[int, tuple[Any, str]] = {
     id(random._inst): (random, "_inst"),
     id(np.random.mtrand._rand): (np.random.mtrand, "_rand"),
@@ -161,7 +161,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         except Exception as error:  # reading objects may raise anything
             deep = isinstance(error, RecursionError) or isinstance(error.__cause__, RecursionError)
             if deep or "recursion" in str(error):
-                raise NotKeepableError("objects lie too deep inside each other") from None
+                raise NotKeepableError("objects are nested too deeply") from None
             raise self._not_keepable(self._last, error) from error
 
     def reducer_override(self, obj: Any) -> Any:  # noqa: PLR0912  # a table
@@ -447,7 +447,7 @@ def _find(name: str) -> Any:
 
 def _is_empty(cell: CellType) -> bool:
     try:
-        cell.cell_contents  # noqa: B018  # asking is all that can be done
+        cell.cell_contents  # noqa: B018  # reading is the only test
     except ValueError:
         return True
     return False

@@ -64,7 +64,7 @@ class StopRequest:
         return self.n_asked > 1
 
     def raise_if_asked(self) -> None:
-        """Raise `Stopped` if a stop was requested; call it when no work is half done."""
+        """Raise `Stopped` if a stop was requested; call it between two pieces of work."""
         if self.number is not None:
             raise Stopped(self.number)
 
@@ -173,8 +173,8 @@ def stops_noticed() -> Iterator[StopRequest]:
             show(kind, error, trace)
 
     try:
-        # A callback from C code, as in Numba's compiler, cannot raise, and C code that imports
-        # NumPy prints what is raised in it: a timer raises later.
+        # Exceptions are lost in callbacks from C code, as in Numba's compiler, and C code that
+        # imports NumPy prints them: a timer raises `Stopped` again.
         sys.unraisablehook, sys.excepthook = tell_others, show_others
         for number, handler in before.items():
             if handler in (signal.SIG_DFL, signal.default_int_handler):

@@ -27,13 +27,13 @@ class TrainSpec:
 
     algo: str  #: name of the agent
     env_id: str  #: id of the environment
-    hyperparams: Hyperparams  #: merged, read but not yet made into objects
+    hyperparams: Hyperparams  #: merged and checked; objects are not built yet
     saved_hyperparams: dict[str, Any]  #: the same as plain data, for the run folder
     seed: int  #: the seed of all randomness in the run
     #: environment steps between two evaluations; below 0: none, None: twenty over the run
     eval_freq: int | None = None
-    eval_episodes: int | None = 20  #: of each evaluation in training; None: as few as needed
-    final_episodes: int | None = 100  #: of the evaluation at the end, likewise
+    eval_episodes: int | None = 20  #: per evaluation in training; None: as few as needed
+    final_episodes: int | None = 100  #: in the evaluation at the end; None: as few as needed
     n_eval_envs: int = 10  #: parallel environments of an evaluation
     save_freq: int = -1  #: environment steps between two checkpoints; below 1 for none
     save_every_n_episodes: int = -1  #: episodes between two checkpoints; below 1 for none
@@ -44,17 +44,17 @@ class TrainSpec:
     trained_agent: Path | None = None
     vec_env: str = "dummy"  #: or ``"subproc"``
     device: str = "auto"  #: torch device of the networks
-    num_threads: int = 1  #: of PyTorch, may affect results; below 1: PyTorch's choice
+    num_threads: int = 1  #: of PyTorch, which may affect results; below 1: PyTorch's choice
     log_interval: int = -1  #: episodes or rollouts a log record; -1: library's default, -2: none
     verbose: int = 1  #: 0 silent, 1 progress and summary, 2 the library's own log as well
     progress: bool = False  #: draw a live bar wherever the output goes
     gym_packages: tuple[str, ...] = ()  #: modules of the user, whose classes settings may name
     user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
-    unique_id: bool = False  #: give the folder a name that is unique over all machines
+    unique_id: bool = False  #: give the folder a globally unique name
     pictures: bool = True  #: draw the learning curve and other pictures into the run folder
     diagnose: bool = False  #: compare values and gradients with exact ones at evaluations
-    watch_learning: Path | None = None  #: file of a page that plays the training step by step
-    watch_episodes: int = 0  #: shown for an agent with tables; 0: as many as have room
+    watch_learning: Path | None = None  #: file of a page that replays the training step by step
+    watch_episodes: int = 0  #: episodes on that page, for agents with tables; 0: automatic
     #: the origin of values that are not in the entry: ``"auto: 1 - 1/(2 x time limit ..."``
     origins: dict[str, str] | None = None
 
@@ -95,8 +95,8 @@ def _defaults() -> Mapping[str, Any]:
 
 # Agents that use only their own random numbers, or draw them after seeding.
 FAMILIES = frozenset({"tabular", "linear"})
-# The library's agents in compiled code, which draw weights after seeding too. In the library's own
-# loop, runs are too long to gain from sharing, except those that `auto` leaves there.
+# The library's agents in compiled code, which draw weights after seeding too. Runs with ``engine:
+# library`` are excluded, because they are too long to gain from sharing a process.
 NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})
 
 HOMES = ("envs.", "gymnasium.envs.")
@@ -139,6 +139,6 @@ def is_known_environment(env_id: str) -> bool:
 
 
 def remembers(spec: TrainSpec) -> bool:
-    """Whether the run's agent acts by earlier observations too, as far as its settings tell."""
+    """Whether the agent is recurrent or observations are stacked, according to the settings."""
     entry = ALGORITHMS.get(spec.algo)
     return (entry is not None and entry.has_memory) or (spec.hyperparams.frame_stack or 1) > 1

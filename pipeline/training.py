@@ -47,15 +47,15 @@ class Outcome:
     run: Run  #: its folder
     state: str  #: ``"finished"`` or ``"interrupted"``
     n_steps: int  #: environment steps done
-    taken: WorkTime  #: their time, with evaluations, but without compiling, which happens once
-    final: Evaluation | None  #: on separate episodes; None if turned off
+    taken: WorkTime  #: the time of training and its evaluations, without compiling
+    final: Evaluation | None  #: the final evaluation; None if turned off or interrupted
     best_return: float | None  #: mean return of the best evaluation during training, if any
     best_timesteps: int  #: the time step of that evaluation
-    engine: str | None  #: for tabular agents, whether training was compiled, and if not, why
-    best_episodes: int  #: number of episodes behind the best return; 0 if it is exact
+    engine: str | None  #: whether training was compiled, and if not, why; None if unknown
+    best_episodes: int  #: the number of episodes of that evaluation; 0 if it is exact
     evaluating: WorkTime  #: the time of all evaluations, including the last one
     evaluation_steps: int  #: environment steps of sampled evaluations
-    pulls: PullSummary | None = None  #: on bandits, figures on the pulls of training
+    pulls: PullSummary | None = None  #: on bandits, the summary of the training pulls
 
 
 def train(
@@ -146,7 +146,7 @@ def _learn(training: Training) -> None:
                 **kwargs,
             )
     except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as e:
-        check_model(training.model)  # PyTorch refuses distributions of nan without the reason
+        check_model(training.model)  # PyTorch's error for nan in distributions is obscure
         blame_settings(spec.algo, training.model, e)
         raise
 
@@ -252,7 +252,7 @@ def _drawn(training: Training, state: str, outcome: Outcome, activity: Activity)
 
 @contextmanager
 def _stoppable(state: str) -> Iterator[None]:
-    """Let a signal end the block: at once, or some time after a signal has ended training."""
+    """Let a signal end the block at once, or after a time limit if one has ended training."""
     seconds_left = SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0
     with current().waiting(seconds_left), exits_as_mistakes():
         yield
@@ -283,7 +283,7 @@ def draw(training: Training, final: Evaluation | None) -> None:
 
 @exits_as_mistakes()
 def close(training: Training) -> None:
-    """Close all open parts, each one even if another cannot be closed."""
+    """Close all open parts; an error in one does not keep the others open."""
     model = training.model
     with ExitStack() as stack:
         if model.env is not None:

@@ -1,4 +1,4 @@
-"""Finds interrupted runs, and prepares resuming them; imported before PyTorch."""
+"""Finds interrupted runs and prepares to resume them; its import does not load PyTorch."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 if TYPE_CHECKING:
     from pipeline.state_files import SavedState
 
-# Settings that may change when a run resumes, and that its record ignores.
+# Settings that comparisons of specs ignore, and that may change when a run resumes.
 _SHOWN_ONLY = ("verbose", "progress", "log_folder", "gym_packages", "user_modules", "unique_id")
 
 EVENT_FILES = "events.out.tfevents.*"
@@ -40,7 +40,7 @@ EVENT_FILES = "events.out.tfevents.*"
 MONITOR_FILES = "[0-9]*.monitor.csv"
 _PIECE = 1 << 20  # bytes
 
-# A file's length in bytes and their checksum.
+# A length in bytes, and the checksum of these bytes of a file.
 Position = tuple[int, int]
 
 
@@ -48,8 +48,8 @@ Position = tuple[int, int]
 class SaveInterval:
     """How often to save the state."""
 
-    seconds: float = 0.0  # between two saves; 0: so that saving takes `SHARE_OF_TIME`
-    steps: int = 0  # instead, steps between two saves, counted over all environments
+    seconds: float = 0.0  # between two saves; 0: saving takes `SHARE_OF_TIME`
+    steps: int = 0  # steps between two saves instead, counted over all environments
     is_off: bool = False  # saves no state
 
 
@@ -60,7 +60,7 @@ class StateKeeping:
     interval: SaveInterval = SaveInterval()
     state: SavedState | None = None  # the state to resume from
     goes_on: bool = False  # uses the run folder of an earlier process, maybe without a state
-    was_cut_off: bool = False  # an earlier process died: save sooner
+    was_cut_off: bool = False  # an earlier process was interrupted: save sooner
     stays: bool = False  # keeps the state of a finished run
 
 
@@ -107,7 +107,7 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
         raise UserError(f"the run needs --gym-packages {' '.join(missing)}: type it again")
     raw = data["hyperparams"]
     if not isinstance(raw, dict) or environment_name(str(data["env_id"])) != run.env_name:
-        what = "its hyperparameters or its names are not ours"
+        what = "its hyperparameters or its environment are invalid"
         raise UserError(f"{run.info_path} is damaged: {what}")
     return replace(
         TrainSpec.of_data({**data, "user_modules": ()}),

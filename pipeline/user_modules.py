@@ -103,7 +103,7 @@ def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[Use
 
 
 def import_checked(modules: Iterable[UserModule]) -> None:
-    """Import modules whose files were compared, whatever Python would find under their names."""
+    """Import modules with verified files, even if Python would find others of the same names."""
     for module in modules:
         folder = module.search_folder
         if folder is not None and module.name not in sys.modules:
@@ -248,7 +248,7 @@ def _refused(typed: str, reason: str) -> UserError:
 
 COPIES = "modules"  # the folder in a run for copies of modules
 SENT = "yardstick-modules"  # the folder on a worker for modules that a driver has sent
-MAX_COPY_BYTES = 1_000_000  # of a module, with its imports from beside it
+MAX_COPY_BYTES = 1_000_000  # of a module with its imports from the same folder
 _parsing = threading.Lock()  # in several threads at once, Python 3.11 raises SystemError
 _OF_LIBRARIES = ("site-packages", "dist-packages")  # folders of installed distributions
 _FOLDERS_ABOVE = 3  # parent folders of a run's pack to search for a study's modules
@@ -261,7 +261,7 @@ def as_flag(modules: Iterable[UserModule], env_id: str = "") -> str:
 
 
 def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
-    """Copy the modules, and their imports from beside them, into a run folder."""
+    """Copy the modules, and their imports from the same folder, into a run folder."""
     for module in modules:
         sources = _sources(module)
         if sum(path.stat().st_size for path in sources.values()) > MAX_COPY_BYTES:
@@ -279,9 +279,9 @@ def _sources(module: UserModule) -> dict[str, Path]:
 
 
 def files_of(module: UserModule) -> dict[str, Path]:
-    """The Python files of a module and of its imports from beside it, by name.
+    """The Python files of a module and of its imports from the same folder, by name.
 
-    Of an installed module, only its own: what it imports are other distributions.
+    Only its own files for an installed module, because its imports are other distributions.
     """
     beside, files = _folder_of(module), dict[str, Path]()
     to_do, seen = [module.name.partition(".")[0]], set[str]()

@@ -1,4 +1,4 @@
-"""Records a training while it runs, for a page that plays it.
+"""Records a training while it runs, for a page that replays it.
 
 For agents with tables it records each step; for all others, maps of the greedy policy.
 """
@@ -91,7 +91,7 @@ class MapRecorder(BaseCallback):
         self.evaluator = evaluator
         self.moments = GrowingRows(_moment_type(n_states))
         self.most = min(max(MOST_FIGURES // (2 * n_states), FEWEST_MAPS), MOST_MAPS)
-        self.stride = 1  # one map is kept for so many units
+        self.stride = 1  # every ``stride``-th map is kept
         self.n_units = 0
 
     @property
@@ -129,7 +129,7 @@ class MapRecorder(BaseCallback):
         if policy is None:
             return
         agent: Any = self.model
-        # From the schedule, because the agent's rate is set at the first step.
+        # From the schedule, because the agent's own rate is set only at the first step.
         schedule = getattr(agent, "exploration_schedule", lambda progress: math.nan)
         log = agent.logger.name_to_value if self.n_units else {}
         returns = [episode["r"] for episode in agent.ep_info_buffer or ()]
@@ -155,7 +155,7 @@ class EvaluationMaps(MapRecorder):
 
 
 class UpdateMaps(MapRecorder, BlockCallback):
-    """Records a map after every update, at the start of rollouts, which engines can compile."""
+    """Records a map after every update, at the start of rollouts, which can stay compiled."""
 
     unit = "update"
 
@@ -200,12 +200,12 @@ def _moment_type(n_states: int) -> np.dtype[np.void]:
 
 # --- steps ----------------------------------------------------------------------------------------
 
-# The capacity of a page of three megabytes, and the default.
+# Limits for a page of three megabytes; MOVES_UNASKED applies without ``--watch-episodes``.
 MOST_MOVES = 20_000
 MOST_CHANGES = 60_000
 MOVES_UNASKED = 5_000
 MOST_ENTRIES = 100_000
-# The search for the rise of the return covers so many steps, and evaluates the policy so often.
+# Limits of the search for the rise of the return, and steps between evaluations of the policy.
 MOVES_SEARCHED = 50_000
 CHANGES_SEARCHED = 1_000_000
 STEPS_BETWEEN_RETURNS = 100
@@ -222,7 +222,7 @@ STEP = np.dtype(
     [
         ("timesteps", np.int64),  # after it, over all environments
         ("exploration", np.float64),
-        ("learning_rate", np.float64),  # nan if it does not come from the schedule
+        ("learning_rate", np.float64),  # nan if it is not from the schedule
     ]
 )
 # One environment's part of a step.
@@ -377,7 +377,7 @@ class TableRecorder(BlockCallback):
         return len(self.steps) >= STEPS_BETWEEN_RETURNS * risen + STEPS_AROUND
 
     def window(self) -> tuple[int, int]:
-        """The first and last step to show: whole episodes around the rise of the greedy return."""
+        """The steps to show, [first, end): whole episodes around the rise of the greedy return."""
         n, n_envs = len(self.steps), self.model.n_envs
         returns = np.array(self._greedy_returns)
         if self.exact is None or not len(returns):
@@ -441,7 +441,7 @@ def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None
         return TableRecorder(spec.watch_episodes, exact if can_be_mapped else None)
     if exact is None or not can_be_mapped or best_actions_of(exact, agent) is None:
         raise UserError(
-            f"--watch-learning shows tables, or what an agent does in up to 2,500 known states: "
+            f"--watch-learning shows tables, or an agent's actions in up to 2,500 known states: "
             f"{spec.algo} on {spec.env_id} has neither"
         )
     tells_updates = isinstance(agent, OnPolicyAlgorithm | OffPolicyAlgorithm)

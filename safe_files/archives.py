@@ -1,6 +1,6 @@
 """Reads members and settings from zips of models, without importing the libraries.
 
-It unpacks no more than the budget of the file allows.
+It unpacks no more bytes than the budget of the file allows.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def read_members(
     budget: Budget | None = None,
     most: int = MAX_MEMBERS,
 ) -> dict[str, bytes]:
-    """Read the members of a zip, by name: only the expected ones, if given, and at most so many."""
+    """Read at most ``most`` members of a zip, by name; refuses names outside ``expected``."""
     budget = budget or Budget(len(content))
     with opened_zip(content, budget) as archive:
         infos = archive.infolist()

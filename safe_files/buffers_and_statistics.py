@@ -90,7 +90,7 @@ def _buffer(found: _Stored, device: th.device) -> ReplayBuffer:
     names = (*_ARGUMENTS, *_MORE_ARGUMENTS.get(found.cls, ()))
     given: dict[str, Any] = {name: state[name] for name in names if name in state}
     shape = (given["buffer_size"], given.get("n_envs", 1))
-    # Its buffers count per environment.
+    # The file has the rows per environment, the constructor takes the total.
     given["buffer_size"] *= given.get("n_envs", 1)
     if found.cls is HerReplayBuffer:
         given["env"] = None

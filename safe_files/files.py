@@ -59,7 +59,7 @@ class Budget:
         self.left = _FREE_BYTES + _TIMES * n_bytes
 
     def charge(self, n_bytes: int) -> None:
-        """Charge so many bytes."""
+        """Charge ``n_bytes``; raises UnsafeFileError if fewer are left."""
         self.left -= n_bytes
         if self.left < 0:
             raise UnsafeFileError(
@@ -163,7 +163,7 @@ def open_number(path: Path, flags: int) -> int:
 
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[io.BufferedReader]:
-    """Open a regular file of at most so many bytes; checks the file that it has opened.
+    """Open a regular file of at most ``limit`` bytes; checks the file that it has opened.
 
     Refuses pipes and devices, which could be endless, and files behind a link in a held
     folder.
@@ -196,7 +196,7 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def content_of(source: Source, limit: int) -> bytes:
-    """Read a whole regular file or stream of at most so many bytes."""
+    """Read a whole regular file or stream of at most ``limit`` bytes."""
     if not isinstance(source, io.BufferedIOBase):
         return read_file(Path(source), limit)
     content = source.read(limit + 1)

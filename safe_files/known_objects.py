@@ -207,7 +207,7 @@ _STORAGE = Name("torch.storage", "TypedStorage")
 
 
 class _TensorReader(Reader):
-    """Reads PyTorch's pickles of protocol 2, whose storages are separate files."""
+    """Reads PyTorch's pickles of protocol 2, with storages in separate files."""
 
     prices = PRICES | {"GLOBAL": 104, "BINPUT": 104, "LONG_BINPUT": 104, "BINPERSID": 320}
 
@@ -262,7 +262,7 @@ def _flat(made: Made, content: bytes) -> th.Tensor:
     if made.state is not None:
         raise wrong(made)
     if size * dtype.itemsize != len(content):
-        raise UnsafeFileError(f"a storage of {len(content):,} bytes that says it has {shown(size)}")
+        raise UnsafeFileError(f"a storage of {len(content):,} bytes for {shown(size)} elements")
     tensor = th.empty(size, dtype=dtype)
     tensor.view(th.uint8).numpy()[:] = np.frombuffer(content, np.uint8)
     return tensor
@@ -287,7 +287,7 @@ def _tensor(made: Made, build: Build) -> th.Tensor:
     end = 1
     for stride, size in sorted(zip(strides, shape, strict=True)):
         if size > 1 and stride < end:
-            raise UnsafeFileError("a tensor that shows numbers of its storage several times")
+            raise UnsafeFileError("a tensor with overlapping elements")
         end += stride * (size - 1)
     if min((offset, *shape, *strides)) < 0 or (0 not in shape and offset + end > len(storage)):
         raise UnsafeFileError("a tensor that is larger than its storage")
@@ -429,7 +429,7 @@ def _composed(parts: list[Any]) -> ComposeTransform:
 
 
 def _code(made: Made, build: Build) -> None:
-    """Replace a function that was pickled with its code, as schedules were before version 2.6."""
+    """Refuse a function that was pickled with its code, as schedules were before version 2.6."""
     # The last text among the arguments of the code object is the function's name.
     code = made.args[0] if made.args else None
     texts = [one for one in getattr(code, "args", ()) if isinstance(one, str)]

@@ -1,8 +1,8 @@
 """Loads models of Stable-Baselines3 and sb3-contrib from files of unknown origin.
 
 The library's own `load` gets a new zip with the checked contents, so it has nothing to unpickle.
-`load` would make networks and buffers of any size in the settings, and PyTorch silently converts
-dtypes. So this module checks sizes and dtypes.
+This module also checks sizes and dtypes, because `load` would make networks and buffers of any size
+in the settings, and PyTorch silently converts dtypes.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def load_model(
         env: the environment for further training, or None.
         device: the device of the tensors.
         classes: your own classes that the file may name, by their full names.
-        custom_objects: values that replace attributes in the file; replaced ones are not read.
-        replaced: attributes to set, whether or not the file has them; the file's are not read.
+        custom_objects: values that replace attributes in the file, which are then not read.
+        replaced: attributes to set, also if the file lacks them; the file's values are not read.
 
     Raises:
         UnsafeFileError: if the file has forbidden contents, is damaged, or is too large.
@@ -175,9 +175,9 @@ def hides(algorithm: type, name: str) -> bool:
 
 
 def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozenset[str]]:
-    """The files of tensors of such a model, and its variables outside networks."""
+    """The tensor files of a model of this class, and its variables outside networks."""
     try:
-        # For the libraries' classes, the class alone is enough, or the answer is known.
+        # For the libraries' classes, an empty instance is enough, or the defaults below are right.
         own: Any = algorithm._get_torch_save_params(algorithm.__new__(algorithm))
         files, variables = frozenset(f"{name}.pth" for name in own[0]), frozenset(own[1])
     except AttributeError:
@@ -211,7 +211,7 @@ def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
 
 
 def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
-    """Write a new zip of the checked contents; of the parameters, it has only the names."""
+    """Write a new zip of the checked contents, with only the names of the parameters."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(SETTINGS, data)
@@ -222,12 +222,12 @@ def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
     return content
 
 
-# --- sizes in proportion to the file, and tensors of such a model ---------------------------------
+# --- checks of sizes and of tensors ---------------------------------------------------------------
 
 # Attributes that determine the rows of a buffer; several of them multiply.
 _BUFFERS = (("buffer_size",), ("n_steps", "n_envs"))
 _FLAT_BYTES = 4
-# Bytes of a network's trial input per number; the weights behind each number take more.
+# Bytes per number of a network's trial input; the weights for each number take more.
 _BYTES_PER_INPUT = 40
 # Operations that make new tensors of given sizes, or of existing ones.
 _MAKERS = frozenset(
@@ -276,7 +276,7 @@ def _check_sizes(settings: Mapping[str, Any], budget: Budget) -> None:
     for names in _BUFFERS:
         values = [settings.get(name, 1) for name in names]
         if not all(isinstance(value, int) and 0 < value <= MAX_ROWS for value in values):
-            raise UnsafeFileError(f"has {' and '.join(names)} out of all proportion", names[0])
+            raise UnsafeFileError(f"has {' and '.join(names)} outside the allowed range", names[0])
         size = math.prod(values) * n_bytes
         if size > memory_bytes():
             raise UnsafeFileError(

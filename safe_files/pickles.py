@@ -47,7 +47,7 @@ _BYTES_PER_KEY = 160
 
 MAX_DEPTH = 40
 # Bytes of a value with its slot in a container; extra bytes of a list, dictionary or object; and
-# bytes of the records about one that is not empty.
+# bytes that `Build` needs to measure one that is not empty.
 _BYTES_PER_VALUE, _BYTES_PER_HOLDER, _BYTES_PER_NOTE = 32, 80, 256
 # Constructors of spaces make several arrays from each argument.
 _SPACES, _COPIES_OF_A_SPACE = "gymnasium.spaces.", 4
@@ -87,8 +87,8 @@ class Made:
 
     @property
     def name(self) -> str:
-        """Its class or function in words, without arguments, which could be endless."""
-        return self.maker.name if isinstance(self.maker, Name) else "a call of what a call returns"
+        """The name of its class or function, without arguments, which could be endless."""
+        return self.maker.name if isinstance(self.maker, Name) else "the result of another call"
 
 
 class Reader(pickle._Unpickler):
@@ -278,7 +278,7 @@ def _quoted(name: str) -> str:
 
 
 def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
-    """The arguments of a call, which must have exactly these types, and nothing besides."""
+    """The arguments of a call, which must have exactly these types; state and items are refused."""
     values = build(made.args)
     fits = len(values) == len(kinds) and all(map(isinstance, values, kinds))
     if not fits or made.state is not None or made.items or made.pairs:

@@ -1,8 +1,8 @@
 """Describes what a failed agent does instead of its task, and proposes a first change.
 
-If the agent values its start about as low as standing still for ever, the discount hides the goal:
-the discount has to be nearer to 1. If the agent has tried its actions too rarely, it needs more
-steps. Each advice requires that exact planning has shown that the change can help.
+If the agent's value of the start is about as low as the value of standing still for ever, the
+discount hides the goal and must be nearer to 1. If the agent has tried its actions too rarely, it
+needs more steps. A change is proposed only if exact planning shows that it can help.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.train_spec import TrainSpec
 
 SOLVED = 0.5  # planning must reach this score for a recommendation
-NEAR_OPTIMUM = 0.01  # of the optimum
+NEAR_OPTIMUM = 0.01  # relative to the optimum
 # The value of the start, divided by the value of standing still.
 NEAR_STANDING_STILL = 0.8
-# Training steps for each pair of state and action; more if the discount is to come nearer to 1.
+# Training steps per pair of state and action: the least (FAR: if gamma is raised), and the advice.
 FEW_STEPS, FEW_STEPS_FAR = 130, 400
 MANY_STEPS = 1000
-# As a share of the score that planning reaches.
+# Smaller differences between scores do not matter.
 MATTERS = 0.05
-# Planning with so many states x actions x outcomes takes about a second.
+# Planning with this many states x actions x outcomes takes about a second.
 MOST_OUTCOMES = 500_000
 # An episode is stuck in a few states if it spends nearly all of its last steps there.
 LAST_STEPS = 100
@@ -60,7 +60,7 @@ def advice(
         return None
     policy = evaluator.policy(agent, deterministic=True)
     if policy.ndim == 2 and np.issubdtype(policy.dtype, np.integer):
-        if len(policy) > 1:  # a planner that knows the time limit
+        if len(policy) > 1:  # a planner's policy that depends on the time step
             return None
         policy = policy[0]
     yardstick = evaluator.yardstick
@@ -75,7 +75,7 @@ def advice(
         if still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # no policy ends an episode
             return None
     instead = how_episodes_end(evaluator, policy)
-    # What plans by the state reach says nothing of agents that do not see it.
+    # Planning uses the state: its score says nothing about agents that do not observe the state.
     hides = evaluator.scale is not None
     return Advice(instead, None if hides else _try_first(spec, agent, evaluator, n_steps))
 
@@ -183,7 +183,7 @@ def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) ->
 def _share_of_standing_still(
     agent: BaseAlgorithm, model: TransitionModel, observations: Any, gamma: float
 ) -> float:
-    """The agent's value of its start, divided by that of standing still; 0 if that is free."""
+    """The agent's start value divided by the value of standing still; 0 if free or unknown."""
     tables = getattr(agent.policy, "q_tables", None)
     stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
     stays &= (model.prob > 0) & model.reachable[:, None, None]

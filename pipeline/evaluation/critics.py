@@ -1,7 +1,7 @@
-"""Compares what an agent believes, and learns from, with the exact values of its present policy.
+"""Compares an agent's values, advantages and gradients with the exact ones of its current policy.
 
-The exact values are those of the environment that the agent trains on, under its own discount and
-without the time limit, where agents bootstrap.
+The exact values are those of the training environment, under the agent's discount and without the
+time limit, because agents bootstrap there.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from pipeline.train_spec import TrainSpec
 
 SECONDS_BETWEEN_WRITES = 1.0
 
-# Agents that learn the values of the policy by which they explore.
+# Agents that learn the values of their exploring policy.
 EXPLORING = frozenset(
     {
         "sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo",
@@ -62,9 +62,9 @@ EXPLORING = frozenset(
     }
 )  # fmt: skip
 
-# Minibatches of a rollout whose gradients are looked at.
+# Gradients are computed for at most this many minibatches of a rollout.
 MOST_MINIBATCHES = 32
-# Larger worlds take too long, even once.
+# In larger models, even one comparison takes too long.
 MOST_OUTCOMES = 1_000_000
 
 
@@ -74,17 +74,17 @@ class KnownWorld:
 
     model: TransitionModel
     observations: NDArray[Any]  # of each state, states along the first axis
-    horizon: int  # the time limit, which says how often states are visited
+    horizon: int  # the time limit, for visit counts
     masks: Bools | None  # action masks, shape (S, A), for agents that use them
-    is_limited: bool = True  # whether the limit is that of training; otherwise of evaluations
+    is_limited: bool = True  # whether ``horizon`` limits training; else only evaluations
 
     @cached_property
     def visits(self) -> OfLastPolicy[Floats]:
-        """The share of the steps that a policy (S, A) spends in each state, shape (S,)."""
+        """The function from a policy (S, A) to the share of its steps in each state, shape (S,)."""
 
         def shares(policy: Floats) -> Floats:
             is_fixed = (policy.max(axis=1) == 1).all()
-            given = policy.argmax(axis=1) if is_fixed else policy  # fewer rows to pass over
+            given = policy.argmax(axis=1) if is_fixed else policy  # faster
             visits = state_visitation(self.model, given, self.horizon)
             return np.asarray(visits / visits.sum())
 
@@ -103,27 +103,27 @@ class KnownWorld:
 
     @cached_property
     def numbers(self) -> dict[bytes, int]:
-        """The numbers of states by what is observed there."""
+        """The index of each state, by the bytes of its observation."""
         rows = np.ascontiguousarray(self.observations.reshape(len(self.observations), -1))
         return {row.tobytes(): number for number, row in enumerate(rows)}
 
     @property
     def tells_states_apart(self) -> bool:
-        """Whether every state looks different."""
+        """Whether every state has a different observation."""
         return len(self.numbers) == self.model.n_states
 
     def states_of(self, observations: NDArray[Any], n_rows: int) -> Ints:
-        """The numbers of the states that so many rows of observations show."""
+        """The indices of the states with these ``n_rows`` observations, shape (n_rows,)."""
         rows = np.ascontiguousarray(observations.reshape(n_rows, -1), self.observations.dtype)
         return np.array([self.numbers[row.tobytes()] for row in rows], np.int64)
 
 
 def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
-    """The world of an agent whose values can be compared with exact ones; else why not."""
+    """The world for comparing the agent's values with exact ones; or why that is impossible."""
     if isinstance(agent, PlanningAgent):
         return "a planner's values are exact already"
     if not isinstance(getattr(agent, "gamma", None), int | float):
-        return f"{spec.algo} has no discount, and so no values to compare"
+        return f"{spec.algo} has no discount, so there are no values to compare"
     if is_wrapped_as_vector(spec):
         return "a VecEnv wrapper changes what the agent sees"
     with closing(make_single_env(spec, training=True)) as env:
@@ -166,7 +166,7 @@ def own_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | Non
 def recorder_of(
     path: Path, spec: TrainSpec, agent: BaseAlgorithm, *, is_evaluated: bool
 ) -> CriticRecorder | str:
-    """The recorder of a training; or why there is none, in one line."""
+    """The recorder of a training; or a line on why there is none."""
     if not is_evaluated:
         return "there are no evaluations during this training"
     world = known_world(spec, agent)
@@ -182,20 +182,20 @@ def recorder_of(
 
 
 class CriticRecorder(BlockCallback):
-    """Writes ``diagnosis.csv``: a row for each moment at which the agent was compared.
+    """Writes ``diagnosis.csv``: a row for each comparison of the agent.
 
     Args:
-        path: of the file.
-        world: what the agent trains on.
-        spec: of the training.
-        explores: whether its values are those of the policy by which it explores; otherwise they
-            are those of its greedy policy.
+        path: the file.
+        world: the environment that the agent trains on.
+        spec: the spec of the training.
+        explores: whether the agent learns the values of its exploring policy, else those of its
+            greedy policy.
     """
 
     def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
         super().__init__()
         self.path, self.world, self.explores = path, world, explores
-        # Who says when to evaluate has each evaluation compared.
+        # With an explicit evaluation interval, the agent is compared at each evaluation.
         self.is_limited = spec.eval_freq is None
         self.training_steps = spec.hyperparams.n_timesteps
         self.training_episodes = spec.hyperparams.n_episodes
@@ -206,12 +206,12 @@ class CriticRecorder(BlockCallback):
         return True
 
     def judge(self, timesteps: int, n_episodes: int) -> None:
-        """Compare the agent now, unless that would take too much of the training's time."""
+        """Compare the agent now, unless comparisons would take too large a share of training."""
         if self.can_afford(n_episodes):
             self._append(timesteps, self.figures())
 
     def can_afford(self, n_episodes: int) -> bool:
-        """Whether the training has come far enough for one more comparison."""
+        """Whether the training has done enough steps for another comparison."""
         if not self.is_limited:
             return True
         n_trained = self.model.num_timesteps - self.model._num_timesteps_at_start
@@ -255,17 +255,17 @@ class CriticRecorder(BlockCallback):
     # --- what is compared -------------------------------------------------------------------------
 
     def policy(self) -> Floats:
-        """The policy whose values the agent has, as probabilities of shape (S, A)."""
+        """The target policy of the agent's values, as probabilities of shape (S, A)."""
         world, agent = self.world, self.model
         if self.explores:
             found = policy_matrix(agent, world.observations, deterministic=False, masks=world.masks)
-            # Networks work in float32.
+            # Probabilities in float32 do not sum to exactly 1.
             return np.asarray(found / found.sum(axis=1, keepdims=True))
         actions = best_actions(agent, world.observations, world.masks)
         return np.eye(world.model.n_actions)[actions]
 
     def figures(self) -> dict[str, float]:
-        """The columns of the present agent."""
+        """The columns for the current agent."""
         world, policy = self.world, self.policy()
         exact = world.values(policy, float(self.model.gamma))  # type: ignore[attr-defined]
         believed, visits = own_values(self.model, world.observations), world.visits(policy)
@@ -297,14 +297,14 @@ class CriticRecorder(BlockCallback):
 
 
 def weighted_mean(numbers: Floats, weights: Floats) -> float:
-    """The mean of the numbers that are known; NaN where none of them has weight."""
+    """The weighted mean of the finite numbers; NaN if none has a positive weight."""
     known = np.isfinite(numbers) & (weights > 0)
     total = weights[known].sum()
     return float(weights[known] @ numbers[known] / total) if total > 0 else float("nan")
 
 
 def root_mean_square(numbers: Floats, weights: Floats) -> float:
-    """The root of the mean square, likewise."""
+    """The weighted root mean square of the finite numbers; NaN as in `weighted_mean`."""
     return float(np.sqrt(weighted_mean(numbers**2, weights)))
 
 
@@ -312,9 +312,9 @@ def root_mean_square(numbers: Floats, weights: Floats) -> float:
 
 
 class RolloutRecorder(CriticRecorder):
-    """Compares PPO, A2C and their kin at the end of a rollout, before they learn from it.
+    """Compares agents such as PPO and A2C at the end of a rollout, before they update.
 
-    The policy is still the one of the evaluation during the rollout, and that of all its steps.
+    Until then, the policy is the same as during the whole rollout and the evaluation within it.
     """
 
     def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
@@ -337,7 +337,7 @@ class RolloutRecorder(CriticRecorder):
         self.model.logger.dump(timesteps)
 
     def rollout_figures(self, seed: int) -> dict[str, float]:
-        """What comes of comparing the advantages of the rollout, and its policy gradient."""
+        """The columns on the errors of the rollout's advantages and of its policy gradient."""
         world, agent = self.world, cast(Any, self.model)
         buffer = agent.rollout_buffer
         n_steps, n_envs = buffer.rewards.shape
@@ -374,10 +374,10 @@ class RolloutRecorder(CriticRecorder):
     def gradient_figures(
         self, true: Floats, states: Ints, actions: Ints, batches: list[tuple[Ints, Floats]]
     ) -> dict[str, float]:
-        """Cosine and signal-to-noise ratio of the gradients of minibatches.
+        """Cosine similarity and signal-to-noise ratio of minibatch gradients.
 
-        Each is a sum over states and actions of a weight times the gradient of the logarithm of
-        the action's probability; ``true`` has the weights of the exact one, shape (S, A).
+        A policy gradient is a weighted sum over states and actions of the gradients of the log
+        probabilities; ``true`` contains the weights of the exact one, shape (S, A).
         """
         shown = np.flatnonzero((np.bincount(states, minlength=len(true)) > 0) | true.any(axis=1))
         place = np.full(len(true), -1)
@@ -398,14 +398,14 @@ class RolloutRecorder(CriticRecorder):
 
 
 def minibatches(agent: Any, estimates: Floats, seed: int) -> list[tuple[Ints, Floats]]:
-    """Steps of a rollout as an epoch divides them, and their advantages.
+    """The steps and advantages of each minibatch in an epoch over a rollout.
 
-    Where the agent scales advantages to standard deviation one, they are centred alone: that scale
-    is a matter of the step size.
+    If the agent normalises advantages, they are only centred here, because their scale only acts
+    as a step size.
     """
     n = len(estimates)
     size = min(agent.batch_size, n) if hasattr(agent, "n_epochs") else n
-    # Not the generator that the agent draws its own order from.
+    # A separate generator, so that the agent's own order does not change.
     order = np.random.default_rng(seed).permutation(n)
     found = []
     for begin in range(0, min(n - size + 1, MOST_MINIBATCHES * size), size):
@@ -417,7 +417,7 @@ def minibatches(agent: Any, estimates: Floats, seed: int) -> list[tuple[Ints, Fl
 
 
 def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> Floats:
-    """By set of weights (n, states, A), the gradient by all parameters, shape (n, parameters)."""
+    """Gradients in the parameters for n sets of weights (n, states, A), shape (n, parameters)."""
     told = {} if world.masks is None else {"action_masks": world.masks[shown]}
     tensor, _ = policy.obs_to_tensor(world.observations[shown])
     logs = policy.get_distribution(tensor, **told).distribution.logits
@@ -431,17 +431,17 @@ def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> 
     return np.asarray(th.stack(found).double().cpu().numpy())
 
 
-# --- how often ------------------------------------------------------------------------------------
+# --- how often to compare -------------------------------------------------------------------------
 
-# Comparisons may take this share of a training, by the figures below, which are rather high for
-# comparisons and rather low for trainings. They go by no clock: the same seed gives the same file.
+# The share of training time for comparisons, by the estimates below: high ones for comparisons, low
+# ones for training steps. No clock is used, so the same seed gives the same file.
 SHARE = 0.1
 SECONDS_IN_ANY_CASE = 5e-3
-SECONDS_OF_NETWORKS = 2e-2  # likewise
+SECONDS_OF_NETWORKS = 2e-2  # the same for networks
 
 
 def seconds_per_step(model: BaseAlgorithm) -> float:
-    """What a step of training takes at least."""
+    """A lower estimate of the time of a training step."""
     engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
     if engine.startswith("compiled but"):
         return 2e-5
@@ -451,7 +451,7 @@ def seconds_per_step(model: BaseAlgorithm) -> float:
 
 
 def seconds_of_comparison(world: KnownWorld, model: BaseAlgorithm, *, explores: bool) -> float:
-    """What a comparison takes at most."""
+    """An upper estimate of the time of a comparison."""
     per_state = world.model.n_actions * world.model.n_outcomes
     n_states = int(world.model.reachable.sum())
     visits = 7e-9 * world.horizon * n_states * per_state
@@ -462,7 +462,7 @@ def seconds_of_comparison(world: KnownWorld, model: BaseAlgorithm, *, explores: 
     else:
         seconds += (3e-5 if explores else 3e-6) * n_states
     if model.gamma == 1:  # type: ignore[attr-defined]
-        seconds *= 2  # first it looks where episodes surely end
+        seconds *= 2  # first it finds the states from which every episode ends
     if is_network(model):
         seconds += 1e-3 + 5e-6 * world.model.n_states
     if isinstance(model, OnPolicyAlgorithm):

@@ -57,19 +57,19 @@ from pipeline.train_spec import TrainSpec, is_plain
 
 # Limit for the array with the observations of all states.
 MOST_BYTES_OBSERVED = 1 << 30
-# Planning backwards from the time limit: steps x outcomes of all states and actions; a second does
-# some hundred million. Beyond the first number, a shorter method is tried.
+# Backups of backward induction (steps x outcomes of all states and actions); a second does some
+# hundred million. Above FEW_BACKUPS, a faster method is tried first.
 FEW_BACKUPS = 200_000_000
 MOST_BACKUPS = 20_000_000_000
-# Outcomes of all states and actions, times steps, up to which further returns are computed. It
-# takes a millisecond on a small model, and about two seconds at most.
+# The most steps x outcomes of all states and actions for which `OtherReturns` are computed: in a
+# millisecond on a small model, and in about two seconds at most.
 MOST_OUTCOMES_OF_OTHERS = 600_000_000
-# Planning to measure the cost of a discount: the number of outcomes of all states and actions that
-# takes a tenth of a second, and the score below which there is a note.
+# For `discount_note`: the most outcomes of all states and actions (planning takes a tenth of a
+# second), and the score below which there is a note.
 MOST_OUTCOMES_PLANNED = 250_000
 LOW_SCORE = 0.95
-# Cached evaluators of plain runs: runs that share a process compute the optimum once. Models with
-# more states have large arrays, and are not cached.
+# The most cached evaluators of plain runs, and the most states of their models. By caching, runs in
+# one process compute the optimum once; larger models would need too much memory.
 MOST_KEPT = 8
 MOST_STATES_KEPT = 20_000
 
@@ -82,23 +82,23 @@ class ExactEvaluator:
     observations: NDArray[Any]  #: of each state, states along the first axis
     horizon: int  #: the time limit
     success: Bools | None  #: the outcomes that count as success, shape (S, A, K), or None
-    yardstick: Yardstick  #: the best possible and the baseline's return
+    yardstick: Yardstick  #: the returns of optimum and baseline
     layout: GridLayout | None = None  #: where the states lie on a map, for grid worlds
     masks: Bools | None = None  #: action masks, shape (S, A), for agents that use them
-    scale: HiddenScale | None = None  #: where observations hide the state
+    scale: HiddenScale | None = None  #: the optima if observations hide the state
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """Evaluate the agent's current policy exactly."""
         return self._worth(self.policy(agent, deterministic))
 
     def at_the_end(self, agent: BaseAlgorithm) -> Evaluation:
-        """Evaluate the final policy, and compute what else is asked of it."""
+        """Evaluate the final policy, and compute its `other_returns`."""
         return replace(self(agent), others=self.other_returns(agent))
 
     def other_returns(self, agent: BaseAlgorithm) -> OtherReturns:
         """The returns of the agent's stochastic policy, and of its greedy one under its discount.
 
-        None of them where the model is large.
+        Empty if the model is large.
         """
         if self.model.prob.size * self.horizon > MOST_OUTCOMES_OF_OTHERS:
             return OtherReturns()
@@ -162,7 +162,7 @@ class ExactEvaluator:
 
 
 def _observation_bytes(space: spaces.Space[Any]) -> int:
-    """Bytes of one observation; 0 if the space does not say."""
+    """Bytes of one observation; 0 if unknown."""
     if isinstance(space, spaces.Dict):
         return sum(map(_observation_bytes, space.spaces.values()))
     if isinstance(space, spaces.Tuple):
@@ -178,7 +178,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
 
 
 def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
-    """As `exact_evaluator`, of the environment without wrappers around the vector of several."""
+    """Like `exact_evaluator`, but ignores VecEnv wrappers."""
     with closing(make_single_env(spec)) as env:
         model, horizon = transition_model(env), time_limit(env)
         if model is None or horizon is None:

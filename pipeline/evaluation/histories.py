@@ -1,11 +1,10 @@
-"""Judges agents that remember observations, exactly, by all histories that may come about.
+"""Evaluates agents with memory exactly, over all possible histories of observations.
 
-A history is what was observed since the episode began. A greedy agent's action follows from it, so
-the histories of a policy are a tree, whose branches are what may be observed next. The evaluation
-follows all of them, step by step, with the chance of each state in each. Histories after which the
-agent remembers the same (such as those with the same last observations, where these are stacked)
-become one. Nothing is left out, however rare. Where there are too many histories, episodes are
-sampled instead.
+A history is the sequence of observations since the episode began. It determines a greedy agent's
+action, so the histories of a policy form a tree that branches by the next observation. The
+evaluation expands this tree step by step, with the probability of each state in each history. It
+merges histories with equal memory (for stacked observations, equal last observations), and omits
+none, however improbable. If there are too many histories, episodes are sampled instead.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.yardstick import Yardstick
 from pipeline.train_spec import TrainSpec, remembers
 
-# At one step, and in all: a second or two. To ask for one takes as long as for some.
+# Histories at one step, and in all: a second or two. Each call of `predict` counts as at least 10.
 MOST_HISTORIES, MOST_IN_ALL, LEAST_AT_ONCE = 3_000, 30_000, 10
 
 
@@ -39,10 +38,10 @@ BY_HISTORIES = (
 
 
 def world_of_memory(spec: TrainSpec, agent: BaseAlgorithm) -> ExactEvaluator | None:
-    """The environment of an agent with memory, if its model is known and nothing else hides it."""
+    """The exact evaluator of an agent with memory; None if histories cannot be followed."""
     special, home = spec.hyperparams, type(agent).__module__.partition(".")[0]
     is_covered = special.normalize is not None or bool(special.vec_env_wrapper)
-    # What others remember has a form that is not known, and some draw their actions.
+    # The memory of other agents has an unknown form, and some sample their actions.
     is_known = home in (*KNOWN_LIBRARIES, "sb3_contrib") and not isinstance(agent, RandomAgent)
     if is_covered or not is_known or not (has_memory(agent) or remembers(spec)):
         return None
@@ -50,7 +49,7 @@ def world_of_memory(spec: TrainSpec, agent: BaseAlgorithm) -> ExactEvaluator | N
 
 
 class HistoryEvaluator(SampledEvaluator):
-    """Evaluates an agent with memory by its histories, or by episodes where those are too many."""
+    """Evaluates an agent with memory by histories, or by episodes if there are too many."""
 
     def __init__(self, spec: TrainSpec, env: VecEnv, world: ExactEvaluator) -> None:
         super().__init__(spec, env, _scale_of_memory(world))
@@ -58,7 +57,7 @@ class HistoryEvaluator(SampledEvaluator):
         self._was_exact = False
 
     def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
-        """Whether the training has done enough steps; of exact evaluations always."""
+        """Whether the training has done enough steps; always, if the last evaluation was exact."""
         may_sample = super().can_afford(model, n_episodes)
         return self._was_exact or may_sample
 
@@ -71,14 +70,14 @@ class HistoryEvaluator(SampledEvaluator):
         return self.exact(model) or super().at_the_end(model)
 
     def exact(self, model: BaseAlgorithm) -> Evaluation | None:
-        """The agent's expected return; None if its histories are too many."""
+        """The exact evaluation; None if there are too many histories."""
         found = by_histories(self.spec, model, self.world)
         self._was_exact = found is not None
         return None if found is None else found.measured_by(self.yardstick)
 
 
 def by_histories(spec: TrainSpec, agent: BaseAlgorithm, world: ExactEvaluator) -> Evaluation | None:
-    """What an agent with memory expects; None if its histories are too many."""
+    """The exact evaluation of an agent with memory; None if there are too many histories."""
     with closing(make_single_env(spec)) as single:
         space = single.observation_space
     found = _of_histories(world, agent, spec.hyperparams.frame_stack or 1, space)
@@ -99,7 +98,7 @@ def _scale_of_memory(world: ExactEvaluator) -> Yardstick:
 
 
 class _Memory:
-    """What an agent remembers in each of n histories."""
+    """The memory of an agent in each of n histories."""
 
     def __init__(self, agent: BaseAlgorithm, n_stacked: int, space: Any) -> None:
         self.agent, self.n_stacked, self.space = agent, n_stacked, space
@@ -107,7 +106,7 @@ class _Memory:
         self.stack: NDArray[Any] | None = None  # shape (n, ...)
 
     def actions(self, observations: NDArray[Any], is_first: bool) -> Ints:
-        """The greedy action in each history, and remember the observation."""
+        """Add observations to the memory; returns the greedy action in each history."""
         n = len(observations)
         if self.n_stacked > 1:
             stacked = StackedObservations(n, self.n_stacked, self.space)
@@ -125,14 +124,14 @@ class _Memory:
         return np.asarray(actions, dtype=np.int64).reshape(n)
 
     def keep(self, places: Ints) -> None:
-        """Go on from the histories at these places, which may repeat."""
+        """Continue with the histories at these indices, which may repeat."""
         if self.stack is not None:
             self.stack = self.stack[places]
         if self.state is not None:
             self.state = tuple(part[:, places] for part in self.state)
 
     def keys(self) -> NDArray[Any]:
-        """A row of bytes for what is remembered in each history."""
+        """The memory in each history, as a row of bytes."""
         parts = [] if self.stack is None else [self.stack]
         parts += [] if self.state is None else [np.swapaxes(part, 0, 1) for part in self.state]
         rows = [np.ascontiguousarray(part.reshape(len(part), -1)).view(np.uint8) for part in parts]
@@ -142,14 +141,14 @@ class _Memory:
 def _of_histories(
     world: ExactEvaluator, agent: BaseAlgorithm, n_stacked: int, space: Any
 ) -> tuple[float, float, float, float] | None:
-    """Mean return, mean squared return, mean length and success; None if too large."""
+    """Mean return, mean squared return, mean length, success rate; None if impossible."""
     model, variance = world.model, world.model.reward_variance
     groups = observation_groups(world.observations, model.reachable)
     groups = np.arange(model.n_states) if groups is None else groups
-    if takes_masks(agent):  # masks say more of the state than observations
+    if takes_masks(agent):  # masks reveal more of the state than observations
         return None
     memory = _Memory(agent, n_stacked, space)
-    # By history and state: the chance, and with it the return and the squared return so far.
+    # Per history and state: the probability p, p x mean return, and p x mean squared return so far.
     state = np.flatnonzero(model.initial)
     history, first = _numbered(groups[state])
     moments = np.stack([model.initial[state], 0 * state, 0 * state]).astype(np.float64)
@@ -182,8 +181,8 @@ def _of_histories(
         if not goes_on.any():
             break
         state, moments = model.next_state[entry][goes_on].astype(np.int64), after[:, goes_on]
-        # A new history for each old one and each observation; then those that are the same for the
-        # agent, who will observe the same and remembers the same, become one.
+        # A new history for each old one and each next observation; then histories with the same
+        # memory and the same next observation are merged.
         parent = history[at][goes_on]
         history, first = _numbered(np.stack([parent, groups[state]], axis=1))
         parents, seen = parent[first], groups[state[first]]
@@ -200,7 +199,7 @@ def _of_histories(
 
 
 def _numbered(rows: NDArray[Any]) -> tuple[Ints, Ints]:
-    """The number of each row among the different ones, and where each of these comes first."""
+    """The index of each row among the unique rows, and the first position of each unique row."""
     rows = np.ascontiguousarray(rows.reshape(len(rows), -1))
     as_bytes = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
     _, first, numbers = np.unique(as_bytes, return_index=True, return_inverse=True)

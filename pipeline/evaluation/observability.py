@@ -1,7 +1,7 @@
-"""The yardstick where observations hide the state: what an agent can reach by what it observes.
+"""The yardstick under partial observability: the optima of policies of observations.
 
-Three optima are told: of agents that see the state, of those that remember all observations, and of
-those that go by the present observation alone. An agent is measured by the one of its kind.
+There are three optima: of policies of the state, of policies of all observations so far, and of
+memoryless policies, which use only the current observation. An agent's score uses that of its kind.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ class HiddenScale:
 
     full_optimum: float
     baseline: float
-    memory: Bracket  # of agents that remember all observations
-    now: Bracket  # of agents that go by the present observation
-    best: BestMemoryless | None  # the policy found for those; None where it was not searched
+    memory: Bracket  # of policies of all observations so far
+    now: Bracket  # of memoryless policies
+    best: BestMemoryless | None  # the best memoryless policy found; None if none was searched
 
     def yardstick(self, with_memory: bool) -> Yardstick:
-        """The scale for agents that remember observations, or for those that do not."""
+        """The yardstick for agents with memory, or for memoryless agents."""
         lower, upper = self.memory if with_memory else self.now
         hidden = HiddenState(self.full_optimum, (self.memory.lower, self.memory.upper), with_memory)
         return Yardstick(upper, self.baseline, None if lower == upper else lower, hidden=hidden)
 
     @property
     def note(self) -> str | None:
-        """What a random policy can do, in one line, if the best one by observations is random."""
+        """A line on the best memoryless policy, if it is stochastic."""
         best = self.best
         if best is None or not best.needs_chance:
             return None
@@ -57,13 +57,13 @@ def hidden_scale(
     full_optimum: float,
     baseline: float,
 ) -> HiddenScale | None:
-    """The optima by what is observed; None if the best policy by observations is the best of all.
+    """The optima under partial observability; None if a memoryless policy reaches the optimum.
 
     Args:
         model: the decision process.
-        observations: what is observed in each state, states along the first axis.
+        observations: the observation of each state, states along the first axis.
         horizon: the time limit.
-        full_optimum: the optimum of agents that see the state.
+        full_optimum: the optimum of policies of the state.
         baseline: the return of the best random or constant policy.
     """
     groups = observation_groups(observations, model.reachable)

@@ -108,13 +108,13 @@ class OfLastPolicy(Generic[Result]):
         return result
 
 
-# Largest input of a network at once, and in total: beyond it, querying all states takes longer than
-# playing episodes.
+# The most input numbers of a network per call, and in total; above, playing episodes is faster than
+# querying all states.
 MOST_AT_ONCE = 1 << 26
 MOST_NUMBERS = 400_000_000
-# A plan that changes with the step has an action for each step and state.
+# The most steps x states of a plan that depends on the time step.
 MOST_PLANNED = 1 << 27
-# States x steps over which probability may spread if actions are random.
+# The most states x steps if actions are random, because these reach many states.
 MOST_AT_RANDOM = 30_000_000
 
 
@@ -130,19 +130,19 @@ def obstacle(
     if reason := _cannot_be_asked(agent, masks):
         return reason
     if is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
-        return f"to ask a network about {n_states:,} states takes longer than to play"
+        return f"querying a network in {n_states:,} states takes longer than playing"
     if isinstance(agent, PlanningAgent):
         if agent.policy.is_stationary or n_states * horizon <= MOST_PLANNED:
             return ""
         return f"a plan for {horizon:,} steps in {n_states:,} states is too large"
     is_random = isinstance(agent, RandomAgent) or not deterministic
     if is_random and n_states * horizon > MOST_AT_RANDOM:
-        return f"random actions come to too many of {n_states:,} states in {horizon:,} steps"
+        return f"random actions reach too many of {n_states:,} states in {horizon:,} steps"
     return ""
 
 
 def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
-    """Why `predict` fails for all states at once; for the user's agents, tries it."""
+    """Why `predict` fails for all states at once, or empty; tries it for the user's agents."""
     if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return ""
     try:
@@ -201,7 +201,7 @@ def policy_matrix(
 
 
 def acts_by(agent: BaseAlgorithm) -> str:
-    """What `policy_matrix` without ``deterministic`` is, in words."""
+    """The stochastic policy of `policy_matrix`, in words."""
     if isinstance(agent, PlanningAgent | RandomAgent):
         return "the same policy"
     draws = isinstance(agent, SoftmaxAlgorithm | PreferenceBandit)

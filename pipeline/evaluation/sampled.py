@@ -28,7 +28,7 @@ from pipeline.evaluation.yardstick import Yardstick
 from pipeline.finite_numbers import FinitePlayer, check_numbers
 from pipeline.train_spec import TrainSpec
 
-# A mean so many standard errors above an upper bound is an error.
+# A mean this many standard errors above an upper bound shows that the bound is wrong.
 BEYOND_CHANCE = 6.0
 # Fewer episodes may all have begun in states of high return.
 FEWEST_TO_TELL = 10
@@ -36,13 +36,13 @@ FEWEST_TO_TELL = 10
 
 @dataclass(frozen=True)
 class OtherReturns:
-    """Exact returns of the final agent beside that of its greedy policy; None where not known."""
+    """Further exact returns of the final agent; None where unknown."""
 
-    acts_by: str | None = None  # what it acts by in training, in words: "epsilon 0.01"
-    stochastic_return: float | None = None  # of the policy that it acts by in training
-    discount: float | None = None  # the agent's
+    acts_by: str | None = None  # its policy in training, in words: "epsilon 0.01"
+    stochastic_return: float | None = None  # of its policy in training
+    discount: float | None = None  # the agent's discount
     discounted_return: float | None = None  # of the greedy policy, under that discount
-    discounted_optimum: float | None = None  # the highest; None where the state is hidden
+    discounted_optimum: float | None = None  # under that discount; None if the state is hidden
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Evaluation:
 
     @property
     def beats_optimum(self) -> bool:
-        """Whether the mean exceeds the upper bound of all policies by more than chance.
+        """Whether the mean is significantly above the upper bound of the optimum.
 
         If so, the bracket is wrong, or belongs to another environment.
         """
@@ -134,7 +134,7 @@ class Evaluation:
 def evaluate(
     model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int | None, deterministic: bool = True
 ) -> Evaluation:
-    """Play ``n_episodes``, determined by the seed; with seed None, the environments go on."""
+    """Play ``n_episodes``, determined by the seed; with None, environments are not reseeded."""
     successes: list[bool] = []
 
     def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:
@@ -200,7 +200,7 @@ class Shares(NamedTuple):
     """Evaluation steps per training step."""
 
     usual: float  # for every training
-    at_first: float  # for short trainings, until the steps reach `STEPS_AT_FIRST`
+    at_first: float  # for short trainings, up to `STEPS_AT_FIRST` evaluation steps
 
 
 # Chosen by the time of an evaluation step relative to a training step, so that evaluations take at
@@ -241,7 +241,7 @@ def allowed_steps(n_trained: float, shares: Shares) -> float:
     return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
 
-# The final evaluation gets the rest, even if the others exceeded their share.
+# Of the allowed steps; the final evaluation gets the rest, but at least the other half.
 PART_DURING_TRAINING = 1 / 2
 
 # Episodes of an evaluation: first this many, then more until the standard error is small.
@@ -261,7 +261,7 @@ class SampledEvaluator:
         self.yardstick = yardstick or bracketed_yardstick(spec)
         self.seed = spec.seed
         self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
-        # Explicit settings of when or how long to evaluate take precedence.
+        # Explicit intervals or numbers of episodes take precedence over the limit.
         self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
         self.training_steps = spec.hyperparams.n_timesteps
         self.training_episodes = spec.hyperparams.n_episodes
@@ -351,7 +351,7 @@ def is_sure(evaluation: Evaluation, precision: float) -> bool:
 
 
 def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
-    """How many environments to play at once: at most one for each episode."""
+    """The number of parallel evaluation environments: at most one for each episode."""
     return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
 
 
@@ -360,8 +360,8 @@ class CompiledCopy:
     """Evaluation environments and their compiled counterpart."""
 
     env: DummyVecEnv
-    world: Any  # what `agents.compiled.loop` steps
-    seen: Any  # how its observations are read
+    world: Any  # the compiled environments, for `agents.compiled.loop`
+    seen: Any  # converts their observations
 
 
 def compiled_copy(env: VecEnv) -> CompiledCopy | None:
@@ -384,7 +384,7 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
 def evaluate_compiled(
     model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
 ) -> Evaluation:
-    """Like `evaluate`, in compiled code; the library decides near ties of a network."""
+    """Like `evaluate`, in compiled code; the library's network decides near ties."""
     from agents.compiled.greedy_play import play_episodes
     from agents.compiled.records import DECIMALS
     from agents.networks.network_worlds import NetworkEnvStates
@@ -393,7 +393,7 @@ def evaluate_compiled(
     env, n_envs = copy.env, copy.env.num_envs
     if seed is not None:
         env.seed(seed)
-    # The same numbers per environment as in `evaluate_policy`.
+    # As many episodes per environment as in `evaluate_policy`.
     wanted = (n_episodes + np.arange(n_envs)) // n_envs
     states = NetworkEnvStates(env, copy.world, copy.seen)
     acting = cast(Any, model).greedy_player(copy.seen)

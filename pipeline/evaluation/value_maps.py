@@ -1,7 +1,7 @@
 """Computes exact values and actions of an agent in every state of a map, and the optimal ones.
 
-A value means the same for tables and networks: the expected return of the agent's deterministic
-policy from that state on, with the whole time limit left. The agent's own estimates are not used.
+For tables and networks alike, the value of a state is the expected return of the agent's
+deterministic policy from there, with the whole time limit left; not the agent's own estimate.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pipeline.files import replacing
 
 # On larger maps, cells are too small to see, and the data too large to store.
 MAX_STATES = 2500
-# More moments than a slider can resolve.
+# More maps than a slider can resolve.
 MAX_MAPS = 400
 SECONDS_BETWEEN_WRITES = 1.0
 
@@ -33,7 +33,7 @@ class ValueMap:
     """An agent's policy in every state of a grid world, with the optimal one."""
 
     layout: GridLayout  #: where the states lie on the map
-    matters: Bools  #: where the agent may have to act, shape (S,); other states are ignored
+    matters: Bools  #: the reachable states, shape (S,); other states are ignored
     initial: Floats  #: probabilities of the starting states, shape (S,)
     values: Floats  #: the expected return of the agent from each state on, shape (S,)
     actions: Ints  #: the agent's action there at the first step, shape (S,)
@@ -105,7 +105,7 @@ class ValueMapRecorder:
         self._last_write = time.monotonic()
 
     def record(self, agent: BaseAlgorithm, timesteps: int) -> None:
-        """Record the map of the current agent after so many steps."""
+        """Record the map of the current agent after ``timesteps`` steps."""
         if len(self._maps) >= MAX_MAPS:
             self._maps = self._maps[1::2]
             self._stride *= 2

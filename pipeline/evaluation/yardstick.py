@@ -5,29 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-# A run with a lower score has failed; a share of episodes from which on all are meant.
+# A run with a lower score has failed; at least this share of episodes counts as all.
 FAILED, NEARLY_ALL = 0.05, 0.99
 
 # Returns closer than this differ only by rounding.
 ROUNDING = 1e-12
 
-# If the gap between baseline and optimum is a smaller share of them, scores mean nothing.
+# If the gap is smaller, relative to baseline and optimum, scores are meaningless.
 LEAST_WAY = 0.01
 
 
 def bracket_mark(is_proven: bool) -> str:
-    """What is said behind the figures of a bracketed optimum."""
+    """The remark behind figures of a bracketed optimum."""
     return "(bracketed)" if is_proven else "(bracketed; the upper end is not proven)"
 
 
 @dataclass(frozen=True)
 class HiddenState:
-    """What other agents can reach, where observations hide the state."""
+    """The optima of other kinds of agents, if observations hide the state."""
 
-    full_optimum: float  # of agents that see the state
-    # bounds of the optimum of agents that remember all observations; equal where it is known
+    full_optimum: float  # of policies of the state
+    # bounds of the optimum of policies of all observations so far; equal if it is known
     memory_optimum: tuple[float, float]
-    with_memory: bool  # whether the yardstick is for agents that remember, else for others
+    with_memory: bool  # whether the yardstick is for agents with memory
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Yardstick:
     # the highest expected return of any policy under the time limit; if that is not known, an upper
     # bound of it
     optimum: float
-    baseline: float  # the highest of uniformly random actions and of each constant action
+    baseline: float  # the highest return of uniformly random or constant actions
     # if the optimum is not known, a return that some policy has reached: the two bracket the
     # optimum. None if the optimum is known.
     at_least: float | None = None
     is_proven: bool = True  # whether the upper end of the bracket, or the optimum, is proven
-    # if observations hide the state: then the optimum is that of policies that go by observations
+    # set if observations hide the state; ``optimum`` is then that of policies of observations
     hidden: HiddenState | None = None
 
     def gap(self, expected_return: float) -> float:
@@ -72,7 +72,7 @@ class Yardstick:
 
     @property
     def mark(self) -> str:
-        """What is said behind the figures of a bracket; empty without one."""
+        """The remark behind figures of a bracket; empty without one."""
         return "" if self.at_least is None else bracket_mark(self.is_proven)
 
     def figures(self, expected_return: float) -> dict[str, Any]:
@@ -92,7 +92,7 @@ class Yardstick:
 
 
 def with_memory(figures: dict[str, Any]) -> dict[str, Any]:
-    """Figures of a run, measured by what agents that remember observations can reach."""
+    """The figures of a run relative to the optimum of agents with memory."""
     if figures.get("measured_by") != "observation":
         return figures
     lower, upper = figures["memory_optimum_at_least"], figures["memory_optimum"]

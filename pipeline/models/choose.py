@@ -68,8 +68,8 @@ class ModelRequest:
     env_id: str | None = None
     log_folder: Path = Path("logs")  # the folder above all runs
     run_number: int = 0  # number of the run; 0 for the newest, -1 for one without a number
-    # the model at the end of training, the best one, the last checkpoint, or the checkpoint after
-    # so many steps
+    # the model at the end of training, the best one, the last checkpoint, or the checkpoint after a
+    # number of steps
     which: Which = "final"
     # a file of VecNormalize statistics, instead of those beside the model
     statistics: Path | None = None
@@ -135,7 +135,7 @@ def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
     try:
         run = Run.find(request.log_folder, algo, env_id, request.run_number)
     except UserError:
-        # An unknown agent or environment is a better reason than a missing run.
+        # An error about an unknown agent or environment says more than one about a missing run.
         check_algorithm(algo)
         check_env_id(env_id)
         raise
@@ -162,7 +162,7 @@ def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) 
             entry = without_auto(read_hyperparams(algo, env_id))
         raw = {key: value for key, value in entry.items() if key != "normalize"}
     hyperparams = split(raw)
-    # For evaluation, these override all others.
+    # In evaluation environments, these override all others.
     env_kwargs = {**hyperparams.eval_env_kwargs, **request.env_kwargs}
     return TrainSpec(
         algo=algo,
@@ -183,8 +183,8 @@ def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenMod
     if path is None:
         if normalize is not None and normalize.get("norm_obs", True):
             raise UserError(
-                f"{chosen.path} was trained on normalised observations, and the statistics of them "
-                "are not there: name their file with --vec-normalize"
+                f"{chosen.path} was trained on normalised observations, but their statistics "
+                "are missing: name their file with --vec-normalize"
             )
         return chosen
     statistics = read_statistics(path, chosen.run)
@@ -228,7 +228,7 @@ def load_to_continue(spec: TrainSpec, file: ModelFile, env: VecEnv, **kwargs: An
     """Load the agent with its replay buffer, on ``env`` and with these hyperparameters."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-    # The networks come from the file, so their shape cannot change.
+    # The networks come from the file, so these arguments cannot apply.
     kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
     if "n_steps" in kwargs and issubclass(agent_class(spec.algo), OffPolicyAlgorithm):
         # The library chooses the buffer class by ``n_steps``, and would keep the file's class.

@@ -58,7 +58,7 @@ def run_of(path: Path) -> Run | None:
     if not isinstance(env_name, str):
         return None
     if env_name != environment_name(env_name):
-        # It becomes part of file names.
+        # ``env_name`` becomes part of file names.
         raise UserError(f"{folder / RECORD} is damaged: env_name is {env_name!r}")
     return Run(folder, env_name)
 
@@ -112,7 +112,7 @@ def recorded_run(run: Run | None) -> RecordedRun:
 
 @contextmanager
 def _telling_way_out() -> Iterator[None]:
-    """Add to the error about a changed file what the user can do."""
+    """Add advice to the error about a changed file."""
     try:
         yield
     except DamagedFileError as error:
@@ -127,7 +127,7 @@ def check_digest(run: Run | None, path: Path) -> None:
 
 
 def read_recorded(run: Run | None, path: Path, limit: int) -> bytes:
-    """Read a whole file of at most so many bytes; checks the digest of a run's file."""
+    """Read a whole file of at most ``limit`` bytes; checks the digest of a run's file."""
     if run is None:
         return read_file(path, limit)
     with _telling_way_out():

@@ -116,7 +116,7 @@ def own_classes(
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
-    # No others, because a file may have parts of a network called with its arguments.
+    # No other classes: a file decides which of them are called, and with which arguments.
     kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = {module.name for module in modules} | {algorithm.__module__}
 
@@ -166,11 +166,11 @@ def load_model(
     except Exception as error:  # a file of another agent can fail anywhere in the library
         key, way_out = getattr(error, "key", None), ""
         if key in _CLASS_KEYS:
-            way_out = "; a class of yours is admitted where you name its module"
+            way_out = "; to admit a class of yours, name its module"
             way_out += ": --gym-packages MODULE"
         elif key in algorithm_parameters(algorithm):
             value = "3e-4" if key == "learning_rate" else "VALUE"
-            way_out = f"; train.py -i goes on with another: -params {key}:{value}"
+            way_out = f"; train.py -i continues with another value: -params {key}:{value}"
         what = f"{file.path} cannot be loaded as a {algo} agent: {one_line(error)}"
         raise UserError(f"{what}{way_out}") from error
 
@@ -238,9 +238,9 @@ def load_to_play(
     saved, given = map(_shown_space, spaces)
     if saved != given and saved is not None:
         raise UserError(
-            f"{file.path} was trained on observations of {saved}, and the environment as it is "
-            f"made here gives {given}: args.yml and config.yml beside the zip would say how it was "
-            "made there, or --env-kwargs"
+            f"{file.path} was trained on observations of {saved}, and the environment here gives "
+            f"{given}: put the run's args.yml and config.yml beside the zip, or give the right "
+            "--env-kwargs"
         )
     unused = ConstantSchedule(0.0)
     replaced: dict[str, Any] = {
@@ -275,7 +275,7 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
     buffer: Any = model.replay_buffer
     if buffer.n_envs != model.n_envs:
         raise UserError(
-            f"{path} was filled by {buffer.n_envs} environments at once, and cannot be by "
+            f"{path} was filled by {buffer.n_envs} environments at once, and does not fit "
             f"{model.n_envs}: give -params n_envs:{buffer.n_envs}"
         )
     kinds = [(type(one).__name__, getattr(one, "n_steps", 1)) for one in (buffer, wanted)]
@@ -290,7 +290,7 @@ class Statistics:
 
     path: Path  # the file that was read
     settings: Mapping[str, Any]  # arguments of VecNormalize
-    # of observations, or by key; None if observations are not normalised
+    # of observations, by key for Dict spaces; None if observations are not normalised
     observations: RunningMeanStd | dict[str, RunningMeanStd] | None
     returns: RunningMeanStd  # of discounted returns, by which rewards are divided
 
@@ -346,7 +346,7 @@ def take_over(env: VecEnv, statistics: Statistics) -> None:
 
 
 def with_normalised_rewards(env: VecEnv) -> VecEnv:
-    """The environments with normalised rewards, as in training, and returns of these."""
+    """The environments with normalised rewards, as in training; returns are sums of these."""
     from stable_baselines3.common.vec_env import VecMonitor, unwrap_vec_normalize
 
     normalization = unwrap_vec_normalize(env)

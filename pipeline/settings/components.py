@@ -162,7 +162,7 @@ def _components(
             is_variable = parameter.kind in {parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD}
             if parameter.default is parameter.empty and name not in kwargs and not is_variable:
                 raise UserError(f"{place}: argument {name!r} is missing")
-            kind = str(parameter.annotation).partition("[")[0]  # accepts functions only
+            kind = str(parameter.annotation).partition("[")[0]  # argument accepts only functions
             if kwargs.get(name) is not None and "Callable" in kind and "|" not in kind:
                 raise UserError(f"{place}: {name} is a function, which settings cannot hold")
         components.append(_Component(cls, build_value(kwargs, extra_packages, place), place))
@@ -303,7 +303,7 @@ def confined(value: Any, folder: Path | None, where: str, name: str = "") -> Any
         raise UserError(f"{where} {what}, unlike {shown(str(value))}")
     folder = Path(_scratch().name) if folder is None else folder
     leads_out = bool(path.anchor) or ".." in path.parts or "\0" in str(value)
-    # After following links.
+    # Links are followed first.
     if leads_out or not (folder / value).resolve().is_relative_to(folder.resolve()):
         raise UserError(f"{where} must lie inside the run folder, unlike {shown(str(value))}")
     return str(folder / value)

@@ -19,7 +19,7 @@ from pipeline.errors import UserError, did_you_mean, shown
 from pipeline.settings.values import check_arguments, check_range, coerce, contains_name
 from pipeline.settings.yaml import read_yaml, settings_bytes
 
-# Constructor arguments that have another source, and its name.
+# Constructor arguments that a flag or another key sets, and its name.
 _SET_ELSEWHERE = {
     "action_noise": "noise_type and noise_std",
     "env": "--env",
@@ -145,7 +145,7 @@ def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
         if not (isinstance(name, str) and is_right):
             raise UserError(
                 f"{where} must be the dotted name of a class, or that name with its arguments "
-                f"indented below it, or a list of such; not {shown(item)}"
+                f"indented below it, or a list of these; not {shown(item)}"
             )
         found.append(ComponentSpec(name, kwargs))
     return tuple(found)
@@ -281,7 +281,7 @@ def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, 
 
 
 def _read_tuned_on(entries: Mapping[str, Any], where: str) -> dict[str, tuple[range, ...]]:
-    """Read the seeds of each entry's tuning: ``{first: 0, count: 10}``, or a list of such."""
+    """Read the tuning seeds of each entry: ``{first: 0, count: 10}``, or a list of these."""
     said = entries[TUNED_ON]
     if not isinstance(said, dict):
         raise UserError(f"{where} must map entries to seeds, not be {shown(said)}")
