@@ -45,7 +45,7 @@ _ANY_PORT = 13000  # of Optuna's proxy
 ASKED, JUDGED_BY = "asked", "judged by"
 # Attributes of a trial, besides Optuna's own data.
 DRIVER, FAILURE, FIGURES = "driver", "failure", "figures"
-# By seed with the optimum, the steps to the threshold.
+# By each seed with the optimum, the steps to the threshold.
 AT_OPTIMUM = "at optimum"
 SETTINGS, SECONDS = "settings", "seconds"
 
