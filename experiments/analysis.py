@@ -63,7 +63,7 @@ from verdicts import (
 # The metrics on the scale of the best random or constant policy.
 ON_THE_SCALE = ("final", "best")
 
-# The module of agents whose policies do not depend on experience.
+# Prefixes of the entry points of agents that do not learn.
 FIXED_POLICIES = ("agents.planning:", "agents.reference:")
 
 
@@ -154,7 +154,7 @@ class Evidence:
     is_score: bool  #: whether these ends define the score
     paired: bool  #: whether runs of one seed share their randomness
     n_environments: int  #: number of environments of the study, which share its error rate
-    against: str = ""  #: the only agent whose mean the others are compared with
+    against: str = ""  #: the only agent to compare the others with; empty for all pairs
 
     def share(self, level: float) -> float:
         """This environment's share of a look's error rate."""
@@ -222,7 +222,7 @@ def _first(table: pd.DataFrame, column: str) -> float | None:
 def bounded_mean(values: Floats, ends: Ends, *, exact: bool = False) -> Estimate:
     """The mean of scores or returns, with an interval valid for every distribution in a range.
 
-    If a run lies outside the range, further runs may lie anywhere: then there is no interval.
+    There is no interval if a run lies outside the range, because then the range is wrong.
     """
     known = values[np.isfinite(values)]
     n_missing = len(values) - len(known)
@@ -324,7 +324,7 @@ def _improvement(scores: Mapping[str, Floats]) -> dict[tuple[str, str], Estimate
 def not_behind(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[str]:
     """The agents to which no other agent is shown to be superior, without a condition.
 
-    Each other agent is behind one of these.
+    Every other agent is shown to be behind some agent.
     """
     behind = {
         p.second if p.verdict == "better" else p.first
@@ -680,7 +680,7 @@ def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tu
 
 
 def runs_to_keep(results: StudyResults) -> list[PlannedRun]:
-    """The stored runs whose agents are kept: the best, median and worst, and what the page loads.
+    """The stored runs whose agents are kept: the best, median and worst, and those for the page.
 
     The page plays the first run, splits the gap of the median final return, and asks the first
     failed run for advice.
@@ -750,7 +750,7 @@ def _failed_runs(results: StudyResults, environment: str) -> list[tuple[list[Pla
 
 
 def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
-    """The advice on the agent of each run; None if there is none."""
+    """The advice on the agent of each run; None for a run without advice."""
     return [_advice_on(run) for run in runs]
 
 

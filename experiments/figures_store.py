@@ -1,6 +1,6 @@
 """Keeps the figures and curves of runs in one SQLite file for each agent and environment.
 
-With ``--keep figures``, a study has such files in place of a folder for each run. A run still
+With ``--keep figures``, a study has these files instead of a folder for each run. A run still
 trains in a folder. When it has ended, the driver writes its row, and removes the folder after the
 commit. After a kill at any moment, a run is in its folder, in the file, or in both: if in both, the
 row in the file counts.
@@ -92,7 +92,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _checked_seeds(path: Path) -> set[int]:
-    """The seeds in a file, whose tables and rows are checked."""
+    """Read the seeds in a file, and check its tables and rows."""
     with _opened(path) as database:
         tables = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"))
         if not tables:  # killed before the first commit

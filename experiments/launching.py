@@ -399,7 +399,7 @@ class EarlyResults:
         return None
 
     def forget(self, planned: PlannedRun) -> None:
-        """Drop what was read of a run, because it is stored."""
+        """Drop the results of a run, because it is stored."""
         self._found.pop(planned.path, None)
 
     def of(self, planned: PlannedRun) -> RunResults | None:

@@ -43,7 +43,7 @@ METRIC_WORDS: dict[str, str] = {
 COSTS = ("regret",)
 
 
-# These metrics use training episodes, the others evaluations.
+# Metrics that are mean returns of training episodes.
 OF_TRAINING = ("training", "last_episodes")
 
 
@@ -173,7 +173,7 @@ class StudySpec:
     first_seed: int = 0  #: the first seed; the others follow it
     #: ``"figures"`` to keep figures and curves of runs in files, and few of their folders.
     keep: Keep | None = None
-    #: Label of the only agent whose mean the others are compared with; empty for all pairs.
+    #: Label of the only agent to compare the others with; empty for all pairs.
     against: str = ""
 
     @property

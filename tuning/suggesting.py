@@ -180,7 +180,7 @@ class Suggestions:
 
     @property
     def n_trials(self) -> int:
-        """The number of trials; a grid has at most as many as points."""
+        """The number of trials; with a grid, at most one more than the number of points."""
         if self.tuning.sampler == "grid":
             return min(self.tuning.n_trials, 1 + len(self.grid))
         return self.tuning.n_trials

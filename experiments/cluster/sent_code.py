@@ -1,8 +1,8 @@
 """The code that runs of a study load: sent with each order by its digests, and compared by workers.
 
 A worker must have the driver's versions of Python, this project and all distributions that a run
-loads, and the same files where settings name files. The user's modules are sent: a worker with
-other contents at their place imports what was sent.
+loads, and the same contents of files that settings name. The user's modules are sent: a worker
+whose own copies differ imports the sent ones.
 """
 
 from __future__ import annotations
