@@ -44,6 +44,7 @@ lint: style types types-elsewhere ## Check style, formatting, types and import c
 # Separate targets, so that make -j2 runs them in parallel.
 style: $(STAMP)
 	$(BIN)/ruff check .
+	$(BIN)/ruff check --preview --select PLW1514 $(PACKAGES) # Windows does not take text for UTF-8
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 

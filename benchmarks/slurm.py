@@ -5,10 +5,9 @@
     python benchmarks/slurm.py                                        # docs/reliability.md
 
 munge, slurmctld and two slurmd are started in a temporary folder, and end with the command. The
-study's jobs are those of docs/cluster.md, smaller. Faults come one by one as runs are done. Then
-one long run loses its job again and again. In the end every file must say what that of an
-undisturbed study on this machine says, no key may be left, and no output lie in the folder where
-the command was given. The exit code is 1 otherwise.
+study's jobs are those of docs/cluster.md, smaller. Faults come one by one as runs are done. In the
+end every file must say what that of an undisturbed study on this machine says, no key may be left,
+and no output lie in the folder where the command was given. The exit code is 1 otherwise.
 """
 
 from __future__ import annotations
@@ -38,9 +37,7 @@ PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scancel", "scontrol", "s
 FAULTS = ["scancel", "preempt", "worker", "requeue", "scancel"]
 FAULTS += ["node", "preempt", "controller", "driver", "scancel"]
 STUDY = "--env FrozenLake-v1 --algos qlearning sarsa -n 2000"
-LONG = "--env FrozenLake-v1 --algos a2c --seeds 1"
 MOST_SECONDS = 1800.0
-WALLTIMES = ("90:00", "1:30:00", "0-01:30")
 CONFIGURATION = """
 ClusterName=yardstick
 SlurmctldHost={host}
@@ -141,18 +138,8 @@ class Slurm:
 
     def jobs(self, node: str = "") -> list[str]:
         """The numbers of the study's running jobs."""
-        words = [
-            "squeue",
-            "-h",
-            "-t",
-            "R",
-            "-p",
-            "normal",
-            "-o",
-            "%i",
-            *(["-w", node] * bool(node)),
-        ]
-        return [line for line in self.said(*words).split() if line.isdecimal()]
+        words = ["-h", "-t", "R", "-p", "normal", "-o", "%i", *(["-w", node] * bool(node))]
+        return [line for line in self.said("squeue", *words).split() if line.isdecimal()]
 
     def wait(self) -> None:
         """Wait until both nodes take jobs."""
@@ -201,7 +188,7 @@ def _kill(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
-def documented_jobs(folder: Path, walltime: str) -> Path:
+def documented_jobs(folder: Path) -> Path:
     """The ``slurm.yml`` of docs/cluster.md for these nodes."""
     page = (ROOT / "docs/cluster.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```yaml\n(jobqueue:.*?)```", page, re.DOTALL)
@@ -209,7 +196,7 @@ def documented_jobs(folder: Path, walltime: str) -> Path:
     settings["jobqueue"]["slurm"] |= {
         "cores": 2,
         "memory": "1GB",
-        "walltime": walltime,
+        "walltime": "90:00",
         "interface": "lo",
         "shared-temp-directory": str(folder / "keys"),
         "local-directory": str(folder / "local"),
@@ -256,12 +243,6 @@ class Study:
         """How many runs are there."""
         return sum(1 for _ in self.folder.glob(f"slurm/{self.name}/runs/*/*/run.json"))
 
-    @property
-    def drafts(self) -> set[str]:
-        """The runs that are under way, or were; by the processes that do them."""
-        places = self.folder.glob(f"slurm/{self.name}/.drafts/*/run.json")
-        return {path.parent.name for path in places}
-
     def suffer(self, fault: str) -> str:
         """Do what a fault says; returns what came of it."""
         cluster = self.cluster
@@ -301,23 +282,6 @@ def disturbed(study: Study, faults: Sequence[tuple[int, str]]) -> None:
         print(f"came too late: {left}")
 
 
-def cancelled(study: Study, n_times: int) -> None:
-    """Let one long run end whose job is cancelled so many times."""
-    n_left, begun, until = n_times, set[str](), time.monotonic() + MOST_SECONDS
-    while study.process.poll() is None and time.monotonic() < until:
-        time.sleep(0.5)
-        if n_left and study.drafts - begun:
-            time.sleep(5)  # it learns for a while
-            begun |= study.drafts
-            n_left -= 1
-            jobs = study.cluster.jobs()
-            for job in jobs:
-                study.cluster.said("scancel", job)
-            print(f"  long run: jobs {', '.join(jobs)} cancelled", flush=True)
-    if n_left:
-        print(f"came too late: {n_left} cancellations")
-
-
 def told(study: Study, folder: Path, n_runs: int) -> bool:
     """Print what there is and what differs; whether all is as it must be."""
     where = folder / "slurm" / study.name
@@ -339,39 +303,26 @@ def told(study: Study, folder: Path, n_runs: int) -> bool:
 
 
 def campaign(folder: Path, args: argparse.Namespace) -> bool:
-    """Do both studies, by SLURM and here."""
+    """Do the study, by SLURM and here."""
     n_seeds = max(args.runs // 2, 1)
-    studies = [(f"{STUDY} --seeds {n_seeds} --no-report --name short", 2 * n_seeds)]
-    if args.cancellations:
-        studies.append((f"{LONG} -n {args.steps} --no-report --name long", 1))
+    words = f"{STUDY} --seeds {n_seeds} --no-report --name short"
+    here = [sys.executable, str(ROOT / "compare.py"), *words.split(), "-f", "here", "-j", "2"]
     places = [round((n + 0.5) * 1.6 * n_seeds / len(args.faults)) for n in range(len(args.faults))]
-    faults = [*zip(places, args.faults, strict=True)]
-    results = []
     with slurm(folder) as cluster:
-        for number, (words, n_runs) in enumerate(studies):
-            documented_jobs(folder, WALLTIMES[number % len(WALLTIMES)])
-            begun = time.monotonic()
-            here = [
-                sys.executable,
-                str(ROOT / "compare.py"),
-                *words.split(),
-                "-f",
-                "here",
-                "-j",
-                "2",
-            ]
-            subprocess.run(
-                here, cwd=folder, env=cluster.environment, check=True, stdout=subprocess.DEVNULL
-            )
-            middle = time.monotonic()
-            study = Study(cluster, folder, words)
-            try:
-                disturbed(study, faults) if number == 0 else cancelled(study, args.cancellations)
-            finally:
-                study.process.kill()
-            results.append(told(study, folder, n_runs))
-            print(f"here {middle - begun:.0f} s, by SLURM {time.monotonic() - middle:.0f} s")
-    return all(results)
+        documented_jobs(folder)
+        begun = time.monotonic()
+        subprocess.run(
+            here, cwd=folder, env=cluster.environment, check=True, stdout=subprocess.DEVNULL
+        )
+        middle = time.monotonic()
+        study = Study(cluster, folder, words)
+        try:
+            disturbed(study, [*zip(places, args.faults, strict=True)])
+        finally:
+            study.process.kill()
+        is_whole = told(study, folder, 2 * n_seeds)
+        print(f"here {middle - begun:.0f} s, by SLURM {time.monotonic() - middle:.0f} s")
+    return is_whole
 
 
 def main() -> int:
@@ -379,8 +330,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--faults", nargs="*", default=FAULTS, choices=sorted({*FAULTS}))
-    parser.add_argument("--cancellations", type=int, default=5, help="of the long run's job")
-    parser.add_argument("--steps", type=int, default=60_000, help="of the long run")
     args = parser.parse_args()
     missing = [name for name in PROGRAMS if shutil.which(name) is None]
     if missing:

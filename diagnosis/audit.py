@@ -21,21 +21,21 @@ from diagnosis.probes import (
 from diagnosis.subjects import Subject
 from pipeline.errors import UserError, one_line
 
-# Where one of these is found, what is said of several steps follows from it.
+# A fault of one-step targets explains these faults of targets of several steps.
 _OF_ONE_STEP = frozenset(list(FAULTS)[: list(FAULTS).index("importance-ratio")])
 _OF_SEVERAL = frozenset({"n-step-return", "traces"})
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What an audit has come to."""
+    """The result of an audit."""
 
     subject: str
     findings: tuple[Finding, ...]
 
     @property
     def faults(self) -> list[Finding]:
-        """Faults, the one that explains most first; none that follow from another."""
+        """The faults, the one that explains most first, without those that follow from another."""
         found = [finding for finding in self.findings if finding.state == "fault"]
         if _OF_ONE_STEP & {finding.fault for finding in found}:
             found = [finding for finding in found if finding.fault not in _OF_SEVERAL]
@@ -44,18 +44,18 @@ class Verdict:
 
     @property
     def is_right(self) -> bool:
-        """Whether its targets were looked at, and nothing was found."""
+        """Whether the targets were checked and no fault was found."""
         states = {f.probe: f.state for f in self.findings}
         decided = [states.get(_title(probe)) for probe in (probe_ends, probe_discount)]
         return not self.faults and decided == ["ok", "ok"]
 
     @property
     def exit_code(self) -> int:
-        """0 right, 1 a fault, 2 nothing can be said."""
+        """0 if right, 1 for a fault, 2 if nothing can be said."""
         return 1 if self.faults else 0 if self.is_right else 2
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values: what was found, and each fault's sentence and source."""
+        """The verdict as JSON: the findings, and the sentence and source of each fault."""
         words = ("right", "fault", "nothing can be said")
         faults = []
         for finding in self.faults:
@@ -74,15 +74,15 @@ class Verdict:
 def audit(
     subject: Subject, seeds: Sequence[int], probes: Sequence[Probe] = PROBES
 ) -> Iterator[Finding]:
-    """What each probe finds, one after the other.
+    """Yield the findings of each probe.
 
-    A probe that finds nothing wrong with the first seed is done. Otherwise the other seeds are
-    asked as well, and what most of them say counts.
+    A probe that finds nothing wrong with the first seed is done. Otherwise it is repeated with the
+    other seeds, and the majority counts.
     """
     labs = [Lab(subject, seed) for seed in seeds]
     if not subject.has_values:
         probes = [probe for probe in probes if probe not in NEEDS_VALUES]
-        yield Finding("its values", "skipped", "it tells none, so that its targets are not seen")
+        yield Finding("its values", "skipped", "it has no values, so its targets cannot be checked")
     for probe in probes:
         found: list[list[Finding]] = []
         for lab in labs:
@@ -93,7 +93,7 @@ def audit(
 
 
 def _findings(probe: Probe, lab: Lab) -> list[Finding]:
-    """What a probe finds with one seed; that nothing can be said where it cannot be done."""
+    """The findings of a probe with one seed; "unsaid" where the probe fails."""
     name = _title(probe)
     try:
         return list(probe(lab))
@@ -101,13 +101,13 @@ def _findings(probe: Probe, lab: Lab) -> list[Finding]:
         return [Finding(name, "unsaid", str(error))]
     except UserError:
         raise
-    except Exception as error:  # noqa: BLE001 (whatever a stranger's code does)
+    except Exception as error:  # noqa: BLE001 (user code may raise anything)
         text = f"{type(error).__name__}: {one_line(error)}"
         return [Finding(name, "unsaid", f"it cannot train here: {text}")]
 
 
 def _most_agreed(found: list[list[Finding]]) -> list[Finding]:
-    """What most seeds agree on, in the words of the first of them."""
+    """The findings of the majority of seeds, as the first of these seeds gave them."""
     signs = [tuple((each.probe, each.state, each.fault) for each in findings) for findings in found]
     (sign, n), *_ = Counter(signs).most_common()
     if 2 * n > len(signs):
@@ -128,7 +128,7 @@ _NAMES = (
     "the next action",
     "the importance ratio",
     "the target network",
-    "the age of what is learnt from",
+    "the age of training data",
     "observations that change in place",
     "targets of several steps",
     "traces",

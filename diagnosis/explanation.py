@@ -1,19 +1,19 @@
-"""Says where an agent loses what it stays behind the optimum, exactly, where the model is known.
+"""Explains where an agent loses return to the optimum, exactly, where the model is known.
 
-The gap is split in two ways, and both sums are exact. By state: what the agent's actions cost where
-it takes them (`mdp.gaps`). By part: between the optimum and the agent stand policies that have one
-more of its handicaps each, and every part is what one handicap costs. Parts may be negative.
+The gap to the optimum is split in two ways, and both sums are exact. By state: the loss of the
+agent's actions in each state (`mdp.gaps`). By part: a sequence of policies leads from the optimum
+to the agent, each with one more of its handicaps, and each part is the cost of one handicap. Parts
+may be negative.
 
-1. Its objective: the best policy for its discount, on the environment that it trains on, which does
-   not know the clock.
+1. Objective: the best policy for the agent's discount on its training environment, without a time
+   limit.
 2. Exploring: the same for agents that learn the values of their own exploring policy.
-3. Not observable: the best that can be done by what is observed.
-4. Never tried: planning on the pairs of state and action that it has tried.
-5. Values not settled: one exact look ahead with its own values.
+3. Not observable: the best memoryless policy.
+4. Never tried: planning on the pairs of state and action that the agent has tried.
+5. Values not settled: one exact look-ahead with the agent's own values.
 6. Look-ahead: the agent itself.
 
-A part says where the return is lost, not why. What helps is found by trying it: see
-`experiments.interventions`.
+A part says where the return is lost, not why. `experiments.interventions` tries what helps.
 """
 
 from __future__ import annotations
@@ -51,22 +51,22 @@ from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.policies import believed_values
 from pipeline.train_spec import TrainSpec
 
-# Planning for an agent's objective takes about a second where outcomes are so many.
+# The largest model to plan in for an agent's objective, which takes about a second.
 MOST_OUTCOMES = 500_000
-# Action values closer to the best than this, relative to it, are as good.
+# Action values within this of the best, relative to it, count as ties.
 TIE = 1e-9
-# States are named where so few of them make up so much of the gap.
+# States are named where at most this many of them make up this share of the gap.
 MOST_STATES, MOST_OF_GAP = 3, 0.5
-# The chance of an end that counts as sure.
+# The probability of an end from which on it counts as sure.
 SURELY = 0.99
-# Parts and repairs below this share of the gap are not worth a line.
+# Repairs that regain less than this share of the gap are not worth a line.
 WORTH_A_LINE = 0.05
-# Parts from which on a change is proposed, those that more training may heal, and how much more.
+# The share from which on a change is proposed; parts that more training may reduce, and its factor.
 LARGE = 0.25
-SMALL = 0.1  # of the gap, the one in the agent's own objective
+SMALL = 0.1  # of the gap: a gap in the agent's own objective below this is small
 UNFINISHED = ("never tried", "not settled", "look-ahead", "learning")
 MORE_TRAINING = 4
-# A return that is reached but for rounding, relative to it.
+# Returns within this of each other, relative to them, count as equal.
 ROUNDING = 1e-9
 
 
@@ -76,7 +76,7 @@ class Part:
 
     name: str  #: ``objective``, ``exploring``, ``not observable``, ``never tried``, ...
     loss: float  #: what it costs, in return per episode
-    meaning: str  #: what that is, in words
+    meaning: str  #: what it is, in words
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,13 @@ class StateLoss:
     """A state in which the agent loses return."""
 
     state: int
-    name: str  #: where that is
+    name: str  #: the name of the state
     loss: float  #: in return per episode
     visits: float  #: how often an episode acts there
-    action: str  #: what the agent does there
-    best: str  #: what is best there
-    #: what the agent believes the two to be worth, what they are truly worth in its own objective,
-    #: and how often each was updated; None where that is not known
+    action: str  #: the agent's action there
+    best: str  #: the best action there
+    #: the agent's values of the two actions, their true values in its own objective, and the number
+    #: of updates of each; None where unknown
     believed: tuple[float, float] | None = None
     true: tuple[float, float] | None = None
     updates: tuple[int, int] | None = None
@@ -98,7 +98,7 @@ class StateLoss:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Where an agent loses what it stays behind the optimum."""
+    """Where an agent loses return to the optimum."""
 
     optimum: float  #: the highest expected return under the time limit
     value: float  #: the agent's expected return
@@ -107,12 +107,12 @@ class Explanation:
     parts: tuple[Part, ...]  #: their losses sum to the gap; empty where they are not known
     states: tuple[StateLoss, ...]  #: the states that lose most, at most 20, the worst first
     n_states: int  #: states in which it loses anything
-    losses: Floats  #: of each state, shape (S,); they sum to the gap
-    repairs: tuple[tuple[str, float], ...]  #: state, and return once it and those before are right
-    #: the discount that it learns under, and the gap at its start in that objective
+    losses: Floats  #: the loss in each state, shape (S,); losses sum to the gap
+    repairs: tuple[tuple[str, float], ...]  #: state, and return after its and all earlier repairs
+    #: the discount of its training, and the gap at the start in that objective
     discount: float | None = None
     own_gap: float | None = None
-    #: where losses are spread, what its own policy does along the best road; or what looks alike
+    #: where losses are spread, what its policy does along the best road; or which states look alike
     road: str = ""
     is_caught: bool = False  #: whether most of its episodes run out of time
     looks_alike: bool = False  #: whether it cannot tell states apart
@@ -125,12 +125,12 @@ class Explanation:
 
     @property
     def is_optimal(self) -> bool:
-        """Whether nothing but rounding lies between the agent and the optimum."""
+        """Whether the agent reaches the optimum, up to rounding."""
         return self.gap <= ROUNDING * max(1.0, abs(self.optimum))
 
     @property
     def is_concentrated(self) -> bool:
-        """Whether few states make up most of the gap, and are where it is lost.
+        """Whether few states make up most of the gap, and better actions there would close it.
 
         An agent that is caught loses most where it stands, not where it should have gone.
         """
@@ -159,24 +159,24 @@ class Explanation:
 
 
 class _Task(NamedTuple):
-    """What the agent was trained for."""
+    """The objective that the agent was trained for."""
 
-    model: TransitionModel  # of the environment that it trains on
+    model: TransitionModel  # the model of the training environment
     discount: float
-    epsilon: float  # how often it explores, where it learns the values of doing so, else 0
+    epsilon: float  # exploration rate, if the agent learns the values of exploring, else 0
     lived: TransitionModel  # the model with these random actions
 
 
 def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> Explanation:
-    """Where an agent loses what it stays behind the optimum.
+    """Explain where an agent loses return to the optimum.
 
     Args:
-        spec: of the run that the agent comes from.
+        spec: the spec of the agent's run.
         agent: the agent, whose greedy policy is explained.
-        evaluator: as `exact_evaluator` gives it for the spec.
+        evaluator: the result of `exact_evaluator` for the spec.
 
     Raises:
-        UserError: where the agent's policy cannot be asked for all states, or the environment is
+        UserError: where the agent's policy cannot be evaluated in all states, or the environment is
             too large.
     """
     if reason := evaluator.obstacle(agent):
@@ -222,7 +222,7 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
 
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:
-    """What the agent was trained for, where that is known and has the same states."""
+    """The agent's objective; None where it is unknown, too large, or of another shape."""
     discount = getattr(agent, "gamma", None)
     if isinstance(agent, PlanningAgent | RandomAgent) or not isinstance(discount, int | float):
         return None
@@ -256,7 +256,7 @@ class _Words:
 
 
 class _Found:
-    """All that is worked out of one agent's gap."""
+    """The analysis of one agent's gap."""
 
     def __init__(
         self,
@@ -296,7 +296,7 @@ class _Found:
 
         def down_to(value: float, name: str, meaning: str) -> None:
             nonlocal reached
-            # A policy that does worse than the agent itself splits nothing off.
+            # A policy that is worse than the agent itself makes no part.
             if value >= self.split.value - ROUNDING * max(1.0, abs(value)):
                 found.append(Part(name, reached - value, meaning))
                 reached = value
@@ -306,13 +306,13 @@ class _Found:
         down_to(best, "objective", known)
         if task.epsilon > 0:
             best = self._best_of(self.own_values)
-            told = f"the best for one that explores with epsilon {task.epsilon:g}"
+            told = f"the best policy that explores with epsilon {task.epsilon:g}"
             down_to(best, "exploring", f"{told} returns {best:.4g}")
         if self.groups is not None:
             best_seen = None if self.evaluator.scale is None else self.evaluator.scale.best
             if best_seen is not None:
                 is_best = best_seen.lower == best_seen.upper
-                told = f"the best policy{'' if is_best else ' found'} that goes by what is observed"
+                told = f"the best memoryless policy{'' if is_best else ' found'}"
                 told += f" returns {best_seen.lower:.4g}"
                 down_to(best_seen.lower, "not observable", told)
         elif self.beliefs is not None:
@@ -324,7 +324,7 @@ class _Found:
         return tuple(found)
 
     def _of_values(self, down_to: Any, task: _Task) -> None:
-        """The parts of an agent that has values of its own, for each state by itself."""
+        """The parts of an agent that has values for each state."""
         assert self.beliefs is not None
         if self.updates is not None:
             planned = self._planned_on_tried(task.lived, task.discount)
@@ -351,10 +351,9 @@ class _Found:
         return policy_return(self.model, policy, self.horizon).expected_return
 
     def _planned_on_tried(self, model: TransitionModel, discount: float) -> float:
-        """The return of the best policy that takes only what was tried.
+        """The return of the best policy that takes only tried actions.
 
-        States in which nothing was tried are worth what the agent believes, and it does there what
-        it does.
+        In states without a tried action, the agent's own value and action are kept.
         """
         assert self.updates is not None
         assert self.beliefs is not None
@@ -368,7 +367,7 @@ class _Found:
         known = replace(model, terminated=ends, reward=reward, reward_variance=None)
         try:
             plan = policy_iteration(known, discount, mask=tried | unknown[:, None])
-        except ValueError:  # without a discount, where what it tried need not end
+        except ValueError:  # without a discount, where tried actions may never end the episode
             return self.split.value
         taken = np.eye(self.model.n_actions, dtype=np.bool_)[self.taken]
         allowed = np.where(unknown[:, None], taken, tried)
@@ -383,7 +382,7 @@ class _Found:
             nearer = 1 - 0.5 / self.horizon  # what `gamma: auto` stands for
             values = policy_iteration(self.task.model, nearer).action_values
             if nearer > self.task.discount and self._best_of(values) > self.split.value:
-                # What costs it little in its own objective it has little reason to learn.
+                # There is little reason to learn what the agent's own objective hardly rewards.
                 is_small = own_gap is not None and own_gap < SMALL * gap
                 suggested["gamma:auto"] = 1.0 if is_small else lost.get("objective", 0.0)
         suggested["exploration_final_eps:0"] = lost.get("exploring", 0.0)
@@ -396,7 +395,7 @@ class _Found:
     # --- in its own objective ---------------------------------------------------------------------
 
     def own_gap(self) -> float | None:
-        """The gap at the start in the agent's own objective, without the clock; None if unknown."""
+        """The gap at the start in its own objective, without a time limit; None if unknown."""
         task = self.task
         if task is None or self.own_values is None or task.discount >= 1:
             return None
@@ -408,7 +407,7 @@ class _Found:
 
     @cached_property
     def direct(self) -> Ints:
-        """The best policy that wastes no time, shape (S,)."""
+        """The best policy for a discount just below 1, which wastes no time, shape (S,)."""
         return policy_iteration(self.model, 1 - 0.5 / self.horizon).policy
 
     def is_caught(self) -> bool:
@@ -461,7 +460,7 @@ class _Found:
         return kept
 
     def alike(self, words: _Words) -> str:
-        """The states that are observed alike, of which it acts most often in one."""
+        """The states of the observation that the agent sees most, where several states share it."""
         assert self.groups is not None
         visits = np.bincount(self.groups, self.split.visits)
         counts = np.bincount(self.groups, self.model.reachable)
@@ -472,10 +471,9 @@ class _Found:
         return f"it cannot tell {len(states)} states apart: {names}{more}"
 
     def road(self, words: _Words) -> str:
-        """From where on the best road the agent's own policy reaches the end, and its last error.
+        """How many states of the best road lead the agent to the end, and its last wrong turn.
 
-        The road is where the best policy that wastes no time most likely goes from the likeliest
-        start.
+        The road follows the likeliest outcomes of `direct` from the likeliest start.
         """
         if self.task is None:
             return ""
@@ -519,13 +517,13 @@ class _Found:
 
 @dataclass(frozen=True)
 class Place:
-    """A state in which two agents first do something different."""
+    """A state in which two agents first act differently."""
 
     state: int
     name: str
-    met: float  #: the chance that an episode comes to its first difference there
+    met: float  #: the probability that an episode's first difference is there
     gain: float  #: what the better agent gains by it, in return per episode
-    actions: tuple[str, str]  #: what the better and the worse agent do there
+    actions: tuple[str, str]  #: the actions of the better and of the worse agent
 
 
 @dataclass(frozen=True)
@@ -533,12 +531,12 @@ class Parting:
     """Where the policies of two agents first part, the one with the higher return first."""
 
     names: tuple[str, str]
-    difference: float  #: of the returns, at least 0; the gains sum to it
-    met: float  #: the chance that an episode comes to a difference
-    places: tuple[Place, ...]  #: those that matter most, at most 20, the dearest first
+    difference: float  #: the difference of the returns, at least 0; gains sum to it
+    met: float  #: the probability that an episode has a difference
+    places: tuple[Place, ...]  #: at most 20, the largest gains or losses first
 
     def as_data(self) -> dict[str, Any]:
-        """The same as JSON."""
+        """The parting as JSON."""
         return {**vars(self), "places": [vars(place) for place in self.places]}
 
 
@@ -546,10 +544,10 @@ Side = tuple[TrainSpec, BaseAlgorithm, ExactEvaluator]
 
 
 def parting(one: Side, other: Side) -> Parting:
-    """Where the policies of two agents on one environment first part, and what that costs.
+    """Where the policies of two agents on one environment first part, and the cost of it.
 
     Raises:
-        UserError: where an agent cannot be asked for all states, or the environment is too large.
+        UserError: where a policy cannot be evaluated in all states, or the model is too large.
     """
     evaluator = one[2]
     model, horizon = evaluator.model, evaluator.horizon

@@ -1,4 +1,4 @@
-"""The faults that an audit can name, and where it is written how it should be."""
+"""The faults that an audit can name, and the sources of what is right."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ class Fault(NamedTuple):
     """A way in which an algorithm is wrong."""
 
     sentence: str
-    source: str  # where it is written how it should be
+    source: str  # the publication that says what is right
 
 
-# The most telling first: what explains others comes before them.
+# The most telling first: a fault that explains others comes before them.
 FAULTS: Mapping[str, Fault] = {
     "shared-buffer": Fault(
-        "What is stored changes later: it is no copy, or another agent writes into it too.",
+        "Stored data changes later: it is no copy, or another agent writes into it too.",
         "Mnih et al. (2015), algorithm 1: the transition is stored as it was",
     ),
     "bootstraps-at-terminal": Fault(
-        "The target goes on with the value of what the end of an episode shows.",
+        "The target bootstraps from what is observed at the end of a terminated episode.",
         f"{BOOK}, section 6.1: V(terminal) = 0",
     ),
     "reset-observation": Fault(
-        "Where an episode is cut off, the first observation of the next one is taken to follow.",
+        "After a truncation, the target bootstraps from the next episode's first observation.",
         "Pardo et al. (2018), Time limits in reinforcement learning, section 3",
     ),
     "no-bootstrap-at-truncation": Fault(
-        "An episode that is cut off is taken to have ended, and nothing to follow.",
+        "A truncated episode is treated as terminated: its target does not bootstrap.",
         "Pardo et al. (2018), Time limits in reinforcement learning, section 3",
     ),
     "target-never-copied": Fault(
-        "The target network stays as it began: what is learnt does not travel back.",
+        "The target network is never updated: what is learnt does not travel back.",
         "Mnih et al. (2015), algorithm 1: every C steps reset Q^ = Q",
     ),
     "discount-twice": Fault(
-        "The discount is applied twice: what comes next counts gamma squared.",
+        "The discount is applied twice: the next value counts gamma squared.",
         f"{BOOK}, section 3.3, equation 3.9",
     ),
     "discount-missing": Fault(
-        "What comes next is not discounted.", f"{BOOK}, section 3.3, equation 3.9"
+        "The next value is not discounted.", f"{BOOK}, section 3.3, equation 3.9"
     ),
     "importance-ratio": Fault(
-        "What was done is weighed by a wrong ratio of the two policies' probabilities.",
+        "The importance sampling ratio of the two policies' probabilities is wrong.",
         f"{BOOK}, section 5.5; Schulman et al. (2017), equations 6 and 7, for PPO",
     ),
     "follows-instead-of-maximises": Fault(
-        "The target takes the action that is done next, where it should take the best one.",
+        "The target follows the policy's next action, where it should take the best one.",
         f"{BOOK}, section 6.5, equation 6.8",
     ),
     "maximises-instead-of-follows": Fault(
-        "The target takes the best next action, where it should follow what is done.",
+        "The target takes the best next action, where it should follow the policy.",
         f"{BOOK}, section 6.4, equation 6.7",
     ),
     "stale-buffer": Fault(
@@ -62,24 +62,24 @@ FAULTS: Mapping[str, Fault] = {
         "(2017), algorithm 1",
     ),
     "n-step-return": Fault(
-        "A target of several steps is not the discounted sum of its rewards and what follows.",
+        "A target of several steps is not the discounted sum of its rewards and the last value.",
         f"{BOOK}, section 7.1, equation 7.1",
     ),
     "traces": Fault(
-        "Credit does not fade by gamma times lambda with each step back, or is not cut off.",
+        "Credit does not decay by gamma times lambda with each step back, or is not cut off.",
         f"{BOOK}, section 12.2, equation 12.5, and 12.10; Schulman et al. (2016), equation 16, for "
         "the advantages of rollouts",
     ),
     "advantage-sign": Fault(
-        "The policy moves away from what was better than expected.",
+        "The policy makes actions less likely that were better than expected.",
         f"{BOOK}, section 13.5, equation 13.14",
     ),
     "entropy-sign": Fault(
-        "The entropy term makes the policy surer, where it should make it less sure.",
+        "The entropy term lowers the policy's entropy, where it should raise it.",
         "Mnih et al. (2016), section 4; Haarnoja et al. (2018), equation 1",
     ),
     "target-always-copied": Fault(
-        "The target network follows at once, whatever its settings say.",
+        "The target network copies the learning one at once, whatever its settings say.",
         "Mnih et al. (2015), algorithm 1; Lillicrap et al. (2016), algorithm 1",
     ),
     "schedule-backwards": Fault(
@@ -87,7 +87,7 @@ FAULTS: Mapping[str, Fault] = {
         f"{BOOK}, section 2.5; Stable-Baselines3: progress_remaining goes from 1 to 0",
     ),
     "schedule-constant": Fault(
-        "A schedule has no effect: the number stays the same.",
+        "A schedule has no effect: its value stays the same.",
         f"{BOOK}, section 2.5; Stable-Baselines3: progress_remaining goes from 1 to 0",
     ),
     "explores-in-evaluation": Fault(
@@ -110,7 +110,7 @@ FAULTS: Mapping[str, Fault] = {
         "Stable-Baselines3: BaseAlgorithm._get_torch_save_params",
     ),
     "zip-forgets-schedules": Fault(
-        "Schedules, or how far they were, are not in the saved file.",
+        "Schedules, or the progress along them, are not in the saved file.",
         "Stable-Baselines3: BaseAlgorithm.save",
     ),
 }

@@ -21,23 +21,23 @@ N_ACTIONS = 2
 
 @dataclass(frozen=True)
 class World:
-    """States 0, 1, ... that follow one another, whatever is done; the actions change the rewards.
+    """A chain of states 0, 1, ...: actions change the rewards, and not the next state.
 
-    One more observation than there are states: what the end shows, where nothing is ever done.
+    There is one more observation than states: that of the end, where no action is taken.
     """
 
     pays: tuple[tuple[float, float], ...]  # reward of each state and action
     ends: bool = True  # the last state ends the episode; else it leads to itself
     cut: int = 0  # steps after which an episode is truncated, 0 for never
-    end_shows: int | None = None  # state whose observation the end shows; None for one of its own
-    quits: float = 0.0  # how probable it is that the first state ends the episode, and pays nothing
-    noise: float = 0.0  # added to each reward, or taken away, as a coin falls
-    pays_after: int = 0  # steps of training during which nothing is paid
+    end_shows: int | None = None  # state whose observation the end has; None for one of its own
+    quits: float = 0.0  # probability that the first state ends the episode, with a reward of 0
+    noise: float = 0.0  # added to or subtracted from each reward, with equal probability
+    pays_after: int = 0  # number of first steps of training that have a reward of 0
     in_place: bool = False  # each observation is the same array, changed in place
 
     @property
     def n_states(self) -> int:
-        """How many states things are done in."""
+        """The number of states in which actions are taken."""
         return len(self.pays)
 
     def following(self, state: int) -> tuple[int, bool]:
@@ -61,7 +61,7 @@ class World:
 
 @dataclass
 class Record:
-    """What was done in a world in the course of a training, in all its copies."""
+    """States, actions and rewards of a training in a world, over all copies of its environment."""
 
     n_states: int
     states: list[int] = field(default_factory=list)
@@ -69,17 +69,17 @@ class Record:
     rewards: list[float] = field(default_factory=list)
 
     def counts(self) -> NDArray[np.int64]:
-        """How often each action was done in each state, shape (S, 2)."""
+        """How often each action was taken in each state, shape (S, 2)."""
         counts = np.zeros((self.n_states, N_ACTIONS), np.int64)
         np.add.at(counts, (self.states, self.actions), 1)
         return counts
 
 
 class ProbeEnv(gym.Env[Any, Any]):
-    """A `World` to act in.
+    """A `World` as a Gymnasium environment.
 
-    Observations are the states' numbers or vectors with a one; actions are 0 and 1, or a number in
-    [-1, 1] that counts as 1 above zero.
+    Observations are state indices or one-hot vectors; actions are 0 and 1, or a number in [-1, 1]
+    that counts as 1 above zero.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class ProbeEnv(gym.Env[Any, Any]):
         self._shown = np.zeros(n, np.float32)
 
     def observation_of(self, state: int) -> Any:
-        """What is seen in a state: a number, or a vector of its own."""
+        """The observation of a state: its index, or a one-hot vector."""
         if self.is_discrete:
             return state
         vector: NDArray[np.float32] = np.eye(self.n_observations, dtype=np.float32)[state]
@@ -114,7 +114,7 @@ class ProbeEnv(gym.Env[Any, Any]):
         return self._shown
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Everything may be done: for agents that ask."""
+        """All actions are allowed: for agents that use masks."""
         return np.ones(N_ACTIONS, np.bool_)
 
     def reset(
@@ -126,7 +126,7 @@ class ProbeEnv(gym.Env[Any, Any]):
         return self._observe(0), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Go on to the next state, and note what was done."""
+        """Go to the next state, and record the step."""
         action = action_number(action, self.action_space)
         reward, (following, terminated) = (
             self.world.pays[self.state][action],
@@ -146,7 +146,7 @@ class ProbeEnv(gym.Env[Any, Any]):
 
 
 class ModelledProbeEnv(ProbeEnv):
-    """One that tells its model as Gymnasium's toy_text do, so that training can be compiled."""
+    """A `ProbeEnv` with its model as in Gymnasium's toy_text, so that training can be compiled."""
 
     @property
     def initial_state_distrib(self) -> Floats:
@@ -180,7 +180,7 @@ def action_number(action: Any, space: spaces.Space[Any]) -> int:
 def make_env(
     world: World, record: Record, observations: Observations, actions: Actions
 ) -> gym.Env[Any, Any]:
-    """An environment of this world; its record goes on in the order in which things are done."""
+    """An environment of this world; its steps are appended to the record."""
     is_modelled = observations == actions == "discrete" and not (world.noise or world.pays_after)
     kind = ModelledProbeEnv if is_modelled else ProbeEnv
     env: gym.Env[Any, Any] = kind(world, record, observations, actions)

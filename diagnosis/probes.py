@@ -1,7 +1,7 @@
-"""What decides: pairs of tiny worlds, or settings, that differ in one thing.
+"""The probes: each compares tiny worlds, or settings, that differ in one thing.
 
-A correct learner must not see that thing, or must see it by an amount that is known. Single values
-only describe. Each probe returns `Finding` objects; the names of faults are in
+The values of a correct learner do not depend on that thing, or change by a known amount. Single
+values only describe. Each probe yields `Finding` objects; the names of faults are in
 `diagnosis.faults`.
 """
 
@@ -28,17 +28,17 @@ State = Literal["ok", "fault", "unsaid", "skipped"]
 
 @dataclass(frozen=True)
 class Finding:
-    """What a probe has come to."""
+    """The result of one check."""
 
-    probe: str  # what was looked at
+    probe: str  # the name of the check
     state: State
     text: str = ""  # what was measured, or why nothing can be said
-    fault: str = ""  # of FAULTS
-    right: str = ""  # what would be right
+    fault: str = ""  # a key of FAULTS
+    right: str = ""  # the correct result
 
 
-class NotSettled(Exception):  # noqa: N818 (no mistake of anybody's)
-    """Values after n and after 2n steps do not agree, up to the limit."""
+class NotSettled(Exception):  # noqa: N818 (not an error)
+    """Values after n and after 2n steps still differ at the largest number of steps."""
 
 
 CHAIN = World(((0, 0), (1, 1)))
@@ -59,7 +59,7 @@ MOST_DOUBLINGS = 3
 
 @dataclass
 class Lab:
-    """Trains one subject with one seed, and keeps what it has trained."""
+    """Trains one subject with one seed, and caches the values that have settled."""
 
     subject: Subject
     seed: int
@@ -104,9 +104,9 @@ class Lab:
         return None
 
     def mean(self, world: World, n: int = 10, **changes: Any) -> tuple[Floats, float]:
-        """Values over the second half of a training, shape (S,), and how often action 1 was last.
+        """Mean values in the second half of training, (S,), and action 1's share in the last state.
 
-        For learners that follow what is done, whose values never come to rest.
+        For learners whose values depend on the actions taken, and so never settle.
         """
         steps = self.subject.steps
         trained = self.begin(world, steps, **changes)
@@ -123,7 +123,7 @@ class Lab:
 
 
 def probe_ends(lab: Lab) -> Iterator[Finding]:
-    """What the end of an episode shows is worth nothing, and so is what begins after it."""
+    """The observation at the end has no value, and the next episode does not count."""
     name = "the end of an episode"
     plain, seeing = lab.settled(CHAIN), lab.settled(SEES_START)
     shown = f"the last state is worth {plain[1]:.2f}"
@@ -171,7 +171,7 @@ def probe_discount(lab: Lab) -> Iterator[Finding]:
 
 
 def probe_cuts(lab: Lab) -> Iterator[Finding]:
-    """A time limit changes no value, and neither does what the next episode begins with."""
+    """Neither a time limit nor the start of the next episode changes a value."""
     name = "an episode that is cut off"
     cut = lab.settled(LOOP)
     text = f"a state that pays 1 for ever is worth {cut[1]:.2f}"
@@ -192,7 +192,7 @@ def probe_cuts(lab: Lab) -> Iterator[Finding]:
 
 
 def probe_next_action(lab: Lab) -> Iterator[Finding]:
-    """What a bad action costs must be seen by who follows, and not by who takes the best one."""
+    """The cost of a bad action lowers targets that follow the policy, not those that maximise."""
     name, target = "the next action", lab.subject.target
     if target is None:
         yield Finding(name, "skipped", "say what it claims to be: --kind q_learning or sarsa")
@@ -221,7 +221,7 @@ def probe_next_action(lab: Lab) -> Iterator[Finding]:
 
 
 def probe_ratio(lab: Lab) -> Iterator[Finding]:
-    """Off-policy returns are weighed; PPO's clipped ratio bounds how far one rollout moves it."""
+    """Off-policy returns are weighted; PPO's clipping bounds the policy change of one rollout."""
     name, subject = "the importance ratio", lab.subject
     if subject.uses_ratio:
         whole = lab.settled(World(((0, 0), (1, 0))))
@@ -253,17 +253,17 @@ def probe_ratio(lab: Lab) -> Iterator[Finding]:
 
 
 def share_of_action(trained: Trained, action: int) -> float:
-    """How often training would draw an action in state 0, of 2,000 times."""
+    """The share of an action among 2,000 that training would draw in state 0."""
     assert isinstance(trained, TrainedModel)
     return float((trained.drawn_actions(0, 2000) == action).mean())
 
 
-# --- what is kept ---------------------------------------------------------------------------------
+# --- stored data ----------------------------------------------------------------------------------
 
 
 def probe_age(lab: Lab) -> Iterator[Finding]:
-    """What was paid long ago, and is no longer, has been forgotten."""
-    name, subject = "the age of what is learnt from", lab.subject
+    """Old rewards that have changed since are forgotten."""
+    name, subject = "the age of training data", lab.subject
     if not (subject.accepts("buffer_size") or subject.is_on_policy):
         return
     steps = subject.steps
@@ -274,14 +274,14 @@ def probe_age(lab: Lab) -> Iterator[Finding]:
     values = trained.state_values()
     assert values is not None
     text = (
-        f"what pays only after {steps:,} steps is worth {values[1]:.2f} after {3 * steps:,}, and "
-        f"what always did {always[1]:.2f}"
+        f"a state that pays only after {steps:,} steps is worth {values[1]:.2f} after "
+        f"{3 * steps:,}, and one that always pays {always[1]:.2f}"
     )
     buffer = getattr(getattr(trained, "model", None), "rollout_buffer", None)
     if always[1] - values[1] > 0.25:
         yield Finding(name, "fault", text, "stale-buffer", "the same")
     elif buffer is not None and not _is_last(np.ravel(buffer.actions), trained.record.actions):
-        text = "the rollout that was learnt from last is not what was done last"
+        text = "the last rollout that was learnt from is not the last one that was collected"
         yield Finding(name, "fault", text, "stale-buffer", "the same actions")
     else:
         yield Finding(name, "ok", text)
@@ -292,7 +292,7 @@ def _is_last(kept: Floats, done: list[int]) -> bool:
 
 
 def probe_copies(lab: Lab) -> Iterator[Finding]:
-    """An environment may give the same array each time, and change it."""
+    """An environment may return the same array each time, and change it in place."""
     name, subject, numbered = "observations that change in place", lab.subject, lab
     if subject.spaces[0] == "discrete" and isinstance(subject, ClassSubject):
         if not subject.has_network:
@@ -336,7 +336,7 @@ def _told(values: Floats) -> str:
 
 
 def has_target(subject: Subject) -> bool:
-    """Whether it has a target network whose copying can be set."""
+    """Whether the subject has a target network whose updates can be set."""
     if isinstance(subject, ClassSubject) and "DeepQLearning" in {
         ancestor.__name__ for ancestor in subject.cls.__mro__
     }:
@@ -345,12 +345,12 @@ def has_target(subject: Subject) -> bool:
 
 
 def probe_target_network(lab: Lab) -> Iterator[Finding]:
-    """A target network that is never due to be copied knows nothing of what is learnt."""
+    """A target network that is never updated passes on nothing that is learnt."""
     name, subject = "the target network", lab.subject
     if not has_target(subject):
         return
-    # The library's SAC counts the interval anew in each training: with one gradient step it is
-    # always due.
+    # The library's SAC restarts the interval in each call of train: with one gradient step it
+    # always updates.
     settings = {"target_update_interval": 10**9, "tau": 1e-9}
     if subject.target != "maximises":
         settings = {"tau": 1e-9}
@@ -358,7 +358,7 @@ def probe_target_network(lab: Lab) -> Iterator[Finding]:
         change = {setting: settings[setting]}
         less, more = lab.settled(CHAIN, **change), lab.settled(END_PAYS_MORE, **change)
         seen = float(more[0] - less[0])
-        text = f"with {setting} {settings[setting]:g}, news of the end travels back by {seen:.2f}"
+        text = f"with {setting} {settings[setting]:g}, an end that pays 1 more adds {seen:.2f}"
         if abs(seen) > 0.35:
             yield Finding(name, "fault", text, "target-always-copied", "0")
             return
@@ -399,12 +399,12 @@ def probe_n_steps(lab: Lab) -> Iterator[Finding]:
 
 
 def subject_mro(subject: Subject) -> tuple[type, ...]:
-    """The classes that a subject is one of; none of a script."""
+    """The class and base classes of a subject; empty for a script."""
     return subject.cls.__mro__ if isinstance(subject, ClassSubject) else ()
 
 
 def probe_traces(lab: Lab) -> Iterator[Finding]:
-    """One episode gives each step back gamma times lambda as much, and the next one nothing."""
+    """Credit decays by gamma times lambda with each step back, and ends with the episode."""
     name, subject = "traces", lab.subject
     if subject.is_on_policy and isinstance(subject, ClassSubject) and subject.accepts("gae_lambda"):
         yield from _probe_advantages(lab)
@@ -414,7 +414,7 @@ def probe_traces(lab: Lab) -> Iterator[Finding]:
     stairs = World(((0, 0), (0, 0), (1, 1)))
     first = _highest(lab.begin(stairs, 3, trace_decay=decay, learning_rate=0.5, **once))
     ratio = first[1] / first[2] if first[2] else np.nan
-    text = f"after one episode a state has {ratio:.2f} of what the next one has"
+    text = f"after one episode a state's value is {ratio:.2f} times that of the next state"
     right = f"gamma x lambda, which is {GAMMA * decay:g}"
     if not abs(ratio - GAMMA * decay) < 0.05 or abs(first[0] - ratio**2 * first[2]) > 0.05:
         yield Finding(name, "fault", text, "traces", right)
@@ -434,8 +434,8 @@ def probe_traces(lab: Lab) -> Iterator[Finding]:
             if np.allclose(values, uncut) and not np.allclose(
                 uncut, watkins_table(fork, record, decay, is_cut=True)
             ):
-                text = "the table after 8 episodes is that of traces which exploring does not cut"
-                yield Finding(name, "fault", text, "traces", "that of traces which it cuts")
+                text = "the table after 8 episodes is that of traces that exploration does not cut"
+                yield Finding(name, "fault", text, "traces", "that of traces that it cuts")
                 return
     yield Finding(name, "ok", text)
 
@@ -447,7 +447,7 @@ def stepwise(subject: Subject) -> dict[str, str]:
 
 
 def watkins_table(world: World, record: Record, decay: float, *, is_cut: bool) -> Floats:
-    """The table of Watkins's Q(lambda) after what a record holds; equal values are all best."""
+    """The table of Watkins's Q(lambda) after the steps of a record; ties are all best."""
     table, traces = np.zeros((2, world.n_states, N_ACTIONS))
     steps = zip(record.states, record.actions, record.rewards, strict=True)
     for state, action, reward in steps:
@@ -471,14 +471,14 @@ def _highest(trained: Trained) -> Floats:
 
 
 def _probe_advantages(lab: Lab) -> Iterator[Finding]:
-    """The advantages in the rollout buffer against the sum that defines them."""
+    """Compare the advantages in the rollout buffer with the sum that defines them."""
     name, found = "advantages of rollouts", {}
     for decay in (0.0, 0.9):
         trained = lab.begin(STAIRS, 128, gae_lambda=decay, n_steps=64)
         assert isinstance(trained, TrainedModel)
         buffer: Any = getattr(trained.model, "rollout_buffer", None)
         if not hasattr(buffer, "advantages"):
-            yield Finding(name, "skipped", "it keeps no rollout buffer of the library's")
+            yield Finding(name, "skipped", "it has no rollout buffer of the library's")
             return
         keys = ("rewards", "values", "episode_starts", "advantages")
         rewards, values, starts, kept = (np.ravel(getattr(buffer, key)) for key in keys)
@@ -503,7 +503,7 @@ def _probe_advantages(lab: Lab) -> Iterator[Finding]:
 
 
 def probe_choice(lab: Lab) -> Iterator[Finding]:
-    """It comes to do what pays, and always does it where it is evaluated."""
+    """The agent learns the action that pays, and always takes it in evaluation."""
     name = "what it does when evaluated"
     trained = [lab.begin(world) for world in (ARM_0, ARM_1)]
     chosen = [_share(each, 400) for each in trained]
@@ -531,7 +531,7 @@ def _share(trained: Trained, n: int) -> float:
 
 
 def probe_entropy(lab: Lab) -> Iterator[Finding]:
-    """Where nothing pays, entropy keeps the policy undecided."""
+    """Without rewards, the entropy term keeps the policy random."""
     name, subject = "the entropy term", lab.subject
     if not (subject.accepts("ent_coef") and isinstance(subject, ClassSubject)):
         return
@@ -553,7 +553,7 @@ def probe_entropy(lab: Lab) -> Iterator[Finding]:
 
 
 def probe_schedules(lab: Lab) -> Iterator[Finding]:
-    """What falls in the course of training falls, and what rises rises."""
+    """Schedules that fall do fall in the course of training, and those that rise do rise."""
     subject = lab.subject
     if not isinstance(subject, ClassSubject):
         yield from _probe_exploration(lab)
@@ -566,11 +566,11 @@ def probe_schedules(lab: Lab) -> Iterator[Finding]:
         yield Finding("the schedule of the learning rate", "skipped", text)
     elif subject.accepts("learning_rate") and isinstance(rate, float) and not subject.uses_ratio:
         name = "the schedule of the learning rate"
-        rate /= 10 if subject.is_on_policy else 1  # or each rollout is learnt by heart
+        rate /= 10 if subject.is_on_policy else 1  # or each rollout is overfitted
         falling = _moves(lab, LinearSchedule(rate, rate / 20, 1.0))
         rising = _moves(lab, LinearSchedule(rate / 20, rate, 1.0))
         if falling is None or rising is None:
-            yield Finding(name, "unsaid", "values do not move where rewards are a coin's")
+            yield Finding(name, "unsaid", "values do not move with random rewards")
         else:
             early, late = np.array(falling) / np.array(rising)
             text = (
@@ -627,15 +627,13 @@ def _probe_exploration(lab: Lab) -> Iterator[Finding]:
         changes["learning_starts"] = 10
     changes |= stepwise(subject)
     if isinstance(subject, ClassSubject) and subject.typed.get("engine") == "compiled":
-        yield Finding(name, "skipped", "compiled training does not tell what was done")
+        yield Finding(name, "skipped", "compiled training does not record actions")
         return
     trained = lab.begin(World(((1, 0),), noise=1e-9), 2 * subject.steps, **changes)
     is_other = np.array(trained.record.actions) != trained.act(0)
-    n = len(is_other)  # not the first steps, in which nothing is known yet
+    n = len(is_other)  # without the first steps, before anything is learnt
     early, late = float(is_other[n // 8 : n // 4].mean()), float(is_other[-n // 4 :].mean())
-    text = (
-        f"what is not best is done in {early:.1%} of the first steps, and in {late:.1%} of the last"
-    )
+    text = f"the best action is not taken in {early:.1%} of the first steps, {late:.1%} of the last"
     if late > early + 0.1:
         yield Finding(name, "fault", text, "schedule-backwards", "less at the end")
     elif is_set and late > 0.15:
@@ -650,7 +648,7 @@ def _probe_exploration(lab: Lab) -> Iterator[Finding]:
 
 
 def probe_seeds(lab: Lab) -> Iterator[Finding]:
-    """The same seed, the same training, whatever state the global generators are in."""
+    """The same seed gives the same training, whatever the state of the global generators."""
     name, results, agents = "seeds", [], []
     steps = 130 if lab.subject.is_on_policy else 300
     for state in (1, 1, 2):
@@ -677,7 +675,7 @@ def probe_seeds(lab: Lab) -> Iterator[Finding]:
 
 
 def _held_by_both(one: Trained, other: Trained) -> str:
-    """The name of what two models hold that can be written into; empty where there is nothing."""
+    """The name of a mutable attribute that two models share; empty if there is none."""
     import torch as th
     from stable_baselines3.common.buffers import BaseBuffer
 
@@ -700,7 +698,7 @@ def _set_global_generators(state: int) -> None:
 
 
 def probe_files(lab: Lab) -> Iterator[Finding]:
-    """What is saved and loaded is what was there."""
+    """A loaded model equals the saved one."""
     name, subject = "saving and loading", lab.subject
     if not isinstance(subject, ClassSubject):
         return
@@ -718,7 +716,7 @@ def probe_files(lab: Lab) -> Iterator[Finding]:
         try:
             model.save(path)
             loaded = subject.cls.load(path, device="cpu")
-        except Exception as error:  # noqa: BLE001 (whatever a stranger's code does)
+        except Exception as error:  # noqa: BLE001 (user code may raise anything)
             text = f"it cannot be saved and loaded: {type(error).__name__}: {one_line(error)}"
             yield Finding(name, "unsaid", text)
             return
@@ -730,7 +728,7 @@ def probe_files(lab: Lab) -> Iterator[Finding]:
 
 
 def _lost(trained: TrainedModel, model: Any, loaded: Any) -> dict[str, str]:
-    """What a loaded model has no longer, by fault."""
+    """What a loaded model has lost, by fault."""
     lost, before = {}, trained.values()
     trained.model = loaded
     after = trained.values()
@@ -760,7 +758,7 @@ def _lost(trained: TrainedModel, model: Any, loaded: Any) -> dict[str, str]:
 
 
 def _optimizers(model: Any) -> dict[str, Any]:
-    """All optimizers of a model, by where they are."""
+    """All optimizers of a model, by the path of their attribute."""
     from torch.optim import Optimizer
 
     holders = {"": model, "policy": model.policy}

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 GAMMA = 0.8
 
-# What a target is made of: the best next action's value; that of what the learner does next; a
-# state's value, which follows what is done. The last is a policy without values of actions.
+# The next value in a target: that of the best action; that of the learner's next action; or the
+# state's under the learner's policy, for learners without action values.
 Target = Literal["maximises", "follows", "states"]
 KINDS: Mapping[str, Target] = {
     "q_learning": "maximises",
@@ -42,7 +42,7 @@ KINDS: Mapping[str, Target] = {
     "policy_gradient": "states",
 }
 
-# Settings of all that is audited: everything is explored, and targets have one step.
+# Settings of all audits, unless others are given: full exploration, and targets of one step.
 BASE: Mapping[str, Any] = {
     "exploration_initial_eps": 1.0,
     "exploration_final_eps": 1.0,
@@ -50,7 +50,7 @@ BASE: Mapping[str, Any] = {
     "n_steps": 1,
 }
 
-# Names that settings have elsewhere, after the one that probes use.
+# Other names of settings; the first is the one that probes use.
 OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
     "trace_decay": ("trace_decay", "lambda_", "lam", "lmbda", "td_lambda"),
     "n_steps": ("n_steps", "n_step"),
@@ -58,18 +58,18 @@ OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
 
 
 class Trained(ABC):
-    """A learner after a training in a world, to be asked."""
+    """A learner that was trained in a world."""
 
     def __init__(self, world: World, record: Record, env: ProbeEnv) -> None:
         self.world, self.record, self._env = world, record, env
 
     def observation(self, state: int) -> Any:
-        """What is seen in a state."""
+        """The observation of a state."""
         return self._env.observation_of(state)
 
     @abstractmethod
     def act(self, state: int) -> int:
-        """What it does in a state where it is evaluated."""
+        """The action in a state when evaluated."""
 
     @abstractmethod
     def values(self) -> Floats | None:
@@ -77,10 +77,10 @@ class Trained(ABC):
 
     @abstractmethod
     def train(self, steps: int) -> None:
-        """Go on for that many steps."""
+        """Train for that many more steps."""
 
     def state_values(self) -> Floats | None:
-        """The value of each state, shape (S,): that of what was done there, if actions have one."""
+        """State values, shape (S,): action values are averaged over the actions taken."""
         values = self.values()
         if values is None or values.shape[1] == 1:
             return None if values is None else values[:, 0]
@@ -94,13 +94,13 @@ class Subject(ABC):
     """An algorithm under audit.
 
     Attributes:
-        typed: settings that were asked for.
-        base: settings under which tiny worlds are learnt, unless others are asked for.
+        typed: settings that the user gave.
+        base: settings that learn tiny worlds, unless the user gave others.
         steps: environment steps after which values are read first.
-        target: what its targets are made of; None where that is not known.
-        uses_ratio: whether it weighs by importance, towards a greedy policy.
+        target: the kind of its targets; None where that is not known.
+        uses_ratio: whether it uses importance sampling, for a greedy target policy.
         is_on_policy: whether it learns from rollouts, as the library's on-policy agents do.
-        has_values: whether it tells values.
+        has_values: whether its values can be read.
         spaces: kinds of observations and actions.
     """
 
@@ -121,7 +121,7 @@ class Subject(ABC):
 
     @abstractmethod
     def named(self, setting: str) -> str | None:
-        """What the learner calls this setting; None where it has no such."""
+        """The learner's name for this setting; None where it has no such setting."""
 
     @abstractmethod
     def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
@@ -146,7 +146,7 @@ class Subject(ABC):
                     return
                 except UserError:
                     raise
-                except Exception as error:  # noqa: BLE001 (whatever a stranger's code does)
+                except Exception as error:  # noqa: BLE001 (user code may raise anything)
                     errors.append(error)
         if not errors:
             raise UserError(f"{self.name} {self.misfit()}")
@@ -156,11 +156,11 @@ class Subject(ABC):
         )
 
     def misfit(self) -> str:
-        """Why it does not fit worlds with its spaces; empty where it may."""
+        """Why it cannot train with its spaces; empty where it can."""
         return ""
 
     def world_env(self, world: World, record: Record) -> ProbeEnv:
-        """An environment to read observations and spaces off."""
+        """An environment to read observations and spaces from."""
         return ProbeEnv(world, record, *self.spaces)
 
 
@@ -195,7 +195,7 @@ class ClassSubject(Subject):
         self.find_spaces(wanted)
 
     def _find_family(self) -> None:
-        """Settings under which the family learns tiny worlds fast, and what it claims to do."""
+        """Set the settings that learn tiny worlds fast, and what the family claims to be."""
         from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
         from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
@@ -228,8 +228,8 @@ class ClassSubject(Subject):
         return trained
 
 
-# Of the library and of ours, the special before the general: what targets are made of, steps, and
-# settings that are quick on tiny worlds. Rates are constant and everything is explored.
+# Families of the library and of ours, subclasses before base classes: kind of target, steps, and
+# settings that learn tiny worlds fast. Rates are constant, and exploration is full.
 _OFF_POLICY: Mapping[str, Any] = {
     "learning_rate": 3e-3,
     "buffer_size": 2000,
@@ -304,7 +304,7 @@ def _is_entry_of(entry: AlgorithmEntry, cls: type) -> bool:
 
 
 class TrainedModel(Trained):
-    """A `BaseAlgorithm` in a world."""
+    """A `BaseAlgorithm` that was trained in a world."""
 
     def __init__(
         self, subject: ClassSubject, world: World, seed: int, changes: Mapping[str, Any]
@@ -332,7 +332,7 @@ class TrainedModel(Trained):
         return self.choose(state, deterministic=True)
 
     def choose(self, state: int, *, deterministic: bool) -> int:
-        """An action, the one of evaluation or one that may explore."""
+        """The action in evaluation (``deterministic``), or one that may explore."""
         observation = np.asarray(self.observation(state))
         action, _ = self.model.predict(observation, deterministic=deterministic)
         return action_number(action, self._env.action_space)
@@ -349,7 +349,7 @@ class TrainedModel(Trained):
 
 
 def _takes_one_argument(function: Any) -> bool:
-    """Whether a stranger's method can be called with an observation alone."""
+    """Whether a user's method can be called with an observation alone."""
     if not callable(function):
         return False
     try:
@@ -407,7 +407,7 @@ def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
             sequence = policy.predict_values(tensor[: last + 1], (start, start.clone()), begins)
             values.append(sequence[-1])
         return th.stack(values)
-    if hasattr(policy, "critic"):  # of what the actor does: the rest of the line is not learnt
+    if hasattr(policy, "critic"):  # at the actor's action: values of other actions are not learnt
         critics = policy.critic(tensor, policy._predict(tensor, deterministic=True))
         critics = th.stack(critics) if isinstance(critics, tuple) else critics.transpose(0, 1)
         return critics.reshape(len(critics), len(tensor), -1).mean(dim=(0, 2))[:, None]
@@ -418,10 +418,10 @@ def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
 
 
 class ScriptSubject(Subject):
-    """A function ``train(make_env, seed, gamma, steps, ...)`` that returns what can be asked.
+    """A function ``train(make_env, seed, gamma, steps, ...)`` that returns a trained agent.
 
-    What it returns has ``act(obs)``, an action, and ``values(obs)``, a number or one for each
-    action. Further arguments that have the name of a setting are given by the probes that need it.
+    The agent has ``act(obs)``, an action, and ``values(obs)``, a number or one for each action.
+    Probes that need a setting give it as the argument of that name.
     """
 
     def __init__(
@@ -434,7 +434,7 @@ class ScriptSubject(Subject):
     ) -> None:
         super().__init__(name, kind)
         self.function, self.typed = function, typed
-        if self.target == "states":  # which may call the length of a rollout so
+        if self.target == "states":  # ``n_steps`` may be the length of a rollout
             self.base = {key: value for key, value in BASE.items() if key != "n_steps"}
         try:
             self.parameters = inspect.signature(function).parameters
@@ -467,7 +467,7 @@ class ScriptSubject(Subject):
 
 
 class TrainedScript(Trained):
-    """What a script's function returned; to go on it begins anew."""
+    """The agent that a script's function returned; more training starts from the beginning."""
 
     def __init__(
         self, subject: ScriptSubject, world: World, seed: int, changes: Mapping[str, Any]
@@ -503,11 +503,11 @@ class TrainedScript(Trained):
         return np.stack([np.asarray(each, dtype=np.float64).reshape(-1) for each in found])
 
 
-# --- what was typed -------------------------------------------------------------------------------
+# --- the command line -----------------------------------------------------------------------------
 
 
 def class_named(name: str) -> type[BaseAlgorithm]:
-    """The class that ``--algo`` means: one of the table, or ``module:Class`` of an imported one."""
+    """The class that ``--algo`` names: an agent of the table, or ``module:Class`` as imported."""
     import sys
 
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -535,7 +535,7 @@ def class_named(name: str) -> type[BaseAlgorithm]:
 
 
 def function_named(name: str) -> Callable[..., Any]:
-    """The function that ``--script module:function`` means, of a module that is imported."""
+    """The function that ``--script module:function`` names, of a module that is imported."""
     import sys
 
     module, colon, attribute = name.rpartition(":")

@@ -64,8 +64,8 @@ gym.register(
 gym.register(
     id="RandomWarehouse-v0",
     entry_point="envs.warehouse:RandomWarehouseEnv",
-    # The limit of the largest map there may be. It stands in until the map is made: then the
-    # wrapper puts the map's own in its place, unless the caller of `gym.make` gave another.
+    # The limit of the largest possible map, until the map is made: then the wrapper replaces it by
+    # the map's own limit, unless the caller of `gym.make` gave another.
     max_episode_steps=PATH_MULTIPLE * MAX_STATES,
     additional_wrappers=(
         WrapperSpec(

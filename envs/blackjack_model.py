@@ -1,12 +1,12 @@
 """The exact model of Gymnasium's Blackjack.
 
-Cards come from a deck without end, so that nothing counts but the hand, and the dealer's hidden
-card is as good as one drawn later. The dealer's final sum follows from the card that shows by
-recursion.
+Cards come from an infinite deck, so only the hand matters, and the dealer's hidden card is
+equivalent to one drawn later. The distribution of the dealer's final sum follows by recursion from
+the visible card.
 
-A state is what is observed, numbered as `FlattenToDiscrete` does: (sum, dealer's card, usable ace).
-Besides, there is a state for each card of the dealer in which the player has a natural, an ace and
-a ten as dealt: it looks as any 21 with a usable ace does, and may be worth more.
+A state is an observation, numbered as `FlattenToDiscrete` does: (sum, dealer's card, usable ace).
+In addition, for each card of the dealer there is a state with a natural, an ace and a ten as dealt:
+it is observed as any 21 with a usable ace, and may be worth more.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
 from mdp.transition_model import Floats, Ints, TransitionModel
 
-SIZES = (32, 11, 2)  # of the observation's parts
+SIZES = (32, 11, 2)  # the number of values of each part of the observation
 N_OBSERVED = 32 * 11 * 2
 N_STATES = N_OBSERVED + 11
 STICK, HIT = 0, 1
@@ -37,7 +37,7 @@ def blackjack_model(env: BlackjackEnv) -> TransitionModel:
 
 
 def blackjack_observations() -> Ints:
-    """What is observed in each state, its three parts side by side, shape (S, 3)."""
+    """The observation of each state, its three parts side by side, shape (S, 3)."""
     seen = np.stack(np.unravel_index(np.arange(N_OBSERVED), SIZES), axis=1)
     naturals = np.array([(MOST, dealer, 1) for dealer in range(11)])
     return np.concatenate([seen, naturals])
@@ -72,8 +72,8 @@ def dealer_sums(total: int, usable_ace: bool) -> tuple[float, ...]:
 def sticking(total: int, dealer: int, natural: str | None) -> tuple[float, float, float, float]:
     """Probabilities of the rewards 1.5, 1, 0 and -1 when the player sticks on a sum.
 
-    A natural "wins" against all but another natural, or "pays" 1.5 where it is more than the dealer
-    has; None for neither, or no natural.
+    ``natural`` is "wins" if a natural beats all but another natural, "pays" if a win with it pays
+    1.5, and None if it counts as any 21, or the hand is no natural.
     """
     if natural == "wins":
         # The other card of the dealer's natural.
@@ -91,7 +91,7 @@ def sticking(total: int, dealer: int, natural: str | None) -> tuple[float, float
 def _model(pays: bool, sab: bool) -> TransitionModel:
     shape = (N_STATES, 2, 10)
     prob, reward = np.zeros(shape), np.zeros(shape)
-    # What no game leads to, and where one is over, leads to itself.
+    # Unreachable states, and those of finished games, lead to themselves.
     prob[..., 0] = 1
     next_state = np.broadcast_to(np.arange(N_STATES)[:, None, None], shape).copy()
     terminated = np.ones(shape, np.bool_)

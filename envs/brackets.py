@@ -1,8 +1,8 @@
-"""Brackets that were worked out for environments of Gymnasium as they are by default.
+"""Precomputed bounds (brackets) of the optimum of Gymnasium's environments, as made by default.
 
-`benchmarks/optimum_brackets.py` of commit d0af048 wrote them. One is claimed of an environment only
-if that is the class, with the constants and under the time limit, that it was worked out for, and
-if nothing around it changes rewards, actions or steps.
+`benchmarks/optimum_brackets.py` of commit d0af048 wrote them. A bracket applies only to an
+environment of the same class, with the same constants and time limit, whose wrappers change neither
+rewards, actions nor steps.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from envs.model_claims import is_changed
 
 DATA = Path(__file__).with_name("brackets.json")
 
-# What an agent is shown makes no difference to what can be had.
+# Modules of wrappers that change observations, but not the dynamics.
 _OBSERVATION_HOMES = ("gymnasium.wrappers.", "envs.wrappers.")
 
 
 @dataclass(frozen=True)
 class OptimumBracket:
-    """What is known of the highest mean return that any policy has, over starts that are drawn."""
+    """Bounds of the highest mean return of any policy, over random starts."""
 
-    lower: float  # what a policy was seen to reach
+    lower: float  # what a policy was observed to reach
     upper: float  # what no policy exceeds
     baseline: float  # the mean return of the best random or constant policy
-    upper_is_proven: bool = True  # whether there is a proof that none exceeds it
+    upper_is_proven: bool = True  # whether there is a proof of the upper bound
 
 
 def optimum_bracket(env: gym.Env[Any, Any]) -> OptimumBracket | None:
-    """The bracket of an environment, or None where there is none that holds for it."""
+    """The bracket of an environment, or None where no bracket applies."""
     base = env.unwrapped
     entry = known_entries().get(f"{type(base).__module__}:{type(base).__qualname__}", {})
     found = entry.get(time_limit(env))
@@ -52,7 +52,7 @@ def may_have_bracket(env_id: str) -> bool:
 
 
 def upper_is_proven(env_id: str) -> bool:
-    """Whether no bracket of the environment's class has an upper end without a proof."""
+    """Whether the upper ends of all brackets of the environment's class are proven."""
     registered = gym.registry.get(env_id.rpartition(":")[2])
     entries = {} if registered is None else known_entries().get(str(registered.entry_point), {})
     return all(entry["upper_is_proven"] for entry in entries.values())
@@ -60,7 +60,7 @@ def upper_is_proven(env_id: str) -> bool:
 
 @cache
 def known_entries() -> dict[str, dict[int | None, dict[str, Any]]]:
-    """What is stored, by class and time limit."""
+    """The stored brackets, by class and time limit."""
     found: dict[str, dict[int | None, dict[str, Any]]] = {}
     for entry in json.loads(DATA.read_text(encoding="utf-8")).values():
         found.setdefault(entry["class"], {})[entry["time_limit"]] = entry
@@ -70,7 +70,7 @@ def known_entries() -> dict[str, dict[int | None, dict[str, Any]]]:
 def constants_of(base: gym.Env[Any, Any]) -> dict[str, Any]:
     """The numbers, texts and lists that an environment's dynamics may depend on, by name.
 
-    Those of its class count too. What drawing needs, and what changes from step to step, do not.
+    Attributes of its class count too; those for rendering, or that change in each step, do not.
     """
     of_class = {k: v for each in reversed(type(base).__mro__) for k, v in vars(each).items()}
     named = {**of_class, **vars(base)}
@@ -88,7 +88,7 @@ _NO_DYNAMICS = (
 
 
 def _is_plain(env: gym.Env[Any, Any]) -> bool:
-    """Whether no wrapper, and nobody's own method, comes between agent and environment."""
+    """Whether wrappers change only observations, and no method was replaced by hand."""
     while isinstance(env, gym.Wrapper):
         kind = type(env)
         if is_changed(env):

@@ -31,7 +31,7 @@ EPISODE_LIMIT = 1000
 DIFFERENT = "the environment's P is not what step does: "
 SEED = 0
 
-# What changes while an environment is played, and says nothing of its dynamics.
+# Attributes that change while an environment is played, and do not affect its dynamics.
 PLAYED = frozenset({"s", "lastaction", "spec", "render_mode", "_np_random", "_np_random_seed"})
 PLAYED_KINDS = (np.random.Generator, np.random.RandomState, random.Random, gym.Space)
 
@@ -41,12 +41,12 @@ class ModelCheck:
     """The result of a check of a model against `step`.
 
     Attributes:
-        refusal: why the model is not believed, in one line; None where it is.
-        bit_for_bit: whether the environment draws as Gymnasium's toy_text environments do, one
+        refusal: why the model is rejected, in one line; None where it is accepted.
+        bit_for_bit: whether the environment samples as Gymnasium's toy_text environments do: one
             uniform number for each start and each step, looked up in the cumulative sum of the
-            probabilities as ``P`` orders them, or never has anything to draw. Whoever draws so
-            from the model, by the same generator, gets the very same episodes.
-        state_can_be_set: whether the environment goes on from where its attribute ``s`` is put.
+            probabilities in the order of ``P``; or has nothing to sample. Sampling from the model
+            with the same generator then gives the same episodes.
+        state_can_be_set: whether setting the attribute ``s`` sets the environment's state.
         n_steps: the steps that were compared with the model.
     """
 
@@ -57,38 +57,37 @@ class ModelCheck:
 
 
 _checks: dict[tuple[Any, ...], ModelCheck] = {}
-_kept_alive: list[object] = []  # what is told apart by its id
+_kept_alive: list[object] = []  # objects that are identified by their id
 
 
 def check_transition_model(env: Env, n_steps: int = N_STEPS) -> ModelCheck:
-    """Compare the model that an environment brings with what its `step` and `reset` do.
+    """Compare an environment's own model with its `step` and `reset`.
 
     A copy of the environment, without its wrappers, plays random episodes, up to their time limit
-    or 1000 steps. Then, where its attribute ``s`` can be set, which is tried out, it takes every
-    action in every state that the model says can be reached, and most often those whose frequencies
-    fit least; elsewhere it is steered to where it was least.
+    or 1000 steps. Then, if trials show that its attribute ``s`` sets the state, it takes every
+    action in every state that the model can reach, and most often those whose frequencies fit
+    worst; otherwise it follows plans to the states and actions seen least.
 
-    - Whatever the model gives no chance (a next state, a reward that differs in single precision,
-      a termination or none, a start, an observation that is not the state's number, a truncation)
-      is found as soon as it happens once.
-    - Frequencies are held against the model's probabilities: of starts, for each state and action,
-      and for all that should be alike together. A right model is refused with a chance of at most
-      one in a million, if ``s``, where it can be set, is all of the state.
+    - An event of probability zero in the model (a next state, a reward that differs in single
+      precision, a termination or none, a start, an observation that is not the state's number, a
+      truncation) is found as soon as it happens once.
+    - Frequencies are tested against the model's probabilities: of starts, for each state and
+      action, and for all with equal probabilities together. A correct model is rejected with a
+      probability of at most one in a million, if ``s``, where it can be set, is the whole state.
 
-    A model has no memory, and is not asked for any: where frequencies depend on the time or on what
-    happened before, and are on the whole as the model says, it is believed. Not found either is
-    what happens too seldom to be seen, what is hidden in states that neither episodes nor setting
-    ``s`` lead to, and what changes after the check. The copy is a deep one, or another environment
-    made alike: the caller's episode and generators stay as they are, but what the environment
-    shares with its copies, such as an attribute of its class, is used. The same environment is
-    always judged in the same way, unless it draws from a generator that `reset` does not seed.
+    The Markov property is not tested: where frequencies depend on time or history, but agree with
+    the model on average, the model is accepted. Nor does the check find events too rare to happen,
+    states that neither episodes nor setting ``s`` lead to, and changes after the check. The copy is
+    a deep one, or another environment made alike: the caller's episode and generators do not
+    change, but objects that copies share, such as class attributes, may. The same environment
+    always gets the same result, unless it draws from a generator that `reset` does not seed.
 
     Args:
         env: an environment that has ``P`` and ``initial_state_distrib``, wrapped or not.
         n_steps: steps to take; more where there are more states and actions.
 
     Raises:
-        ValueError: if it brings no model.
+        ValueError: if the environment has no model.
     """
     base = env.unwrapped
     try:
@@ -101,11 +100,11 @@ def check_transition_model(env: Env, n_steps: int = N_STEPS) -> ModelCheck:
 
 
 def checked(base: Env, claim: Claim) -> ModelCheck:
-    """As `check_transition_model`, worked out once for environments of the same attributes."""
+    """As `check_transition_model`, cached for environments of the same attributes."""
     kind = (type(base), _limit(base))
     now = (*kind, _digest(base, claim.model))
     if now not in _checks:
-        # An environment that is being played differs from a new one, and yet is the same.
+        # During an episode the attributes differ from those of a new environment: try both.
         new = (*kind, _digest_when_new(base, claim.model))
         if new not in _checks:
             _checks[new] = _check(base, claim, N_STEPS)
@@ -143,7 +142,7 @@ def _digest_when_new(base: Env, model: TransitionModel) -> bytes:
         with _global_generators_apart():
             twin = _copy_of(base)
             twin.reset(seed=SEED)
-    except Exception:  # noqa: BLE001  # whatever it is, the check will say
+    except Exception:  # noqa: BLE001  # the check will report it
         return _digest(base, model)
     return _digest(twin, model)
 
@@ -155,9 +154,9 @@ def _digest(base: Env, model: TransitionModel) -> bytes:
         if name in PLAYED or isinstance(value, PLAYED_KINDS):
             continue
         try:
-            # Written to be compared, and never read.
+            # Pickled for comparison, and never loaded.
             found.update(pickle.dumps((name, value)))
-        except Exception:  # noqa: BLE001  # such as a function without a name: that very object
+        except Exception:  # noqa: BLE001  # such as a lambda: identified by its id
             _kept_alive.append(value)
             found.update(f"{name} {id(value)}".encode())
     return found.digest()
@@ -171,9 +170,9 @@ def _model_digest(model: TransitionModel) -> bytes:
 
 
 def _copy_of(base: Env) -> Env:
-    """A deep copy that draws nothing on the screen; where there is none, one made as this was."""
+    """A deep copy without rendering; where that fails, an environment of the same spec."""
     for name in ("step", "reset"):
-        if name in vars(base):  # that of a copy may well act on the original
+        if name in vars(base):  # that of a copy may act on the original
             raise ValueError(f"its {name} was replaced by hand, and cannot be tried on a copy")
     try:
         twin = copy.deepcopy(base)
@@ -192,7 +191,7 @@ def _copy_of(base: Env) -> Env:
 
 @contextmanager
 def _global_generators_apart() -> Iterator[None]:
-    """Seed the generators that all code shares, which some environments use, and restore them."""
+    """Seed the global generators, which some environments use, and restore them afterwards."""
     kept = random.getstate(), np.random.get_state()  # noqa: NPY002  # not to draw from it
     random.seed(SEED)
     np.random.seed(SEED)  # noqa: NPY002
@@ -203,8 +202,8 @@ def _global_generators_apart() -> Iterator[None]:
         np.random.set_state(kept[1])  # noqa: NPY002
 
 
-# What may be seen of a step: row (``state * A + action``), next state, reward in single precision,
-# and whether the episode terminated.
+# An observed step: row (``state * A + action``), next state, reward in single precision, and
+# whether the episode terminated.
 Observed = tuple[int, int, float, bool]
 
 # Probabilities within this of one are one, and rows this alike are the same.
@@ -212,7 +211,7 @@ TOLERANCE = 1e-9
 
 
 class OutcomeClasses:
-    """A model's outcomes by what may be seen of them: those that look alike are one class."""
+    """A model's outcomes in classes: outcomes that are observed alike form one class."""
 
     def __init__(self, model: TransitionModel) -> None:
         n_rows = model.n_states * model.n_actions
@@ -230,7 +229,7 @@ class OutcomeClasses:
             for key in zip(rows.tolist(), *seen, strict=True)
         ]
         self.row: Ints = np.array([key[0] for key in self.ids])  # of each class, shape (C,)
-        # Which of its row's classes it is, from 0 on, shape (C,).
+        # The index of each class among those of its row, shape (C,).
         self.place: Ints = np.arange(len(self.row)) - np.searchsorted(self.row, self.row)
         self.of_outcome = np.full(prob.shape, -1)  # the class of each outcome of a row
         self.of_outcome[possible] = classes
@@ -255,9 +254,9 @@ STARTS_PER_STEP = 0.02
 DOUBTFUL = (64, 16, 4)
 STEERED_PARTS = 6
 STEERED_STEPS = 200
-# Steps from states that were set, after which an episode begins anew.
+# The number of steps from states that were set, after which an episode begins anew.
 STEPS_FROM_SET_STATES = 25
-# Attempts at setting the state, and how much more likely, as a logarithm, what follows has to be.
+# The number of attempts at setting the state, and the log-likelihood ratio that shows success.
 N_ATTEMPTS = 500
 CERTAIN = 20.0
 RARE = 1e-3
@@ -265,7 +264,7 @@ MAX_MISSES = N_ATTEMPTS // 50
 
 
 class Trial:
-    """A copy of an environment that is played, each step compared with the model that it claims."""
+    """Plays a copy of an environment, and compares each step with its claimed model."""
 
     def __init__(self, env: Env, claim: Claim, limit: int) -> None:
         self.env: Any = env
@@ -274,8 +273,8 @@ class Trial:
         self.limit = limit  # steps after which an episode is left
         self.classes = OutcomeClasses(self.model)
         self.state, self.time, self.over = 0, 0, True
-        # Where episodes began; and of each step the class of its outcome. Beside them, how many
-        # uniform numbers had been drawn, if one is for each step and each start.
+        # The starting state of each episode, and the class of each step's outcome; each followed
+        # by the number of uniform numbers drawn before, if each start and step draws one.
         self._starts, self._steps, self._rewards = array("q"), array("q"), array("d")
         self._n_drawn = 0
         self._rng = np.random.default_rng(SEED)
@@ -283,9 +282,9 @@ class Trial:
     def run(self, n_steps: int) -> bool:
         """Play random episodes, then visit all states and actions, then those that seem wrong.
 
-        Where the state cannot be set, episodes are steered instead, by plans on the model itself,
-        to states and actions that were seen least. Returns whether the state can be set; raises
-        DisagreementError as soon as something happens that the model rules out.
+        Where the state cannot be set, episodes follow plans made on the model instead, to states
+        and actions seen least. Returns whether the state can be set; raises DisagreementError as
+        soon as something happens that the model rules out.
         """
         n_random = int(EPISODE_SHARE * n_steps)
         for action in self._rng.integers(self.n_actions, size=n_random).tolist():
@@ -319,7 +318,7 @@ class Trial:
         return self.classes.row[outcomes], self.classes.place[outcomes]
 
     def draws_as_toy_text(self) -> bool:
-        """Whether all was what toy_text makes of the uniform numbers of the same generator."""
+        """Whether all outcomes are those of toy_text's sampling with the same generator."""
         generator, _ = seeding.np_random(SEED)
         uniforms = generator.random(self._n_drawn)
         starts_upto, drawn = np.cumsum(self.model.initial), uniforms[self._steps[1::2]]
@@ -360,11 +359,10 @@ class Trial:
         return doubtful
 
     def _obeys(self) -> bool:
-        """Whether the environment goes on from where it is put, and not from where it was.
+        """Whether setting ``s`` sets the whole state, so that the environment goes on from there.
 
-        Only states and actions that episodes have seen are tried, of which it is known that they
-        hardly ever do what the model rules out. If they do now, then more makes up the state than
-        what was set.
+        Only states and actions that episodes have seen are tried, in which the environment did what
+        the model says. If it does not now, ``s`` is not the whole state.
         """
         n_actions, evidence, misses = self.n_actions, 0.0, 0
         rows = np.unique(self.steps[0])
@@ -397,7 +395,7 @@ class Trial:
                 self._step(int(actions[left - 1, self.state]))
 
     def _plan_to_the_unseen(self, horizon: int) -> Ints:
-        """What to do with 1, 2, ... steps left to see what was seen least, shape (m, S)."""
+        """Actions with 1, 2, ... steps left that lead to what was seen least, shape (m, S)."""
         from mdp.finite_horizon import finite_horizon_optimum
 
         visits = np.bincount(self.steps[0], minlength=len(self.classes.prob))
@@ -422,7 +420,7 @@ class Trial:
         self.time, self.over = 0, False
 
     def _step(self, action: int) -> None:
-        """Take a step and count what came of it."""
+        """Take a step and count its outcome."""
         n_drawn = self._n_drawn
         seen, reward = self._act(action)
         outcome = self.classes.ids.get(seen)
@@ -437,7 +435,7 @@ class Trial:
         self.time += 1
 
     def _act(self, action: int) -> tuple[Observed, float]:
-        """What comes of an action, and the reward in full precision."""
+        """The outcome of an action as observed, and the reward in full precision."""
         row = self.state * self.n_actions + action
         try:
             obs, reward, terminated, truncated, _ = self.env.step(action)
@@ -461,14 +459,14 @@ class Trial:
         return self._states_agree()
 
     def _states_agree(self) -> bool:
-        """Whether the environment's attribute ``s`` is where it is."""
+        """Whether the environment's attribute ``s`` equals the observed state."""
         try:
             return operator.index(self.env.s) == self.state
         except (AttributeError, TypeError):
             return False
 
     def _state_of(self, obs: Any, row: int | None) -> int:
-        """Where the environment is after a row, or a start, by what is observed."""
+        """The state after a row, or a start (None), from the observation or ``s``."""
         by_obs = self.claim.observes_states
         found: Any = obs if by_obs else getattr(self.env, "s", None)
         try:
@@ -502,14 +500,14 @@ def _error_text(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-# Counts that the right probabilities would not have led to: a test at a fixed number of draws goes
-# wrong where what is seen decides what is drawn next, as the states of episodes do. A likelihood
-# ratio does not: where the probabilities are right, that of any mixture of others to them is a
-# martingale with mean one, and exceeds 1/alpha, ever, with probability alpha at most (Ville, Étude
-# critique de la notion de collectif, 1939; Robbins, Annals of Mathematical Statistics 41, 1970).
-# Nothing is approximated, at any number of draws.
+# A test of frequencies at a fixed number of draws is invalid where outcomes decide what is drawn
+# next, as the states of episodes do. A test by likelihood ratio is valid: under the right
+# probabilities, the likelihood ratio of any mixture of others to them is a martingale with mean
+# one, and ever exceeds 1/alpha with probability alpha at most (Ville, Étude critique de la notion
+# de collectif, 1939; Robbins, Annals of Mathematical Statistics 41, 1970). It is exact for any
+# number of draws.
 
-# The chance that counts of a right model are called odd: over all that is looked at.
+# The probability that a correct model is rejected, over all tests.
 FALSE_ALARMS = 1e-6
 N_FAMILIES = 3
 
@@ -549,9 +547,9 @@ class Odd(NamedTuple):
 
 
 def _oddest(groups: Ints, outcomes: Ints, probabilities: Floats, n_tests: int) -> Odd | None:
-    """The count that speaks most against its probability, if that is beyond chance.
+    """The count with the most evidence against its probability, if that is significant.
 
-    ``n_tests`` counts all groups and outcomes that could be looked at, whether they came up or not.
+    ``n_tests`` counts all groups and outcomes that may be drawn, whether they were or not.
     """
     groups, counts, evidence = frequencies(groups, outcomes, probabilities)
     group, outcome = np.unravel_index(np.argmax(evidence), evidence.shape)
@@ -567,7 +565,7 @@ def _oddest(groups: Ints, outcomes: Ints, probabilities: Floats, n_tests: int) -
 
 
 def frequencies(groups: Ints, outcomes: Ints, probabilities: Floats) -> tuple[Ints, Ints, Floats]:
-    """The groups in which something was drawn, and how often which outcome, with its evidence.
+    """The groups with draws, the counts of their outcomes, and the evidence of each count.
 
     ``groups`` and ``outcomes``, of shape (n,), are those of each draw, ``probabilities``, of shape
     (H, K), those of the outcomes in each group. Shapes returned: (G,), (G, K), (G, K).
@@ -580,11 +578,11 @@ def frequencies(groups: Ints, outcomes: Ints, probabilities: Floats) -> tuple[In
 
 
 def log_evidence(counts: Ints, trials: Ints, prob: Floats) -> Floats:
-    """Logarithm of how much likelier counts are under a probability that nobody knows.
+    """The log-likelihood ratio of counts: an unknown probability against ``prob``.
 
-    That one is drawn from Beta(1/2, 1/2); Krichevsky and Trofimov, IEEE Transactions on Information
-    Theory 27, 1981. Minus infinity where ``prob``, that of a success which is doubted, is 0 or 1:
-    counts cannot refute these bit by bit, one draw does, or none.
+    The unknown probability is drawn from Beta(1/2, 1/2); Krichevsky and Trofimov, IEEE Transactions
+    on Information Theory 27, 1981. Minus infinity where ``prob`` is 0 or 1: these are refuted by a
+    single draw, or not at all.
     """
     from scipy.special import betaln
 

@@ -82,7 +82,7 @@ class Label(NamedTuple):
     at: Point
     height: float
     colour: Colour
-    # Which part of the text stands there: 0 its left end, 0.5 its middle, 1 its right end.
+    # The part of the text at this point: 0 its left end, 0.5 its middle, 1 its right end.
     align: float = 0.5
 
 
@@ -222,7 +222,7 @@ class Renderer(ABC):
         return np.ascontiguousarray(pygame.surfarray.array3d(picture).swapaxes(0, 1))
 
     def show(self, scene: Any) -> None:
-        """Draw a scene into the window, no sooner than the time for it has come."""
+        """Draw a scene into the window, at most ``fps`` times a second."""
         import pygame
 
         picture = self.paint(scene)
@@ -268,13 +268,13 @@ MAX_CELL = 64
 MIN_DETAILED_CELL = 12
 # Start, goal and robot of such maps are drawn across cells, large enough to be seen.
 MARKER = 28
-# By how many pixels the trail there is wider than one.
+# The additional width of the trail on such maps, in pixels.
 TRAIL_MARKER = 4
 OVERSAMPLING = 4
 
 
 class GridRenderer(Renderer):
-    """Shows the moments of one map; what they have in common is drawn once."""
+    """Shows scenes on one map, whose common background is drawn once."""
 
     def __init__(self, rows: tuple[str, ...], fps: int, title: str) -> None:
         super().__init__(fps, title)
@@ -444,7 +444,7 @@ RENDER_MODES = ("ansi", "rgb_array", "human")
 
 
 class ShownEnv(gym.Env[Any, Any], ABC):
-    """An environment with three ways of looking at it: ``ansi``, ``rgb_array`` and ``human``."""
+    """An environment with three render modes: ``ansi``, ``rgb_array`` and ``human``."""
 
     # Not annotated as ClassVar, since Gymnasium declares it as an attribute of the instance.
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
@@ -482,8 +482,8 @@ class ShownEnv(gym.Env[Any, Any], ABC):
 
     @abstractmethod
     def _picture(self) -> Any:
-        """The state as what the renderer paints."""
+        """The state as the scene that the renderer paints."""
 
     @abstractmethod
     def _make_renderer(self, fps: int, title: str) -> Renderer:
-        """What paints the pictures."""
+        """The renderer of the pictures."""

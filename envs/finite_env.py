@@ -1,4 +1,4 @@
-"""Environments that are played from the arrays of their own model, as Gymnasium's toy_text are."""
+"""Environments that sample from the arrays of their own model, as Gymnasium's toy_text do."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Outcome = tuple[float, int, float, bool]
 
 
 class FiniteEnv(ShownEnv):
-    """Numbered states and actions; a step draws from what the model says.
+    """An environment with numbered states and actions, whose steps sample from its model.
 
-    A subclass says with `transition_model` what may happen, and how a state looks. `reset` and
+    A subclass defines the dynamics in `transition_model`, and how a state is rendered. `reset` and
     `step` draw one uniform number each, even where nothing is random, and choose by cumulative sum
     in the order of the arrays. Where the model's rewards have a variance, a step then draws a
-    standard normal number. A subclass may draw otherwise, see `_draw`, as long as it comes to the
-    same probabilities, means and variances.
+    standard normal number. A subclass may sample otherwise, see `_draw`, with the same
+    probabilities, means and variances.
 
     Args:
         n_states: observations are the states, `Discrete(n_states)`, unless a subclass says
@@ -49,8 +49,8 @@ class FiniteEnv(ShownEnv):
     def transition_model(self) -> TransitionModel:
         """The exact dynamics as arrays.
 
-        Asked for at each step: a subclass hands out one that is kept outside of the environment,
-        so that copies and saved states do not carry it along.
+        Called at each step: a subclass returns a model that is cached outside of the environment,
+        so that copies and saved states do not contain it.
         """
 
     def reset(
@@ -65,7 +65,7 @@ class FiniteEnv(ShownEnv):
         return self._observe(), {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        """Do one thing; see the class for the meaning of what is returned."""
+        """Take an action; the class describes the results."""
         action = int(action)
         if not 0 <= action < self.n_actions:
             raise ValueError(
@@ -78,14 +78,14 @@ class FiniteEnv(ShownEnv):
         return self._observe(), reward, terminated, False, {}
 
     def observation_of(self, states: Any) -> Any:
-        """What is observed in each of many states, shape (n,): by default their numbers."""
+        """The observations of many states, shape (n,): by default their numbers."""
         return states
 
     def _observe(self) -> int:
         return int(self.observation_of(self.s))
 
     def _draw(self, action: int) -> tuple[int, float, bool]:
-        """What comes of an action: next state, reward, and whether the episode terminates."""
+        """Sample the outcome: next state, reward, and whether the episode terminates."""
         model = self.transition_model()
         drawn = first_above(model.prob[self.s, action].cumsum(), self.np_random.random())
         outcome = self.s, action, drawn
@@ -104,30 +104,30 @@ class FiniteEnv(ShownEnv):
     def P(self) -> dict[int, dict[int, list[Outcome]]]:  # noqa: N802 (the name toy_text gave it)
         """The dynamics as Gymnasium's toy_text environments hold them.
 
-        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built when
-        first asked for. Where rewards are drawn, these are their means.
+        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built on
+        first access. Random rewards are given by their means.
         """
         return as_dictionaries(self.transition_model())
 
 
 class MaskedFiniteEnv(FiniteEnv):
-    """One where what may be done depends on the state.
+    """A finite environment whose allowed actions depend on the state.
 
-    What may not be done does something all the same, which the class says: agents that know
-    nothing of masks may choose it.
+    Other actions have an effect too, which the class describes: agents that know nothing of masks
+    may choose them.
     """
 
     @abstractmethod
     def masks_of_states(self) -> Bools:
-        """What may be done in each state, bool of shape (S, A), never nothing."""
+        """The allowed actions of each state, bool of shape (S, A), at least one each."""
 
     def action_masks(self) -> Bools:
-        """What may be done now, bool of shape (A,): sb3-contrib's convention."""
+        """The allowed actions now, bool of shape (A,): sb3-contrib's convention."""
         mask: Bools = self.masks_of_states()[self.s]
         return mask.copy()
 
 
-# Of bars, in characters.
+# The length of a bar, in characters.
 BAR = 40
 # In pixels.
 WIDTH, MARGIN, TITLE, ROW, TEXT = 560, 24, 48, 64, 22
@@ -142,11 +142,11 @@ class Gauge(NamedTuple):
 
 
 class GaugeEnv(MaskedFiniteEnv):
-    """One whose state is one or more amounts, shown as bars."""
+    """An environment whose state is one or more amounts, shown as bars."""
 
     @abstractmethod
     def _gauges(self) -> tuple[str, list[Gauge]]:
-        """What was done last, in words, and the amounts."""
+        """The last action, in words, and the amounts."""
 
     def _text(self) -> str:
         title, gauges = self._gauges()
@@ -176,7 +176,7 @@ class GaugeEnv(MaskedFiniteEnv):
 
 
 def first_above(cumulative: Sequence[float] | Floats, uniform: float) -> int:
-    """The first place whose sum exceeds the number; 0 where rounding leaves none, as toy_text."""
+    """The first index whose sum exceeds the number; 0 where rounding leaves none, as toy_text."""
     place = bisect_right(cumulative, uniform)
     return place if place < len(cumulative) else 0
 
@@ -198,7 +198,7 @@ def summing_to_one(probabilities: Floats) -> Floats:
     """Probabilities whose running sum, over the last axis, ends at exactly one.
 
     Otherwise a uniform number above the sum would choose the first, as `categorical_sample` does.
-    What rounding leaves goes to the last one that is not zero.
+    The rounding error is added to the last probability that is not zero.
     """
     before = np.zeros_like(probabilities)
     before[..., 1:] = probabilities.cumsum(axis=-1)[..., :-1]

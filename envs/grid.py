@@ -200,7 +200,7 @@ POSSIBLE_MOVES = ((0, 2, 3), (1, 2, 3), (2, 0, 1), (3, 0, 1))
 
 @dataclass(frozen=True)
 class Tile:
-    """What a robot meets that tries to move onto a cell.
+    """The effect of trying to move onto a cell.
 
     Attributes:
         reward: what the move earns.
@@ -225,7 +225,7 @@ class Move(NamedTuple):
 
 
 class GridDynamics:
-    """What happens when a robot moves on a map, for a single step and for all at once.
+    """The dynamics of a robot on a map, for a single step and for all states at once.
 
     A state is a cell plus the number of cells times a bit mask: bit i is set when the i-th
     collectable cell, row by row, has been visited in this episode. Without collectable cells
@@ -235,7 +235,7 @@ class GridDynamics:
     Args:
         grid_map: the map.
         tiles: what each letter of the map means.
-        edge: what a robot meets that tries to leave the map.
+        edge: the effect of trying to leave the map.
         slip: probability that a move goes sideways, half of it to each side.
 
     Raises:
@@ -284,7 +284,7 @@ class GridDynamics:
         return Move(target + self.n_cells * collected, reward, tile.terminated, bumped=False)
 
     def transition_model(self, initial: Floats) -> TransitionModel:
-        """Every move of every state as arrays, for starts of probabilities of shape (S,).
+        """The model as arrays, with the probabilities ``initial`` of starts, shape (S,).
 
         There is one outcome, or three where moves may slip: as meant, then to the two sides.
         """
@@ -299,7 +299,7 @@ class GridDynamics:
         )
 
     def action_mask(self, state: int) -> Bools:
-        """The moves that neither a wall nor the edge stops, bool of shape (4,), never none."""
+        """The moves that neither a wall nor the edge stops, bool of shape (4,); all if none."""
         free = [not self.move(state, direction).bumped for direction in range(len(MOVES))]
         return np.array(free) | (not any(free))
 
@@ -406,7 +406,7 @@ def _title(scene: Scene, rows: range, columns: range) -> str:
 
 
 def _window(centre: int, length: int, most: int) -> range:
-    """At most so many indices around one of them."""
+    """At most ``most`` indices around ``centre``."""
     first = max(0, min(centre - most // 2, length - most))
     return range(first, min(first + most, length))
 
@@ -421,15 +421,15 @@ Observation = int | NDArray[np.float32]
 class GridWorld(ShownEnv):
     """A robot on a map of letters, moving up, down, left or right; the base of all grid worlds.
 
-    A subclass says in `tiles` what its letters mean; cells that neither block nor terminate can
-    be walked on. What it must hold to, so that the arrays of `transition_model` replay an episode
-    exactly: `reset` and `step` draw one uniform number each, even where nothing is random, and
+    A subclass defines its letters in `tiles`; cells that neither block nor terminate can be walked
+    on. So that the arrays of `transition_model` replay an episode exactly, a subclass must keep
+    this rule: `reset` and `step` draw one uniform number each, even where nothing is random, and
     choose by cumulative sum in the order of `initial_state_distrib` and `P`.
 
     Args:
         desc: the map: its rows, or the path to a text file. Exactly one ``S``, at least one ``G``.
         tiles: what each letter means.
-        edge: what meets a robot that tries to leave the map.
+        edge: the effect of trying to leave the map.
         slip: probability that a move goes sideways, half of it to each side.
         random_start: start each episode on any cell that can be walked on, holds nothing to
             collect, and has a way to the goal, with equal probability, instead of on ``S``.
@@ -482,7 +482,7 @@ class GridWorld(ShownEnv):
         return self._observe(), self._info(bumped=False)
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Try to move one cell; see the class for the meaning of what is returned."""
+        """Try to move one cell; the class describes the results."""
         action = int(action)
         if not 0 <= action < len(MOVES):
             raise ValueError(f"action {action} does not exist: 0 up, 1 down, 2 left, 3 right")
@@ -501,14 +501,13 @@ class GridWorld(ShownEnv):
     def action_masks(self) -> Bools:
         """Which moves neither a wall nor the edge stops, bool of shape (4,).
 
-        Where moves may slip, the one that is meant counts: slipping to the side is not ruled out.
-        Never none: all may be tried in a cell that is walled in, and where an episode has ended.
-        The convention is that of sb3-contrib's agents.
+        Where moves may slip, only the intended move counts. All moves are allowed in a cell that is
+        walled in, and where an episode has ended. The convention is that of sb3-contrib's agents.
         """
         return self.dynamics.action_mask(self.s)
 
     def observation_of(self, states: AnyInts) -> NDArray[Any]:
-        """What is observed in each of many states, shape (n,): here the states themselves."""
+        """The observations of many states, shape (n,): here the states themselves."""
         return states
 
     def transition_model(self) -> TransitionModel:
@@ -527,14 +526,14 @@ class GridWorld(ShownEnv):
     def P(self) -> dict[int, dict[int, list[Outcome]]]:  # noqa: N802 (the name toy_text gave it)
         """The dynamics as Gymnasium's toy_text environments hold them.
 
-        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built when
-        first asked for, from `transition_model`, whose arrays take a tenth of the memory.
+        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built
+        on first access, from `transition_model`, whose arrays take a tenth of the memory.
         """
         return as_dictionaries(self.transition_model())
 
     @property
     def is_stationary(self) -> bool:
-        """Whether the dynamics stay as they are, so that their model holds at any time."""
+        """Whether the dynamics do not change over time, so that their model always holds."""
         return True
 
     @property
@@ -591,18 +590,18 @@ def _equal(n: int) -> Floats:
     return summing_to_one(np.full(n, 1 / n))
 
 
-# Chains that are longer are drawn in several rows, to be read as text is.
+# Longer chains are drawn in several rows, read as lines of text are.
 LONGEST_ROW = 50
 
 
 class MapEnv(FiniteEnv):
-    """One whose states are shown on a map, ``rows``; its letters are those of `envs.drawing`."""
+    """An environment whose states are shown on a map, ``rows``, with letters of `envs.drawing`."""
 
     rows: tuple[str, ...]
     action_names: ClassVar[tuple[str, ...]]
 
     def cell_of(self, state: int) -> int:
-        """Where a state lies, cells counted row by row: by default states are cells."""
+        """The cell of a state, counted row by row: by default states are cells."""
         return state
 
     def _text(self) -> str:
@@ -617,7 +616,7 @@ class MapEnv(FiniteEnv):
 
 
 class ChainEnv(MapEnv):
-    """One whose states lie side by side."""
+    """An environment whose states lie side by side."""
 
     @abstractmethod
     def letters(self) -> str:

@@ -1,9 +1,9 @@
-"""What is known exactly about a Gymnasium environment: its dynamics, with the wrappers folded in.
+"""The exact dynamics of a Gymnasium environment, with the effects of its wrappers.
 
-The answer is None wherever a wrapper is not known to leave the dynamics alone: a wrong model would
-make every figure computed from it wrong. For the same reason a model that comes neither from
-Gymnasium's own classes nor from this project's is compared with `step` before it is believed, once
-a process: see `envs.checking`.
+The result is None where the effect of a wrapper is unknown, since a wrong model would make every
+figure computed from it wrong. For the same reason a model that is neither of Gymnasium's own
+classes nor of this project's is compared with `step` before it is accepted, once a process: see
+`envs.checking`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from mdp.transition_model import Bools, TransitionModel
 Env = gym.Env[Any, Any]
 Wrapper = gym.Wrapper[Any, Any, Any, Any]
 
-# By name, and not as classes: environments know no Stable-Baselines3, and a subclass of one of
-# these may do anything.
+# By name, and not as classes: this package does not import Stable-Baselines3, and a subclass may
+# do anything.
 TRANSPARENT_WRAPPERS = frozenset(
     {
         "gymnasium.wrappers.common.OrderEnforcing",
@@ -57,20 +57,20 @@ OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservat
 
 Judgement = tuple[Claim | None, ModelCheck | None]
 
-# What was found out about environments, by `id`: set while they live.
+# A cache of judgements of environments, by `id`: set only while these live.
 _looked_at: ContextVar[dict[int, Judgement] | None] = ContextVar("looked_at", default=None)
 
 
 def transition_model(env: Env) -> TransitionModel | None:
     """The exact dynamics of an environment, with the rewards that its outermost wrapper gives.
 
-    Known are this project's grid worlds and textbook environments, its bandits with click rates,
-    Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, and environments that hold ``P`` and
-    ``initial_state_distrib`` as toy_text's do and pass `envs.check_transition_model`, under
-    wrappers that leave the dynamics alone, `ScaleReward`, Gymnasium's `ClipReward`, and
-    `TerminationReward` where it gives its reward at terminations only. What `ClipReward` makes of
-    rewards that are drawn is not known. A time limit is no part of the model: see `time_limit`.
-    None where the model is not known.
+    The model is known for this project's grid worlds and textbook environments, its bandits with
+    click rates, Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, and environments that
+    hold ``P`` and ``initial_state_distrib`` as toy_text's do and pass
+    `envs.check_transition_model`. Known wrappers are those that leave the dynamics alone,
+    `ScaleReward`, Gymnasium's `ClipReward` (unless rewards are random), and `TerminationReward`
+    where it gives its reward at terminations only. A time limit is no part of the model: see
+    `time_limit`. None where the model is not known.
     """
     base, wrappers = _layers(env)
     claim = _believed(base) if all(map(_folds, wrappers)) else None
@@ -95,10 +95,9 @@ def transition_model(env: Env) -> TransitionModel | None:
 
 
 def model_check(env: Env) -> ModelCheck | None:
-    """What came of comparing the environment's own model with its `step`.
+    """The result of checking the environment's own model against its `step`.
 
-    Those whose word is enough pass without a look. None where there is no model, or wrappers hide
-    it.
+    Trusted environments pass without a check. None where there is no model, or wrappers hide it.
     """
     base, wrappers = _layers(env)
     return _judged(base)[1] if all(map(_folds, wrappers)) else None
@@ -145,7 +144,7 @@ def success_outcomes(env: Env) -> Bools | None:
 
 
 def observations_of_states(env: Env) -> NDArray[Any] | None:
-    """What an agent observes in each state of `transition_model`; None where it is not known."""
+    """The observation of each state of `transition_model`; None where it is not known."""
     base, wrappers = _layers(env)
     claim = _believed(base)
     if claim is None or claim.observations is None:
@@ -160,10 +159,10 @@ def observations_of_states(env: Env) -> NDArray[Any] | None:
 
 
 def action_masks_of_states(env: Env) -> Bools | None:
-    """What may be done in each state of `transition_model`, bool of shape (S, A).
+    """The action mask of each state of `transition_model`, bool of shape (S, A).
 
-    Known are the masks of this project's environments, of Gymnasium's Taxi, and of
-    `IdleActionMasks`, under the wrappers that `transition_model` knows; elsewhere it is None.
+    Known for this project's environments, Gymnasium's Taxi, and `IdleActionMasks`, under the
+    wrappers that `transition_model` knows; None elsewhere.
     """
     base, wrappers = _layers(env)
     if not all(map(_folds, wrappers)):
@@ -171,7 +170,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
     if idle:
         return np.array(idle[-1])
-    # A class of one's own may have masks of its own.
+    # A subclass may have masks of its own.
     kind: Any = type(base)
     if isinstance(base, GridWorld) and kind.action_masks is GridWorld.action_masks:
         return base.dynamics.action_masks() if base.is_stationary else None
@@ -183,7 +182,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
 
 
 def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
-    """The environment without its wrappers, and these, the innermost first."""
+    """The environment without its wrappers, and the wrappers, the innermost first."""
     wrappers = []
     while isinstance(env, gym.Wrapper):
         wrappers.append(env)
@@ -192,7 +191,7 @@ def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
 
 
 def _folds(wrapper: Wrapper) -> bool:
-    """Whether a wrapper leaves the states alone and changes rewards, if so, in a known way."""
+    """Whether a wrapper keeps the states, and changes rewards at most in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
     if type(wrapper) is ClipReward:  # as it was made, with the same bounds for all rewards
@@ -204,14 +203,14 @@ def _folds(wrapper: Wrapper) -> bool:
 
 
 def _believed(base: Env) -> Claim | None:
-    """What an environment says of its dynamics, where that is to be believed."""
+    """The environment's claim about its dynamics, if it is accepted."""
     claim, check = _judged(base)
     return claim if check is not None and check.refusal is None else None
 
 
 @contextmanager
 def one_look(env: Env) -> Iterator[None]:
-    """Within the ``with`` statement, ``env`` must not change: its model is worked out once."""
+    """Cache the model of ``env``, which must not change within the ``with`` statement."""
     token = _looked_at.set({id(env.unwrapped): _judged(env.unwrapped)})
     try:
         yield
@@ -220,7 +219,7 @@ def one_look(env: Env) -> Iterator[None]:
 
 
 def _judged(base: Env) -> Judgement:
-    """What an environment says of its dynamics, and what came of the check of that."""
+    """The environment's claim about its dynamics, and the result of its check."""
     known = _looked_at.get()
     if known is not None and id(base) in known:
         return known[id(base)]

@@ -1,7 +1,7 @@
-"""Where the states of a grid world lie on its map, and what stands there: all that a drawing needs.
+"""The map of a grid world, and the cells of its states: all that a drawing needs.
 
-Letters of every layout, whatever the environment's own map writes: ``.`` free, ``S`` start, ``#``
-wall, ``G`` goal, ``X`` trap, ``P`` prize.
+Layouts have these letters, whatever those of the environment's own map: ``.`` free, ``S`` start,
+``#`` wall, ``G`` goal, ``X`` trap, ``P`` prize.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class GridLayout:
 
     @property
     def n_layers(self) -> int:
-        """In how many ways prizes may have been collected."""
+        """The number of subsets of prizes that may have been collected."""
         return 1 << len(self.prizes)
 
     @property
@@ -137,7 +137,7 @@ def _letter(own: str, tile: Tile) -> str:
 
 
 def action_names(env: gym.Env[Any, Any]) -> tuple[str, ...]:
-    """What the actions of an environment are called; empty where it does not say."""
+    """The names of an environment's actions; empty where it has none."""
     given = getattr(env.unwrapped, "action_names", None)
     if isinstance(given, tuple | list):
         return tuple(map(str, given))
@@ -148,7 +148,7 @@ def action_names(env: gym.Env[Any, Any]) -> tuple[str, ...]:
 
 
 def state_name(env: gym.Env[Any, Any], layout: GridLayout | None, state: int) -> str:
-    """What a state of `envs.known_models.transition_model` is called: a place, where it is one."""
+    """The name of a state of `envs.known_models.transition_model`: its place, where it has one."""
     base = env.unwrapped
     if layout is not None:
         name = layout.place_name(state % layout.n_cells)

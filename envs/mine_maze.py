@@ -41,8 +41,8 @@ class MineMazeEnv(GridWorld):
     power, counted row by row, has been collected.
 
     ## Rewards
-    Every move costs 1, also one against the outer wall, where the robot stays. What the robot steps
-    on is added:
+    Every move costs 1, also one against the outer wall, where the robot stays. The cell that the
+    robot enters adds:
 
     - a mine: -100
     - power, the first time in an episode: +1
@@ -62,7 +62,7 @@ class MineMazeEnv(GridWorld):
     `reset` and `step` give `position` (row, column), `bumped` (whether the robot ran into the outer
     wall) and `is_success` (whether it stands on the goal).
     `action_masks()` tells which moves do not run into the outer wall; with `slip` it
-    judges the move that is meant, and in a cell that is walled in it allows all.
+    considers the intended move, and in a cell that is walled in it allows all.
     The exact dynamics are available as arrays from `transition_model()`, and as `P` and
     `initial_state_distrib` as in Gymnasium's FrozenLake.
 

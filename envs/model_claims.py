@@ -1,8 +1,8 @@
-"""What environments, without their wrappers, say of their own dynamics, and whose word is enough.
+"""The models that environments (without wrappers) claim for themselves, and which are trusted.
 
-Gymnasium's FrozenLake, CliffWalking and Taxi and this project's own classes step as they say, which
-tests hold. Gymnasium's Blackjack says nothing, but `envs.blackjack_model` knows its rules. Whatever
-else brings a model, a subclass of one of these too, only claims to.
+Gymnasium's FrozenLake, CliffWalking and Taxi and this project's own classes follow their models,
+as tests confirm. Gymnasium's Blackjack has no model, but `envs.blackjack_model` knows its rules.
+The models of all others, subclasses of these too, are only claims.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ OWN_CLASSES = (GridWorld, ClickBandit, FiniteEnv)
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """What an environment without wrappers says of its dynamics, worked out when asked for."""
+    """An environment's claim about its dynamics, without wrappers, computed on first access."""
 
     base: Env
 
@@ -51,7 +51,7 @@ class Claim:
 
     @cached_property
     def observations(self) -> NDArray[Any] | None:
-        """What is observed in each state, states along the first axis; None if it does not say."""
+        """The observation of each state, states along the first axis; None if unknown."""
         if isinstance(self.base, GridWorld):
             return self.base.observation_of(np.arange(self.base.dynamics.n_states))
         if isinstance(self.base, FiniteEnv):
@@ -63,9 +63,9 @@ class Claim:
 
     @property
     def plays_from_model(self) -> bool:
-        """Whether a trusted environment draws just what its model says, and goes on from any state.
+        """Whether a trusted environment samples exactly its model, and goes on from any state.
 
-        Blackjack draws cards, and others draw rewards of which the model holds the means.
+        Blackjack draws cards, and random rewards have only their means in the model.
         """
         if isinstance(self.base, FiniteEnv):
             return self.model.reward_variance is None
@@ -93,10 +93,10 @@ class Claim:
 
 
 def claim_of(base: Env) -> Claim | None:
-    """What an environment without wrappers says of its dynamics, None where it says nothing.
+    """The claim of an environment without wrappers about its dynamics, None without a model.
 
     Raises:
-        ValueError: where what it says is no model, in one line.
+        ValueError: where the model is invalid, in one line.
     """
     try:
         if not _brings_model(base):
@@ -113,7 +113,7 @@ def _brings_model(base: Env) -> bool:
     if isinstance(base, OWN_CLASSES):
         return not isinstance(base, GridWorld) or base.is_stationary
     if isinstance(base, BlackjackEnv):
-        return is_trusted(base)  # what a subclass does could not even be looked at
+        return is_trusted(base)  # a subclass could not even be checked
     # A fickle passenger of Taxi changes his mind outside of P.
     fickle = getattr(base, "fickle_passenger", False)
     brings = isinstance(getattr(base, "P", None), Mapping)
@@ -121,12 +121,12 @@ def _brings_model(base: Env) -> bool:
 
 
 def is_trusted(base: Env) -> bool:
-    """Whether an environment's own word on its dynamics is enough."""
+    """Whether an environment's claim about its dynamics needs no check."""
     return is_ours(base) or (type(base) in TRUSTED_CLASSES and not is_changed(base))
 
 
 def is_ours(base: Env) -> bool:
-    """Whether it is one of this project's, as it was made."""
+    """Whether it is an environment of this project, with no method replaced by hand."""
     ours = isinstance(base, OWN_CLASSES)
     return ours and type(base).__module__.startswith("envs.") and not is_changed(base)
 

@@ -1,4 +1,4 @@
-"""Random maps that can be solved."""
+"""Warehouses to find a way through, on given maps or on random ones that can be solved."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def random_warehouse(size: int, shelf_density: float = 0.3, seed: int = 0) -> li
     """A square map for Warehouse-v0 with shelves at random.
 
     The start is in the lower left corner and the goal in the upper right one. Where shelves cut
-    them off from each other, the fewest that make a way are taken out.
+    them off from each other, the smallest number of shelves that opens a way is removed.
 
     Args:
         size: number of rows and of columns.
@@ -57,10 +57,10 @@ def _rows(size: int, shelf_density: float, seed: int) -> tuple[str, ...]:
 
 
 def _easiest_way(free: Bools, start: int, goal: int) -> list[int]:
-    """The cells of a way that passes the fewest cells that are not free.
+    """The cells of a way with the fewest shelves.
 
-    A breadth-first search that first goes wherever it can without entering a shelf, then enters
-    those it has met, goes on from there, and so forth. The border of the map stays closed.
+    A breadth-first search that visits all cells it can reach without entering a shelf, then enters
+    the shelves it has met, goes on from there, and so forth. The border of the map stays closed.
     """
     width = free.shape[1]
     is_free = free.tobytes()
@@ -71,7 +71,7 @@ def _easiest_way(free: Bools, start: int, goal: int) -> list[int]:
     frontier = [start]
     while came_from[goal] < 0:
         shelves: list[int] = []
-        # It grows while it is gone through: a queue that nothing is taken out of.
+        # The loop appends to the list, which serves as a queue.
         for cell in frontier:
             for beside in (cell - width, cell + 1, cell - 1, cell + width):
                 if came_from[beside] < 0:
@@ -150,7 +150,7 @@ class WarehouseEnv(GridWorld):
     `reset` and `step` give `position` (row, column), `bumped` (whether the robot ran into a shelf
     or the outer wall) and `is_success` (whether it stands on the goal).
     `action_masks()` tells which moves do not run into a shelf or the outer wall; with `slip` it
-    judges the move that is meant, and in a cell that is walled in it allows all.
+    considers the intended move, and in a cell that is walled in it allows all.
     The exact dynamics are available as arrays from `transition_model()`, and as `P` and
     `initial_state_distrib` as in Gymnasium's FrozenLake. States are numbered as the discrete
     observation is, whatever is observed.
@@ -202,7 +202,7 @@ class WarehouseEnv(GridWorld):
             self.observation_space = spaces.Discrete(3 ** len(MOVES))
 
     def observation_of(self, states: AnyInts) -> NDArray[Any]:
-        """What is observed in each of many states: shape (n,), (n, 2) or (n, cells)."""
+        """The observations of many states: shape (n,), (n, 2) or (n, cells)."""
         if self.observation == "position":
             largest = np.maximum((self.map.n_rows - 1, self.map.n_columns - 1), 1)
             position = np.stack(np.divmod(states, self.map.n_columns), axis=-1)
@@ -260,7 +260,7 @@ class RandomWarehouseEnv(WarehouseEnv):
 
     ## Arguments
     - `size=10`: number of rows and of columns
-    - `shelf_density=0.3`: the part of the cells that hold a shelf, about
+    - `shelf_density=0.3`: the approximate share of cells that hold a shelf
     - `map_seed=0`: the same seed gives the same map
     - all of Warehouse-v0's but `desc`
 

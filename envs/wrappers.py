@@ -18,16 +18,16 @@ from mdp.transition_model import AnyInts, Bools, Floats, Ints
 
 Env = gym.Env[Any, Any]
 
-# The keys under which Gymnasium's Taxi and sb3-contrib's environments have it.
+# The names of masks in Gymnasium's Taxi (in ``info``) and in sb3-contrib (a method).
 INFO_KEY = "action_mask"
 METHOD = "action_masks"
 
 
 def mask_source(env: Env) -> Callable[[], Any] | None:
-    """What to call for the mask of the present state, or None where there is nothing to call.
+    """A function that returns the mask of the present state, or None where there are no masks.
 
-    That is the method `action_masks`, of the environment or of a wrapper around it; of Gymnasium's
-    Taxi, which has none, its mask of the state that it is in.
+    That is the method `action_masks` of the environment or of a wrapper around it; for Gymnasium's
+    Taxi, which has no such method, its mask of the present state.
     """
     if env.has_wrapper_attr(METHOD):
         method: Callable[[], Any] = env.get_wrapper_attr(METHOD)
@@ -39,14 +39,14 @@ def mask_source(env: Env) -> Callable[[], Any] | None:
 
 
 def has_masks(env: Env) -> bool:
-    """Whether the environment says what it allows, in whichever way; one may have to be begun."""
+    """Whether the environment has action masks, in either form; may call its `reset`."""
     return mask_source(env) is not None or INFO_KEY in env.reset()[1]
 
 
 def action_masks(env: Env) -> Bools | None:
-    """What may be done now, bool of shape (n_actions,), or None where the environment has no say.
+    """The allowed actions now, bool of shape (n_actions,), or None where there are no masks.
 
-    An environment that speaks by ``info["action_mask"]`` alone is asked through
+    An environment that gives masks by ``info["action_mask"]`` alone needs the wrapper
     `envs.wrappers.ActionMasks`.
     """
     source = mask_source(env)
@@ -54,16 +54,16 @@ def action_masks(env: Env) -> Bools | None:
 
 
 class ActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Says in both ways what may be done: by `action_masks()` and by ``info["action_mask"]``.
+    """Gives action masks in both forms: by `action_masks()` and by ``info["action_mask"]``.
 
-    The first is sb3-contrib's convention and can be asked at any time. The second comes with each
-    step, so that it also tells of the state in which an episode is cut off.
+    The first is sb3-contrib's convention and can be called at any time. The second comes with each
+    step, so that it also masks the state in which an episode is truncated.
 
     Args:
-        env: an environment that says it in one of the two ways, or Gymnasium's Taxi.
+        env: an environment with masks in one of the two forms, or Gymnasium's Taxi.
 
     Raises:
-        ValueError: if it says it in neither.
+        ValueError: if it has masks in neither.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -78,7 +78,7 @@ class ActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
 
     def action_masks(self) -> Bools:
-        """What may be done now, bool of shape (n_actions,)."""
+        """The allowed actions now, bool of shape (n_actions,)."""
         source = mask_source(self.env)
         return np.asarray(self._told if source is None else source(), dtype=np.bool_)
 
@@ -88,7 +88,7 @@ class ActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return obs, self._with_mask(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """As the environment, with the mask in ``info`` unless nothing can be done any more."""
+        """As the environment, with the mask in ``info`` unless the episode has terminated."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         if not terminated:
             info = self._with_mask(info)
@@ -100,7 +100,7 @@ class ActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Allows the actions that may change something, by the model that the environment holds.
+    """Masks actions that change nothing, by the model that the environment holds.
 
     An action that surely leaves the state as it is, without ending the episode, is masked; in a
     state that no action changes, none is. For FrozenLake and CliffWalking, which have no masks.
@@ -109,10 +109,10 @@ class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env: an environment that holds ``P`` and its state ``s`` as Gymnasium's toy_text does.
 
     Attributes:
-        masks: of all states, bool of shape (S, A).
+        masks: the masks of all states, bool of shape (S, A).
 
     Raises:
-        ValueError: if it holds none.
+        ValueError: if it holds no ``P``.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -127,7 +127,7 @@ class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.masks |= ~self.masks.any(axis=1, keepdims=True)
 
     def action_masks(self) -> Bools:
-        """What may be done now, bool of shape (A,)."""
+        """The allowed actions now, bool of shape (A,)."""
         base: Any = self.env.unwrapped
         return np.array(self.masks[base.s])
 
@@ -161,13 +161,13 @@ class ScaleReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
 
 
 class TerminationReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Puts a reward in place of the last one of an episode.
+    """Replaces the last reward of an episode.
 
     Args:
-        env: any environment. What lies outside this wrapper, such as a further time limit, it does
-            not see.
+        env: any environment. Truncation by wrappers outside this one, such as a further time limit,
+            does not count.
         reward: the reward of the step that terminates the episode.
-        on_truncation: give it also where time runs out.
+        on_truncation: replace the reward of a truncated episode as well.
 
     Raises:
         ValueError: if the reward is not a finite number.
@@ -375,8 +375,8 @@ def limit_by_shortest_path(
     Args:
         env: a grid world as `gymnasium.make` returns it.
         multiple: the limit in shortest paths.
-        instead_of: the limit that this one takes the place of. One that differs, or none, is the
-            wish of whoever made the environment, and stays.
+        instead_of: the default limit to replace. Another limit, or none, was chosen by the caller
+            of `gymnasium.make`, and stays.
 
     Returns:
         The environment under the limit.

@@ -177,7 +177,7 @@ def _send(pid: int | None, number: int) -> None:
     """Send a signal to a process, if it still exists."""
     if sys.platform != "win32" and pid is not None:
         with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, number)
+            os.kill(pid, number)  # noqa: TID251  # not on Windows
 
 
 # --- The supervisor.

@@ -1,7 +1,7 @@
-"""Compiling with Numba: decorators, a cache of machine code keyed by sources, and its timing.
+"""Compiling with Numba: decorators, a cache of machine code keyed by sources, compile times.
 
-The package knows no other one of this project. A package whose machine code is to be kept on disk
-says so with `machine_code.sources.keep_machine_code`, and names the sources that decide about it.
+The package imports no other package of this project. A package that wants its machine code cached
+on disk calls `machine_code.sources.keep_machine_code` with the packages its code depends on.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from dataclasses import dataclass
 class WorkTime:
     """A duration."""
 
-    seconds: float = 0.0  # by the clock
-    # That the processor spent on this process, all threads together, its children left out; on a
-    # busy machine less than ``seconds``, with several threads maybe more.
-    cpu_seconds: float = 0.0
+    seconds: float = 0.0  # wall-clock time
+    cpu_seconds: float = 0.0  # CPU time of all threads of this process, without child processes
 
     @classmethod
     def now(cls) -> WorkTime:
-        """A moment to count from; only the difference of two has a meaning."""
+        """The current clock readings; only the difference of two of them has a meaning."""
         return cls(time.monotonic(), time.process_time())
 
     def __add__(self, other: WorkTime) -> WorkTime:
@@ -31,5 +29,5 @@ class WorkTime:
         return WorkTime(self.seconds - other.seconds, self.cpu_seconds - other.cpu_seconds)
 
     def as_data(self) -> dict[str, float]:
-        """As ``run.json`` has it, in milliseconds' precision."""
+        """The fields as in ``run.json``, rounded to milliseconds."""
         return {name: round(value, 3) for name, value in vars(self).items()}

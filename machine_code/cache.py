@@ -1,17 +1,17 @@
-"""Where machine code is kept between two processes, and when it may be used again.
+"""A disk cache of machine code, and when its files may be used.
 
-Numba keeps the machine code of a function beside its source, and throws it away when that one file
-changes. A function that others inline can change without that: they go on running as it was. Here
-the machine code of a package lies in a folder named for a digest of every source that can take
-part in it, and of the versions of Python, Numba and NumPy. A changed source has another digest, and
-so never meets old code; nor does another processor, which Numba itself keeps apart.
+Numba caches the machine code of a function beside its source file, and discards it when that file
+changes. It misses changes in a function of another file that was inlined. Here the machine code of
+a package is in a folder named by a digest of every source that the code depends on, and of the
+versions of Python, Numba and NumPy. After a change of a source the digest differs, so stale code
+is never loaded. Numba itself keeps the code of different processors apart.
 
-Not kept on disk is code that depends on other sources, such as a user's own update rule, and
-whatever is compiled in a process whose sources have changed since it began. Where no folder can be
-written, nothing is kept.
+Code that depends on other sources, such as a user's own update rule, is not cached, nor is code
+compiled in a process whose sources have changed since it began. Without a writable folder, nothing
+is cached.
 
-Numba unpickles what it finds, which can run any code. So a folder serves only if no other user but
-root can put a file into it, or another folder in its place; and a file only if it is the user's.
+Numba unpickles cache files, which can run any code. So a folder is used only if nobody but the user
+and root can add a file to it or replace it; and a file only if it belongs to the user.
 """
 
 # mypy: allow-untyped-calls
@@ -45,14 +45,14 @@ from numba.core.caching import (
 
 from machine_code.sources import ROOT, content_lines, digest_of, kept_packages, source_paths
 
-# Folders of other digests that are left, so that one can go back and forth between two versions.
+# Folders of other digests to keep, for switching between versions.
 KEPT_BESIDE = 3
 
-# What Numba's names and folders for one function come to, with some to spare. Windows takes paths
-# of 260 characters, and an environment deep in somebody's folders leaves too few.
+# An upper bound on the length of Numba's file and folder names for one function. Windows allows
+# paths of 260 characters, which an environment in a deep folder may exceed.
 LONGEST_NAME = 120
 
-# The first field of a record of settings: after this come the algorithm's module and its class.
+# The first field of a settings record starts with this; the algorithm's module and class follow.
 RULE_PREFIX = "rule "
 
 logger = logging.getLogger("machine_code")
@@ -60,30 +60,30 @@ logger = logging.getLogger("machine_code")
 Stamps = tuple[tuple[str, int, int], ...]
 
 
-# What machine code is keyed by.
+# The cache key.
 
 
 def source_stamps(package: str) -> Stamps:
-    """Path, time of change in nanoseconds and size of every source, in the order of their names."""
+    """Path, modification time in nanoseconds and size of every source, ordered by path."""
     paths = source_paths(kept_packages()[package])
     return tuple((str(path), (at := path.stat()).st_mtime_ns, at.st_size) for path in paths)
 
 
 @cache
 def stamps_at_start(package: str) -> Stamps:
-    """The stamps when they were first asked for in this process."""
+    """The stamps at the first call in this process."""
     return source_stamps(package)
 
 
 @cache
 def digest(package: str) -> str:
-    """Of a package's sources and of what compiles them; Numba itself tells processors apart."""
+    """Digest of a package's sources and compilers; Numba itself tells processors apart."""
     compilers = ("numba", "numpy", "llvmlite")
     lines = [f"{name} {importlib.metadata.version(name)}" for name in compilers]
     lines.append(f"python {platform.python_version()}")
     settings: Any = numba.config
     lines.append(f"optimised {settings.OPT}, bounds checked {settings.BOUNDSCHECK}")
-    # Stamped before they are read: what changes from then on is noticed.
+    # Sources are stamped before they are read: later changes are noticed.
     lines += content_lines(Path(path) for path, _, _ in stamps_at_start(package))
     return digest_of(lines)
 
@@ -105,7 +105,7 @@ def is_keyed(package: str, signature: Any) -> bool:
 
 
 def modules_of(kind: Any) -> Iterator[str]:
-    """Where the classes and rules live that argument types, or one such type, are made of."""
+    """The modules that define the classes and rules in argument types, or in one such type."""
     if hasattr(kind, "args"):  # a signature
         kind = kind.args
     if isinstance(kind, tuple | list):
@@ -138,7 +138,7 @@ def parents(package: str) -> Iterator[Path]:
 
 @cache
 def folder(package: str) -> Path | None:
-    """Where this process keeps machine code; None where no folder is the user's, or writable."""
+    """The cache folder of a package; None where no folder is both safe and writable."""
     reason = "no folder for machine code can be written"
     for parent in parents(package):
         try:
@@ -158,18 +158,18 @@ def folder(package: str) -> Path | None:
 
 @cache
 def warn_once(reason: str) -> None:
-    """Of several packages, one line is enough."""
+    """Warn once for each reason, whatever the number of packages."""
     logger.warning("%s: it is compiled anew in each process", reason)
 
 
 class NotOwnError(OSError):
-    """Another user could have written what would be unpickled."""
+    """Another user could have written the files that would be unpickled."""
 
 
 def own_folder(path: Path) -> Path:
-    """A folder, made where it is missing, whose files only the user and root can have written.
+    """Create a folder if it is missing, and check that only the user and root can write to it.
 
-    Returned without the links on the way to it; else a `NotOwnError` or another `OSError`.
+    Returns the path with links resolved; raises `NotOwnError` or another `OSError`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.mkdir(mode=0o700, exist_ok=True)
@@ -177,14 +177,14 @@ def own_folder(path: Path) -> Path:
     _check_owner(path, path.stat(), 0o077)
     for parent in path.parents:
         status = parent.stat()
-        # Of a folder such as /tmp, everybody can take away what is their own alone.
+        # In a sticky folder, such as /tmp, users can remove and rename only their own files.
         is_sticky = status.st_mode & stat.S_ISVTX
         _check_owner(parent, status, 0 if is_sticky else 0o022, root_too=True)
     return path
 
 
 def _check_owner(path: Path, status: os.stat_result, mask: int, root_too: bool = False) -> None:
-    """Refuse what belongs to another user, or that the users in the mask have a right to."""
+    """Raise `NotOwnError` for another user's path, or for any permission in ``mask``."""
     if sys.platform == "win32":
         return
     owners = {os.geteuid(), 0} if root_too else {os.geteuid()}
@@ -195,7 +195,7 @@ def _check_owner(path: Path, status: os.stat_result, mask: int, root_too: bool =
 
 
 def remove_old(used: Path) -> None:
-    """Leave the folder in use, and of those beside it the few that were used last."""
+    """Remove all folders beside ``used`` except the few that were used last."""
     dated = []
     for path in used.parent.iterdir():
         try:
@@ -208,16 +208,16 @@ def remove_old(used: Path) -> None:
 
 
 def is_compiled_before(name: str) -> bool:
-    """Whether machine code of a function of ours is kept, for whatever argument types."""
+    """Whether the cache holds machine code of a function, for any argument types."""
     folders = filter(None, map(folder, kept_packages()))
     return any(any(kept_in.glob(f"*/*.{name}-*.nbi")) for kept_in in folders)
 
 
-# Numba's cache, told where and when.
+# Numba's cache classes, with our folders and conditions.
 
 
 class Locator(_CacheLocator):
-    """The place of one function in the folder of its package."""
+    """The cache folder of one function, within the folder of its package."""
 
     def __init__(self, function: Callable[..., object], kept_in: Path) -> None:
         file = inspect.getfile(function)
@@ -234,20 +234,20 @@ class Locator(_CacheLocator):
         return self._path
 
     def get_source_stamp(self) -> str:
-        return ""  # the folder's name has it
+        return ""  # the folder's name contains the digest of the sources
 
     def get_disambiguator(self) -> str:
         return str(self._line)
 
 
 class Implementation(CompileResultCacheImpl):
-    """What Numba keeps of a compiled function, in the place that `Locator` gives."""
+    """Numba's cache of a compiled function, in the folder of `Locator`."""
 
     _locator_classes = [Locator]  # noqa: RUF012  # as Numba has it
 
 
 class OwnFiles(IndexDataCacheFile):
-    """The files of Numba's cache of one function: unpickled only if they are the user's."""
+    """The files of Numba's cache of one function, unpickled only if they belong to the user."""
 
     def _load_index(self) -> Any:
         self._check(Path(self._index_path))
@@ -271,7 +271,7 @@ class OwnFiles(IndexDataCacheFile):
 
 
 class KeyedCache(FunctionCache):
-    """Numba's cache of one function, asked only where what it holds is sure to be right."""
+    """Numba's cache of one function, used only where the digest covers the code."""
 
     _impl_class = Implementation
 
@@ -295,17 +295,17 @@ class KeyedCache(FunctionCache):
         return found
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        """Keep the machine code for these argument types, where the digest stands for it."""
+        """Cache the machine code for these argument types, if the digest covers it."""
         if not is_keyed(self._package, signature):
             return
         try:
             super().save_overload(signature, data)
-        except OSError as error:  # a full disk, say: the code is there, for this process
+        except OSError as error:  # such as a full disk; this process still has the code
             logger.warning("the machine code of %s is not kept: %s", self._function, error)
 
 
 class NoCache(NullCache):
-    """Of one function that is compiled anew in each process."""
+    """The cache of a function that is compiled anew in each process."""
 
     def __init__(self, function: Callable[..., object]) -> None:
         self._function = function.__qualname__
@@ -315,7 +315,7 @@ class NoCache(NullCache):
 
 
 def cache_of(function: Callable[..., object]) -> KeyedCache | NoCache:
-    """Where a function's machine code is kept."""
+    """The cache for a function's machine code."""
     package = package_of(function)
     if package is None or folder(package) is None:
         return NoCache(function)

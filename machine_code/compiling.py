@@ -1,14 +1,14 @@
 """The decorators of compiled functions.
 
-Numba ships no type annotations, so that its own decorator would hide the signatures of the
-functions under it. These keep them, and hold the options in one place: the machine code is kept as
-`machine_code.cache` says, nothing compiles before the first call, and floating-point arithmetic
-stays as IEEE 754 has it.
+Numba ships no type annotations, so its own decorator would hide the signatures of functions. These
+decorators keep the signatures, and set the options in one place: machine code is cached by
+`machine_code.cache`, nothing compiles before the first call, and floating-point arithmetic follows
+IEEE 754.
 
-For each function Numba makes machine code, with a wrapper for Python and another for C. Where only
-compiled functions call it, all of that is thrown away: each of them compiles the function anew, as
-a part of itself. Of such a `Part`, compiling ends with what they need, LLVM's intermediate code. It
-is not kept on disk: where the machine code of the whole is kept, nobody needs the parts.
+For each function Numba makes machine code, with a wrapper for Python and another for C. A function
+that only compiled functions call needs none of these: each caller compiles it into its own code.
+Such a `Part` is compiled only to LLVM's intermediate representation (IR), and not cached on disk,
+since the cached code of its callers contains it.
 """
 
 # mypy: allow-untyped-calls
@@ -34,17 +34,16 @@ from machine_code.cache import cache_of
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-# Division by zero gives what IEEE 754 says and raises nothing: checks for it would keep the
-# compiler from seeing through a function that is called by another.
+# Division by zero follows IEEE 754 and raises nothing: checks for it would hinder the compiler in
+# optimising across calls.
 OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 
-# Without reference counts, which cost a loop of small steps more than the steps themselves. Right
+# Without reference counts, which cost a loop of small steps more than the steps themselves. Safe
 # for functions that allocate nothing: their caller in Python keeps all arrays alive.
 BARE_OPTIONS: dict[str, Any] = {**OPTIONS, "_nrt": False}
 
-# What arithmetic in single precision may do besides, so that many numbers are worked out at once:
-# take sums in any order, multiply and add in one go, and forget the sign of a zero. Numbers that
-# are not finite stay what they are.
+# Fast-math flags for single precision, so that loops are vectorised: sums in any order, fused
+# multiply-add, and no sign of zero. Infinities and NaN keep their meaning.
 REORDERED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "fastmath": {"reassoc", "contract", "nsz"}}
 
 INLINED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "forceinline": True}
@@ -71,7 +70,7 @@ def vectorised(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile a small function that allocates nothing, as a part of those that call it."""
+    """Compile a small function that allocates nothing into its callers."""
     if is_interpreted():
         return function
     return cast(Function, called_as_part(_decorated(function, INLINED_OPTIONS), INLINED_OPTIONS))
@@ -83,15 +82,15 @@ def internal(function: Function) -> Function:
 
 
 def view(function: Function) -> Function:
-    """Compile a function that returns a part of an array, as a part of those that call it.
+    """Compile a function that returns a view of an array into its callers.
 
-    Without reference counts, only the caller's own code may make such a thing.
+    Without reference counts, only the caller's own code may make a view.
     """
     return _decorated(function, {**BARE_OPTIONS, "inline": "always"})
 
 
 def is_interpreted() -> bool:
-    """Whether Python itself is to run everything, as NUMBA_DISABLE_JIT asks for."""
+    """Whether NUMBA_DISABLE_JIT turns compiling off."""
     return bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 
 
@@ -111,7 +110,7 @@ def _decorated(function: Function, options: dict[str, Any]) -> Function:
 
 
 class _CompileTimer(event.Listener):
-    """Adds up what compiling takes; functions that are compiled for others count once."""
+    """Sums the compile time; a compilation within another counts once."""
 
     def __init__(self) -> None:
         self.depth = 0
@@ -130,24 +129,24 @@ class _CompileTimer(event.Listener):
 
 @contextmanager
 def compile_timer() -> Iterator[Callable[[], WorkTime]]:
-    """Let a caller leave the time of compiling, which is spent once, out of what it measures.
+    """Measure the compile time of a ``with`` statement, to leave it out of other timings.
 
     Yields:
-        A function that tells how much time has gone into compiling in the ``with`` statement.
+        A function that returns the compile time so far.
     """
     timer = _CompileTimer()
     with event.install_listener("numba:compile", timer):
         yield lambda: timer.spent
 
 
-# Functions that are parts of others.
+# Functions compiled into others.
 
-# What unpacks the arrays of a call from Python takes longer to compile than a loop.
+# The wrapper that unpacks the arrays of a call from Python takes longer to compile than a loop.
 WITHOUT_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 class PartLibrary(JITCodeLibrary):
-    """Optimised intermediate code, of which no machine code is made."""
+    """Optimised IR, without machine code."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -156,7 +155,7 @@ class PartLibrary(JITCodeLibrary):
 
 
 class PartCompiler(Compiler):
-    """Numba's compiler, as far as intermediate code."""
+    """Numba's compiler up to the IR."""
 
     def __init__(self, typing_context: Any, target_context: Any, _: Any, *others: Any) -> None:
         library = PartLibrary(target_context.codegen(), "part")
@@ -165,7 +164,7 @@ class PartCompiler(Compiler):
 
     def _compile_core(self) -> Any:
         result = super()._compile_core()
-        # Calls find the code by what Python would call, which here leads nowhere.
+        # Numba finds code by its Python entry point; this entry point is a dummy.
         about, parts = result.fndesc, (result.library,)
         key = make_function(about.lookup_module(), about.qualname, "", 0, result.environment, parts)
         self.state.targetctx.insert_user_function(key, about, parts)
@@ -173,27 +172,27 @@ class PartCompiler(Compiler):
 
 
 class Part(CPUDispatcher):
-    """A function as those see it that are compiled with it as a part."""
+    """A function that is compiled into its callers only."""
 
     def __init__(self, function: Callable[..., object], options: dict[str, Any]) -> None:
         options = {"nopython": True, **options, **WITHOUT_WRAPPERS}
         super().__init__(function, targetoptions=options, pipeline_class=PartCompiler)
 
     def add_overload(self, result: Any) -> None:
-        """Keep the code where compiled functions find it, and Python does not."""
+        """Store the code where compiled functions find it, and Python does not."""
         self.overloads[tuple(result.signature.args)] = result
 
     def _compile_for_args(self, *args: Any, **kws: Any) -> Any:
         raise TypeError(f"only compiled functions can call {self.py_func.__qualname__}")
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Types of the call; numbers that are written out have no type of their own."""
+        """The types of a call, with the types of literals replaced by those of variables."""
         kws = {name: unliteral(kind) for name, kind in kws.items()}
         return super().get_call_template([unliteral(kind) for kind in args], kws)
 
 
 def called_as_part(dispatcher: Any, options: dict[str, Any]) -> Any:
-    """Let compiled functions have a function as a part that Python calls as it is."""
+    """Let compiled callers use a `Part` of a function that Python calls as it is."""
 
     @cache
     def part() -> Part:

@@ -1,4 +1,4 @@
-"""The sources of packages, a digest that stands for what they say, and whose code they decide."""
+"""The sources of packages, a digest of their content, and the packages with cached machine code."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 # The folder of all packages.
 ROOT = Path(__file__).resolve().parent.parent
 
-# By package: all packages whose sources decide about the machine code of its functions.
+# For each package: all packages whose sources its machine code depends on.
 _SOURCES_OF_CODE: dict[str, tuple[str, ...]] = {}
 
 
 def keep_machine_code(package: str, *others: str) -> None:
-    """Keep the machine code of a package's functions on disk.
+    """Cache the machine code of a package's functions on disk.
 
     Args:
         package: its name.
@@ -24,7 +24,7 @@ def keep_machine_code(package: str, *others: str) -> None:
 
 
 def kept_packages() -> dict[str, tuple[str, ...]]:
-    """The packages whose machine code is kept, each with those whose sources decide about it."""
+    """The packages with cached machine code, each with those whose sources the code depends on."""
     return dict(_SOURCES_OF_CODE)
 
 
@@ -34,7 +34,7 @@ def source_paths(packages: Iterable[str]) -> list[Path]:
 
 
 def content_lines(paths: Iterable[Path]) -> list[str]:
-    """A line for each source: its path below the packages' folder, and a digest of what it says."""
+    """A line for each source: its path below the packages' folder, and a digest of its content."""
     return [
         f"{path.relative_to(ROOT).as_posix()} {hashlib.sha256(path.read_bytes()).hexdigest()}"
         for path in paths
@@ -42,5 +42,5 @@ def content_lines(paths: Iterable[Path]) -> list[str]:
 
 
 def digest_of(lines: Iterable[str]) -> str:
-    """16 hexadecimal digits that stand for these lines."""
+    """The first 16 hexadecimal digits of the lines' SHA-256."""
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]

@@ -1,7 +1,7 @@
 """Finite Markov decision processes: the transition model, planning, exact evaluation.
 
-The package knows arrays alone, neither environments nor agents. The functions are loaded on first
-use, because the libraries behind them take longer to import than a command may take to answer.
+The package works on arrays and imports neither environments nor agents. Functions are imported on
+first use: the libraries behind them would delay commands that do not need them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The exact values and advantages of a policy under a discount, and what estimates of them expect.
+"""Exact discounted values and advantages of a policy, and the exact expectation of GAE estimates.
 
-An episode goes on until it terminates: agents bootstrap where a time limit cuts it off, so that
-the limit is no part of what they estimate.
+There is no time limit: agents bootstrap where one cuts an episode off, so their estimates do not
+depend on it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from mdp.graph import PolicyChain
 from mdp.transition_model import Floats, Ints, TransitionModel
 
-# Without discount, an episode surely ends where its chance of ending is that near to one.
+# Without discount, an episode surely ends if its probability of ending is within this of one.
 SURELY = 1e-9
 SETTLED = 1e-14
 
@@ -23,12 +23,11 @@ class PolicyValues:
     """The values of a stationary policy.
 
     Attributes:
-        values: of states, shape (S,).
-        action_values: of actions, after which the policy is followed, shape (S, A).
-        advantages: how much better actions are than the policy there, shape (S, A).
+        values: state values V(s), shape (S,).
+        action_values: action values Q(s, a), shape (S, A).
+        advantages: Q(s, a) - V(s), shape (S, A).
 
-    NaN stands in states that cannot be reached, and, without discount, where the episode may never
-    end.
+    All are NaN in unreachable states, and, without discount, where the episode may never end.
     """
 
     values: Floats
@@ -36,7 +35,7 @@ class PolicyValues:
 
     @property
     def advantages(self) -> Floats:
-        """Action values less those of their states."""
+        """Action values minus state values."""
         return self.action_values - self.values[:, None]
 
 
@@ -55,7 +54,7 @@ def discounted_values(model: TransitionModel, policy: Floats, discount: float) -
 
 
 def expected_next(model: TransitionModel, values: Floats) -> Floats:
-    """The mean of values (S,) over what follows each action, shape (S, A); 0 after the end."""
+    """Expected value of the state after each action, shape (S, A); 0 after termination."""
     goes_on = (model.prob > 0) & ~model.terminated
     following = np.where(goes_on, values[model.next_state], 0.0)
     mean: Floats = np.einsum("sak,sak->sa", model.prob, following)
@@ -70,7 +69,7 @@ def expected_estimates(
     trace: float,
     steps: tuple[Ints, Ints, Ints],
 ) -> tuple[Floats, Floats]:
-    """What generalised advantage estimation expects of steps, exactly.
+    """The exact expectation of generalised advantage estimates (GAE).
 
     An estimate is the sum of the TD errors of a critic from the step on, discounted by ``discount``
     times ``trace``, until the episode ends or is cut off (Schulman, Moritz, Levine, Jordan and
@@ -78,16 +77,16 @@ def expected_estimates(
 
     Args:
         model: the decision process.
-        policy: probabilities of shape (S, A), by which steps are taken.
-        critic: values of states, shape (S,); those of unreachable ones are ignored.
+        policy: action probabilities of the policy that takes the steps, shape (S, A).
+        critic: the critic's state values, shape (S,); unreachable states are ignored.
         discount: gamma.
         trace: lambda.
-        steps: of N steps the states, the actions, and how many steps each estimate is a sum of,
-            itself included, all of shape (N,).
+        steps: the states and the actions of N steps, and how many TD errors each estimate sums,
+            all of shape (N,).
 
     Returns:
-        The mean of the estimate of each step given its state and action, shape (N,), and the same
-        given its state alone.
+        The expectation of each estimate given its state and action, shape (N,), and given its
+        state alone, shape (N,).
     """
     chain = PolicyChain.build(model, policy, model.reachable)
     leads = ~chain.terminated
@@ -101,10 +100,10 @@ def expected_estimates(
     order = np.argsort(n_left, kind="stable")
     bounds = np.searchsorted(n_left[order], np.arange(int(n_left.max(initial=0)) + 2))
     given_action, given_state = np.empty(len(states)), np.empty(len(states))
-    later = np.zeros(chain.size)  # of what is left after one step more
+    later = np.zeros(chain.size)  # expected estimate of each state, with one TD error fewer
     for n in range(1, len(bounds) - 1):
         now = of_policy + np.bincount(row, weight * later[following], chain.size)
-        # More steps change nothing but the last digits.
+        # Converged: more TD errors change only the last digits.
         is_settled = np.abs(now - later).max() <= SETTLED * max(1.0, np.abs(now).max())
         here = order[bounds[n] : None if is_settled else bounds[n + 1]]
         if len(here):

@@ -1,20 +1,19 @@
-"""The best that can be done with memory, where observations hide the state.
+"""The optimum over policies with memory, where observations hide the state (POMDPs).
 
-An agent that remembers all observations knows how likely each state is: its belief. The optimum
-over beliefs is the optimum over all policies that go by histories of observations (Astrom, Optimal
-Control of Markov Processes with Incomplete State Information, 1965; Kaelbling, Littman and
-Cassandra, Planning and Acting in Partially Observable Stochastic Domains, 1998). From the start and
-in finite time, finitely many beliefs can be reached. Where they are few enough, finite-horizon
-planning over them is exact. Else those that are furthest from the start are not followed further,
-and the optimum is bracketed:
+An agent that remembers all observations knows the probability of each state: its belief. The
+optimum over beliefs is the optimum over all policies that depend on the history of observations
+(Astrom, Optimal Control of Markov Processes with Incomplete State Information, 1965; Kaelbling,
+Littman and Cassandra, Planning and Acting in Partially Observable Stochastic Domains, 1998). Within
+a time limit, finitely many beliefs are reachable from the start. Where they are few enough,
+finite-horizon planning over them is exact. Else the beliefs furthest from the start are not
+expanded, and bounds on their values give bounds on the optimum:
 
-- At most, such a belief is worth what the fast informed bound says (Hauskrecht, Value-Function
-  Approximations for Partially Observable Markov Decision Processes, 2000): the state is seen from
-  the step after next on.
-- At least, it is worth the best of a set of plans, which point-based value iteration (Pineau,
-  Gordon and Thrun, 2003) works out for a few beliefs under each number of steps left.
+- Upper: the fast informed bound (Hauskrecht, Value-Function Approximations for Partially Observable
+  Markov Decision Processes, 2000), as if each state were revealed one step late.
+- Lower: the best of a set of plans, which point-based value iteration (Pineau, Gordon and Thrun,
+  2003) computes at a few beliefs for each number of steps left.
 
-Rewards are not observed. That an episode has ended is.
+Rewards are not observed; the end of an episode is.
 """
 
 from __future__ import annotations
@@ -27,42 +26,42 @@ from numpy.typing import NDArray
 
 from mdp.transition_model import Floats, Ints, TransitionModel
 
-# Beliefs that are followed if those are all, and else; numbers of the arrays by hidden states and
-# observations; beliefs of which plans are worked out, and walks that meet them: a few seconds.
+# Limits for a few seconds of planning: beliefs to expand if exact, and if not; size of arrays by
+# class and observation; beliefs to compute plans for, and the random walks that find them.
 MOST_BELIEFS, MOST_OF_MORE = 30_000, 1_000
 MOST_NUMBERS = 4_000_000
 MOST_POINTS, WALKS = 128, 32
-# Beliefs that agree to so many digits are one.
+# Beliefs that agree to this many decimal places are merged.
 DIGITS = 12
-# Ends of a bracket this close are one, relative to the return.
+# The ends of a bracket count as equal within this, relative to the return.
 SAME = 1e-9
 
 
 class Bracket(NamedTuple):
-    """Bounds of an optimum; equal where it is known."""
+    """Bounds on an optimum; equal where the optimum is known."""
 
-    lower: float  # some policy with memory returns as much
-    upper: float  # none returns more
+    lower: float  # some policy with memory returns this much
+    upper: float  # no policy returns more
 
 
 @dataclass(frozen=True, eq=False)
 class HiddenModel:
-    """A decision process by what is hidden (C classes of states) and what is observed (G groups).
+    """A decision process split into hidden classes of states (C) and groups of observations (G).
 
-    States from which the same may come are one class: how a state looks is no part of it.
+    States with the same outcomes form one class, whatever the agent observes in them.
     """
 
     reward: Floats  # mean reward of an action in a class, shape (A, C)
-    arrive: Floats  # the chance to go on in class c' and observe g, shape (A, C, G, C)
-    start: Floats  # the chance to begin in class c and observe g, shape (G, C)
+    arrive: Floats  # probability to go on in class c' and observe g, shape (A, C, G, C)
+    start: Floats  # probability to begin in class c and observe g, shape (G, C)
 
     @classmethod
     def of(cls, model: TransitionModel, groups: Ints) -> HiddenModel | None:
-        """Take apart what is hidden and what is observed; None where that is too large.
+        """Split the states of a model into classes and groups; None if the arrays are too large.
 
         Args:
             model: the decision process.
-            groups: the number of what is observed in each state, shape (S,).
+            groups: the index of each state's observation, shape (S,).
         """
         states = np.flatnonzero(model.reachable)
         possible = model.prob[states] > 0
@@ -96,16 +95,16 @@ class HiddenModel:
 
 
 def memory_optimum(model: TransitionModel, groups: Ints, horizon: int) -> Bracket | None:
-    """The highest expected return of all policies that go by the history of observations.
+    """The highest expected return of any policy that depends on the history of observations.
 
     Args:
         model: the decision process.
-        groups: the number of what is observed in each state, from 0 on, shape (S,).
+        groups: the index of each state's observation, from 0 on, shape (S,).
         horizon: the time limit in steps.
 
     Returns:
-        The optimum, or a bracket of it where too many beliefs can be reached; None where there are
-        too many states and observations for either.
+        The optimum, or bounds on it where too many beliefs are reachable; None where there are too
+        many states and observations for either.
     """
     hidden = HiddenModel.of(model, groups)
     if hidden is None:
@@ -129,20 +128,20 @@ def memory_optimum(model: TransitionModel, groups: Ints, horizon: int) -> Bracke
 
 
 class _Tree:
-    """The beliefs that can be reached from the start, each once, nearest first."""
+    """The beliefs reachable from the start, each once, nearest first."""
 
     def __init__(self, hidden: HiddenModel, horizon: int, most: int) -> None:
         self.hidden = hidden
         self._known: dict[bytes, int] = {}
         self._found: list[Floats] = []
-        self.weights = np.zeros(0)  # chances of the first beliefs
+        self.weights = np.zeros(0)  # probabilities of the initial beliefs
         chances = hidden.start.sum(axis=1)
         for group in np.flatnonzero(chances > 0):
             place = self._place(hidden.start[group] / chances[group])
             self.weights = np.pad(self.weights, (0, max(place + 1 - len(self.weights), 0)))
             self.weights[place] += chances[group]
         self.n_followed = 0  # beliefs whose successors are known
-        self.is_cut = False  # whether too many can be reached in time to follow them all
+        self.is_cut = False  # whether there are too many beliefs to expand all of them
         self._links: list[tuple[Ints, Ints, Floats]] = []
         self._grow(horizon, most)
 
@@ -154,7 +153,7 @@ class _Tree:
         return self._known[key]
 
     def _grow(self, horizon: int, most: int) -> None:
-        """Follow beliefs step by step, as long as there are not too many."""
+        """Expand beliefs step by step, as long as there are not too many."""
         from scipy.sparse import csr_array
 
         n_actions, _, n_groups, n_classes = self.hidden.arrive.shape
@@ -191,9 +190,9 @@ class _Tree:
             self._links.append(link)
 
     def backed_up(self, values: Floats, plans: Floats) -> Floats:
-        """Values with one more step left; of beliefs that are not followed, by the best of plans.
+        """Values with one more step left; beliefs that are not expanded get the best plan's.
 
-        Plans have shape (n, C): what each returns from each class, with these steps left.
+        Plans have shape (n, C): the return of each plan from each class, with these steps left.
         """
         following = (self._next @ values).reshape(self._reward.shape)
         tail = (self.beliefs[self.n_followed :] @ plans.T).max(axis=1)
@@ -213,7 +212,7 @@ def _informed_bounds(hidden: HiddenModel, horizon: int) -> list[Floats]:
 
 
 def _improved(hidden: HiddenModel, plans: Floats, points: Floats) -> Floats:
-    """For each point the best first action, followed by the best plan for what is observed."""
+    """Point-based backup: for each point the best action, then the best plan per observation."""
     n_actions, n_classes, n_groups, _ = hidden.arrive.shape
     flat = hidden.arrive.reshape(-1, n_classes)
     ahead = (flat @ plans.T).reshape(n_actions, n_classes, n_groups, -1).transpose(0, 2, 3, 1)
@@ -227,7 +226,7 @@ def _improved(hidden: HiddenModel, plans: Floats, points: Floats) -> Floats:
 
 
 def _points(hidden: HiddenModel, bound: Floats, horizon: int) -> Floats:
-    """Beliefs that are met on the way, acting as if the bound were right."""
+    """Beliefs met on random walks whose actions are greedy for the bound."""
     rng = np.random.default_rng(0)
     found: dict[bytes, Floats] = {}
     for _ in range(WALKS):

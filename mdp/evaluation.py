@@ -1,4 +1,4 @@
-"""What a policy is worth, computed and not sampled.
+"""Exact evaluation of policies, without sampling.
 
 A policy is given in one of three forms. Only the rows of states that it visits are used.
 
@@ -23,7 +23,7 @@ from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
 @dataclass(frozen=True)
 class PolicyReturn:
-    """Mean and variance of one episode, from the distribution of starting states.
+    """Moments of one episode, averaged over the distribution of starting states.
 
     Attributes:
         expected_return: the mean of the (discounted) sum of rewards.
@@ -70,8 +70,8 @@ def policy_return(
         policy: in any of its forms.
         horizon: the time limit in steps, after which the episode is cut off; None for none.
         discount: from 0 to 1.
-        success: the outcomes that make an episode a success, bool of shape (S, A, K). They must
-            end the episode: marks on others are ignored.
+        success: the outcomes that make an episode a success, bool of shape (S, A, K). Outcomes
+            that do not end the episode are ignored.
 
     Raises:
         ValueError: for arguments out of range or of the wrong shape, and, without time limit and
@@ -126,14 +126,14 @@ def baseline_policies(model: TransitionModel) -> list[Floats]:
 def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0) -> float:
     """The largest expected return of uniformly random actions and of each constant action.
 
-    Random actions alone would be too low a mark: wherever mistakes cost more than time, standing
-    still beats them by far. (Not the best that ignores the observation: a fixed list of actions
-    does too, and may be optimal where nothing is random.)
+    Random actions alone would be too easy to beat: where mistakes cost more than time, standing
+    still beats them by far. (A fixed sequence of actions ignores observations too, but may be
+    optimal where nothing is random.)
     """
     _check(model, horizon, discount, None)
     best = -np.inf
     uniform, *constant = baseline_policies(model)
-    # Random actions visit most, and it soon shows that they are worse, where others are known.
+    # Random actions visit most states: with a known floor, their evaluation often stops early.
     for policy in (*constant, uniform):
         episodes = LimitedEpisodes(model, canonical_policy(model, policy, horizon), horizon)
         floor = best if discount == 1 else -np.inf
@@ -149,9 +149,9 @@ def _with_drawn_rewards(
     discount: float,
     success: Bools | None,
 ) -> PolicyReturn:
-    """As `policy_return`, where rewards vary around their means independently of all else.
+    """As `policy_return`, with independent random rewards around the model's means.
 
-    That adds the expected sum of their own variances, each discounted twice, to the variance.
+    Adds the expected sum of their variances, discounted by ``discount**2``, to the variance.
     """
     assert model.reward_variance is not None
     settled = replace(model, reward_variance=None)
@@ -200,7 +200,7 @@ def _refuse_endless(chain: PolicyChain) -> None:
         )
 
 
-# Far above what a thousand steps round off, far below what a learner could tell apart.
+# Far above the rounding errors of a thousand steps, far below what a learner can distinguish.
 OPTIMAL_TOLERANCE = 1e-9
 
 
@@ -240,7 +240,7 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
 
 
 def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools]:
-    """The best that can be made of each state, and all the actions that begin it.
+    """The optimal value of each state, and its optimal actions.
 
     Sutton and Barto, Reinforcement Learning, 2nd edition, section 3.6.
 
@@ -251,7 +251,7 @@ def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools
     Returns:
         The optimal expected undiscounted returns, shape (S,), zero for states that no policy
         reaches. And the actions whose value comes within 1e-9 of the best, relative to it where
-        it is above 1: bool of shape (S, A), all of them where nothing is reached.
+        it is above 1: bool of shape (S, A), all actions in unreachable states.
 
     Raises:
         ValueError: for a horizon below 1.
@@ -274,7 +274,7 @@ def _returns_under_limit(
     policy: Floats,
     horizon: int,
 ) -> Floats:
-    """The mean alone of what ``moments_under_limit`` gives, shape (n,)."""
+    """The expected returns alone, as in ``moments_under_limit``, shape (n,)."""
     later = np.zeros(prob.shape[0])
     now = np.zeros(prob.shape[0])
     for step in range(horizon - 1, -1, -1):
@@ -292,7 +292,7 @@ def _returns_under_limit(
             changed = changed or value != later[state]
             now[state] = value
         now, later = later, now
-        # One more step has changed nothing: nor will any further one.
+        # Converged: further steps change nothing.
         if not changed and policy.shape[0] == 1:
             break
     return later
@@ -359,7 +359,7 @@ def actions_used(model: TransitionModel, policy: Policy) -> Bools:
 
 # Under a time limit.
 
-# Visited states times steps; beyond, going backwards takes longer than tenths of a second.
+# Visited states times steps; above this, backward induction takes more than tenths of a second.
 MOST_BACKWARDS = 2_000_000
 
 
@@ -368,7 +368,7 @@ class LimitedEpisodes:
     """The episodes of a policy under a time limit."""
 
     model: TransitionModel  # the decision process
-    policy: Policy  # as `canonical_policy` gives it
+    policy: Policy  # in the form of `canonical_policy`
     horizon: int  # the time limit in steps
 
     def result(
@@ -376,8 +376,8 @@ class LimitedEpisodes:
     ) -> PolicyReturn:
         """Mean and variance of one episode.
 
-        A mean return that surely is below ``floor`` may be told as minus infinity; only without
-        discount.
+        A mean return that is certainly below ``floor`` may be given as minus infinity; only
+        without discount.
         """
         states = self._visited()
         moments = self.along_ways(states, discount, ends_well)
@@ -390,7 +390,7 @@ class LimitedEpisodes:
             rows = (*self._rows(states), self.model.reward[states], ends_well[states])
             chances = chances_in(self.model, self.policy, states)
             if len(chances) == 1 and ((chances == 0) | (chances == 1)).all():
-                # The rows of all other actions would only be passed over, again and again.
+                # Keep the rows of these actions only: the sweeps would skip all others each time.
                 taken = np.arange(len(states)), chances[0].argmax(axis=1)
                 rows = tuple(array[taken][:, None] for array in rows)
                 chances = np.ones((1, len(states), 1))
@@ -409,7 +409,7 @@ class LimitedEpisodes:
         return np.flatnonzero(reachable_states(self.model, actions_used(self.model, self.policy)))
 
     def _rows(self, states: Ints) -> tuple[Floats, Ints, Bools]:
-        """Rows of the model for the n states alone: prob, next_state (counting in those n), ..."""
+        """Rows of n states: prob, next_state (as indices into these n states), terminated."""
         model = self.model
         following = self._places(states)[model.next_state[states]]
         return model.prob[states], following, model.terminated[states]
@@ -427,9 +427,9 @@ class LimitedEpisodes:
         return self._is_stationary() and len(states) * self.horizon > MOST_BACKWARDS
 
     def along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
-        """The moments where each of the states has one outcome; None where one has more.
+        """The moments, if each of the n states has one outcome; None if a state has more.
 
-        The states, n of them, must not lead to any other; shape (n, 5) as `moments_under_limit`.
+        The states must be closed under the policy; shape (n, 5) as `moments_under_limit`.
         """
         if not self._is_stationary():
             return None
@@ -474,8 +474,8 @@ def moments_under_limit(
 ) -> Floats:
     """Moments of the episodes that start in each state.
 
-    The variances are sums of squared deviations, so that they keep their digits where the mean is
-    large (Sobel, The Variance of Discounted Markov Decision Processes, 1982).
+    The variances are sums of squared deviations, which stay accurate where the mean is large
+    (Sobel, The Variance of Discounted Markov Decision Processes, 1982).
 
     Returns:
         Shape (n, 5): mean and variance of the return, mean and variance of the length, and the
@@ -493,7 +493,7 @@ def moments_under_limit(
             for moment in range(5):
                 changed = changed or now[state, moment] != later[state, moment]
         now, later = later, now
-        # One more step has changed nothing: nor will any further one.
+        # Converged: further steps change nothing.
         if not changed and policy.shape[0] == 1:
             break
     return later
@@ -539,7 +539,7 @@ def _variances(
     later: Floats,
     now: Floats,
 ) -> None:
-    """The variances of one state: of the means that may follow, and the mean of theirs."""
+    """The variances of one state, by the law of total variance."""
     now[1] = 0.0
     now[3] = 0.0
     for action in range(prob.shape[0]):

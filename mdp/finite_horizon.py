@@ -1,4 +1,4 @@
-"""The best policy under a time limit: what is best depends on the steps that are left."""
+"""The optimal policy under a time limit, which depends on the number of steps left."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from machine_code.compiling import compiled
 from mdp.planning import TIE_TOLERANCE
 from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel, allowed_actions
 
-# Of as few bytes each as the number of actions allows.
+# The smallest unsigned integers that hold the actions.
 Actions = NDArray[np.unsignedinteger]
 
 
@@ -24,7 +24,7 @@ class FiniteHorizonPlan:
             (S,); zero for states that cannot be reached.
         actions_left: the greedy action, the first among ties within 1e-12 of the best value, with
             1, 2, ... steps left: shape (m, S) of a small unsigned integer type. With more than m
-            steps left nothing changes any more, and the last row stands for all.
+            steps left, the last row applies.
         horizon: the number of steps after which the episode is cut off.
         start_value: the mean of ``values`` over the starting states.
     """
@@ -54,8 +54,8 @@ def finite_horizon_optimum(
 ) -> FiniteHorizonPlan:
     """Plan backwards from the time limit.
 
-    Stops early where one more step changes no value in its last bit: neither would any further
-    one. Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
+    Stops once a step changes no value in its last bit: further steps would change none either.
+    Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
     Decision Processes, 1994, section 4.5.
 
     Args:
@@ -103,7 +103,7 @@ def back_up(
     """Values one step earlier, and the actions to take there, into ``earlier`` and ``actions``."""
     action_values = np.empty(prob.shape[1])
     for state in states:
-        # Worked out here: NumPy's own maximum takes longer to compile than all of this.
+        # A loop: NumPy's maximum takes longer to compile than all of this.
         best = -np.inf
         for action in range(prob.shape[1]):
             if not allowed[state, action]:

@@ -1,9 +1,9 @@
-"""Where a policy loses what it stays behind the optimum, exactly and under a time limit.
+"""The gap between a policy and the optimum by state, exactly and under a time limit.
 
-The gap between the optimum and a policy is a sum over the states in which the policy acts: of the
-chance to be there at each step, times what its action loses there against the best one (the
-performance difference lemma: Kakade and Langford, Approximately Optimal Approximate Reinforcement
-Learning, 2002, lemma 6.1, here with time). Policies have the forms of `mdp.evaluation`.
+The gap is a sum over states and steps: the probability of being in the state at that step, times
+what the policy's action loses there against the best one (the performance difference lemma:
+Kakade and Langford, Approximately Optimal Approximate Reinforcement Learning, 2002, lemma 6.1, here
+with time). Policies have the forms of `mdp.evaluation`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from mdp.evaluation import Policy, canonical_policy, chances_in, policy_return
 from mdp.finite_horizon import back_up
 from mdp.transition_model import AnyInts, Bools, Floats, TransitionModel, allowed_actions
 
-# Values kept of all steps, 8 bytes each.
+# The largest number of values to store over all steps, 8 bytes each.
 MOST_VALUES = 30_000_000
-# States that a repair is tried in, those with the largest losses first; and the outcomes of all
-# states at all steps beyond which trying takes too long.
+# The number of states to try a repair in, those with the largest losses first; and the outcomes
+# of all states at all steps above which trying takes too long.
 MOST_CANDIDATES = 24
 MOST_OUTCOMES_REPAIRED = 20_000_000
-# Probabilities of two policies that differ by no more are the same.
+# Probabilities of two policies within this of each other count as equal.
 SAME = 1e-9
 
 
@@ -39,11 +39,11 @@ class GapByState:
     Attributes:
         optimum: the highest expected return under the time limit.
         value: the policy's expected return.
-        losses: what is lost in each state, in return per episode, shape (S,). They are at least
-            0, and sum to ``optimum - value`` but for rounding.
+        losses: the return lost in each state per episode, shape (S,). Losses are at least 0, and
+            sum to ``optimum - value`` up to rounding.
         visits: how often an episode acts in each state, shape (S,).
-        action_values: what each action is worth there if all later ones are optimal, averaged over
-            the moments at which the policy is there, shape (S, A); 0 where it never is.
+        action_values: the optimal action values, averaged over the steps at which the policy is in
+            the state, shape (S, A); 0 in states that the policy never visits.
     """
 
     optimum: float
@@ -84,26 +84,26 @@ def gap_by_state(model: TransitionModel, policy: Policy, horizon: int) -> GapByS
 
 
 class Repair(NamedTuple):
-    """A state in which to do what is best, and what the policy is worth then."""
+    """A state in which to act optimally, and the policy's return after that change."""
 
     state: int
-    value: float  # with this and all earlier repairs
+    value: float  # expected return with this and all earlier repairs
 
 
 def greedy_repairs(
     model: TransitionModel, policy: Policy, horizon: int, split: GapByState, most: int = 3
 ) -> list[Repair]:
-    """The states that would help most if the policy did what is best there, one after the other.
+    """The states in which better actions would raise the return most, one after the other.
 
-    In a repaired state the policy does at each step what is best, given what it does everywhere
-    else. Each repair is the best of those in the states with the largest losses. There is none
-    where the model is so large that trying them takes many seconds.
+    In a repaired state the policy takes the best action at each step, given its actions in all
+    other states. Each repair is the best among those in the states with the largest losses. The
+    list is empty where the model is so large that trying repairs takes many seconds.
 
     Args:
         model: the decision process.
         policy: in any of its forms.
         horizon: the time limit in steps.
-        split: as `gap_by_state` gives it for this policy.
+        split: the result of `gap_by_state` for this policy.
         most: the largest number of repairs.
     """
     if model.prob.size * horizon > MOST_OUTCOMES_REPAIRED:
@@ -114,7 +114,7 @@ def greedy_repairs(
     repaired = np.zeros(model.n_states, np.bool_)
     repairs: list[Repair] = []
     losses, value = split.losses, split.value
-    least = 1e-9 * max(1.0, abs(split.gap))  # what rounding makes of nothing
+    least = 1e-9 * max(1.0, abs(split.gap))  # smaller gains are rounding errors
     while len(repairs) < most and split.optimum - value > least:
         worst = np.argsort(-losses, kind="stable")[:MOST_CANDIDATES]
         tried: list[Repair] = []
@@ -134,10 +134,10 @@ def greedy_repairs(
 
 @dataclass(frozen=True, eq=False)
 class FirstDifferences:
-    """Where two policies first do something different in an episode, and what comes of it.
+    """Where two policies first differ in an episode, and how that changes the return.
 
     Attributes:
-        met: the chance that an episode comes to its first difference in each state, shape (S,).
+        met: the probability that an episode's first difference is in each state, shape (S,).
         gains: what the first policy gains over the second by these differences, in return per
             episode, shape (S,). They sum to the difference of the two returns.
     """
@@ -168,14 +168,14 @@ def first_differences(
 
 
 def policy_gradient(model: TransitionModel, policy: Floats, horizon: int) -> tuple[float, Floats]:
-    """The return of a stationary policy (S, A), and its derivatives by the policy's probabilities.
+    """The return of a stationary policy (S, A), and its gradient in the action probabilities.
 
     Sutton, McAllester, Singh and Mansour, Policy Gradient Methods for Reinforcement Learning with
     Function Approximation, 2000, theorem 1.
 
     Returns:
-        The expected return, and shape (S, A): how it grows with each probability, the others being
-        as they are.
+        The expected return, and its partial derivative with respect to each probability, shape
+        (S, A).
     """
     arrays, none = _arrays(model), np.zeros(model.n_states, np.bool_)
     rows = _policy_rows(*arrays, policy[None], none, horizon)
@@ -215,7 +215,7 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
     return np.array(rows)
 
 
-# Compiled. With more steps left than there are rows of values, those of the last row count.
+# Compiled. With more steps left than there are rows of values, the last row applies.
 
 
 @called
@@ -228,7 +228,7 @@ def action_value(
     action: int,
     later: Floats,
 ) -> float:
-    """What an action is worth, with what states are worth one step later."""
+    """The undiscounted value of an action, from the state values one step later."""
     value = float(mean_reward[state, action])
     for k in range(prob.shape[2]):
         if prob[state, action, k] > 0 and not terminated[state, action, k]:
@@ -246,7 +246,7 @@ def _spread(
     weight: float,
     there: Floats,
 ) -> float:
-    """Move a chance of being in a state to the states that follow; how much of it goes on."""
+    """Move a state's probability to its successors in ``there``; returns the part that goes on."""
     left = 0.0
     for k in range(prob.shape[2]):
         if prob[state, action, k] > 0 and not terminated[state, action, k]:
@@ -270,7 +270,7 @@ def _losses(
 ) -> tuple[Floats, Floats, Floats]:
     """Losses (S,), visits (S,) and summed action values (S, A) of a policy (1 or horizon, S, A).
 
-    In repaired states it does what is best by its own values, ``rows``.
+    In repaired states the policy is greedy for its own values, ``rows``.
     """
     n_states, n_actions = mean_reward.shape
     losses, visits = np.zeros(n_states), np.zeros(n_states)
@@ -322,7 +322,7 @@ def _policy_rows(
     repaired: Bools,
     horizon: int,
 ) -> Floats:
-    """Values with 0, 1, ... steps left, shape (m, S); in repaired states of the best actions."""
+    """Values with 0, 1, ... steps left, shape (m, S); repaired states take the best action."""
     n_states, n_actions = mean_reward.shape
     rows = np.zeros((horizon + 1, n_states))
     for left in range(1, horizon + 1):
@@ -341,7 +341,7 @@ def _policy_rows(
                 mean += taken[state, action] * value
             now[state] = highest if repaired[state] else mean
             changed = changed or now[state] != later[state]
-        # One more step has changed nothing: nor will any further one.
+        # Converged: further steps change nothing.
         if not changed and len(chances) == 1:
             return rows[: left + 1].copy()
     return rows
@@ -360,7 +360,7 @@ def _partings(
     other_rows: Floats,
     horizon: int,
 ) -> tuple[Floats, Floats]:
-    """Chances (S,) of the first difference in each state, and gains (S,) by it."""
+    """Probabilities (S,) of the first difference in each state, and its gains (S,)."""
     n_states, n_actions = mean_reward.shape
     met, gains = np.zeros(n_states), np.zeros(n_states)
     here = initial.copy()

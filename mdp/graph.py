@@ -1,7 +1,7 @@
-"""Which states lead where, and the Markov chain that a policy makes of a decision process.
+"""Reachability between states, and the Markov chain that a policy induces.
 
-Of functions that take ``allowed``, bool of shape (S, A), these are the actions that count. Outcomes
-of probability zero lead nowhere.
+Functions with an argument ``allowed``, bool of shape (S, A), consider these actions only. Outcomes
+of probability zero are ignored.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple
     """The fewest transitions of positive probability to a termination or to a target state.
 
     Returns:
-        The number of steps, shape (S,): 0 for target states, -1 where there is no way. And the
-        states that have a way, in the order of that number.
+        The number of steps, shape (S,): 0 for target states, -1 where neither can be reached. And
+        the states that can reach one, in ascending order of steps.
     """
     ends = (model.terminated & (model.prob > 0) & allowed[:, :, None]).any(axis=(1, 2))
     steps = np.where(target, 0, np.where(ends, 1, -1))
@@ -45,7 +45,7 @@ def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple
 
 
 def end_components(model: TransitionModel, allowed: Bools) -> tuple[Ints, Bools]:
-    """The maximal sets of states in which an agent can stay for ever, surely.
+    """The maximal end components: sets of states in which an agent can stay for ever.
 
     An end component is a set of states and actions such that no outcome ends the episode or
     leaves the set, and each state can be reached from each other (de Alfaro, Formal Verification
@@ -85,7 +85,7 @@ def _count_predecessors(
     terminated: Bools,
     allowed: Bools,
 ) -> Ints:
-    """Where each state's list of predecessors begins; the last entry is the length of all."""
+    """Where each state's list of predecessors begins; the last entry is their total number."""
     n_states, n_actions, n_outcomes = prob.shape
     first = np.zeros(n_states + 1, np.int64)
     for state in range(n_states):
@@ -123,7 +123,7 @@ def _list_predecessors(
 def _search_backwards(
     first: Ints, predecessors: AnyInts, steps: Ints, order: Ints, found: int
 ) -> int:
-    """Breadth-first search from the first ``found`` states in order; returns how many there are."""
+    """Breadth-first search from the first ``found`` states of ``order``; the number then found."""
     done = 0
     while done < found:
         reached = order[done]
@@ -148,11 +148,11 @@ class PolicyChain:
 
     model: TransitionModel  # the decision process
     used: Bools  # the actions that the policy takes, bool of shape (S, A)
-    # The states of the chain, shape (n,); rows and following states below are places in this array.
+    # The states of the chain, shape (n,); ``row`` and ``following`` are indices into this array.
     states: Ints
-    row: Ints  # where each outcome happens, shape (m,)
+    row: Ints  # the state of each outcome, shape (m,)
     weight: Floats  # its probability under the policy, shape (m,)
-    following: Ints  # where it leads, shape (m,); of no meaning where it ends the episode
+    following: Ints  # its next state, shape (m,); meaningless where it ends the episode
     outcome: Ints  # its flat index into the arrays of the model, shape (m,)
 
     @classmethod
@@ -203,11 +203,11 @@ class PolicyChain:
         return total.astype(np.float64)
 
     def after(self, values: Floats) -> Floats:
-        """The value (n,) of the state that each outcome leads to (m,): zero where none follows."""
+        """The value of each outcome's next state, shape (m,); zero after termination."""
         return np.where(self.terminated, 0.0, values[self.following])
 
     def spread(self, result: Floats, mean: Floats) -> Floats:
-        """The mean square (n,) by which a result per outcome (m,) differs from its mean (n,)."""
+        """The variance (n,) of a result per outcome (m,) around its mean (n,)."""
         return self.mean((result - mean[self.row]) ** 2)
 
     def solve(
@@ -218,15 +218,15 @@ class PolicyChain:
         zero: Bools | None = None,
         transposed: bool = False,
     ) -> Floats:
-        """Solve (I - discount P) x = right, where P are the probabilities of going on.
+        """Solve (I - discount P) x = right, with P the probabilities of going on to each state.
 
         With a reward per step on the right, x is the expected sum until the episode ends; the
         transposed system, with the starting distribution, gives the expected visits.
 
         Args:
             right: shape (n,).
-            discount: from 0 to 1; without discount the episode must end, or x be known to be
-                zero, wherever the chain may settle.
+            discount: from 0 to 1; at 1, each recurrent class of the chain must end the episode
+                or be in ``zero``.
             zero: states where x is zero, bool of shape (n,).
             transposed: solve the transposed system.
         """

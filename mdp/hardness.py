@@ -1,8 +1,8 @@
-"""How hard a decision process is to learn, by numbers that follow from its model alone.
+"""How hard a decision process is to learn: measures that follow from its model alone.
 
-All of them are exact, but for rounding and the bound that says it is one. Episodes have a time
-limit, returns are undiscounted, and random actions are uniform. `docs/hardness.md` says what the
-numbers mean, and which agents suffer from which.
+All are exact up to rounding, except the effective horizon, which is a bound. Episodes have a time
+limit, returns are undiscounted, and random actions are uniform. `docs/hardness.md` explains the
+measures, and which agents suffer from which.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from mdp.graph import steps_to_end
 from mdp.planning import policy_iteration, surely_ending
 from mdp.transition_model import AnyInts, Bools, Floats, TransitionModel
 
-# Beyond these, a number is None. Outcomes of reachable states, times these states.
+# Above these limits, a measure is None. Outcomes of reachable states, times these states.
 MOST_FOR_DIAMETER = 5_000_000
 # Values of reachable states at all steps, 8 bytes each, in three tables.
 MOST_VALUES = 10_000_000
-# Outcomes of reachable states at all steps and for all depths; at least so many depths are tried.
+# Outcomes of reachable states times steps times depths; and the fewest depths it must allow.
 MOST_LOOKED_AT = 1_000_000_000
 LEAST_DEPTHS = 10
 
 
 @dataclass(frozen=True)
 class Hardness:
-    """How hard a decision process is. A number is None where it is not defined or too large."""
+    """How hard a decision process is. A measure is None if undefined, or the model too large."""
 
     states: int  # S, the states of the model
     reachable_states: int  # those in which an agent may have to act
@@ -47,14 +47,14 @@ class Hardness:
     mean_gap: float | None  # return: the same, averaged over the states that the optimum visits
     return_variance: float  # return squared, of one episode of the optimal policy
     lookahead: int | None  # steps: k, see `looking_ahead`
-    effective_horizon: float | None  # steps: a bound, see `looking_ahead`; not with chance
+    effective_horizon: float | None  # steps: a bound, see `looking_ahead`; None if random
     random_steps_to_reward: float  # steps of random actions up to the first positive reward
     random_episodes_to_reward: float  # the same in episodes; infinite if there is no such reward
     random_steps_to_goal: float | None  # steps to the first success; None where it is not defined
 
 
 def hardness_of(model: TransitionModel, horizon: int, success: Bools | None = None) -> Hardness:
-    """All that this module can say of a decision process.
+    """All measures of a decision process.
 
     Args:
         model: the decision process.
@@ -94,8 +94,8 @@ def diameter(model: TransitionModel) -> tuple[float, float] | None:
     Jaksch, Ortner and Auer, Near-Optimal Regret Bounds for Reinforcement Learning, 2010,
     definition 1: the maximum, over ordered pairs of states, of the smallest expected number of
     steps from the first to the second. Here the states are the reachable ones, and pairs count if
-    some policy surely arrives before the episode terminates; theirs is infinite if any does not.
-    There is no time limit.
+    some policy surely arrives before the episode terminates; the paper's diameter is infinite if
+    a pair does not count. There is no time limit.
 
     Returns:
         The diameter in steps, and the share of ordered pairs that count; where it is 1, this is
@@ -113,7 +113,7 @@ def diameter(model: TransitionModel) -> tuple[float, float] | None:
 
 
 def hitting_times(model: TransitionModel, target: int) -> Floats:
-    """The smallest expected number of steps from each state to another one, shape (S,).
+    """The smallest expected number of steps from each state to ``target``, shape (S,).
 
     Infinite where no policy surely arrives before the episode terminates, and in unreachable
     states.
@@ -128,8 +128,8 @@ def hitting_times(model: TransitionModel, target: int) -> Floats:
     if (model.prob.max(axis=2)[allowed & ~at[:, None]] == 1).all():
         times[going] = steps_to_end(model, allowed, at)[0][going]
         return times
-    # The model of those states alone, which ends at the target: other actions are left out, by
-    # putting an action that stays within them in their place.
+    # A model of those states alone, which ends at the target. Actions that leave them are replaced
+    # by an action that does not.
     used = np.where(allowed, np.arange(model.n_actions), allowed.argmax(axis=1)[:, None])[going]
     rows = going[:, None], used
     place = np.zeros(model.n_states, np.int64)
@@ -146,17 +146,17 @@ def hitting_times(model: TransitionModel, target: int) -> Floats:
     return times
 
 
-# Mistakes.
+# Suboptimal actions.
 
 
 def action_gaps(
     model: TransitionModel, plan: FiniteHorizonPlan
 ) -> tuple[float | None, float | None]:
-    """What the least mistake costs: the best action's value less that of the best worse one.
+    """The value of the best action minus that of the best suboptimal one.
 
     The gap of Simchowitz and Jamieson, Non-Asymptotic Gap-Dependent Regret Bounds for Tabular
-    MDPs, 2019, with all steps of the time limit left. Actions within 1e-9 of the best are not
-    worse. States in which no action is a mistake have no gap.
+    MDPs, 2019, with all steps of the time limit left. Actions within 1e-9 of the best count as
+    optimal. States without a suboptimal action have no gap.
 
     Args:
         model: the decision process.
@@ -179,14 +179,14 @@ def action_gaps(
     return (smallest if np.isfinite(smallest) else None), mean
 
 
-# Chance.
+# Random actions.
 
 
 def random_wait(model: TransitionModel, marked: Bools, horizon: int) -> tuple[float, float]:
-    """How long random actions take to the first of some outcomes, episode after episode.
+    """The expected time until random actions reach the first marked outcome, over episodes.
 
-    By Wald's identity: the expected steps of an episode that ends there, divided by the chance that
-    an episode has such an outcome.
+    By Wald's identity: the expected length of an episode that stops at a marked outcome, divided by
+    the probability that an episode has such an outcome.
 
     Args:
         model: the decision process.
@@ -208,30 +208,30 @@ def random_wait(model: TransitionModel, marked: Bools, horizon: int) -> tuple[fl
 
 
 def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, float | None]:
-    """How many steps an agent has to look ahead, if it values what comes after by random actions.
+    """How many steps an agent must look ahead, if it evaluates the rest by random actions.
 
     Laidlaw, Russell and Dragan, Bridging RL Theory and Practice with the Effective Horizon, 2023.
-    Let Q(1) be the action values of random actions, and Q(k + 1) what a sweep of value iteration
-    makes of Q(k), all with the steps that are left. A model is *k-QVI-solvable* if every policy
-    that is greedy for Q(k) is optimal. The number that is returned is the smallest such k.
+    Let Q(1) be the action values of random actions, and Q(k + 1) the result of a sweep of value
+    iteration over Q(k), for each number of steps left. A model is *k-QVI-solvable* if every policy
+    that is greedy for Q(k) is optimal. The first result is the smallest such k.
 
-    If transitions are deterministic, Greedy Over Random Policy (GORP) tries all sequences of k
-    actions, each followed by random ones, m episodes of each; takes the first action of the best
-    sequence; and goes on from there. The *effective horizon* is the smallest k + log_A(m) with
-    which that is optimal with probability 1/2; it takes T^2 A^(k + log_A m) steps at most. What is
-    returned is a bound on it, as their theorem 5.4 but with the constants that follow from
+    If transitions are deterministic, Greedy Over Random Policy (GORP) tries each sequence of k
+    actions, followed by random ones, in m episodes; takes the first action of the best sequence;
+    and repeats this in the next state. The *effective horizon* is the smallest k + log_A(m) for
+    which GORP is optimal with probability 1/2; it takes T^2 A^(k + log_A m) steps at most. The
+    second result is a bound on it, as their theorem 5.4 but with the constants that follow from
     Bernstein's inequality, and for rewards of any sign: m = 8 (v + b d / 6) / d^2 ln(2 T A^k) are
-    enough, d being the gap of Q(k) between optimal and other actions, b = Q - W the range of what
-    can follow an action, from the lowest return W to the optimal value Q, and v = (Q(k) - W) b;
-    the worst case of what GORP visits. T is the time limit or the longest possible episode,
-    whichever is less. The bound is at most T, as all sequences of T actions need no luck.
+    enough, where d is the gap of Q(k) between optimal and other actions, b = Q - W the range of
+    returns after an action, from the lowest return W to the optimal value Q, and v = (Q(k) - W) b;
+    in the worst state that GORP visits. T is the time limit or the longest possible episode,
+    whichever is less. The bound is at most T, since sequences of T actions leave nothing random.
 
     Values within 1e-9 of each other count as equal, relative to them where they are above 1.
 
     Returns:
-        k, and the bound in steps. None where the model is too large, or where more depths would
-        have to be tried than there is time for; the bound also where transitions or rewards are
-        random, or there is one action alone.
+        k, and the bound in steps. None where the model is too large or the depths that time allows
+        do not suffice; the bound also where transitions or rewards are random, or there is only
+        one action.
     """
     states = np.flatnonzero(model.reachable)
     place = np.cumsum(model.reachable) - 1
@@ -333,8 +333,8 @@ def _greedy_is_optimal(
 ) -> tuple[bool, float]:
     """Whether all greedy policies are optimal, and the largest (v + b d / 6) / d^2 for GORP.
 
-    ``current`` are the values of the states that follow an action. Greedy policies take the best
-    actions; GORP may take each that looks better than the best mistake, see `looking_ahead`.
+    Q(k) follows from the state values ``current``. Greedy policies take the best actions; GORP may
+    take each action that looks better than the best mistake, see `looking_ahead`.
     """
     n_states, n_actions = mean_reward.shape
     is_optimal, spread = True, 0.0

@@ -1,12 +1,12 @@
-"""What would take too long on large maps under a time limit, worked out in other ways.
+"""Faster methods for large maps under a time limit.
 
-- The optimum under a limit that is too far away to matter, from planning without one.
-- A policy's episodes followed forwards: how the probability spreads from the starting states. On
-  large state spaces an episode is in few of them at any one step. Backwards, every state that it
-  might come to takes part in every step of the time limit; forwards, those where it may be now.
-- Episodes in which nothing is random: where each state's one way leads, by doubling. What 2 n steps
-  from a state earn is what n steps earn from there, and n more from where those lead: a time limit
-  of T takes log2(T) rounds over the states, however often a way goes round in circles.
+- The optimum under a limit too distant to matter, from planning without a limit.
+- Forward evaluation of a policy: the distribution of states, step by step. On large state spaces
+  few states have positive probability at any one step; backward induction would update every
+  reachable state at every step.
+- Evaluation without randomness, by doubling. The return of 2 n steps from a state is that of n
+  steps, plus that of n steps from the state they lead to: a time limit of T takes log2(T) rounds
+  over the states, however often an episode goes round in circles.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from machine_code.compiling import compiled, inlined, kernel
 from mdp.planning import value_iteration
 from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
-# A limit that is far away.
+# A distant limit.
 
 # Backwards from a limit of T steps, planning takes T sweeps over all states. Where every step costs
-# something, the optimum without the limit is nearly always the same number to the last digits; here
-# that is shown, or it is not taken.
+# something, the optimum without the limit nearly always equals it to the last digits; the result is
+# used only where that is proved.
 #
 # Let V be the optimal values without the limit, let -c be the lowest of them, and let no step that
 # goes on earn more than -e. A step by an optimal action raises V by e or more, in the mean. An
-# agent that is still under way after T steps has come to max V at most, and so has lost at least
+# agent that is still under way after T steps has reached max V at most, and so has lost at least
 # B = T e - (max V - V(start)) to chance or to actions that are not optimal. The limit spares it c
-# at most: to lose c by its actions is no gain. So the limit is worth no more than c times the
-# probability that chance alone takes the rest, B - c = x. What chance takes is a sum of T terms of
-# mean zero, which by Bernstein's inequality for martingales (Freedman, On Tail Probabilities for
-# Martingales, 1975) comes to x with a probability of at most exp(-x^2 / (2 T v + 2 b x / 3)), where
-# v is the largest variance of a step's term and b its largest fall.
+# at most: to lose c by its actions is no gain. So the limit raises the return by at most c times
+# the probability that chance alone takes the rest, x = B - c. The loss by chance is a sum of T
+# terms of mean zero, which by Bernstein's inequality for martingales (Freedman, On Tail
+# Probabilities for Martingales, 1975) reaches x with a probability of at most
+# exp(-x^2 / (2 T v + 2 b x / 3)), where v is the largest variance of a term and b its largest fall.
 #
-# Nor does the limit cost more than that: what is optimal without it is under way after T steps with
-# a probability that is smaller still, and might then have earned max V more.
+# The limit lowers the return by no more: the policy that is optimal without the limit is under way
+# after T steps with an even smaller probability, and could then earn at most max V more.
 
 
-# The limit may change the optimum by this, relative to it where it is above 1.
+# The largest error accepted, relative to the optimum where that is above 1.
 TOLERANCE = 1e-9
 
 
 def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None:
-    """The highest expected return under the time limit, without going through its steps.
+    """The highest expected return under a distant time limit, from planning without a limit.
 
     Args:
         model: the decision process.
@@ -52,11 +52,11 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
 
     Returns:
         The mean over the starting states, within 1e-9 of it (relative, where it is above 1), the
-        error bound of planning included. None where that cannot be shown, as where the limit is
-        near, or steps cost nothing.
+        error bound of planning included. None where this accuracy cannot be proved, for example
+        because the limit is near or steps cost nothing.
     """
     if not (model.terminated & (model.prob > 0)).any():
-        return None  # a task that never ends: to find out what it earns for ever takes longest
+        return None  # a task that never ends, which takes longest to plan
     try:
         plan = value_iteration(model, 1.0)
     except ValueError:
@@ -69,7 +69,7 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
     highest, lowest = max(float(values.max()), 0.0), min(float(values.min()), 0.0)
     rows = model.prob, model.next_state, model.terminated, model.reward
     step_cost, fall, variance = drift(*rows, reached, plan.values)
-    slack = 4 * plan.error_bound  # of differences of values, each known to within the bound
+    slack = 4 * plan.error_bound  # error of differences of values, each within the bound
     overdue = horizon * step_cost - (highest - lowest_start) - slack
     fall, deviation = fall + slack, math.sqrt(variance) + slack
     chance = 1.0
@@ -80,9 +80,9 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
 
 
 def chance_of_losing(loss: float, fall: float, variance: float, horizon: int) -> float:
-    """A bound on the probability that chance alone takes so much in so many steps.
+    """A bound on the probability that ``horizon`` steps lose ``loss`` by chance alone.
 
-    A step changes the value by this variance at most, and lets it fall below its mean by ``fall``.
+    ``variance`` bounds that of the value after a step, ``fall`` how far it falls below its mean.
     """
     if loss <= 0:
         return 1.0
@@ -99,11 +99,11 @@ def drift(
     reached: Bools,
     values: Floats,
 ) -> tuple[float, float, float]:
-    """How values change on the way, over all states and actions that can be met.
+    """How a step changes the value: the worst cases over all reachable states and actions.
 
-    The least cost of a step that goes on, the largest fall of the value below its mean in a step,
-    and the largest variance of the value after one. An end counts as if the episode went on where a
-    step at the least cost would be worth as much.
+    Returns the least cost of a step that goes on, the largest fall of the value below its mean in a
+    step, and the largest variance of the value after a step. An end with reward r counts as a step
+    of least cost e to a state of value r + e.
     """
     step_cost = np.inf
     for state in range(prob.shape[0]):
@@ -135,8 +135,8 @@ def drift(
 
 Rows = tuple[Floats, AnyInts, Bools, Floats, Bools]
 
-# No more than this share of the episodes may be left out, since they are so rare: if all of the
-# least likely states were, at all steps.
+# Upper bound on the total probability that is ignored, in states that are unlikely at a step:
+# reached if all states were ignored at all steps.
 SHARE_LEFT_OUT = 1e-15
 
 
@@ -150,9 +150,9 @@ def moments_by_spreading(
 ) -> Floats:
     """Mean and variance of the return, of the length, and the probability of success.
 
-    Groups of episodes that are in the same state at the same step are one: its probability, the
-    mean of its returns so far, and their sum of squared deviations, which keeps its digits where
-    the mean is large.
+    Episodes in the same state at the same step form a group: its probability, the mean of its
+    returns so far, and their sum of squared deviations, which stays accurate where the mean is
+    large.
 
     Args:
         rows: prob, next_state, terminated, reward of `TransitionModel`, and the outcomes that count
@@ -161,11 +161,11 @@ def moments_by_spreading(
         initial: probabilities of the starting states, shape (S,).
         horizon: the time limit in steps.
         discount: from 0 to 1.
-        floor: give up as soon as the mean return surely is below this. Minus infinity for never,
-            which it has to be where there is a discount.
+        floor: give up once the mean return is certainly below this. Must be minus infinity
+            (never) where there is a discount.
 
     Returns:
-        Shape (5,); a mean return of minus infinity where it was given up.
+        Shape (5,); a mean return of minus infinity if evaluation gave up.
     """
     n_states = len(initial)
     now, later = np.zeros((n_states, 3)), np.zeros((n_states, 3))
@@ -174,7 +174,7 @@ def moments_by_spreading(
     starts = np.flatnonzero(initial)
     here[: len(starts)] = starts
     over = np.zeros((3, 3))
-    least = SHARE_LEFT_OUT / (n_states * horizon)  # of a state at a step
+    least = SHARE_LEFT_OUT / (n_states * horizon)  # the least probability of a state at a step
     limits = _best_rewards(rows[0], rows[2], rows[3])
     groups = now, later, here, there
     if not _follow(
@@ -200,11 +200,11 @@ def _follow(
 ) -> bool:
     """Follow the episodes from step to step; False where their mean return is below the floor.
 
-    ``groups`` are what is in each state now and one step later, both (S, 3), and the states of
-    which that is true, both (S,), in any order, ``n_here`` of them at the beginning. ``over``, of
-    shape (3, 3), is of the episodes that are over: a group of returns, one of lengths, and the
-    probability of success. States that are less likely than ``least`` are left out. ``limits`` are
-    the highest rewards of an end and of another step.
+    ``groups`` holds the groups of each state now and one step later, both (S, 3), and the lists of
+    states that have one, both (S,), in any order, ``n_here`` of them at the beginning. ``over``,
+    shape (3, 3), holds the episodes that are over: a group of returns, a group of lengths, and the
+    probability of success. States less likely than ``least`` are ignored. ``limits`` are the
+    highest rewards of a step that ends the episode and of one that does not.
     """
     now, later, here, there = groups
     factor = 1.0
@@ -246,7 +246,7 @@ def _spread(
     n_there: int,
     over: Floats,
 ) -> int:
-    """Let the episodes that are in one state take a step; how many states there are then."""
+    """Let the group of one state take a step; returns the number of states in ``there``."""
     prob, next_state, terminated, reward, success = rows
     at, mean, variance = now[state, 0], now[state, 1], now[state, 2] / now[state, 0]
     for action in range(prob.shape[1]):
@@ -287,7 +287,7 @@ def _merge(groups: Floats, place: int, chance: float, mean: float, spread: float
 
 @inlined
 def _most_to_come(limits: tuple[float, float], n_steps: int) -> float:
-    """No episode earns more than this in so many steps."""
+    """An upper bound on the return of an episode's next ``n_steps`` steps."""
     best_end, best_step = limits
     on_the_way = best_step * (n_steps - 1) if best_step > 0 else 0.0
     unfinished = best_step * n_steps if best_step > -np.inf else -np.inf
@@ -296,7 +296,7 @@ def _most_to_come(limits: tuple[float, float], n_steps: int) -> float:
 
 @compiled
 def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[float, float]:
-    """The highest reward of an end, and of a step that is none; minus infinity without any."""
+    """The highest reward of an end, and of any other step; minus infinity without any."""
     best_end, best_step = -np.inf, -np.inf
     for state in range(prob.shape[0]):
         for action in range(prob.shape[1]):
@@ -308,11 +308,11 @@ def _best_rewards(prob: Floats, terminated: Bools, reward: Floats) -> tuple[floa
     return best_end, best_step
 
 
-# Ways.
+# Deterministic episodes.
 
-# What some number of steps from each state comes to, each of shape (n + 1,); the last entry stands
-# for the end. The (discounted) sum of rewards, the number of steps until then or the end, whether
-# the episode has ended well by then, and the state after them.
+# The result of some number of steps from each state, arrays of shape (n + 1,), the last entry for
+# the ended episode: the (discounted) sum of rewards, the number of steps until then or the end,
+# whether the episode has succeeded, and the state reached.
 Ways = tuple[Floats, Floats, Bools, Ints]
 
 
@@ -341,7 +341,7 @@ def _walked(
     horizon: int,
     discount: float,
 ) -> Ways:
-    """All steps of the limit from each state, out of powers of two of them."""
+    """The result of ``horizon`` steps from each state, by doubling."""
     n = len(reward)
     step = np.zeros(n + 1), np.ones(n + 1), np.zeros(n + 1, np.bool_), np.full(n + 1, n)
     step[1][n] = 0.0
@@ -364,7 +364,7 @@ def _walked(
 
 @compiled
 def _followed(first: Ways, then: Ways, discount: float) -> Ways:
-    """Some steps and then others, whose rewards count ``discount`` times."""
+    """The steps of ``first``, then those of ``then`` with rewards multiplied by ``discount``."""
     n = len(first[0])
     both = np.empty(n), np.empty(n), np.empty(n, np.bool_), np.empty(n, np.int64)
     for state in range(n):

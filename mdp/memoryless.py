@@ -1,12 +1,12 @@
-"""The best that can be done by what is observed now, where several states look alike.
+"""The optimum over memoryless policies, where several states look alike.
 
-Which stationary policy is best then is a hard problem (Littman, Memoryless Policies: Theoretical
-Limitations and Practical Results, 1994), and it may have to be random. Several ascents along the
-exact gradient find a policy. A branch and bound over boxes of policies then proves how much better
-any other can be: within a box, an agent that sees the state and chooses anew at each step from the
-box's probabilities does at least as well as each policy of the box; and bounds of how the return
-grows with each probability bound it too. The smaller the boxes, the closer the bounds; with few
-observations and actions they meet what was found.
+A memoryless policy depends on the current observation alone. The best one is hard to find
+(Littman, Memoryless Policies: Theoretical Limitations and Practical Results, 1994), and may have to
+be stochastic. Gradient ascent from several starts finds a policy. Branch and bound over boxes of
+policies (each probability between two bounds) then bounds the return of all others, in two ways: by
+an agent that observes the state and chooses from the box anew at each step, and by bounds on the
+derivatives of the return in each probability. Smaller boxes give closer bounds; with few
+observations and actions they meet the return that was found.
 """
 
 from __future__ import annotations
@@ -23,40 +23,39 @@ from mdp.evaluation import policy_return
 from mdp.gaps import policy_gradient
 from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
-# Outcomes and choices of all states at all steps: of one return, beyond which nothing is climbed,
-# and of all, beyond which no ascent or box is begun, as beyond so many returns: some seconds.
-MOST_OUTCOMES_CLIMBED = 100_000_000
-MOST_WORK = 100_000_000
+# Limits for a search of some seconds. Work is in outcomes and choices of all states at all steps.
+MOST_OUTCOMES_CLIMBED = 100_000_000  # for one return; above, there is no search
+MOST_WORK = 100_000_000  # for all returns of the ascents, and again for those of the bounds
 RANDOM_STARTS = 4
-MOST_RETURNS = 100_000
-MOST_FIRM = 256  # policies without chance that are all tried
-# A policy that all but surely takes an action: further ascent changes its return by rounding.
+MOST_RETURNS = 100_000  # for the bounds
+MOST_FIRM = 256  # deterministic policies; up to this number, all are tried
+# Logit of an almost deterministic policy; ascents start from half of it.
 STEEP = 6.0
-# Relative to the return: bounds that close are taken to meet.
+# Bounds within this of the return found, relative to it, count as meeting it.
 PROVED = 1e-6
 ROUNDING = 1e-12  # of probabilities
 
 
 class BestMemoryless(NamedTuple):
-    """What stationary policies can do that go by what is observed now."""
+    """The best memoryless policy found, and an upper bound on all of them."""
 
     lower: float  # the return of `policy`
-    upper: float  # no policy returns more; equal to ``lower`` where that is proved within 1e-6
+    upper: float  # no memoryless policy returns more; ``lower`` where proved within 1e-6
     policy: Floats  # probabilities of actions, by observation, shape (G, A)
-    firm: float  # the highest return found without chance
-    is_firm_known: bool  # whether all policies without chance were tried
+    firm: float  # the highest return found of a deterministic policy
+    is_firm_known: bool  # whether all deterministic policies were tried
 
     @property
     def needs_chance(self) -> bool:
-        """Whether a random policy was found that is better than all without chance."""
+        """Whether a stochastic policy was found that beats all deterministic ones found."""
         return self.lower > self.firm + 10 * PROVED * max(1.0, abs(self.firm))
 
 
 def observation_groups(observations: NDArray[np.generic], reachable: Bools) -> Ints | None:
-    """The number of what is observed in each state, shape (S,); None where it tells them apart.
+    """The index of each state's observation, shape (S,); None if observations identify states.
 
     Args:
-        observations: of each state, states along the first axis.
+        observations: the observation of each state, states along the first axis.
         reachable: the states that count, bool of shape (S,).
     """
     if observations.ndim == 1 and np.array_equal(observations, np.arange(len(observations))):
@@ -72,16 +71,16 @@ def observation_groups(observations: NDArray[np.generic], reachable: Bools) -> I
 def best_memoryless(
     model: TransitionModel, groups: Ints, horizon: int, most: float = np.inf
 ) -> BestMemoryless | None:
-    """What policies can do that go by the group of a state alone.
+    """The best policy that depends on the group of a state alone, and a bound on all.
 
     Args:
         model: the decision process.
-        groups: the number of what is observed in each state, from 0 on, shape (S,).
+        groups: the index of each state's observation, from 0 on, shape (S,).
         horizon: the time limit in steps.
-        most: a return that is known to be out of reach, or just in it.
+        most: a known upper bound on the return.
 
     Returns:
-        The best policy found, and what none exceeds; None where the search would take too long.
+        The best policy found, and the bound; None where the search would take too long.
     """
     from scipy.optimize import minimize
 
@@ -129,14 +128,14 @@ def best_memoryless(
 
 
 class _Best:
-    """The best policy so far."""
+    """The best policy found so far."""
 
     def __init__(self, model: TransitionModel, groups: Ints, horizon: int) -> None:
         self.model, self.groups, self.horizon = model, groups, horizon
         self.value, self.policy = -np.inf, np.zeros((0, 0))
 
     def take(self, policy: Floats) -> float:
-        """The return of a policy, shape (G, A), which is kept if it is the best."""
+        """Return the value of a policy, shape (G, A), and keep the policy if it is the best."""
         value = policy_return(self.model, policy[self.groups], self.horizon).expected_return
         if value > self.value:
             self.value, self.policy = value, policy
@@ -144,13 +143,13 @@ class _Best:
 
 
 def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
-    """A return that no memoryless policy exceeds, by branch and bound with so many returns."""
+    """A return that no memoryless policy exceeds, from branch and bound."""
     model = found.model
     enough = found.value + PROVED * max(1.0, abs(found.value))
     arrays = model.prob, model.next_state, model.terminated, model.expected_reward
     states: Ints = np.flatnonzero(model.reachable)
     shape, groups = found.policy.shape, found.groups
-    order = count()  # so that arrays are never compared
+    order = count()  # breaks ties, so that arrays are never compared
     heap: list[tuple[float, int, Floats, Floats]] = []
     n_slopes = 2 * len(seen) * shape[1]
 
@@ -174,7 +173,7 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
         for part in (0, 1):
             lower, upper = low.copy(), high.copy()
             (upper if part == 0 else lower)[group, action] = middle
-            # What the others leave.
+            # Probabilities sum to one, so each bound limits the others.
             upper[group] = np.minimum(upper[group], 1 - lower[group].sum() + lower[group])
             lower[group] = np.maximum(lower[group], 1 - upper[group].sum() + upper[group])
             if (lower[group] <= upper[group] + ROUNDING).all():
@@ -185,11 +184,11 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
 def _bound_by_slopes(
     found: _Best, states: Ints, seen: Ints, low: Floats, high: Floats, horizon: int
 ) -> float:
-    """A return that no policy of the box exceeds, from one of its policies and bounds of slopes.
+    """An upper bound on the return in a box, from one of its policies and bounds on derivatives.
 
-    By how much another policy is better is, summed over observations and actions, the difference
-    of the two probabilities times what the other one expects to meet of the first one's advantages
-    (Kakade and Langford, 2002). An agent that sees the state bounds that from both sides.
+    Another policy is better by a sum over observations and actions: the difference of the two
+    probabilities, times the first policy's advantages summed over the other's expected visits
+    (Kakade and Langford, 2002). An agent that sees the state bounds that sum from both sides.
     """
     model, groups = found.model, found.groups
     arrays, middle = (model.prob, model.next_state, model.terminated), _inside(low, high)
@@ -209,7 +208,7 @@ def _bound_by_slopes(
 
 
 def _inside(low: Floats, high: Floats) -> Floats:
-    """A policy of the box, without chance where there is one."""
+    """A policy of the box, deterministic where the box holds one."""
     room = (high - low).sum(axis=1, keepdims=True)
     left = 1 - low.sum(axis=1, keepdims=True)
     policy: Floats = low + (high - low) * np.divide(
@@ -290,7 +289,7 @@ def _most_met(
     group: int,
     rewards: Floats,
 ) -> Floats:
-    """As `_return_in_box`, for rewards (horizon, S) that are had where a group is observed."""
+    """As `_return_in_box`, for rewards (horizon, S) received in states of ``group`` alone."""
     later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
     values, is_used = np.zeros(prob.shape[1]), np.zeros(prob.shape[1], np.bool_)
     for step in range(len(rewards) - 1, -1, -1):
@@ -313,7 +312,7 @@ def _look_ahead(
     later: Floats,
     values: Floats,
 ) -> None:
-    """What follows each action of a state, into ``values``."""
+    """Write the expected value after each action of a state into ``values``."""
     for action in range(prob.shape[1]):
         values[action] = 0.0
         for k in range(prob.shape[2]):
@@ -329,7 +328,7 @@ def _best_in_box(values: Floats, low: Floats, high: Floats, is_used: Bools) -> f
         is_used[action] = False
         total += low[action] * values[action]
         left -= low[action]
-    # What is left goes to the best action, as much as the box allows, then to the next.
+    # The rest goes to the best action, as much as the box allows, then to the next best.
     for _ in range(len(values)):
         best = -1
         for action in range(len(values)):

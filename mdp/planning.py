@@ -1,12 +1,12 @@
 """The best policy of a finite Markov decision process, and its values.
 
-Without a time limit the best policy is stationary; for the best one under a time limit, which is
-not, see ``mdp.finite_horizon``.
+Without a time limit some best policy is stationary; for planning under a time limit, see
+``mdp.finite_horizon``.
 
 Without discount, the sum of rewards until the episode ends is a stochastic shortest path problem
 (Bertsekas and Tsitsiklis, An Analysis of Stochastic Shortest Path Problems, 1991). It has a finite
-optimum where an agent can surely bring the episode to its end, or stay for ever at no cost, and
-cannot earn for ever.
+optimum where an agent can surely end the episode, or stay for ever at no cost, and cannot earn
+reward for ever.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel, 
 
 # Beyond this many rounds only plain sweeps are made, which are known to converge.
 ROUNDS_WITH_EVALUATION = 1000
-# With a discount, rounds in which sweeps leave a policy's values rough, times states: then linear
-# systems are solved. It is about the work that SciPy's import takes.
+# With a discount: rounds in which sweeps do not converge on a policy's values, times states, after
+# which linear systems are solved instead. About the work of importing SciPy.
 ROUGH_STATES = 100_000
-# An action has to be better by this to be taken then, relative to the value: by more than rounding.
+# The policy then changes only to an action better by this, relative to the value: above rounding.
 FINE_TIE = 1e-15
-# What counts as a tie, relative to the largest value, where no bound of the error is known.
+# The tolerance of ties, relative to the largest value, where no error bound is proven.
 UNPROVEN_TIE = 1e-9
 
 
@@ -40,12 +40,12 @@ class Plan:
         values: the optimal expected (discounted) sum of rewards from each state, shape (S,); zero
             for states that cannot be reached, minus infinity for those from which no policy
             surely ends an undiscounted episode.
-        action_values: the same after taking each action first, shape (S, A); minus infinity for
+        action_values: the same after each first action, shape (S, A); minus infinity for
             actions that cannot be part of a finite value, zero in unreachable states.
         policy: the greedy action in each state, shape (S,): the first of those whose values
             differ from the best by less than 1e-12 of it or twice the error bound, whichever is
-            more (1e-9 of the largest value where the bound is an estimate). Where going round at
-            no cost ties with going on, the first that goes on.
+            more (1e-9 of the largest value where the bound is an estimate). Where a cycle at no
+            cost ties with progress towards the end, the first action that makes progress.
         iterations: sweeps of value iteration, or policies that policy iteration evaluated.
         error_bound: a bound on the distance between ``values`` and the optimum. It is proven,
             rounding included, with a discount below one and where every step that cannot end the
@@ -69,16 +69,16 @@ def value_iteration(
 
     The sweeps are Gauss-Seidel, the states nearest to the end first, and between them the greedy
     policy is evaluated roughly (modified policy iteration: Puterman, Markov Decision Processes,
-    1994, section 6.5). Where sweeps evaluate it too slowly, as where agents do best to stand still
-    until the discount has made all else worth nothing, its linear system is solved by an iterative
-    method, whose memory grows with the states alone. Whether values have converged is judged by
-    the plain sweeps alone.
+    1994, section 6.5). Where sweeps evaluate it too slowly, for example if standing still is best
+    until the discount has made all else worthless, its linear system is solved by an iterative
+    method, with memory linear in the number of states. Plain sweeps alone decide whether values
+    have converged.
 
     Args:
         model: the decision process; rows of unreachable states are ignored.
         discount: from 0 to 1; 1 sums rewards until the episode ends.
-        tolerance: sweeping stops when the proven error bound is at most this, and otherwise
-            when values change by no more than rounding makes them.
+        tolerance: sweeping stops when the proven error bound is at most this, or when values
+            change by no more than rounding.
         mask: the actions that may be taken, bool of shape (S, A), or None for all.
 
     Raises:
@@ -118,8 +118,8 @@ def value_iteration(
 def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None = None) -> Plan:
     """Plan by evaluating a policy exactly and making it greedy, until no action is better.
 
-    The linear systems are solved directly, which suits some ten thousand states; beyond, the
-    memory that this takes depends on the model, and ``value_iteration`` is faster. Howard, Dynamic
+    The linear systems are solved directly, which suits up to some ten thousand states; above, the
+    memory needed depends on the model, and ``value_iteration`` is faster. Howard, Dynamic
     Programming and Markov Processes, 1960.
 
     Args:
@@ -151,7 +151,7 @@ def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None
 def _worth_evaluating(
     problem: PlanningProblem, values: Floats, change: float, iterations: int, solving: bool
 ) -> bool:
-    """Whether to evaluate the policy: by sweeps, not where only rounding is left to mend."""
+    """Whether to evaluate the policy; sweeps no longer help once only rounding errors are left."""
     if problem.part.resting.any() or iterations >= ROUNDS_WITH_EVALUATION:
         return False
     return solving or change > 1e-13 * float(np.abs(values).max())
@@ -165,7 +165,7 @@ def _exact_values(problem: PlanningProblem, policy: Ints) -> Floats:
     values = np.zeros(model.n_states)
     rests = None
     if problem.part.resting.any():
-        # Where a single action per state stays for ever, it does so at no cost.
+        # An end component of a single policy that is never left has no net cost: values are zero.
         component, _ = end_components(model, chain.used)
         rests = component[chain.states] >= 0
     values[chain.states] = chain.solve(chain.mean(chain.reward), problem.discount, zero=rests)
@@ -191,14 +191,14 @@ def _plan(problem: PlanningProblem, values: Floats, change: float, iterations: i
 
 
 def _greedy(problem: PlanningProblem, action_values: Floats, tie: float, rests: Bools) -> Ints:
-    """The first best action of each state, shape (S,), that also gets somewhere."""
+    """The first best action of each state, shape (S,), that makes progress or rests."""
     model, part = problem.model, problem.part
     best = action_values.max(axis=1)
     margin = np.maximum(TIE_TOLERANCE * np.maximum(1.0, np.abs(best)), tie)
     tied = part.allowed & (action_values >= (best - margin)[:, None])
     if not part.resting.any():
         return np.asarray(tied.argmax(axis=1))
-    # Going round at no cost ties with going on: only an action that may lead nearer counts.
+    # A cycle at no cost ties with progress: only actions that may lead nearer to the end count.
     steps, _ = steps_to_end(model, tied, rests)
     nearer = model.terminated | (steps[model.next_state] < steps[:, None, None])
     goes_on = tied & ((model.prob > 0) & nearer).any(axis=2)
@@ -222,8 +222,7 @@ class FinitePart:
     allowed: Bools  # the actions of those states that lead to no others, bool of shape (S, A)
     resting: Bools  # the states in which an agent can stay for ever at no cost, bool of shape (S,)
     rest_actions: Bools  # the actions that do so, bool of shape (S, A)
-    # No step that cannot end the episode earns more than minus this; zero where some such step
-    # costs nothing.
+    # A lower bound on the mean cost of steps that cannot end the episode; zero where one is free.
     step_cost: float
 
     @classmethod
@@ -239,8 +238,8 @@ def finite_part(model: TransitionModel, mask: Bools | None = None) -> FinitePart
     allowed = allowed_actions(model, mask)
     ends = (model.terminated & (model.prob > 0)).any(axis=2)
     endless = allowed & ~ends
-    # Where every step may end the episode, any cost will do; one of the rewards' own size makes
-    # the bound of the error as close as it can be.
+    # Where every step may end the episode, any cost is valid; one of the size of the rewards makes
+    # the error bound tightest.
     largest = max(1.0, float(np.abs(model.expected_reward[allowed]).max()))
     step_cost = -float(model.expected_reward[endless].max()) if endless.any() else largest
     rest_actions = np.zeros_like(allowed)
@@ -261,7 +260,7 @@ def finite_part(model: TransitionModel, mask: Bools | None = None) -> FinitePart
 def surely_ending(model: TransitionModel, allowed: Bools, resting: Bools) -> tuple[Bools, Bools]:
     """The states from which some policy ends the episode, or comes to rest, with probability one.
 
-    What has no way there is left out, and then what might lead to it, until nothing changes.
+    Removes states without a path there, and actions that may lead to them, until nothing changes.
     """
     leads = (model.prob > 0) & ~model.terminated
     while True:
@@ -316,15 +315,15 @@ def _largest_gain(model: TransitionModel, inside: Bools) -> float:
     return float(-flow.fun)
 
 
-# Where to plan, from where, how exactly.
+# A planning problem.
 
 EPSILON = float(np.finfo(np.float64).eps)
-# Where less of the probability than this is settled, relaxing by its inverse overshoots.
+# Where ``settled`` of `policy_rows` is less than this, over-relaxation by its inverse overshoots.
 LEAST_SETTLED = 0.8
 SWEEPS_PER_EVALUATION = 30
-# Plenty for any chain that mixes at all; a bound that needs more is not worth waiting for.
+# Enough for any chain that mixes; a bound that needs more sweeps is not worth waiting for.
 MOST_EVALUATIONS = 10_000
-# Of a linear system that is solved between two sweeps: the next policy asks for another one.
+# Relative, for linear systems solved between two sweeps: the next policy has another system.
 ACCURACY_OF_SOLUTIONS = 1e-2
 MOST_KRYLOV_STEPS = 100
 
@@ -362,8 +361,8 @@ class PlanningProblem:
     def start(self) -> tuple[Floats, Ints]:
         """First values, shape (S,), and a policy, shape (S,), that surely ends or comes to rest.
 
-        Where rest is possible these are the policy's own values: from below, sweeps converge to
-        the optimum, from above they may hold on to a reward that staying never collects.
+        Where rest is possible the values are the policy's own: from below, sweeps converge to
+        the optimum; from above, they may keep a reward that staying never collects.
         """
         part = self.part
         values = np.zeros(self.model.n_states)
@@ -384,8 +383,8 @@ class PlanningProblem:
     ) -> float:
         """Improve the values of a policy, in place, by some sweeps over the states of ``order``.
 
-        All others count as ends. Stops once values change by no more than ``enough``; returns the
-        largest change of the last sweep.
+        Other states count as terminal. Stops once values change by no more than ``enough``;
+        returns the largest change of the last sweep.
         """
         model = self.model
         arrays = (model.prob, model.next_state, model.terminated, reward)
@@ -406,7 +405,7 @@ class PlanningProblem:
         """Improve the values of a policy, in place, where ``evaluate`` would need many sweeps.
 
         The linear system is solved by BiCGSTAB (van der Vorst, 1992), with a sweep as
-        preconditioner, to a hundredth of what was missing. Needs a discount below one.
+        preconditioner, to a hundredth of the residual. Needs a discount below one.
         """
         from scipy.sparse.linalg import LinearOperator, bicgstab
 
@@ -445,7 +444,7 @@ class PlanningProblem:
         return 8 * EPSILON * max(1.0, float(np.abs(values[self.order]).max(initial=0.0)))
 
     def error_bound(self, values: Floats, change: float) -> float:
-        """How far values are from the optimum that a sweep has changed by at most ``change``.
+        """Bound the distance to the optimum after a sweep that changed values by ``change``.
 
         With discount, the operator is a contraction. Without, let each step that cannot end the
         episode cost at least c, and let M be so large that each step that may end it with
@@ -507,8 +506,8 @@ def improve(
 ) -> tuple[float, float]:
     """One Gauss-Seidel sweep of the Bellman optimality operator, in place.
 
-    ``policy`` follows the best action, and moves only where another one is better by more than
-    ``tie``, relative to the value where that is above 1.
+    ``policy`` switches to the best action only where that is better by more than ``tie``, relative
+    to the value where that is above 1.
 
     Returns:
         The largest rise and the largest fall of a value.
@@ -555,11 +554,12 @@ def first_guess(
     values: Floats,
     policy: Ints,
 ) -> None:
-    """Values and actions in one pass, as if what leads away from the end left the agent in place.
+    """First values and actions, in one pass.
 
-    Without chance these are the shortest paths. With it, each action still leads nearer to the
-    end, or to the states ``known`` before, with positive probability wherever it can, so that the
-    policy ends every episode. ``known``, bool of shape (S,), is extended on the way.
+    Outcomes that lead away from the end count as staying in place. Without randomness the results
+    are shortest paths. With it, each action still leads nearer to the end, or to the states
+    ``known`` before, with positive probability wherever it can, so that the policy ends every
+    episode. ``known``, bool of shape (S,), is extended on the way.
     """
     for state in order:
         best = -np.inf
@@ -596,13 +596,13 @@ def policy_rows(
     order: Ints,
     policy: Ints,
 ) -> tuple[Floats, NDArray[np.int32], Floats, Floats]:
-    """The rows that a policy uses, in the order of the sweep and with places in it for states.
+    """The rows of a policy's actions in sweep order, with states as indices into that order.
 
-    States that are not in the order count as ends.
+    States that are not in ``order`` count as terminal.
 
     Returns:
-        Discounted weights and places of the following states, both (n, K); rewards (n,); and the
-        weight of all that does not lie further on in the order, (n,).
+        Discounted weights and indices of the following states, both (n, K); rewards (n,); and 1
+        minus the weight of states at the same or a later index, (n,).
     """
     n_outcomes = prob.shape[2]
     place_of = np.full(prob.shape[0], -1, np.int32)
@@ -637,9 +637,9 @@ def evaluate(
 ) -> float:
     """One sweep of the Bellman operator of a policy over its rows, in place; the largest change.
 
-    Each change is divided by ``settled``: as if the states further on, whose turn comes later,
-    were to change by as much. Chance that leads back holds values to where they were; this lets
-    go of them (successive over-relaxation, with its factor chosen state by state).
+    Each change is divided by ``settled``, as if the states swept later changed by as much
+    (successive over-relaxation with a factor for each state). Without this, transitions to those
+    states would hold values near their old ones.
     """
     largest = 0.0
     for place in range(len(reward)):
@@ -656,7 +656,7 @@ def evaluate(
 def residuals(
     weight: Floats, following: NDArray[np.int32], reward: Floats, values: Floats
 ) -> Floats:
-    """What one more step of a policy would change in each value of its rows, shape (n,)."""
+    """The Bellman residual of each row of a policy, shape (n,)."""
     result = np.empty(len(reward))
     for place in range(len(reward)):
         value = reward[place] - values[place]
@@ -676,7 +676,7 @@ def action_values(
     discount: float,
     values: Floats,
 ) -> Floats:
-    """Values of shape (S, A) of taking an action and going on as well as ``values`` says.
+    """The action values, shape (S, A), that follow from the state values ``values``.
 
     Actions that are not allowed get minus infinity.
     """

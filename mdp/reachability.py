@@ -1,6 +1,6 @@
-"""What can be reached at all, from arrays as `mdp.transition_model.TransitionModel` has them.
+"""Reachable states, from the arrays of `mdp.transition_model.TransitionModel`.
 
-The model itself asks for this, so nothing here knows the model.
+The model itself imports this module, so this module does not import the model.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ AnyInts = NDArray[np.integer]
 def reached_from(
     start: Bools, prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools
 ) -> Bools:
-    """The states that are visited from some of ``start`` on, by allowed actions."""
+    """The states reachable from ``start`` by allowed actions, with ``start`` itself."""
     found = start.copy()
-    # However they lie in memory, it is compiled once.
+    # A single memory layout, so that Numba compiles once.
     allowed = np.ascontiguousarray(allowed)
     _flood(prob, next_state, terminated, allowed, found)
     return found
@@ -35,7 +35,7 @@ def _flood(
     allowed: Bools,
     found: Bools,
 ) -> None:
-    """Extend ``found`` by all that it leads to, in place."""
+    """Add all states reachable from ``found`` to ``found``, in place."""
     n_states, n_actions, n_outcomes = prob.shape
     stack = np.empty(n_states, np.int64)
     height = 0

@@ -1,4 +1,4 @@
-"""Whether other rewards have the same optimal policies, and what they cost, exactly.
+"""Whether shaped rewards keep the optimal policies, and what return they cost otherwise, exactly.
 
 Shaped rewards keep the optimal policies if they are the original ones times a positive factor, plus
 ``discount * potential(next state) - potential(state)``, with a potential of 0 where the episode has
@@ -17,10 +17,10 @@ from mdp.finite_horizon import finite_horizon_optimum
 from mdp.planning import Plan, policy_iteration
 from mdp.transition_model import Bools, Floats, Ints, TransitionModel
 
-# Values closer than this are equal: relative to the state's own value, and, for values near 0, to
-# the largest value of all states, which is what rounding goes by.
+# Values closer than this count as equal: relative to the state's best value or, for values near 0,
+# to the largest value of all states, which sets the size of rounding errors.
 EQUAL, EQUAL_NEAR_ZERO = 1e-9, 1e-12
-# Outcomes of all states and actions, and the same times the steps of the time limit. Beyond,
+# Outcomes of all states and actions, and the same times the steps of the time limit. Above these,
 # planning takes many seconds.
 MOST_OUTCOMES = 2_000_000
 MOST_BACKED_UP = 50_000_000
@@ -30,20 +30,20 @@ Ends = tuple[float, float]  # the highest and the lowest return of several polic
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """What shaped rewards make of the optimal policies, in one objective.
+    """How shaped rewards change the optimal policies, in one objective.
 
     Attributes:
         differs: the states in which the sets of optimal actions differ, bool of shape (S,). With a
-            discount all states count that can be reached; under a time limit, states at the
-            moments at which an optimal policy is there.
+            discount all reachable states count; under a time limit, a state counts at the steps at
+            which an optimal policy may be in it.
         optimal: the optimal actions in the original rewards, bool of shape (S, A); under a time
             limit with all steps left.
         shaped: the same in the shaped rewards.
         optimum: the highest expected return in the original rewards.
-        returns: those of the policies that are optimal in the shaped rewards.
+        returns: the original returns of the policies that are optimal in the shaped rewards.
         judged: the same without a discount and under the time limit.
-        judged_before: the same of the policies that are optimal in the original rewards. What they
-            lack of the optimum under the limit is due to the discount.
+        judged_before: the same of the policies that are optimal in the original rewards. Their
+            distance from the optimum under the limit is due to the discount.
         policy: a policy that is optimal in the original rewards, actions of shape (horizon, S). It
             does what ``worst_policy`` does wherever that is optimal.
         worst_policy: of the policies that are optimal in the shaped rewards, the one with the
@@ -78,8 +78,8 @@ def discounted_effect(
 
     Args:
         original: the decision process in which policies are judged.
-        shaped: the one in which they are optimal. Its starting states do not matter; in states that
-            it never reaches, every action counts as optimal.
+        shaped: the same with shaped rewards. Its starting states do not matter; in states that it
+            never reaches, every action counts as optimal.
         discount: at least 0 and below 1.
         horizon: the time limit under which returns are judged.
 
@@ -121,9 +121,9 @@ def discounted_effect(
 def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horizon: int) -> Effect:
     """Compare the policies that are optimal without a discount under a time limit.
 
-    What is optimal depends on the steps that are left, so that the sets are compared at each step,
-    in the states that an optimal policy may come to by then: two sets of optimal policies are equal
-    if they are equal there. Arguments and errors are those of `discounted_effect`.
+    Optimal actions depend on the steps left. So the sets of optimal actions are compared at each
+    step, in the states that an optimal policy may be in: if they agree there, the optimal policies
+    are the same. Arguments and errors are those of `discounted_effect`.
     """
     _check(original, shaped, horizon)
     values = [np.zeros(original.n_states)] * 4
@@ -169,13 +169,13 @@ def _check(original: TransitionModel, shaped: TransitionModel, horizon: int) -> 
 
 
 def _action_values(model: TransitionModel, later: Floats) -> Floats:
-    """What actions are worth without a discount, by the states' values one step later."""
+    """The undiscounted action values, from the state values one step later."""
     following = np.where(model.terminated, 0.0, later[model.next_state])
     return np.asarray(model.expected_reward + np.einsum("sak,sak->sa", model.prob, following))
 
 
 def _best(action_values: Floats) -> Bools:
-    """The best actions of each state, those that tie but for rounding, bool of shape (S, A)."""
+    """The best actions of each state, ties up to rounding included, bool of shape (S, A)."""
     best = action_values.max(axis=1, keepdims=True)
     margin = np.maximum(EQUAL * np.abs(best), EQUAL_NEAR_ZERO * np.abs(action_values).max())
     return np.asarray(action_values >= best - margin)
@@ -192,7 +192,7 @@ def _following(model: TransitionModel, here: Bools, actions: Bools) -> Bools:
 def _potential(
     original: TransitionModel, shaped: TransitionModel, plan: Plan, shaped_plan: Plan
 ) -> tuple[float | None, Floats | None]:
-    """The factor and the potential that make the shaped rewards of the original ones, or None.
+    """The factor and the potential that turn the original rewards into the shaped ones, or None.
 
     They exist if and only if the advantages of actions in the two optima are proportional: then the
     potential is the factor times the original's optimal values, minus those of the shaped rewards.
@@ -208,7 +208,7 @@ def _potential(
         (each.action_values - each.values[:, None])[states] for each in (plan, shaped_plan)
     )
     largest = np.abs(plan.values).max(), np.abs(shaped_plan.values).max()
-    ours = np.where(np.abs(ours) > EQUAL * largest[0], ours, 0.0)  # what is left is rounding
+    ours = np.where(np.abs(ours) > EQUAL * largest[0], ours, 0.0)  # smaller ones are rounding
     factor = float((ours * theirs).sum() / (ours**2).sum()) if ours.any() else 1.0
     margin = EQUAL * max(factor * largest[0], largest[1])
     if factor <= 0 or np.abs(theirs - factor * ours).max() > margin:

@@ -5,8 +5,8 @@ any state and action has. Outcome k of taking action a in state s happens with p
 ``prob[s, a, k]``, leads to ``next_state[s, a, k]``, earns ``reward[s, a, k]`` and ends the episode
 if ``terminated[s, a, k]``. Rows with fewer outcomes are padded with outcomes of probability zero.
 
-Termination belongs to the transition, not to the state: what the row of a state says that is
-entered by terminating transitions alone is never used.
+Termination belongs to the transition, not to the state: the rows of a state that only terminating
+transitions enter are never used.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Kinds of arrays; shapes are not part of a type, docstrings give them.
+# Types of arrays; docstrings give the shapes.
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -35,9 +35,9 @@ Outcomes = Sequence[tuple[float, int, float, bool]]
 class TransitionModel:
     """The dynamics, rewards and starting states of a finite Markov decision process.
 
-    The arrays are converted to the types below, copied only where that needs it, and read-only.
-    Outcomes keep the order they are given in, and equal ones stay apart: a simulator that picks
-    an outcome by cumulative sum then picks what the source would have picked.
+    The arrays are converted to the types below, copied only if necessary, and made read-only.
+    Outcomes keep their order, and equal ones are not merged: a simulator that samples an outcome
+    by cumulative sum then picks the same one as the source.
 
     Args:
         prob: probabilities, float64 of shape (S, A, K), summing to one over K.
@@ -45,9 +45,9 @@ class TransitionModel:
         reward: rewards, float64 of shape (S, A, K).
         terminated: whether the episode ends with the outcome, bool of shape (S, A, K).
         initial: probabilities of the starting states, float64 of shape (S,), summing to one.
-        reward_variance: where rewards are drawn, their variance, float64 of shape (S, A, K);
-            ``reward`` holds their means, and they are independent of each other. None where the
-            outcome says what the reward is.
+        reward_variance: variances of random rewards, float64 of shape (S, A, K); ``reward`` holds
+            their means, and rewards are independent of each other. None where the outcome
+            determines the reward.
 
     Raises:
         ValueError: where the shapes disagree, a probability lies outside [0, 1], a row of
@@ -81,7 +81,7 @@ class TransitionModel:
         P: Mapping[int, Mapping[int, Outcomes]],  # noqa: N803 (Gymnasium's own name)
         initial_state_distrib: ArrayLike,
     ) -> TransitionModel:
-        """The model held in the attributes of the same names of Gymnasium's toy_text environments.
+        """The model in the attributes ``P`` and ``initial_state_distrib`` of Gymnasium's toy_text.
 
         Args:
             P: ``P[state][action]`` is a list of (probability, next state, reward, terminated);
@@ -137,8 +137,8 @@ class TransitionModel:
     def reachable(self) -> Bools:
         """The states in which the agent may have to act, bool of shape (S,).
 
-        These are the possible starting states and whatever transitions lead to, from one to the
-        next, without ending the episode. The rows of all other states mean nothing.
+        These are the possible starting states and all states that transitions reach from them
+        without ending the episode. The rows of all other states are meaningless.
         """
         from mdp.reachability import reached_from
 
@@ -202,7 +202,7 @@ def allowed_actions(model: TransitionModel, mask: Bools | None) -> Bools:
         mask: bool of shape (S, A), or None for all actions.
 
     Raises:
-        ValueError: if the mask has another shape, or allows nothing in a state that is reachable.
+        ValueError: if the mask has another shape, or allows nothing in a reachable state.
     """
     shape = (model.n_states, model.n_actions)
     reachable = model.reachable[:, None]

@@ -126,7 +126,7 @@ else:
 
     def _has_process(pid: int) -> bool:
         try:
-            os.kill(pid, 0)
+            os.kill(pid, 0)  # noqa: TID251  # not on Windows
         except ProcessLookupError:
             return False
         except PermissionError:

@@ -33,7 +33,7 @@ def told():
     program = runpy.run_path(str(GOLDEN / "__main__.py"), run_name="golden")
     facts = program["facts"]()
 
-    def tell(was, now, dropped=(), holds="anywhere", changed=None):
+    def tell(was, now, holds="anywhere", changed=None):
         class Found:
             values = {} if now is None else {"entry": now}
 
@@ -41,8 +41,7 @@ def told():
         if was is not None:
             entries[holds]["entry"] = was
         recorded = {"facts": {**facts, **(changed or {})}, "entries": entries}
-        reasons = dict.fromkeys(dropped, "on purpose")
-        return list(program["differences"](recorded, Found, reasons, ["*"]))
+        return list(program["differences"](recorded, Found, ["*"]))
 
     return tell
 
@@ -57,15 +56,6 @@ def test_each_difference_is_told_in_a_line(told):
     assert told("1", None) == ["entry: is gone"]
     (new,) = told(None, "1")
     assert new.startswith("entry: is new")
-
-
-def test_what_is_dropped_on_purpose_has_to_have_changed(told):
-    assert told("1", "2", dropped=["entry"]) == []
-    assert told("1", None, dropped=["entry"]) == []
-    assert told("1", "1", dropped=["entry"]) == ["entry: is in dropped.yml, and has not changed"]
-    assert told(None, None, dropped=["entry"]) == [
-        "entry: is in dropped.yml, and there is no such entry"
-    ]
 
 
 def test_what_depends_on_the_machine_is_no_difference_on_another(told):

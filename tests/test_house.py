@@ -1,4 +1,4 @@
-"""The project as a whole: start-up, imports, dependencies, sizes, stray paths, other systems."""
+"""The project as a whole: start-up, imports, dependencies, sizes, stray paths."""
 
 import ast
 import importlib.metadata
@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -63,13 +62,6 @@ def test_importing_a_package_is_cheap(package: str, tmp_path: Path) -> None:
     assert python(code, cwd=tmp_path) == str(ROOT / package / "__init__.py")
 
 
-def test_every_module_can_be_imported(tmp_path: Path) -> None:
-    """In any order, since no two of them need each other."""
-    names = [module_name(path) for path in sources()]
-    code = f"import importlib\nfor name in {names}:\n    importlib.import_module(name)"
-    assert python(code, cwd=tmp_path) == ""
-
-
 def test_every_imported_library_is_a_declared_dependency() -> None:
     extras = PROJECT["optional-dependencies"]
     optional = [line for extra in extras if extra != "dev" for line in extras[extra]]
@@ -104,63 +96,6 @@ def imported_names(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names.add(node.module)
     return {name.partition(".")[0] for name in names}
-
-
-def imported_modules(path: Path, modules: frozenset[str]) -> set[str]:
-    """Those of ``modules`` that a file imports: anywhere in it, and for types alone too."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            for alias in node.names:
-                inside = f"{node.module}.{alias.name}"
-                found.add(inside if inside in modules else node.module)
-    return (found & modules) - {module_name(path)}
-
-
-def import_graph() -> dict[str, set[str]]:
-    """The project's modules, each with those that it imports."""
-    files = {module_name(path): path for path in sources()}
-    modules = frozenset(files)
-    return {name: imported_modules(path, modules) for name, path in files.items()}
-
-
-def cycles(graph: dict[str, set[str]]) -> list[str]:
-    """A shortest way round through each group of modules that need each other."""
-    found: dict[frozenset[str], str] = {}
-    for start in sorted(graph):
-        ways = deque([[start]])
-        seen = set()
-        while ways:
-            way = ways.popleft()
-            if start in graph[way[-1]]:
-                found.setdefault(frozenset(way), " -> ".join([*way, start]))
-                break
-            following = sorted(graph[way[-1]] - seen)
-            seen |= set(following)
-            ways.extend([*way, name] for name in following)
-    return list(found.values())
-
-
-def test_cycles_are_found() -> None:
-    graph = {"a": {"b"}, "b": {"c", "d"}, "c": {"a"}, "d": {"e"}, "e": {"d"}, "f": {"a"}}
-    assert cycles(graph) == ["a -> b -> c -> a", "d -> e -> d"]
-
-
-def test_no_module_needs_one_that_needs_it() -> None:
-    assert "\n".join(cycles(import_graph())) == ""
-
-
-def test_no_module_has_the_name_of_one_of_pythons_own() -> None:
-    parts = {part for path in sources() for part in module_name(path).split(".")}
-    assert parts & sys.stdlib_module_names == set()
-
-
-def test_only_commands_parse_arguments() -> None:
-    users = [module_name(path) for path in sources() if "argparse" in imported_names(path)]
-    assert users
-    assert [name for name in users if not name.startswith("commands.")] == []
 
 
 def test_no_module_is_longer_than_900_lines() -> None:
@@ -266,121 +201,3 @@ def test_all_that_is_compiled_stands_where_the_digest_of_machine_code_looks() ->
     }
     assert {Path(name).parts[0] for name in compiling} == {"machine_code", *kept}
     assert set(kept["agents"]) == {"agents", "machine_code", "mdp"}
-
-
-# === what Windows understands otherwise ===========================================================
-
-# `make lint` lets mypy read the packages as on Windows, which finds every module and function that
-# Windows has not. Here is what is there too, but is or does something else.
-
-# What each of them does on Windows.
-ELSEWHERE = {
-    "os.kill": "ends the process, or sends Ctrl-C to it, whatever the signal",
-    "os.rename": "refuses where there is a file; use os.replace",
-    "os.symlink": "needs a privilege",
-    "os.chmod": "knows no permissions but read-only",
-    "os.system": "is another shell",
-    "os.popen": "is another shell",
-    ".rename": "refuses where there is a file; use replace",
-    ".symlink_to": "needs a privilege",
-    ".chmod": "knows no permissions but read-only",
-}
-
-ABSENT = ("/tmp", "/dev/", "/proc")  # noqa: S108  # nothing is written there
-
-# Where one of them stands all the same, and why.
-GUARDED = {
-    ("experiments/child_processes.py", "os.kill"): "asks for the platform before it",
-    ("experiments/run_limits.py", "/proc"): "refuses to measure on Windows",
-    ("machine_code/cache.py", ".chmod"): "modes are neither set nor checked on Windows",
-    ("pipeline/locks.py", "os.kill"): "asks _winapi on Windows, before it",
-    ("pipeline/locks.py", "/proc"): "does without where there is none",
-    ("pipeline/runs.py", "/proc"): "does without where there is none",
-}
-
-
-def name_of(function: ast.expr) -> str:
-    """``module.function`` where a name stands before the dot, else ``.method``.
-
-    A member of a zip is opened as bytes: ``archive`` counts as such a name.
-    """
-    if isinstance(function, ast.Name):
-        return function.id
-    if not isinstance(function, ast.Attribute):
-        return ""
-    is_module = isinstance(function.value, ast.Name) and function.value.id in {
-        "os",
-        "Image",
-        "archive",
-    }
-    return f"{function.value.id if is_module else ''}.{function.attr}"
-
-
-def opens_text_anyhow(call: ast.Call) -> bool:
-    """Whether a text file is opened in whatever encoding the country has."""
-    name = name_of(call.func)
-    if "encoding" in {keyword.arg for keyword in call.keywords}:
-        return False
-    if name in {".read_text", ".write_text"}:
-        return len(call.args) < (1 if name == ".read_text" else 2)
-    if name not in {"open", ".open"}:
-        return False
-    modes = [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
-    modes += call.args[1:2] if name == "open" else call.args[:1]
-    return not any(isinstance(mode, ast.Constant) and "b" in str(mode.value) for mode in modes)
-
-
-def complaints(path: str, source: str) -> Iterator[str]:
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and opens_text_anyhow(node):
-            yield f"{path}:{node.lineno}: say encoding=, which Windows does not take for UTF-8"
-        if isinstance(node, ast.Attribute):
-            for name in {name_of(node), f".{node.attr}"} & ELSEWHERE.keys():
-                if (path, name) not in GUARDED:
-                    yield f"{path}:{node.lineno}: {name} {ELSEWHERE[name]} on Windows"
-        if isinstance(node, ast.Constant):
-            for name in filter(str(node.value).startswith, ABSENT):
-                if (path, name) not in GUARDED:
-                    yield f"{path}:{node.lineno}: there is no {node.value} on Windows"
-
-
-def test_nothing_that_windows_understands_otherwise():
-    found = [
-        complaint
-        for package in PACKAGES
-        for path in sorted((ROOT / package).rglob("*.py"))
-        for complaint in complaints(
-            path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
-        )
-    ]
-    assert "\n".join(found) == ""
-
-
-@pytest.mark.parametrize(
-    ("source", "n"),
-    [
-        ("os.kill(pid, 0)", 1),
-        ("from os import kill", 0),  # nobody does that here
-        ("draft.rename(path)", 1),
-        ("open(path)", 1),
-        ("open(path, 'w')", 1),
-        ("open(path, 'wb')", 0),
-        ("open(path, mode='rb')", 0),
-        ("open(path, encoding='utf-8')", 0),
-        ("path.open()", 1),
-        ("path.open('rb+')", 0),
-        ("Image.open(path)", 0),
-        ("path.read_text()", 1),
-        ("path.read_text('utf-8')", 0),
-        ("path.write_text('a')", 1),
-        ("path.write_text('a', encoding='utf-8')", 0),
-        ("folder = '/dev/null'", 1),
-    ],
-)
-def test_what_is_found(source, n):
-    assert len(list(complaints("x.py", source))) == n
-
-
-def test_every_exception_is_still_needed():
-    for path, name in GUARDED:
-        assert name in (ROOT / path).read_text(encoding="utf-8")

@@ -37,7 +37,9 @@ def test_which_errors_are_caught(tmp_path):
     source, tests, record = (
         tmp_path / name for name in ("toy/a.py", "tests/toy/test_a.py", "record")
     )
-    for path, text in (tmp_path / "toy/__init__.py", ""), (source, SOURCE), (tests, TESTS):
+    made = {source: SOURCE, tests: TESTS, tmp_path / "toy/__init__.py": ""}
+    made[tmp_path / "pytest.ini"] = "[pytest]\nfilterwarnings = error\n"
+    for path, text in made.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
 

@@ -1,11 +1,10 @@
-"""What scores over seeds say, and how sure they are: pure functions over arrays.
+"""Statistics of scores over seeds, with intervals and verdicts: pure functions over arrays.
 
-Runs that failed are given as NaN: they are left out and counted. Every function that draws random
-numbers takes a seed, and the same seed gives the same figures. docs/statistics.md says which method
-stands behind each figure, and why.
+Failed runs are given as NaN: they are left out and counted. Every function that draws random
+numbers takes a seed, and the same seed gives the same figures. docs/statistics.md names the method
+behind each figure, and the reasons for it.
 
-The functions are loaded on first use, since SciPy takes longer to import than a command may take to
-answer.
+The functions are imported on first use: importing SciPy takes longer than some commands.
 """
 
 from __future__ import annotations
@@ -123,7 +122,7 @@ __all__ = [
     "summarise_steps",
 ]
 
-# Those that load least come first: some of them a command needs before it may take long.
+# Cheap imports come first: a command may need one of their names before it has time for SciPy.
 _MODULES = (
     *("error_levels", "resampling", "rank_tests", "means"),
     *("pairs", "failures", "curves", "growth"),

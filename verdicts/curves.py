@@ -24,7 +24,7 @@ from verdicts.resampling import (
     percentile_interval,
 )
 
-# As many points as a figure can show.
+# The largest number of points that a figure can show.
 _MOST_POINTS = 500
 
 
@@ -41,8 +41,8 @@ class Band:
 class ThresholdSummary:
     """How soon runs reach a threshold, where some never do."""
 
-    #: Steps to the threshold, a run that never reaches it counting as later than all others;
-    #: infinite where half of the runs or more do not.
+    #: Median steps to the threshold; runs that never reach it count as later than all others.
+    #: Infinite where half of the runs or more never do.
     median: Estimate
     share_reached: Estimate  #: the share of runs that reach it
 
@@ -54,14 +54,14 @@ def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
     points, put them ``on_grid`` first.
 
     Args:
-        steps: shape (n_points,), not falling.
+        steps: shape (n_points,), non-decreasing.
         values: shape (n_points,) or (n_curves, n_points).
 
     Returns:
         Shape () or (n_curves,); the last value where the span is 0.
 
     Raises:
-        ValueError: for steps that fall, or shapes that do not fit.
+        ValueError: for decreasing steps, or shapes that do not fit.
     """
     x, y = _curve(steps, values)
     if x[-1] == x[0]:
@@ -73,7 +73,7 @@ def shared_grid(curves: Sequence[ArrayLike], n_points: int = _MOST_POINTS) -> Fl
     """Steps at which several curves can be compared.
 
     Args:
-        curves: the steps of each curve, not falling.
+        curves: the steps of each curve, non-decreasing.
         n_points: how many points to return at most.
 
     Returns:
@@ -99,10 +99,10 @@ def shared_grid(curves: Sequence[ArrayLike], n_points: int = _MOST_POINTS) -> Fl
 def on_grid(steps: ArrayLike, values: ArrayLike, grid: ArrayLike) -> Floats:
     """A curve at other steps: at each, the latest evaluation so far.
 
-    Nothing is read off between evaluations, because nothing is known of it.
+    There is no interpolation: nothing is known between two evaluations.
 
     Args:
-        steps: shape (n_points,), not falling.
+        steps: shape (n_points,), non-decreasing.
         values: shape (n_points,) or (n_curves, n_points).
         grid: shape (n_grid,).
 
@@ -110,7 +110,7 @@ def on_grid(steps: ArrayLike, values: ArrayLike, grid: ArrayLike) -> Floats:
         Shape (n_grid,) or (n_curves, n_grid); NaN before the first evaluation.
 
     Raises:
-        ValueError: for steps that fall, or shapes that do not fit.
+        ValueError: for decreasing steps, or shapes that do not fit.
     """
     x, y = _curve(steps, values)
     latest = np.searchsorted(x, np.asarray(grid, dtype=np.float64), side="right") - 1
@@ -120,15 +120,15 @@ def on_grid(steps: ArrayLike, values: ArrayLike, grid: ArrayLike) -> Floats:
 def curve_band(
     values: ArrayLike, *, seed: int, confidence: float = 0.95, n_resamples: int = 2000
 ) -> Band:
-    """The mean over seeds at each point, with intervals that hold point by point.
+    """The mean over seeds at each point, with pointwise intervals.
 
-    They are those that ``estimate`` gives each point by itself.
+    The intervals are those of ``estimate`` at each point.
 
     Args:
-        values: shape (n_seeds, n_points), on a common grid. What is not finite is left out at its
-            point.
-        seed: of the resampling, which draws the same seeds at every point.
-        confidence: of the intervals.
+        values: shape (n_seeds, n_points), on a common grid. Non-finite values are left out at
+            their point.
+        seed: the seed of the resampling, which draws the same runs at every point.
+        confidence: the confidence level of the intervals.
         n_resamples: how many resamples they come from.
 
     Raises:
@@ -149,7 +149,7 @@ def curve_band(
 def _resampled_means(columns: Floats, seed: int, confidence: float, n_resamples: int) -> Floats:
     """Mean, low and high end at each point, shape (3, n_points), of (n_seeds, n_points)."""
     n = len(columns)
-    # Counted from the smallest value, so that equal values keep theirs exactly.
+    # Relative to the smallest value, so that the mean of equal values is exact.
     least = columns.min(axis=0)
     above = columns - least
     pieces = drawn_in_pieces((n,), enough_resamples(n_resamples, n), seed)
@@ -162,7 +162,7 @@ def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) ->
     """The step of the first evaluation whose value is at least the threshold.
 
     Args:
-        steps: shape (n_points,), not falling.
+        steps: shape (n_points,), non-decreasing.
         values: shape (n_points,).
         threshold: in the unit of the values.
 
@@ -170,7 +170,7 @@ def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) ->
         The step; infinity if no evaluation reaches the threshold, NaN if there is no evaluation.
 
     Raises:
-        ValueError: for steps that fall, or shapes that do not fit.
+        ValueError: for decreasing steps, or shapes that do not fit.
     """
     x, y = _curve(steps, values)
     if np.isnan(y).all():
@@ -180,20 +180,20 @@ def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) ->
 
 
 def steps_to_stay(steps: ArrayLike, values: ArrayLike, threshold: float) -> float:
-    """The first evaluation from which on a curve keeps to a threshold.
+    """The step of the first evaluation from which on a curve never falls below a threshold.
 
-    A curve that fluctuates crosses it by luck long before; with many evaluations nearly any does.
+    A fluctuating curve crosses it by luck long before; with many evaluations nearly every one does.
 
     Args:
-        steps: shape (n_points,), not falling.
+        steps: shape (n_points,), non-decreasing.
         values: shape (n_points,).
         threshold: in the unit of the values.
 
     Returns:
-        The step; infinity if the last evaluation is below the threshold, NaN if there is none.
+        The step; infinity if the last evaluation is below the threshold, NaN without evaluations.
 
     Raises:
-        ValueError: for steps that fall, or shapes that do not fit.
+        ValueError: for decreasing steps, or shapes that do not fit.
     """
     x, y = _curve(steps, values)
     if np.isnan(y).all():
@@ -207,14 +207,14 @@ def steps_to_stay(steps: ArrayLike, values: ArrayLike, threshold: float) -> floa
 def summarise_steps(steps: ArrayLike, confidence: float = 0.95) -> ThresholdSummary:
     """How soon runs reach a threshold, and how many do.
 
-    The interval of the median goes from one order statistic to another, which holds for any
-    distribution and also where runs never arrive; for 95 % it needs at least six runs. That of the
-    share is Wilson's.
+    The interval of the median goes from one order statistic to another: it holds for any
+    distribution, also if some runs never reach the threshold; for 95 % it needs at least six runs.
+    The interval of the share is Wilson's.
 
     Args:
-        steps: what ``steps_to_threshold`` says of each run, shape (n_seeds,): infinity for a run
-            that never reaches the threshold, NaN for one that failed.
-        confidence: of the intervals.
+        steps: the result of ``steps_to_threshold`` for each run, shape (n_seeds,): infinity for a
+            run that never reaches the threshold, NaN for a failed run.
+        confidence: the confidence level of the intervals.
 
     Raises:
         ValueError: for a confidence out of range.
@@ -226,7 +226,7 @@ def summarise_steps(steps: ArrayLike, confidence: float = 0.95) -> ThresholdSumm
     if n == 0:
         nothing = Estimate(np.nan, np.nan, np.nan, 0, n_missing)
         return ThresholdSummary(nothing, nothing)
-    # How many runs to leave out at each end: one fewer than the smallest count likely enough.
+    # The runs to leave out at each end: one fewer than the quantile of the binomial distribution.
     cut = int(stats.binom.ppf((1 - confidence) / 2, n, 0.5)) - 1
     low, high = (ordered[cut], ordered[n - 1 - cut]) if cut >= 0 else (np.nan, np.nan)
     n_reached = int(np.isfinite(ordered).sum())
@@ -260,11 +260,11 @@ def performance_profile(
     """The share of runs that score higher than each threshold, averaged over environments.
 
     Args:
-        scores: shape (n_seeds,), or (n_seeds, n_envs) on a scale that the environments share. What
-            is not finite counts as missing; where an environment has nothing else the share is NaN.
+        scores: shape (n_seeds,), or (n_seeds, n_envs) on a scale that the environments share.
+            Non-finite scores count as missing; NaN is returned if an environment has no others.
         thresholds: shape (n_thresholds,).
-        seed: of the resampling, of seeds within each environment.
-        confidence: of the intervals, which hold threshold by threshold.
+        seed: the seed of the resampling of runs, separately within each environment.
+        confidence: the confidence level of the intervals, separately for each threshold.
         n_resamples: how many resamples they come from.
 
     Returns:
@@ -295,21 +295,21 @@ def performance_profile(
     return Band(np.mean([rows.mean(axis=0) for rows in above], axis=0), low, high)
 
 
-# Which agent reaches a threshold sooner, from curves that were looked at now and then.
+# Which agent reaches a threshold sooner, from curves that were evaluated now and then.
 
 
 @dataclass(frozen=True)
 class SpeedComparison:
-    """How many times the steps of one agent another needs."""
+    """The ratio of the steps that two agents need to reach a threshold."""
 
-    first: str  #: the name of one, in the order of the mapping
-    second: str  #: the name of the other
+    first: str  #: the name of the first agent, in the order of the mapping
+    second: str  #: the name of the second agent
     #: Steps of the second divided by those of the first: the median over pairs of runs. The
     #: intervals of all pairs hold together, wherever between two evaluations runs arrived.
     ratio: Estimate
-    #: Of "one of the two is sooner", after Holm's correction over all pairs.
+    #: The p-value of "one of the two is sooner", with Holm's correction over all pairs.
     adjusted_p_value: float
-    sooner: str | None  #: the name of the one that is shown to be, or None
+    sooner: str | None  #: the name of the agent that is shown to be sooner, or None
 
 
 def compare_speed(
@@ -318,11 +318,11 @@ def compare_speed(
     """Compare every two agents, in the order of the mapping.
 
     Args:
-        steps: by agent, shape (n_seeds,): the evaluation at which a run had arrived; infinity for a
-            run that never did, NaN for one that is missing.
-        spacing: the most steps between two evaluations. A run that had arrived at one may have
-            arrived at any step since the one before: times that share such a span are equal.
-        level: the share of studies in which anything said here may be wrong.
+        steps: by agent, shape (n_seeds,): the step of the evaluation at which a run first reached
+            the threshold; infinity for a run that never did, NaN for a missing run.
+        spacing: the most steps between two evaluations. A run may have reached the threshold at
+            any step since the evaluation before: times within the same spacing count as equal.
+        level: the share of studies in which any of the results may be wrong.
     """
     arrived = {
         name: np.ceil(found[~np.isnan(found)] / spacing) * spacing
@@ -345,18 +345,18 @@ def compare_speed(
 
 
 def _ranked(first: Floats, second: Floats) -> tuple[Floats, Floats]:
-    """Times as scores: the sooner the higher, never below all."""
+    """Times as scores: sooner is higher, and a run that never reaches the threshold is lowest."""
     both = np.concatenate([first, second])
     last = both[np.isfinite(both)].max(initial=0.0) + 1
     return -np.minimum(first, last), -np.minimum(second, last)
 
 
 def _ratio(first: Floats, second: Floats, spacing: float, level: float) -> Estimate:
-    """The ratio of times, between those that the spans of the arrivals allow."""
+    """The median ratio of times; its interval allows for any step since the evaluation before."""
     both = np.concatenate([first, second])
-    # Runs that never arrived would have taken longer than any that did.
+    # Runs that never reached the threshold would have taken longer than any that did.
     last = both[np.isfinite(both)].max(initial=0.0)
-    # Evaluations are few, so that many runs arrive at the same.
+    # There are few evaluations, so many runs have the same time.
     (x, n_x), (y, n_y) = (np.unique(times, return_counts=True) for times in (first, second))
     x, weights = x[:, None], np.outer(n_x, n_y).ravel()
 

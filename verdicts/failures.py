@@ -1,4 +1,4 @@
-"""Runs that failed, apart from the typical run: few seeds cannot carry both in one figure."""
+"""Failed runs, counted apart from typical runs: with few seeds, one figure cannot show both."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from verdicts.rank_tests import holm
 class FailureCount:
     """How many runs failed."""
 
-    n_failed: int  #: runs that did
-    n: int  #: runs that there are
-    most: float  #: the largest share of all runs that is compatible with that
+    n_failed: int  #: the number of failed runs
+    n: int  #: the number of all runs
+    most: float  #: an upper confidence bound on the probability that a run fails
 
 
 def failure_threshold(baseline: float, typical: float) -> float:
@@ -27,21 +27,21 @@ def failure_threshold(baseline: float, typical: float) -> float:
 
     Args:
         baseline: the score of the best random or constant policy.
-        typical: the median score of the agent that has the highest.
+        typical: the highest median score of any agent.
 
     Returns:
-        The threshold; NaN where no agent is better than that, so that nothing sets failures apart.
+        The threshold; NaN where no agent beats the baseline, so that failures have no meaning.
     """
     return (baseline + typical) / 2 if typical > baseline else float("nan")
 
 
 def count_failures(scores: ArrayLike, threshold: float, level: float = 0.05) -> FailureCount:
-    """How many runs score below a threshold, and how large a share of all runs may.
+    """Count the runs below a threshold, and bound the probability of such a run.
 
     Args:
-        scores: shape (n_seeds,); what is not finite is missing.
+        scores: shape (n_seeds,); non-finite scores are missing.
         threshold: from ``failure_threshold``.
-        level: how often the bound may be too low. For those of several agents to hold together,
+        level: the error rate of the bound. For the bounds of several agents to hold together,
             divide it by their number.
 
     Source: Clopper and Pearson (1934), "The use of confidence or fiducial limits illustrated in the
@@ -57,9 +57,9 @@ def count_failures(scores: ArrayLike, threshold: float, level: float = 0.05) -> 
 def fail_more_often(
     counts: Mapping[str, FailureCount], level: float = 0.05
 ) -> list[tuple[str, str]]:
-    """The pairs of agents of which the first is shown to fail more often than the second.
+    """The pairs of agents whose first agent is shown to fail more often than the second.
 
-    Fisher's exact test, after Holm's correction over all pairs.
+    Fisher's exact test, with Holm's correction over all pairs.
 
     Args:
         counts: by agent.

@@ -1,4 +1,4 @@
-"""A study that grows until its verdicts are there: who gets more seeds, and what holds by then."""
+"""A study that adds seeds until its verdicts are decided: a group sequential design."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from verdicts.means import FEWEST_SEEDS
 from verdicts.pairs import Ends, Judgement, fewest_seeds, judge_pairs
 from verdicts.resampling import Floats
 
-# How many times the seeds of a look the next one has, about.
+# The approximate ratio of the numbers of seeds at one look and at the look before.
 STEP = 1.5
 
 
@@ -21,23 +21,23 @@ STEP = 1.5
 class Growth:
     """How far a study has grown on one environment."""
 
-    #: By pair of agents, what is said of the first, at the look that decided it, or else at the
-    #: last.
+    #: By pair of agents, the judgement on the first, from the look that decided it, or else from
+    #: the last.
     judged: Mapping[tuple[str, str], Judgement]
-    looks: Mapping[tuple[str, str], int]  #: by pair, which look that was, counted from 1
-    #: By agent, how many seeds it has at the next look; as many as at the last where every pair
-    #: that it is in is decided.
+    looks: Mapping[tuple[str, str], int]  #: by pair, the number of that look, counted from 1
+    #: By agent, the number of seeds at the next look; the same as at the last look where all pairs
+    #: with the agent are decided.
     seeds: Mapping[str, int]
-    n_looks: int  #: how many looks there have been
-    level: float  #: the error rate of each
-    is_done: bool  #: whether no agent lacks a seed that another look would take
+    n_looks: int  #: the number of looks so far
+    level: float  #: the error rate of each look
+    is_done: bool  #: whether no agent lacks seeds for another look
 
 
 def look_sizes(first: int, most: int, n_agents: int, level: float) -> tuple[int, ...]:
-    """How many seeds an agent has at each look: from ``first`` to ``most``, in equal ratios.
+    """The number of seeds of an agent at each look: from ``first`` to ``most``, in equal ratios.
 
-    The first look has more seeds where ``first`` could not tell any agents apart whatever they
-    score: such a look would be lost.
+    The first look has more seeds where ``first`` seeds could decide nothing, whatever the scores:
+    such a look would be wasted.
 
     Args:
         first: how many seeds the study begins with.
@@ -65,20 +65,20 @@ def grow(
     paired: bool = False,
     against: str = "",
 ) -> Growth:
-    """Look at a study as often as was settled and its seeds allow, and say who needs more.
+    """Make all planned looks that the seeds allow, and say which agents need more seeds.
 
-    Only agents in pairs that are undecided get more seeds, so that at each look every pair that is
-    tested has the same, settled number of them. A pair that has been decided stays so. All looks
-    are gone through from the first, so that what comes out depends on the scores alone, and not on
-    how often somebody asked.
+    Only agents in undecided pairs get more seeds, so that at each look all tested pairs have the
+    same, planned number of seeds. Decided pairs keep their judgement. All looks are computed from
+    the first, so that the result depends on the scores alone, and not on how often somebody
+    looked.
 
     Args:
-        scores: by agent, as many as it has seeds; what is not finite is a run that failed.
-        sizes: how many seeds a growing agent has at each look, settled before the first.
+        scores: by agent, one for each of its seeds; a non-finite score is a failed run.
+        sizes: the number of seeds of an undecided agent at each look, fixed before the first.
         margin: the largest difference that does not matter.
         level: the error rate of all looks together. Each has an equal share.
-        certain: the agents that do not depend on chance; see ``judge_pairs``.
-        ends: of the scores; see ``judge_pairs``.
+        certain: the deterministic agents; see ``judge_pairs``.
+        ends: the ends of the scores' scale; see ``judge_pairs``.
         paired: whether the agents' runs of one seed share their randomness.
         against: the only agent that the others are compared with; see ``judge_pairs``.
 
@@ -111,7 +111,7 @@ def _undecided_agents(
     seeds: Mapping[str, int],
     against: str,
 ) -> set[str]:
-    """The agents in undecided pairs, but for those whose runs all but fail."""
+    """The agents in undecided pairs, if both agents of the pair have enough finite scores."""
     there = {name: np.isfinite(values[: seeds[name]]).sum() for name, values in scores.items()}
     return {
         name

@@ -1,10 +1,10 @@
-"""Claims about expected scores: what agents earn on average, runs that fail included.
+"""Claims about expected scores: means over all runs, with the runs that fail.
 
-No test on the runs that were seen keeps its error rate for the mean: what fails in one run of
-twenty has mostly not failed in ten. Scores, however, have ends, 0 and 1. So a claim without a
-condition passes two tests that compare the runs that were seen, and two guards that allow for runs
-that were not. Where the guards do not pass, the claim has a condition: that few further runs lie
-outside of what was seen. docs/statistics.md says how often each of them is wrong.
+No test on observed runs keeps its error rate for the mean: an agent that fails in one run of twenty
+has mostly not failed in ten. Scores, however, are bounded by 0 and 1. So an unconditional claim
+passes two tests that compare the observed runs, and two guards that allow for unobserved runs.
+Where the guards do not pass, the claim is conditional: it assumes that few further runs lie outside
+the observed range. docs/statistics.md gives the error rates of both kinds of claims.
 """
 
 from __future__ import annotations
@@ -24,36 +24,36 @@ from scipy import optimize, stats
 from verdicts.resampling import Floats
 
 Verdict = Literal["better", "worse", "equivalent", "undecided"]
-Exact = tuple[bool, bool]  # of two agents, whether each does not depend on chance
+Exact = tuple[bool, bool]  # of two agents, whether each is deterministic
 
 # With fewer runs of an agent nothing is claimed about its mean.
 FEWEST_SEEDS = 5
-N_SPLITS = 4000  # of a permutation test; all of them where there are fewer
-# From so many scores of both agents on, permutations say what Welch's test does.
+N_SPLITS = 4000  # splits of a permutation test; all of them where there are fewer
+# From this many scores of both agents on, Welch's test gives the same result as permutations.
 MOST_PERMUTED = 400
 N_SPACINGS = 4000
-# Of more scores, those beside each other count together, each as the lowest of them.
+# More sorted scores than this are grouped with their neighbours, at the lowest score of the group.
 MOST_SPACINGS = 2000
 SAME = 1e-12  # means closer than this are equal
-ROUNDED = 1e-9  # a run that is closer to an end may be there, but for rounding
+ROUNDED = 1e-9  # scores this close to an end count as the end, and such differences as 0
 
 
 def opposite(verdict: Verdict) -> Verdict:
-    """The same, seen from the second agent."""
+    """The verdict from the second agent's point of view."""
     turned: dict[Verdict, Verdict] = {"better": "worse", "worse": "better"}
     return turned.get(verdict, verdict)
 
 
 @dataclass(frozen=True)
 class MeanVerdict:
-    """What is said of the means of two agents."""
+    """A verdict on the means of two agents."""
 
-    verdict: Verdict  #: on the first of the two
-    #: Whether it holds only as long as few further runs lie outside of those that were seen.
+    verdict: Verdict  #: the verdict on the first of the two
+    #: Whether it holds only as long as few further runs lie outside the observed range.
     is_conditional: bool = False
 
     def swapped(self) -> MeanVerdict:
-        """The same, seen from the second agent."""
+        """The same verdict from the second agent's point of view."""
         return replace(self, verdict=opposite(self.verdict))
 
 
@@ -62,16 +62,16 @@ class MeanDifference:
     """How far one agent is ahead of another on average, in scores between 0 and 1."""
 
     point: float  #: the difference of the means of the runs
-    low: float  #: what every law of scores between 0 and 1 allows; agrees with the verdict
-    high: float  #: likewise
-    seen_low: float  #: what is possible if further runs lie within those that were seen
-    seen_high: float  #: likewise
-    #: The share of further runs, of the agent ahead below and of the other above all that were
-    #: seen, from which on the lead of those that were seen may be gone; 0 where there is none.
+    low: float  #: lower end for every distribution of scores in [0, 1]; agrees with the verdict
+    high: float  #: upper end, likewise
+    seen_low: float  #: lower end if further runs lie within the observed range
+    seen_high: float  #: upper end, likewise
+    #: The smallest share of further runs outside the observed range (the leading agent's below, the
+    #: other's above) that may cancel the observed lead; 0 without a lead.
     most_outside: float = 0.0
 
     def swapped(self) -> MeanDifference:
-        """The same, seen from the second agent."""
+        """The same difference from the second agent's point of view."""
         return replace(
             self,
             point=-self.point,
@@ -82,13 +82,13 @@ class MeanDifference:
         )
 
 
-# Tests on the runs that were seen.
+# Tests on the observed runs.
 
 
 def welch_p_value(first: Floats, second: Floats, *, cautious: bool = False) -> float:
-    """Of "the first mean is higher", where spreads may differ.
+    """The p-value of "the first mean is higher", where variances may differ.
 
-    Cautious, it has no more degrees of freedom than the smaller sample.
+    ``cautious`` limits the degrees of freedom to those of the smaller sample.
 
     Source: Welch (1947), "The generalization of 'Student's' problem when several different
     population variances are involved", Biometrika 34.
@@ -108,7 +108,7 @@ def welch_p_value(first: Floats, second: Floats, *, cautious: bool = False) -> f
 
 
 def permutation_p_value(first: Floats, second: Floats) -> float:
-    """Of the same, by all ways or many to deal out the scores, ranked by Welch's statistic.
+    """The same p-value, from all or many permutations of the scores, with Welch's statistic.
 
     Source: Janssen (1997), "Studentized permutation tests for non-i.i.d. hypotheses", Statistics
     and Probability Letters 36; Chung and Romano (2013), "Exact and asymptotically robust
@@ -131,12 +131,12 @@ def permutation_p_value(first: Floats, second: Floats) -> float:
     found = float((statistic >= statistic[0] * (1 - 1e-9)).mean())
     if len(taken) < N_SPLITS:
         return found
-    # Drawn splits cannot show less than their own share.
+    # Sampled splits cannot show p-values below 1 / N_SPLITS.
     return min(found, welch_p_value(first, second, cautious=True))
 
 
 def paired_p_value(first: Floats, second: Floats) -> float:
-    """Of the same for runs that share their randomness, seed by seed: paired t and sign flips.
+    """The same p-value for paired runs: paired t-test and, if all can be tried, sign flips.
 
     Source: Student (1908); Fisher (1935), "The design of experiments", section 21.
     """
@@ -146,7 +146,7 @@ def paired_p_value(first: Floats, second: Floats) -> float:
         return 1.0
     spread = float(apart.std(ddof=1)) / len(apart) ** 0.5
     by_t = 0.0 if spread <= SAME else float(stats.t.sf(mean / spread, len(apart) - 1))
-    if 2 ** len(apart) >= N_SPLITS:  # drawn flips cannot show less than their own share
+    if 2 ** len(apart) >= N_SPLITS:  # sampled flips cannot show p-values below 1 / N_SPLITS
         return by_t
     sums = _signs(len(apart)) @ apart
     return max(by_t, float((sums >= sums[0] * (1 - 1e-9)).mean()))
@@ -172,14 +172,14 @@ def _signs(n: int) -> Floats:
     return np.where((np.arange(2**n)[:, None] >> np.arange(n)) & 1, -1.0, 1.0)
 
 
-# Guards that allow for runs that were not seen.
+# Guards that allow for unobserved runs.
 
 
 def lowest_means(scores: Floats, *, exact: bool = False) -> Floats:
-    """Means that scores between 0 and 1 may have, those that were not seen being 0; ascending.
+    """Simulated lower bounds on the mean of scores in [0, 1]; ascending.
 
-    The share of these below a value is the level at which the expected score is above it. Where
-    scores are ``exact``, all runs being alike, they have one mean.
+    The share of these at or below a value is the p-value of "the expected score is above it".
+    ``exact`` scores are all equal, and are their own mean.
 
     Source: Learned-Miller and Thomas (2019), "A new confidence interval for the mean of a bounded
     random variable", arXiv:1905.06208.
@@ -190,14 +190,14 @@ def lowest_means(scores: Floats, *, exact: bool = False) -> Floats:
 
 
 def _starts(n: int) -> NDArray[np.int64]:
-    """Where those of n sorted scores begin that count together; each by itself if they are few."""
+    """The index at which each group of n sorted scores begins; groups of one if they are few."""
     n_groups = min(n, MOST_SPACINGS)
     return np.arange(n_groups) * n // max(n_groups, 1)
 
 
 @lru_cache(maxsize=32)
 def _spacings(n: int) -> Floats:
-    """Gaps above each of n sorted uniform numbers, or above several, shape (groups, draws)."""
+    """Gaps above each of n sorted uniform numbers, summed by group, shape (groups, draws)."""
     if n > MOST_SPACINGS:  # sums of gaps are gamma variates, divided by the sum of all
         sizes = np.diff(_starts(n), append=n)
         gaps = np.random.default_rng(0).gamma([1, *sizes], size=(N_SPACINGS, len(sizes) + 1))
@@ -207,27 +207,27 @@ def _spacings(n: int) -> Floats:
 
 
 def mean_interval(scores: ArrayLike, level: float, *, exact: bool = False) -> tuple[float, float]:
-    """The interval of the expected score of one agent, for every law between 0 and 1.
+    """The interval of an agent's expected score, for every distribution on [0, 1].
 
     Args:
-        scores: of its runs, between 0 and 1, shape (n,), at least 1.
+        scores: of the agent's runs, between 0 and 1, shape (n,), with n at least 1.
         level: one minus the confidence.
-        exact: whether it does not depend on chance.
+        exact: whether the agent is deterministic.
     """
     values = np.asarray(scores, np.float64)
     low = float(np.quantile(lowest_means(values, exact=exact), level / 2))
     return low, 1 - float(np.quantile(lowest_means(1 - values, exact=exact), level / 2))
 
 
-# What the two together say.
+# Tests and guards together.
 
 
 def seen_p_value(
     first: Floats, second: Floats, *, paired: bool = False, enough: float = 1.0
 ) -> float:
-    """Of "the first mean is higher", by the runs that were seen.
+    """The p-value of "the first mean is higher", from the observed runs.
 
-    A p-value above ``enough`` may be too low, but not below that.
+    A p-value above ``enough`` may be too low, but its true value is above ``enough`` as well.
     """
     if paired:
         return paired_p_value(first, second)
@@ -245,9 +245,9 @@ def ahead_on_average(
     exact: Exact = (False, False),
     enough: float = 1.0,
 ) -> float:
-    """The p-value of "the first expected score is higher", for every law between 0 and 1.
+    """The p-value of "the first expected score is higher", for every distribution on [0, 1].
 
-    A p-value above ``enough`` may be too low, but not below that.
+    A p-value above ``enough`` may be too low, but its true value is above ``enough`` as well.
     """
     if _is_at_an_end(first, second, exact):
         return 0.0
@@ -262,9 +262,9 @@ def ahead_on_average(
 
 
 def _is_at_an_end(first: Floats, second: Floats, exact: Exact) -> bool:
-    """Whether one always has the most that there is and the other once had less, or the reverse.
+    """Whether a deterministic agent at an end of the scale proves that the first mean is higher.
 
-    Then their means cannot be equal, however few runs tell it.
+    The first always scores 1 and the second once less, or the second always 0 and the first more.
     """
     has_most = exact[0] and first[0] >= 1 - SAME and bool((second < 1 - ROUNDED).any())
     return has_most or (exact[1] and second[0] <= SAME and bool((first > ROUNDED).any()))
@@ -281,15 +281,15 @@ def judge_means(
 ) -> MeanVerdict:
     """Say which of two agents scores more on average.
 
-    Within the margin a difference does not matter, however sure it is: equivalence goes first.
+    Equivalence is tested first: within the margin a difference does not matter, however certain.
 
     Args:
-        first: scores of its runs, between 0 and 1, shape (n,), finite.
+        first: scores of the first agent's runs, between 0 and 1, shape (n,), finite.
         second: likewise, shape (m,); of the same seeds in the same order where ``paired``.
         level: the error rate of the verdict, on both sides together.
         margin: the largest difference that does not matter.
         paired: whether runs of one seed share their randomness.
-        exact: of each agent, whether it does not depend on chance.
+        exact: of each agent, whether it is deterministic.
     """
     x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
     if min(len(x), len(y)) < FEWEST_SEEDS:
@@ -298,7 +298,7 @@ def judge_means(
     is_known = _is_at_an_end(x, y, exact), _is_at_an_end(y, x, exact[::-1])
 
     def seen(lead: float) -> bool:
-        """Whether the first is ahead of the second by more than this."""
+        """Whether the first is ahead of the second by more than ``lead``."""
         return seen_p_value(x - lead, y, paired=paired, enough=level / 2) <= level / 2
 
     def seen_behind(lead: float) -> bool:
@@ -320,7 +320,7 @@ def judge_means(
         "worse": high < -ROUNDED or is_known[1],
     }[said]
     if said == "equivalent" and not is_sure and (low > ROUNDED or high < -ROUNDED):
-        # So far apart, if not by much, that no further runs could turn it round.
+        # The guards show a difference, though a small one: no further runs could reverse it.
         return MeanVerdict("better" if means[0] > means[1] else "worse")
     return MeanVerdict(said, is_conditional=not is_sure)
 
@@ -335,7 +335,7 @@ def compare_means(
 ) -> MeanDifference:
     """How far one agent is ahead of another on average: the intervals of `judge_means`.
 
-    They hold what the tests at this level do not refuse. Arguments as there.
+    The intervals contain what the tests do not reject at this level. Arguments as there.
     """
     x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
     apart = float(x.mean() - y.mean()) if min(len(x), len(y)) else np.nan
@@ -343,14 +343,14 @@ def compare_means(
         return MeanDifference(apart, -1.0, 1.0, -1.0, 1.0)
     seen_low, seen_high = _seen_low(x, y, level / 2, paired), -_seen_low(y, x, level / 2, paired)
     guarded = _guarded(x, y, level, exact)
-    # So many runs at the far ends would take away the lead that was seen.
+    # This share of runs at the far ends would cancel the observed lead.
     outside = max(seen_low, -seen_high, 0.0) / (1 + abs(apart))
     low, high = min(seen_low, guarded[0]), max(seen_high, guarded[1])
     return MeanDifference(apart, low, high, seen_low, seen_high, outside)
 
 
 def _guarded(first: Floats, second: Floats, level: float, exact: Exact) -> tuple[float, float]:
-    """Between which values the difference lies by the guards."""
+    """The interval of the difference by the guards."""
     x_low, x_high = mean_interval(first, level, exact=exact[0])
     y_low, y_high = mean_interval(second, level, exact=exact[1])
     x, y = float(first.mean()), float(second.mean())
@@ -358,13 +358,13 @@ def _guarded(first: Floats, second: Floats, level: float, exact: Exact) -> tuple
 
 
 def _seen_low(first: Floats, second: Floats, level: float, paired: bool) -> float:
-    """The largest lead that the runs that were seen show; -1, the least there is, for none."""
+    """The largest lead that the observed runs show; -1, the lowest possible, if they show none."""
     ahead = float(first.mean() - second.mean())
 
     def excess(lead: float) -> float:
         return seen_p_value(first - lead, second, paired=paired) - level
 
-    # Far from the truth every split but the real one is lost: with too few splits nothing shows.
+    # If the runs do not even show a lead above -2, there are too few splits to show anything.
     if excess(-2.0) > 0:
         return -1.0
     if excess(ahead - 2 * SAME) <= 0:
@@ -385,17 +385,17 @@ def rank_by_mean(
 ) -> int:
     """How many agents, from the first on, are each shown to be ahead of all that follow.
 
-    The agent with the highest mean is held against every other, each time with half of the level:
-    that it was chosen for its mean costs nothing more. Only if it is ahead of all of them is the
-    second held against those behind it, and so on.
+    The agent with the highest mean is tested against every other, at half of the level: that it
+    was selected by its mean needs no further correction. Only if it is ahead of all of them is the
+    second tested against those behind it, and so on.
 
     Args:
         scores: by agent, the highest mean first, between 0 and 1, shape (n_runs,) each.
         level: the share of studies in which any of these claims may be wrong.
         paired: whether runs of one seed share their randomness.
-        exact: by agent, whether it does not depend on chance.
-        seen_only: whether the claims have the condition that few further runs lie outside of what
-            was seen.
+        exact: by agent, whether it is deterministic.
+        seen_only: whether the claims are conditional: few further runs lie outside the observed
+            range.
 
     Source: Gutmann and Maymin (1987), "Is the selected population the best?", Annals of Statistics
     15; Hung and Fithian (2019), "Rank verification for exponential families", Annals of Statistics
@@ -418,20 +418,20 @@ def rank_by_mean(
     return max(len(scores) - 1, 0)
 
 
-# Nobody runs more; a difference that needs them is as good as none.
+# The largest number of seeds to recommend: nobody runs more.
 MOST_SEEDS = 10_000
 
 
 def seeds_needed(
     first: Floats, second: Floats, level: float, margin: float = 0.0, power: float = 0.8
 ) -> int | None:
-    """About how many runs of each agent show who is ahead, as long as further runs are like these.
+    """About how many runs of each agent show who is ahead, if further runs are like the observed.
 
     Args:
         first: scores, shape (n,), at least 2.
         second: likewise.
-        level: of the verdict, on both sides together.
-        margin: within which they would be equivalent.
+        level: the two-sided error rate of the verdict.
+        margin: the margin of equivalence.
         power: the probability of a verdict.
 
     Returns:
@@ -448,5 +448,5 @@ def seeds_needed(
 
 
 def fewest_for(level: float) -> int:
-    """With how few runs of each of two agents their splits can show anything at a level."""
+    """The fewest runs of each of two agents with which permutations can reach a level."""
     return next(n for n in count(FEWEST_SEEDS) if comb(2 * n, n) * level >= 2)

@@ -1,4 +1,4 @@
-"""Verdicts on pairs of agents: tests corrected for their number, sizes of effects, power."""
+"""Verdicts on pairs of agents: tests corrected for their number, effect sizes, power."""
 
 from __future__ import annotations
 
@@ -46,40 +46,40 @@ from verdicts.resampling import (
 
 
 def fewest_seeds(level: float, n_pairs: int = 1) -> int:
-    """With how few seeds anything can be claimed of means, where so many pairs share a level."""
+    """The fewest seeds that can decide about means, where ``n_pairs`` pairs share a level."""
     return fewest_for(level_of_claim(level, "means") / n_pairs)
 
 
-# Verdicts on pairs of agents: on what they earn on average, and on their typical runs.
+# Verdicts on pairs of agents: on their means and on their typical runs.
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdicts on a pair of agents, on the first of the two."""
+    """Verdicts on the first agent of a pair."""
 
-    mean: MeanVerdict  #: on what they earn on average
-    #: On their typical runs: ``better`` or ``worse`` if a run of one scores higher than one of the
+    mean: MeanVerdict  #: the verdict on the means
+    #: On typical runs: ``better`` or ``worse`` if a run of one scores higher than one of the
     #: other more often than not; ``equivalent`` if neither does by more than the margin.
     typical: Verdict
-    #: Whether neither agent depends on chance, so that nothing was to be tested.
+    #: Whether both agents are deterministic, so that there was nothing to test.
     certain: bool = False
 
     @property
     def is_decided(self) -> bool:
-        """Whether anything is said about the means, with a condition or without."""
+        """Whether there is a verdict on the means, conditional or not."""
         return self.mean.verdict != "undecided"
 
 
 @dataclass(frozen=True)
 class Ends:
-    """The ends of the scale on which means are judged; what lies beyond counts as the end."""
+    """The ends of the scale on which means are judged; scores beyond an end count as that end."""
 
-    low: float  #: what the worst run scores
-    high: float  #: what the best does
+    low: float  #: the lowest score that a run may have
+    high: float  #: the highest
 
     @staticmethod
     def beyond(scores: Mapping[str, Floats]) -> Ends:
-        """For scores without known ends: as far beyond the runs that there are as they reach."""
+        """Ends for an unknown scale: the observed range, extended by its length on each side."""
         values = np.concatenate([*scores.values(), []])
         values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
@@ -87,7 +87,7 @@ class Ends:
         return Ends(low - reach, high + reach)
 
     def shares(self, values: Floats) -> Floats:
-        """Scores as shares of the way from one end to the other."""
+        """Scores as shares of the scale, from 0 at the lower end to 1 at the upper."""
         return np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
 
 
@@ -108,16 +108,16 @@ def judge_pairs(
     runs are corrected by Holm's procedure.
 
     Args:
-        scores: by agent, shape (n_seeds,); what is not finite is a run that is missing.
+        scores: by agent, shape (n_seeds,); a non-finite score is a missing run.
         margin: the largest difference that does not matter.
-        level: the share of studies in which anything that is said of the means, of typical runs, of
-            failures or of speed may be wrong; see ``SHARES``.
-        certain: the agents that do not depend on chance. Two of these are compared by what they
-            score, and no other pair pays for it.
-        decided: the pairs that were decided at an earlier look, in the same order; see ``grow``.
-            They stay as they are. None for a look by itself: half of what is for means is then
-            spent on who is best, see ``rank_by_mean``.
-        ends: of the scores; where they are not known, see ``Ends.beyond``.
+        level: the share of studies in which any claim about means, typical runs, failures or speed
+            may be wrong; see ``SHARES``.
+        certain: the deterministic agents. Two of these are compared by their scores, without a
+            test, and the other pairs keep the whole level.
+        decided: the pairs that an earlier look decided, in the same order; see ``grow``. They keep
+            their judgement. None for a single look: half of the error rate for means is then
+            spent on the ranking, see ``rank_by_mean``.
+        ends: the ends of the scores' scale; None for ``Ends.beyond``.
         paired: whether the agents' runs of one seed share their randomness.
         against: the only agent whose mean the others are compared with. Other pairs are not tested:
             they are undecided, unless two tested pairs imply a verdict. Empty for all pairs.
@@ -130,7 +130,7 @@ def judge_pairs(
     for_means = level_of_claim(level, "means")
     ranks = decided is None and len(scores) > 2 and not against
     if ranks:
-        for_means /= 2  # the other half is for who is best
+        for_means /= 2  # the other half is for the ranking
     compared = {pair for pair in pairs if not against or against in pair}
     share = for_means / max(len(compared - known), 1)
     runs = {pair: _runs(scores, pair, paired=paired) for pair in tested}
@@ -169,7 +169,7 @@ def _say(
     pair: tuple[str, str],
     said: MeanVerdict,
 ) -> None:
-    """Put a verdict in the place of one on the same pair that says less."""
+    """Replace the verdict on a pair by one that says more."""
     if pair not in means:
         pair, said = pair[::-1], said.swapped()
     known = means.get(pair, MeanVerdict("equivalent"))
@@ -180,7 +180,7 @@ def _say(
 
 
 def _close(means: dict[tuple[str, str], MeanVerdict]) -> None:
-    """Who is better than one that is better than a third is better than that."""
+    """Add what follows by transitivity: if a is better than b and b than c, a is better than c."""
     better = {pair for pair, said in means.items() if said == MeanVerdict("better")}
     better |= {(b, a) for (a, b), said in means.items() if said == MeanVerdict("worse")}
     names = {name for pair in means for name in pair}
@@ -200,7 +200,7 @@ def _ahead_of_all(
     paired: bool,
     seen_only: bool,
 ) -> list[tuple[str, str]]:
-    """The pairs of which the first is shown to be ahead of the second and of all that follow it."""
+    """The pairs whose first agent is shown to be ahead of the second and of all that follow it."""
     shares = {name: ends.shares(values) for name, values in scores.items()}
     there = {name: np.isfinite(values) for name, values in scores.items()}
     if paired:
@@ -222,7 +222,7 @@ def _mean_or_last(values: Floats) -> float:
 def _runs(
     scores: Mapping[str, Floats], pair: tuple[str, str], *, paired: bool
 ) -> tuple[Floats, Floats]:
-    """The scores of two agents that are there; of the same seeds where they are paired."""
+    """The finite scores of two agents; of the same seeds where they are paired."""
     x, y = (np.asarray(scores[name], np.float64) for name in pair)
     there = np.isfinite(x), np.isfinite(y)
     if paired:
@@ -236,7 +236,7 @@ def _typical(
     level: float,
     n_others: int,
 ) -> dict[tuple[str, str], Verdict]:
-    """Verdicts on typical runs, corrected for all pairs and so many others."""
+    """Verdicts on typical runs, with Holm's correction over these pairs and ``n_others`` more."""
     enough = [pair for pair, both in runs.items() if min(map(len, both)) >= FEWEST_SEEDS]
     others = [1.0] * n_others
     apart = holm([*(apart_p_value(*runs[pair]) for pair in enough), *others])
@@ -244,8 +244,8 @@ def _typical(
     found: dict[tuple[str, str], Verdict] = dict.fromkeys(runs, "undecided")
     for pair, different, same in zip(enough, apart, close, strict=False):
         first, second = runs[pair]
-        # Within the margin a difference does not matter, however sure it is. But not where runs,
-        # if only some, are shown to lie further apart than that on one side.
+        # Within the margin a difference does not matter, however certain: equivalence comes first,
+        # unless runs of one agent are shown to be ahead by more than the margin more often.
         if same <= level and not apart_beyond(first, second, margin, level):
             found[pair] = "equivalent"
         elif different <= level:
@@ -256,7 +256,7 @@ def _typical(
 def apart_beyond(first: Floats, second: Floats, margin: float, level: float) -> bool:
     """Whether one agent is ahead by more than the margin more often than the other is.
 
-    The sign test, on two sides, over runs in the order of their seeds.
+    The two-sided sign test, over runs in the order of their seeds.
     """
     n = min(len(first), len(second))
     apart = differences(first[:n], second[:n])
@@ -275,7 +275,7 @@ def _known(first: Floats, second: Floats, margin: float) -> Judgement:
 
 # How often an agent beats another.
 
-# From here on the bootstrap and the normal interval look the same.
+# From this many seeds on, the bootstrap interval and the normal interval agree.
 MANY_SEEDS = 200
 
 
@@ -290,25 +290,25 @@ def probability_of_improvement(
     """The probability that a run of the first agent scores higher than one of the second.
 
     It is the share of all pairs of runs, equal scores counting half: the statistic of Mann and
-    Whitney. Over several environments it is the mean of theirs. Both agents' seeds are resampled
+    Whitney. Over several environments it is the mean over them. Both agents' seeds are resampled
     together, as they were run on the same random numbers. Where the first agent always won, or
-    always lost, resampling cannot show any doubt; the interval is then that of Clopper and Pearson
-    for as many independent wins as there are seeds.
+    always lost, a bootstrap interval would have length 0; the interval is then that of Clopper and
+    Pearson for as many independent wins as there are seeds.
 
     Args:
         first: shape (n_seeds,) or (n_seeds, n_envs).
         second: likewise, the same seeds at the same places. A seed counts where neither is NaN;
             infinite scores are compared as any others.
-        seed: of the resampling.
-        confidence: of the interval.
+        seed: the seed of the resampling.
+        confidence: the confidence level of the interval.
         n_resamples: how many resamples it comes from.
 
     Raises:
         ValueError: for arguments out of range or of another shape.
 
     Source: Agarwal et al. (2021), section 4.3. The interval is widened for few seeds, see
-    ``interval_tail``; with more than ``MANY_SEEDS`` seeds it is the normal one, which resampling
-    would take long to agree with.
+    ``interval_tail``; with more than ``MANY_SEEDS`` seeds it is the normal interval, which agrees
+    with resampling and is faster.
     """
     check_confidence(confidence)
     x, y = as_columns(first), as_columns(second)
@@ -319,14 +319,14 @@ def probability_of_improvement(
     n, n_missing = sum(sizes), x.size - sum(sizes)
     if min(sizes) == 0:
         return Estimate(np.nan, np.nan, np.nan, n, n_missing)
-    # How often each seed wins, through its run of the first agent and through the other's.
+    # The pairs that each seed wins, by its run of the first agent, and by its run of the second.
     wins = [(wins_of(one, other), len(one) - wins_of(other, one)) for one, other in pairs]
     point = float(np.mean([ahead.sum() / len(ahead) ** 2 for ahead, _ in wins]))
     if point in {0, 1} and min(sizes) > 1:
         sure = ((1 - confidence) / 2) ** (1 / (min(sizes) * len(sizes)))
         low, high = (sure, 1.0) if point else (0.0, 1 - sure)
         return Estimate(point, low, high, n, n_missing)
-    # What each seed adds, through both of its runs, decides how far the statistic varies.
+    # The influence of each seed, by both of its runs, gives the variance of the statistic.
     influences = [(ahead + behind) / len(ahead) for ahead, behind in wins]
     if min(sizes) > MANY_SEEDS:
         low, high = _normal_interval(point, influences, confidence)
@@ -342,7 +342,7 @@ def probability_of_improvement(
 def _normal_interval(
     point: float, influences: list[Floats], confidence: float
 ) -> tuple[float, float]:
-    """The interval from the spread of what each seed adds; the probability stays within 0 and 1.
+    """The normal interval from the variance of the seeds' influences, within 0 and 1.
 
     Source: DeLong, DeLong and Clarke-Pearson (1988), "Comparing the areas under two or more
     correlated receiver operating characteristic curves", Biometrics 44(3).
@@ -367,34 +367,34 @@ def _resampled(wins: Floats, counts: Counts) -> Floats:
 
 @dataclass(frozen=True)
 class PairComparison:
-    """What the seeds say about two agents."""
+    """The comparison of two agents."""
 
-    first: str  #: the name of one
-    second: str  #: the name of the other
-    said: MeanVerdict  #: of the means
-    #: How far they are apart, in scores between the ends; the intervals for all pairs hold
-    #: together and agree with what is said.
+    first: str  #: the name of the first agent
+    second: str  #: the name of the second agent
+    said: MeanVerdict  #: the verdict on the means
+    #: The difference of the means, as shares of the scale between the ends; the intervals for all
+    #: pairs hold together and agree with the verdict.
     mean: MeanDifference
-    typical: Verdict  #: on the typical run of the first; see ``Judgement``
-    #: That a run of the first scores higher than one of the second.
+    typical: Verdict  #: the verdict on typical runs; see ``Judgement``
+    #: The probability that a run of the first agent scores higher than one of the second.
     probability_of_improvement: Estimate
-    #: Where the means are undecided, about the number of seeds that would decide at the next look
-    #: with 80 % power if all is as observed. None where that is more than 10,000, or there are too
+    #: Where the means are undecided, the approximate number of seeds that would decide at the next
+    #: look with 80 % power if means and variances are as observed. None above 10,000, or with too
     #: few seeds to say.
     seeds_needed: int | None
-    #: Whether neither agent depends on chance, so that their scores say all there is.
+    #: Whether both agents are deterministic, so that their scores are exact.
     certain: bool = False
-    #: How many seeds each of the two had then, those of runs that failed among them.
+    #: The number of seeds of each agent at the time of the judgement, failed runs included.
     n_seeds: int = 0
 
     @property
     def verdict(self) -> Verdict:
-        """On the first agent's mean."""
+        """The verdict on the first agent's mean."""
         return self.said.verdict
 
     @property
     def is_conditional(self) -> bool:
-        """Whether that holds only as long as further runs are like those that were seen."""
+        """Whether the verdict holds only if few further runs lie outside the observed range."""
         return self.said.is_conditional
 
     def swapped(self) -> PairComparison:
@@ -429,17 +429,17 @@ def compare_pairs(
     """Compare every two agents, in the order of the mapping.
 
     Args:
-        scores: by agent, shape (n_seeds,), higher is better. What is not finite is missing.
+        scores: by agent, shape (n_seeds,), higher is better. Non-finite scores are missing.
         margin: the largest difference, in the unit of the scores, that does not matter.
-        seed: of the resampling.
-        ends: the lowest and the highest score that a run may have; what lies beyond counts as the
-            end. Where they are not given, see ``Ends.beyond``.
+        seed: the seed of the resampling.
+        ends: the lowest and the highest score that a run may have; scores beyond an end count as
+            that end. None for ``Ends.beyond``.
         paired: whether the agents' runs of one seed share their randomness.
-        confidence: of the study: in so many studies no verdict is wrong, over all of its looks.
+        confidence: the share of studies in which no verdict is wrong, over all looks of a study.
         n_resamples: how many resamples the intervals of the probabilities come from.
-        look: how often the study has been looked at, this time included, each with more seeds.
+        look: the number of this look, counted from 1; each look has more seeds.
         n_looks: how many looks there will be; see ``level_of_look``.
-        certain: the agents that do not depend on chance; see ``judge_pairs``.
+        certain: the deterministic agents; see ``judge_pairs``.
 
     Raises:
         ValueError: for arguments out of range, or agents with different numbers of seeds.
@@ -481,20 +481,20 @@ def describe_pairs(
     confidence: float = 0.95,
     n_resamples: int = N_RESAMPLES,
 ) -> list[PairComparison]:
-    """Say by how much, and of what, pairs of agents were judged to be better, worse or equivalent.
+    """Add differences, probabilities and seeds needed to the judgements on pairs of agents.
 
     Args:
-        judged: by pair, the judgement, and with how many of the seeds it was made.
+        judged: by pair, the judgement and the number of seeds that it was made with.
         scores: by agent, shape (n_seeds,).
         margin: the largest difference that does not matter.
         levels: the error rates of the look that judged, and of the next.
-        ends: of the scores.
-        seed: of the resampling.
+        ends: the ends of the scores' scale.
+        seed: the seed of the resampling.
         paired: whether the agents' runs of one seed share their randomness.
-        ranks: whether half of what is for means was spent on who is best.
+        ranks: whether half of the error rate for means was spent on the ranking.
         against: the only agent that the others were compared with; empty for all pairs.
-        certain: the agents that do not depend on chance.
-        confidence: of the probabilities of improvement.
+        certain: the deterministic agents.
+        confidence: the confidence level of the probabilities of improvement.
         n_resamples: how many resamples their intervals come from.
     """
     compared = {pair for pair in judged if not against or against in pair}
@@ -526,7 +526,7 @@ def describe_pairs(
                 mean=_mean_difference(
                     (ends.shares(x), ends.shares(y)),
                     (one in certain, two in certain),
-                    # Without a test, an interval has every difference.
+                    # The interval of a pair that was not tested contains every difference.
                     (level if (one, two) in compared else 0.0, for_best),
                     margin / (ends.high - ends.low),
                     judgement,
@@ -574,12 +574,12 @@ def _mean_difference(
     *,
     paired: bool,
 ) -> MeanDifference:
-    """The difference of two means, its intervals made to say what the verdict says.
+    """The difference of two means, with intervals that agree with the verdict.
 
-    Who is best is shown by a test of its own, which may decide what an interval leaves open; the
-    level of that is the second of the two, and that of the intervals of all pairs the first. And
-    who is shown to lie within the margin lies within it: Stefansson, Kim and Hsu (1988), "On
-    confidence sets in multiple comparisons".
+    The first level is that of the intervals of all pairs; the second that of the ranking, a test of
+    its own, which may decide what an interval leaves open. Where agents are equivalent, the
+    interval is cut at the margin: Stefansson, Kim and Hsu (1988), "On confidence sets in multiple
+    comparisons".
     """
     x, y = runs
     if judgement.certain:

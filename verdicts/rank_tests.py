@@ -11,7 +11,7 @@ from scipy import special, stats
 
 from verdicts.resampling import Estimate, Floats, check_confidence
 
-# Differences between two agents on the same seeds: how large.
+# Paired differences between two agents.
 
 # Exact returns of two policies that are equally good can differ in their last bits.
 SAME = 1e-12
@@ -39,13 +39,13 @@ def paired_difference(first: ArrayLike, second: ArrayLike, confidence: float = 0
 
     In simulations with 5 to 30 seeds the 95 % interval covered the mean in 93 to 97 % of the cases
     where differences are symmetric or two-peaked, and in 82 to 94 % where they are strongly skewed
-    (exponential, log-normal). BCa covered 80 to 95 % and 75 to 92 %, and least with 5 seeds. With
-    failures too rare to have shown up, no interval can cover.
+    (exponential, log-normal). BCa covered 80 to 95 % and 75 to 92 %, and least with 5 seeds. If
+    failures are too rare to be observed, no interval covers the mean.
 
     Args:
         first: shape (n_seeds,).
         second: likewise, the same seeds at the same places. A seed counts where both are finite.
-        confidence: of the interval.
+        confidence: the confidence level of the interval.
 
     Returns:
         The estimate, without interval for fewer than two seeds. Where all differences are equal the
@@ -64,7 +64,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike, confidence: float = 0
     n = len(apart)
     if n == 0:
         return Estimate(np.nan, np.nan, np.nan, 0, x.size)
-    # Counted from the first, so that equal differences have a spread of exactly 0.
+    # Relative to the first, so that equal differences have a spread of exactly 0.
     offsets = apart - apart[0]
     mean, half = float(apart[0] + offsets.mean()), np.nan
     if n > 1:
@@ -73,13 +73,13 @@ def paired_difference(first: ArrayLike, second: ArrayLike, confidence: float = 0
 
 
 def holm(p_values: ArrayLike) -> Floats:
-    """P-values corrected for how many there are: those below 0.05 hold jointly with 95 %.
+    """P-values with Holm's correction: those up to a level hold jointly at this error rate.
 
     Args:
         p_values: shape (n_tests,). NaN stands for a test that could not be made, and stays.
 
     Returns:
-        The corrected ones, in the same order.
+        The corrected p-values, in the same order.
 
     Source: Holm (1979), "A simple sequentially rejective multiple test procedure".
     """
@@ -93,7 +93,7 @@ def holm(p_values: ArrayLike) -> Floats:
 
 # Which of two agents is ahead: the exact rank-sum test, guarded against unequal spreads.
 
-# Up to so many scores of both agents together the null distribution is counted out; beyond, it is
+# Up to this many scores of both agents together, the null distribution is exact; above, it is
 # normal, corrected for ties.
 MOST_COUNTED = 40
 
@@ -121,10 +121,10 @@ def ahead_p_value(first: Floats, second: Floats) -> float:
 
 
 def apart_p_value(first: Floats, second: Floats) -> float:
-    """The p-value of "one of the two is ahead", whichever the scores say.
+    """The two-sided p-value of "one of the two is ahead".
 
-    On two sides: both claims can be wrong, as on a fair coin beside an agent that is always
-    half-way between its two sides.
+    It is doubled because both claims can be wrong, as for a fair coin against an agent that always
+    scores half-way between the two sides.
     """
     if min(len(first), len(second)) == 0:
         return float("nan")
@@ -140,7 +140,7 @@ def equivalent_p_value(first: Floats, second: Floats, margin: float) -> float:
 
 
 def rank_sum_p_value(first: Floats, second: Floats) -> float:
-    """The chance of ranks as high as those of ``first`` if all its splits are alike."""
+    """The one-sided p-value of the rank-sum test for "``first`` is ahead"."""
     ranks, ties = doubled_ranks(np.concatenate([first, second]))
     found = int(ranks[: len(first)].sum())
     if len(ranks) <= MOST_COUNTED:
@@ -149,12 +149,12 @@ def rank_sum_p_value(first: Floats, second: Floats) -> float:
 
 
 def share_p_value(first: Floats, second: Floats) -> float:
-    """The chance of so large a share of won pairs if that of all runs is a half.
+    """The p-value of the share of won pairs, if the true share is a half.
 
-    As if the share came from so many independent comparisons as have the variance that was
-    estimated for it, but from no fewer than there are seeds. And n seeds cannot give less than
-    1 / 2**n: a steady agent in the middle between an erratic one's two peaks lies below all of its
-    runs as often as that.
+    A binomial test with the effective number of comparisons: as many independent ones as have the
+    estimated variance of the share, but no fewer than there are seeds. The p-value is at least
+    1 / 2**n for n seeds: so often all runs of an erratic agent with two peaks lie above a steady
+    agent in the middle.
 
     Source: the variance is that of DeLong, DeLong and Clarke-Pearson (1988); the binomial with an
     effective number of comparisons follows Korn and Graubard (1998), "Confidence intervals for
@@ -181,7 +181,7 @@ def wins_of(values: Floats, others: Floats) -> Floats:
 
 
 def doubled_ranks(scores: Floats) -> tuple[Floats, tuple[int, ...]]:
-    """Twice the rank of each score, which is whole also for ties, and how many share each rank."""
+    """Twice the rank of each score, an integer also for ties, and the sizes of groups of ties."""
     order = np.argsort(scores, kind="stable")
     ordered = scores[order]
     new = np.diff(ordered) > SAME * np.maximum(np.abs(ordered[1:]), np.abs(ordered[:-1]))
@@ -194,10 +194,10 @@ def doubled_ranks(scores: Floats) -> tuple[Floats, tuple[int, ...]]:
 
 @lru_cache(maxsize=4096)
 def rank_sum_tail(ties: tuple[int, ...], n: int) -> Floats:
-    """By doubled rank sum of ``n`` of the scores, the chance of that or a higher one.
+    """For each doubled rank sum of ``n`` of the scores, the probability of at least that sum.
 
-    Counted group by group of equal scores: how many ways there are to have taken so many scores,
-    of that sum, from the groups so far.
+    Dynamic programming over groups of equal scores: the number of ways to take some number of
+    scores with some rank sum from the groups so far.
     """
     total = sum(ties)
     ways = np.zeros((n + 1, total * (total + 1) + 1))
@@ -215,7 +215,7 @@ def rank_sum_tail(ties: tuple[int, ...], n: int) -> Floats:
 
 
 def _normal_tail(ranks: Floats, n: int, m: int, found: int) -> float:
-    """The same for many scores, with the correction for the steps that rank sums come in."""
+    """The same for many scores: the normal approximation with a continuity correction."""
     total = n + m
     spread = math.sqrt(n * m / (total * (total - 1)) * float(((ranks - ranks.mean()) ** 2).sum()))
     if spread == 0:
@@ -226,10 +226,10 @@ def _normal_tail(ranks: Floats, n: int, m: int, found: int) -> float:
 
 @lru_cache(maxsize=4096)
 def interval_places(n: int, m: int, level: float) -> tuple[int, int] | None:
-    """Where the interval of the median of n m differences ends; None for too few seeds.
+    """Where the interval of the median of n m sorted differences ends; None for too few seeds.
 
-    It belongs to the rank-sum test: where scores differ by a shift, it holds those shifts that the
-    test does not refuse at this level.
+    It inverts the rank-sum test: where scores differ by a shift, the interval contains the shifts
+    that the test does not reject at this level.
 
     Source: Hodges and Lehmann (1963), "Estimates of location based on rank tests"; Lehmann (1975),
     "Nonparametrics", section 2.6.

@@ -15,17 +15,17 @@ Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]  # how often something was drawn
 
 
-# Resampling of seeds, within each environment apart from the others.
+# Resampling of seeds, separately within each environment.
 #
-# A resample is kept as how often it drew each seed. Sums over resamples are then matrix products,
+# A resample is stored as the count of each seed. Sums over resamples are then matrix products,
 # and sorting is done once and not once per resample.
 
-# The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would vary too much.
+# Intervals over few seeds end beyond the 1 % quantiles: with fewer resamples they vary too much.
 N_RESAMPLES = 10_000
-# Those over many seeds lie further in, and need fewer.
+# Intervals over many seeds end further inside, and need fewer resamples.
 ENOUGH_RESAMPLES = 1_000
 _MOST_DRAWS = 2_000_000
-_MOST_AT_ONCE = 4_000_000  # draws that are in memory; more are drawn in pieces
+_MOST_AT_ONCE = 4_000_000  # draws in memory; more are drawn in pieces
 _PIECE = 1_000_000
 
 
@@ -40,7 +40,7 @@ def as_columns(scores: ArrayLike) -> Floats:
 
 
 def check_confidence(confidence: float) -> None:
-    """Refuse a confidence that is no share, as 95 would be."""
+    """Refuse a confidence outside of 0 to 1, such as 95."""
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is {confidence}, it must lie between 0 and 1, as 0.95 does")
 
@@ -52,7 +52,7 @@ def resample_counts(n: int, n_resamples: int, rng: np.random.Generator) -> Count
 
 
 def enough_resamples(n_resamples: int, n_seeds: int) -> int:
-    """So many resamples as are asked for, or fewer where there are many seeds to draw."""
+    """The number of resamples: ``n_resamples``, or fewer where there are many seeds to draw."""
     return min(n_resamples, max(ENOUGH_RESAMPLES, _MOST_DRAWS // n_seeds))
 
 
@@ -105,9 +105,9 @@ _CUTS: dict[Statistic, Callable[[int], int]] = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure and how sure it is."""
+    """An estimate with its confidence interval."""
 
-    point: float  #: the figure; NaN where there is nothing to compute it from
+    point: float  #: the estimate; NaN where there is nothing to compute it from
     low: float  #: the lower end of its interval; NaN where there is none, as with a single seed
     high: float  #: the upper end, likewise
     n: int  #: the number of values that it is computed from
@@ -121,7 +121,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Summary:
-    """Where the scores of an agent lie."""
+    """Mean, median and interquartile mean of an agent's scores."""
 
     mean: Estimate  #: what the next run is expected to score
     median: Estimate  #: what half of the runs exceed
@@ -133,16 +133,16 @@ def summarise(
 ) -> Summary:
     """The three statistics of an agent's scores.
 
-    Over several environments the runs are pooled, each environment weighing the same, also where
-    runs of it are missing. Seeds are resampled within each environment by itself. The median is
-    therefore that of the runs, and not that of the environments' means.
+    Over several environments the runs are pooled, each environment with the same weight, even if
+    some of its runs are missing. Seeds are resampled separately within each environment. The median
+    is therefore that of the runs, and not that of the environments' means.
 
     Args:
-        scores: shape (n_seeds,), or (n_seeds, n_envs) on a scale that the environments share. What
-            is not finite counts as missing. Where an environment has no score at all the figures
-            are NaN: leave it out for every agent, or say what a failed run is worth.
-        seed: of the resampling.
-        confidence: of the intervals.
+        scores: shape (n_seeds,), or (n_seeds, n_envs) on a scale that the environments share.
+            Non-finite scores count as missing. Where an environment has no score at all the
+            estimates are NaN: leave it out for every agent, or give failed runs a score.
+        seed: the seed of the resampling.
+        confidence: the confidence level of the intervals.
         n_resamples: how many resamples they come from; fewer with hundreds of seeds.
 
     Raises:
@@ -192,8 +192,8 @@ def _estimates(
             * (n / (len(strata) * size))
             for size, each in zip(sizes, drawn, strict=True)
         ]
-        # How much each resample weighs the scores, ascending and cumulated; the first is the scores
-        # as they are. A row ends at n.
+        # The cumulated weights of the sorted scores in each resample; the first row is the original
+        # sample. A row ends at n.
         weights = np.hstack(counts)[:, order].cumsum(axis=1)
         for statistic, means in found.items():
             means.append(_trimmed_means(values[order], weights, _CUTS[statistic](n)))
@@ -208,7 +208,7 @@ def _estimates(
 def drawn_in_pieces(
     sizes: tuple[int, ...], n_resamples: int, seed: int
 ) -> Iterator[tuple[Counts, ...]]:
-    """Resamples of strata, as many at once as memory has room for; nobody changes them."""
+    """Resamples of strata, in pieces that fit into memory; callers must not change them."""
     if n_resamples * sum(sizes) <= _MOST_AT_ONCE:
         yield _drawn(sizes, n_resamples, seed)
         return
@@ -221,7 +221,7 @@ def drawn_in_pieces(
         )
 
 
-# Agents of a study have as many seeds, and several figures each.
+# Agents of a study have equally many seeds, so that one draw serves all agents and statistics.
 @lru_cache(maxsize=1)
 def _drawn(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[Counts, ...]:
     """Resamples of each stratum."""

@@ -1,4 +1,4 @@
-"""Bandits: each step pulls one arm, and no pull changes what the next ones give."""
+"""Bandits: each step pulls one arm, and no pull affects the rewards of later pulls."""
 
 from envs.bandits.bandit import Bandit, StochasticBandit
 from envs.bandits.clicks import BernoulliBandit, ClickBandit, SegmentBandit

@@ -1,4 +1,4 @@
-"""What bandits share: counting pulls, what `step` tells, and how they are drawn."""
+"""The base classes of bandits: counts of pulls, the ``info`` of `step`, and rendering."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from envs.argument_checks import check_whole_number
 from envs.drawing import Box, Chart, ChartRenderer, Disc, Label, Shape, ShownEnv
 from mdp.transition_model import Floats, Ints
 
-# Of more arms the first are shown, of more contexts those around the present one.
+# Above these numbers, only the first arms are shown, and the contexts around the present one.
 MAX_ARMS_SHOWN = 40
 MAX_CONTEXTS_SHOWN = 4
-# In characters, of the bars in a text.
+# The length of a bar in a text, in characters.
 BAR = 30
 # In pixels.
 MARGIN = 56
@@ -29,16 +29,16 @@ TITLE = 40
 PANEL = 200
 CAPTION = 48
 TEXT = 20
-# What numbers need: in narrower slots some of them are left out.
+# The narrowest slot that numbers fit into: in narrower slots some of them are left out.
 MIN_LABELLED = 30
 
 
 @dataclass(eq=False)
 class Tally:
-    """What the pulls of an episode have brought."""
+    """Counts and rewards of the pulls of an episode."""
 
     counts: Ints  # the number of pulls, shape (n_contexts, n_arms)
-    sums: Floats  # of their rewards, likewise
+    sums: Floats  # the sums of their rewards, likewise
     last: tuple[int, int, float] | None = None  # context, arm and reward of the latest pull
 
     @classmethod
@@ -70,7 +70,7 @@ class Tally:
 
 
 class _Scale:
-    """From values to places on an axis; zero is always on it."""
+    """Maps values to positions on an axis, which always includes zero."""
 
     def __init__(self, *means: Floats | None) -> None:
         known = np.concatenate([array.ravel() for array in means if array is not None])
@@ -87,8 +87,8 @@ class _Scale:
 def render_text(tally: Tally, true: Floats | None, present: int) -> str:
     """The latest pull on a line, then a line for each arm.
 
-    In the bars ``=`` reaches from zero to the observed mean, ``|`` marks the ``true`` one, of shape
-    (n_contexts, n_arms). ``present`` is the context of the next pull.
+    In the bars ``=`` reaches from zero to the observed mean, ``|`` marks the mean in ``true``, of
+    shape (n_contexts, n_arms). ``present`` is the context of the next pull.
     """
     observed = tally.observed
     scale = _Scale(observed, true)
@@ -147,7 +147,7 @@ class _Panel:
         return self.top + 20 + (1 - self.scale.part(value)) * (PANEL - 40)
 
     def name(self, context: int, present: bool) -> Iterator[Shape]:
-        """Which context this is, with a dot where it is the next one's."""
+        """The name of a context, with a dot if it is the context of the next pull."""
         at = (self.width - MARGIN // 4, self.top + 8)
         yield Label(f"context {context}", at, TEXT, drawing.INK, align=1)
         if present:
@@ -183,7 +183,7 @@ class _Panel:
 
 
 def _heading(title: str, cut: str, width: int, knows_truth: bool) -> Iterator[Shape]:
-    """The latest pull, which arms are shown where not all are, and what the colours mean."""
+    """The latest pull, the range of arms if not all are shown, and the meaning of the colours."""
     left, right = MARGIN // 4, width - MARGIN // 4
     yield Label(title, (left, 14), TEXT + 2, drawing.INK, align=0)
     yield Label(cut, (right, 14), TEXT - 2, drawing.SHELF, align=1)
@@ -223,11 +223,11 @@ MAX_ARMS = 10_000
 class Bandit(ShownEnv):
     """Arms to pull, one a step, in the present context.
 
-    A subclass says with `_begin` how an episode begins, with `step` what a pull gives, and with
-    `_true_means` what is known of the arms. `gymnasium.make` makes ``pulls`` the time limit.
+    A subclass defines the start of an episode in `_begin`, a pull in `step`, and the known means of
+    the arms in `_true_means`. `gymnasium.make` makes ``pulls`` the time limit.
     """
 
-    kind: str  # of the dynamics, by which compiled copies know them
+    kind: str  # the kind of dynamics, which selects the compiled copy
     context: Any  # what the agent observes before the next pull
 
     def __init__(
@@ -245,7 +245,7 @@ class Bandit(ShownEnv):
         self.batch_size = check_whole_number("batch_size", batch_size, 1, MAX_PULLS)
         self.observation_space = observation_space
         self.action_space = spaces.Discrete(n_arms)
-        self.pulls_done = 0  # of this episode
+        self.pulls_done = 0  # in this episode
         self._tally = Tally.empty(max(self.n_contexts, 1), n_arms)
 
     @property
@@ -284,11 +284,11 @@ class Bandit(ShownEnv):
         return arm
 
     def _row(self, context: Any) -> int:
-        """Which row of the tally a context counts to: its own, or the only one."""
+        """The row of the tally for a context: its own, or the only one."""
         return int(context) if self.n_contexts else 0
 
     def _show_pull(self, context: Any, arm: int, reward: float) -> None:
-        """Remember a pull for the next picture, and draw it where there is a window."""
+        """Record a pull for the next picture, and render it in mode ``human``."""
         if self.render_mode is not None:
             self._tally.add(self._row(context), arm, reward)
         if self.render_mode == "human":
@@ -296,24 +296,24 @@ class Bandit(ShownEnv):
 
     @abstractmethod
     def _true_means(self) -> Floats | None:
-        """What each arm gives on average, one row for each of the tally's; None if not known."""
+        """The mean reward of each arm, with the rows of the tally; None if not known."""
 
     @abstractmethod
     def _begin(self) -> None:
-        """Make ready for the first pull of an episode."""
+        """Prepare the first pull of an episode."""
 
 
 class StochasticBandit(Bandit):
-    """Arms whose rewards are drawn, each with an expected one in the present context.
+    """Arms with random rewards, each with an expected reward in the present context.
 
-    A subclass says with `_begin` how arms and first context are drawn, with `expected_rewards`
-    what each arm is worth in the context, and with `_pull` what reward it gives and which context
-    comes next. Its docstring lists the random numbers in the order in which it draws them: compiled
-    copies draw the same ones.
+    A subclass draws the arms and the first context in `_begin`, returns the expected reward of each
+    arm in the context from `expected_rewards`, and draws a reward and the next context in `_pull`.
+    Its docstring lists the random numbers in the order in which it draws them: compiled copies draw
+    the same ones.
     """
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Pull an arm; see the class for the meaning of what is returned."""
+        """Pull an arm; the class describes the results."""
         arm = self._checked(action)
         expected = self.expected_rewards()
         best = max(expected)
@@ -331,7 +331,7 @@ class StochasticBandit(Bandit):
 
     @abstractmethod
     def expected_rewards(self) -> list[float]:
-        """What each arm gives on average in the present context."""
+        """The expected reward of each arm in the present context."""
 
     @abstractmethod
     def _pull(self, arm: int) -> float:
@@ -342,7 +342,7 @@ class StochasticBandit(Bandit):
 
 
 def agreed_size(name: str, asked: int | None, given: int | None, default: int, low: int) -> int:
-    """How many there are: as many as are given, else as are asked for, else the default."""
+    """The size ``given`` by other arguments, else ``asked``, else the default; they must agree."""
     if asked is None:
         return default if given is None else given
     size = check_whole_number(name, asked, low, MAX_ARMS)

@@ -15,7 +15,7 @@ from mdp.transition_model import Floats, TransitionModel
 
 # How far probabilities of segments may be from summing to one.
 TOLERANCE = 1e-9
-# What a pull may bring, over all contexts and arms.
+# The largest number of outcomes in a model, over all contexts and arms.
 MAX_OUTCOMES = 2_000_000
 
 
@@ -106,7 +106,7 @@ class BernoulliBandit(ClickBandit):
     """Arms that give 1 with a probability of their own, and 0 otherwise.
 
     ## Description
-    Each arm is a coin. Which one comes up heads most often has to be found out while pulling.
+    Each arm is a coin. The agent has to find out by pulling which one comes up heads most often.
 
     ## Action Space
     `Discrete(n_arms)`: the arm to pull.
@@ -125,9 +125,9 @@ class BernoulliBandit(ClickBandit):
     `max_episode_steps` where that is given.
 
     ## Information
-    `step` gives of the pull just made `optimal_action`, the first of the best arms;
-    `expected_reward`, the mean of the arm pulled; `regret`, by how much the best arm's mean is
-    higher, 0 for each of several best ones; and `feedback_due`, always True. `reset` gives nothing.
+    `step` gives, for the pull just made, `optimal_action`, the first of the best arms;
+    `expected_reward`, the mean of the arm pulled; `regret`, the best arm's mean minus that of the
+    arm pulled; and `feedback_due`, always True. `reset` gives nothing.
     One uniform number is drawn by `reset`, without effect, and one by each step: the reward is 1 if
     it lies below the arm's probability.
     The exact dynamics are available as arrays from `transition_model()`.
@@ -156,8 +156,8 @@ class SegmentBandit(ClickBandit):
 
     ## Description
     Each user belongs to a known segment, and is shown one of the treatments. A treatment that works
-    for one segment need not work for another. With the default figures, of Li et al.'s kind ("A
-    contextual-bandit approach to personalized news article recommendation", 2010), 30 % of the
+    for one segment need not work for another. With the default figures, in the style of Li et al.
+    ("A contextual-bandit approach to personalized news article recommendation", 2010), 30 % of the
     users are core users and 70 % casual ones:
 
     | segment | treatment 0 | treatment 1 | treatment 2 |
@@ -185,9 +185,9 @@ class SegmentBandit(ClickBandit):
     `max_episode_steps` where that is given.
 
     ## Information
-    `step` gives of the pull just made `optimal_action`, the first of the best treatments for the
-    segment; `expected_reward`, the click rate of the one shown; `regret`, by how much that of the
-    best one is higher, 0 for each of several best ones; and `feedback_due`. `reset` gives nothing.
+    `step` gives, for the pull just made, `optimal_action`, the first of the best treatments for the
+    segment; `expected_reward`, the click rate of the treatment shown; `regret`, the best
+    treatment's click rate minus that one; and `feedback_due`. `reset` gives nothing.
 
     Feedback arrives in batches: `feedback_due` is True on each `batch_size`-th pull and on the last
     of the episode. The reward that `step` returns is always that pull's own, so that returns,
@@ -195,9 +195,9 @@ class SegmentBandit(ClickBandit):
     batch only once feedback is due, or the episode over. The bandit agents do so. Agents that know
     nothing of batches, such as DQN, learn as if `batch_size` were 1.
 
-    `reset` and `step` draw one uniform number each. The former chooses the segment by cumulative
-    sum; the latter, from the outcomes in the order of `transition_model()`, click and next segment
-    in one.
+    `reset` and `step` draw one uniform number each, and choose by cumulative sum: `reset` the
+    segment; `step` click and next segment together, from the outcomes in the order of
+    `transition_model()`.
 
     ## Arguments
     - `segment_probabilities=(0.3, 0.7)`: shares of the segments, summing to 1

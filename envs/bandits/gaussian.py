@@ -14,7 +14,7 @@ from mdp.transition_model import Floats
 
 
 class GaussianBandit(StochasticBandit):
-    """Arms with normally distributed rewards, whose means may wander.
+    """Arms with normally distributed rewards, whose means may drift.
 
     ## Description
     By default the ten-armed testbed (Sutton and Barto, Reinforcement Learning, 2nd edition, section
@@ -40,10 +40,9 @@ class GaussianBandit(StochasticBandit):
     `max_episode_steps` where that is given.
 
     ## Information
-    `step` gives of the pull just made, by the means before they drift, `optimal_action`, the first
-    of the best arms; `expected_reward`, the mean of the arm pulled; `regret`, by how much the best
-    arm's mean is higher, 0 for each of several best ones; and `feedback_due`, always True. `reset`
-    gives nothing.
+    `step` gives, for the pull just made and by the means before they drift, `optimal_action`, the
+    first of the best arms; `expected_reward`, the mean of the arm pulled; `regret`, the best arm's
+    mean minus that of the arm pulled; and `feedback_due`, always True. `reset` gives nothing.
     `reset` draws one standard normal number for each arm if means are not given, else nothing. Each
     step draws one for the reward; and then, if `drift_std` is not 0, one for each arm.
 

@@ -15,11 +15,11 @@ from envs.bandits.bandit import StochasticBandit, agreed_size
 
 
 class LinearBandit(StochasticBandit):
-    """Arms whose expected reward is a weighted sum of what is observed.
+    """Arms whose expected reward is a weighted sum of the observed features.
 
     ## Description
-    Before each pull the agent sees a vector of features. Each arm has weights of its own, and is
-    worth on average the sum of the features times the weights: what linear contextual bandits
+    Before each pull the agent sees a vector of features. Each arm has its own weights, and its
+    expected reward is the sum of the features times the weights, as linear contextual bandits
     assume (Li et al., "A contextual-bandit approach to personalized news article recommendation",
     2010).
 
@@ -42,10 +42,9 @@ class LinearBandit(StochasticBandit):
     `max_episode_steps` where that is given.
 
     ## Information
-    `step` gives of the pull just made `optimal_action`, the first of the best arms for the
-    features; `expected_reward`, the mean of the arm pulled; `regret`, by how much the best arm's
-    mean is higher, 0 for each of several best ones; and `feedback_due`, always True. `reset` gives
-    nothing.
+    `step` gives, for the pull just made, `optimal_action`, the first of the best arms for the
+    features; `expected_reward`, the mean of the arm pulled; `regret`, the best arm's mean minus
+    that of the arm pulled; and `feedback_due`, always True. `reset` gives nothing.
     `reset` draws a standard normal number for each weight, those of arm 0 first, if they are not
     given. Each step draws one for the reward. Both then draw a uniform number u for each feature,
     which is 2 u - 1 in single precision. Expected rewards are summed from the first feature to the
@@ -53,7 +52,7 @@ class LinearBandit(StochasticBandit):
 
     ## Arguments
     - `arm_parameters=None`: the weights, one row for each arm; None to draw them
-    - `n_arms=None`, `n_features=None`: how many there are; 5, or as `arm_parameters` has it
+    - `n_arms=None`, `n_features=None`: their numbers; 5, or those of `arm_parameters`
     - `reward_std=1`: standard deviation of the rewards
     - `pulls=1000`: the length of an episode
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`

@@ -1,7 +1,7 @@
-"""Logged pulls in a CSV file, and policies tried on them.
+"""Logged pulls in a CSV file, and replay of policies on them.
 
-Each row is one pull, under a header with the columns ``arm``, ``reward`` and, if it is known with
-what probability the arm was chosen, ``propensity``. Every other column is part of the context.
+Each row is one pull, under a header with the columns ``arm``, ``reward`` and, if known,
+``propensity``, the probability that the arm was chosen. All other columns are the context.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from safe_files.files import UnsafeFileError, opened
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
 
 MAX_BYTES = 1 << 30
-# An arm's linear model of the context takes its square in numbers.
+# An arm's linear model of the context needs the square of this in numbers.
 MAX_COLUMNS = 1000
-# Squares of numbers beyond these no longer are numbers, nor are the weights of rarer pulls.
+# Bounds within which squares of numbers, and the weights of rare pulls, stay usable.
 MAX_NUMBER, MIN_PROPENSITY = 1e15, 1e-9
 # Characters of a row; a thousand numbers take a tenth of that.
 MAX_ROW = 1 << 20
@@ -40,12 +40,12 @@ NUMBER = "a finite number of no more than 1e15"
 
 
 class _LogReader:
-    """Reads a file in pieces and keeps numbers: as texts, a large one would take gigabytes."""
+    """Reads a file in pieces as numbers: as text, a large file would take gigabytes."""
 
     def __init__(self, path: Path, file: TextIO) -> None:
         self.path = path
         self.columns: dict[str, Floats] = {}
-        # The values of text, each with a number, where text is all of the context.
+        # The distinct values of text, numbered, if the context is one column of text.
         self.words: dict[str, int] = {}
         self.codes: list[Ints] = []  # the number of each row's text, in pieces
         self._file = file
@@ -91,7 +91,7 @@ class _LogReader:
             yield line
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
-        """The header, and each row below it, which has as many cells; each with its line."""
+        """The header and each row below it, of as many cells, each with its line number."""
         n_cells = None
         for row in self._reader:
             self._room = MAX_ROW
@@ -118,7 +118,7 @@ class _LogReader:
     def _mistake(
         self, name: str, lines: list[int], texts: tuple[str, ...], values: Floats
     ) -> ValueError | None:
-        """The first number that is not valid, or not of a size to reckon with."""
+        """The error for the first number that is invalid or too large; None without one."""
         wanted, valid = _WANTED.get(name, _CONTEXT)
         wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
         if not len(wrong):
@@ -156,7 +156,7 @@ def _is_propensity(values: Floats) -> Bools:
     return (values >= MIN_PROPENSITY) & (values <= 1)
 
 
-# What a column must hold: in words, and of numbers.
+# The valid values of a column: in words, and as a check of numbers.
 _CONTEXT = f"{NUMBER}: text can only be all of the context", np.isfinite
 _WANTED: Mapping[str, tuple[str, Callable[[Floats], Bools]]] = {
     ARM: (f"a whole number from 0 to {MAX_ARMS - 1}", _is_arm),
@@ -167,14 +167,14 @@ _WANTED: Mapping[str, tuple[str, Callable[[Floats], Bools]]] = {
 
 @dataclass(frozen=True, eq=False)
 class LoggedData:
-    """Pulls that somebody else made, in the order of the file."""
+    """Logged pulls, in the order of the file."""
 
     source: str  # the file, for messages
     context_names: tuple[str, ...]  # the columns that make up the context, d of them
-    contexts: Floats  # before each pull, shape (n, d); text is given as its place in `categories`
+    contexts: Floats  # before each pull, shape (n, d); text is given as its index in `categories`
     arms: Ints  # shape (n,)
     rewards: Floats  # shape (n,)
-    propensities: Floats | None  # with what probability each was chosen, shape (n,)
+    propensities: Floats | None  # the probability that each arm was chosen, shape (n,)
     categories: tuple[str, ...] | None = None  # the values of a context of text, in order
 
     def __len__(self) -> int:
@@ -200,7 +200,7 @@ class LoggedData:
         return spaces.Box(rounded.min(axis=0), rounded.max(axis=0), dtype=np.float32)
 
     def observations(self, space: spaces.Space[Any]) -> NDArray[Any]:
-        """The contexts as an agent with a certain observation space is shown them.
+        """The contexts as observations in a given observation space.
 
         Shape (n,) for Discrete, (n, d) for a Box; a ValueError if they do not fit.
         """
@@ -240,7 +240,7 @@ def read_log(path: str | Path) -> LoggedData:
         path: a CSV file, separated by commas, with a header; see the module.
 
     Raises:
-        ValueError: if it cannot be read, a column is missing or there twice, a row is too short or
+        ValueError: if it cannot be read, a column is missing or duplicated, a row is too short or
             too long, an arm is not a whole number from 0, a number not finite or beyond 1e15, or a
             propensity not from 1e-9 to 1. The message names file and line.
     """
@@ -272,18 +272,18 @@ def read_log(path: str | Path) -> LoggedData:
 
 
 def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -> None:
-    """Pull arms uniformly at random and write what came of it, for `read_log` to read.
+    """Pull arms uniformly at random, and write the log for `read_log`.
 
     Args:
         env: a bandit as `gymnasium.make` returns it; its observations are Discrete, or a Box of
             one axis.
         n: the number of pulls; episodes follow each other where one is too short.
-        seed: of the environment and of the arms.
+        seed: the seed of the environment and of the arms.
         path: the file to write.
     """
     assert isinstance(env.action_space, spaces.Discrete)
     n_arms = int(env.action_space.n)
-    # A stream of its own: the environment draws from that of the seed itself.
+    # A separate stream: the environment uses that of the seed itself.
     arms = np.random.default_rng([seed, 1]).integers(n_arms, size=n).tolist()
     space = env.observation_space
     if isinstance(space, spaces.Discrete):
@@ -303,12 +303,12 @@ def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -
                 context, _ = env.reset()
 
 
-# By what part a propensity may differ from one in so many arms: files round.
+# The relative tolerance between a propensity and 1 / n_arms: files hold rounded numbers.
 TOLERANCE = 0.02
 
 
 class ReplayBandit(Bandit):
-    """Logged pulls, of which those count that chose the same arm.
+    """Replay of logged pulls, of which only those of the same arm count.
 
     ## Description
     What would another policy have earned on the users of a log? If the log chose its arms uniformly
@@ -319,7 +319,7 @@ class ReplayBandit(Bandit):
     reward is estimated by the return divided by `matched_pulls`.
 
     ## Action Space
-    `Discrete(n_arms)`: the arm to pull; there are as many as the propensities say.
+    `Discrete(n_arms)`: the arm to pull; the propensities determine their number.
 
     ## Observation Space
     `Discrete(1)` if the log has no context; `Discrete(n)` if its context is one column of text, or
@@ -341,7 +341,7 @@ class ReplayBandit(Bandit):
     been so in this episode; and `feedback_due`, always True. `reset` gives nothing. The best arm is
     not known, so there is no regret.
 
-    If `matched` is False, the row says nothing, and an agent must not learn from it. The bandit
+    If `matched` is False, the reward is unknown, and an agent must not learn from it. The bandit
     agents skip it. Other agents, such as DQN, learn from the reward of 0. With uniform logging this
     divides their estimate for each arm by `n_arms`, and does not change the order of the arms. No
     random numbers are drawn.
@@ -384,7 +384,7 @@ class ReplayBandit(Bandit):
         self.matched_pulls += matched
         reward = float(self.data.rewards[row]) if matched else 0.0
         before = self.context
-        # After the last row there is no context any more: it stays.
+        # After the last row there is no next context: the context stays.
         self.context = self._contexts[min(self.pulls_done, self.pulls - 1)]
         info = {
             "matched": matched,
@@ -404,7 +404,7 @@ class ReplayBandit(Bandit):
 
 
 def _number_of_arms(data: LoggedData) -> int:
-    """How many arms a uniform log chose from; ValueError if it did not choose so, or says not."""
+    """The number of arms of a uniform log; ValueError if it is not uniform, or does not say."""
     if data.propensities is None:
         raise ValueError(
             f"{data.source} has no column 'propensity': replay needs one, each value the "

@@ -18,10 +18,10 @@ ROWS = ("...........", "##.#.#.#G##")
 STEPS = ((-1, 0), (0, 1), (1, 0), (0, -1))
 SOUTH = 2
 STAY, FORWARD = 0, 1
-# Turns by 0, 90, 180 and 270 degrees to the right that come of turning right, around, left.
+# Probabilities of turning right by 0, 90, 180 and 270 degrees, for turns right, around and left.
 TURNS = ((0.1, 0.7, 0.1, 0.1), (0.1, 0.15, 0.6, 0.15), (0.1, 0.1, 0.1, 0.7))
-# Of a move forward: which way it goes, which way the robot then faces, both by turns, and how
-# likely that is. Else it stays as it is, as where a wall is in the way.
+# Outcomes of a move forward: the direction, the new facing, both by turns, and the probability.
+# Otherwise the robot stays as it is, and also where a wall is in the way.
 MOVES = ((0, 0, 0.8), (1, 1, 0.05), (3, 3, 0.05), (2, 0, 0.025), (2, 2, 0.025))
 SEES_WALL, SEES_NO_WALL = 0.9, 0.95  # where there is one, and where there is none
 N_WALL_READINGS, N_READINGS = 16, 21
@@ -41,9 +41,9 @@ class HallwayEnv(MapEnv):
     The robot faces north, east, south or west. It does not know where it is, and feels only whether
     there are walls in front of it, to its right, behind it and to its left.
 
-    The numbers are those of the file `hallway.POMDP` that the authors have given away, there
-    rounded to six digits. Different are: the episode ends at the goal, where the original begins
-    anew, and the first reading comes before the first action.
+    The probabilities are those of the authors' file `hallway.POMDP`, which rounds them to six
+    digits. Two things differ: the episode ends at the goal, where the original begins anew, and the
+    first reading comes before the first action.
 
     ## Action Space
     `Discrete(5)`: 0 stay, 1 forward, 2 turn right, 3 turn around, 4 turn left. Forward leads
@@ -54,8 +54,8 @@ class HallwayEnv(MapEnv):
     ## Observation Space
     `Discrete(21)`: 0 to 15 the sum of 8 for a wall in front, 4 to the right, 2 behind and 1 to the
     left. A wall is felt with probability .9, and where there is none, one is felt with .05. Facing
-    south above an alcove, the robot sees its sign instead, without error: 16 to 19, the last one
-    that of the goal's. At the goal it sees 20.
+    south above an alcove, the robot sees its sign instead, without error: 16 to 19, where 19 is the
+    goal's alcove. At the goal it sees 20.
 
     ## Rewards
     1 at the goal.

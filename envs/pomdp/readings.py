@@ -1,8 +1,8 @@
-"""Noisy readings of what is hidden, as a part of the state.
+"""Noisy observations (readings) of a hidden state, as a part of the state.
 
-A finite environment says what is observed in each state (`observation_of`). Where a reading is
-drawn, the state holds the last one besides what is hidden. So steps, exact figures and compiled
-training need to know nothing of noise.
+The observation of a finite environment is a function of its state (`observation_of`). Where
+readings are random, the state holds the last one beside the hidden state. So steps, exact figures
+and compiled training need no code for noise.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mdp.transition_model import Floats, Ints, TransitionModel
 class World(NamedTuple):
     """A decision process with readings."""
 
-    model: TransitionModel  # its states are pairs of what is hidden and the last reading
-    hidden: Ints  # what is hidden in each state, shape (S,)
+    model: TransitionModel  # its states are pairs of hidden state and last reading
+    hidden: Ints  # the hidden state in each state, shape (S,)
     reading: Ints  # the last reading in each state, shape (S,)
 
 
@@ -29,9 +29,9 @@ def with_readings(hidden: TransitionModel, first: Floats, later: Floats) -> Worl
 
     Args:
         hidden: the decision process; H states, A actions.
-        first: the chance of each reading in the state in which an episode begins, shape (H, O).
-        later: the chance of each reading after an action that has led to a state, shape (A, H, O).
-            Of an episode's last reading only one is kept, the first that is possible.
+        first: the probability of each reading in a starting state, shape (H, O).
+        later: the probability of each reading after an action that led to a state, shape (A, H, O).
+            Where the episode ends, only the first reading that is possible is kept.
 
     Raises:
         ValueError: if the shapes disagree or chances do not sum to one.
@@ -58,7 +58,7 @@ def with_readings(hidden: TransitionModel, first: Floats, later: Floats) -> Worl
     joint = hidden.prob[..., None] * chances
     shape = (n_hidden, n_actions, n_outcomes * n_readings)
     following = number[hidden.next_state[..., None], np.arange(n_readings)]
-    # What is possible first, in its order, and no more columns than needed.
+    # Possible outcomes first, in their order, and no more columns than needed.
     possible = joint.reshape(shape) > 0
     order = np.argsort(~possible, axis=2, kind="stable")[:, :, : int(possible.sum(axis=2).max())]
 

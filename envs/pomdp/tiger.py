@@ -28,9 +28,9 @@ class TigerEnv(ChainEnv):
     After a door has been opened, the tiger and the reward are put behind the doors anew, and the
     game goes on.
 
-    An agent without memory goes by what it heard last, which is not enough to open a door, so that
-    it can only listen. An agent with memory counts: it opens a door when it has heard the tiger
-    twice more often behind the other one.
+    An agent without memory knows only what it heard last, which is not enough to open a door, so
+    that it can only listen. An agent with memory counts: it opens a door when it has heard the
+    tiger twice more often behind the other one.
 
     ## Action Space
     `Discrete(3)`: 0 listen, 1 open the left door, 2 open the right door.

@@ -1,4 +1,4 @@
-"""A sea to dive through, whose treasure only an agent finds that explores deeply."""
+"""A sea whose treasure only agents find that explore deeply."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class DeepSeaEnv(MapEnv):
     the cost of the rest.
 
     ## Action Space
-    `Discrete(2)`: one is left, the other right, as the cell has it.
+    `Discrete(2)`: one is left, the other right, depending on the cell.
 
     ## Observation Space
     `Discrete(size * size + 1)`: row times `size` plus column, row 0 being at the top; the last
     number is the ground below the lowest row.
 
     ## Rewards
-    - each move to the right, tried: -0.01 / size
+    - each attempted move to the right: -0.01 / size
     - the move to the right in the lower right corner: +1
     - with `deterministic=False`, any move in either lower corner: a standard normal number
 
@@ -54,8 +54,8 @@ class DeepSeaEnv(MapEnv):
     `reset` and `step` give nothing more. Each draws one uniform number; a step whose reward is
     drawn, then a standard normal one.
     The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake. Rewards that are drawn have their means in
-    them, and their variance beside.
+    `initial_state_distrib` as in Gymnasium's FrozenLake. Random rewards are given by their means;
+    the arrays hold their variance too.
 
     ## Arguments
     - `size=10`: number of rows and of columns

@@ -19,7 +19,7 @@ OPEN_ROWS = ("........G", ".........", ".........")
 LOWER_ROWS = (".........", "...S.....")
 BLOCKING = (*OPEN_ROWS, "########.", *LOWER_ROWS), (*OPEN_ROWS, ".########", *LOWER_ROWS)
 SHORTCUT = (*OPEN_ROWS, ".########", *LOWER_ROWS), (*OPEN_ROWS, ".#######.", *LOWER_ROWS)
-# As it is at first, and what becomes of it.
+# Each maze before its change, and after.
 MAZES = {"dyna": (DYNA, DYNA), "blocking": BLOCKING, "shortcut": SHORTCUT}
 MOST_STEPS = 10**12
 
@@ -81,8 +81,8 @@ class DynaMazeEnv(GridWorld):
     ## Information
     `reset` and `step` give `position` (row, column), `bumped` (whether the robot ran into a wall
     or the edge) and `is_success` (whether it stands on the goal).
-    `action_masks()` tells which moves do not run into a wall or the edge; with `slip` it judges the
-    move that is meant.
+    `action_masks()` tells which moves do not run into a wall or the edge; with `slip` it considers
+    the intended move.
     The exact dynamics are available as arrays from `transition_model()`, and as `P` and
     `initial_state_distrib` as in Gymnasium's FrozenLake; with `change_after_steps` they are those
     of the moment.
@@ -152,7 +152,7 @@ class DynaMazeEnv(GridWorld):
         return result
 
     def _change(self, rows: tuple[str, ...]) -> None:
-        """Put another maze in the place of this one, between two steps."""
+        """Replace the maze by another one, between two steps."""
         self._becomes = None
         passable = [letter for letter, tile in self._tiles.items() if not tile.blocked]
         self.map = GridMap.read(rows, self._tiles, passable)

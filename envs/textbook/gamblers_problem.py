@@ -20,13 +20,13 @@ class GamblersProblemEnv(GaugeEnv):
     Sutton and Barto (Reinforcement Learning, 2nd edition), example 4.3: a gambler wins the stake if
     the coin comes up heads, else loses it, and goes on until the capital is 100, or gone. The value
     of a capital is the probability to reach 100. With heads in 40 of 100 throws it is .4 for a
-    capital of 50 and .16 for 25; staking all that may be staked is optimal then, and so is many
-    another policy.
+    capital of 50 and .16 for 25; staking as much as allowed is then optimal, as are many other
+    policies.
 
     ## Action Space
-    `Discrete(goal // 2 + 1)`: the stake. It may be at most the capital, and at most what is missing
-    to the goal, as `action_masks()` says. A larger one is not taken: the capital stays as it is, as
-    with a stake of 0, which may be made.
+    `Discrete(goal // 2 + 1)`: the stake, at most the capital, and at most what is missing to the
+    goal, as `action_masks()` says. A larger stake counts as 0, which is allowed and changes
+    nothing.
 
     ## Observation Space
     `Discrete(goal + 1)`: the capital.
@@ -83,7 +83,7 @@ class GamblersProblemEnv(GaugeEnv):
 
 
 def allowed_stakes(goal: int) -> Bools:
-    """What may be staked at each capital, bool of shape (goal + 1, goal // 2 + 1)."""
+    """The allowed stakes at each capital, bool of shape (goal + 1, goal // 2 + 1)."""
     capital = np.arange(goal + 1)[:, None]
     allowed: Bools = np.arange(goal // 2 + 1) <= np.minimum(capital, goal - capital)
     return allowed

@@ -31,14 +31,14 @@ class JacksCarRentalEnv(GaugeEnv):
 
     ## Description
     Sutton and Barto (Reinforcement Learning, 2nd edition), example 4.2. In the evening Jack moves
-    up to five cars from one place to the other, at 2 dollars each. Next day customers come, as many
-    as Poisson variables say, with means 3 at the first place and 4 at the second; each rents a car
-    for 10 dollars, where there is one. Cars come back likewise, with means 3 and 2, and can be
-    rented the day after. There is room for 20 cars at each place: any more are gone.
+    up to five cars from one place to the other, at 2 dollars each. The next day's numbers of
+    customers are Poisson variables, with means 3 at the first place and 4 at the second; each rents
+    a car for 10 dollars, if there is one. So are the numbers of cars that come back, with means 3
+    and 2; these can be rented the day after. Each place has room for 20 cars: any more are gone.
 
     With `variant="exercise"` (exercise 4.7) one of the cars that are moved from the first place to
-    the second goes for nothing, and a place with more than 10 cars overnight, after moving, costs 4
-    dollars.
+    the second is moved free of charge, and a place with more than 10 cars overnight, after moving,
+    costs 4 dollars.
 
     It is a continuing task, which the book discounts by .9: 20 cars at each place are worth 636.99
     dollars then, and none at either 421.41. (Figure 4.2 reads 612 and 420. With Poisson variables
@@ -48,8 +48,8 @@ class JacksCarRentalEnv(GaugeEnv):
 
     ## Action Space
     `Discrete(11)`: 5 plus the number of cars to move from the first place to the second; below 5
-    cars go the other way. No more go than there are, as `action_masks()` says; where an action asks
-    for more, all go that are there.
+    cars go the other way. `action_masks()` allows no more than are there; an action that asks for
+    more moves all of them.
 
     ## Observation Space
     `Discrete(441)`: 21 times the cars at the first place plus those at the second, in the evening.
@@ -67,8 +67,8 @@ class JacksCarRentalEnv(GaugeEnv):
     `reset` and `step` give nothing more. `reset` draws one uniform number, without effect; a step
     draws four Poisson numbers: requests at the first place and at the second, and returns likewise.
     The dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake: exactly, without cutting the Poisson
-    variables off, since what lies beyond 20 cars comes to the same. Rewards in them are means by
+    `initial_state_distrib` as in Gymnasium's FrozenLake. They are exact: Poisson variables are not
+    cut off, since all numbers beyond a limit have the same effect. Rewards in them are means, given
     the cars of two evenings; the arrays hold their variance too.
 
     ## Arguments
@@ -146,7 +146,7 @@ def poisson(mean: float, most: int) -> Floats:
 
 
 def _day(requests: float, returns: float) -> tuple[Floats, Floats, Floats]:
-    """What a day brings at one place, by the cars in the morning and in the evening, (21, 21).
+    """Outcomes of a day at one place, by the cars in the morning and in the evening, (21, 21).
 
     The probability of the evening, and mean and variance of the cars rented out.
     """

@@ -1,4 +1,4 @@
-"""Two states in which Q-learning takes chance for worth."""
+"""Two states in which Q-learning overestimates values."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ LEFT_END, B, A, RIGHT_END = range(4)
 
 
 class MaximizationBiasEnv(ChainEnv, MaskedFiniteEnv):
-    """To the right nothing, to the left many actions that lose a little and often seem to win.
+    """To the right no reward, to the left many actions that lose a little and often seem to win.
 
     ## Description
     Sutton and Barto (Reinforcement Learning, 2nd edition), example 6.7: an episode begins in A.
-    Right ends it with nothing. Left leads to B, from where each of many actions ends it with a
-    reward that is normally distributed around -0.1. The largest of many estimates is too high, so
+    Right ends it with a reward of 0. Left leads to B, from where each of many actions ends it with
+    a reward that is normally distributed around -0.1. The largest of many estimates is too high, so
     that Q-learning goes left far more often than it should; double Q-learning does not.
 
-    Right is optimal, at 0. An agent that always goes right earns as much whatever it sees, so the
-    score says little here: what counts is how often an agent goes left while it learns.
+    Right is optimal, at 0. Always going right earns as much without any learning, so the score says
+    little here: what counts is how often an agent goes left while it learns.
 
     ## Action Space
     `Discrete(n_actions)`. In A, 0 is left and 1 is right; there `action_masks()` allows these two.

@@ -67,7 +67,7 @@ class RacetrackEnv(MapEnv):
     ## Description
     Sutton and Barto (Reinforcement Learning, 2nd edition), exercise 5.12, on the tracks of figure
     5.5. The car has a place and a velocity, in cells a step, upwards and to the right: each is from
-    0 to 4, and both are 0 on the starting line alone. An action changes each by -1, 0 or 1; with
+    0 to 4, and both are 0 only on the starting line. An action changes each by -1, 0 or 1; with
     probability .1 neither changes, whatever was chosen. A change is left out if it would lead out
     of 0 to 4, or if it would stop the car outside the starting line.
 
@@ -141,9 +141,9 @@ class RacetrackEnv(MapEnv):
 
 
 def crossed_cells(up: int, right: int) -> list[tuple[int, int]]:
-    """The cells that the straight line to one so many rows up and columns right enters, in order.
+    """The cells that a straight line enters, to the cell ``up`` rows up and ``right`` to the right.
 
-    Of each cell, how many rows up and columns to the right it lies.
+    In order; of each cell, how many rows up and columns to the right it lies.
     """
     # The line leaves a row, or a column, halfway between two middles.
     rows = {Fraction(2 * i + 1, 2 * up) for i in range(up)}
@@ -161,7 +161,7 @@ def _cells_of(rows: tuple[str, ...]) -> Ints:
 
 
 def _arrivals(rows: tuple[str, ...]) -> tuple[Ints, Bools]:
-    """Where a car gets from each cell of the track at each velocity, and whether it finishes.
+    """The cell that a car reaches from each cell at each velocity, and whether it finishes.
 
     The number of a cell of the track, or `CRASH`, and the flag, both of shape (cells, 25).
     """
@@ -182,7 +182,7 @@ def _arrivals(rows: tuple[str, ...]) -> tuple[Ints, Bools]:
 
 
 def _new_velocities(is_start: Bools) -> Ints:
-    """The velocity that an action makes of each one, by cell, shape (cells, 25, 9)."""
+    """The velocity after each action, by cell and velocity, shape (cells, 25, 9)."""
     velocity, action = np.arange(N_SPEEDS**2)[:, None], np.arange(9)
     parts = []
     for part, change in zip(np.divmod(velocity, N_SPEEDS), np.divmod(action, 3), strict=True):

@@ -1,4 +1,4 @@
-"""The random walk, on which methods that estimate values are compared."""
+"""The random walk, for comparing methods that estimate values."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class RandomWalkEnv(ChainEnv):
     Each step goes to one of the neighbours, to both with equal probability, until it leaves the row
     at either end. Ending on the right earns 1, so the value of state i is i / 6.
 
-    There is nothing to choose: with its one action an agent does not control, it predicts.
-    Q-learning is TD(0) here, and all agents earn the same.
+    There is only one action, so an agent does not control, it predicts. Q-learning is TD(0) here,
+    and all agents earn the same.
 
     - Example 7.1: `n_states=19, left_reward=-1`; the value of state i is (i - 10) / 10.
     - Example 9.1: `n_states=1000, max_jump=100, left_reward=-1`: a step jumps to any of the 100
-      states on either side; what would jump beyond an end, ends there.
+      states on either side; a jump beyond an end terminates there.
 
     ## Action Space
     `Discrete(1)`: 0 takes a step.

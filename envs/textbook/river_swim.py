@@ -1,4 +1,4 @@
-"""A river to swim up: the reward is far, the current strong, and a little something lies near."""
+"""A river to swim up: a large reward is far up a strong current, a small one near."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class RiverSwimEnv(ChainEnv):
     reinforcement learning via posterior sampling", 2013): six states in a row. Swimming left
     always succeeds. Swimming right moves up by one with probability .35 and down by one with .05,
     else it stays; in the leftmost state it moves up with .6, and in the rightmost one it stays with
-    .6 and moves down with .4. Agents that do not look for it never see the large reward.
+    .6 and moves down with .4. Agents that explore too little never see the large reward.
 
     Always swimming right is optimal in the long run: it earns .4286 a step, always swimming left
-    .005. Since that is one action throughout, the score says little here: look at the gap.
+    .005. Since a constant action is optimal, the score says little here: look at the gap.
 
     ## Action Space
     `Discrete(2)`: 0 left, with the current; 1 right, against it.

@@ -18,7 +18,7 @@ GOAL = 3
 
 
 class ShortCorridorEnv(ChainEnv):
-    """A corridor that only random actions can leave: always the same action leads nowhere.
+    """A corridor that only random actions can leave: repeating one action leads nowhere.
 
     ## Description
     Sutton and Barto (Reinforcement Learning, 2nd edition), example 13.1: three states in a row, and
@@ -28,8 +28,8 @@ class ShortCorridorEnv(ChainEnv):
     goal. Going right with probability p takes (4 - 2 p) / (p (1 - p)) steps on average: 82 for .05,
     44 for .95, and at best 11.66, for p = 2 - sqrt(2), or .59.
 
-    The score's 1 is -11.66 for an agent without memory. With memory, as for one that sees the
-    states, it is -3. Greedy evaluations say nothing of agents without memory here, because they
+    A score of 1 is a return of -11.66 for agents without memory. With memory, or for agents that
+    see the states, it is -3. Greedy evaluations say nothing about agents without memory here: they
     always take the more probable action.
 
     ## Action Space
@@ -71,7 +71,7 @@ class ShortCorridorEnv(ChainEnv):
         return _model()
 
     def observation_of(self, states: Any) -> NDArray[Any]:
-        """The same in all states."""
+        """Always 0: all states look alike."""
         return np.zeros_like(states)
 
     def letters(self) -> str:

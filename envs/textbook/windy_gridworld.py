@@ -102,7 +102,7 @@ class WindyGridworldEnv(MapEnv):
 
     @property
     def steps(self) -> tuple[tuple[int, int], ...]:
-        """What each action tries: rows down, columns to the right."""
+        """The intended move of each action: rows down, columns to the right."""
         return STEPS[self.moves]
 
     def transition_model(self) -> TransitionModel:

@@ -220,7 +220,7 @@ def test_a_script_of_ones_own(type_audit, tmp_path):
     code, out, err = type_audit(*words)
     assert (code, err) == (1, "")
     assert "an episode that is cut off          FAULT\n" in out
-    assert "\nfault: no-bootstrap-at-truncation. An episode that is cut off is taken to " in out
+    assert "\nfault: no-bootstrap-at-truncation. A truncated episode is treated as " in out
     assert "right would be: 5 in both" in " ".join(out.split())
     found = json.loads((tmp_path / "out.json").read_text())
     assert (found["verdict"], found["fault"]) == ("fault", "no-bootstrap-at-truncation")

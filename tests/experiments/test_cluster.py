@@ -466,7 +466,7 @@ SLURM = ("munged", "slurmctld", "slurmd", "sbatch", "scancel", "scontrol", "sque
 
 @pytest.mark.skipif(not all(map(shutil.which, SLURM)), reason="apt-get install slurm-wlm munge")
 def test_a_study_by_the_real_slurm_is_that_of_this_machine():
-    words = ["--runs", "4", "--faults", "scancel", "requeue", "--cancellations", "0"]
+    words = ["--runs", "4", "--faults", "scancel", "requeue"]
     done = subprocess.run(
         [sys.executable, str(ROOT / "benchmarks/slurm.py"), *words],
         # Which a server of processes in this one has set for what it forks.

@@ -8,9 +8,6 @@ For changes that shall change nothing: whatever differs is told in one line, and
 All is done through command lines, the names in the registry and the formats of files. So the same
 program looks at commits before and after modules have moved. ``--only 'train Taxi*' 'help *'``
 looks at a part.
-
-What was changed on purpose is written into dropped.yml with its reason, until it is recorded anew;
-an entry there that has not changed is told too.
 """
 
 from __future__ import annotations
@@ -29,11 +26,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-GOLDEN, DROPPED = HERE / "golden.json", HERE / "dropped.yml"
+GOLDEN = HERE / "golden.json"
 LIBRARIES = (
     *("gymnasium", "mabwiser", "matplotlib", "numba", "numpy", "optuna", "sb3-contrib", "scipy"),
     *("stable-baselines3", "torch"),
@@ -53,8 +48,7 @@ def main() -> int:
         record(found, arguments.only)
         return 0
     recorded = json.loads(GOLDEN.read_text(encoding="utf-8"))
-    dropped = yaml.safe_load(DROPPED.read_text(encoding="utf-8")) or {}
-    lines = list(differences(recorded, found, dropped, arguments.only))
+    lines = list(differences(recorded, found, arguments.only))
     print(*lines or ["no difference"], sep="\n")
     return int(any(not line.startswith(NOT_HERE) for line in lines))
 
@@ -131,9 +125,7 @@ def matches(name: str, patterns: list[str]) -> bool:
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def differences(
-    recorded: dict[str, Any], found: Found, dropped: dict[str, str], patterns: list[str]
-) -> Iterator[str]:
+def differences(recorded: dict[str, Any], found: Found, patterns: list[str]) -> Iterator[str]:
     """A line for each difference, and for each thing that cannot be compared here."""
     here = facts()
     changed_facts = [name for name, value in recorded["facts"].items() if here[name] != value]
@@ -147,19 +139,13 @@ def differences(
             lines = list(changes(name, was, left.pop(name, None)))
             if blocked[where] and lines:
                 skipped += 1
-            elif name in dropped:
-                if not lines:
-                    yield f"{name}: is in {DROPPED.name}, and has not changed"
             else:
                 yield from lines
         if skipped:
             names = ", ".join(f"{n} {recorded['facts'][n]}, here {here[n]}" for n in changed_facts)
             yield f"{NOT_HERE}{skipped} entries that depend on {names}"
-    for name in sorted(left.keys() - dropped.keys()):
+    for name in sorted(left):
         yield f"{name}: is new; {sys.executable} tests/golden --record --only {name!r}"
-    known = {name for entries in recorded["entries"].values() for name in entries} | left.keys()
-    for name in sorted(dropped.keys() - known):
-        yield f"{name}: is in {DROPPED.name}, and there is no such entry"
 
 
 def changes(name: str, was: Any, now: Any) -> Iterator[str]:

@@ -19,7 +19,6 @@ import tomllib
 import zipfile
 from collections.abc import Iterator
 from functools import partial
-from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -222,14 +221,13 @@ def things(root: Path, folder: Path) -> Iterator[Thing]:
     for line in AFTERWARDS:
         yield Thing(f"then {line}", "here", lambda typed=line: commands.typed(typed).lines(), "run")
     yield Thing("pack lake.zip", "here", lambda: pack(folder / "lake.zip"), "then")
-    yield Thing("page lake.html", "here", lambda: page(folder / "lake.html"), "then")
     for line in wrong["commands"]:
         needs = "run" if "logs/" in line or line.startswith("enjoy") else ""
         look = partial(lambda typed: commands.typed(typed).words(), line)
         yield Thing(f"wrong {line}", "python", look, needs)
     for name, line in STUDIES.items():
         yield Thing(f"study {name}", "here", lambda typed=line: commands.started(typed).lines())
-        for file in ("summary.csv", "verdicts.md", "verdicts.tex", "study.yml", "report.html"):
+        for file in ("summary.csv", "verdicts.md", "verdicts.tex", "study.yml"):
             look = partial(written, root, folder / "studies" / name / file)
             yield Thing(f"study {name} {file}", "here", look, f"study {name}")
     yield Thing("search", "here", lambda: commands.started(SEARCH).lines())
@@ -302,57 +300,9 @@ def written(root: Path, path: Path) -> list[str]:
     """What a study has written into a file; nothing if there is none."""
     if not path.is_file():
         return ["no such file"]
-    if path.suffix == ".html":
-        return [line.replace(f"{root}/", "") for line in page(path)]
     text = path.read_text(encoding="utf-8").replace(f"{root}/", "")
     if path.suffix == ".csv":
         rows = list(csv.DictReader(io.StringIO(text)))
         timeless = [key for key in rows[0] if "seconds" not in key]
         return [",".join(rows[0]), *(",".join(row[key] for key in timeless) for row in rows)]
     return readable(text, indented=True)
-
-
-class _Text(HTMLParser):
-    """Collects the texts of a page that a reader sees or hears, but for columns of times."""
-
-    HIDDEN = ("script", "style", "svg")
-    TIMES = "CPU time"
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[str] = []
-        self._depth = 0
-        self._column = 0
-        self._times: set[int] = set()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self._depth += tag in self.HIDDEN
-        if tag == "table":
-            self._times.clear()
-        elif tag == "tr":
-            self._column = 0
-        elif tag in ("th", "td"):
-            self._column += 1
-        read_out = (value for key, value in attrs if key in ("alt", "aria-label", "title"))
-        self.lines.extend(f"{tag}: {value}" for value in read_out if value)
-
-    def handle_endtag(self, tag: str) -> None:
-        self._depth -= tag in self.HIDDEN
-        if tag == "table":
-            self._times.clear()
-
-    def handle_data(self, data: str) -> None:
-        text = " ".join(data.split())
-        if text == self.TIMES:
-            self._times.add(self._column)
-        elif self._column in self._times:
-            return
-        if not self._depth:
-            self.lines.append(text)
-
-
-def page(path: Path) -> list[str]:
-    """The text of a page."""
-    reader = _Text()
-    reader.feed(path.read_text(encoding="utf-8"))
-    return readable("\n".join(reader.lines))

@@ -1,10 +1,10 @@
-"""Make deliberate errors in a package, one at a time, and see whether its tests notice.
+"""Make deliberate errors in a package, one at a time, and see whether the tests notice.
 
     make mutants PACKAGE=mdp N=25
 
-The tests that enter the function are tried first, cheap ones before others, for a limited time:
-what survives may be caught by a test that there was no time for. mutmut and cosmic-ray do not know
-that Numba's cache brings back the machine code from before the error.
+The tests that enter the function are tried first, whatever folder they are in, cheap ones before
+others, for a limited time: what survives may be caught by a test that there was no time for. mutmut
+and cosmic-ray do not know that Numba's cache brings back the machine code from before the error.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from collections import defaultdict
 from itertools import accumulate
 from pathlib import Path
 
+import hypothesis  # noqa: F401  # pytest's plugin imports it, in every child that has not
 import pytest
 from drawing import Mutant, drawn
 from quick import chosen, weights
@@ -33,9 +34,10 @@ from quick import chosen, weights
 NOT_COPIED = shutil.ignore_patterns(".*", "logs", "runs", "build", "__pycache__")
 LIBRARIES = "torch._dynamo scipy.stats pandas matplotlib.pyplot gymnasium stable_baselines3 numba"
 OPTIONS = ["-q", "-n", "0", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
+OPTIONS += ["-W", "ignore:Module already imported"]  # before the fork
 # Seconds of processor time after which no further test begins, and more where all is compiled anew.
 # The first round has tests of FIRST seconds. So much after the budget the test that runs hangs.
-BUDGET, COMPILING, FIRST, HANG = 10, 15, 3, 40
+BUDGET, COMPILING, FIRST, HANG = 10, 30, 3, 40
 
 
 class Observer:
@@ -74,28 +76,36 @@ def processor_time() -> float:
 
 
 class Copy:
-    """A copy of a checkout, and which functions each test of one package enters in it."""
+    """A copy of a checkout, and which functions each test enters in it."""
 
-    def __init__(self, root: Path, package: str) -> None:
+    def __init__(self, root: Path) -> None:
         self.place = root / "build" / "mutants"
         self.path, self.report = self.place / "copy", self.place / "report"
         shutil.rmtree(self.path, ignore_errors=True)
         shutil.copytree(root, self.path, ignore=NOT_COPIED)
-        folders = [file.parent for file in sorted(self.path.glob("*/__init__.py"))]
-        folders.append(self.path / "tests" / package)
-        text = b"\0".join(p.read_bytes() for f in folders for p in sorted(f.rglob("*.py")))
-        results = self.place / f"{package}.{hashlib.sha256(text).hexdigest()[:16]}"
-        if not results.exists():
-            for old in self.place.glob(f"{package}.*"):
-                old.unlink()
-            self.run([f"tests/{package}"], trace=True)
-            self.report.rename(results)
-        found = [json.loads(line) for line in results.read_text().splitlines()]
-        self.broken = [test for test, passed, *_ in found if not passed]
-        self.costs = {test: cost for test, passed, cost, _ in found if passed}
-        assert self.costs, f"without any error no test passes: {self.place / 'log'}"
+        sources = [file.parent for file in sorted(self.path.glob("*/__init__.py"))]
+        self.broken: list[str] = []
+        self.costs: dict[str, float] = {}
         self.entering: dict[str, set[str]] = defaultdict(set)
-        for test, _, _, functions in found:
+        for folder in sorted({file.parent for file in self.path.glob("tests/*/test_*.py")}):
+            self._watch(folder, [*sources, folder])
+        assert self.costs, f"without any error no test passes: {self.place / 'log'}"
+
+    def _watch(self, folder: Path, sources: list[Path]) -> None:
+        """Run the tests of a folder, or take what they did when the same sources were watched."""
+        text = b"\0".join(p.read_bytes() for f in sources for p in sorted(f.rglob("*.py")))
+        results = self.place / f"{folder.name}.{hashlib.sha256(text).hexdigest()[:16]}"
+        if not results.exists():
+            for old in self.place.glob(f"{folder.name}.*"):
+                old.unlink()
+            self.run([f"tests/{folder.name}"], trace=True)
+            self.report.rename(results)
+        for line in results.read_text().splitlines():
+            test, passed, cost, functions = json.loads(line)
+            if not passed:
+                self.broken.append(test)
+                continue
+            self.costs[test] = cost
             for function in functions:
                 self.entering[function].add(test)
 
@@ -205,17 +215,14 @@ class Copy:
         return sorted(self.costs, key=rank), not covering
 
 
-def choose_quick(root: Path, seconds: float) -> None:
-    """Watch all tests, and write the names of those of daily work to ``tests/quick.txt``."""
+def choose_quick(root: Path, copy: Copy, seconds: float) -> None:
+    """Write the names of those of daily work to ``tests/quick.txt``."""
     costs, entered = defaultdict(float), defaultdict(set)
-    for folder in sorted({file.parent.name for file in root.glob("tests/*/test_*.py")}):
-        copy = Copy(root, folder)
-        for test, cost in copy.costs.items():
-            costs[test.partition("[")[0]] += cost
-        for place, tests in copy.entering.items():
-            for test in tests:
-                entered[test.partition("[")[0]].add(place)
-        print(f"{folder}: {len(copy.costs)} tests", flush=True)
+    for test, cost in copy.costs.items():
+        costs[test.partition("[")[0]] += cost
+    for place, tests in copy.entering.items():
+        for test in tests:
+            entered[test.partition("[")[0]].add(place)
     names = chosen(costs, entered, weights(root), seconds)
     (root / "tests" / "quick.txt").write_text("\n".join(sorted(names)) + "\n")
     print(f"{len(names)} test functions, {sum(costs[name] for name in names):.0f} s")
@@ -239,12 +246,12 @@ def main() -> None:
     for name in LIBRARIES.split() if (root / "constraints.txt").exists() else ():
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
+    copy = Copy(root)
     if args.choose_quick:
-        choose_quick(root, args.choose_quick)
+        choose_quick(root, copy, args.choose_quick)
+    for test in copy.broken:
+        print(f"left out, as it fails without any error: {test}", file=sys.stderr)
     for package in args.packages:
-        copy = Copy(root, package)
-        for test in copy.broken:
-            print(f"left out, as it fails without any error: {test}", file=sys.stderr)
         known = {Mutant(*m): fate for *m, fate in replayed if m[0].startswith(f"{package}/")}
         mutants = known if args.replay else drawn(root, package, args.n, args.seed)
         for mutant in mutants:
