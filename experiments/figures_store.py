@@ -333,7 +333,7 @@ class FigureStore:
         return found
 
     def add(self, planned: PlannedRun, found: RunResults | None) -> bool:
-        """Queue a finished run for storing, which removes its folder; returns whether it fits."""
+        """Queue a finished run to be stored instead of its folder; returns whether it is queued."""
         with suppress(DamagedFileError, OSError):  # damage is reported when all runs are read
             planned = planned.read()
             stays = planned.seed == self.first_seed

@@ -149,8 +149,8 @@ class StudySpec:
     #: Whether runs of different agents with the same seed share their randomness, as on bandits
     #: whose arms and rewards are drawn by the seed; if so, they are compared seed by seed.
     shared_randomness: bool = False
-    #: Return that counts as solved; None for the point at 95 % of that gap if it is known, else for
-    #: the environment's registered threshold.
+    #: Return that counts as solved; None for the point at 95 % of that gap if the optimum is exact,
+    #: else for the environment's registered threshold.
     threshold: float | None = None
     #: Episodes per row in the table of training returns; 0 for no table.
     episodes_table: int = 0

@@ -11,7 +11,7 @@ optima; ``hardness``, with several ids, for a table of their hardness; ``agents`
 ``agents-by-spaces`` for tables of agents; ``flags``, with the name of a command; ``trainings`` for
 a table of commands with their results; ``reference``, with a module and optional names in it, for
 their docstrings below a heading; ``measured`` for a linked file that a benchmark has published;
-``timings`` for such a file of `benchmarks/timing.py`.
+``timings``, the same for a file of `benchmarks/timing.py`.
 """
 
 from __future__ import annotations
