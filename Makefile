@@ -1,5 +1,5 @@
-# Every target sets up .venv once, again when pyproject.toml changes, and anew when the pins do: pip
-# leaves what is no longer pinned.
+# Every target makes .venv if it is missing, updates it if pyproject.toml has changed, and makes it
+# anew if the pins have changed, because pip keeps packages that are no longer pinned.
 PYTHON ?= python3
 ARGS ?=
 PYTEST_ARGS ?= -n auto --maxprocesses 8 --dist worksteal
@@ -7,13 +7,13 @@ PACKAGE ?= mdp
 N ?= 25
 SEED ?= 0
 
-# What is installed, and has to work on systems other than this one.
+# The installed packages, which have to work on other systems too.
 PACKAGES := safe_files machine_code mdp verdicts envs agents pipeline diagnosis experiments tuning report commands
 
 BIN := .venv/bin
 STAMP := .venv/.installed
 PINS := constraints.txt requirements.txt
-# One thread per process: more of them slow networks this small down, and tests run side by side.
+# One thread per process: small networks are slower with more, and tests run in parallel.
 export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
@@ -24,24 +24,24 @@ help: ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
 	  awk -F'|' '{ printf "%-12s %s\n", $$1, $$2 }'
 
-train: $(STAMP) ## Train PPO on the warehouse, or what ARGS="--env ... --algo ..." says
+train: $(STAMP) ## Train PPO on the warehouse, or as in ARGS="--env ... --algo ..."
 	$(BIN)/python train.py $(if $(strip $(ARGS)),$(ARGS),--env Warehouse-v0 --algo ppo)
 
 test: peers ## Run the whole test suite; PYTEST_ARGS replaces its options
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-golden: $(STAMP) ## Tell what is produced differently than tests/golden/golden.json says; ARGS="--record"
+golden: $(STAMP) ## Compare results with tests/golden/golden.json; ARGS="--record" replaces it
 	$(BIN)/python tests/golden $(ARGS)
 
 size: $(STAMP) ## Count lines and files against the limits in CONTRIBUTING.md
 	@$(BIN)/python docs/scripts/sizes.py
 
-peers: $(STAMP) ## Set up rl_zoo3, which tests need, in .venv/peers
+peers: $(STAMP) ## Install rl_zoo3, which tests need, in .venv/peers
 	@$(BIN)/python tests/peers/peer_environment.py
 
 lint: style types types-elsewhere ## Check style, formatting, types and import contracts
 
-# Apart, so that make -j2 has both halves of what takes long done at once.
+# Separate targets, so that make -j2 runs them in parallel.
 style: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff check --preview --select PLW1514 $(PACKAGES) # Windows does not take text for UTF-8
@@ -54,7 +54,7 @@ types: $(STAMP)
 types-elsewhere: $(STAMP)
 	$(BIN)/python -m mypy --platform win32 --no-warn-unreachable --cache-dir .mypy_cache/win32 $(PACKAGES)
 
-format: $(STAMP) ## Format the code and mend what ruff can mend
+format: $(STAMP) ## Format the code, and apply ruff's fixes
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
@@ -64,16 +64,16 @@ bench: peers ## Time everything, with one round
 mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0
 	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED)
 
-docs: $(STAMP) ## Make the site of all pages, build/site/index.html, and check its links
+docs: $(STAMP) ## Build the site, build/site/index.html, and check its links
 	rm -rf build/site
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/site
 	$(BIN)/python docs/scripts/check_links.py build/site
 
-images: $(STAMP) ## Draw the pictures of README and docs anew; needs Chromium for one of them
+images: $(STAMP) ## Redraw the pictures of README and docs; one needs Chromium
 	$(BIN)/python docs/scripts/draw_images.py
 	$(BIN)/python docs/images/bandits.py
 
-wheel: $(STAMP) ## Build dist/, install the wheel in an environment of its own, and try it
+wheel: $(STAMP) ## Build dist/, install the wheel in a new environment, and test it
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist .
 	PYTHON=$(BIN)/python .ci/try-wheel dist/*.whl
@@ -82,7 +82,7 @@ clean: ## Remove caches and builds; .venv and logs/ stay
 	rm -rf build dist *.egg-info .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamp is written last, so a set-up that failed half-way is taken up again.
+# The stamp is written last, so a failed set-up is repeated.
 $(STAMP): pyproject.toml $(PINS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 	  { echo "Yardstick needs Python 3.11 or newer; $(PYTHON) is not. Name one: make PYTHON=python3.12" >&2; exit 1; }

@@ -3,7 +3,7 @@
 try:
     from commands.cli import run_command
     from commands.compare import main
-except KeyboardInterrupt:  # before there is anything to be stopped
+except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Watch a trained agent: ``python enjoy.py --env Warehouse-v0 --algo ppo``."""
+"""Play a trained agent: ``python enjoy.py --env Warehouse-v0 --algo ppo``."""
 
 try:
     from commands.cli import run_command
     from commands.enjoy import main
-except KeyboardInterrupt:  # before there is anything to be stopped
+except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Explain an agent: ``python explain.py --env Warehouse-v0 --algo ppo``."""
+"""Explain an agent's gap to the optimum: ``python explain.py --env Warehouse-v0 --algo ppo``."""
 
 try:
     from commands.cli import run_command
     from commands.explain import main
-except KeyboardInterrupt:  # before there is anything to be stopped
+except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Say what other rewards cost: ``python shaping.py --env Warehouse-v0 --algo ppo``."""
+"""Check changed rewards in training: ``python shaping.py --env Warehouse-v0 --algo ppo``."""
 
 try:
     from commands.cli import run_command
     from commands.shaping import main
-except KeyboardInterrupt:  # before there is anything to be stopped
+except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 
 if __name__ == "__main__":

@@ -63,13 +63,13 @@ from verdicts import (
 # The metrics on the scale of the best random or constant policy.
 ON_THE_SCALE = ("final", "best")
 
-# The module of agents whose policies do not depend on experience.
+# Prefixes of the entry points of agents that do not learn.
 FIXED_POLICIES = ("agents.planning:", "agents.reference:")
 
 
 def agents_without_chance(results: StudyResults, table: pd.DataFrame) -> frozenset[str]:
     """The agents that do not learn, if policies are evaluated exactly: all their runs are equal."""
-    if not (table["exact"] == True).all():  # noqa: E712  # None is no False here
+    if not (table["exact"] == True).all():  # noqa: E712  # None is neither True nor False
         return frozenset()
     return frozenset(
         agent.label
@@ -86,10 +86,10 @@ def failures(
     level: float,
     certain: Collection[str],
 ) -> dict[str, FailureCount]:
-    """Failed runs by agent that depends on chance: less than half as far as the best agent.
+    """Count the failed runs of each agent that depends on chance.
 
-    Both distances count from the baseline. The bounds of all agents hold simultaneously. Empty if
-    the baseline is not known.
+    A run fails if its score is less than half as far above the baseline as the best agent's median.
+    The bounds of all agents hold simultaneously. Empty if the metric has no known baseline.
     """
     by_chance = {name: values for name, values in scores.items() if name not in certain}
     if metric not in ON_THE_SCALE or baseline is None or not by_chance:
@@ -108,7 +108,7 @@ def failures(
 def speeds(
     results: StudyResults, environment: str, agents: Sequence[str], level: float
 ) -> tuple[SpeedComparison, ...]:
-    """Compares how soon agents reach the threshold for good."""
+    """Compare how soon the agents reach the threshold and stay above it."""
     curves = results.curves
     chosen = (curves["environment"] == environment) & (curves["kind"] == "evaluation")
     spans = [
@@ -141,20 +141,20 @@ class Evidence:
     #: By agent, higher is better, shape (n_seeds,): NaN for a missing run.
     scores: Mapping[str, Floats]
     seeds: Mapping[str, int]  #: by agent, the planned number of seeds
-    #: The highest expected return of any policy, or the upper end of its bracket; or None.
+    #: The highest expected return of any policy, or an upper bound of it; None if unknown.
     optimum: float | None
-    optimum_at_least: float | None  #: the lower end of that bracket; None without a bracket
-    baseline: float | None  #: that of the best random or constant policy, or None
+    optimum_at_least: float | None  #: a lower bound of the optimum; None if it is exact or unknown
+    baseline: float | None  #: expected return of the best random or constant policy, or None
     threshold: float | None  #: the return that counts as solved, or None
     margin: float  #: the difference within which agents count as equivalent
     certain: frozenset[str]  #: the agents that do not depend on chance
-    #: The range in which means are judged: from the best random or constant policy to the optimum,
-    #: if the verdicts use this scale and it is known; else a range beyond all runs.
+    #: The range in which means are judged: from the baseline to the optimum, if the metric is on
+    #: this scale and both are known; else a range that contains all runs.
     ends: Ends
     is_score: bool  #: whether these ends define the score
     paired: bool  #: whether runs of one seed share their randomness
-    n_environments: int  #: of the study, which share its error rate
-    against: str = ""  #: the only agent whose mean the others are compared with
+    n_environments: int  #: number of environments of the study, which share its error rate
+    against: str = ""  #: the only agent to compare the others with; empty for all pairs
 
     def share(self, level: float) -> float:
         """This environment's share of a look's error rate."""
@@ -222,7 +222,7 @@ def _first(table: pd.DataFrame, column: str) -> float | None:
 def bounded_mean(values: Floats, ends: Ends, *, exact: bool = False) -> Estimate:
     """The mean of scores or returns, with an interval valid for every distribution in a range.
 
-    If a run lies outside the range, further runs may lie anywhere: then there is no interval.
+    There is no interval if a run lies outside the range, because then the range is wrong.
     """
     known = values[np.isfinite(values)]
     n_missing = len(values) - len(known)
@@ -324,7 +324,7 @@ def _improvement(scores: Mapping[str, Floats]) -> dict[tuple[str, str], Estimate
 def not_behind(names: Sequence[str], pairs: Sequence[PairComparison]) -> list[str]:
     """The agents to which no other agent is shown to be superior, without a condition.
 
-    Each other agent is behind one of these.
+    Every other agent is shown to be behind some agent.
     """
     behind = {
         p.second if p.verdict == "better" else p.first
@@ -354,8 +354,8 @@ class AgentAnalysis:
 
     agent: str  #: its label
     algo: str  #: its name in the table of agents
-    judged: Estimate  #: its mean score in the range in which means are judged
-    spread: float  #: the standard deviation of these scores over runs, or else of the metric
+    judged: Estimate  #: its mean, scaled so that the ``ends`` of the environment are 0 and 1
+    spread: float  #: standard deviation over runs of these scores; without a scale, of the metric
     n_runs: int  #: finished runs
     n_missing: int  #: unfinished runs
     metric: Summary  #: estimates of the metric of the verdicts, over seeds
@@ -366,9 +366,9 @@ class AgentAnalysis:
     area: Estimate  #: mean return over the learning curve
     last_episodes: Estimate  #: mean return of the last training episodes
     regret: Estimate  #: on bandits, the sum over all pulls; else NaN
-    #: When the learning curve first reached the threshold; None without one.
+    #: Steps until the learning curve first reached the threshold; None without a threshold.
     steps_to_threshold: ThresholdSummary | None
-    episodes_to_stay: ThresholdSummary | None  #: likewise
+    episodes_to_stay: ThresholdSummary | None  #: episodes until it reached the threshold for good
     success_rate: Estimate | None  #: of the final policy; None if not reported
     #: Processor time of training; nan for runs of older versions, which did not measure it.
     seconds: Estimate
@@ -377,12 +377,12 @@ class AgentAnalysis:
     on_variant: bool = False
     #: Training's changes of the environment in words, as the runs recorded them.
     changes: tuple[str, ...] = ()
-    #: When it reached the threshold for good; likewise.
+    #: Steps until the learning curve reached the threshold for good; None without a threshold.
     steps_to_stay: ThresholdSummary | None = None
-    #: Exact returns of the policy that it acts by in training, and what that is; None if unknown.
+    #: Exact return of the policy that acts in training, None if unknown, and its description.
     stochastic: Estimate | None = None
     acts_by: str = ""
-    #: Exact returns of the final policy under the agent's discount, and the highest one under it.
+    #: Exact discounted return of the final policy, the agent's discount, and the optimum under it.
     discounted: Estimate | None = None
     discount: float | None = None
     discounted_optimum: float | None = None
@@ -399,9 +399,9 @@ class EnvironmentAnalysis:
 
     environment: str  #: its label
     env_id: str  #: its Gymnasium id
-    #: The highest expected return of any policy, or the upper end of its bracket; or None.
+    #: The highest expected return of any policy, or an upper bound of it; None if unknown.
     optimum: float | None
-    baseline: float | None  #: that of the best random or constant policy, or None
+    baseline: float | None  #: expected return of the best random or constant policy, or None
     threshold: float | None  #: the return that counts as solved, or None
     margin: float  #: the difference within which agents count as equivalent
     exact: bool  #: whether all final returns are exact expectations, not means of episodes
@@ -419,20 +419,20 @@ class EnvironmentAnalysis:
     #: By agent, its planned number of seeds.
     seeds: Mapping[str, int] = field(default_factory=dict)
     look: Standing = field(default_factory=Standing)  #: the look at these runs
-    #: The lower end of the optimum's bracket; None without a bracket.
+    #: A lower bound of the optimum; None if ``optimum`` is exact or unknown.
     optimum_at_least: float | None = None
-    optimum_is_proven: bool = True  #: whether the upper end of that bracket is proven
-    #: Where observations hide the state, the optimum of agents that see it; else None.
+    optimum_is_proven: bool = True  #: whether the upper bound is proven
+    #: In a partially observable environment, the optimum of agents that see the state; else None.
     full_optimum: float | None = None
-    #: Then what agents go by whose optimum is the scale: ``observation`` or ``memory``.
+    #: There, the input of the policies whose optimum is the scale: ``observation`` or ``memory``.
     measured_by: str | None = None
     #: The optima by agent, if agents play environments with different optima; else empty.
     optima: Mapping[str, float] = field(default_factory=dict)
-    advice: tuple[str, ...] = ()  #: sentences on runs that failed, see `experiments.analysis`
+    advice: tuple[str, ...] = ()  #: sentences on failed runs, see `with_advice`
     ends: Ends = UNIT  #: the range in which means are judged
     is_score: bool = True  #: whether these ends define the score
     is_same: bool = False  #: whether all runs of all agents have the same figure
-    #: The agents whose final returns exceed the upper bound of all policies by six standard errors.
+    #: The agents whose mean final return exceeds the upper bound by more than six standard errors.
     impossible: tuple[str, ...] = ()
 
     @property
@@ -507,7 +507,7 @@ def _analyse_environment(
         baseline=evidence.baseline,
         threshold=evidence.threshold,
         margin=evidence.margin,
-        exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is no False here
+        exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is neither True nor False
         agents=tuple(agents),
         pairs=tuple(_pairs(evidence, names, look)),
         missing=missing,
@@ -518,7 +518,7 @@ def _analyse_environment(
         seeds=evidence.seeds,
         look=look,
         optimum_at_least=evidence.optimum_at_least,
-        optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # None is none
+        optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # likewise
         full_optimum=_first(table, "full_optimum") if "full_optimum" in table else None,
         measured_by=_measured_by(table),
         optima=_differing_optima(table),
@@ -680,7 +680,7 @@ def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tu
 
 
 def runs_to_keep(results: StudyResults) -> list[PlannedRun]:
-    """The stored runs whose agents are kept: the best, median and worst, and what the page loads.
+    """The stored runs whose agents are kept: the best, median and worst, and those for the page.
 
     The page plays the first run, splits the gap of the median final return, and asks the first
     failed run for advice.
@@ -741,7 +741,7 @@ def _failed_runs(results: StudyResults, environment: str) -> list[tuple[list[Pla
     found = []
     for agent, rows in table.groupby("agent", sort=False):
         has_failed = rows["score"].astype(float) < FAILED
-        # Such a policy may never end an episode; the advice checks this.
+        # A policy that does not always succeed may never end an episode; the advice checks this.
         has_failed |= rows["success_rate"].astype(float) < 1 - NEARLY_ALL
         seeds = rows[has_failed & rows["exact"].astype(bool)]["seed"]
         if len(seeds):
@@ -750,7 +750,7 @@ def _failed_runs(results: StudyResults, environment: str) -> list[tuple[list[Pla
 
 
 def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
-    """The advice on the agent of each run; None if there is none."""
+    """The advice on the agent of each run; None for a run without advice."""
     return [_advice_on(run) for run in runs]
 
 

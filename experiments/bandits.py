@@ -1,7 +1,7 @@
 """Does runs on bandits as one batch for each agent, and computes figures pull by pull.
 
-Functions that read raise `DamagedFileError` for a file that is missing, changed, or of another
-form.
+Functions that read raise `DamagedFileError` for a file that is missing, changed, or has another
+schema.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from agents.bandits.runs import BatchResult
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-FIRST_PULLS = 100  # kept one by one; later pulls ever more rarely, `MAX_POINTS` in all
+FIRST_PULLS = 100  # each is a point; later points are ever farther apart, `MAX_POINTS` in all
 MAX_POINTS = 300
 
 
@@ -48,7 +48,7 @@ class PullStatistics:
     recommending the most pulled arm so far (Bubeck, Munos and Stoltz, 2009), in each context.
     """
 
-    # The pulls of the figures, counted from 1.
+    # The points: pulls for which there are statistics, counted from 1.
     pulls: Annotated[Ints, "points"]
     reward: Annotated[Floats, "points"]  # mean reward of a pull since the previous point
     optimal: Annotated[Floats, "points"]  # share of best arms among these pulls
@@ -84,7 +84,7 @@ class PullStatistics:
         """Read the file that `save` wrote.
 
         Raises:
-            DamagedFileError: if the file is missing, changed, or of another form.
+            DamagedFileError: if the file is missing, changed, or has another schema.
         """
         kinds = get_type_hints(cls, include_extras=True)
         shapes = {name: kind.__metadata__[0] for name, kind in kinds.items()}
@@ -97,7 +97,7 @@ class PullStatistics:
 
 
 def points_of(n_pulls: int) -> Ints:
-    """The pulls of the figures: the first ones all, later ones at growing distances."""
+    """The points: all of the first pulls, then pulls at growing distances, shape (points,)."""
     if n_pulls <= MAX_POINTS:
         return np.arange(1, n_pulls + 1)
     first = np.arange(1, FIRST_PULLS + 1)
@@ -200,7 +200,7 @@ def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int
 # --- Results of batches, and of single runs.
 
 STATISTICS_FILE = "pull_statistics.npz"
-_PULLS = ("arms", "rewards", "regrets")  # the data of the figures, besides contexts
+_PULLS = ("arms", "rewards", "regrets")  # the arrays of a run, besides contexts
 
 
 def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStatistics]:
@@ -274,7 +274,7 @@ def _statistics_on(
         more["true_means"] = true_means(env)
     contexts = contexts if n_contexts > 1 else None
     found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
-    # No arm can be recommended if the means drift, or depend on a vector.
+    # Simple regret is not defined if the means drift, or depend on a vector.
     nowhere = np.full_like(found.simple_regret, np.nan)
     return found if is_known else replace(found, simple_regret=nowhere)
 

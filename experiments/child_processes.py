@@ -63,7 +63,7 @@ def answer_from_child(line: Connection, last_words: Connection) -> None:
             function, args, clean_up = ForkingPickler.loads(task)
             clean_ups[:] = [clean_up]
             answer = function(*args)
-        except BaseException as error:  # noqa: BLE001  # whatever it is, the supervisor is told
+        except BaseException as error:  # noqa: BLE001  # the supervisor reports every error
             kind, answer = RAISED, (_words(error), traceback.format_exc())
         with contextlib.suppress(ConnectionError):
             line.send((kind, answer))
@@ -71,7 +71,7 @@ def answer_from_child(line: Connection, last_words: Connection) -> None:
 
 
 def leave_signals_to_supervisor() -> None:
-    """Ignore such signals in this process, but not in programs that it starts."""
+    """Ignore `LEFT_TO_SUPERVISOR` in this process, but not in programs that it starts."""
     for number in LEFT_TO_SUPERVISOR:
         signal.signal(number, _do_nothing)  # not SIG_IGN, which child programs inherit
     if sys.platform != "win32":
@@ -162,7 +162,7 @@ def server_pid() -> int | None:
 
 
 def end_server() -> None:
-    """Kill the fork server, whatever it is doing."""
+    """Kill the fork server."""
     if sys.platform != "win32":
         _send(server_pid(), signal.SIGKILL)
 

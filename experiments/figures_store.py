@@ -1,9 +1,9 @@
 """Keeps the figures and curves of runs in one SQLite file for each agent and environment.
 
-With ``--keep figures``, a study has such files in place of a folder for each run. A run still
+With ``--keep figures``, a study has these files instead of a folder for each run. A run still
 trains in a folder. When it has ended, the driver writes its row, and removes the folder after the
-commit. After a kill at any moment, a run is in its folder, in the file, or in both, and then the
-file counts.
+commit. After a kill at any moment, a run is in its folder, in the file, or in both: if in both, the
+row in the file counts.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ KINDS = ("evaluation", "training")
 ENDS = ("threshold", "stay")
 POINTS = ("step", "episode", "seconds", "value")  # of a curve
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
-TIMES = ("seconds", "cpu_seconds")  # in which two runs with the same seed differ
+TIMES = ("seconds", "cpu_seconds")  # these differ between two runs with the same seed
 _NAMES = ("agent", "algo", "environment", "env_id", "seed", "engine", "path")
 # These follow from the curve and the study's threshold, which may change.
 _SPEED = ("threshold", *(f"{unit}_to_{end}" for unit in ("steps", "episodes") for end in ENDS))
@@ -62,7 +62,7 @@ _SCHEMA = {
     "runs": f"CREATE TABLE runs (seed INTEGER PRIMARY KEY, {', '.join(_COLUMNS[1:])})",
     "kept": "CREATE TABLE kept (seed INTEGER PRIMARY KEY)",  # seeds whose folders stay
 }
-# A commit waits for the disk, so that several runs share one. A kill leaves these in folders.
+# A commit waits for the disk, so several runs share one. After a kill, they are still in folders.
 SECONDS_BETWEEN_COMMITS = 1.0
 MOST_WAITING = 500
 _LARGEST_CURVE = 1 << 24  # bytes
@@ -92,7 +92,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _checked_seeds(path: Path) -> set[int]:
-    """The seeds in a file, whose tables and rows are checked."""
+    """Read the seeds in a file, and check its tables and rows."""
     with _opened(path) as database:
         tables = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"))
         if not tables:  # killed before the first commit
@@ -111,7 +111,7 @@ def _checked_seeds(path: Path) -> set[int]:
 
 
 def checksum_of(seed: int, origin: str, content: Sequence[Any]) -> int:
-    """The checksum of a row, whose origin is given as its text."""
+    """The checksum of a row; ``origin`` is the JSON text of its origin."""
     return zlib.crc32(repr((seed, origin, tuple(content))).encode())
 
 
@@ -121,18 +121,18 @@ _SCALES = (1.0, 1e6)  # whole numbers, and times in microseconds
 
 
 def packed(columns: Sequence[Floats]) -> bytes:
-    """Columns of numbers as few bytes, from which `unpacked` makes the same to the bit."""
+    """Compress columns of numbers; `unpacked` restores them bit for bit."""
     codes, words = zip(
         *(_as_whole(np.ascontiguousarray(c, np.float64)) for c in columns), strict=True
     )
     heads = (struct.pack("<BI", *head) for head in zip(codes, map(len, columns), strict=True))
-    # Bytes of one place of all numbers together, which are alike.
+    # All first bytes of the numbers, then all second bytes, ...: similar neighbours compress well.
     planes = np.concatenate([word.view(np.uint8).reshape(-1, 8) for word in words]).T
     return zlib.compress(bytes([len(columns)]) + b"".join(heads) + planes.tobytes(), 9, -15)
 
 
 def _as_whole(column: Floats) -> tuple[int, NDArray[Any]]:
-    """The scale with which numbers are whole, from 1, and their steps; 0 if there is none."""
+    """The code of a scale that makes all numbers integers, and their differences; else 0."""
     for code, scale in enumerate(_SCALES, start=1):
         with np.errstate(over="ignore"):
             scaled = np.rint(column * scale)
@@ -144,7 +144,7 @@ def _as_whole(column: Floats) -> tuple[int, NDArray[Any]]:
 
 
 def unpacked(content: bytes) -> list[Floats]:
-    """The columns that `packed` was given."""
+    """Restore the columns from the bytes that `packed` returned."""
     inflated = zlib.decompressobj(-15).decompress(content, _LARGEST_CURVE)
     start = 1 + 5 * inflated[0]
     planes = np.frombuffer(inflated, np.uint8, offset=start).reshape(8, -1)
@@ -171,7 +171,7 @@ def _content_of(planned: PlannedRun, found: RunResults) -> tuple[str, list[Any]]
     digest = hashlib.sha256()
     for name, tensor in sorted(tensors(planned.run).items()):
         digest.update(f"{name} {len(tensor)}\n".encode() + tensor)
-    # As SQLite gives them back: it knows no NaN and no boolean.
+    # As SQLite returns them: it stores NaN as NULL, and booleans as integers.
     figures = [int(v) if isinstance(v, bool) else v for v in figures]
     figures = [None if isinstance(v, float) and math.isnan(v) else v for v in figures]
     return origin, [*figures, curves, digest.digest()[:16]]
@@ -186,9 +186,9 @@ def _without_times(content: Sequence[Any]) -> list[Any]:
 
 
 def _is_single(planned: PlannedRun, found: RunResults) -> bool:
-    """Whether a run is no batch, has no pulls, and is measured by the same optimum for good.
+    """Whether a run can be stored: it is no batch, has no pulls, and its scale cannot change.
 
-    Where observations hide the state, the scale changes with the other agents of the study.
+    In partially observable environments, the scale depends on the other agents of the study.
     """
     has_pulls = PULLS_FILE in (planned.run.files.digests or {})
     is_hidden = any(row.get("full_optimum") is not None for row in found.rows)
@@ -196,7 +196,7 @@ def _is_single(planned: PlannedRun, found: RunResults) -> bool:
 
 
 def _is_our_own(planned: PlannedRun) -> bool:
-    """Whether all files in the folder are the run's."""
+    """Whether all files in the folder belong to the run."""
     names = {path.relative_to(planned.path).as_posix() for path in files_below(planned.path)}
     return names <= {*(planned.run.files.digests or {}), RECORD, LOCK}
 
@@ -206,7 +206,7 @@ class StoredRuns:
     """The stored runs of an agent on an environment."""
 
     first: PlannedRun  # one of them
-    seeds: list[int]  # all that are stored between the first and the last, ascending
+    seeds: list[int]  # ascending, with all stored seeds between the first and the last
     _speed: dict[str, list[Any]] = field(default_factory=dict)
 
     def __contains__(self, seed: int) -> bool:
@@ -214,9 +214,9 @@ class StoredRuns:
         return place < len(self.seeds) and self.seeds[place] == seed
 
     def _rows(self, columns: str, seeds: Sequence[int] | None = None) -> Iterator[Any]:
-        """Columns of the runs from the first of these seeds to the last, by rising seed.
+        """Columns of the runs from the first to the last of these seeds, ordered by seed.
 
-        If the last one is that of the curves, they are unpacked.
+        If the last column is ``curves``, unpacks it.
         """
         seeds = seeds or self.seeds
         query = f"SELECT {columns} FROM runs WHERE seed BETWEEN ? AND ? ORDER BY seed"  # noqa: S608
@@ -254,7 +254,7 @@ class StoredRuns:
         return self._speed.pop(name)
 
     def curves(self, seeds: Sequence[int] | None = None) -> Iterator[list[Curve]]:
-        """The curves of evaluations and training of each run, with these seeds or all."""
+        """The evaluation and the training curve of each run with these seeds; by default of all."""
         labels = {"agent": self.first.agent, "environment": self.first.environment}
         for seed, unpacked_curves in self._rows("seed, curves", seeds):
             columns = iter(unpacked_curves)
@@ -270,9 +270,9 @@ class StoredRuns:
         return list(next(self._rows("*", [seed]))[2:-1])
 
     def infos(self) -> list[dict[str, Any]]:
-        """What ``run.json`` says of settings and versions, once for all runs that are alike.
+        """The settings and versions in ``run.json``, once for each group of equal ones.
 
-        ``n_runs`` is the number of these.
+        ``n_runs`` is the size of the group.
         """
         origins = self._origins()
         with _opened(store_path(self.first)) as database:
@@ -325,7 +325,7 @@ class FigureStore:
         return self._seeds[planned.labels]
 
     def runs(self, planned: Sequence[PlannedRun]) -> dict[tuple[str, str], StoredRuns]:
-        """Those of these runs that are stored, by labels; given by rising seed."""
+        """The stored runs among ``planned`` by labels; ``planned`` is ordered by seed."""
         found: dict[tuple[str, str], StoredRuns] = {}
         for run in planned:
             if self.holds(run):
@@ -333,7 +333,7 @@ class FigureStore:
         return found
 
     def add(self, planned: PlannedRun, found: RunResults | None) -> bool:
-        """Store a finished run soon, and then remove its folder; returns whether it will be."""
+        """Queue a finished run to be stored instead of its folder; returns whether it is queued."""
         with suppress(DamagedFileError, OSError):  # damage is reported when all runs are read
             planned = planned.read()
             stays = planned.seed == self.first_seed
@@ -354,7 +354,7 @@ class FigureStore:
         return False
 
     def commit(self) -> None:
-        """Store the runs that wait, and remove their folders."""
+        """Store the queued runs, and remove their folders."""
         by_file: dict[Path, list[tuple[PlannedRun, str, list[Any]]]] = {}
         for one in self._waiting:
             by_file.setdefault(store_path(one[0]), []).append(one)
@@ -389,7 +389,7 @@ class FigureStore:
             database.execute("INSERT OR IGNORE INTO kept VALUES (?)", (planned.seed,))
 
     def is_again(self, study: StudySpec, planned: PlannedRun) -> bool:
-        """Whether a run in its folder is the stored one to the bit, but for times."""
+        """Whether a run in its folder equals the stored run bit for bit, except for times."""
         found = read_run(study, planned)
         if found is None:
             return False
@@ -399,7 +399,7 @@ class FigureStore:
     def differences(
         self, planned: Sequence[PlannedRun]
     ) -> list[tuple[PlannedRun, int, Differences]]:
-        """One run of each file with other settings, the number of runs there, and these."""
+        """For each file with other settings: one run, the number of stored runs, differences."""
         found = []
         for run in {run.labels: run for run in planned}.values():
             if not run.is_batch and (seeds := self._seeds_of(run)):
@@ -425,7 +425,7 @@ class FigureStore:
                 self._seeds_of(run)
             except DamagedFileError:
                 moved.append(move_aside(store_path(run)))
-                # It would be applied to the next file of this name.
+                # SQLite would apply the journal to the next file of this name.
                 store_path(run).with_suffix(f"{SUFFIX}-journal").unlink(missing_ok=True)
         return moved
 

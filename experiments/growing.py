@@ -82,7 +82,7 @@ def _taken(looks: Looks, evidence: Evidence, question: Question) -> tuple[Looks,
 
 
 def _says_nothing(evidence: Evidence, level: float) -> bool:
-    """Whether so few runs can claim nothing at this level: such a look does not count."""
+    """Whether there are too few runs for any claim at this level: then the look does not count."""
     there = sorted(int(np.isfinite(values).sum()) for values in evidence.scores.values())
     return len(there) < 2 or there[-2] < evidence.fewest(level)
 

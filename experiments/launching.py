@@ -53,7 +53,7 @@ class RunFailure:
 
 
 class Launcher(Protocol):
-    """The interface of a place that does runs."""
+    """The interface to this machine or a cluster, which does runs."""
 
     @property
     def n_workers(self) -> int:
@@ -61,14 +61,14 @@ class Launcher(Protocol):
 
     @property
     def words(self) -> str:
-        """A text on the launcher to show during runs; mostly empty."""
+        """A text on the launcher to show during runs, such as its workers; may be empty."""
 
     def submit(self, planned: PlannedRun) -> Future[RunFailure | None]:
         """Submit a run.
 
         Returns:
-            A future of how it failed; None once its folder is in place. Futures are independent.
-            They raise only if the launcher itself is lost.
+            A future with the failure, or with None once the run's folder is in place. It raises an
+            error only if the launcher itself is lost.
         """
 
 
@@ -244,8 +244,8 @@ def execute(
 # --- The remaining time of the runs, by the clock.
 
 # The time of a run differs a thousandfold between agents, so each agent on each environment has its
-# own estimate: the mean of its ended runs, or else its expected time, times the ratio by which the
-# expectations of similar agents were wrong.
+# own estimate: the mean of its ended runs; without them, its expected time, multiplied by the mean
+# ratio of actual to expected time of similar agents.
 
 Key = tuple[str, str]
 
@@ -309,7 +309,7 @@ class TimeLeft:
 
     def end(self, run: PlannedRun, now: float) -> None:
         """Record the end of a run."""
-        if run.path not in self._began:  # another run had not begun instead
+        if run.path not in self._began:  # a run that was assumed to have begun has not: swap them
             if not (self._began and run in self._waiting):
                 return
             path, (other, began) = next(iter(self._began.items()))
@@ -399,7 +399,7 @@ class EarlyResults:
         return None
 
     def forget(self, planned: PlannedRun) -> None:
-        """Drop what was read of a run, because it is stored."""
+        """Drop the results of a run, because it is stored."""
         self._found.pop(planned.path, None)
 
     def of(self, planned: PlannedRun) -> RunResults | None:

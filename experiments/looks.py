@@ -1,4 +1,4 @@
-"""Counts the looks at a study, and assigns error rates to them.
+"""Counts the looks at a study (interim analyses of its runs), and assigns error rates to them.
 
 At most ``ALPHA`` of the studies contain a wrong claim: each environment, and all of them together,
 have a share of this rate. Looks are counted separately for each environment.
@@ -64,7 +64,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Design:
-    """Looks that were planned before the first of them: they share the level of one look."""
+    """Looks that were planned before the first of them; together they count as one look."""
 
     question: Question  # the question
     sizes: tuple[int, ...]  # the seeds of a growing agent at each look

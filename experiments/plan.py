@@ -72,7 +72,7 @@ class PlannedRun:
     #: Whether it is a batch of all seeds of a bandit agent; ``seed`` is the first.
     is_batch: bool = False
     n_runs: int = 1  #: the number of runs in the batch
-    #: Whether some agent remembers observations of this environment: then all have its scale.
+    #: Whether some agent here has a memory: then the optimum with memory is the scale of all.
     on_memory_scale: bool = False
 
     @property
@@ -107,9 +107,9 @@ class PlannedRun:
 
     @property
     def differences(self) -> dict[str, tuple[Any, Any]]:
-        """By name, the settings of a finished run in this folder and the requested ones.
+        """By name, the recorded and requested values of settings in which a finished run differs.
 
-        Empty if they are the same: then the run is repeated because something is missing, such as
+        Empty if no setting differs: then the run is repeated because something is missing, such as
         checkpoints, or new seeds of a batch.
         """
         info = _info(self.run)
@@ -167,7 +167,7 @@ def _identity(spec: Mapping[str, Any]) -> Any:
 
 
 def differences(recorded: Mapping[str, Any], spec: TrainSpec) -> dict[str, tuple[Any, Any]]:
-    """By name, the settings of a recorded spec and those of another one, where they differ."""
+    """By name, the values of settings in which a recorded spec and ``spec`` differ."""
     there = _by_name(_identity(completed(recorded)))
     now = _by_name(_identity(spec.as_data()))
     return {
@@ -391,7 +391,7 @@ def _raw_hyperparams(
         except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
-    # Removals by the environment's settings come before the agent's own settings.
+    # The environment's settings remove keys with None before the agent's settings apply.
     kept = {
         key: value for key, value in raw.items() if environment.settings.get(key, key) is not None
     }

@@ -2,7 +2,7 @@
 
 Each file of a run is checked against its digest and its schema. Runs of earlier versions recorded
 no digests: only the schema of their files is checked. Functions that read raise `DamagedFileError`
-for a file that is missing, changed, or of another form.
+for a file that is missing, changed, or has another schema.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ _FINAL_FIGURES = (
     "gap",
     "score",
 )
-# Missing in runs of earlier versions, and where figures are sampled.
+# Missing in runs of earlier versions, and if returns are sampled.
 _OTHER_RETURNS = ("stochastic_return", "discount", "discounted_return", "discounted_optimum")
-# The last ones only if the optimum is bracketed.
+# The last one exists only if the optimum is known only within bounds.
 _YARDSTICK = ("optimum", "baseline", "optimum_at_least")
-# Only if observations hide the state.
+# These exist only for partially observable environments.
 _HIDDEN = ("full_optimum", "memory_optimum_at_least", "memory_optimum")
 _SCALES = ("observation", "memory")
 _MAPS = {
@@ -116,7 +116,7 @@ def _table_of(content: bytes) -> Floats:
     places = [found.index(name) for name in _COLUMNS]
     if not rows.strip():
         return np.empty((0, len(places)))
-    # NumPy's own reader takes three times as long, which is half the time of reading a run.
+    # NumPy's own reader takes three times as long: half of the total time for reading a run.
     table = pd.read_csv(
         io.BytesIO(rows), header=None, usecols=places, dtype=np.float64, na_filter=False
     )
@@ -206,7 +206,7 @@ def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
 
 
 def read_compared(run: Run) -> dict[str, Floats]:
-    """Read what `pipeline.evaluation.critics` wrote of a run, by column."""
+    """Read the columns of the diagnosis that `pipeline.evaluation.critics` wrote."""
     path = run.diagnosis_path
     try:
         found = read_diagnosis(run.files.read(path))
@@ -224,8 +224,8 @@ def read_compared(run: Run) -> dict[str, Floats]:
 
 TRAINING_POINTS = 100
 
-# Columns of `StudyResults.curves`. Each row is an evaluation, or the mean of some training episodes
-# at the end of the last of them.
+# Columns of `StudyResults.curves`. Each row is an evaluation, or the mean return of consecutive
+# training episodes at the end of the last one.
 CURVE_COLUMNS = (
     "agent",
     "environment",
@@ -301,7 +301,7 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
 # --- The results of runs.
 
 LAST_EPISODES = 100
-RUNS_IN_A_PIECE = 1000  # whose curves are in memory at once when tables are written
+RUNS_IN_A_PIECE = 1000  # number of runs with curves in memory while tables are written
 
 
 @dataclass(frozen=True)
@@ -321,7 +321,7 @@ class RunResults:
 
 
 class RunsInFile(Protocol):
-    """The runs of an agent on an environment that are in a file instead of folders."""
+    """Stored runs: those of an agent on an environment in a file instead of folders."""
 
     def __contains__(self, seed: int) -> bool: ...
 
@@ -329,10 +329,10 @@ class RunsInFile(Protocol):
         """A column of the summary, see `RUN_COLUMNS`."""
 
     def curves(self, seeds: Sequence[int] | None = None) -> Iterator[list[Curve]]:
-        """The curves of evaluations and training of each run, with these seeds or all."""
+        """The evaluation and the training curve of each run with these seeds; by default of all."""
 
     def infos(self) -> list[dict[str, Any]]:
-        """What ``run.json`` says of settings and versions, once for all runs that are alike."""
+        """The settings and versions in ``run.json``, once for each group of equal ones."""
 
 
 @dataclass(frozen=True)
@@ -386,7 +386,7 @@ class StudyResults:
                 yield from run
 
     def infos(self) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-        """By labels, what the runs recorded of settings and versions; of stored runs once."""
+        """Agent, environment, settings and versions; once for each group of equal stored runs."""
         told: set[tuple[str, str]] = set()
         for run in self.finished:
             if not self.is_stored(run):
@@ -410,21 +410,21 @@ RUN_COLUMNS = (
     "success_rate",
     "exact",  # whether these are exact expectations, not means of episodes
     "optimum",
-    "optimum_at_least",  # lower end of a bracket; ``optimum`` is then the upper end
-    "optimum_is_proven",  # whether that upper end is proven
+    "optimum_at_least",  # lower bound, if ``optimum`` is only an upper bound
+    "optimum_is_proven",  # whether this upper bound is proven
     "baseline",
     "gap",  # optimum minus final
     "score",  # final return, scaled: 0 is the best random or constant policy, 1 the optimum
-    "acts_by",  # what the agent acts by in training: "epsilon 0.01", "its own distribution"
-    "stochastic_return",  # exact, of the policy that it acts by in training
-    "discount",  # the agent's
-    "discounted_return",  # exact, of the final policy under that discount
-    "discounted_optimum",  # the highest one under it
+    "acts_by",  # description of the policy in training: "epsilon 0.01", "its own distribution"
+    "stochastic_return",  # exact return of this policy
+    "discount",  # the agent's discount
+    "discounted_return",  # exact return of the final policy under this discount
+    "discounted_optimum",  # the optimum under this discount
     "best",  # highest return of an evaluation during training
     "best_timesteps",
     "area",  # mean return over the learning curve
     "training",  # mean return of the training episodes
-    "last_episodes",  # of the last 100
+    "last_episodes",  # mean return of the last 100 training episodes
     "regret",  # on bandits, the sum of best expected rewards minus those of the pulled arms
     "threshold",
     "steps_to_threshold",  # infinite if it was never reached
@@ -439,8 +439,8 @@ RUN_COLUMNS = (
     "path",
 )
 
-# Further columns, if observations of some environment hide the state: the optimum of agents that
-# see it, and what agents go by that reach ``optimum``, "observation" or "memory".
+# Further columns, if some environment is partially observable: the optimum of agents that see the
+# state, and the input of the policies that reach ``optimum``, "observation" or "memory".
 HIDDEN_COLUMNS = ("full_optimum", "measured_by")
 
 # Columns with the same name in ``run.json``.
@@ -512,11 +512,11 @@ def _summary(
     rows: Mapping[int, dict[str, Any]],
     stored: Mapping[tuple[str, str], tuple[list[int], RunsInFile]],
 ) -> pd.DataFrame:
-    """The summary of runs in folders, by number of row, and of stored runs with their numbers."""
+    """The summary of ``rows``, by row number, and of stored runs, given with their row numbers."""
     if not stored:
         return pd.DataFrame([*rows.values()], columns=_columns(rows.values()))
     table = {}
-    for name in _columns(rows.values()):  # one after the other, because of the memory
+    for name in _columns(rows.values()):  # one column at a time, to save memory
         column: list[Any] = [None] * n_rows
         for number, row in rows.items():
             column[number] = row.get(name)
@@ -572,7 +572,7 @@ def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float 
 
     if study.threshold is not None:
         return study.threshold
-    # It is unknown whether the upper end of a bracket can be reached.
+    # It is unknown whether any policy reaches an upper bound of the optimum.
     reachable = final.get("optimum_at_least", final.get("optimum"))
     if "optimum_at_least" in final or reachable is None:
         registered = gym.spec(env_id.rpartition(":")[2]).reward_threshold

@@ -185,7 +185,7 @@ def check_settings_kept(
 ) -> None:
     """Refuse to repeat runs that finished with other settings, and name the ways out.
 
-    ``stored`` are numbers of runs that are in files with other settings, and these.
+    ``stored`` has the number of runs and the differences for each file with other settings.
     """
     found = [(1, run.differences) for run in in_the_way(planned)]
     others = [each for each in (*found, *stored) if each[1]]

@@ -1,8 +1,8 @@
 """Limits of time and memory for a run, and checks of its process.
 
-Memory means the resident set, which is checked a few times a second. The system's limit on
-addresses would be exact, but networks and compiled code reserve many times the memory that they
-use.
+Memory means the resident set, which is checked a few times a second. The system's limit on the
+address space would be exact, but networks and compiled code reserve many times the memory that
+they use.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ METRIC_WORDS: dict[str, str] = {
 COSTS = ("regret",)
 
 
-# These metrics use training episodes, the others evaluations.
+# Metrics that are mean returns of training episodes.
 OF_TRAINING = ("training", "last_episodes")
 
 
@@ -149,8 +149,8 @@ class StudySpec:
     #: Whether runs of different agents with the same seed share their randomness, as on bandits
     #: whose arms and rewards are drawn by the seed; if so, they are compared seed by seed.
     shared_randomness: bool = False
-    #: Return that counts as solved; None for 95 % of that gap, or else the environment's registered
-    #: threshold.
+    #: Return that counts as solved; None for the point at 95 % of that gap if the optimum is exact,
+    #: else for the environment's registered threshold.
     threshold: float | None = None
     #: Episodes per row in the table of training returns; 0 for no table.
     episodes_table: int = 0
@@ -173,7 +173,7 @@ class StudySpec:
     first_seed: int = 0  #: the first seed; the others follow it
     #: ``"figures"`` to keep figures and curves of runs in files, and few of their folders.
     keep: Keep | None = None
-    #: Label of the only agent whose mean the others are compared with; empty for all pairs.
+    #: Label of the only agent to compare the others with; empty for all pairs.
     against: str = ""
 
     @property
@@ -472,7 +472,7 @@ def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[
 
 
 def _conf_file(document: _Document, entry: Mapping[str, Any], keys: Keys) -> Path | None:
-    """The agent's own file of hyperparameters, relative to the study; it need not be tuned."""
+    """The agent's own file of hyperparameters, relative to the study; refuses ``tuned: false``."""
     given = entry.get("conf_file")
     if given is None:
         return None

@@ -29,7 +29,7 @@ from tuning.tuning_spec import SHIPPED
 Word = str | int | float | bool | None
 # A function that chooses a value for the parameter of this name.
 Pick = Callable[[str, BaseDistribution], Any]
-# By the names of other choices, the words of which one must be chosen; empty: no condition.
+# By the name of another choice, the words of which one must be chosen there; empty for none.
 Conditions = Mapping[str, tuple[Word, ...]]
 
 Scale = Literal["linear", "log", "log_below_one", "powers_of_two"]

@@ -25,7 +25,7 @@ MIN_OTHERS = 4
 P_THRESHOLD = 0.1
 # One of three settings continues.
 REDUCTION = 3
-# From so many seeds on, a rank test can decide before most seeds are done.
+# With at least this number of seeds, a rank test can decide before most seeds are done.
 SEEDS_FOR_RANKS = 10
 
 
@@ -40,7 +40,7 @@ class Rivals:
 
     @property
     def best(self) -> Scores:
-        """The best complete trial, as running ones may have been lucky; empty if there is none."""
+        """The best complete trial; empty if there is none. Running trials may have been lucky."""
         whole = [each for each in self.others if len(each) == self.n_seeds]
         return max(whole, key=lambda each: self.value([*each.values()]), default={})
 

@@ -54,7 +54,7 @@ class Candidate:
     number: int  # number of its trial
     entry: Mapping[str, Any]  # its hyperparameters
     value: float  # its value in the search
-    figures: tuple[float, ...] = ()  # those of its seeds there
+    figures: tuple[float, ...] = ()  # its figure on each seed of the search
     steps: float | None = None  # mean steps to the threshold, if it has the optimum on all seeds
 
     @property
@@ -66,8 +66,8 @@ class Candidate:
 def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candidate]:
     """The settings of complete trials, best first; equal ones in order of their trials.
 
-    Settings with the optimum on all seeds are equal, but for their steps to the threshold. A
-    setting of several trials appears once.
+    Settings with the optimum on all seeds are ordered by their steps to the threshold. A setting of
+    several trials appears once.
     """
     found: dict[str, Candidate] = {}
     for trial in trials:
@@ -145,8 +145,8 @@ class Retested:
     number: int  # number of its trial; 0 for the initial settings
     in_search: float | None  # its value in the search, if its trial is complete
     held_out: float | None  # its value on held-out seeds; None without runs
-    interval: Estimate  # of that value
-    verdict: str  # compared with the initial settings by that value; empty for these
+    interval: Estimate  # the confidence interval of ``held_out``
+    verdict: str  # the comparison with the initial settings; empty for the initial settings
     n_runs: int  # number of runs
     # Number of failed runs, which got less than half as far as the best typical run; None if
     # that is not defined.
@@ -164,11 +164,11 @@ class Outcome:
     # The best of the other settings with runs on all held-out seeds and a verdict that it is better
     # than the initial settings.
     winner: Retested | None
-    # By how much the best setting of the search was better there than on held-out seeds; None if
-    # it was not re-tested.
+    # How much better the best setting of the search was in the search than on held-out seeds; None
+    # if it was not re-tested.
     optimism: float | None
     reason: str  # why there is no winner; empty if there is one
-    held_out: range  # the held-out seeds; a growing re-test may have fewer of some settings
+    held_out: range  # the held-out seeds; in a growing re-test, some settings may have fewer
 
 
 def concluded(
@@ -178,7 +178,7 @@ def concluded(
     analysis: StudyAnalysis,
 ) -> Outcome:
     """The result of the re-test of ``candidates``; ``ranked`` are all complete settings."""
-    # In the verdicts of a study, a score below 0 counts as 0. So it does here.
+    # As in the verdicts of a study, a score below 0 counts as 0.
     is_score = tuning.figure == "score" and all(each.is_score for each in analysis.environments)
     least = 0.0 if is_score and tuning.is_judged_by_study else -math.inf
     in_search = {each.number: _value(tuning, each.figures, least) for each in ranked}
@@ -202,7 +202,7 @@ def _value(tuning: TuningSpec, figures: Sequence[float] | Floats, least: float) 
 
 
 def optimism(tuning: TuningSpec, best: Retested) -> float | None:
-    """The optimism of the search: positive if a setting looked better there than held out."""
+    """The optimism of the search: positive if the setting was worse on held-out seeds."""
     if best.in_search is None or best.held_out is None:
         return None
     apart = best.in_search - best.held_out
@@ -288,10 +288,10 @@ def _by_resampling(
     figures: Mapping[str, Floats],
     environment: EnvironmentAnalysis,
 ) -> tuple[str, str]:
-    """The same for other statistics and figures: whether an interval of the difference has 0.
+    """The same for other statistics and figures: whether an interval of the difference excludes 0.
 
     The interval is a percentile bootstrap's, widened for few seeds. The settings of the re-test
-    share its error rate equally. What was not seen cannot be resampled, so there is a condition.
+    share its error rate equally. The verdict has a condition, because only seen runs are resampled.
     """
     own, shipped = figures[label], figures[SHIPPED]
     if min(len(own), len(shipped)) < FEWEST_SEEDS:
@@ -324,8 +324,8 @@ def statistic_of(tuning: TuningSpec) -> str:
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
     """The best setting that the verdict calls better than the initial settings.
 
-    It counts only held-out seeds. A setting with failed runs is excluded, because its remaining
-    runs are the luckier ones.
+    It counts only held-out seeds. A setting with missing runs is excluded, because its remaining
+    runs may be the luckier ones.
     """
     shipped, *others = retested
     enough = tuning.retest_seeds
@@ -427,7 +427,7 @@ def _figure(value: float | None) -> str:
 
 
 def unproven_mark(tuning: TuningSpec) -> str:
-    """What is said of scores that go by an upper end without a proof; empty for others."""
+    """A note on scores whose optimum is an unproven upper bound; empty for other figures."""
     is_proven = tuning.figure != "score" or upper_is_proven(tuning.environment.env_id)
     return "" if is_proven else " by a bracket whose upper end is not proven"
 

@@ -1,4 +1,4 @@
-"""Search spaces: reads them from files, samples them by Optuna, and inverts settings.
+"""Search spaces: read from files, sampled by Optuna, and inverted from settings to parameters.
 
 ``hyperparams/search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see
 `docs/search-spaces.md`. An environment's entry overrides ``default`` name by name; null removes a
@@ -49,7 +49,7 @@ from tuning.dimensions import (
     spread,
 )
 
-# Points over a range: with so many, the second one is hardly ever an integer.
+# The number of points over a range for a check between its ends: the second is rarely an integer.
 _PARTS = 98
 
 _FOLDER = Path(__file__).resolve().parents[1] / "hyperparams" / "search_spaces"

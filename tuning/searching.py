@@ -55,15 +55,16 @@ from tuning.tuning_spec import AUTO, COST_OF_THRESHOLD, TuningSpec, judged
 from verdicts import steps_to_threshold
 
 SECONDS_BETWEEN_LOOKS = 1.0
-# If so many trials fail at the start without a success, the settings are not the reason.
+# If this many trials fail at the start without a success, the settings are not the reason.
 MOST_FAILURES = 5
 _ROOM_FOR_A_RUN = 1 << 18  # bytes of a small run
 # Penalty for never reaching the threshold: twice the budget (PAR-2). If only the steps done
 # counted, giving up early would look cheap.
 WHOLE_RUNS = 2
-# Scores from here on are the optimum, but for rounding.
+# Scores from here on are the optimum, up to rounding.
 OPTIMAL_SCORE = 1 - 1e-6
-# With so many settings at the optimum on all seeds, or as many as are re-tested, a search ends.
+# A search ends with this many settings at the optimum on all seeds, or with as many as are
+# re-tested, if that is more.
 ENOUGH_AT_OPTIMUM = 10
 
 
@@ -109,15 +110,14 @@ class OpenTuning:
 
     @property
     def is_saturated(self) -> bool:
-        """Whether so many settings have the optimum that more trials cannot tell the best."""
+        """Whether enough settings have the optimum on all seeds, so that the search can end."""
         return self.n_at_optimum >= max(ENOUGH_AT_OPTIMUM, self.tuning.retest)
 
 
 def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:
     """Check a tuning, and open the storage of its trials.
 
-    Makes the folder if all checks pass; ``storage`` is the value of
-    ``--storage``.
+    Makes the folder if all checks pass; ``storage`` is the value of ``--storage``.
     """
     take_up(root)
     run = shipped_run(tuning, root)
@@ -417,7 +417,7 @@ class Search:
 
 
 def _check_room(root: Path) -> None:
-    """Check that a full disk is not the reason of a failed run, instead of its settings."""
+    """Raise UserError if the disk is full: then a run did not fail because of its settings."""
     try:
         with tempfile.TemporaryFile(dir=root) as file:
             file.write(bytes(_ROOM_FOR_A_RUN))

@@ -81,7 +81,7 @@ class SeededSampler(BaseSampler):
 def make_sampler(tuning: TuningSpec) -> BaseSampler:
     """Make the sampler of a tuning; a grid has fixed trials, and ignores its sampler.
 
-    Options are explicit although they are version 5's defaults, because version 5 changed them. TPE
+    Options are explicit although they are Optuna 5's defaults, because Optuna 5 changed them. TPE
     draws parameters jointly (``multivariate``), conditional ones together with others of the same
     condition (``group``), and treats running trials as bad ones (``constant_liar``), so that
     parallel trials do not try the same settings.
@@ -132,7 +132,7 @@ class Suggestions:
         return {name: self.first[name] for name in names if name in self.first}
 
     def _fits_batches(self) -> bool:
-        """Whether trials draw batches, or buffers, of an agent that splits its buffer into them."""
+        """Whether trials sample sizes of batches or buffers, and the agent splits its buffer."""
         from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
         algorithm = agent_class(self.tuning.agent.algo)
@@ -150,7 +150,7 @@ class Suggestions:
 
     @cached_property
     def grid(self) -> list[dict[str, Any]]:
-        """The points of the finest grid that the number of trials allows, in random order."""
+        """The points of the finest grid with fewer points than trials, in random order."""
         n_trials, found = self.tuning.n_trials - 1, self._points(2)
         if len(found) > n_trials:
             raise UserError(
@@ -180,7 +180,7 @@ class Suggestions:
 
     @property
     def n_trials(self) -> int:
-        """The number of trials; a grid has at most as many as points."""
+        """The number of trials; with a grid, at most one more than the number of points."""
         if self.tuning.sampler == "grid":
             return min(self.tuning.n_trials, 1 + len(self.grid))
         return self.tuning.n_trials

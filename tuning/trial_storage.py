@@ -45,7 +45,7 @@ _ANY_PORT = 13000  # of Optuna's proxy
 ASKED, JUDGED_BY = "asked", "judged by"
 # Attributes of a trial, besides Optuna's own data.
 DRIVER, FAILURE, FIGURES = "driver", "failure", "figures"
-# By seed with the optimum, the steps to the threshold.
+# By each seed with the optimum, the steps to the threshold.
 AT_OPTIMUM = "at optimum"
 SETTINGS, SECONDS = "settings", "seconds"
 
@@ -220,7 +220,7 @@ class TrialQueue:
 
     def __init__(self, study: Study, root: Path, n_trials: int) -> None:
         self.study, self.root, self.n_trials = study, root, n_trials
-        # The study's own storage, which caches what it has read.
+        # The study's own storage, which has a cache.
         self.storage = study._storage
         self._token = secrets.token_hex(8)
         self._n_signs = 0

@@ -1,4 +1,4 @@
-"""The classes of all agents of this project, as the registry lists them."""
+"""Documents the classes of all agents of this project that the registry lists."""
 
 from __future__ import annotations
 

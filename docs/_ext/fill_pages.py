@@ -1,17 +1,17 @@
-"""Puts what follows from code into pages: pieces of source, facts on environments, tables.
+"""Inserts blocks generated from code into pages: source code, facts on environments, tables.
 
-A page says what stands there by a link with a title, which a code host shows as a link::
+A page requests a block by a link with a title, which a code host shows as a link::
 
     [The code](../../agents/tabular/one_step.py "code: best_next_value QLearning")
 
-The kinds: ``code``, with names that the linked file defines; ``environment``, with an id and
-arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, likewise, for
-a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``hardness``,
-likewise, for a table of how hard they are; ``agents`` and ``agents-by-spaces``, with nothing, for
-tables of agents; ``flags``, with the name of a command; ``trainings``, for what commands reach;
-``reference``, with a module and perhaps names in it, for their docstrings below a heading;
-``measured``, for the linked file of what a benchmark has published; ``timings``, likewise of
-`benchmarks/timing.py`.
+The kinds of blocks: ``code``, with names that the linked file defines; ``environment``, with an id
+and arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, with the
+same arguments, for one part only; ``optima`` and ``variants``, with several ids, for tables of
+optima; ``hardness``, with several ids, for a table of their hardness; ``agents`` and
+``agents-by-spaces`` for tables of agents; ``flags``, with the name of a command; ``trainings`` for
+a table of commands with their results; ``reference``, with a module and optional names in it, for
+their docstrings below a heading; ``measured`` for a linked file that a benchmark has published;
+``timings``, the same for a file of `benchmarks/timing.py`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from recommended_commands import trainings_block, with_outcomes  # noqa: E402
 
 
 def reference_block(module: str, *names: str) -> str:
-    """The heading and the docstrings of a module, all or those of some names."""
+    """A heading and the docstrings of a module, or of some names in it."""
     members = f":members: {', '.join(names)}".rstrip()
     return f"## `{module}`\n\n```{{eval-rst}}\n.. automodule:: {module}\n   {members}\n```"
 
@@ -68,7 +68,7 @@ LINE = re.compile(rf'^\[[^\]\n]*\]\((\S+) "({"|".join(KINDS)})(?:: ([^"\n]*))?"\
 
 
 def filled(text: str, folder: Path) -> str:
-    """A page of a folder, with what belongs in the place of its lines."""
+    """The text of a page in ``folder``, with its requests replaced by the generated blocks."""
 
     def fill(line: re.Match[str]) -> str:
         target, kind, arguments = line.groups()
@@ -94,7 +94,7 @@ def pictured_environments() -> dict[str, dict[str, object]]:
 
 
 def read(app: Sphinx, page: str, source: list[str]) -> None:
-    """Fill a page before it is parsed; commands in docstrings say what they reach as well."""
+    """Fill a page before it is parsed, also with the results of commands in docstrings."""
     source[0] = with_outcomes(filled(source[0], (DOCS / page).parent))
 
 

@@ -1,4 +1,4 @@
-"""Formulas as MathML, which browsers draw by themselves: no script, and nothing from a network."""
+"""Formulas as MathML, which browsers render without scripts or downloads."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sphinx.application import Sphinx
 
 
 def visit_inline(writer: Any, node: nodes.math) -> None:
-    """A formula in a line of text."""
+    """Write an inline formula."""
     writer.body.append(tex2mathml(node.astext(), as_block=False))
     raise nodes.SkipNode
 
 
 def visit_display(writer: Any, node: nodes.math_block) -> None:
-    """A formula by itself, which is scrolled where it is wider than the page."""
+    """Write a displayed formula, which scrolls if it is wider than the page."""
     formula = tex2mathml(node.astext(), as_block=True)
     writer.body.append(f'<div class="formula">{formula}</div>\n')
     raise nodes.SkipNode

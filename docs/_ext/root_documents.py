@@ -1,7 +1,7 @@
-"""The documents at the root of the repository as pages, and links to them from other pages.
+"""Turns documents at the root of the repository into pages, and adapts links to them.
 
-A code host shows CONTRIBUTING.md and its like at the root, and pages in docs/ link there. On the
-site each is a page, whose file in docs/ says in a line where its text is.
+A code host shows CONTRIBUTING.md and similar documents at the root, and pages in docs/ link there.
+On the site, each is a page; its file in docs/ has one line, which refers to the document.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PAGES = {
 
 
 def read(app: Sphinx, page: str, source: list[str]) -> None:
-    """Put a document's text in the place of its page's, or mend a page's links to documents."""
+    """Replace the text of a document's page by the document, and adapt links to documents."""
     if page in PAGES:
         path = ROOT / PAGES[page]
         app.env.note_dependency(path, docname=page)

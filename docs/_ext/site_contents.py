@@ -1,4 +1,4 @@
-"""What stands below which page, put there on the site alone: a code host would show it as code."""
+"""Adds tables of contents to pages on the site only: a code host would show them as code."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import re
 
 from sphinx.application import Sphinx
 
-# Pages that begin a folder, and what the names of the pages in it begin with. Those that the page
-# links to come first, in its order.
+# First pages of folders, and the prefix of the names of the other pages there. Pages to which the
+# first page links come first, in the order of the links.
 FOLDERS = {
     "algorithms": "algorithms/",
     "environments": "environments/",
     "decisions/README": "0",
     "lessons/index": "0",
 }
-# In index.md, the place of the pages that it does not name.
+# The placeholder in index.md for the pages that index.md does not name.
 REST = "every-other-page"
 
 
 def read(app: Sphinx, page: str, source: list[str]) -> None:
-    """Add the list of pages to a page that begins a folder, and what is new to the first page."""
+    """Add the list of pages to the first page of a folder, and all other pages to the index."""
     if page in FOLDERS:
         linked = re.findall(rf"\]\(({FOLDERS[page]}[\w-]+)\.md", source[0])
         above = page.rpartition("/")[0]

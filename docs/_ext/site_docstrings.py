@@ -1,4 +1,4 @@
-"""Docstrings as Sphinx reads them: headings and lists of environments' Markdown become its own."""
+"""Converts headings, lists and tables in docstrings from Markdown to reStructuredText."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from sphinx.application import Sphinx
 
 
 def mend(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Turn ``## Heading`` into a rubric, and begin lists after an empty line."""
+    """Turn ``## Heading`` into a rubric, tables into literal text; put empty lines before lists."""
     mended: list[str] = []
     for line in lines:
         if line.startswith("| ") and not (mended and mended[-1].startswith("    |")):
-            mended += ["::", ""]  # a table of Markdown is shown as it stands
+            mended += ["::", ""]  # a Markdown table becomes literal text
         if line.startswith(("| ", "|--")):
             mended.append(f"    {line}")
             continue

@@ -1,4 +1,4 @@
-"""What the figures share: agents with a book's settings, random walks, drawings, statements."""
+"""Common code of the figures: agents with the book's settings, random walks, plots, statements."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from mdp.transition_model import Floats
 mpl.use("Agg")
 
 IMAGES = Path(__file__).resolve().parent.parent / "images" / "textbook"
-MOST_STEPS = 10**9  # where episodes are counted
+MOST_STEPS = 10**9  # no limit, because episodes are counted
 WALK = "envs:RandomWalk-v0"
-LARGEST_ERROR = 2.0  # that means something
+LARGEST_ERROR = 2.0  # larger errors mean that learning diverges
 
 
 class Statement(NamedTuple):
-    """Something that the book says, and whether it came out."""
+    """A statement of the book, and whether our measurement confirms it."""
 
-    text: str  # what it says, in our words
-    figures: str  # what was measured
+    text: str  # the statement in our words
+    figures: str  # the measured figures
     holds: bool
 
 
 class ValueErrors(BlockCallback):
-    """The root mean square error of predicted values after each episode, but for those of ends."""
+    """Root mean square errors of the predicted values of nonterminal states after each episode."""
 
     def __init__(self, true_values: Floats) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class ValueErrors(BlockCallback):
         self._has_ended = bool(self.locals["dones"].any())
         return True
 
-    def _on_rollout_end(self) -> None:  # what the last step says has been learnt by now
+    def _on_rollout_end(self) -> None:  # by now, the agent has learnt from the last step
         if self._has_ended:
             policy: Any = self.model.policy
             differences = policy.q_table[1:-1, 0] - self.true_values
@@ -63,7 +63,7 @@ class ValueErrors(BlockCallback):
 
 
 def arguments(description: str, n_runs: int) -> argparse.Namespace:
-    """How many runs to average over, and where the picture goes."""
+    """Parse the number of runs to average, and the folder of the picture."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
@@ -75,14 +75,14 @@ def arguments(description: str, n_runs: int) -> argparse.Namespace:
 def agent_on(
     env_id: str | Callable[[], gym.Env[Any, Any]], algo: str, seed: int, **settings: Any
 ) -> Any:
-    """An agent as the book has them: no discount, a constant epsilon, ties broken at random."""
+    """Make an agent with the book's settings: no discount, constant epsilon, random ties."""
     env = make_vec_env(env_id, seed=seed, env_kwargs=settings.pop("env_kwargs", None))
     always = {"gamma": 1.0, "exploration_decay": "constant", "exploration_initial_eps": 0.1}
     return load_algorithm(algo)(env=env, seed=seed, **{**always, **settings})
 
 
 def learn_episodes(agent: Any, n_episodes: int) -> tuple[Floats, Floats]:
-    """Returns and lengths of a training of so many episodes, by which schedules run too."""
+    """Train for ``n_episodes``, by which schedules run too; returns their returns and lengths."""
     agent.learn(MOST_STEPS, callback=EpisodeBudget(n_episodes), log_interval=None)
     monitor = agent.env.envs[0]
     returns, lengths = monitor.get_episode_rewards(), monitor.get_episode_lengths()
@@ -90,7 +90,7 @@ def learn_episodes(agent: Any, n_episodes: int) -> tuple[Floats, Floats]:
 
 
 def true_values(env_kwargs: dict[str, Any]) -> Floats:
-    """The probability of ending on the right, turned into rewards, shape (n_states + 2,)."""
+    """The values of the states, from their probability of ending right, shape (n_states + 2,)."""
     walk: Any = gym.make(WALK, **env_kwargs).unwrapped
     right = np.arange(walk.n_states + 2) / (walk.n_states + 1)
     return np.asarray(walk.left_reward + (walk.right_reward - walk.left_reward) * right)
@@ -99,16 +99,16 @@ def true_values(env_kwargs: dict[str, Any]) -> Floats:
 def errors_of_runs(
     algo: str, seeds: Sequence[int], n_episodes: int, env_kwargs: dict[str, Any], **settings: Any
 ) -> Floats:
-    """Root mean square errors over the states, after each episode of each run.
+    """Root mean square errors over the states after each episode, shape (n_runs, n_episodes).
 
-    There is one action, so what a method learns of it is the state's value.
+    There is only one action, so its value is the state's value.
     """
     values = true_values(env_kwargs)
     agent = agent_on(WALK, algo, 0, env_kwargs=env_kwargs, **settings)
     start = {name: table.clone() for name, table in agent.policy.state_dict().items()}
     runs = []
     for seed in seeds:
-        # The same agent begins anew, which takes a tenth of the time of making another.
+        # Resetting the agent takes a tenth of the time of making a new one.
         agent.policy.load_state_dict(start)
         agent.set_random_seed(seed)
         errors = ValueErrors(values)
@@ -119,7 +119,7 @@ def errors_of_runs(
 
 
 def canvas(title: str, x: str, y: str) -> tuple[Figure, Any]:
-    """An empty picture with its words."""
+    """Make an empty plot with title and axis labels."""
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.subplots()
     axes.set(title=title, xlabel=x, ylabel=y)
@@ -130,9 +130,9 @@ def canvas(title: str, x: str, y: str) -> tuple[Figure, Any]:
 def step_size_curves(
     name: str, algo: str, step_sizes: Floats, settings: dict[Any, dict[str, Any]], n_runs: int
 ) -> tuple[Figure, dict[Any, list[float]]]:
-    """Errors over the first ten episodes on the walk of 19 states, by step size, for each setting.
+    """Plot errors over the first ten episodes on the walk of 19 states by step size and setting.
 
-    Errors that mean nothing, because large steps diverge, are NaN.
+    Errors above `LARGEST_ERROR` are NaN.
     """
     figure, axes = canvas(
         "RandomWalk-v0, 19 states", "step size", "error over the first 10 episodes"
@@ -153,7 +153,7 @@ def step_size_curves(
 
 
 def finish(name: str, figure: Figure, folder: Path, statements: Sequence[Statement]) -> None:
-    """Save the picture, and print what the book says; exit with 1 if that does not hold."""
+    """Save the picture, and print the book's statements; exit with 1 if one of them fails."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.png"
     figure.savefig(path, dpi=110)

@@ -1,9 +1,9 @@
-"""Figure 10.1: what it costs to go on, on the mountain car, as it is learnt (example 10.1).
+"""Figure 10.1: the cost-to-go function of the mountain car during learning (example 10.1).
 
     python docs/textbook/figure_10_1.py              # 9,000 episodes, as in the book: a minute
 
-The cost-to-go is the negative of the best action value: the steps that the agent thinks are left.
-Semi-gradient SARSA on eight tilings, without exploration: values of 0 are optimistic enough.
+The cost-to-go is the negative of the largest action value: the estimated number of steps to the
+goal. The agent is semi-gradient SARSA on eight tilings, with optimistic values of 0, and epsilon 0.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def learner() -> SemiGradientSARSA:
 
 
 def cost_to_go(agent: Any) -> Floats:
-    """Over positions and velocities, shape (60, 60)."""
+    """The cost-to-go over positions and velocities, shape (60, 60)."""
     grid = np.stack(np.meshgrid(POSITIONS, VELOCITIES, indexing="ij"), axis=-1)
     sums = agent.policy.sums(grid.reshape(-1, 2).astype(np.float32))
     costs: Floats = -sums.max(axis=1).reshape(grid.shape[:2])
@@ -48,7 +48,7 @@ def cost_to_go(agent: Any) -> Floats:
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 10.1 of Sutton and Barto: the mountain car.", MOMENTS[-1])
     agent, figure = learner(), Figure(figsize=(9, 7.4), layout="constrained")
     costs, lengths = {}, np.empty(0)
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def statements(lengths: Floats, costs: dict[int, Floats]) -> list[Statement]:
-    """What the book says, of lengths of episodes and costs after some of them."""
+    """The book's statements on lengths of episodes, and on costs-to-go by number of episodes."""
     last = costs[MOMENTS[-1]]
     start = int(np.abs(POSITIONS + 0.5).argmin()), int(np.abs(VELOCITIES).argmin())
     return [

@@ -2,7 +2,7 @@
 
     python docs/textbook/figure_12_6.py              # 100 runs: three minutes
 
-The error of the predicted values, over the first ten episodes, with accumulating traces.
+The plot has the mean error of values over the first ten episodes, with accumulating traces.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ STEP_SIZES = np.array([0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 12.6 of Sutton and Barto: TD(lambda).", 100)
     settings = {each: {"trace_decay": each, "trace_type": "accumulating"} for each in DECAYS}
     figure, curves = step_size_curves("lambda", "sarsa_lambda", STEP_SIZES, settings, args.runs)
@@ -23,7 +23,7 @@ def main() -> None:
 
 
 def statements(curves: dict[float, list[float]]) -> list[Statement]:
-    """What the book says of the curves."""
+    """The book's statements on the curves."""
     best = {decay: float(np.nanmin(curve)) for decay, curve in curves.items()}
     decay = min(best, key=lambda each: best[each])
     diverges = [each for each, curve in curves.items() if np.isnan(curve[-1])]

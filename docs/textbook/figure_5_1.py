@@ -1,8 +1,8 @@
-"""Figure 5.1: what sticking on 20 and 21 is worth in Blackjack, by Monte Carlo (example 5.1).
+"""Figure 5.1: values of sticking only on 20 and 21 in Blackjack, by Monte Carlo (example 5.1).
 
     python docs/textbook/figure_5_1.py              # 500,000 episodes, as in the book: a minute
 
-Beside the estimates stand the exact values, which the book does not have.
+We add the exact values, which the book does not have.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from mdp.transition_model import Floats, Ints, TransitionModel
 FEW, MANY = 10_000, 500_000
 STICK, HIT = 0, 1
 STICKS_FROM = 20
-PLAYER, DEALER = np.arange(12, 22), np.arange(1, 11)  # below 12 to hit cannot hurt
+PLAYER, DEALER = np.arange(12, 22), np.arange(1, 11)  # below 12, hitting is never worse
 
 
 def game() -> gym.Env[Any, Any]:
-    """Gymnasium's game by the book's rules, its observations numbered."""
+    """Make Gymnasium's Blackjack with the book's rules and numbered observations."""
     return FlattenToDiscrete(gym.make("Blackjack-v1", sab=True))
 
 
 def model() -> TransitionModel:
-    """Its exact dynamics, one state for each observation and eleven for naturals."""
+    """The exact model of `game`: one state for each observation, and eleven for naturals."""
     known = transition_model(game())
     assert known is not None
     return known
 
 
 def observations() -> Ints:
-    """Numbers of the observations that the figures show: usable ace (no, yes), player, dealer."""
+    """Numbers of the plotted observations by usable ace, player, dealer, shape (2, 10, 10)."""
     ace, player, dealer = np.ix_(np.arange(2), PLAYER, DEALER)
     return np.asarray((player * 11 + dealer) * 2 + ace)
 
 
 def stick_on_twenty(n_observations: int) -> Ints:
-    """The policy of example 5.1, an action for each observation."""
+    """The policy of example 5.1: the action for each observation."""
     return np.where(np.arange(n_observations) // 22 >= STICKS_FROM, STICK, HIT)
 
 
 class OnePolicy(gym.ObservationWrapper[Any, Any, Any]):
-    """Plays a policy: its one action is what that does, so that a learner only predicts."""
+    """Has only one action, the one that ``policy`` takes, so that an agent only predicts."""
 
     def __init__(self, env: gym.Env[Any, Any], policy: Ints) -> None:
         super().__init__(env)
@@ -59,17 +59,17 @@ class OnePolicy(gym.ObservationWrapper[Any, Any, Any]):
         self._obs = 0
 
     def observation(self, observation: int) -> int:
-        """Remember it for the policy."""
+        """Store the observation for the policy."""
         self._obs = observation
         return observation
 
     def step(self, action: int) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Take a step of the policy."""
+        """Take the policy's action."""
         return super().step(self.policy[self._obs])
 
 
 def surfaces(axes: Any, values: Floats, title: str) -> None:
-    """Draw a value for each sum of the player and card of the dealer, shape (10, 10)."""
+    """Draw values by the player's sum and the dealer's card, shape (10, 10)."""
     mesh = axes.imshow(
         values, origin="lower", extent=(0.5, 10.5, 11.5, 21.5), vmin=-1, vmax=1, cmap="coolwarm"
     )
@@ -78,9 +78,9 @@ def surfaces(axes: Any, values: Floats, title: str) -> None:
 
 
 def exact_values() -> Floats:
-    """The policy's values of all observations, naturals apart, shape (S,)."""
+    """The policy's exact values of all states of the model, shape (S,); NaN if never visited."""
     blackjack = model()
-    policy = stick_on_twenty(blackjack.n_states)  # naturals come after all that is observed
+    policy = stick_on_twenty(blackjack.n_states)  # naturals come after the observations
     chain = PolicyChain.build(blackjack, np.eye(2)[policy])
     values = np.full(blackjack.n_states, np.nan)
     values[chain.states] = chain.solve(chain.mean(chain.reward), 1.0)
@@ -88,9 +88,9 @@ def exact_values() -> Floats:
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 5.1 of Sutton and Barto: a policy's values in Blackjack.", MANY)
-    policy, shown = stick_on_twenty(model().n_states - 11), observations()  # of what is observed
+    policy, shown = stick_on_twenty(model().n_states - 11), observations()  # without naturals
     agent = agent_on(
         lambda: OnePolicy(game(), policy), "monte_carlo", 0, learning_rate="sample_average"
     )
@@ -107,7 +107,7 @@ def main() -> None:
 
 
 def statements(few: Floats, many: Floats, exact: Floats) -> list[Statement]:
-    """What the book says of the surfaces, shapes (2, 10, 10)."""
+    """The book's statements on the surfaces, shapes (2, 10, 10)."""
     off = {"few": np.abs(few - exact), "many": np.abs(many - exact)}
     return [
         Statement(

@@ -1,10 +1,10 @@
-"""Figure 5.2: how to play Blackjack, learnt by Monte Carlo control (example 5.3).
+"""Figure 5.2: the optimal policy in Blackjack, found by Monte Carlo control (example 5.3).
 
     python docs/textbook/figure_5_2.py              # 500,000 episodes: two minutes
 
-The book explores by its starts, and averages all returns. Ours explores by an epsilon that falls
-from 0.3 to 0.05, and its step size falls too: returns of early, worse play are forgotten. Beside
-what was learnt stands the optimal policy, by planning.
+The book uses exploring starts, and averages all returns. We use epsilon-greedy exploration, with
+epsilon falling from 0.3 to 0.05, and a falling step size, which forgets returns of early, worse
+policies. We add the optimal policy, found by planning.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from mdp.finite_horizon import finite_horizon_optimum
 from mdp.transition_model import Ints
 
 N_EPISODES = 500_000
-LONGEST = 25  # cards; a hand is bust before
+LONGEST = 25  # cards; no hand lasts so long
 NAMES = {HIT: "hit", STICK: "stick"}
 
 
 def learnt(n_episodes: int) -> Any:
-    """Monte Carlo control after so many episodes."""
+    """Train Monte Carlo control for ``n_episodes``."""
     agent = agent_on(
         game,
         "monte_carlo",
@@ -43,13 +43,13 @@ def learnt(n_episodes: int) -> Any:
 
 
 def by_state(actions: Ints) -> Ints:
-    """Actions for all states of the model; a natural looks as any other 21 does."""
+    """Actions for all states of the model; a natural has the same observation as any other 21."""
     naturals = (21 * 11 + np.arange(11)) * 2 + 1
     return np.concatenate([actions, actions[naturals]])
 
 
 def statements(actions: Ints, best: Ints) -> list[Statement]:
-    """What the book says, of actions for each observation."""
+    """The book's statements on the actions for each observation."""
     blackjack, shown = model(), observations()
     differ = int((actions[shown] != best[shown]).sum())
     optimum = policy_return(blackjack, by_state(best), LONGEST).expected_return
@@ -72,7 +72,7 @@ def statements(actions: Ints, best: Ints) -> list[Statement]:
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 5.2 of Sutton and Barto: Blackjack's policy.", N_EPISODES)
     shown, blackjack = observations(), model()
     n_observed = blackjack.n_states - 11

@@ -1,8 +1,8 @@
-"""Figure 6.2, on the right: TD(0) and Monte Carlo on the walk of five states (example 6.2).
+"""The figure in example 6.2, right: TD(0) and Monte Carlo on the walk of five states.
 
     python docs/textbook/figure_6_2.py              # 100 runs, as in the book: half a minute
 
-The error of the predicted values after each of 100 episodes. All values begin at 0.5.
+The plot has the error of predicted values after each of 100 episodes. All values begin at 0.5.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ LABELS = {"qlearning": "TD", "monte_carlo": "Monte Carlo"}
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 6.2 of Sutton and Barto: TD(0) and Monte Carlo.", 100)
     figure, axes = canvas("RandomWalk-v0, 5 states", "episodes", "root mean square error")
     ends, sums = {}, {}
@@ -36,7 +36,7 @@ def main() -> None:
 def statements(
     ends: dict[tuple[str, float], float], sums: dict[tuple[str, float], float]
 ) -> list[Statement]:
-    """What the book says, of the errors at the end and of those over all episodes."""
+    """The book's statements on the errors at the end, and on mean errors over all episodes."""
     by_algo = {algo: [sums[algo, size] for size in sizes] for algo, sizes in STEP_SIZES.items()}
     worst, best = max(by_algo["qlearning"]), min(by_algo["monte_carlo"])
     return [

@@ -1,10 +1,10 @@
-"""Figure 6.3: three targets on the cliff, over step sizes (section 6.6).
+"""Figure 6.3: three TD control methods on the cliff, by step size (section 6.6).
 
     python docs/textbook/figure_6_3.py              # 100 runs: three minutes; the book has 50,000
 
-Mean return of an episode while learning, with a constant epsilon of 0.1: of the first 100 episodes
-(interim) and of 20,000 (asymptotic; the book has 100,000). Expected SARSA does not feel the chance
-in its own next action, so that its step size can be 1.
+The plot has the mean return of training episodes with a constant epsilon of 0.1: over the first 100
+episodes (interim) and over 20,000 (asymptotic; the book has 100,000). The target of expected SARSA
+has no variance from the next action, so its step size can be 1.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def mean_return(algo: str, step_size: float, n_episodes: int, n_runs: int) -> fl
 
 
 def statements(curves: Curves) -> list[Statement]:
-    """What the book says of the curves."""
+    """The book's statements on the curves."""
     expected_interim, expected_long = curves["expected_sarsa"]
     sarsa_interim, sarsa_long = curves["sarsa"]
     q_interim, q_long = curves["qlearning"]
@@ -61,7 +61,7 @@ def statements(curves: Curves) -> list[Statement]:
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 6.3 of Sutton and Barto: three targets on the cliff.", 100)
     figure, axes = canvas("CliffWalking-v1", "step size", "mean return of an episode")
     curves: Curves = {}

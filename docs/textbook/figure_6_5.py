@@ -1,9 +1,9 @@
-"""Figure 6.5: Q-learning takes chance for worth, double Q-learning does not (section 6.7).
+"""Figure 6.5: maximization bias of Q-learning and double Q-learning (section 6.7).
 
     python docs/textbook/figure_6_5.py              # 1,000 runs: two minutes; the book has 10,000
 
-How often each goes left from A, in each of the first 300 episodes. With epsilon-greedy choices, 5 %
-are left at least.
+The plot has the share of runs that go left from A in each of the first 300 episodes. An
+epsilon-greedy agent goes left in at least 5 % of the cases.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LABELS = {"qlearning": "Q-learning", "double_qlearning": "double Q-learning"}
 
 
 def went_left(algo: str, seed: int) -> Floats:
-    """Whether each episode of a run went left, shape (N_EPISODES,): it took two steps then."""
+    """Whether each episode of a run went left, which takes two steps, shape (N_EPISODES,)."""
     agent = agent_on("envs:MaximizationBias-v0", algo, seed, learning_rate=0.1, mask_actions=True)
     _, lengths = learn_episodes(agent, N_EPISODES)
     left: Floats = np.where(lengths == LEFT, 1.0, 0.0)
@@ -28,7 +28,7 @@ def went_left(algo: str, seed: int) -> Floats:
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 6.5 of Sutton and Barto: maximization bias.", 1000)
     figure, axes = canvas("Maximization bias", "episodes", "left from A, % of runs")
     shares = {}
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def statements(single: Floats, double: Floats) -> list[Statement]:
-    """What the book says of the two curves, shapes (N_EPISODES,)."""
+    """The book's statements on the two curves, shapes (N_EPISODES,)."""
     late = slice(N_EPISODES - 50, None)
     return [
         Statement(

@@ -2,7 +2,7 @@
 
     python docs/textbook/figure_7_2.py              # 100 runs, as in the book: three minutes
 
-The error of the predicted values, over the first ten episodes. All values begin at 0.
+The plot has the mean error of predicted values over the first ten episodes. All values begin at 0.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ STEP_SIZES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8,
 
 
 def main() -> None:
-    """Draw the figure, and hold it against the book."""
+    """Draw the figure, and compare it with the book."""
     args = arguments("Figure 7.2 of Sutton and Barto: n-step TD.", 100)
     settings = {n: {"n_steps": n} for n in LENGTHS}
     figure, curves = step_size_curves("n", "n_step_sarsa", STEP_SIZES, settings, args.runs)
@@ -24,7 +24,7 @@ def main() -> None:
 
 
 def statements(best: dict[int, float]) -> list[Statement]:
-    """What the book says, of the least error for each n."""
+    """The book's statement on the smallest error for each n."""
     first, last = LENGTHS[0], LENGTHS[-1]
     n = min(best, key=lambda length: best[length])
     return [

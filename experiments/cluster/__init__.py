@@ -1,7 +1,7 @@
 """Does runs on many machines, by Dask distributed.
 
 This module has the only function that Dask calls. The scheduler has to import the module too, so it
-imports nothing at the top. Only workers know what a run is.
+imports nothing at the top. Only workers import the code of runs.
 """
 
 from __future__ import annotations

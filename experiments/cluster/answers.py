@@ -27,7 +27,7 @@ from pipeline.locks import is_gone
 from safe_files.archives import read_members
 from safe_files.files import UnsafeFileError
 
-# The last one is for a worker that cannot do any run.
+# UNFIT: the worker has other code than the driver.
 DONE, FAILED, STOPPED, UNFIT = "done", "failed", "stopped", "unfit"
 KINDS = (DONE, FAILED, STOPPED, UNFIT)
 LARGEST = 256 << 20  # bytes, of all files of a run
@@ -48,7 +48,7 @@ class Answer:
 
     kind: str  # one of `KINDS`
     reason: str = ""  # why it failed
-    details: str = ""  # the same at length
+    details: str = ""  # the reason at length
     # The run's files by relative name; None if they are already in their place.
     files: dict[str, bytes] | None = field(default=None, repr=False)
 

@@ -56,9 +56,9 @@ N_RECEIVERS = 4
 
 
 MOST_TRIES = 3
-# Sends of a run that came back without a reason.
+# The largest number of times that a run is sent.
 MOST_SENDS = 50
-# How long all existing workers may have other code than this.
+# The time-out while every existing worker has other code than this command.
 SECONDS_WITHOUT_FIT_WORKERS = 120.0
 
 
@@ -122,7 +122,7 @@ def cluster_launcher(
     warm_ups: str = "[]",
     tell: Callable[[str], object] = str,
 ) -> Iterator[Launcher]:
-    """Do runs on a cluster; ``tell`` receives the dashboard's address, and who does no runs.
+    """Do runs on a cluster; ``tell`` gets the dashboard's address, and workers that do no runs.
 
     Workers compile ``warm_ups`` once, see `experiments.run_in_child.warm_ups`.
 
@@ -213,7 +213,7 @@ class ClusterLauncher:
                 replace_jobs(left)
         except UserError as error:
             self._end_all(error)
-        except Exception:  # noqa: BLE001  # of the library, gone just now: the next look knows more
+        except Exception:  # noqa: BLE001  # an error of the library: the next look retries
             self._workers = {}
 
     def _look_at(self, found: Mapping[str, int]) -> None:
@@ -285,11 +285,11 @@ class ClusterLauncher:
         except UserError as error:  # about the whole cluster
             _set_error(sent.future, error)
             self._end_all(error)
-        except Exception as error:  # noqa: BLE001  # whoever waits for it has to know
+        except Exception as error:  # noqa: BLE001  # the future raises it
             _set_error(sent.future, error)
 
     def _send(self, sent: SentRun) -> None:
-        """Send a run to the scheduler, unless its retries are used up, or nobody may do it."""
+        """Send a run to the scheduler, unless its retries are used up, or no worker may do it."""
         with self._lock:
             self._sent.pop(sent.key, None)
             if sent.is_given_up:
@@ -339,7 +339,7 @@ class ClusterLauncher:
             except TimeoutError:  # its worker has died, and the run is repeated
                 task.add_done_callback(partial(self._on_done, sent))
                 return
-            except Exception:  # noqa: BLE001  # of whatever kind, from the scheduler: it is lost
+            except Exception:  # noqa: BLE001  # any error of the scheduler: the result is lost
                 sent.excuse(sent.worker in self._left)
             else:
                 ending = self._ending_of(sent, content)
@@ -353,7 +353,7 @@ class ClusterLauncher:
             else:
                 with contextlib.suppress(Exception):  # the scheduler may be lost just now
                     self._look_at(self.connection.n_threads())
-                if sent.n_aside == self._n_aside:  # otherwise that worker may have failed it
+                if sent.n_aside == self._n_aside:  # else a worker with other code may have failed
                     sent.refuse(one_line(error))
         else:
             sent.worker = None
@@ -362,9 +362,9 @@ class ClusterLauncher:
         self._send(sent)
 
     def _ending_of(self, sent: SentRun, content: object) -> tuple[str, str] | None:
-        """Why a run failed, in one line and at length; both empty if it is done and in its place.
+        """Why a run failed, in one line and at length; both empty if it succeeded.
 
-        ``content``, the worker's answer, is not trusted. None: the run must be sent again.
+        ``content``, the worker's answer, is not trusted. None if the run must be sent again.
         """
         try:
             answer = unpacked(content)
@@ -388,7 +388,7 @@ class ClusterLauncher:
         return "", ""
 
     def _set_unfit_aside(self, sent: SentRun, answer: Answer) -> None:
-        """Set aside the worker of an answer, which says that it has other code."""
+        """Set aside a worker that answered that it has other code."""
         try:
             told = json.loads(answer.details)
         except (ValueError, RecursionError):

@@ -74,7 +74,7 @@ class SchedulerAddress:
 
     text: str  # the address; empty if it is in the file
     file: Path | None = None  # the file, or None
-    n_workers: int = 0  # to wait for: any number is enough
+    n_workers: int = 0  # workers to count on: any number is enough
     is_insecure: bool = False  # whether the user accepts a scheduler that is open to the network
 
     def read(self) -> str:
@@ -222,10 +222,10 @@ def opened_queue(queue: JobQueue, root: Path) -> Iterator[Any]:
         settings["worker-extra-args"] = [*words, "--no-dashboard", "--worker-class", closed]
     settings["log-directory"] = settings["log-directory"] or str(root.absolute() / JOB_LOGS)
     directives = settings.get("job-extra-directives") or []
-    # A job that SLURM sends again would meet the one that `Jobs` has sent instead.
+    # A job that SLURM requeues would duplicate the job that `Jobs` has submitted in its place.
     if queue.system == "slurm" and not any("requeue" in str(word) for word in directives):
         settings["job-extra-directives"] = [*directives, "--no-requeue"]
-    # Otherwise Dask would cancel the waiting job of the same name that `Jobs` has sent instead.
+    # Otherwise Dask would cancel the waiting job of the same name that `Jobs` has submitted.
     dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER})
     kind = getattr(_library(), QUEUES[queue.system])
     options = settings["scheduler-options"] or {}
@@ -258,9 +258,9 @@ def opened_queue(queue: JobQueue, root: Path) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _folder_for_keys(typed: str) -> Iterator[str]:
-    """A folder in this one that ends with the command; removes those of killed commands.
+    """A temporary folder for keys inside ``typed``; removes folders that killed commands left.
 
-    Its name begins as it was typed, because ``~`` may be another folder on other machines.
+    The path begins as the user typed it, because ``~`` may be another folder on other machines.
     """
     parent = Path(os.path.expanduser(os.path.expandvars(typed)))  # noqa: PTH111  # as Dask does
     for left in parent.glob(f"{_KEYS}*"):
@@ -309,7 +309,7 @@ class Jobs:
             elif listed is not None and name in jobs and str(jobs[name].job_id) not in listed:
                 if name in before:
                     self._close(name)
-                else:  # it may have been sent after the list was made
+                else:  # it may have been submitted after the list was made
                     self._unlisted.add(name)
         self._queue.scale(jobs=self._n_jobs)
 

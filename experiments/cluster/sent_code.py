@@ -1,8 +1,8 @@
 """The code that runs of a study load: sent with each order by its digests, and compared by workers.
 
 A worker must have the driver's versions of Python, this project and all distributions that a run
-loads, and the same files where settings name files. The user's modules are sent: a worker with
-other contents at their place imports what was sent.
+loads, and the same contents of files that settings name. The user's modules are sent: a worker
+whose own copies differ imports the sent ones.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> str:
 
 @dataclass(frozen=True)
 class SentModule:
-    """A module of the user, with what it imports from beside it."""
+    """A module of the user, with the modules in its folder that it imports."""
 
     digests: dict[str, str]  # of its files, by name
     files: dict[str, bytes] | None  # None if it is installed or too large
@@ -103,7 +103,7 @@ class SentModule:
 
 @dataclass(frozen=True)
 class SentCode:
-    """What the runs of an order load."""
+    """The code that the run of an order loads."""
 
     version: str  # the digest of `versions` with ``more``
     more: tuple[str, ...]  # the distributions that the user's modules import
@@ -118,7 +118,7 @@ class SentCode:
         return cls(digest_of_lines(versions(*more)), more, modules, files)
 
     def as_data(self) -> dict[str, Any]:
-        """The same as plain data."""
+        """Convert to plain data."""
         return {**asdict(self), "more": list(self.more), "modules": [*map(asdict, self.modules)]}
 
     @classmethod
@@ -154,7 +154,7 @@ def _of_modules(
 
 @cache
 def _first_digest(path: Path) -> str:
-    """The digest of a file at the first call, likewise."""
+    """The digest of a file at the first call; later changes do not enter a study."""
     return digest_of(path)
 
 

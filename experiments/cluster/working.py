@@ -70,8 +70,8 @@ class RunOrder:
     command: str  # the command that requested it
     limits: RunLimits  # its limits
     probe: Probe  # the test for a shared folder
-    topic: str  # the topic of the event that it begins
-    code: SentCode  # what the run loads
+    topic: str  # the topic of the event that the run has begun
+    code: SentCode  # the code that the run loads
 
     def packed(self) -> bytes:
         """The order as YAML: plain data that keeps the types of numbers and keys."""
@@ -139,7 +139,7 @@ _UNWANTED = ("cancelled", "released", "forgotten")
 
 
 class _Closed:
-    """Mixin without an HTTP port, which would answer every user of the machine without TLS."""
+    """Mixin that opens no HTTP port: it would answer every user of the machine without TLS."""
 
     def start_http_server(self, *args: Any, **kwargs: Any) -> None:
         """Do nothing, because Dask has no setting for this."""
@@ -161,8 +161,8 @@ class Supervisors(WorkerPlugin):
 
     def __init__(self, warm_ups: str, modules: Mapping[str, SentModule]) -> None:
         self.warm_ups = warm_ups  # compiled once, see `experiments.run_in_child.warm_ups`
-        self.modules = modules  # that it imports, by name
-        self._served: dict[str, str] = {}  # digests of these, by the names of top-level modules
+        self.modules = modules  # the user's modules that warm-ups import, by name
+        self._served: dict[str, str] = {}  # digests of imported modules, by top-level name
 
     def setup(self, worker: Worker) -> None:
         """Start the fork server in the background."""
@@ -176,7 +176,7 @@ class Supervisors(WorkerPlugin):
                 asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, leave)
 
     def _checked_warm_ups(self, folder: Path) -> str:
-        """The warm-ups with modules of the driver's contents."""
+        """The warm-ups whose modules have the driver's contents on this worker."""
         checked = []
         for item in json.loads(self.warm_ups):
             modules = [UserModule(**module) for module in item["modules"]]
@@ -189,7 +189,7 @@ class Supervisors(WorkerPlugin):
         return json.dumps(checked)
 
     def serve(self, modules: tuple[SentModule, ...]) -> None:
-        """Replace the fork server if it has imported others of these names."""
+        """Replace the fork server if it has imported other modules with these names."""
         for sent in modules:
             if any(self._served.get(name, sent.digest) != sent.digest for name in sent.names):
                 self._served.clear()
@@ -208,7 +208,7 @@ class Supervisors(WorkerPlugin):
 
 
 def found_versions(dask_worker: Worker) -> dict[str, Any]:
-    """What a driver wants to know of a worker before it sends runs."""
+    """The name and versions of a worker, which a driver reads before it sends runs."""
     _supervisors(dask_worker)
     return {"name": _name(dask_worker), "versions": versions()}
 
@@ -218,7 +218,7 @@ def _name(worker: Worker) -> str:
 
 
 def _supervisors(worker: Worker) -> Supervisors:
-    """The plugin of this worker, which after a restart of the scheduler it may lack."""
+    """The plugin of this worker; adds it if missing, as after a restart of the scheduler."""
     plugin = worker.plugins.get(Supervisors.name)
     if isinstance(plugin, Supervisors):
         return plugin
@@ -254,7 +254,7 @@ def answer_to(content: bytes) -> bytes:
 
 
 def _fitting(order: RunOrder, worker: Worker) -> RunOrder:
-    """The order with the user's modules where they are on this worker, which loads the same code.
+    """The order with the paths of the user's modules on this worker, if its code is the same.
 
     Raises:
         UnfitError: if this worker does not have the same code.

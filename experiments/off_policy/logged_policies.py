@@ -43,7 +43,7 @@ class Judged:
     """One row of the comparison."""
 
     name: str  # of the policy
-    terms: PolicyTerms  # of its estimates
+    terms: PolicyTerms  # the terms of its estimates
     # Whether the user asked about this policy; otherwise it is an alternative.
     is_given: bool = False
 
@@ -62,7 +62,7 @@ def load_policy(found: PolicyFile, modules: Iterable[UserModule] = ()) -> Logged
     """Load an agent; ``modules`` are the typed modules, which it may need.
 
     Raises:
-        UserError: if it cannot be loaded, or does not observe the log's contexts.
+        UserError: if it cannot be loaded, or its actions are not numbered.
     """
     agent = load_model(found.algo, found.model, modules=modules, device="cpu")
     if not isinstance(agent.action_space, spaces.Discrete):
