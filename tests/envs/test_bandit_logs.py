@@ -52,23 +52,18 @@ def test_columns_may_stand_in_any_order_and_propensities_be_missing(write):
     assert (observations.dtype, observations.tolist()) == (np.float32, [[30, 1000], [40.5, 2000]])
 
 
-def log_of(values, *, arm=0):
-    return "segment,arm,reward\n" + "".join(f"{value},{arm},1\n" for value in values.split())
+def log_of(values):
+    return "segment,arm,reward\n" + "".join(f"{value},0,1\n" for value in values.split())
 
 
 DISCRETE, BOX = spaces.Discrete, spaces.Box
 CONTEXTS = [  # of a column, its own space, others in which it can be shown, and in which not
-    ("0 1 2 1", DISCRETE(3), [DISCRETE(4), BOX(0, 9, (1,))], []),
-    ("0 2 2 0", BOX(0, 2, (1,)), [DISCRETE(3)],
+    ("0 1 2 1", DISCRETE(3), [DISCRETE(4), BOX(0, 9, (1,))],
      [(DISCRETE(2), "has the context segment, the agent observes one column of who")]),
-    ("0 0.5 1 0", BOX(0, 1, (1,)), [], [(DISCRETE(2), "one column of whole numbers from 0 to 1")]),
-    ("0 -1", BOX(-1, 0, (1,)), [], [(DISCRETE(3), "one column of whole numbers from 0 to 2")]),
+    ("0 -0.5", BOX(-0.5, 0, (1,)), [], [(DISCRETE(3), "one column of whole numbers from 0 to 2")]),
     ("a b", DISCRETE(2), [],
      [(DISCRETE(3), "the context segment with 2 values of text, the agent"),
       (BOX(0, 1, (1,)), "with 2 values of text, the agent observes Box")]),
-    ("0 1", DISCRETE(2), [],
-     [(BOX(0, 1, (2,)), r"the agent observes Box\(0.0, 1.0, \(2,\), float32\)"),
-      (spaces.MultiBinary(1), r"the agent observes MultiBinary\(1\)")]),
 ]  # fmt: skip
 
 
@@ -90,36 +85,28 @@ def test_a_log_without_context_and_of_one_pull(write):
     assert (len(data), data.n_arms, data.contexts.shape) == (1, 4, (1, 0))
     assert data.observation_space == spaces.Discrete(1)
     assert data.observations(spaces.Discrete(1)).tolist() == [0]
-    for space in (spaces.Discrete(2), spaces.Box(0, 1, (1,))):
-        with pytest.raises(ValueError, match="has no context, the agent observes"):
-            data.observations(space)
+    with pytest.raises(ValueError, match="has no context, the agent observes"):
+        data.observations(spaces.Discrete(2))
 
 
-NUMBER = "it must be a finite number of no more than 1e15"
-NO_PULLS = "holds no pulls: a header and a row for each are needed"
 MISTAKES = [
-    ("", NO_PULLS),
+    ("", "holds no pulls: a header and a row for each are needed"),
     ("arm;reward\n0;1\n", "has no column 'arm', only arm;reward"),
-    ("arm,click\n0,1\n", "has no column 'reward', only arm, click"),
     ("arm,reward,arm\n0,1,0\n", "has two columns 'arm'"),
     ("arm,reward\n0,1\n0\n", ", line 3 has 1 values, not 2"),
     ("arm,reward\n0,1\n0,yes\n", ", line 3: reward is 'yes', it must be a finite number"),
+    ("arm,reward\n0,1\n0,1e16\n", ", line 3: reward is '1e16', it must be a finite number"),
     ("arm,reward\n0,1\n0.5,1\n", ", line 3: arm is '0.5', it must be a whole number from 0 to 9"),
-    ("arm,reward,x\n0,1,3\n0,1,core\n", f", line 3: x is 'core', {NUMBER}: text can only be all"),
-    ("arm,reward,x,y\n0,1,3,core\n", f", line 2: y is 'core', {NUMBER}"),
-    ('arm,reward\n0,"1\n', "cannot read .*: unexpected end of data"),
+    ("arm,reward,propensity\n0,1,0\n", ", line 2: propensity is '0', it must be a probability"),
+    ("arm,reward,x\n0,1,3\n0,1,core\n", ", line 3: x is 'core', it must .*: text can only be all"),
+    ("arm,reward,x,y\n0,1,3,core\n", ", line 2: y is 'core', it must be a finite number"),
     ("arm,reward,x\n0,1,\xff\n".encode("latin1"), r"cannot read .*: 'utf-8' codec can't decode"),
-    (",".join(["arm", "reward", *map(str, range(5000))]), "has 5,002 columns, more than 1,000"),
-    # Rows without an end are refused before they are read.
+    # A row without an end is refused before it is read.
     ("1," * 2**20, r"more than 1,048,576 characters"),
-    ("arm,reward\n" + '"\n",' * 2**19, r"more than 1,048,576 characters"),
 ]
 
 
-NAMES = [f"{i}, {message}" for i, (_, message) in enumerate(MISTAKES)]
-
-
-@pytest.mark.parametrize(("text", "message"), MISTAKES, ids=NAMES)
+@pytest.mark.parametrize(("text", "message"), MISTAKES, ids=[message for _, message in MISTAKES])
 def test_mistakes_in_a_log_are_named_with_their_line(tmp_path, text, message):
     path = tmp_path / "log.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -129,42 +116,13 @@ def test_mistakes_in_a_log_are_named_with_their_line(tmp_path, text, message):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("column", "accepted", "refused"),
-    [
-        ("arm", ["9999", "1e3"], ["-1", "10000", "9999.5", "nan"]),
-        ("reward", ["0.1", "-1e15", "1e15", "5e-324"], ["nan", "inf", "1.1e15"]),
-        ("propensity", ["1e-9", "1"], ["0", "9e-10", "1.0000000000000002", "nan"]),
-        ("age", ["0.1", "-1e15"], ["nan", "-inf", "1.1e15"]),
-    ],
-)
-def test_the_limits_of_each_column_from_both_sides(write, column, accepted, refused):
-    row = {"arm": "0", "reward": "1", "propensity": "0.5", "age": "30"}
-
-    def log_with(value):
-        rows = [row, row.values(), {**row, column: value}.values()]
-        return write("\n".join(",".join(cells) for cells in rows))
-
-    for value in accepted:  # to the last bit
-        data = read_log(log_with(value))
-        columns = (data.arms, data.rewards, data.propensities, data.contexts[:, 0])
-        assert dict(zip(row, columns, strict=True))[column][1] == float(value)
-    for value in refused:
-        with pytest.raises(ValueError, match=f"line 3: {column} is '{value}', it must be"):
-            read_log(log_with(value))
-
-
-def test_a_log_is_read_in_pieces_without_a_seam(write, monkeypatch):
-    # As a log of millions of rows is read, which a test has no time for.
-    monkeypatch.setattr("envs.bandits.logged.ROWS_AT_ONCE", 2)
-    lines = [f"{word},{i % 3},{i},0.5" for i, word in enumerate("zabzcabca")]
-    data = read_log(write("\n".join(["word,arm,reward,propensity", *lines])))
-    assert data.categories == ("a", "b", "c", "z")
-    assert data.contexts[:, 0].tolist() == [3, 0, 1, 3, 2, 0, 1, 2, 0]
-    assert data.rewards.tolist() == list(range(9))
-    for values in ("1 1 a 1", "a a 1 1"):
-        with pytest.raises(ValueError, match="text can only be all of the context"):
-            read_log(write(log_of(values)))
+def test_a_log_is_read_in_pieces_without_a_seam(write):
+    words = [f"{'zab'[i % 3]}{i // 9_000}" for i in range(21_000)]  # ten thousand rows are a piece
+    data = read_log(write(log_of(" ".join(words))))
+    assert data.categories == tuple(sorted(set(words)))
+    assert [data.categories[int(code)] for code in data.contexts[:, 0]] == words
+    with pytest.raises(ValueError, match=r"line 21002: .*text can only be all of the context"):
+        read_log(write(log_of(" ".join([*["1"] * 21_000, "a"]))))
 
 
 # --- writing --------------------------------------------------------------------------------------
@@ -196,13 +154,8 @@ def test_a_uniform_log_holds_what_the_environment_gave(env_id, kwargs, names, tm
 
 
 def test_replay_by_hand(tmp_path):
-    for path, said in (
-        (None, "log must be the path to a CSV file of logged pulls"),
-        (tmp_path / "missing.csv", r"cannot read .*missing\.csv: No such file or directory"),
-        (tmp_path, "no regular file"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            gym.make("ReplayBandit-v0", **({"log": str(path)} if path else {}))
+    with pytest.raises(ValueError, match=r"cannot read .*missing\.csv: No such file or directory"):
+        gym.make("ReplayBandit-v0", log=str(tmp_path / "missing.csv"))
     env = gym.make("ReplayBandit-v0", log=str(LOG))
     assert (env.observation_space, env.action_space) == (spaces.Discrete(2), spaces.Discrete(2))
     assert (time_limit(env), transition_model(env)) == (7, None)
@@ -225,23 +178,13 @@ def test_replay_by_hand(tmp_path):
         env.unwrapped.step(1)
 
 
-NOT_UNIFORM = [  # arms, their propensities, and the refusal
-    ("01", None, "has no column 'propensity': replay needs one, each value the"),
-    ("011", "0.5 0.5 0.4", "among its 2 arms uniformly: the propensity of pull 3 is 0.4, not 0.5"),
-    ("01", "0.9 0.1", "use inverse propensities instead: compare --logged .*log.csv --policy RUN"),
-    ("012", "0.5 0.5 0.5", "its 3 arms uniformly: the propensity of pull 1 is 0.5, not 0.3333"),
-]
-
-
-@pytest.mark.parametrize(("arms", "propensities", "message"), NOT_UNIFORM)
-def test_logs_that_were_not_uniform_are_refused(write, arms, propensities, message):
-    header, rows = "arm,reward", [f"{arm},1" for arm in arms]
-    if propensities:
-        shares = propensities.split()
-        header, rows = f"{header},propensity", list(map(",".join, zip(rows, shares, strict=True)))
-    with pytest.raises(ValueError, match=message) as refused:
-        ReplayBandit(write("\n".join([header, *rows])))
-    assert "\n" not in str(refused.value)
+def test_logs_that_were_not_uniform_are_refused(write):
+    for text, message in (
+        ("arm,reward\n0,1\n", "has no column 'propensity': replay needs one, each value the"),
+        ("arm,reward,propensity\n0,1,0.5\n1,1,0.4\n", "the propensity of pull 2 is 0.4, not 0.5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ReplayBandit(write(text))
     # Arms that were never pulled are known from the propensities.
     log = write("arm,reward,propensity\n0,1,0.2\n2,0,0.2\n")
     assert ReplayBandit(log).action_space == spaces.Discrete(5)
