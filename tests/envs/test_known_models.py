@@ -64,6 +64,8 @@ WORLDS = {
     "DarkWarehouse": ("DarkWarehouse-v0", {"slip": 0.1}),
     "DeepSea": ("DeepSea-v0", {"size": 4}),
     "Racetrack": ("Racetrack-v0", {}),
+    "BernoulliBandit": ("BernoulliBandit-v0", {"pulls": 90}),
+    "SegmentBandit": ("SegmentBandit-v0", {"batch_size": 9, "pulls": 90}),
 }
 
 
