@@ -2,7 +2,6 @@
 
 import math
 import pickle
-from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -25,6 +24,7 @@ from envs.wrappers import (
     TerminationReward,
     action_masks,
 )
+from tests.envs.test_environment_contract import assert_equal, play
 
 
 class Showing(gym.Env):
@@ -81,10 +81,8 @@ def test_bins_worked_by_hand():
 @pytest.mark.parametrize(
     ("space", "shown", "n", "index"),
     [
-        (spaces.MultiDiscrete([2, 3, 4]), np.array([1, 0, 2]), 24, (1 * 3 + 0) * 4 + 2),
         (spaces.MultiDiscrete([2, 3], start=[5, -1]), np.array([6, 1]), 6, 1 * 3 + 2),
         (spaces.Tuple([spaces.Discrete(32), spaces.Discrete(11)]), (13, 10), 352, 153),
-        (spaces.Tuple([spaces.Discrete(3, start=1), spaces.Discrete(2)]), (3, 0), 6, 4),
         (spaces.Discrete(5, start=-2), 2, 5, 4),
     ],
 )
@@ -121,27 +119,22 @@ def test_rewards_are_scaled_and_the_last_one_is_replaced(limit, on_truncation, r
 
 # --- what all share -------------------------------------------------------------------------------
 
-BOX = spaces.Box(0, 1, (2,))
-DISCRETE = spaces.Discrete(2)
-MIXED, HUGE = spaces.Tuple([DISCRETE, BOX]), spaces.MultiDiscrete([2**31] * 3)
-IN_BINS = partial(DiscretizeObservation, bins=2)
+BOX, DISCRETE = spaces.Box(0, 1, (2,)), spaces.Discrete(2)
+HUGE = spaces.MultiDiscrete([2**31] * 3)
 REFUSED = [
     (lambda: cart_pole(low=None), "dimension 3 of the observation has the bounds -inf and 50.0: g"),
     (lambda: cart_pole(low=[1, -50]), "dimension 2: low 1.0 is not below high 0.418"),
     (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
-    (lambda: cart_pole(bins=[2, 2, 2]), r"bins must be one number, or one for each of .* \[2, 3"),
-    (lambda: cart_pole(dims=[4]), "dims must be a whole number from 0 to 3, not 4"),
     (lambda: cart_pole(dims=[2, 2]), r"dims must list dimensions, each once, not \[2, 2\]"),
-    (lambda: cart_pole(dims=2), "dims must list dimensions, each once, not 2"),
-    (lambda: IN_BINS(Showing(DISCRETE)), "DiscretizeObservation needs a Box of"),
-    (lambda: IN_BINS(Showing(spaces.Box(0, 1, (2, 2)))), "needs a Box of one axis"),
+    (
+        lambda: DiscretizeObservation(Showing(DISCRETE), bins=2),
+        "DiscretizeObservation needs a Box of",
+    ),
     (lambda: FlattenToDiscrete(Showing(BOX)), "FlattenToDiscrete needs MultiDiscrete, a Tuple of"),
-    (lambda: FlattenToDiscrete(Showing(MIXED)), r"not Tuple\(Discrete\(2\), Box"),
     (lambda: FlattenToDiscrete(Showing(HUGE)), "too many to be numbered"),
     (lambda: OneHotObservation(Showing(BOX)), "OneHotObservation needs Discrete observations, not"),
     (lambda: ScaleReward(Showing(DISCRETE), 0), "scale must not be 0"),
     (lambda: TerminationReward(Showing(DISCRETE), math.nan), "reward must be a finite number"),
-    (lambda: TerminationReward(Showing(DISCRETE), 0, "yes"), "on_truncation must be true or false"),
     (lambda: ActionMasks(gym.make("CartPole-v1")), "^CartPole-v1 has no action masks: neither a m"),
     (lambda: IdleActionMasks(gym.make("CartPole-v1")), "needs an environment that holds P"),
 ]
@@ -166,34 +159,22 @@ WRAPPED = {
 }
 
 
-def rollout(env):
-    history = [(np.asarray(env.reset(seed=3)[0]).tolist(), 0.0)]
-    for action in np.random.default_rng(0).integers(2, size=100).tolist():
-        observation, reward, terminated, truncated, _ = env.step(action)
-        history.append((np.asarray(observation).tolist(), float(reward)))
-        if terminated or truncated:
-            env.reset()
-    return history
-
-
 @pytest.mark.parametrize("name", WRAPPED)
 def test_wrapped_environments_are_checked_remade_from_their_spec_and_pickled(name):
     env = WRAPPED[name]()
     check_env(env, warn=True)
-    expected = rollout(env)
     for other in (gym.make(env.spec), pickle.loads(pickle.dumps(env))):
         assert str(other) == str(env)
-        assert rollout(other) == expected
+        assert_equal(env.reset(seed=3), other.reset(seed=3))
+        assert_equal(play(env, 50, seed=0), play(other, 50, seed=0))
 
 
 # --- action masks ---------------------------------------------------------------------------------
 
 STILL = {"is_slippery": False}
 MASKED = {
-    "Warehouse": lambda: gym.make("Warehouse-v0"),
     "MineMaze": lambda: ScaleReward(FlattenToDiscrete(gym.make("MineMaze-v0")), 0.1),
     "told Taxi": lambda: ActionMasks(gym.make("Taxi-v4")),
-    "idle lake": lambda: IdleActionMasks(gym.make("FrozenLake-v1", **STILL)),
     "idle cliff": lambda: ActionMasks(IdleActionMasks(gym.make("CliffWalking-v1"))),
 }
 
@@ -247,16 +228,5 @@ def test_masks_that_are_not_there_are_not_guessed():
         assert action_masks(env) is action_masks_of_states(env) is None
     assert action_masks_of_states(OwnMasks()) is None
     assert action_masks(OwnMasks()).tolist() == [False, True, True, True]
-    # A wrapper that nobody here knows may mask as well, and say so in info alone.
+    # A wrapper that nobody here knows may mask as well.
     assert action_masks_of_states(gym.Wrapper(MineMazeEnv())) is None
-    env = ActionMasks(ToldByInfo(gym.make("CartPole-v1")))
-    env.reset(seed=0)
-    assert env.action_masks().tolist() == [False, True]
-
-
-class ToldByInfo(gym.Wrapper):
-    """Says it in info alone."""
-
-    def reset(self, **kwargs):
-        obs, info = self.env.reset(**kwargs)
-        return obs, {**info, "action_mask": np.array([0, 1], np.int8)}
