@@ -9,7 +9,7 @@ from scipy.stats import poisson
 
 import envs  # noqa: F401 (registers the environments)
 from envs.known_models import action_masks_of_states, success_outcomes, time_limit, transition_model
-from envs.textbook.racetrack import LEFT_TRACK, TRACKS, crossed_cells
+from envs.textbook.racetrack import LEFT_TRACK
 from mdp import finite_horizon_optimum, policy_iteration, policy_return, value_iteration
 
 
@@ -51,22 +51,15 @@ def test_the_walk_of_a_thousand_states_is_example_9_1():
     assert sorted(set(model.next_state[500, 0].tolist())) == [*range(400, 500), *range(501, 601)]
 
 
-@pytest.mark.parametrize("p", [0.05, 0.59])
-def test_returns_of_the_corridor_are_those_of_the_closed_form(p):
-    # Example 13.1: v1 = 1 + p v2 + (1-p) v1, v2 = 1 + p v1 + (1-p) v3, v3 = 1 + (1-p) v2.
-    policy = np.tile([1 - p, p], (4, 1))
-    found = policy_return(model_of("ShortCorridor-v0"), policy, 20_000).expected_return
-    assert found == pytest.approx(-(4 - 2 * p) / (p * (1 - p)), rel=1e-9)
-
-
 def test_the_second_state_of_the_corridor_alone_is_reversed():
-    env = gym.make("ShortCorridor-v0").unwrapped
-    assert optimum_of("ShortCorridor-v0") == -3
+    # Example 13.1: v1 = 1 + p v2 + (1-p) v1, v2 = 1 + p v1 + (1-p) v3, v3 = 1 + (1-p) v2.
+    p, env = 0.59, gym.make("ShortCorridor-v0").unwrapped
+    found = policy_return(env.transition_model(), np.tile([1 - p, p], (4, 1)), 20_000)
+    assert found.expected_return == pytest.approx(-(4 - 2 * p) / (p * (1 - p)), rel=1e-9)
     env.reset(seed=0)
     states = [0, 1, 0, 1, 2, 1, 0, 0, 1]
     assert walk(env, [0, 1, 1, 1, 0, 0, 1, 0, 1]) == (states, [-1.0] * 9, False)
-    env.step(0)
-    assert env.step(1)[:3] == (0, -1.0, True)
+    assert walk(env, [0, 1])[1:] == ([-1.0, -1.0], True)
 
 
 # --- WindyGridworld -------------------------------------------------------------------------------
@@ -155,7 +148,7 @@ def test_swimming_right_for_ever_earns_what_its_chain_says():
     assert left == pytest.approx(20 * 0.005)
 
 
-@pytest.mark.parametrize(("size", "map_seed"), [(2, 0), (10, None), (30, 5)])
+@pytest.mark.parametrize(("size", "map_seed"), [(2, 0), (10, None)])
 def test_the_treasure_is_worth_99_hundredths(size, map_seed):
     kwargs = {"size": size, "map_seed": map_seed}
     assert optimum_of("DeepSea-v0", **kwargs) == pytest.approx(0.99, abs=1e-12)
@@ -198,43 +191,24 @@ STEPS = [
     # A car moves by its new velocity, from 0 to 4, and stops on the starting line alone.
     (0, (31, 4, 0, 0), FASTER_UP, {((30, 4, 1, 0), False): 1.0}),
     (0, (20, 5, 2, 1), FASTER_RIGHT, {((18, 7, 2, 2), False): 1.0}),
-    (0, (20, 5, 2, 0), COAST, {((18, 5, 2, 0), False): 1.0}),
     (0, (20, 5, 4, 0), FASTER_UP, {((16, 5, 4, 0), False): 1.0}),
-    (0, (20, 5, 2, 0), SLOWER_RIGHT, {((18, 5, 2, 0), False): 1.0}),
     (0, (20, 5, 1, 0), SLOWER_UP, {((19, 5, 1, 0), False): 1.0}),
     (0, (31, 5, 0, 1), SLOWER_RIGHT, {((31, 5, 0, 0), False): 1.0}),
-    (0, (31, 5, 0, 0), COAST, {((31, 5, 0, 0), False): 1.0}),
     # It leaves the track, at the end of its move and on the way.
     (0, (20, 8, 1, 0), FASTER_RIGHT, back_to_the_line()),
     (0, (8, 8, 2, 2), FASTER_UP, back_to_the_line()),
     # It finishes, whatever lies beyond, but not beyond the upper edge before the line.
-    (0, (2, 15, 0, 4), COAST, {((2, 16, 0, 4), True): 1.0}),
     (0, (0, 15, 1, 4), COAST, {((0, 16, 1, 4), True): 1.0}),
     (0, (0, 13, 3, 3), COAST, back_to_the_line()),
     # With noise the velocity may stay as it is.
     (0.1, (20, 5, 2, 0), FASTER_RIGHT, {((18, 6, 2, 1), False): 0.9, ((18, 5, 2, 0), False): 0.1}),
     (0.1, (20, 8, 1, 0), FASTER_RIGHT, {**back_to_the_line(0.9), ((19, 8, 1, 0), False): 0.1}),
-    (0.1, (20, 8, 1, 1), FASTER_RIGHT, back_to_the_line()),
 ]
 
 
 @pytest.mark.parametrize(("noise", "start", "action", "expected"), STEPS)
 def test_steps_of_the_racetrack(noise, start, action, expected):
     assert outcomes(noise, start, action) == expected
-
-
-def test_tracks_and_the_cells_that_a_line_enters():
-    found = {}
-    for name, rows in TRACKS.items():
-        text = "".join(rows)
-        found[name] = (len(rows), len(rows[0]), text.count("S"), text.count("G"), len(cells(rows)))
-    assert found == {"left": (32, 17, 6, 6, 298), "right": (30, 32, 23, 9, 515)}
-    # Many points of the line, none of them on a border between cells.
-    shares = (np.arange(1000) + 0.5) / 1000 + 1e-7
-    for up, right in np.ndindex(5, 5):
-        points = [(int(up * t + 0.5), int(right * t + 0.5)) for t in shares if t <= 1]
-        entered = [cell for cell in dict.fromkeys(points) if cell != (0, 0)]
-        assert crossed_cells(up, right) == entered
 
 
 def test_without_noise_the_race_takes_ten_steps_and_more():
