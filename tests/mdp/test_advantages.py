@@ -49,6 +49,7 @@ def drawn_cases(draw):
     return model, policy, critic, draw(st.sampled_from([0.0, 0.5, 0.9]))
 
 
+@settings(max_examples=40)
 @given(drawn_cases())
 def test_values_are_those_of_long_episodes_from_each_state(case):
     model, policy, _, discount = case
@@ -84,7 +85,7 @@ def by_enumeration(model, policy, critic, discount, trace, state, action, n_left
     return total
 
 
-@settings(max_examples=30)
+@settings(max_examples=25)
 @given(drawn_cases(), st.sampled_from([0.0, 0.6, 1.0]))
 def test_what_estimates_expect_is_the_mean_over_all_that_may_happen(case, trace):
     model, policy, critic, discount = case
@@ -92,25 +93,10 @@ def test_what_estimates_expect_is_the_mean_over_all_that_may_happen(case, trace)
     steps = [(s, a, n) for s in reachable for a in range(model.n_actions) for n in (3, 1, 2)]
     columns = tuple(np.array(steps).T)
     given_action, given_state = expected_estimates(model, policy, critic, discount, trace, columns)
-    for (state, action, n), found in zip(steps, given_action, strict=True):
-        told = by_enumeration(model, policy, critic, discount, trace, state, action, n)
-        assert found == pytest.approx(told, abs=1e-9)
-    for (state, _, n), found in zip(steps, given_state, strict=True):
-        told = sum(
-            policy[state, a] * by_enumeration(model, policy, critic, discount, trace, state, a, n)
+    for i, (state, action, n) in enumerate(steps):
+        told = [
+            by_enumeration(model, policy, critic, discount, trace, state, a, n)
             for a in range(model.n_actions)
-        )
-        assert found == pytest.approx(told, abs=1e-9)
-
-
-@given(drawn_cases())
-def test_with_lambda_1_the_bias_is_that_of_the_state_alone(case):
-    """Of estimates over whole episodes: whatever the critic says, it is a mere baseline."""
-    model, policy, critic, discount = case
-    policy = policy / policy.sum(axis=1, keepdims=True)
-    exact = discounted_values(model, policy, discount)
-    reachable = np.flatnonzero(model.reachable)
-    pairs = np.array([(s, a, 400) for s in reachable for a in range(model.n_actions)]).T
-    given_action, given_state = expected_estimates(model, policy, critic, discount, 1.0, pairs)
-    assert given_action - given_state == pytest.approx(exact.advantages[pairs[0], pairs[1]])
-    assert given_state == pytest.approx((exact.values - critic)[pairs[0]])
+        ]
+        assert given_action[i] == pytest.approx(told[action], abs=1e-9)
+        assert given_state[i] == pytest.approx(policy[state] @ told, abs=1e-9)

@@ -1,14 +1,12 @@
 """What planning says of its own error, against the error itself, in exact fractions."""
 
 import itertools
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from mdp import TransitionModel, policy_iteration, value_iteration
-from mdp.planning import FinitePart, PlanningProblem
 
 STATES, ACTIONS, OUTCOMES = 3, 2, 2
 EPSILON = float(np.finfo(np.float64).eps)
@@ -107,43 +105,6 @@ def test_bounds_are_never_below_the_error_and_not_far_above(discount, scale):
         assert (0.2 if costly else 0.85 * discount) < max(shares[tolerance]) <= discount
 
 
-@pytest.mark.parametrize(
-    ("change", "bound"), [(0.0, 0.0), (0.25, 2 / 3), (0.5, 2.0), (1 - 1e-9, 2e9), (1.0, np.inf)]
-)
-def test_the_bound_without_discount_by_hand(change, bound):
-    """A step costs 1, or ends the episode with a chance of 1/2 and earns 4: M is 5, the value 3."""
-    model = TransitionModel(
-        prob=np.array([[[0.5, 0.5]]]),
-        next_state=np.zeros((1, 1, 2), np.int64),
-        reward=np.array([[[-1.0, 4.0]]]),
-        terminated=np.array([[[False, True]]]),
-        initial=np.ones(1),
-    )
-    problem = PlanningProblem(model, 1.0, replace(FinitePart.everything(model), step_cost=1.0))
-    found = problem.error_bound(np.array([3.0]), change)
-    assert found == pytest.approx(bound, rel=1e-5, abs=1e-13)
-
-
 def rounded(values, times):
     """So many times what rounding may do to the largest of some values."""
     return times * EPSILON * max(1.0, float(np.abs(values).max()))
-
-
-@pytest.mark.parametrize(("bounds_apart", "chosen"), [(0.0, 0), (1.9, 0), (2.1, 1), (2.9, 1)])
-def test_what_lies_within_twice_the_bound_is_a_tie(bounds_apart, chosen):
-    """Three states take many sweeps; beside them stands one whose actions end the episode."""
-    slow = drawn_model(0, 1.0)
-    rows = {"prob": [[1, 0], [1, 0]], "next_state": [[0, 0], [0, 0]]}
-    rows["terminated"] = [[True, True], [True, True]]
-
-    def plan_with(gap):
-        more = {**rows, "reward": [[1 - gap, 0], [1, 0]]}
-        arrays = {name: np.concatenate([getattr(slow, name), [row]]) for name, row in more.items()}
-        model = TransitionModel(**arrays, initial=np.full(4, 0.25))
-        return value_iteration(model, discount=0.99, tolerance=0.01)
-
-    bound = plan_with(0.0).error_bound
-    assert 1e-4 < bound <= 0.01
-    plan = plan_with(bounds_apart * bound)
-    assert plan.error_bound == bound
-    assert plan.policy[3] == chosen

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.known_models import transition_model
@@ -44,6 +44,7 @@ def at_each_step(model, policy, horizon):
     return np.broadcast_to(chances, (horizon, model.n_states, model.n_actions))
 
 
+@settings(max_examples=40)
 @given(models_and_policies())
 def test_what_each_state_loses_is_that_of_a_recursion(drawn):
     """The chance to be there at each step, times what is lost by doing what the policy does."""
@@ -68,6 +69,7 @@ def test_what_each_state_loses_is_that_of_a_recursion(drawn):
     assert split.action_values * visits[:, None] == pytest.approx(worth, abs=1e-9)
 
 
+@settings(max_examples=40)
 @given(models_and_policies(n_policies=2))
 def test_gains_where_two_policies_part_sum_to_their_difference(drawn):
     model, horizon, first, second = drawn
@@ -83,6 +85,7 @@ def test_gains_where_two_policies_part_sum_to_their_difference(drawn):
     assert found.met == pytest.approx(met, abs=1e-9)
 
 
+@settings(max_examples=40)
 @given(models_and_policies())
 def test_repairs_are_the_best_states_to_mend_one_after_the_other(drawn):
     """Against the optimum of a model in which all states but the repaired have one action."""
@@ -111,6 +114,7 @@ def test_repairs_are_the_best_states_to_mend_one_after_the_other(drawn):
         mask, done = mask | (states == repair.state), plans[repair.state].policy.astype(np.int64)
 
 
+@settings(max_examples=40)
 @given(models_and_policies())
 def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     model, horizon, policy = drawn

@@ -6,7 +6,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.known_models import success_outcomes, time_limit, transition_model
@@ -41,19 +41,15 @@ def choice(rewards):
 
 def test_random_actions_take_n_squared_steps_to_the_end_of_a_corridor():
     """A walk that is held at 0 needs n (n + 1) steps to n; the limit of 10,000 cuts off none."""
-    steps, episodes = random_wait(corridor(5, ends=True), corridor(5, ends=True).reward > 0, 10_000)
-    assert steps == pytest.approx(5 * 6, rel=1e-9)
-    assert episodes == pytest.approx(1.0, rel=1e-9)
-
-
-def test_episodes_that_are_cut_off_are_begun_anew():
-    """With three steps for three places, one episode of 8 gets there, and each takes 3 steps."""
+    model = corridor(5, ends=True)
+    assert random_wait(model, model.reward > 0, 10_000) == pytest.approx((5 * 6, 1), rel=1e-9)
+    # With three steps for three places, one episode of 8 gets there, and each takes 3 steps.
     model = corridor(3, ends=True)
     assert random_wait(model, model.reward > 0, 3) == pytest.approx((24.0, 8.0))
     assert random_wait(model, model.reward > 0, 2) == (math.inf, math.inf)
 
 
-@pytest.mark.parametrize("size", [4, 9, 15])
+@pytest.mark.parametrize("size", [4, 9])
 def test_the_sea_is_deep(size):
     """Looking k steps ahead pays if 2^-(size - k), the chance of the rest, exceeds their cost."""
     env = gym.make("DeepSea-v0", size=size)
@@ -84,13 +80,6 @@ def test_a_lake_that_is_not_slippery():
     assert found.lookahead == 1
 
 
-def test_slips_on_a_lake_disconnect_what_a_hole_may_part():
-    found = hardness_of(transition_model(gym.make("FrozenLake-v1")), 100)
-    assert found.effective_horizon is None
-    assert 0 < found.connected < 1
-    assert found.random_steps_to_goal is None
-
-
 def test_two_arms():
     """With 20 pulls left: v = 9.5 * 19, b = 19 and d = 1 for both arms, so m = 6439."""
     model = choice([1.0, 0.0])
@@ -101,9 +90,6 @@ def test_two_arms():
     assert bound == pytest.approx(1 + math.log2(episodes))
     # Seven pulls can be tried in all combinations, with less.
     assert looking_ahead(model, 7) == (1, 7.0)
-    # A single pull needs no luck.
-    assert looking_ahead(model, 1) == (1, 1.0)
-    assert diameter(model) is None
 
 
 def test_arms_that_are_alike_are_no_mistake():
@@ -115,9 +101,7 @@ def test_arms_that_are_alike_are_no_mistake():
 
 
 def test_a_world_that_is_too_large_has_fewer_numbers():
-    long = corridor(2000, ends=False)
-    assert diameter(long) is None
-    assert looking_ahead(long, 20_000) == (None, None)
+    assert diameter(corridor(2000, ends=False)) is None
 
 
 # Against brute force.
@@ -151,6 +135,7 @@ def worst_greedy_return(model, horizon, k):
     return sum(model.initial[state] * worst(state, horizon) for state in starts)
 
 
+@settings(max_examples=40)
 @given(models(states=3, actions=2, outcomes=2), st.integers(1, 4))
 def test_the_lookahead_is_the_first_depth_at_which_no_greedy_policy_fails(model, horizon):
     lookahead, bound = looking_ahead(model, horizon)
@@ -163,6 +148,7 @@ def test_the_lookahead_is_the_first_depth_at_which_no_greedy_policy_fails(model,
     assert bound is None or lookahead <= bound <= horizon
 
 
+@settings(max_examples=40)
 @given(models(states=4, actions=2), st.data())
 def test_hitting_times_are_those_of_the_fastest_policy(model, data):
     """The best of all stationary policies, each one's times by a linear system."""
