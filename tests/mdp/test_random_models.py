@@ -87,6 +87,7 @@ def by_linear_program(model, discount):
     return values
 
 
+@settings(max_examples=40)
 @given(models(), st.sampled_from([0.0, 0.3, 0.9, 0.99]))
 def test_discounted_planning_by_three_methods(model, discount):
     one, two = value_iteration(model, discount), policy_iteration(model, discount)
@@ -100,8 +101,8 @@ def test_discounted_planning_by_three_methods(model, discount):
 
 
 def stationary_policies(model):
-    for actions in itertools.product(range(model.n_actions), repeat=model.n_states):
-        yield np.array(actions)
+    actions = itertools.product(range(model.n_actions), repeat=model.n_states)
+    return [np.array(each) for each in actions]
 
 
 def total_rewards(model, policy):
@@ -138,7 +139,7 @@ def total_rewards(model, policy):
     return values
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(models(states=3, actions=2, outcomes=2))
 def test_undiscounted_planning_against_every_stationary_policy(model):
     totals = np.array([total_rewards(model, policy) for policy in stationary_policies(model)])
@@ -162,6 +163,7 @@ def test_undiscounted_planning_against_every_stationary_policy(model):
     np.testing.assert_allclose(found[starts], best[starts], rtol=0, atol=1e-9)
 
 
+@settings(max_examples=40)
 @given(models(always_ends=True), st.data())
 def test_no_time_limit_is_a_distant_one(model, data):
     policy = data.draw(distributions((model.n_states, model.n_actions)))
@@ -220,9 +222,10 @@ def moments_by_recursion(model, chances, discount, success):
     return figures, values, visits
 
 
+@settings(max_examples=50)
 @given(
     models(),
-    st.integers(1, 70),
+    st.integers(1, 30),
     st.sampled_from([1.0, 0.9, 0.0]),
     st.sampled_from(["random", "fixed", "changing"]),
     st.data(),
@@ -260,6 +263,7 @@ def test_evaluation_against_a_recursion(model, horizon, discount, kind, data):
     assert found == pytest.approx(max(returns), abs=1e-9)
 
 
+@settings(max_examples=40)
 @given(models(), st.integers(1, 20))
 def test_optimal_actions_followed_by_the_best_plan_earn_the_optimum(model, horizon):
     values, optimal = optimal_choices(model, horizon)
@@ -274,7 +278,8 @@ def test_optimal_actions_followed_by_the_best_plan_earn_the_optimum(model, horiz
         np.testing.assert_array_equal(optimal[reached, action], equal[reached])
 
 
-@given(models(), st.integers(1, 4000))
+@settings(max_examples=40)
+@given(models(), st.integers(1, 2000))
 def test_what_is_said_of_a_limit_far_away_without_the_steps_is_the_optimum(model, horizon):
     model = replace(model, reward=np.where(model.terminated, model.reward, -1.0))
     found = optimum_far_from_limit(model, horizon)
