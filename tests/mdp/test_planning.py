@@ -76,6 +76,24 @@ def test_optima_under_a_time_limit():
         assert earned == pytest.approx(found.start_value, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "discount", "most"),
+    [
+        ("RiverSwim-v0", {}, 0.99, 0.7),
+        ("Warehouse-v0", {"slip": 0.1}, 0.9, 0.4),
+        ("WindyGridworld-v0", {"moves": "king", "stochastic": True}, 1.0, 0.1),
+    ],
+)
+def test_sweeps_that_end_early_say_by_how_much_they_may_be_wrong(env_id, kwargs, discount, most):
+    """The error reaches a share of the bound, and never more than the bound."""
+    model = model_of(env_id, **kwargs)
+    exact = policy_iteration(model, discount).values
+    for tolerance in (1e-3, 0.1):
+        found = value_iteration(model, discount, tolerance)
+        error = np.abs(found.values - exact)[model.reachable].max()
+        assert most * found.error_bound < error <= found.error_bound <= tolerance
+
+
 def test_a_time_limit_out_of_reach_costs_no_memory():
     found = finite_horizon_optimum(model_of("Warehouse-v0"), 10**6)
     assert found.actions_left.dtype == np.uint8

@@ -88,8 +88,8 @@ def by_linear_program(model, discount):
 
 
 @settings(max_examples=40)
-@given(models(), st.sampled_from([0.0, 0.3, 0.9, 0.99]), st.sampled_from([1e-3, 1.0]))
-def test_discounted_planning_by_three_methods(model, discount, tolerance):
+@given(models(), st.sampled_from([0.0, 0.3, 0.9, 0.99]))
+def test_discounted_planning_by_three_methods(model, discount):
     one, two = value_iteration(model, discount), policy_iteration(model, discount)
     # The tolerance, or with values up to 300 over 1 - 0.99 what rounding leaves.
     assert one.error_bound <= 2e-10
@@ -98,10 +98,6 @@ def test_discounted_planning_by_three_methods(model, discount, tolerance):
     )
     np.testing.assert_allclose(one.values, by_linear_program(model, discount), atol=1e-6)
     assert one.start_value == pytest.approx(model.initial @ two.values, abs=1e-9)
-    # Sweeps that end early say by how much they may be wrong.
-    rough = value_iteration(model, discount, tolerance)
-    error = np.abs(rough.values - two.values).max()
-    assert error - two.error_bound <= rough.error_bound <= tolerance
 
 
 def stationary_policies(model):
