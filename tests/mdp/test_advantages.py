@@ -7,16 +7,12 @@ from hypothesis import strategies as st
 
 from mdp import TransitionModel, policy_return
 from mdp.advantages import discounted_values, expected_estimates
-from tests.mdp.test_random_models import distributions, models
+from tests.mdp.test_random_models import deterministic, distributions, models
 
 
 def chain():
     """Two states: 0 goes on (rewards 1 and 2, then the end), 1 stays for nothing."""
-    prob = np.ones((2, 2, 1))
-    following = np.array([[[1], [0]], [[1], [1]]])
-    reward = np.array([[[1.0], [0.0]], [[2.0], [0.0]]])
-    ends = np.array([[[False], [False]], [[True], [False]]])
-    return TransitionModel(prob, following, reward, ends, np.array([1.0, 0.0]))
+    return deterministic([[1, 0], [1, 1]], [[1, 0], [2, 0]], [[False, False], [True, False]])
 
 
 EVEN = np.full((2, 2), 0.5)

@@ -10,21 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.known_models import success_outcomes, time_limit, transition_model
-from mdp import TransitionModel, finite_horizon_optimum, hardness_of
+from mdp import finite_horizon_optimum, hardness_of
 from mdp.hardness import action_gaps, diameter, hitting_times, looking_ahead, random_wait
-from tests.mdp.test_random_models import continuing, models
-
-
-def deterministic(next_state, reward, ends):
-    """A model of tables (S, A) that begins in state 0."""
-    next_state = np.array(next_state)
-    return TransitionModel(
-        prob=np.ones((*next_state.shape, 1)),
-        next_state=next_state[..., None],
-        reward=np.array(reward, np.float64)[..., None],
-        terminated=np.array(ends, np.bool_)[..., None],
-        initial=np.eye(len(next_state))[0],
-    )
+from tests.mdp.test_random_models import continuing, deterministic, models
 
 
 def corridor(n, *, ends):

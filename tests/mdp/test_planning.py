@@ -12,32 +12,19 @@ from hypothesis.extra import numpy as hnp
 
 from envs.known_models import transition_model
 from mdp import (
-    TransitionModel,
     finite_horizon_optimum,
     policy_iteration,
     policy_return,
     value_iteration,
 )
 from mdp.planning import Plan
-from tests.mdp.test_random_models import models
+from tests.mdp.test_random_models import deterministic, models
 
 PLANNERS = pytest.mark.parametrize("plan", [value_iteration, policy_iteration])
 
 
 def model_of(env_id, **kwargs):
     return transition_model(gym.make(f"envs:{env_id}", **kwargs))
-
-
-def deterministic(next_state, reward, terminated, start=0):
-    """A model without chance, from arrays of shape (S, A)."""
-    following = np.asarray(next_state)[:, :, None]
-    return TransitionModel(
-        prob=np.ones(following.shape),
-        next_state=following,
-        reward=np.asarray(reward, float)[:, :, None],
-        terminated=np.asarray(terminated, bool)[:, :, None],
-        initial=np.eye(len(following))[start],
-    )
 
 
 # --- known optima ---------------------------------------------------------------------------------

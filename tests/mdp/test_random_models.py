@@ -55,6 +55,18 @@ def models(draw, states=5, actions=3, outcomes=3, always_ends=False):
     )
 
 
+def deterministic(next_state, reward, terminated):
+    """A model without chance that begins in state 0, from tables of shape (S, A)."""
+    following = np.array(next_state)[..., None]
+    return TransitionModel(
+        prob=np.ones(following.shape),
+        next_state=following,
+        reward=np.array(reward, np.float64)[..., None],
+        terminated=np.array(terminated, np.bool_)[..., None],
+        initial=np.eye(len(following))[0],
+    )
+
+
 def continuing(model):
     """By action, the probabilities of going from state to state without an end, shape (A, S, S)."""
     found = np.zeros((model.n_actions, model.n_states, model.n_states))

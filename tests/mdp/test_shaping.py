@@ -9,28 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mdp import TransitionModel, policy_return
+from mdp import policy_return
 from mdp.shaping import discounted_effect, effect_under_limit
-from tests.mdp.test_random_models import models, stationary_policies
+from tests.mdp.test_random_models import deterministic, models, stationary_policies
 
 DISCOUNTS = [0.3, 0.9]
 
 
-def chain(rewards, ends, following):
-    """A model with one outcome for each state and action, which begins in state 0."""
-    following = np.array(following)[..., None]
-    return TransitionModel(
-        prob=np.ones(following.shape),
-        next_state=following,
-        reward=np.array(rewards, np.float64)[..., None],
-        terminated=np.array(ends, np.bool_)[..., None],
-        initial=np.eye(len(following))[0],
-    )
-
-
 def crossing(stop=1.0):
     """In state 0: stop for a reward, or go on to state 1 for nothing, where the end earns 3."""
-    return chain([[stop, 0.0], [3.0, 3.0]], [[True, False], [True, True]], [[0, 1], [1, 1]])
+    return deterministic([[0, 1], [1, 1]], [[stop, 0], [3, 3]], [[True, False], [True, True]])
 
 
 @pytest.mark.parametrize(
@@ -161,6 +149,6 @@ def test_what_cannot_be_compared_is_refused():
         discounted_effect(crossing(), crossing(), 1.0, 10)
     with pytest.raises(ValueError, match="too many to plan"):
         discounted_effect(crossing(), crossing(), 0.5, 10**9)
-    other = chain([[0.0, 0.0]], [[1, 1]], [[0, 0]])
+    other = deterministic([[0, 0]], [[0, 0]], [[True, True]])
     with pytest.raises(ValueError, match="1 states and 2 actions cannot be compared with 2 states"):
         effect_under_limit(crossing(), other, 3)
