@@ -108,42 +108,6 @@ def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, da
 # --- steps worked by hand -------------------------------------------------------------------------
 
 
-OWN = {"desc": ["S#", ".G"], "shelf_reward": -7, "step_reward": -0.5, "goal_reward": 3}
-OWN_MINES = {"step_reward": -2, "mine_reward": -5, "power_reward": 4, "goal_reward": 10}
-STEPS = {  # a world, moves, and what they come to: states, rewards and what was bumped into
-    # Against the wall, up, against a shelf, off the map, back.
-    "warehouse": (
-        WarehouseEnv(), "DLURLD", [90, 90, 80, 80, 80, 90], [-1, -1, -1, -100, -1, -1], "yynyyn"),
-    # After the end nothing moves.
-    "own rewards": (
-        WarehouseEnv(**OWN), "RUDRU", [0, 0, 2, 3, 3], [-7, -0.5, -0.5, 3, 0], "yynnn"),
-    "own mines": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "URR", [0, 7, 8], [-2, 2, 8], "ynn"),
-    "a mine of one's own": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "D", [3], [-7], "n"),
-    "maze": (DynaMazeEnv(), "DDRRRRURRRRUUU", None, [0] * 13 + [1], "n" * 14),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", STEPS)
-def test_steps_by_hand(name):
-    env, letters, states, rewards, bumped = STEPS[name]
-    for _ in range(2):  # all is forgotten at reset
-        first, info = env.reset(seed=0)
-        assert (first, info["position"]) == (env.map.start, divmod(first, env.map.n_columns))
-        found, earned, over, infos = walk(env, letters)
-        assert found == (states or found)
-        assert earned == rewards
-        assert "".join("ny"[info["bumped"]] for info in infos) == bumped
-        at_goal = [env.map.rows[row][column] == "G" for row, column in at(infos)]
-        assert [info["is_success"] for info in infos] == at_goal
-        assert {type(index) for place in at(infos) for index in place} == {int}
-        at_mine = [env.map.rows[row][column] == "M" for row, column in at(infos)]
-        assert over == [goal or mine for goal, mine in zip(at_goal, at_mine, strict=True)]
-
-
-def at(infos):
-    return [info["position"] for info in infos]
-
-
 def test_slip_goes_to_both_sides_in_the_stated_order():
     middle = WarehouseEnv(desc=["...", ".S.", "..G"], slip=0.2).P[4]
     reached = {UP: (1, 3, 5), DOWN: (7, 3, 5), LEFT: (3, 1, 7), RIGHT: (5, 1, 7)}
@@ -198,17 +162,19 @@ def maps(draw, letters):
     return ["".join(found[i : i + n_columns]) for i in range(0, size, n_columns)]
 
 
-def rules(rows, position, collected, action):
-    """What the descriptions of both worlds say: position, reward, end, and whether it bumped."""
+def rules(rows, position, collected, action, rewards):
+    """What the descriptions of both worlds say: position, reward, end, and whether it bumped.
+
+    ``rewards`` has what entering a letter earns, or driving against it; other steps earn that of
+    an empty cell.
+    """
     row = position[0] + {UP: -1, DOWN: 1}.get(action, 0)
     column = position[1] + {LEFT: -1, RIGHT: 1}.get(action, 0)
     if not (0 <= row < len(rows) and 0 <= column < len(rows[0])):
-        return position, -1, False, True
-    letter = rows[row][column]
-    if letter == "#":
-        return position, -100, False, True
-    earned = {"M": -101, "G": 99, "P": -1 if (row, column) in collected else 0}.get(letter, -1)
-    return (row, column), earned, letter in "MG", False
+        return position, rewards["."], False, True
+    letter = "." if (row, column) in collected else rows[row][column]
+    place = position if letter == "#" else (row, column)
+    return place, rewards.get(letter, rewards["."]), letter in "MG", letter == "#"
 
 
 def is_solvable(rows):
@@ -219,7 +185,7 @@ def is_solvable(rows):
         if place not in found:
             found.add(place)
             if rows[place[0]][place[1]] not in "GM":
-                waiting += [rules(rows, place, (), action)[0] for action in range(4)]
+                waiting += [rules(rows, place, (), action, {".": 0})[0] for action in range(4)]
     return any(rows[row][column] == "G" for row, column in found)
 
 
@@ -235,9 +201,14 @@ def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start,
         with pytest.raises(ValueError, match="cannot be reached"):
             kind(desc=rows)
         return
-    env = kind(
-        desc=rows, slip=slip, random_start=random_start, goal_reward=99 + (kind is MineMazeEnv)
-    )
+    step, shelf, mine, power, goal = data.draw(st.tuples(*[st.integers(-9, 9)] * 5))
+    kwargs = {"step_reward": step, "goal_reward": goal, "slip": slip, "random_start": random_start}
+    if kind is WarehouseEnv:
+        rewards = {".": step, "#": shelf, "G": goal}
+        env = kind(rows, shelf_reward=shelf, **kwargs)
+    else:  # what is found there comes on top of the step
+        rewards = {".": step, "M": step + mine, "P": step + power, "G": step + goal}
+        env = kind(rows, mine_reward=mine, power_reward=power, **kwargs)
     model = env.transition_model()
     np.testing.assert_allclose(model.prob.sum(axis=2), 1)
     for state, action in np.ndindex(model.n_states, 4):
@@ -245,10 +216,11 @@ def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start,
         listed = (model.next_state, model.reward, model.terminated)
         assert tuple(array[state, action, 0] for array in listed) == move[:3]
     position, collected = env.reset(seed=seed)[1]["position"], set()
+    assert random_start or rows[position[0]][position[1]] == "S"
     powers = [divmod(i, len(rows[0])) for i, letter in enumerate("".join(rows)) if letter == "P"]
     for action in np.random.default_rng(seed).integers(4, size=40).tolist():
         ways = (action, *SIDES[action]) if slip else (action,)
-        possible = [rules(rows, position, collected, way) for way in ways]
+        possible = [rules(rows, position, collected, way, rewards) for way in ways]
         state, reward, terminated, _, info = env.step(action)
         position = info["position"]
         assert (position, reward, terminated, info["bumped"]) in possible
@@ -312,6 +284,8 @@ def test_shortest_ways_of_the_mazes():
     assert found == [10, 16, 16, 10]
     env = DynaMazeEnv()
     assert (env.shortest_path_length, env.transition_model().n_states) == (14, 54)
+    env.reset(seed=0)
+    assert walk(env, "DDRRRRURRRRUUU")[1] == [0] * 13 + [1]
 
 
 def test_a_maze_changes_once_after_so_many_steps_over_all_episodes():

@@ -34,6 +34,7 @@ OPTIMA = [
     ("Warehouse-v0", {}, 0.5, -1.99995, 5e-6),
     # Standing still costs nothing here, and ties with every way to the goal.
     ("Warehouse-v0", {"step_reward": 0}, 1.0, 100.0, 1e-9),
+    ("MineMaze-v0", {}, 1.0, 91.0, 1e-9),
     ("FrozenLake-v1", {}, 1.0, 14 / 17, 1e-9),
     ("CliffWalking-v1", {}, 0.9, -(1 - 0.9**13) / 0.1, 1e-9),
 ]

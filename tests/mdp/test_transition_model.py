@@ -30,17 +30,6 @@ def test_sizes_and_derived_arrays():
         np.testing.assert_array_equal(getattr(copy, name), getattr(model, name))
 
 
-def test_arrays_are_read_only_and_the_callers_stay_writable():
-    given = arrays()
-    model = TransitionModel(**given)
-    with pytest.raises(ValueError, match="read-only"):
-        model.prob[0, 0, 0] = 0.5
-    with pytest.raises(ValueError, match="read-only"):
-        model.expected_reward[0, 0] = 0.5
-    given["prob"][0, 0] = [0.5, 0.5]
-    assert np.shares_memory(model.prob, given["prob"])
-
-
 @pytest.mark.parametrize(
     ("name", "place", "value", "message"),
     [
