@@ -5,7 +5,6 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
-from scipy.stats import poisson
 
 import envs  # noqa: F401 (registers the environments)
 from envs.known_models import action_masks_of_states, success_outcomes, time_limit, transition_model
@@ -223,50 +222,21 @@ def test_without_noise_the_race_takes_ten_steps_and_more():
 N = 21
 
 
-@pytest.fixture(scope="module")
-def days():
-    """For both places the chances of evenings after mornings, and the cars rented by then."""
-    counts, found = np.arange(60), []
-    for requests, returns in ((3, 3), (4, 2)):
-        asked_for, brought = poisson.pmf(counts, requests), poisson.pmf(counts, returns)
-        chances, rentals = np.zeros((N, N)), np.zeros(N)
-        for morning, asked in np.ndindex(N, 60):
-            rented = min(asked, morning)
-            rentals[morning] += asked_for[asked] * rented
-            evening = np.minimum(morning - rented + counts, 20)
-            np.add.at(chances[morning], evening, asked_for[asked] * brought)
-        found.append((chances, rentals))
-    return found
-
-
-def action_values(values, days, exercise):
-    """One sweep over all evenings and moves by the book's rules; -inf where cars are missing."""
-    (first, first_rentals), (second, second_rentals) = days
-    mornings = 10 * (first_rentals[:, None] + second_rentals) + 0.9 * first @ values @ second.T
-    found = np.full((N, N, 11), -np.inf)
-    for moved in range(-5, 6):
-        for one in range(max(moved, 0), N):
-            for two in range(max(-moved, 0), N):
-                left, right = min(one - moved, 20), min(two + moved, 20)
-                cost = 2 * abs(moved)
-                if exercise:
-                    cost += 4 * (left > 10) + 4 * (right > 10) - 2 * (moved > 0)
-                found[one, two, moved + 5] = mornings[left, right] - cost
-    return found
-
-
-@pytest.mark.parametrize("variant", ["example", "exercise"])
-def test_the_model_backs_values_up_as_the_book_does(variant, days):
-    env = gym.make("JacksCarRental-v0", variant=variant)
-    model = env.unwrapped.transition_model()
-    values = np.random.default_rng(0).normal(500, 50, (N, N))
-    by_hand = action_values(values, days, variant == "exercise").reshape(-1, 11)
-    found = model.expected_reward + 0.9 * model.prob @ values.ravel()
-    possible = np.isfinite(by_hand)
-    np.testing.assert_allclose(found[possible], by_hand[possible], atol=1e-9)
-    assert np.array_equal(action_masks_of_states(env), possible)
+def test_the_exercise_adds_a_free_move_and_fees_for_parking():
+    example, exercise = (
+        gym.make("JacksCarRental-v0", variant=variant) for variant in ("example", "exercise")
+    )
+    one, two, moved = np.ogrid[:N, :N, -5:6]
+    possible = (moved <= one) & (-moved <= two)
+    left, right = np.minimum(one - moved, 20), np.minimum(two + moved, 20)
+    added = 2 * (moved > 0) - 4 * (left > 10) - 4 * (right > 10)
+    models = [env.unwrapped.transition_model() for env in (example, exercise)]
+    np.testing.assert_array_equal(models[0].prob, models[1].prob)
+    found = (models[1].expected_reward - models[0].expected_reward).reshape(N, N, 11)
+    np.testing.assert_allclose(found[possible], added[possible], atol=1e-9)
+    assert np.array_equal(action_masks_of_states(example).reshape(N, N, 11), possible)
     # More cars than there are cannot be moved: 2 and 0 of them here.
-    for array in (model.prob, model.reward):
+    for array in (models[0].prob, models[0].reward):
         np.testing.assert_array_equal(array[2 * N, [10, 0]], array[2 * N, [7, 5]])
 
 
@@ -291,7 +261,6 @@ def test_optimal_values_and_policy_are_those_of_figure_4_2():
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "state", "action"),
     [
-        ("DeepSea-v0", {"size": 4, "deterministic": False, "map_seed": None}, 15, 1),
         ("MaximizationBias-v0", {"reward_mean": 2, "reward_std": 3}, 1, 4),
         ("JacksCarRental-v0", {"variant": "exercise"}, 21 * 15 + 12, 10),
     ],
