@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.sparse.csgraph import shortest_path
 
-from envs.grid import GridMap, distances_to
+from envs.grid import GridMap
 from envs.mine_maze import MineMazeEnv
 from envs.textbook.dyna_maze import DynaMazeEnv
 from envs.warehouse import WarehouseEnv, random_warehouse
@@ -84,25 +83,6 @@ def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
     assert MineMazeEnv(desc=["S" + "P" * 18 + "G"]).dynamics.n_states == 20 * 2**18
     # Of several goals the nearest counts.
     assert WarehouseEnv(desc=["G..S.G", "......"]).shortest_path_length == 2
-
-
-ROW_OF = st.integers(1, 7).flatmap(lambda n: st.lists(st.booleans(), min_size=n, max_size=n))
-
-
-@settings(max_examples=50)
-@given(st.integers(1, 7), ROW_OF, st.randoms(), st.data())
-def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, data):
-    free = np.array([shuffler.sample(row, len(row)) for _ in range(n_rows)])
-    cells = st.integers(0, free.size - 1)
-    targets = data.draw(st.lists(cells, min_size=1, max_size=3, unique=True))
-    at, column = np.divmod(np.arange(free.size), free.shape[1])
-    apart = abs(at[:, None] - at) + abs(column[:, None] - column)
-    usable = free.ravel().copy()
-    usable[targets] = True
-    edges = (apart == 1) & usable & usable[:, None]
-    nearest = shortest_path(edges, unweighted=True, indices=targets).min(axis=0)
-    expected = np.where(np.isfinite(nearest), nearest, -1)
-    assert np.array_equal(distances_to(targets, free).ravel(), expected)
 
 
 # --- steps worked by hand -------------------------------------------------------------------------

@@ -192,8 +192,6 @@ MINE = {"desc": ["S.M", "..G"], "mine_reward": 500}
 SUCCESSES = {
     # The goal, 15, is reached from 14 by moving right or slipping there; 11 is a hole.
     "slippery lake": (lambda: make("FrozenLake"), [(14, 1), (14, 2), (14, 3)]),
-    "wrapped lake": (
-        lambda: TerminationReward(ScaleReward(make("still FrozenLake"), -1), 0), [(14, 2)]),
     "cliff": (lambda: make("CliffWalking"), [(35, 2)]),
     # The passenger, who sits in the taxi (4), is dropped where he wants to go.
     "taxi": (lambda: make("Taxi"), [(16, 5), (97, 5), (418, 5), (479, 5)]),
@@ -318,10 +316,6 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("what", OTHERS)
-def test_none_is_claimed_of_anything_else(what, monkeypatch):
+def test_none_is_claimed_of_anything_else(what):
     with OTHERS[what]() as env:
         assert optimum_bracket(env) is None
-    if what == "attribute":  # a user may have changed the library's class
-        assert optimum_bracket(gym.make("Acrobot-v1")) is not None
-        monkeypatch.setattr("gymnasium.envs.classic_control.AcrobotEnv.LINK_MASS_1", 0.5)
-        assert optimum_bracket(gym.make("Acrobot-v1")) is None

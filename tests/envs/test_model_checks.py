@@ -43,25 +43,12 @@ class Careless(Corridor):
         return int(uniform < row[1][0])
 
 
-class Pictured(Corridor):
-    """What is observed is no number."""
-
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.observation_space = spaces.Box(0, 1, (5,))
-
-    def observe(self):
-        return np.eye(5, dtype=np.float32)[self.s]
-
-
 SAME_REWARDS = outcomes(goal_reward=-1.0)
 # Whether it draws bit for bit as toy_text does, and whether its state can be set.
 RIGHT = {
     "as toy_text": (lambda: Corridor(render_mode="human"), True, True),
     "other successors": (lambda: Backwards(SAME_REWARDS, SAME_REWARDS), False, True),
     "the global generators": (Careless, False, True),
-    "rewards in single precision": (
-        lambda: Corridor(altered(reward=0.1 + 0.2), altered(reward=0.3)), False, True),
     "unsettable": (Unsettable, True, False),
     "deaf": (Deaf, True, False),
 }  # fmt: skip
@@ -94,7 +81,7 @@ class Odd(Corridor):
         return obs, reward, terminated, truncated, info
 
     def observe(self):
-        return {"shifted": self.s + 1, "pair": (0, self.s)}.get(self.how, self.s)
+        return (0, self.s) if self.how == "pair" else self.s
 
 
 def ladder(reward):
@@ -107,34 +94,22 @@ def ladder(reward):
 
 
 LADDER = ladder(2.0), ladder(1.0), np.eye(16)[0]
-ONE_ROW = outcomes()
-ONE_ROW[2][0] = [(0.6, *ONE_ROW[2][0][0][1:]), (0.4, *ONE_ROW[2][0][1][1:])]
 NO_MODEL = "the environment's P is no model"
 SAYS = r"^the environment's P is not what step does: state 3, action 1: P says state "
-GAVE = r"step gave state 4 with reward 9\.0, terminated$"
-LATER = r"or state 1 with reward -1\.0, "
 FALSE = {
     "reward": (lambda: Corridor(altered(reward=10.0)),
-        rf"{SAYS}4 with reward 10\.0, terminated {LATER}{GAVE}"),
-    "termination": (lambda: Corridor(altered(ends=False)),
-        rf"{SAYS}4 with reward 9\.0 {LATER}{GAVE}"),
+        rf"{SAYS}4 with reward 10\.0, terminated or .* step gave state 4 with reward 9\.0, term"),
     "unknown wind": (lambda: Corridor(outcomes(wind=0.0)),
         r"state 3, action 0: P says state 2 with .* step gave state 1 with reward -1\.0$"),
-    "frequency of one row": (lambda: Corridor(ONE_ROW, outcomes()),
-        r"state 2, action 0: P says state 1 with reward -1\.0 in 60\.0% of cases"),
     "frequency everywhere": (lambda: Careless(outcomes(0.4), outcomes()),
         r" in (40.0% of .* gave it in (2[5-9]|3[0-4])|60.0% of .* in (6[5-9]|7[0-4]))\.\d% of "),
     "frequency of a start": (
         lambda: Corridor(start=(0.9, 0.1, 0, 0, 0)), "initial_state_distrib"),
     "far away": (lambda: Corridor(*LADDER),
         r"state 15, action 1: P says state 15 with reward 2\.0"),
-    "far away, steered": (lambda: Unsettable(*LADDER),
-        r"state 15, action 1: P says state 15 with reward 2\.0, terminated"),
     "truncates": (lambda: Odd("truncates"),
         "step gave truncated, which no model holds: leave time limits to max_episode_steps"),
     "raises": (lambda: Odd("raises"), "step raised RuntimeError: one two$"),
-    "shifted": (
-        lambda: Odd("shifted"), "reset gave state 1, where initial_state_distrib says"),
     "pair": (lambda: Odd("pair"), r"the observation is \(0, 0\), not the number of a state"),
     "a short outcome": (lambda: with_p({0: {0: [(1.0,)]}}), NO_MODEL),
     "six states": (lambda: Odd("six states"),
@@ -184,8 +159,6 @@ def test_a_subclass_that_does_the_same_is_believed():
     ours, known = (transition_model(env) for env in (Same(), FrozenLakeEnv()))
     np.testing.assert_array_equal(ours.prob, known.prob)
     assert transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
-    assert transition_model(Pictured()) is not None
-    assert observations_of_states(Pictured()) is None
     assert "its step was replaced by hand" in model_check(replaced_by_hand()).refusal
 
 
