@@ -13,7 +13,6 @@ from stable_baselines3.common.env_checker import check_env
 import envs  # noqa: F401 (registers the environments)
 from envs.known_models import action_masks_of_states, observations_of_states, transition_model
 from envs.mine_maze import MineMazeEnv
-from envs.warehouse import WarehouseEnv
 from envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,
@@ -59,23 +58,18 @@ def cart_pole(**kwargs):
 
 # --- observations ---------------------------------------------------------------------------------
 
-BINS = [(-np.inf, 0), (-0.51, 0), (-0.5, 1), (-0.01, 1), (0, 2), (0.5, 3), (1, 3), (np.inf, 3)]
-
 
 def test_bins_worked_by_hand():
     """The last dimension counts fastest, and only the chosen ones count."""
-    for value, index in BINS:
+    for value, index in ((-np.inf, 0), (-0.51, 0), (-0.5, 1), (-0.01, 1), (0, 2), (0.5, 3), (9, 3)):
         env = DiscretizeObservation(box([-np.inf], [np.inf], [value]), bins=4, low=-1, high=1)
         observation = env.reset()[0]
         assert (observation, type(observation)) == (index, int)
         assert env.map_observations(np.array([[value], [0]])).tolist() == [index, 2]
-    env = DiscretizeObservation(box([0, 0, 0], [1, 1, 1], [0.9, 0.1, 0.6]), bins=[2, 3, 4])
+    inner = box([0, -np.inf, 0, 0], [1, np.inf, 1, 1], [0.9, 7, 0.6, 0.1])
+    env = DiscretizeObservation(inner, bins=[2, 4, 3], dims=[2, 0, 3])
     assert env.observation_space == spaces.Discrete(24)
-    assert env.reset()[0] == (1 * 3 + 0) * 4 + 2
-    inner = box([0, -np.inf, 0], [1, np.inf, 1], [0.9, 7, 0.6])
-    env = DiscretizeObservation(inner, bins=[2, 4], dims=[2, 0])
-    assert env.observation_space == spaces.Discrete(8)
-    assert env.reset()[0] == 1 * 4 + 3
+    assert env.reset()[0] == (1 * 4 + 3) * 3 + 0
 
 
 @pytest.mark.parametrize(
@@ -151,9 +145,7 @@ WRAPPED = {
     "FlattenToDiscrete": lambda: FlattenToDiscrete(gym.make("Blackjack-v1")),
     "OneHotObservation": lambda: OneHotObservation(gym.make("Warehouse-v0", slip=0.2)),
     "ScaleReward": lambda: ScaleReward(gym.make("Warehouse-v0"), 0.01),
-    "TerminationReward": lambda: TerminationReward(
-        gym.make("CartPole-v1"), -10, on_truncation=True
-    ),
+    "TerminationReward": lambda: TerminationReward(gym.make("CartPole-v1"), -10),
     "ActionMasks": lambda: ActionMasks(gym.make("MineMaze-v0")),
     "IdleActionMasks": lambda: IdleActionMasks(gym.make("FrozenLake-v1")),
 }
@@ -171,24 +163,13 @@ def test_wrapped_environments_are_checked_remade_from_their_spec_and_pickled(nam
 
 # --- action masks ---------------------------------------------------------------------------------
 
-STILL = {"is_slippery": False}
-MASKED = {
-    "MineMaze": lambda: ScaleReward(FlattenToDiscrete(gym.make("MineMaze-v0")), 0.1),
-    "told Taxi": lambda: ActionMasks(gym.make("Taxi-v4")),
-    "idle cliff": lambda: ActionMasks(IdleActionMasks(gym.make("CliffWalking-v1"))),
-}
-
 
 def test_moves_that_bump_and_actions_that_are_idle_are_masked():
     env = gym.make("Warehouse-v0", desc=["S#", ".G"])
     # Of the start: up leaves the map, down is free, left leaves it, right is a shelf.
     expected = [[0, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
     np.testing.assert_array_equal(action_masks_of_states(env), expected)
-    walled_in = WarehouseEnv(desc=["S.G", "###", "#.#", "###"])
-    walled_in.s = 7
-    assert walled_in.action_masks().all()
-    assert walled_in.dynamics.action_masks()[7].all()
-    for env in (MineMazeEnv(slip=0.3), IdleActionMasks(gym.make("FrozenLake-v1", **STILL))):
+    for env in (MineMazeEnv(slip=0.3), IdleActionMasks(gym.make("CliffWalking-v1"))):
         model, masks = transition_model(env), action_masks_of_states(env)
         # The first outcome is the one that is meant.
         goes = model.next_state[:, :, 0] != np.arange(model.n_states)[:, None]
@@ -197,12 +178,18 @@ def test_moves_that_bump_and_actions_that_are_idle_are_masked():
     assert IdleActionMasks(gym.make("FrozenLake-v1")).masks.all()
 
 
+MASKED = {
+    "MineMaze": lambda: ScaleReward(FlattenToDiscrete(gym.make("MineMaze-v0")), 0.1),
+    "told Taxi": lambda: ActionMasks(gym.make("Taxi-v4")),
+    "idle cliff": lambda: ActionMasks(IdleActionMasks(gym.make("CliffWalking-v1"))),
+}
+
+
 @pytest.mark.parametrize("name", MASKED)
 def test_masks_of_all_states_are_those_told_on_the_way(name):
     bare = MASKED[name]()
     masks = action_masks_of_states(bare)
     assert masks.shape == (len(observations_of_states(bare)), bare.action_space.n)
-    assert masks.dtype == np.bool_
     assert masks.any(axis=1).all()
     env, rng = ActionMasks(bare), np.random.default_rng(0)
     _, info = env.reset(seed=0)
