@@ -176,31 +176,16 @@ def test_columns_may_stand_in_any_order_and_propensities_be_missing(write):
 
 
 def log_of(values):
-    return "segment,arm,reward\n" + "".join(f"{value},0,1\n" for value in values.split())
+    return "segment,arm,reward\n" + "".join(f"{value},0,1\n" for value in values)
 
 
-DISCRETE, BOX = spaces.Discrete, spaces.Box
-CONTEXTS = [  # of a column, its own space, others in which it can be shown, and in which not
-    ("0 1 2 1", DISCRETE(3), [DISCRETE(4), BOX(0, 9, (1,))],
-     [(DISCRETE(2), "has the context segment, the agent observes one column of who")]),
-    ("0 -0.5", BOX(-0.5, 0, (1,)), [], [(DISCRETE(3), "one column of whole numbers from 0 to 2")]),
-    ("a b", DISCRETE(2), [],
-     [(DISCRETE(3), "the context segment with 2 values of text, the agent"),
-      (BOX(0, 1, (1,)), "with 2 values of text, the agent observes Box")]),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("values", "own", "fitting", "unfit"), CONTEXTS)
-def test_in_which_spaces_contexts_are_shown(write, values, own, fitting, unfit):
-    data = read_log(write(log_of(values)))
-    assert data.observation_space == own
-    for space in fitting:
-        shown = [float(value) for value in values.split()]
-        assert np.ravel(data.observations(space)).tolist() == shown
-    for space, message in unfit:
-        with pytest.raises(ValueError, match=message) as refused:
-            data.observations(space)
-        assert str(refused.value).startswith(str(data.source))
+def test_a_column_of_all_whole_numbers_from_0_on_is_a_number_of_a_context(write):
+    data = read_log(write(log_of([0, 1, 2, 1])))
+    assert data.observation_space == spaces.Discrete(3)
+    assert data.observations(spaces.Discrete(4)).tolist() == [0, 1, 2, 1]
+    assert data.observations(spaces.Box(0, 9, (1,))).tolist() == [[0], [1], [2], [1]]
+    with pytest.raises(ValueError, match="has the context segment, the agent observes one column"):
+        data.observations(spaces.Discrete(2))
 
 
 def test_a_log_without_context_and_of_one_pull(write):
@@ -241,11 +226,11 @@ def test_mistakes_in_a_log_are_named_with_their_line(tmp_path, text, message):
 
 def test_a_log_is_read_in_pieces_without_a_seam(write):
     words = [f"{'zab'[i % 3]}{i // 9_000}" for i in range(21_000)]  # ten thousand rows are a piece
-    data = read_log(write(log_of(" ".join(words))))
+    data = read_log(write(log_of(words)))
     assert data.categories == tuple(sorted(set(words)))
     assert [data.categories[int(code)] for code in data.contexts[:, 0]] == words
     with pytest.raises(ValueError, match=r"line 21002: .*text can only be all of the context"):
-        read_log(write(log_of(" ".join([*["1"] * 21_000, "a"]))))
+        read_log(write(log_of([*["1"] * 21_000, "a"])))
 
 
 # --- writing logs ---------------------------------------------------------------------------------

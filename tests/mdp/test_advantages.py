@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mdp import TransitionModel, policy_return
 from mdp.advantages import discounted_values, expected_estimates
 from tests.mdp.test_random_models import deterministic, distributions, models
 
@@ -43,20 +42,6 @@ def drawn_cases(draw):
     numbers = st.floats(-3, 3, width=16)
     critic = np.array(draw(st.lists(numbers, min_size=model.n_states, max_size=model.n_states)))
     return model, policy, critic, draw(st.sampled_from([0.0, 0.5, 0.9]))
-
-
-@settings(max_examples=40)
-@given(drawn_cases())
-def test_values_are_those_of_long_episodes_from_each_state(case):
-    model, policy, _, discount = case
-    found = discounted_values(model, policy, discount)
-    for state in np.flatnonzero(model.reachable):
-        start = np.eye(model.n_states)[state]
-        there = TransitionModel(model.prob, model.next_state, model.reward, model.terminated, start)
-        value = policy_return(there, policy, None, discount).expected_return
-        assert found.values[state] == pytest.approx(value, abs=1e-9)
-        assert policy[state] @ found.advantages[state] == pytest.approx(0.0, abs=1e-9)
-    assert np.isnan(found.values[~model.reachable]).all()
 
 
 def by_enumeration(model, policy, critic, discount, trace, state, action, n_left):

@@ -14,7 +14,6 @@ from mdp import (
     optimal_choices,
     optimum_far_from_limit,
     policy_return,
-    state_values,
     state_visitation,
     value_iteration,
 )
@@ -123,15 +122,6 @@ def test_wrong_policies_are_refused(policy, horizon, message):
     for function in (policy_return, state_visitation):
         with pytest.raises(ValueError, match=message):
             function(coin(0.5), np.array(policy), horizon)
-
-
-def test_other_wrong_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"success has shape \(1,\), the model has \(1, 2, 2\)"):
-        policy_return(coin(0.5), np.array([0]), 5, success=np.ones(1, bool))
-    with pytest.raises(ValueError, match="horizon is 0, it must be at least 1"):
-        optimal_choices(corridor(), horizon=0)
-    with pytest.raises(ValueError, match=r"outside 0..1"):
-        state_values(corridor(), np.full(5, 2), 3)
 
 
 # --- values of states, with the whole time limit ahead -------------------------------------------

@@ -95,14 +95,8 @@ def test_best_and_worst_are_those_of_all_optimal_policies(data, model, discount)
     ends = returns[theirs].max(), returns[theirs].min()
     assert found.returns == pytest.approx(ends, abs=1e-9)
     assert found.is_same == (ours == theirs).all()
-    limited = np.array([policy_return(model, p, 4).expected_return for p in policies])[theirs]
     worst = policy_return(model, found.worst_policy, 4).expected_return
     assert worst == pytest.approx(found.judged[1], abs=1e-9)
-    assert worst - 1e-9 <= limited.min() <= limited.max() <= found.judged[0] + 1e-9
-    live = np.flatnonzero(model.reachable)
-    is_best = found.optimal[live, found.worst_policy[:, live]]
-    assert found.optimal[live, found.policy[:, live]].all()
-    assert (found.policy == found.worst_policy)[:, live][is_best].all()
 
 
 @settings(max_examples=30)
@@ -137,11 +131,6 @@ def test_where_training_never_comes_every_action_may_be_taken():
         crossing(), replace(crossing(), initial=np.array([0.0, 1.0])), 0.5, 10
     )
     assert (found.differs.tolist(), found.returns) == ([True, False], (1.5, 1.0))
-
-
-def test_rewards_times_a_negative_number_are_no_potential():
-    opposite = replace(crossing(), reward=-crossing().reward)
-    assert discounted_effect(crossing(), opposite, 0.5, 10).factor is None
 
 
 def test_what_cannot_be_compared_is_refused():

@@ -2,7 +2,6 @@
 
 import pickle
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -77,18 +76,3 @@ def test_from_gymnasium_pads_keeps_the_order_and_refuses_gaps():
     ):
         with pytest.raises(ValueError, match=message):
             TransitionModel.from_gymnasium(broken, np.ones(len(broken)) / len(broken))
-
-
-@pytest.mark.parametrize(
-    ("env_id", "shape", "unreachable"),
-    [
-        ("FrozenLake-v1", (16, 4, 3), [5, 7, 11, 12, 15]),
-        # The passenger is where he wants to be, and waits there: entered by terminating alone.
-        ("Taxi-v4", (500, 6, 1), [s for s in range(500) if s // 4 % 5 == s % 4]),
-    ],
-)
-def test_gymnasium_models(env_id, shape, unreachable):
-    env = gym.make(env_id).unwrapped
-    model = TransitionModel.from_gymnasium(env.P, env.initial_state_distrib)
-    assert model.prob.shape == shape
-    assert np.flatnonzero(~model.reachable).tolist() == unreachable
