@@ -29,15 +29,13 @@ def altered(row=(3, 1), **changes):
 class Corridor(gym.Env):
     """Steps by ``true``, and tells ``P``; draws as toy_text does."""
 
-    metadata = {"render_modes": ["human"]}  # noqa: RUF012
     action_space = spaces.Discrete(2)
 
-    def __init__(self, told=None, true=None, start=(1, 0, 0, 0, 0), render_mode=None):
+    def __init__(self, told=None, true=None, start=(1, 0, 0, 0, 0)):
         self.true = true or outcomes()
         self.P = told or self.true
         self.initial_state_distrib = np.array(start, float)
         self.observation_space = spaces.Discrete(len(self.P))
-        self.render_mode = render_mode
         self.s = 0
 
     def reset(self, *, seed=None, options=None):
@@ -47,8 +45,6 @@ class Corridor(gym.Env):
         return self.observe(), {}
 
     def step(self, action):
-        if self.render_mode == "human":
-            self.render()
         row = self.true[int(self.s)][action]
         _, self.s, reward, terminated = row[self.draw(row)]
         self.steps += 1
@@ -62,9 +58,6 @@ class Corridor(gym.Env):
 
     def observe(self):
         return self.s
-
-    def render(self):
-        raise AssertionError("a check draws nothing")
 
 
 class Backwards(Corridor):

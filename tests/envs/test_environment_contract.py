@@ -1,6 +1,7 @@
-"""What holds for every registered environment, whatever its arguments."""
+"""What holds for every registered environment and every wrapper, and wrappers worked by hand."""
 
 import copy
+import math
 import pickle
 import re
 import subprocess
@@ -12,10 +13,24 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3.common.env_checker as sb3_checker
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import env_checker
+from gymnasium.wrappers import TimeLimit
 
 import envs  # noqa: F401 (registers the environments)
+from envs.known_models import action_masks_of_states, observations_of_states, transition_model
+from envs.mine_maze import MineMazeEnv
+from envs.wrappers import (
+    ActionMasks,
+    DiscretizeObservation,
+    FlattenToDiscrete,
+    IdleActionMasks,
+    OneHotObservation,
+    ScaleReward,
+    TerminationReward,
+    action_masks,
+)
 from mdp import TransitionModel
 
 LOG = {"log": str(Path(__file__).parent / "uniform_log.csv")}
@@ -149,3 +164,191 @@ def test_arguments_out_of_range_are_refused(name, wrong, line):
     with pytest.raises(ValueError, match=re.escape(line)) as refused:
         gym.make(f"{name}-v0", **wrong)
     assert "\n" not in str(refused.value)
+
+
+# --- wrappers, worked by hand ---------------------------------------------------------------------
+
+
+class Showing(gym.Env):
+    """Shows what it is told to, for two steps of reward 1 and 2; the second one terminates."""
+
+    def __init__(self, space, shown=None):
+        self.observation_space = space
+        self.action_space = spaces.Discrete(2)
+        self.shown = shown
+        self.n_steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_steps = 0
+        return self.shown, {}
+
+    def step(self, action):
+        self.n_steps += 1
+        return self.shown, float(self.n_steps), self.n_steps == 2, False, {}
+
+
+def box(low, high, shown=None):
+    space = spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
+    return Showing(space, np.array(low if shown is None else shown, np.float32))
+
+
+def cart_pole(**kwargs):
+    bounds = {"low": [-0.41887903, -50], "high": [0.41887903, 50]}
+    settings = {"bins": 50, "dims": [2, 3], **bounds, **kwargs}
+    return DiscretizeObservation(gym.make("CartPole-v1"), **settings)
+
+
+def test_bins_worked_by_hand():
+    """The last dimension counts fastest, and only the chosen ones count."""
+    for value, index in ((-np.inf, 0), (-0.51, 0), (-0.5, 1), (-0.01, 1), (0, 2), (0.5, 3), (9, 3)):
+        env = DiscretizeObservation(box([-np.inf], [np.inf], [value]), bins=4, low=-1, high=1)
+        observation = env.reset()[0]
+        assert (observation, type(observation)) == (index, int)
+        assert env.map_observations(np.array([[value], [0]])).tolist() == [index, 2]
+    inner = box([0, -np.inf, 0, 0], [1, np.inf, 1, 1], [0.9, 7, 0.6, 0.1])
+    env = DiscretizeObservation(inner, bins=[2, 4, 3], dims=[2, 0, 3])
+    assert env.observation_space == spaces.Discrete(24)
+    assert env.reset()[0] == (1 * 4 + 3) * 3 + 0
+
+
+@pytest.mark.parametrize(
+    ("space", "shown", "n", "index"),
+    [
+        (spaces.MultiDiscrete([2, 3], start=[5, -1]), np.array([6, 1]), 6, 1 * 3 + 2),
+        (spaces.Tuple([spaces.Discrete(32), spaces.Discrete(11)]), (13, 10), 352, 153),
+        (spaces.Discrete(5, start=-2), 2, 5, 4),
+    ],
+)
+def test_flattening_worked_by_hand(space, shown, n, index):
+    env = FlattenToDiscrete(Showing(space, shown))
+    assert env.observation_space == spaces.Discrete(n)
+    observed = [env.reset()[0], env.step(0)[0]]
+    assert (observed, type(observed[0])) == ([index, index], int)
+    assert env.map_observations([shown, shown]).tolist() == [index, index]
+
+
+def test_one_hot_worked_by_hand():
+    env = OneHotObservation(Showing(spaces.Discrete(4, start=2), 3))
+    assert env.observation_space == spaces.Box(0, 1, (4,), np.float32)
+    for found in (env.reset()[0], env.step(0)[0]):
+        assert (found.tolist(), found.dtype) == ([0, 1, 0, 0], np.float32)
+    batch = env.map_observations(np.array([5, 2]))
+    assert (batch.tolist(), batch.dtype) == ([[0, 0, 0, 1], [1, 0, 0, 0]], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("limit", "on_truncation", "rewards"),
+    [(9, False, [0.25, -10]), (9, True, [0.25, -10]), (1, False, [0.25]), (1, True, [-10])],
+)
+def test_rewards_are_scaled_and_the_last_one_is_replaced(limit, on_truncation, rewards):
+    inner = ScaleReward(TimeLimit(Showing(spaces.Discrete(2), 0), limit), scale=0.25)
+    env = TerminationReward(inner, reward=-10, on_truncation=on_truncation)
+    env.reset()
+    assert [env.step(0)[1] for _ in rewards] == rewards
+
+
+BOX, DISCRETE = spaces.Box(0, 1, (2,)), spaces.Discrete(2)
+HUGE = spaces.MultiDiscrete([2**31] * 3)
+MISTAKEN = [
+    (lambda: cart_pole(low=None), "dimension 3 of the observation has the bounds -inf and 50.0: g"),
+    (lambda: cart_pole(low=[1, -50]), "dimension 2: low 1.0 is not below high 0.418"),
+    (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
+    (lambda: cart_pole(dims=[2, 2]), r"dims must list dimensions, each once, not \[2, 2\]"),
+    (
+        lambda: DiscretizeObservation(Showing(DISCRETE), bins=2),
+        "DiscretizeObservation needs a Box of",
+    ),
+    (lambda: FlattenToDiscrete(Showing(BOX)), "FlattenToDiscrete needs MultiDiscrete, a Tuple of"),
+    (lambda: FlattenToDiscrete(Showing(HUGE)), "too many to be numbered"),
+    (lambda: OneHotObservation(Showing(BOX)), "OneHotObservation needs Discrete observations, not"),
+    (lambda: ScaleReward(Showing(DISCRETE), 0), "scale must not be 0"),
+    (lambda: TerminationReward(Showing(DISCRETE), math.nan), "reward must be a finite number"),
+    (lambda: ActionMasks(gym.make("CartPole-v1")), "^CartPole-v1 has no action masks: neither a m"),
+    (lambda: IdleActionMasks(gym.make("CartPole-v1")), "needs an environment that holds P"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), MISTAKEN)
+def test_what_makes_no_sense_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+WRAPPED = {
+    "DiscretizeObservation": cart_pole,
+    "FlattenToDiscrete": lambda: FlattenToDiscrete(gym.make("Blackjack-v1")),
+    "OneHotObservation": lambda: OneHotObservation(gym.make("Warehouse-v0", slip=0.2)),
+    "ScaleReward": lambda: ScaleReward(gym.make("Warehouse-v0"), 0.01),
+    "TerminationReward": lambda: TerminationReward(gym.make("CartPole-v1"), -10),
+    "ActionMasks": lambda: ActionMasks(gym.make("MineMaze-v0")),
+    "IdleActionMasks": lambda: IdleActionMasks(gym.make("FrozenLake-v1")),
+}
+
+
+@pytest.mark.parametrize("name", WRAPPED)
+def test_wrapped_environments_are_checked_remade_from_their_spec_and_pickled(name):
+    env = WRAPPED[name]()
+    sb3_checker.check_env(env, warn=True)
+    for other in (gym.make(env.spec), pickle.loads(pickle.dumps(env))):
+        assert str(other) == str(env)
+        assert_equal(env.reset(seed=3), other.reset(seed=3))
+        assert_equal(play(env, 50, seed=0), play(other, 50, seed=0))
+
+
+# --- action masks ---------------------------------------------------------------------------------
+
+
+def test_moves_that_bump_and_actions_that_are_idle_are_masked():
+    env = gym.make("Warehouse-v0", desc=["S#", ".G"])
+    # Of the start: up leaves the map, down is free, left leaves it, right is a shelf.
+    expected = [[0, 1, 0, 0], [1, 1, 1, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
+    np.testing.assert_array_equal(action_masks_of_states(env), expected)
+    for env in (MineMazeEnv(slip=0.3), IdleActionMasks(gym.make("CliffWalking-v1"))):
+        model, masks = transition_model(env), action_masks_of_states(env)
+        # The first outcome is the one that is meant.
+        goes = model.next_state[:, :, 0] != np.arange(model.n_states)[:, None]
+        np.testing.assert_array_equal(masks, goes | model.terminated[:, :, 0])
+    # On ice any move may lead somewhere.
+    assert IdleActionMasks(gym.make("FrozenLake-v1")).masks.all()
+
+
+MASKED = {
+    "MineMaze": lambda: ScaleReward(FlattenToDiscrete(gym.make("MineMaze-v0")), 0.1),
+    "told Taxi": lambda: ActionMasks(gym.make("Taxi-v4")),
+    "idle cliff": lambda: ActionMasks(IdleActionMasks(gym.make("CliffWalking-v1"))),
+}
+
+
+@pytest.mark.parametrize("name", MASKED)
+def test_masks_of_all_states_are_those_told_on_the_way(name):
+    bare = MASKED[name]()
+    masks = action_masks_of_states(bare)
+    assert masks.shape == (len(observations_of_states(bare)), bare.action_space.n)
+    assert masks.any(axis=1).all()
+    env, rng = ActionMasks(bare), np.random.default_rng(0)
+    _, info = env.reset(seed=0)
+    for _ in range(300):
+        mask = masks[env.unwrapped.s]
+        for told in (info["action_mask"], env.action_masks(), action_masks(bare)):
+            np.testing.assert_array_equal(told, mask)
+        _, _, terminated, truncated, info = env.step(rng.choice(np.flatnonzero(mask)))
+        if terminated or truncated:
+            _, info = env.reset()
+
+
+class OwnMasks(MineMazeEnv):
+    """Never up."""
+
+    def action_masks(self):
+        return np.array([False, True, True, True])
+
+
+def test_masks_that_are_not_there_are_not_guessed():
+    for env_id in ("CartPole-v1", "FrozenLake-v1", "BernoulliBandit-v0"):
+        env = gym.make(env_id)
+        assert action_masks(env) is action_masks_of_states(env) is None
+    assert action_masks_of_states(OwnMasks()) is None
+    assert action_masks(OwnMasks()).tolist() == [False, True, True, True]
+    # A wrapper that nobody here knows may mask as well.
+    assert action_masks_of_states(gym.Wrapper(MineMazeEnv())) is None

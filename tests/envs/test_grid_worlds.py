@@ -269,17 +269,6 @@ def test_a_maze_changes_once_after_so_many_steps_over_all_episodes():
     assert walk(env, "LLLUUUUU")[3][-1]["position"] == (0, 0)
 
 
-def test_it_waits_until_nobody_stands_where_a_wall_comes():
-    env = DynaMazeEnv(**CHANGING, change_after_steps=1)
-    env.reset(seed=0)
-    env.s, env.steps_done = 3 * 9 + 8, 1
-    walk(env, "R")  # against the edge: the robot stays in the gap
-    assert env.map.rows[3] == "########."
-    walk(env, "U")
-    assert env.map.rows[3] == ".########"
-    assert walk(env, "D")[3][0]["bumped"]
-
-
 def test_what_a_changing_maze_tells_is_of_the_moment():
     env = DynaMazeEnv(**CHANGING, change_after_steps=2, random_start=True, slip=0.25)
     env.reset(seed=0)

@@ -45,7 +45,7 @@ class Careless(Corridor):
 SAME_REWARDS = outcomes(goal_reward=-1.0)
 # Whether it draws bit for bit as toy_text does, and whether its state can be set.
 RIGHT = {
-    "as toy_text": (lambda: Corridor(render_mode="human"), True, True),
+    "as toy_text": (Corridor, True, True),
     "other successors": (lambda: Backwards(SAME_REWARDS, SAME_REWARDS), False, True),
     "the global generators": (Careless, False, True),
     "deaf": (Deaf, True, False),
@@ -142,18 +142,13 @@ def replaced_by_hand():
     return env
 
 
-@pytest.mark.parametrize("make", [Frozen, replaced_by_hand])
-def test_what_differs_from_a_known_class_is_not_believed(make):
-    env = make()
-    assert model_check(env).refusal is not None
-    assert transition_model(env) is success_outcomes(env) is observations_of_states(env) is None
-
-
-def test_a_subclass_that_does_the_same_is_believed():
+def test_a_known_class_that_was_changed_is_not_believed_unless_it_does_the_same():
+    for env in (Frozen(), replaced_by_hand()):
+        assert transition_model(env) is success_outcomes(env) is observations_of_states(env) is None
+    assert "its step was replaced by hand" in model_check(env).refusal
     ours, known = (transition_model(env) for env in (Same(), FrozenLakeEnv()))
     np.testing.assert_array_equal(ours.prob, known.prob)
     assert transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
-    assert "its step was replaced by hand" in model_check(replaced_by_hand()).refusal
 
 
 # --- the check itself -----------------------------------------------------------------------------
@@ -181,8 +176,8 @@ def test_the_caller_notices_nothing():
 class Locked(Corridor):
     """Cannot be copied."""
 
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
+    def __init__(self, true=None, render_mode=None):
+        super().__init__(true=true)
         self.lock = threading.Lock()
 
 
@@ -190,7 +185,7 @@ gym.register("Locked-v0", entry_point=Locked)
 
 
 def test_what_cannot_be_copied_is_made_anew():
-    env = gym.make("Locked-v0", true=outcomes(wind=0.5), render_mode="human")
+    env = gym.make("Locked-v0", true=outcomes(wind=0.5))
     assert check_transition_model(env, n_steps=FEW).refusal is None
     refusal = check_transition_model(Locked()).refusal
     assert "cannot be held against step: it cannot be copied" in refusal
@@ -212,11 +207,9 @@ def test_each_environment_is_checked_once_until_it_is_changed():
     tried = set()
     for seed in range(2):
         env = gym.wrappers.TimeLimit(Counted(), 50)
-        env.unwrapped.rng = np.random.default_rng(seed)
-        for _ in range(2):
-            env.reset(seed=seed)
-            assert transition_model(env) is not None
-            assert observations_of_states(env) is not None
+        env.reset(seed=seed)
+        for known in (transition_model, observations_of_states, transition_model):
+            assert known(env) is not None
             tried.add(Counted.tried)
     assert len(tried) == 1
     env = env.unwrapped

@@ -1,16 +1,13 @@
 """The gap of a policy, split over states; and what estimates of advantages expect."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.known_models import transition_model
 from mdp import finite_horizon_optimum, policy_return
 from mdp.advantages import discounted_values, expected_estimates
 from mdp.gaps import (
-    TooLargeError,
     first_differences,
     gap_by_state,
     greedy_repairs,
@@ -128,12 +125,6 @@ def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     nearby = policy_return(model, policy + step * toward, horizon).expected_return
     scale = max(1.0, np.abs(slope).max())
     assert (nearby - value) / step == pytest.approx((slope * toward).sum(), abs=1e-3 * scale)
-
-
-def test_worlds_that_are_too_large_are_refused():
-    model = transition_model(gym.make("envs:RandomWarehouse-v0", size=100).unwrapped)
-    with pytest.raises(TooLargeError, match="too many to keep"):
-        first_differences(model, np.zeros(model.n_states, int), np.zeros(model.n_states, int), 9999)
 
 
 # --- what advantage estimation expects ------------------------------------------------------------

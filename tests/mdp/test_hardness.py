@@ -85,10 +85,6 @@ def test_arms_that_are_alike_are_no_mistake():
     assert (alone.lookahead, alone.effective_horizon) == (1, None)
 
 
-def test_a_world_that_is_too_large_has_fewer_numbers():
-    assert diameter(corridor(2000, ends=False)) is None
-
-
 def test_hitting_times_are_those_of_the_fastest_policy():
     """From 0 to 1 the better action takes four steps in the mean, and from there one leads back."""
     model = TransitionModel(
