@@ -23,8 +23,6 @@ checker, exploration, traces, networks, figures = map(
 )
 
 MODEL = transition_model(gym.make("FrozenLake-v1"))
-
-
 RANDOM = np.full((16, 4), 0.25)
 DISCOUNT = 0.9
 
@@ -183,7 +181,6 @@ CASES = {
     ],
     exploration.check_divergence: [
         (divergence, "Right."),
-        (lambda p, q: None, "Not done yet"),
         (lambda p, q: p * math.log(p / q), "It falls below 0. A pull can pay 1"),
         (lambda p, q: divergence(q, p), "The two are the wrong way round"),
     ],
@@ -227,7 +224,6 @@ CASES = {
     ],
     figures.check_gain: [
         (gain, "Right."),
-        (lambda r, a, e: r * a, "Nothing is bounded"),
         (lambda r, a, e: np.clip(r, 1 - e, 1 + e) * a, "A good action that has become much less"),
     ],
     figures.check_wins: [
@@ -236,7 +232,6 @@ CASES = {
         (lambda x, y: wins(y, x), "It is the share that the second agent wins."),
     ],
     policy_values: [
-        ("many", "It has to be an array of numbers, one value for each state."),
         (np.ones(15), "The shape has to be (16,), one value for each state; it is (15,)."),
         (value_iteration(MODEL, DISCOUNT).values, "They are those of an agent that always takes"),
         (solved(RANDOM, discount=1 - 1e-12), "The discount is missing"),
@@ -322,8 +317,6 @@ def test_greedy_policies():
     worse[14] = 0
     said = checker.check_greedy(MODEL, DISCOUNT, plan.values, worse)
     assert said.startswith("1 states have a better action by these values. In state 14 the action")
-    said = checker.check_greedy(MODEL, DISCOUNT, plan.values, np.full(16, 4))
-    assert said == "Actions are the numbers 0 to 3."
 
 
 def test_means_of_the_lambda_return():

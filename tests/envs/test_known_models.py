@@ -199,7 +199,6 @@ LAYOUTS = {
     "Warehouse": ("...#.....G", {"#": "shelf"}, (UP, DOWN, LEFT, RIGHT)),
     "MineMaze": ("S..X..", {"X": "mine", "P": "power"}, (UP, DOWN, LEFT, RIGHT)),
     "still FrozenLake": ("S...", {"X": "hole"}, (LEFT, DOWN, RIGHT, UP)),
-    "CliffWalking": ("............", {"X": "cliff"}, (UP, RIGHT, DOWN, LEFT)),
 }
 
 
@@ -218,8 +217,6 @@ def test_moves_lead_where_the_layout_says(name):
         target = row * layout.n_columns + column if inside else cell
         if letters[target] == "#":
             target = cell
-        if name == "CliffWalking" and letters[target] == "X":
-            target = 36
         assert layout.cells[reached] == target
         assert letters[target] != "P" or target in layout.collected_in(layout.layers[reached])
         assert model.terminated[state, action, 0] == (letters[target] in "GX")
