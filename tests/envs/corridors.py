@@ -31,11 +31,12 @@ class Corridor(gym.Env):
 
     action_space = spaces.Discrete(2)
 
-    def __init__(self, told=None, true=None, start=(1, 0, 0, 0, 0)):
+    def __init__(self, told=None, true=None, start=(1, 0, 0, 0, 0), render_mode=None):
         self.true = true or outcomes()
         self.P = told or self.true
         self.initial_state_distrib = np.array(start, float)
         self.observation_space = spaces.Discrete(len(self.P))
+        self.render_mode = render_mode
         self.s = 0
 
     def reset(self, *, seed=None, options=None):

@@ -176,8 +176,8 @@ def test_the_caller_notices_nothing():
 class Locked(Corridor):
     """Cannot be copied."""
 
-    def __init__(self, true=None, render_mode=None):
-        super().__init__(true=true)
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
         self.lock = threading.Lock()
 
 
