@@ -49,7 +49,6 @@ BROKEN = [
         "the goal at row 3, column 3 cannot be reached from the start at row 1",
     ),
     ("missing.txt", "cannot read the map file missing.txt: No such file or directory"),
-    (7, "desc must be a list of rows"),
     (["S" + "." * 5000 + "G"] * 5000, "5000 rows of 5002 cells, more than 16,777,216 cells"),
 ]
 

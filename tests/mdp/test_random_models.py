@@ -134,7 +134,7 @@ def total_rewards(model, policy):
     return values
 
 
-@settings(max_examples=100)
+@settings(max_examples=80)
 @given(models(states=3, actions=2, outcomes=2))
 def test_undiscounted_planning_against_every_stationary_policy(model):
     totals = np.array([total_rewards(model, policy) for policy in stationary_policies(model)])
