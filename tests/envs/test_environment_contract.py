@@ -144,7 +144,6 @@ def test_p_is_the_model_as_dictionaries(env_id, kwargs):
 REFUSED = [
     ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),
     ("Warehouse", {"observation": "positon"}, "'positon': did you mean 'position'? It must be one"),
-    ("MineMaze", {"random_start": 1}, "random_start must be true or false, not 1"),
     ("RandomWarehouse", {"shelf_density": 1.1}, "shelf_density must be a finite number from 0 to"),
     ("DynaMaze", {"maze": "blocking", "change_after_steps": 5}, "change_after_steps needs changed"),
     ("BernoulliBandit", {"probabilities": [0.5]}, "must hold 2 numbers or more, not 1"),
