@@ -269,8 +269,8 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     env.reset(seed=4)
     for _ in range(n):
         env.s = state
-        found.append(env.step(action)[1])
-    rewards = np.array(found)
+        found.append(env.step(action)[:2])
+    states, rewards = np.array(found).T
     model = env.transition_model()
     prob, mean = model.prob[state, action], model.reward[state, action]
     expected = prob @ mean
@@ -278,6 +278,9 @@ def test_drawn_rewards_have_the_models_mean_and_variance(env_id, kwargs, state, 
     # Five standard errors of each; that of a normal variance is itself times sqrt(2 / n).
     assert rewards.mean() == pytest.approx(expected, abs=5 * np.sqrt(variance / n))
     assert rewards.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / n))
+    counts, chances = np.bincount(states.astype(int), minlength=len(model.prob)), 0 * model.initial
+    np.add.at(chances, model.next_state[state, action], prob)
+    assert (np.abs(counts - n * chances) <= 5 * np.sqrt(n * chances) + 3).all()
 
 
 # --- Blackjack ------------------------------------------------------------------------------------
