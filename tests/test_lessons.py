@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import special
 
 from envs.known_models import transition_model
-from mdp import TransitionModel, policy_iteration, value_iteration
+from mdp import value_iteration
 
 # A lesson imports them as a script in its folder does.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "lessons"))
@@ -23,8 +23,6 @@ checker, exploration, traces, networks, figures = map(
 )
 
 MODEL = transition_model(gym.make("FrozenLake-v1"))
-
-
 RANDOM = np.full((16, 4), 0.25)
 DISCOUNT = 0.9
 
@@ -53,12 +51,6 @@ def expected_target(reward, discount, terminated, next_values, epsilon):
     return reward if terminated else reward + discount * mean
 
 
-def best_left_out(reward, discount, terminated, next_values, epsilon):
-    others = (next_values.sum() - next_values.max()) / 3
-    mean = epsilon * others + (1 - epsilon) * next_values.max()
-    return reward if terminated else reward + discount * mean
-
-
 MEANS = [0.2, 0.9, 0.5]
 ARMS = [0, 1, 2, 0, 1]
 
@@ -83,12 +75,10 @@ WALK = transition_model(gym.make("RandomWalk-v0", n_states=19, left_reward=-1))
 ZEROS = np.zeros(21)
 
 
-def n_step_return(rewards, discount, value_after, *, first=0, powers=None):
+def n_step_return(rewards, discount, value_after, *, first=0):
     n = len(rewards)
     kept = discount ** np.arange(first, n + first)
-    return (kept * np.asarray(rewards)).sum() + discount ** (
-        n if powers is None else powers(n)
-    ) * value_after
+    return (kept * np.asarray(rewards)).sum() + discount**n * value_after
 
 
 def n_step_means(values, n):
@@ -98,10 +88,9 @@ def n_step_means(values, n):
     return values
 
 
-def lambda_means(values, decay, weights=None, n=200):
-    chances = (1 - decay) * decay ** np.arange(n) if weights is None else weights(np.arange(n))
+def lambda_means(values, decay, n=200):
     means = np.zeros(21)
-    for chance in chances:
+    for chance in (1 - decay) * decay ** np.arange(n):
         values = n_step_means(values, 1)
         means += chance * values
     return means
@@ -113,22 +102,14 @@ def replacing(trace, state, discount, decay):
     return trace
 
 
-def changed(visited, faded=lambda trace, discount, decay: discount * decay * trace):
-    """A step that differs from the right one in what is given."""
-
-    def step(trace, state, discount, decay):
-        after = faded(trace, discount, decay)
-        after[state] = visited(after[state], discount * decay)
-        return after
-
-    return step
+def accumulating(trace, state, discount, decay):
+    trace = discount * decay * trace
+    trace[state] += 1
+    return trace
 
 
-def targets(rewards, terminated, values, discount, follows=lambda values: values.max(axis=1)):
-    return rewards + discount * ~terminated * follows(values)
-
-
-ROWS = "A target has to depend on the values of its own next state alone"
+def targets(rewards, terminated, values, discount):
+    return rewards + discount * ~terminated * values.max(axis=1)
 
 
 def doubled(choosing, judging):
@@ -195,157 +176,87 @@ def means_of_returns(answer):
 CASES = {
     checker.check_index: [
         (lambda mean, n, t: mean + np.sqrt(2 * np.log(t) / n), "Right."),
-        (lambda mean, n, t: mean, "The index has to lie above the mean"),
         (lambda mean, n, t: mean + np.log(t) / n, "With four times as many pulls"),
-        (lambda mean, n, t: mean + np.sqrt(2 * t / n), "The bonus has to grow with all pulls"),
         (lambda mean, n, t: mean + np.sqrt(np.log(t) / n), "The form is right, but a factor"),
     ],
     exploration.check_divergence: [
         (divergence, "Right."),
-        (lambda p, q: None, "Not done yet"),
-        (lambda p: p, "It fails when it is called"),
-        (lambda p, q: [p, q], "It has to give a number"),
-        (lambda p, q: -p * math.log(q), "For two equal probabilities it has to be 0"),
         (lambda p, q: p * math.log(p / q), "It falls below 0. A pull can pay 1"),
-        (lambda p, q: divergence(p, q) / math.log(2), "The form is right, but"),
         (lambda p, q: divergence(q, p), "The two are the wrong way round"),
-        (lambda p, q: 2 * (p - q) ** 2, "It is 0 where it has to be"),
     ],
     exploration.check_episodes: [
         (lambda n, e: (2 / e) ** n, "Right."),
         (lambda n, e: (e / 2) ** n, "That is the chance that one episode"),
         (lambda n, e: (2 / e) ** (n - 1), "There is one move too few"),
-        (lambda n, e: 2 * n / e, "For 5 rows and epsilon 0.1 it is too low."),
     ],
     exploration.check_bonus_target: [
         (bonus_target(lambda n, s: s / math.sqrt(n)), "Right."),
-        (
-            bonus_target(lambda n, s: 1 / math.sqrt(n)),
-            "With a scale of 0 it should be the target of Q-learning. When the episode",
-        ),
         (bonus_target(lambda n, s: s / math.sqrt(n), at_the_end=False), "There is no bonus at the"),
-        (bonus_target(lambda n, s: s * math.sqrt(n)), "What was tried less often"),
         (bonus_target(lambda n, s: s / n), "The bonus falls too fast"),
-        (bonus_target(lambda n, s: 2 * s / math.sqrt(n)), "The form is right, but"),
     ],
     traces.check_return: [
         (n_step_return, "Right."),
         (lambda r, d, v: sum(r) + d * v, "With 3 steps: the rewards are not discounted"),
         (lambda r, d, v: n_step_return(r, d, v, first=1), "With 3 steps: the first reward is disc"),
-        (lambda r, d, v: max(r) + d * v, "What one reward counts depends on the others"),
-        (
-            lambda r, d, v: n_step_return(r, d, v, powers=lambda n: n - 1),
-            "With 3 steps: the value after the last step is discounted too little",
-        ),
-        (lambda r, d, v: n_step_return(r[:3], d, v, powers=lambda n: len(r)), "With 5 steps: rew"),
     ],
     traces.check_replacing_trace: [
         (replacing, "Right."),
-        (lambda *_: np.ones(3), "The shape has to be (4,)"),
-        (changed(lambda own, _: own + 1), "That is the accumulating trace"),
-        (changed(lambda own, rate: rate), "The state that is visited now"),
-        (changed(lambda *_: 1, lambda z, *_: 0 * z), "The other states are forgotten"),
-        (changed(lambda *_: 1, lambda z, *_: z), "The traces of the other states have to"),
-        (
-            changed(lambda *_: 1, lambda z, d, _: d * z),
-            "The traces of the other states do not fade enough: lambda",
-        ),
+        (accumulating, "That is the accumulating trace"),
     ],
     networks.check_targets: [
         (targets, "Right."),
         (lambda r, t, v, d: (r + d * v.T).T, "The shape has to be (12,), one target for each step"),
-        (lambda r, t, v, d: r + d * v.max(), ROWS),
         (lambda r, t, v, d: r + d * v.max(axis=1), "When the episode has terminated nothing"),
-        (lambda r, t, v, d: targets(r, t, v, d, lambda v: v.min(axis=1)), "If the best next value"),
     ],
     networks.check_double_targets: [
         (doubled(online, lagging), "Right."),
         (doubled(lagging, online), "The roles are the wrong way round"),
-        (doubled(lagging, lagging), "The target network chooses and judges."),
-        (doubled(online, online), "The target network has no part in it"),
-        (lambda r, t, a, b, d: r + d * b[:, a.argmax(axis=1)][0], ROWS),
-        (lambda r, t, a, b, d: r + d * b.max(axis=1), "When the episode has terminated"),
     ],
     networks.check_loss: [
         (huber, "Right."),
         (lambda e: e**2 / 2 if e < 1 else e - 0.5, "An error above and one below"),
-        (abs, "Between -1 and 1 it has to be half the square"),
         (lambda e: e**2 / 2, "Beyond 1 it has to be a straight line"),
-        (lambda e: e**2 / 2 if abs(e) < 1 else abs(e), "It jumps where"),
-        (lambda e: e**2 / 2 if abs(e) < 1 else 2 * abs(e) - 1.5, "It bends whe"),
     ],
     figures.check_score: [
         (score, "Right."),
         (lambda x, top, low: top - x, "The optimum has the score 0"),
         (lambda x, top, low: (x - low) / top, "The optimum has to have the sc"),
-        (lambda *all_: max(score(*all_), 0), "Who is worse than the baseline"),
-        (lambda x, *_: (x + 20) / 100, "It is right for one optimum"),
     ],
     figures.check_gain: [
         (gain, "Right."),
-        (lambda r, a, e: r * a, "Nothing is bounded"),
-        (
-            lambda r, a, e: np.clip(r, 1 - e, 1 + e) * a,
-            "A good action that has become much less pr",
-        ),
-        (
-            lambda r, a, e: min(r, 1 + e) * a,
-            "A bad action (advantage below 0) that has become much",
-        ),
-        (lambda r, a, e: gain(r, a, 0.2), "Epsilon is not always 0.2."),
+        (lambda r, a, e: np.clip(r, 1 - e, 1 + e) * a, "A good action that has become much less"),
     ],
     figures.check_wins: [
         (wins, "Right."),
         (lambda x, y: np.mean(x > y), "It depends on the order of the seeds."),
-        (lambda x, y: np.mean(x[:, None] > y), "Two agents that always tie win"),
         (lambda x, y: wins(y, x), "It is the share that the second agent wins."),
-        (
-            lambda x, y: wins(x[: len(y)], y[: len(x)]),
-            "It is right where both have the same number",
-        ),
     ],
     policy_values: [
-        ("many", "It has to be an array of numbers, one value for each state."),
         (np.ones(15), "The shape has to be (16,), one value for each state; it is (15,)."),
-        (np.full(16, np.nan), "There are numbers in it that are not finite."),
         (value_iteration(MODEL, DISCOUNT).values, "They are those of an agent that always takes"),
         (solved(RANDOM, discount=1 - 1e-12), "The discount is missing"),
     ],
     follows_the_best: [
         (q_target, "Right."),
-        (lambda *_: None, "It cannot be called or gives no number"),
-        (lambda *_: float("nan"), "It gives a number that is not finite."),
         (lambda r, d, t, v: r + d * v.max(), "When the episode has terminated"),
-        (lambda r, d, t, v: r, "If all next values rise by 1"),
         (lambda r, d, t, v: r if t else r + d * v.mean(), "If the best next value"),
     ],
     follows_the_next: [
         (sarsa_target, "Right."),
-        (
-            lambda r, d, t, v, next_action: r if t else r + d * v.max(),
-            "The target has to follow the value of the next action",
-        ),
+        (lambda r, d, t, v, next_action: r if t else r + d * v.max(), "The target has to follow"),
     ],
     follows_the_mean: [
         (expected_target, "Right."),
-        (best_left_out, "With epsilon 1 all actions are equally probable"),
-        (
-            lambda r, d, t, v, epsilon: r if t else r + d * v.mean(),
-            "With epsilon 0 the policy is greedy",
-        ),
+        (lambda r, d, t, v, epsilon: r if t else r + d * v.mean(), "With epsilon 0 the policy"),
     ],
     regrets: [
         (np.cumsum([0.7, 0.0, 0.4, 0.7, 0.0]), "Right."),
         ([0.7, 0.0, 0.4, 0.7, 0.0], "Regret never falls, but yours does at pull 2."),
-        (np.cumsum([1.0, 0.0, 0.4, 0.0, 0.0]), "Pulls of arm 0 add different amounts."),
         (np.cumsum([0.2, 0.0, 0.4, 0.2, 0.0]), "A pull of arm 0 adds the wrong amount"),
     ],
     means_of_returns: [
         (..., "Not done yet."),
         (n_step_means(ZEROS, 1), "They look one step ahead only"),
-        ((np.arange(21) - 10) / 10, "No estimate is in them any more"),
-        (lambda_means(ZEROS, 0.8, lambda k: 0.8**k), "The weights have to sum up to 1"),
-        (n_step_means(ZEROS, 5), "The two sides"),
     ],
 }
 
@@ -370,35 +281,12 @@ def test_values_of_any_policy_are_right(seed, discount):
     state = int(np.random.default_rng(seed).choice(np.flatnonzero(MODEL.reachable)))
     values[state] += 0.01
     said = checker.check_policy_values(MODEL, policy, discount, values)
-    assert said != "Right."
-
-
-def test_the_state_that_disagrees_most_is_named_and_no_answer():
-    values = solved(RANDOM)
-    values[9] += 0.5
-    said = checker.check_policy_values(MODEL, RANDOM, DISCOUNT, values)
-    assert "most in state 9: yours is higher" in said
-    assert f"{solved(RANDOM)[9]:.3f}" not in said
-
-
-def test_values_that_go_on_after_the_end_are_named():
-    """One state, whose only step earns 1 and ends the episode."""
-    model = TransitionModel(
-        prob=np.ones((1, 1, 1)),
-        next_state=np.zeros((1, 1, 1), dtype=int),
-        reward=np.ones((1, 1, 1)),
-        terminated=np.ones((1, 1, 1), dtype=bool),
-        initial=np.ones(1),
-    )
-    assert checker.check_policy_values(model, np.zeros(1), 0.5, np.ones(1)) == "Right."
-    for check, more in ((checker.check_policy_values, [[0]]), (checker.check_optimal_values, [])):
-        assert check(model, *more, 0.5, np.full(1, 2.0)).startswith("They go on after the end")
+    assert f"most in state {state}: yours is higher" in said
 
 
 def test_optimal_values():
     best = value_iteration(MODEL, DISCOUNT).values
     assert checker.check_optimal_values(MODEL, DISCOUNT, best) == "Right."
-    assert policy_iteration(MODEL, DISCOUNT).values == pytest.approx(best)
     few = np.zeros(16)
     for _ in range(25):
         few = checker.looked_ahead(MODEL, DISCOUNT, few).max(axis=1)
@@ -409,6 +297,9 @@ def test_optimal_values():
 
 def test_action_values():
     values = solved(RANDOM)
+    wrong = values + 0.5 * np.eye(16)[9]
+    # The reply does not hold the answer.
+    assert f"{values[9]:.3f}" not in checker.check_policy_values(MODEL, RANDOM, DISCOUNT, wrong)
     right = checker.looked_ahead(MODEL, DISCOUNT, values)
     assert checker.check_action_values(MODEL, DISCOUNT, values, right) == "Right."
     undiscounted = checker.looked_ahead(MODEL, 1.0, values)
@@ -425,16 +316,12 @@ def test_greedy_policies():
     worse = plan.policy.copy()
     worse[14] = 0
     said = checker.check_greedy(MODEL, DISCOUNT, plan.values, worse)
-    assert said.startswith(
-        "1 states have a better action by these values. In state 14 the action 0"
-    )
-    said = checker.check_greedy(MODEL, DISCOUNT, plan.values, np.full(16, 4))
-    assert said == "Actions are the numbers 0 to 3."
+    assert said.startswith("1 states have a better action by these values. In state 14 the action")
 
 
 def test_means_of_the_lambda_return():
     values = np.random.default_rng(0).normal(size=21)
-    for decay, given in ((0.8, ZEROS), (0.3, values), (0.8, values)):
+    for decay, given in ((0.8, ZEROS), (0.3, values)):
         means = lambda_means(given, decay)
         assert traces.check_lambda_targets(WALK, decay, given, means) == "Right."
         means[4] += 0.01

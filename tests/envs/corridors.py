@@ -29,7 +29,6 @@ def altered(row=(3, 1), **changes):
 class Corridor(gym.Env):
     """Steps by ``true``, and tells ``P``; draws as toy_text does."""
 
-    metadata = {"render_modes": ["human"]}  # noqa: RUF012
     action_space = spaces.Discrete(2)
 
     def __init__(self, told=None, true=None, start=(1, 0, 0, 0, 0), render_mode=None):
@@ -47,8 +46,6 @@ class Corridor(gym.Env):
         return self.observe(), {}
 
     def step(self, action):
-        if self.render_mode == "human":
-            self.render()
         row = self.true[int(self.s)][action]
         _, self.s, reward, terminated = row[self.draw(row)]
         self.steps += 1
@@ -63,38 +60,10 @@ class Corridor(gym.Env):
     def observe(self):
         return self.s
 
-    def render(self):
-        raise AssertionError("a check draws nothing")
-
 
 class Backwards(Corridor):
     def draw(self, row):
         return int(self.np_random.random() < row[1][0])
-
-
-class Unsettable(Corridor):
-    """Its place is not ``s``, which cannot be set."""
-
-    place = None
-
-    @property
-    def s(self):
-        return self.place
-
-    @s.setter
-    def s(self, place):
-        if self.place is not None:
-            raise AttributeError
-
-    def step(self, action):
-        row = self.true[self.place][action]
-        _, self.place, reward, terminated = row[self.draw(row)]
-        return self.place, reward, terminated, False, {}
-
-    def reset(self, *, seed=None, options=None):
-        gym.Env.reset(self, seed=seed)
-        self.place = self.first()
-        return self.place, {}
 
 
 class Deaf(Corridor):

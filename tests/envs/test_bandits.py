@@ -1,20 +1,28 @@
-"""The dynamics of the bandits: their draws one by one, and what is known of them exactly."""
+"""The bandits: their draws one by one, what is known of them exactly, and logs of their pulls."""
 
 import math
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.toy_text.utils import categorical_sample
+from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import envs  # noqa: F401 (registers the environments)
-from envs.bandits import BernoulliBandit, GaussianBandit, LinearBandit, SegmentBandit
+from envs.bandits import (
+    BernoulliBandit,
+    GaussianBandit,
+    LinearBandit,
+    ReplayBandit,
+    log_uniformly,
+    read_log,
+)
 from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
 from envs.wrappers import ScaleReward
 from mdp import baseline_return, finite_horizon_optimum, policy_return
+
+LOG = Path(__file__).parent / "uniform_log.csv"
 
 
 def arms_to_pull(n, n_arms):
@@ -22,39 +30,6 @@ def arms_to_pull(n, n_arms):
 
 
 # --- draws ----------------------------------------------------------------------------------------
-
-
-def replay_clicks(env, shares, rates):
-    """Step a bandit beside the draws that its docstring states, and compare to the last bit."""
-    rng, _ = np_random(7)
-    context, _ = env.reset(seed=7)
-    assert context == categorical_sample(shares, rng)
-    for arm in arms_to_pull(300, len(rates[0])):
-        rate = rates[context][arm]
-        outcomes = [rate * share for share in shares] + [(1 - rate) * share for share in shares]
-        drawn = int(categorical_sample(outcomes, rng))
-        click, following = (1.0, drawn) if drawn < len(shares) else (0.0, drawn - len(shares))
-        best, expected = max(rates[context]), env.step(arm)
-        context = following
-        assert expected[:4] == (following, click, False, False)
-        assert expected[4]["expected_reward"] == rate
-        assert expected[4]["regret"] == best - rate
-    assert env.np_random.random() == rng.random()
-
-
-@given(
-    weights=st.lists(st.integers(0, 9), min_size=1, max_size=5).filter(any),
-    n_arms=st.integers(2, 4),
-    batch_size=st.sampled_from([1, 50]),
-    data=st.data(),
-)
-@settings(max_examples=25)
-def test_draws_of_any_segments_and_coins(weights, n_arms, batch_size, data):
-    shares = [weight / sum(weights) for weight in weights]
-    row = st.lists(st.floats(0, 1), min_size=n_arms, max_size=n_arms)
-    rates = data.draw(st.lists(row, min_size=len(shares), max_size=len(shares)))
-    replay_clicks(SegmentBandit(np.array(shares), np.array(rates), batch_size), shares, rates)
-    replay_clicks(BernoulliBandit(rates[0]), [1.0], rates[:1])
 
 
 @pytest.mark.parametrize("drift_std", [0.0, 0.25])
@@ -120,32 +95,14 @@ def test_draws_of_linear_bandits(redraws):
 def test_each_of_several_best_arms_has_no_regret():
     env = BernoulliBandit([0.1, 0.7, 0.7])
     assert env.reset(seed=0)[1] == {}
-    for arm, regret in ((0, 0.7 - 0.1), (1, 0.0), (2, 0.0)):
+    for arm, expected, regret in ((0, 0.1, 0.7 - 0.1), (1, 0.7, 0.0), (2, 0.7, 0.0)):
         info = env.step(arm)[4]
-        assert (info["optimal_action"], info["regret"]) == (1, regret)
-
-
-@pytest.mark.parametrize("kind", ["Bernoulli", "Gaussian", "Linear", "Segment"])
-def test_what_is_shown_tells_nothing_of_the_arms_and_information_is_plain(kind):
-    one, other = (gym.make(f"{kind}Bandit-v0") for _ in range(2))
-    one.reset(seed=4)
-    other.reset(seed=4)
-    for _ in range(20):
-        first, _ = one.step(0)[4], other.step(1)
-    # Rewards and contexts to come do not depend on earlier arms.
-    assert one.step(1)[1] == other.step(1)[1]
-    types = {"optimal_action": int, "expected_reward": float, "regret": float}
-    types["feedback_due"] = bool
-    assert {name: type(value) for name, value in first.items()} == types
+        assert (info["optimal_action"], info["expected_reward"]) == (1, expected)
+        assert info["regret"] == regret
 
 
 def test_an_episode_ends_after_its_pulls():
-    for kwargs, length in (
-        ({}, 1000),
-        ({"pulls": 7}, 7),
-        ({"pulls": 2500}, 2500),
-        ({"max_episode_steps": 40, "pulls": 30}, 40),
-    ):
+    for kwargs, length in (({}, 1000), ({"max_episode_steps": 40, "pulls": 30}, 40)):
         env = gym.make("GaussianBandit-v0", **kwargs)
         assert time_limit(env) == env.spec.max_episode_steps == length
         env.reset(seed=0)
@@ -153,13 +110,12 @@ def test_an_episode_ends_after_its_pulls():
     assert time_limit(gym.make("GaussianBandit-v0", max_episode_steps=-1)) is None
 
 
-@pytest.mark.parametrize(("batch_size", "pulls"), [(1, 3), (4, 12), (5, 12), (12, 5)])
-def test_feedback_is_due_at_the_end_of_each_batch(batch_size, pulls):
-    env = gym.make("SegmentBandit-v0", batch_size=batch_size, pulls=pulls)
+def test_feedback_is_due_at_the_end_of_each_batch_and_of_the_episode():
+    env = gym.make("SegmentBandit-v0", batch_size=5, pulls=12)
     for _ in range(2):
         env.reset(seed=0)
-        due = [env.step(0)[4]["feedback_due"] for _ in range(pulls)]
-        assert due == [(i + 1) % batch_size == 0 or i == pulls - 1 for i in range(pulls)]
+        due = [env.step(0)[4]["feedback_due"] for _ in range(12)]
+        assert [i for i in range(12) if due[i]] == [4, 9, 11]
 
 
 # --- known figures --------------------------------------------------------------------------------
@@ -179,3 +135,162 @@ def test_what_a_pooled_test_of_segments_loses_is_exact():
     assert model.expected_reward.tolist() == [[0.4, 1.0, 1.5]]
     assert observations_of_states(env).tolist() == [0]
     assert success_outcomes(env) is None
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(text):
+        path = tmp_path / "log.csv"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return written
+
+
+# --- reading logs ---------------------------------------------------------------------------------
+
+
+def test_a_log_with_a_context_of_text():
+    data = read_log(LOG)
+    assert (data.source, len(data), data.n_arms) == (str(LOG), 7, 2)
+    assert (data.context_names, data.categories) == (("segment",), ("casual", "core"))
+    assert data.contexts[:, 0].tolist() == [1, 0, 0, 1, 0, 1, 0]
+    assert data.arms.tolist() == [0, 1, 0, 1, 1, 0, 0]
+    assert data.rewards.tolist() == [1, 0, 1, 1, 0, 0, 0.25]
+    assert data.propensities.tolist() == [0.5] * 7
+    assert data.observation_space == spaces.Discrete(2)
+    assert data.observations(spaces.Discrete(2)).tolist() == [1, 0, 0, 1, 0, 1, 0]
+
+
+def test_columns_may_stand_in_any_order_and_propensities_be_missing(write):
+    # As a spreadsheet writes it: a mark in front, commas in names, and lines without anything.
+    data = read_log(write('\ufeffreward,age,arm,"income, net"\n1.5,30,2,1e3\n\n-1,40.5,0,2000\n'))
+    assert data.context_names == ("age", "income, net")
+    assert data.contexts.tolist() == [[30, 1000], [40.5, 2000]]
+    assert (data.arms.tolist(), data.rewards.tolist()) == ([2, 0], [1.5, -1])
+    assert data.propensities is data.categories is None
+    box = data.observation_space
+    assert (box.low.tolist(), box.high.tolist()) == ([30, 1000], [40.5, 2000])
+    observations = data.observations(spaces.Box(-1, 1, (2,)))
+    assert (observations.dtype, observations.tolist()) == (np.float32, [[30, 1000], [40.5, 2000]])
+
+
+def log_of(values):
+    return "segment,arm,reward\n" + "".join(f"{value},0,1\n" for value in values)
+
+
+def test_a_column_of_all_whole_numbers_from_0_on_is_a_number_of_a_context(write):
+    data = read_log(write(log_of([0, 1, 2, 1])))
+    assert data.observation_space == spaces.Discrete(3)
+    assert data.observations(spaces.Discrete(4)).tolist() == [0, 1, 2, 1]
+    assert data.observations(spaces.Box(0, 9, (1,))).tolist() == [[0], [1], [2], [1]]
+    with pytest.raises(ValueError, match="has the context segment, the agent observes one column"):
+        data.observations(spaces.Discrete(2))
+
+
+def test_a_log_without_context_and_of_one_pull(write):
+    data = read_log(write("arm,reward\n3,1\n"))
+    assert (len(data), data.n_arms, data.contexts.shape) == (1, 4, (1, 0))
+    assert data.observation_space == spaces.Discrete(1)
+    assert data.observations(spaces.Discrete(1)).tolist() == [0]
+    with pytest.raises(ValueError, match="has no context, the agent observes"):
+        data.observations(spaces.Discrete(2))
+
+
+MISTAKES = [
+    ("", "holds no pulls: a header and a row for each are needed"),
+    ("arm;reward\n0;1\n", "has no column 'arm', only arm;reward"),
+    ("arm,reward\n0,1\n0\n", ", line 3 has 1 values, not 2"),
+    ("arm,reward\n0,1\n0,yes\n", ", line 3: reward is 'yes', it must be a finite number"),
+    ("arm,reward\n0,1\n0.5,1\n", ", line 3: arm is '0.5', it must be a whole number from 0 to 9"),
+    ("arm,reward,propensity\n0,1,0\n", ", line 2: propensity is '0', it must be a probability"),
+    ("arm,reward,x\n0,1,3\n0,1,core\n", ", line 3: x is 'core', it must .*: text can only be all"),
+    ("arm,reward,x,y\n0,1,3,core\n", ", line 2: y is 'core', it must be a finite number"),
+    ("arm,reward,x\n0,1,\xff\n".encode("latin1"), r"cannot read .*: 'utf-8' codec can't decode"),
+    # A row without an end is refused before it is read.
+    ("1," * 2**20, r"more than 1,048,576 characters"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), MISTAKES, ids=[message for _, message in MISTAKES])
+def test_mistakes_in_a_log_are_named_with_their_line(tmp_path, text, message):
+    path = tmp_path / "log.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ValueError, match=message) as refused:
+        read_log(path)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_log_is_read_in_pieces_without_a_seam(write):
+    words = [f"{'zab'[i % 3]}{i // 9_000}" for i in range(21_000)]  # ten thousand rows are a piece
+    data = read_log(write(log_of(words)))
+    assert data.categories == tuple(sorted(set(words)))
+    assert [data.categories[int(code)] for code in data.contexts[:, 0]] == words
+    with pytest.raises(ValueError, match=r"line 21002: .*text can only be all of the context"):
+        read_log(write(log_of([*["1"] * 21_000, "a"])))
+
+
+# --- writing logs ---------------------------------------------------------------------------------
+
+
+UNIFORM = [  # an environment, its settings, the names of its contexts
+    ("SegmentBandit-v0", {"pulls": 30}, ("context",)),
+    ("LinearBandit-v0", {}, tuple(f"feature_{i}" for i in range(5))),
+]
+
+
+@pytest.mark.parametrize(("env_id", "kwargs", "names"), UNIFORM)
+def test_a_uniform_log_holds_what_the_environment_gave(env_id, kwargs, names, tmp_path):
+    path, env = tmp_path / "log.csv", gym.make(env_id, **kwargs)
+    log_uniformly(gym.make(env_id, **kwargs), 100, seed=3, path=path)
+    data, n_arms = read_log(path), int(env.action_space.n)
+    assert data.context_names == names
+    assert set(data.propensities.tolist()) == {1 / n_arms}
+    shown, (context, _) = data.observations(env.observation_space), env.reset(seed=3)
+    for i, arm in enumerate(np.random.default_rng([3, 1]).integers(n_arms, size=100).tolist()):
+        assert (np.asarray(shown[i]).tolist(), data.arms[i]) == (np.asarray(context).tolist(), arm)
+        context, reward, _, truncated, _ = env.step(arm)
+        assert data.rewards[i] == reward
+        if truncated:
+            context, _ = env.reset()
+
+
+# --- replay ---------------------------------------------------------------------------------------
+
+
+def test_replay_by_hand(tmp_path):
+    with pytest.raises(ValueError, match=r"cannot read .*missing\.csv: No such file or directory"):
+        gym.make("ReplayBandit-v0", log=str(tmp_path / "missing.csv"))
+    env = gym.make("ReplayBandit-v0", log=str(LOG))
+    assert (env.observation_space, env.action_space) == (spaces.Discrete(2), spaces.Discrete(2))
+    assert (time_limit(env), transition_model(env)) == (7, None)
+    # Context after the step, reward, matched, matched pulls so far; the arm pulled is always 0.
+    expected = [
+        (0, 1.0, True, 1),
+        (0, 0.0, False, 1),
+        (1, 1.0, True, 2),
+        (0, 0.0, False, 2),
+        (1, 0.0, False, 2),
+        (0, 0.0, True, 3),
+        (0, 0.25, True, 4),
+    ]
+    for _ in range(2):
+        assert env.reset(seed=0) == (1, {})
+        for step, (context, reward, matched, matched_pulls) in enumerate(expected):
+            info = {"matched": matched, "matched_pulls": matched_pulls, "feedback_due": True}
+            assert env.step(0) == (context, reward, False, step == 6, info)
+    with pytest.raises(ValueError, match="has 7 rows: call reset after the last"):
+        env.unwrapped.step(1)
+
+
+def test_logs_that_were_not_uniform_are_refused(write):
+    for text, message in (
+        ("arm,reward\n0,1\n", "has no column 'propensity': replay needs one, each value the"),
+        ("arm,reward,propensity\n0,1,0.5\n1,1,0.4\n", "the propensity of pull 2 is 0.4, not 0.5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ReplayBandit(write(text))
+    # Arms that were never pulled are known from the propensities.
+    log = write("arm,reward,propensity\n0,1,0.2\n2,0,0.2\n")
+    assert ReplayBandit(log).action_space == spaces.Discrete(5)

@@ -1,20 +1,17 @@
 """Maps, and the worlds on them: steps worked by hand, rules spelt out, optima by search."""
 
 import itertools
-import tracemalloc
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra, shortest_path
 
-from envs.grid import GridMap, distances_to
+from envs.grid import GridMap
 from envs.mine_maze import MineMazeEnv
 from envs.textbook.dyna_maze import DynaMazeEnv
-from envs.warehouse import RandomWarehouseEnv, WarehouseEnv, random_warehouse
+from envs.warehouse import WarehouseEnv, random_warehouse
 
 UP, DOWN, LEFT, RIGHT = range(4)
 ROWS = ["..G", ".#.", "S.."]
@@ -29,13 +26,11 @@ def walk(env, letters):
 # --- maps -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("start", ["", "\ufeff"], ids=["plain", "marked as UTF-8"])
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-@pytest.mark.parametrize("end", ["", "\n", "\n\n"])
-def test_a_map_is_read_from_rows_text_and_files(tmp_path, newline, end, start):
-    path = tmp_path / "map.txt"
-    path.write_bytes((start + newline.join(ROWS) + end.replace("\n", newline)).encode())
-    for desc in (ROWS, "\n".join(ROWS) + end, path, str(path)):
+def test_a_map_is_read_from_rows_text_and_files(tmp_path):
+    path, marked = tmp_path / "map.txt", tmp_path / "marked.txt"
+    path.write_text("\n".join(ROWS))
+    marked.write_bytes(("\ufeff" + "\r\n".join(ROWS) + "\r\n\r\n").encode())
+    for desc in (ROWS, "\n".join(ROWS) + "\n", path, str(path), marked):
         grid_map = GridMap.read(desc, known="#.SG", passable=".S")
         assert (grid_map.rows, grid_map.codes) == (tuple(ROWS), b"..G.#.S..")
         assert grid_map.start == 6
@@ -44,28 +39,21 @@ def test_a_map_is_read_from_rows_text_and_files(tmp_path, newline, end, start):
 
 BROKEN = [
     ([], "the map is empty"),
-    ([""], "the map is empty"),
-    ("\n", "the map is empty"),
     (["S..", "..", "..G"], "row 2 has 2 cells and row 1 has 3: they differ from column 3 on"),
-    (["S..", "....", "..G"], "row 2 has 4 cells and row 1 has 3: they differ from column 4 on"),
     (["...", "..G"], "the map has no start: mark it with the letter S"),
     (["..S", "S.G"], "two starts, at row 1, column 3 and at row 2, column 1; there must be one"),
     (["S..", "..."], "the map has no goal: mark it with the letter G"),
-    (["S..", ".x.", "..G"], "unknown letter 'x' at row 2, column 2; known are # . S G"),
-    (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2"),
+    (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2; known are # . S G"),
     (
         ["S#.", "#..", "..G"],
-        "the goal at row 3, column 3 cannot be reached from the start at row 1, column 1",
+        "the goal at row 3, column 3 cannot be reached from the start at row 1",
     ),
     ("missing.txt", "cannot read the map file missing.txt: No such file or directory"),
-    (7, "desc must be a list of rows"),
-    ([1, 2], "desc must be a list of rows"),
     (["S" + "." * 5000 + "G"] * 5000, "5000 rows of 5002 cells, more than 16,777,216 cells"),
-    ("/dev/zero", "is no regular file"),
 ]
 
 
-@pytest.mark.parametrize(("desc", "message"), BROKEN)
+@pytest.mark.parametrize(("desc", "message"), BROKEN, ids=[message for _, message in BROKEN])
 def test_a_broken_map_is_refused_in_one_line(desc, message):
     with pytest.raises(ValueError, match=message) as refused:
         WarehouseEnv(desc=desc)
@@ -81,10 +69,6 @@ def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=message):
             WarehouseEnv(desc=path)
-    with path.open("wb") as file:
-        file.truncate(2**40)  # it takes no room on the disk
-    with pytest.raises(ValueError, match="is larger than"):
-        WarehouseEnv(desc=path)
 
 
 def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
@@ -92,7 +76,6 @@ def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
         (["S#G"], r"unknown letter '#' at row 1, column 2; known are S \. M P"),
         (["SMG"], "the goal at row 1, column 3 cannot be reached"),
         (["S" + "P" * 25 + "G"], r"has 27 cells, 25 of them to collect: these make 27 \* 2\*\*25"),
-        (["S" + "P" * 100_000 + "G"], r"100002 cells, 100000 of them to collect"),
     ):
         with pytest.raises(ValueError, match=message):
             MineMazeEnv(desc=desc)
@@ -101,71 +84,7 @@ def test_a_maze_has_letters_of_its_own_and_room_for_so_many_powers():
     assert WarehouseEnv(desc=["G..S.G", "......"]).shortest_path_length == 2
 
 
-ROW_OF = st.integers(1, 7).flatmap(lambda n: st.lists(st.booleans(), min_size=n, max_size=n))
-
-
-@given(st.integers(1, 7), ROW_OF, st.randoms(), st.data())
-def test_distances_are_those_of_a_general_graph_search(n_rows, row, shuffler, data):
-    free = np.array([shuffler.sample(row, len(row)) for _ in range(n_rows)])
-    cells = st.integers(0, free.size - 1)
-    targets = data.draw(st.lists(cells, min_size=1, max_size=3, unique=True))
-    at, column = np.divmod(np.arange(free.size), free.shape[1])
-    apart = abs(at[:, None] - at) + abs(column[:, None] - column)
-    usable = free.ravel().copy()
-    usable[targets] = True
-    edges = (apart == 1) & usable & usable[:, None]
-    nearest = shortest_path(edges, unweighted=True, indices=targets).min(axis=0)
-    expected = np.where(np.isfinite(nearest), nearest, -1)
-    assert np.array_equal(distances_to(targets, free).ravel(), expected)
-
-
 # --- steps worked by hand -------------------------------------------------------------------------
-
-
-OWN = {"desc": ["S#", ".G"], "shelf_reward": -7, "step_reward": -0.5, "goal_reward": 3}
-OWN_MINES = {"step_reward": -2, "mine_reward": -5, "power_reward": 4, "goal_reward": 10}
-STEPS = {  # a world, moves, and what they come to: states, rewards and what was bumped into
-    # Against the wall, up, against a shelf, off the map, back.
-    "warehouse": (
-        WarehouseEnv(), "DLURLD", [90, 90, 80, 80, 80, 90], [-1, -1, -1, -100, -1, -1], "yynyyn"),
-    # After the end nothing moves.
-    "own rewards": (
-        WarehouseEnv(**OWN), "RUDRU", [0, 0, 2, 3, 3], [-7, -0.5, -0.5, 3, 0], "yynnn"),
-    # Off the map, then to the power at (1, 3) and back onto it, then onto the mine at (2, 3). The
-    # power is the first of three: its bit counts 36 * 1.
-    "mines": (
-        MineMazeEnv(), "URRDRLRD", [0, 1, 2, 8, 36 + 9, 36 + 8, 36 + 9, 36 + 15],
-        [-1, -1, -1, -1, 0, -1, -1, -101], "ynnnnnnn"),
-    "own mines": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "URR", [0, 7, 8], [-2, 2, 8], "ynn"),
-    "a mine of one's own": (MineMazeEnv(["SPG", "M.."], **OWN_MINES), "D", [3], [-7], "n"),
-    "collected once": (
-        MineMazeEnv(desc=["SPG"], power_reward=5), "RUDLRR", [4, 4, 4, 3, 4, 5],
-        [4, -1, -1, -1, -1, 99], "nyynnn"),
-    # Bits are numbered row by row.
-    "two powers": (MineMazeEnv(desc=["SP", "PG"]), "RLD", [5, 4, 14], [0, -1, 0], "nnn"),
-    "maze": (DynaMazeEnv(), "DDRRRRURRRRUUU", None, [0] * 13 + [1], "n" * 14),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", STEPS)
-def test_steps_by_hand(name):
-    env, letters, states, rewards, bumped = STEPS[name]
-    for _ in range(2):  # all is forgotten at reset
-        first, info = env.reset(seed=0)
-        assert (first, info["position"]) == (env.map.start, divmod(first, env.map.n_columns))
-        found, earned, over, infos = walk(env, letters)
-        assert found == (states or found)
-        assert earned == rewards
-        assert "".join("ny"[info["bumped"]] for info in infos) == bumped
-        at_goal = [env.map.rows[row][column] == "G" for row, column in at(infos)]
-        assert [info["is_success"] for info in infos] == at_goal
-        assert {type(index) for place in at(infos) for index in place} == {int}
-        at_mine = [env.map.rows[row][column] == "M" for row, column in at(infos)]
-        assert over == [goal or mine for goal, mine in zip(at_goal, at_mine, strict=True)]
-
-
-def at(infos):
-    return [info["position"] for info in infos]
 
 
 def test_slip_goes_to_both_sides_in_the_stated_order():
@@ -222,45 +141,42 @@ def maps(draw, letters):
     return ["".join(found[i : i + n_columns]) for i in range(0, size, n_columns)]
 
 
-def rules(rows, position, collected, action):
-    """What the descriptions of both worlds say: position, reward, end, and whether it bumped."""
+def rules(rows, position, collected, action, rewards):
+    """What the descriptions of both worlds say: position, reward, end, and whether it bumped.
+
+    ``rewards`` has what entering a letter earns, or driving against it; other steps earn that of
+    an empty cell.
+    """
     row = position[0] + {UP: -1, DOWN: 1}.get(action, 0)
     column = position[1] + {LEFT: -1, RIGHT: 1}.get(action, 0)
     if not (0 <= row < len(rows) and 0 <= column < len(rows[0])):
-        return position, -1, False, True
-    letter = rows[row][column]
-    if letter == "#":
-        return position, -100, False, True
-    earned = {"M": -101, "G": 99, "P": -1 if (row, column) in collected else 0}.get(letter, -1)
-    return (row, column), earned, letter in "MG", False
-
-
-def is_solvable(rows):
-    at = "".join(rows).index("S")
-    found, waiting = set(), [divmod(at, len(rows[0]))]
-    while waiting:
-        place = waiting.pop()
-        if place not in found:
-            found.add(place)
-            if rows[place[0]][place[1]] not in "GM":
-                waiting += [rules(rows, place, (), action)[0] for action in range(4)]
-    return any(rows[row][column] == "G" for row, column in found)
+        return position, rewards["."], False, True
+    letter = "." if (row, column) in collected else rows[row][column]
+    place = position if letter == "#" else (row, column)
+    return place, rewards.get(letter, rewards["."]), letter in "MG", letter == "#"
 
 
 SIDES = {UP: (LEFT, RIGHT), DOWN: (LEFT, RIGHT), LEFT: (UP, DOWN), RIGHT: (UP, DOWN)}
 
 
 @pytest.mark.parametrize("kind", [WarehouseEnv, MineMazeEnv])
+@settings(max_examples=60)
 @given(st.data(), st.sampled_from([0, 0.25, 1]), st.booleans(), st.integers(0, 2**32))
-def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start, seed):
+def test_any_map_that_can_be_solved_follows_the_rules(kind, data, slip, random_start, seed):
     rows = data.draw(maps("..#" if kind is WarehouseEnv else "...M"))
-    if not is_solvable(rows):
-        with pytest.raises(ValueError, match="cannot be reached"):
-            kind(desc=rows)
-        return
-    env = kind(
-        desc=rows, slip=slip, random_start=random_start, goal_reward=99 + (kind is MineMazeEnv)
-    )
+    try:
+        kind(rows)
+    except ValueError as error:
+        assume("cannot be reached" not in str(error))
+        raise
+    step, shelf, mine, power, goal = data.draw(st.tuples(*[st.integers(-9, 9)] * 5))
+    kwargs = {"step_reward": step, "goal_reward": goal, "slip": slip, "random_start": random_start}
+    if kind is WarehouseEnv:
+        rewards = {".": step, "#": shelf, "G": goal}
+        env = kind(rows, shelf_reward=shelf, **kwargs)
+    else:  # what is found there comes on top of the step
+        rewards = {".": step, "M": step + mine, "P": step + power, "G": step + goal}
+        env = kind(rows, mine_reward=mine, power_reward=power, **kwargs)
     model = env.transition_model()
     np.testing.assert_allclose(model.prob.sum(axis=2), 1)
     for state, action in np.ndindex(model.n_states, 4):
@@ -268,10 +184,11 @@ def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start,
         listed = (model.next_state, model.reward, model.terminated)
         assert tuple(array[state, action, 0] for array in listed) == move[:3]
     position, collected = env.reset(seed=seed)[1]["position"], set()
+    assert random_start or rows[position[0]][position[1]] == "S"
     powers = [divmod(i, len(rows[0])) for i, letter in enumerate("".join(rows)) if letter == "P"]
     for action in np.random.default_rng(seed).integers(4, size=40).tolist():
         ways = (action, *SIDES[action]) if slip else (action,)
-        possible = [rules(rows, position, collected, way) for way in ways]
+        possible = [rules(rows, position, collected, way, rewards) for way in ways]
         state, reward, terminated, _, info = env.step(action)
         position = info["position"]
         assert (position, reward, terminated, info["bumped"]) in possible
@@ -287,39 +204,16 @@ def test_any_map_follows_the_rules_or_is_refused(kind, data, slip, random_start,
 # --- random warehouses ----------------------------------------------------------------------------
 
 
-def shelves(rows):
-    return np.array([[letter == "#" for letter in row] for row in rows])
-
-
-@given(st.integers(2, 9), st.floats(0, 1), st.integers(0, 2**63 - 1))
-def test_no_more_shelves_are_taken_out_than_needed(size, density, seed):
-    # The generator's first numbers give the map before; Dijkstra on it the fewest shelves.
-    rows = random_warehouse(size, density, seed)
-    before = np.random.default_rng(seed).random((size, size)) < density
-    before[-1, 0] = before[0, -1] = False
-    row, column = np.divmod(np.arange(size * size), size)
-    beside = abs(row[:, None] - row) + abs(column[:, None] - column) == 1
-    # Graphs hold no edges of weight zero; so many small ones do not add up to one shelf.
-    entering = np.where(before.ravel(), 1.0, 1e-6)
-    cost = dijkstra(csr_array(beside * entering), indices=size * (size - 1))[size - 1]
-    after = shelves(rows)
-    assert not np.any(after & ~before)
-    assert np.count_nonzero(before & ~after) == int(cost)
-    assert (rows[-1][0], rows[0][-1]) == ("S", "G")
-    assert WarehouseEnv(desc=rows).shortest_path_length >= 2 * (size - 1)
-
-
 def test_a_seed_names_a_map_for_good():
     expected = ["...##G", "#...#.", "#.....", "..##.#", "......", "S###.#"]
     assert random_warehouse(6, 0.4, 7) == expected
-    assert len({tuple(random_warehouse(10, 0.3, seed)) for seed in range(20)}) == 20
-
-
-def test_the_density_is_as_asked_for():
-    # A quarter of a million cells at 0.3 have a standard deviation of 0.0009.
-    assert abs(shelves(random_warehouse(500)).mean() - 0.3) < 0.004
-    # A full warehouse keeps all but one shortest way of eleven cells.
-    assert [shelves(random_warehouse(6, density)).sum() for density in (0, 1)] == [0, 36 - 11]
+    found = [random_warehouse(10, 0.3, seed) for seed in range(20)]
+    assert len({tuple(rows) for rows in found}) == 20
+    assert 0.2 < np.mean([list("".join(rows)).count("#") for rows in found]) / 100 < 0.4
+    # A full warehouse keeps all shelves but those on one shortest way of eleven cells.
+    assert [str(random_warehouse(6, density)).count("#") for density in (0, 1)] == [0, 36 - 11]
+    # Each can be solved, or it would be refused.
+    assert all(WarehouseEnv(desc=rows).shortest_path_length >= 18 for rows in found)
 
 
 @pytest.mark.parametrize(
@@ -337,18 +231,6 @@ def test_an_episode_is_limited_by_ten_shortest_ways_unless_it_is_said_otherwise(
     assert str(again) == str(env)
 
 
-def test_steps_and_resets_among_many_cells_take_little_memory():
-    env = RandomWarehouseEnv(size=500, random_start=True)
-    env.reset(seed=0)
-    tracemalloc.start()
-    for step in range(100):
-        env.step(step % 4)
-        env.reset()
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 100e3
-
-
 # --- mazes that change ----------------------------------------------------------------------------
 
 CHANGING = {"maze": "blocking", "changed": True}
@@ -362,6 +244,8 @@ def test_shortest_ways_of_the_mazes():
     assert found == [10, 16, 16, 10]
     env = DynaMazeEnv()
     assert (env.shortest_path_length, env.transition_model().n_states) == (14, 54)
+    env.reset(seed=0)
+    assert walk(env, "DDRRRRURRRRUUU")[1] == [0] * 13 + [1]
 
 
 def test_a_maze_changes_once_after_so_many_steps_over_all_episodes():
@@ -374,19 +258,6 @@ def test_a_maze_changes_once_after_so_many_steps_over_all_episodes():
     assert env.map.rows[3] == ".########"
     env.reset()
     assert walk(env, "LLLUUUUU")[3][-1]["position"] == (0, 0)
-
-
-def test_it_waits_until_nobody_stands_where_a_wall_comes():
-    env = DynaMazeEnv(**CHANGING, change_after_steps=1, render_mode="rgb_array")
-    env.reset(seed=0)
-    before = env.render()
-    env.s, env.steps_done = 3 * 9 + 8, 1
-    walk(env, "R")  # against the edge: the robot stays in the gap
-    assert env.map.rows[3] == "########."
-    walk(env, "U")
-    assert env.map.rows[3] == ".########"
-    assert not np.array_equal(env.render()[200:256, 512:], before[200:256, 512:])
-    assert walk(env, "D")[3][0]["bumped"]
 
 
 def test_what_a_changing_maze_tells_is_of_the_moment():

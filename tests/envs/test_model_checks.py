@@ -9,7 +9,6 @@ import threading
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from envs import check_transition_model, checking
@@ -20,7 +19,7 @@ from envs.known_models import (
     transition_model,
 )
 from envs.warehouse import WarehouseEnv
-from tests.envs.corridors import Backwards, Corridor, Deaf, Unsettable, altered, outcomes, with_p
+from tests.envs.corridors import Backwards, Corridor, Deaf, altered, outcomes, with_p
 
 # Where nothing is a question of frequencies, or these are far off.
 FEW = 5_000
@@ -43,29 +42,13 @@ class Careless(Corridor):
         return int(uniform < row[1][0])
 
 
-class Pictured(Corridor):
-    """What is observed is no number."""
-
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.observation_space = spaces.Box(0, 1, (5,))
-
-    def observe(self):
-        return np.eye(5, dtype=np.float32)[self.s]
-
-
 SAME_REWARDS = outcomes(goal_reward=-1.0)
 # Whether it draws bit for bit as toy_text does, and whether its state can be set.
 RIGHT = {
-    "as toy_text": (lambda: Corridor(render_mode="human"), True, True),
+    "as toy_text": (Corridor, True, True),
     "other successors": (lambda: Backwards(SAME_REWARDS, SAME_REWARDS), False, True),
     "the global generators": (Careless, False, True),
-    "rewards in single precision": (
-        lambda: Corridor(altered(reward=0.1 + 0.2), altered(reward=0.3)), False, True),
-    "unsettable": (Unsettable, True, False),
     "deaf": (Deaf, True, False),
-    # Contexts come from nowhere: nothing shows whether it goes on from one that is set.
-    "segments": (lambda: gym.make("SegmentBandit-v0"), True, False),
 }  # fmt: skip
 
 
@@ -88,18 +71,13 @@ class Odd(Corridor):
 
     def step(self, action):
         obs, reward, terminated, truncated, info = super().step(action)
-        match self.how:
-            case "truncates":
-                truncated = self.steps == 20
-            case "raises":
-                if self.s == 3:
-                    raise RuntimeError("one\ntwo")
-            case "nothing":
-                reward = float("nan")
+        if self.how == "raises" and self.s == 3:
+            raise RuntimeError("one\ntwo")
+        truncated = self.how == "truncates" and self.steps == 20
         return obs, reward, terminated, truncated, info
 
     def observe(self):
-        return {"shifted": self.s + 1, "beyond": 7, "pair": (0, self.s)}.get(self.how, self.s)
+        return (0, self.s) if self.how == "pair" else self.s
 
 
 def ladder(reward):
@@ -112,54 +90,25 @@ def ladder(reward):
 
 
 LADDER = ladder(2.0), ladder(1.0), np.eye(16)[0]
-ONE_ROW = outcomes()
-ONE_ROW[2][0] = [(0.6, *ONE_ROW[2][0][0][1:]), (0.4, *ONE_ROW[2][0][1][1:])]
-NO_MODEL = "the environment's P is no model"
 SAYS = r"^the environment's P is not what step does: state 3, action 1: P says state "
-GAVE = r"step gave state 4 with reward 9\.0, terminated$"
-LATER = r"or state 1 with reward -1\.0, "
 FALSE = {
     "reward": (lambda: Corridor(altered(reward=10.0)),
-        rf"{SAYS}4 with reward 10\.0, terminated {LATER}{GAVE}"),
-    "termination": (lambda: Corridor(altered(ends=False)),
-        rf"{SAYS}4 with reward 9\.0 {LATER}{GAVE}"),
-    "successor": (lambda: Corridor(altered(state=0)),
-        rf"{SAYS}0 with reward 9\.0, terminated {LATER}{GAVE}"),
+        rf"{SAYS}4 with reward 10\.0, terminated or .* step gave state 4 with reward 9\.0, term"),
     "unknown wind": (lambda: Corridor(outcomes(wind=0.0)),
         r"state 3, action 0: P says state 2 with .* step gave state 1 with reward -1\.0$"),
-    "frequency of one row": (lambda: Corridor(ONE_ROW, outcomes()),
-        r"state 2, action 0: P says state 1 with reward -1\.0 in 60\.0% of cases"),
     "frequency everywhere": (lambda: Careless(outcomes(0.4), outcomes()),
         r" in (40.0% of .* gave it in (2[5-9]|3[0-4])|60.0% of .* in (6[5-9]|7[0-4]))\.\d% of "),
     "frequency of a start": (
         lambda: Corridor(start=(0.9, 0.1, 0, 0, 0)), "initial_state_distrib"),
     "far away": (lambda: Corridor(*LADDER),
         r"state 15, action 1: P says state 15 with reward 2\.0"),
-    "far away, steered": (lambda: Unsettable(*LADDER),
-        r"state 15, action 1: P says state 15 with reward 2\.0, terminated"),
     "truncates": (lambda: Odd("truncates"),
         "step gave truncated, which no model holds: leave time limits to max_episode_steps"),
     "raises": (lambda: Odd("raises"), "step raised RuntimeError: one two$"),
-    "no number": (lambda: Odd("nothing"), "step gave state 1 with reward nan"),
-    "shifted": (
-        lambda: Odd("shifted"), "reset gave state 1, where initial_state_distrib says"),
-    "beyond": (lambda: Odd("beyond"), "P has states 0 to 4, this led to 7"),
     "pair": (lambda: Odd("pair"), r"the observation is \(0, 0\), not the number of a state"),
-    "a short outcome": (lambda: with_p({0: {0: [(1.0,)]}}), NO_MODEL),
-    "three actions": (lambda: with_spaces(5, 3),
-        f"^{NO_MODEL}: it has 2 actions, where the space is Discrete\\(3\\)$"),
-    "six states": (lambda: with_spaces(6, 2),
-        f"^{NO_MODEL}: it has 5 states, where the space is Discrete\\(6\\)$"),
+    "a short outcome": (
+        lambda: with_p({0: {0: [(1.0,)]}}), "the environment's P is no model"),
 }  # fmt: skip
-
-
-AGAIN = {"reward", "frequency everywhere"}
-
-
-def with_spaces(n_states, n_actions):
-    env = Corridor()
-    env.observation_space, env.action_space = spaces.Discrete(n_states), spaces.Discrete(n_actions)
-    return env
 
 
 @pytest.mark.parametrize("name", FALSE)
@@ -169,7 +118,7 @@ def test_false_models_are_refused_in_one_line(name):
     check = check_transition_model(make(), n_steps)
     assert re.search(line, check.refusal), check.refusal
     assert "\n" not in check.refusal
-    if name in AGAIN:
+    if name == "frequency everywhere":  # its own draws do not depend on what others have drawn
         random.seed(1)
         assert check_transition_model(make(), n_steps) == check
 
@@ -193,20 +142,13 @@ def replaced_by_hand():
     return env
 
 
-@pytest.mark.parametrize("make", [Frozen, replaced_by_hand])
-def test_what_differs_from_a_known_class_is_not_believed(make):
-    env = make()
-    assert model_check(env).refusal is not None
-    assert transition_model(env) is success_outcomes(env) is observations_of_states(env) is None
-
-
-def test_a_subclass_that_does_the_same_is_believed():
+def test_a_known_class_that_was_changed_is_not_believed_unless_it_does_the_same():
+    for env in (Frozen(), replaced_by_hand()):
+        assert transition_model(env) is success_outcomes(env) is observations_of_states(env) is None
+    assert "its step was replaced by hand" in model_check(env).refusal
     ours, known = (transition_model(env) for env in (Same(), FrozenLakeEnv()))
     np.testing.assert_array_equal(ours.prob, known.prob)
     assert transition_model(type("Plain", (WarehouseEnv,), {})(slip=0.1)) is not None
-    assert transition_model(Pictured()) is not None
-    assert observations_of_states(Pictured()) is None
-    assert "its step was replaced by hand" in model_check(replaced_by_hand()).refusal
 
 
 # --- the check itself -----------------------------------------------------------------------------
@@ -243,7 +185,7 @@ gym.register("Locked-v0", entry_point=Locked)
 
 
 def test_what_cannot_be_copied_is_made_anew():
-    env = gym.make("Locked-v0", true=outcomes(wind=0.5), render_mode="human")
+    env = gym.make("Locked-v0", true=outcomes(wind=0.5))
     assert check_transition_model(env, n_steps=FEW).refusal is None
     refusal = check_transition_model(Locked()).refusal
     assert "cannot be held against step: it cannot be copied" in refusal
@@ -251,36 +193,27 @@ def test_what_cannot_be_copied_is_made_anew():
     assert "made in the same way has another P" in check_transition_model(env).refusal
 
 
-def counted():
-    """A class of its own, whose copies count their steps together."""
+class Counted(Corridor):
+    """Copies count their steps together."""
 
-    class Counted(Corridor):
-        tried = 0
+    tried = 0
 
-        def step(self, action):
-            Counted.tried += 1
-            return super().step(action)
-
-    return Counted
+    def step(self, action):
+        Counted.tried += 1
+        return super().step(action)
 
 
 def test_each_environment_is_checked_once_until_it_is_changed():
-    kind, tried = counted(), set()
-    for seed in range(3):
-        env = gym.wrappers.TimeLimit(kind(), 50)
-        env.unwrapped.observation_space.seed(seed)
-        env.unwrapped.rng = np.random.default_rng(seed)
-        for _ in range(3):
-            env.reset(seed=seed)
-            assert transition_model(env) is not None
-            assert observations_of_states(env) is not None
-            tried.add(kind.tried)
+    tried = set()
+    for seed in range(2):
+        env = gym.wrappers.TimeLimit(Counted(), 50)
+        env.reset(seed=seed)
+        for known in (transition_model, observations_of_states, transition_model):
+            assert known(env) is not None
+            tried.add(Counted.tried)
     assert len(tried) == 1
-    env, goal = env.unwrapped, outcomes(goal_reward=3.0)
+    env = env.unwrapped
     env.true = outcomes(wind=0.6)
     assert transition_model(env) is None
     env.P = outcomes(wind=0.6)
     assert transition_model(env) is not None
-    before = kind.tried
-    assert transition_model(kind(goal, goal)) is not None
-    assert kind.tried > before

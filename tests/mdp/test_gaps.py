@@ -1,21 +1,19 @@
-"""The gap of a policy, split over states: by a recursion, exact sums, repairs by brute force."""
+"""The gap of a policy, split over states; and what estimates of advantages expect."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.known_models import transition_model
 from mdp import finite_horizon_optimum, policy_return
+from mdp.advantages import discounted_values, expected_estimates
 from mdp.gaps import (
-    TooLargeError,
     first_differences,
     gap_by_state,
     greedy_repairs,
     policy_gradient,
 )
-from tests.mdp.test_random_models import distributions, models, moved_on
+from tests.mdp.test_random_models import deterministic, distributions, models, moved_on
 
 
 @st.composite
@@ -44,6 +42,7 @@ def at_each_step(model, policy, horizon):
     return np.broadcast_to(chances, (horizon, model.n_states, model.n_actions))
 
 
+@settings(max_examples=40)
 @given(models_and_policies())
 def test_what_each_state_loses_is_that_of_a_recursion(drawn):
     """The chance to be there at each step, times what is lost by doing what the policy does."""
@@ -68,6 +67,7 @@ def test_what_each_state_loses_is_that_of_a_recursion(drawn):
     assert split.action_values * visits[:, None] == pytest.approx(worth, abs=1e-9)
 
 
+@settings(max_examples=40)
 @given(models_and_policies(n_policies=2))
 def test_gains_where_two_policies_part_sum_to_their_difference(drawn):
     model, horizon, first, second = drawn
@@ -83,6 +83,7 @@ def test_gains_where_two_policies_part_sum_to_their_difference(drawn):
     assert found.met == pytest.approx(met, abs=1e-9)
 
 
+@settings(max_examples=40)
 @given(models_and_policies())
 def test_repairs_are_the_best_states_to_mend_one_after_the_other(drawn):
     """Against the optimum of a model in which all states but the repaired have one action."""
@@ -111,6 +112,7 @@ def test_repairs_are_the_best_states_to_mend_one_after_the_other(drawn):
         mask, done = mask | (states == repair.state), plans[repair.state].policy.astype(np.int64)
 
 
+@settings(max_examples=40)
 @given(models_and_policies())
 def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     model, horizon, policy = drawn
@@ -125,7 +127,78 @@ def test_the_gradient_of_a_policy_is_that_of_its_return(drawn):
     assert (nearby - value) / step == pytest.approx((slope * toward).sum(), abs=1e-3 * scale)
 
 
-def test_worlds_that_are_too_large_are_refused():
-    model = transition_model(gym.make("envs:RandomWarehouse-v0", size=100).unwrapped)
-    with pytest.raises(TooLargeError, match="too many to keep"):
-        first_differences(model, np.zeros(model.n_states, int), np.zeros(model.n_states, int), 9999)
+# --- what advantage estimation expects ------------------------------------------------------------
+
+
+def chain():
+    """Two states: 0 goes on (rewards 1 and 2, then the end), 1 stays for nothing."""
+    return deterministic([[1, 0], [1, 1]], [[1, 0], [2, 0]], [[False, False], [True, False]])
+
+
+EVEN = np.full((2, 2), 0.5)
+
+
+def test_values_of_a_chain_worked_out_by_hand():
+    # V(1) = 1/2 2 + 1/2 1/2 V(1), and V(0) = 1/2 (1 + 1/2 V(1)) + 1/2 1/2 V(0).
+    found = discounted_values(chain(), EVEN, 0.5)
+    assert found.values == pytest.approx([10 / 9, 4 / 3])
+    assert found.action_values == pytest.approx(np.array([[5 / 3, 5 / 9], [2, 2 / 3]]))
+    assert found.advantages == pytest.approx(np.array([[5 / 9, -5 / 9], [2 / 3, -2 / 3]]))
+
+
+def test_without_discount_what_may_never_end_has_no_value():
+    # In state 1 it stays for ever; without it, state 0 would have one.
+    found = discounted_values(chain(), np.array([[0.5, 0.5], [0.0, 1.0]]), 1.0)
+    assert np.isnan(found.values).all()
+    assert found.action_values[1, 0] == 2.0
+    assert np.isnan(found.action_values[[0, 0, 1], [0, 1, 1]]).all()
+    ends = discounted_values(chain(), np.array([[1.0, 0.0], [0.5, 0.5]]), 1.0)
+    assert ends.values == pytest.approx([3.0, 2.0])
+
+
+@st.composite
+def drawn_cases(draw):
+    model = draw(models())
+    policy = draw(distributions((model.n_states, model.n_actions)))
+    numbers = st.floats(-3, 3, width=16)
+    critic = np.array(draw(st.lists(numbers, min_size=model.n_states, max_size=model.n_states)))
+    return model, policy, critic, draw(st.sampled_from([0.0, 0.5, 0.9]))
+
+
+def by_enumeration(model, policy, critic, discount, trace, state, action, n_left):
+    """The mean of the sum of TD errors, over all that may happen in so many steps."""
+    if n_left == 0:
+        return 0.0
+    total = 0.0
+    for k in range(model.n_outcomes):
+        chance, after = model.prob[state, action, k], model.next_state[state, action, k]
+        if chance == 0:
+            continue
+        goes_on = not model.terminated[state, action, k]
+        error = model.reward[state, action, k] - critic[state]
+        if goes_on:
+            error += discount * critic[after]
+            for then in range(model.n_actions):
+                later = by_enumeration(
+                    model, policy, critic, discount, trace, after, then, n_left - 1
+                )
+                error += discount * trace * policy[after, then] * later
+        total += chance * error
+    return total
+
+
+@settings(max_examples=25)
+@given(drawn_cases(), st.sampled_from([0.0, 0.6, 1.0]))
+def test_what_estimates_expect_is_the_mean_over_all_that_may_happen(case, trace):
+    model, policy, critic, discount = case
+    reachable = np.flatnonzero(model.reachable)
+    steps = [(s, a, n) for s in reachable for a in range(model.n_actions) for n in (3, 1, 2)]
+    columns = tuple(np.array(steps).T)
+    given_action, given_state = expected_estimates(model, policy, critic, discount, trace, columns)
+    for i, (state, action, n) in enumerate(steps):
+        told = [
+            by_enumeration(model, policy, critic, discount, trace, state, a, n)
+            for a in range(model.n_actions)
+        ]
+        assert given_action[i] == pytest.approx(told[action], abs=1e-9)
+        assert given_state[i] == pytest.approx(policy[state] @ told, abs=1e-9)

@@ -1,30 +1,15 @@
 """How hard worlds are: worked out by hand, and against brute force on random models."""
 
-import itertools
 import math
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import TransitionModel, finite_horizon_optimum, hardness_of
 from mdp.hardness import action_gaps, diameter, hitting_times, looking_ahead, random_wait
-from tests.mdp.test_random_models import continuing, models
-
-
-def deterministic(next_state, reward, ends):
-    """A model of tables (S, A) that begins in state 0."""
-    next_state = np.array(next_state)
-    return TransitionModel(
-        prob=np.ones((*next_state.shape, 1)),
-        next_state=next_state[..., None],
-        reward=np.array(reward, np.float64)[..., None],
-        terminated=np.array(ends, np.bool_)[..., None],
-        initial=np.eye(len(next_state))[0],
-    )
+from tests.mdp.test_random_models import deterministic
 
 
 def corridor(n, *, ends):
@@ -41,19 +26,15 @@ def choice(rewards):
 
 def test_random_actions_take_n_squared_steps_to_the_end_of_a_corridor():
     """A walk that is held at 0 needs n (n + 1) steps to n; the limit of 10,000 cuts off none."""
-    steps, episodes = random_wait(corridor(5, ends=True), corridor(5, ends=True).reward > 0, 10_000)
-    assert steps == pytest.approx(5 * 6, rel=1e-9)
-    assert episodes == pytest.approx(1.0, rel=1e-9)
-
-
-def test_episodes_that_are_cut_off_are_begun_anew():
-    """With three steps for three places, one episode of 8 gets there, and each takes 3 steps."""
+    model = corridor(5, ends=True)
+    assert random_wait(model, model.reward > 0, 10_000) == pytest.approx((5 * 6, 1), rel=1e-9)
+    # With three steps for three places, one episode of 8 gets there, and each takes 3 steps.
     model = corridor(3, ends=True)
     assert random_wait(model, model.reward > 0, 3) == pytest.approx((24.0, 8.0))
     assert random_wait(model, model.reward > 0, 2) == (math.inf, math.inf)
 
 
-@pytest.mark.parametrize("size", [4, 9, 15])
+@pytest.mark.parametrize("size", [4, 9])
 def test_the_sea_is_deep(size):
     """Looking k steps ahead pays if 2^-(size - k), the chance of the rest, exceeds their cost."""
     env = gym.make("DeepSea-v0", size=size)
@@ -84,13 +65,6 @@ def test_a_lake_that_is_not_slippery():
     assert found.lookahead == 1
 
 
-def test_slips_on_a_lake_disconnect_what_a_hole_may_part():
-    found = hardness_of(transition_model(gym.make("FrozenLake-v1")), 100)
-    assert found.effective_horizon is None
-    assert 0 < found.connected < 1
-    assert found.random_steps_to_goal is None
-
-
 def test_two_arms():
     """With 20 pulls left: v = 9.5 * 19, b = 19 and d = 1 for both arms, so m = 6439."""
     model = choice([1.0, 0.0])
@@ -101,9 +75,6 @@ def test_two_arms():
     assert bound == pytest.approx(1 + math.log2(episodes))
     # Seven pulls can be tried in all combinations, with less.
     assert looking_ahead(model, 7) == (1, 7.0)
-    # A single pull needs no luck.
-    assert looking_ahead(model, 1) == (1, 1.0)
-    assert diameter(model) is None
 
 
 def test_arms_that_are_alike_are_no_mistake():
@@ -114,72 +85,15 @@ def test_arms_that_are_alike_are_no_mistake():
     assert (alone.lookahead, alone.effective_horizon) == (1, None)
 
 
-def test_a_world_that_is_too_large_has_fewer_numbers():
-    long = corridor(2000, ends=False)
-    assert diameter(long) is None
-    assert looking_ahead(long, 20_000) == (None, None)
-
-
-# Against brute force.
-
-
-def worst_greedy_return(model, horizon, k):
-    """The least that a policy earns that is greedy for Q(k), by recursion over what is left."""
-
-    def after(state, action, value, left):
-        at = state, action
-        outcomes = zip(model.prob[at], model.next_state[at], strict=True)
-        ends, reward = model.terminated[at], model.reward[at]
-        return sum(
-            chance * (reward[j] + (0 if ends[j] or left == 1 else value(following, left - 1)))
-            for j, (chance, following) in enumerate(outcomes)
-        )
-
-    def q_values(state, left, depth):
-        def value(following, fewer):
-            values = q_values(following, fewer, max(depth - 1, 0))
-            return max(values) if depth > 1 else sum(values) / len(values)
-
-        return [after(state, action, value, left) for action in range(model.n_actions)]
-
-    def worst(state, left):
-        seems = q_values(state, left, k)
-        greedy = [a for a, one in enumerate(seems) if one >= max(seems) - 1e-9]
-        return min(after(state, action, worst, left) for action in greedy)
-
-    starts = np.flatnonzero(model.initial > 0)
-    return sum(model.initial[state] * worst(state, horizon) for state in starts)
-
-
-@given(models(states=3, actions=2, outcomes=2), st.integers(1, 4))
-def test_the_lookahead_is_the_first_depth_at_which_no_greedy_policy_fails(model, horizon):
-    lookahead, bound = looking_ahead(model, horizon)
-    optimum = finite_horizon_optimum(model, horizon).start_value
-    solved = [
-        worst_greedy_return(model, horizon, k) == pytest.approx(optimum, abs=1e-9)
-        for k in range(1, lookahead + 1)
-    ]
-    assert solved == [False] * (lookahead - 1) + [True]
-    assert bound is None or lookahead <= bound <= horizon
-
-
-@given(models(states=4, actions=2), st.data())
-def test_hitting_times_are_those_of_the_fastest_policy(model, data):
-    """The best of all stationary policies, each one's times by a linear system."""
-    target = data.draw(st.sampled_from(np.flatnonzero(model.reachable).tolist()))
-    n = model.n_states
-    going_on = continuing(model)
-    best = np.full(n, np.inf)
-    for policy in itertools.product(range(model.n_actions), repeat=n):
-        chain = going_on[policy, np.arange(n)]
-        chain[target] = np.eye(n)[target]
-        far = np.linalg.matrix_power(chain, 4096)
-        sure = np.isclose(far[:, target], 1.0, atol=1e-9)
-        rest = np.flatnonzero(sure & (np.arange(n) != target))
-        times = np.full(n, np.inf)
-        times[target] = 0.0
-        inner = chain[np.ix_(rest, rest)]
-        times[rest] = np.linalg.solve(np.eye(len(rest)) - inner, np.ones(len(rest)))
-        best = np.minimum(best, times)
-    best[~model.reachable] = np.inf
-    assert hitting_times(model, target) == pytest.approx(best, rel=1e-9)
+def test_hitting_times_are_those_of_the_fastest_policy():
+    """From 0 to 1 the better action takes four steps in the mean, and from there one leads back."""
+    model = TransitionModel(
+        prob=np.array([[[0.25, 0.75], [0.1, 0.9]], [[1.0, 0.0], [0.5, 0.5]]]),
+        next_state=np.array([[[1, 0], [1, 0]], [[0, 1], [0, 1]]]),
+        reward=np.zeros((2, 2, 2)),
+        terminated=np.zeros((2, 2, 2), np.bool_),
+        initial=np.array([1.0, 0.0]),
+    )
+    assert hitting_times(model, 1).tolist() == pytest.approx([4, 0])
+    assert hitting_times(model, 0).tolist() == pytest.approx([0, 1])
+    assert diameter(model) == pytest.approx((4, 1))
