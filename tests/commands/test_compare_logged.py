@@ -77,20 +77,13 @@ MISTAKES = {
     "--logged second.csv": "--logged LOG.csv and --policy RUN go together",
     f"--logged second.csv --policy {RUN} --env X": "not both",
     "--logged second.csv --policy logs": "logs is no run folder",
-    "--logged second.csv --policy first.csv": "first.csv is no whole zip",
-    f"--logged second.csv --policy {RUN} {RUN}": f"--policy names {RUN} twice",
 }
 
 
 def test_mistakes_are_one_line(judge):
     for typed, message in MISTAKES.items():
-        words = typed.split()
-        code, out, err = judge(*words)
-        # What the files hold is looked at after the first line.
-        about = f"{len(words) - 3} {'policy' if len(words) == 4 else 'policies'} on {words[1]}\n"
-        is_known_beforehand = "together" in message or "not both" in message
-        assert (code, out) == (2, "" if is_known_beforehand else about)
-        assert err.count("\n") == 1
+        code, _, err = judge(*typed.split())
+        assert (code, err.count("\n")) == (2, 1)
         assert message in err
 
 

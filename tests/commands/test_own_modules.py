@@ -1,6 +1,7 @@
 """train.py, enjoy.py and compare.py on agents and environments of a user's own."""
 
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -60,20 +61,34 @@ def test_a_run_does_not_have_modules_imported(in_own_folder, own_folder, monkeyp
     assert (code, err) == (0, "")
 
 
-def test_a_study_in_a_folder_full_of_names(own_folder):
-    """A new process, typed in a folder with modules that have the names of ours and Python's."""
+STUDY = """
+title: Größer als ∞?
+seeds: 1
+n_timesteps: 50
+agents: {lazy: {algo: lazy, weight: 0.25}}
+environments: {'Eis, glatt': {id: my/Lake-v0}}
+"""
+NAMES = ("agents", "envs", "json", "numpy", "experiments", "pipeline", "mdp", "typing")
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
+
+
+def test_a_study_in_a_folder_full_of_names_on_a_machine_that_knows_ascii_alone(own_folder):
+    """The folder's modules have the names of ours and Python's; files are in UTF-8 all the same."""
     (own_folder / "my_agents.py").write_text(AGENTS)
-    for name in ("agents", "envs", "json", "numpy", "experiments", "pipeline", "mdp", "typing"):
+    for name in NAMES:
         (own_folder / f"{name}.py").write_text("raise SystemExit('a module of the user was taken')")
-    (own_folder / "lazy.yml").write_text("my/Lake-v0:\n  n_timesteps: 40\n  weight: 0.25\n")
-    words = [sys.executable, compare.__file__, "--gym-packages", "./my_agents.py"]
-    words += ["--env", "my/Lake-v0", "--algos", "lazy", "--seeds", "1", "--no-report"]
-    words += ["--conf-file", "lazy:lazy.yml", "-n", "50"]
-    done = subprocess.run(words, cwd=own_folder, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    runs = sorted(own_folder.glob("logs/studies/*/runs/lazy/*/run.json"))
-    specs = [json.loads(run.read_text())["spec"] for run in runs]
-    assert [spec["hyperparams"] for spec in specs] == [{"n_timesteps": 50, "weight": 0.25}]
+    (own_folder / "s.yml").write_text(STUDY, encoding="utf-8")
+    words = [sys.executable, compare.__file__, "s.yml", "--gym-packages", "./my_agents.py"]
+    done = subprocess.run(
+        words, cwd=own_folder, env={**os.environ, **ASCII}, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"Gr??er als inf?" in done.stdout
+    (run,) = own_folder.glob("logs/studies/s/runs/lazy/*/run.json")
+    spec = json.loads(run.read_text(encoding="utf-8"))["spec"]
+    assert spec["hyperparams"] == {"n_timesteps": 50, "weight": 0.25}
+    page = (own_folder / "logs" / "studies" / "s" / "report.html").read_text(encoding="utf-8")
+    assert "Größer als ∞?" in page
 
 
 # --- an environment that does other than its P says ----------------------------------------------

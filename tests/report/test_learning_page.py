@@ -84,31 +84,9 @@ def test_without_a_table_the_policy_in_every_state(watch):
     assert data["moments"]["timesteps"] == [0, 64]
 
 
-def test_of_a_network_the_page_says_which_updates_it_shows(watch, monkeypatch):
-    settings = {"n_steps": 16, "batch_size": 16, "engine": "compiled"}
-    data, text, training = watch("FrozenLake-v1", "ppo", 320, settings)
-    assert "from update to update" in text
-    assert "20 updates\n" in text.replace("</p>", "\n")
-    assert data["moments"]["number"] == [*range(21)]
-    # As large as the page is with every second one, and a letter less.
-    monkeypatch.setattr(learning, "MOST_BYTES", len(text) - 1)
-    _, second = again(training)
-    assert "20 updates, one in 2 of which is shown" in second
-    monkeypatch.setattr(learning, "MOST_BYTES", len(second.encode()) - 1)
-    data, text = again(training)
-    assert "20 updates, one in 4 of which is shown" in text
-    assert (data["moments"]["number"], data["stride"]) == ([0, 4, 8, 12, 16, 20], 4)
-
-
-def test_a_page_is_no_larger_than_three_megabytes_and_replaced_whole(
-    watch, monkeypatch, small_disk
-):
-    _, text, training = watch("Taxi-v4", n_timesteps=2000)
+def test_a_page_is_no_larger_than_three_megabytes(watch, monkeypatch):
+    _, text, training = watch(n_timesteps=2000)
     path = training.spec.watch_learning
-    with small_disk(1000), pytest.raises(OSError, match="too large"):
-        again(training)
-    assert path.read_text(encoding="utf-8") == text
-    assert [other.name for other in path.parent.glob("*.tmp")] == []
     assert len(text) < learning.MOST_BYTES
     smaller = len(text) - 20_000
     monkeypatch.setattr(learning, "MOST_BYTES", smaller)
@@ -176,12 +154,8 @@ def test_each_agent_that_learns_is_shown_once_and_kept(done, analysis, tmp_path)
     page.write_text(text.replace("2,000", "9,000"), encoding="utf-8")
     assert done(analysis)[1] == sorted(["Q-learning & co", HOSTILE])
     assert page.read_text(encoding="utf-8") == text
-    note = page.with_suffix(".json")
-    run = next(run for run in analysis.results.finished if run.agent == "Q-learning & co")
-    for damaged in ("{", "[]", "{}", json.dumps({**json.loads(note.read_text()), "words": 3})):
-        note.write_text(damaged)
-        assert learning.kept_page(tmp_path, run) is None
     # What comes out otherwise is not shown.
+    run = next(run for run in analysis.results.finished if run.agent == "Q-learning & co")
     other = replace(run, spec=replace(run.spec, seed=7))
     results = replace(analysis.results, finished=(other,), root=tmp_path / "other")
     pages, _ = done(replace(analysis, results=results))

@@ -81,15 +81,6 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
     }
 
 
-def test_an_upper_end_without_a_proof_has_a_footnote():
-    guessed = of_lake(optimum_at_least=95.0, optimum_is_proven=False)
-    _, legend = table_as("md", headline(guessed)).split("\n\n")
-    assert (
-        "On lake the optimum is bracketed: 1 is the upper end. On lake the upper end of the "
-        "optimum's bracket is not proven: a score there may be too high. ±:"
-    ) in legend
-
-
 def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():
     study = made_up.study(NAMES)
     seen = {"first": "open", "same": "open", "open": "open", "low": "behind"}
@@ -123,19 +114,17 @@ def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_foo
 
 SAFE = [
     (latex_text, r"\input{x} $a^b$", r"\textbackslash{}input\{x\} \$a\textasciicircum{}b\$"),
-    (latex_text, '~ `b "c"', r"\textasciitilde{} {\char96}b {\char34}c{\char34}"),
     (latex_text, "--seeds a---b ,,x ''", r"-{}-seeds a-{}-{}-b ,{},x '{}'"),
     (latex_text, "-1,000 [-2, 3] Lake-v1 -∞", r"$-$1,000 [$-$2, 3] Lake-v1 $-$$\infty$"),
-    (latex_text, "*x", r"{}*x"),
     (latex_text, "ε = 0.1 ± 2 λ ά Ω", r"$\varepsilon$ = 0.1 $\pm$ 2 $\lambda$ ά Ω"),
     (markdown_text, "a|b <b>*x*</b> [x](y) `c`", "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"),
     (name_of, "a`b|", "a\\`b\\|"),
 ]
 
 
-@pytest.mark.parametrize(("escaped", "text", "safe"), SAFE)
-def test_nothing_of_a_text_is_markup(escaped, text, safe):
-    assert escaped(text) == safe
+def test_nothing_of_a_text_is_markup():
+    for escaped, text, safe in SAFE:
+        assert escaped(text) == safe
 
 
 def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
@@ -218,29 +207,6 @@ def test_a_title_a_table_a_caption_and_sentences(width, options):
     assert ("a wider terminal shows training and IQM too" in told) is (width == 80)
     for sentence in (*conclusion(found.study, place).everything, "Seeds 0 to 3: nothing was tuned"):
         assert sentence in told
-
-
-def test_marks_of_trainings_that_were_changed_and_dashes():
-    nothing = ThresholdSummary(made_up.NOTHING, made_up.NOTHING)
-    without = {"score": None, "last_episodes": made_up.NOTHING, "steps_to_stay": nothing}
-    agents = [
-        made_up.agent("with", 90.0, changes=("slip 0.1",), on_variant=True),
-        made_up.agent("without", 1.0, **without),
-    ]
-    found = made_up.analysis([made_up.environment(agents)], ["with", "without"])
-    lines = lines_of(print_analysis, found, width=200)
-    first, second = cells(lines)[1:]
-    assert (first[0], first[4]) == ("with †", "95 [94.9, 95.2] *")
-    assert second == ["without", "1 [0.9, 1.2]", "3 [2.9, 3.2]", *"----", "10 s"]
-    assert "†: trained on a changed environment: with (slip 0.1)." in lines
-    assert "training episodes (*: on a variant of the environment);" in below(lines)
-    # What applies to no agent has no column and no explanation.
-    alone = made_up.agent("alone", 1.0, score=None, steps_to_stay=None, episodes_to_stay=None)
-    place = made_up.environment([alone], optimum=None, baseline=None, threshold=None)
-    lines = lines_of(print_analysis, made_up.analysis([place], ["alone"]))
-    assert lines[1] == "lake"
-    assert cells(lines)[0] == ["agent", "mean", "IQM", "training", "CPU time"]
-    assert "stays from" not in below(lines)
 
 
 # === the ranking on the page ======================================================================
@@ -334,8 +300,3 @@ def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
     for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
         cell = absent[titles.index(title)]
         assert (cell.text, cell.value, cell.note, cell.aside) == ("-", None, "", ""), title
-    few = dict.fromkeys(("score", "success_rate", "steps_to_stay", "episodes_to_stay"))
-    headings, _ = ranked([made_up.agent("alone", 1.0, **few)], optimum=None, threshold=None)
-    assert [heading["title"] for heading in headings] == [
-        *("Mean", "IQM", "Median", "CPU time", "Runs")
-    ]
