@@ -8,15 +8,13 @@ import time
 from collections import Counter
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from PIL import Image
 from rich.text import Text
 
 from commands import enjoy
-from commands.enjoy import build_parser, figures_table, play
+from commands.enjoy import build_parser, play
 from commands.terminal import TextConsole
-from pipeline.evaluation.policies import ActionFigures
 from pipeline.models.choose import ModelRequest
 from pipeline.models.load import load_to_play
 from pipeline.playing import FRAMES_PER_SECOND
@@ -108,19 +106,10 @@ REFUSED = [
 
 def test_one_line_for_what_is_not_there_or_not_done(type_command, lake, tmp_path):
     (tmp_path / "truncated.zip").write_bytes((lake / "FrozenLake-v1.zip").read_bytes()[:-200])
-    # A zip of another agent is neither played nor trained further.
-    sarsa, zipped = ["--algo", "sarsa", "--env", "FrozenLake-v1"], f"{RUN}/FrozenLake-v1.zip"
-    other = "cannot be loaded as a sarsa agent"
-    asked = [
-        *((["enjoy.py", *LAKE, *words.split()], complaint) for words, complaint in REFUSED),
-        (["enjoy.py", zipped, *sarsa[:2]], other),
-        ([*QUICK, *sarsa, "-i", zipped], other),
-    ]
-    for words, complaint in asked:
-        code, _, err = type_command(*words)
+    for words, complaint in REFUSED:
+        code, _, err = type_command("enjoy.py", *LAKE, *words.split())
         assert (code, err.count("\n")) == (2, 1)
         assert complaint in err
-    assert not (tmp_path / "logs" / "sarsa").exists()
 
 
 # --- films ------------------------------------------------------------------------------------
@@ -194,8 +183,8 @@ def pauses(monkeypatch):
     return waited
 
 
-def played(chosen, *words, width=100):
-    console = TextConsole(file=io.StringIO(), force_terminal=True, width=width, height=40)
+def played(chosen, *words):
+    console = TextConsole(file=io.StringIO(), force_terminal=True, width=100, height=40)
     play(console, chosen, build_parser().parse_args(["--render", "ansi", *map(str, words)]))
     return console.file.getvalue()
 
@@ -222,25 +211,3 @@ def test_pictures_replace_each_other_at_their_pace_with_figures_beside(walker, p
         assert name in first
         assert f"{number:.4g}" in first
     assert any("SFFF" in line and "left" in line for line in without_style(first).splitlines())
-    # Where there is no room beside the map, they stand below it.
-    narrow = without_style(played(walker, "--n-episodes", 1, width=30))
-    assert any(line.strip() == "SFFF" for line in narrow.splitlines())
-
-
-def rows_of(figures, chosen, *more):
-    console = TextConsole(file=io.StringIO(), width=60)
-    console.print(figures_table(ActionFigures("value", np.array(figures)), chosen, *more))
-    return [line.split() for line in console.file.getvalue().splitlines()]
-
-
-def test_bars_lie_between_the_lowest_and_the_highest_and_the_chosen_one_is_shown():
-    rows = rows_of([-1.0, 0.0, 3.0], 2, ("a", "b"))
-    assert rows[1:] == [["a", "-1"], ["b", "0", "###"], [">", "2", "3", "#" * 12]]
-    for numbers in ([np.nan, 1.0], [np.inf, 0.0], [0.0, 0.0]):  # without a range
-        rows = rows_of(numbers, 0, ())
-        assert rows[0] == ["action", "value"]
-        assert not any("#" in cell for row in rows for cell in row)
-    # Of many, as many as there is room for.
-    rows = rows_of(np.arange(100.0), 99, (), 5)
-    assert (len(rows), rows[-1]) == (6, [">", "99", "99", "#" * 12])
-    assert rows_of(np.arange(100.0), 0, (), 5)[1] == [">", "0", "0"]

@@ -19,7 +19,7 @@ from pipeline.runs import Run
 NAME = "FrozenLake-v1_qlearning-sarsa"
 TWO = ["--env", "FrozenLake-v1", "--algos", "qlearning", "sarsa", "--n-episodes", "30", "-j", "2"]
 ALL = [*TWO, "--seeds", 5, "--no-report", "-f", "all"]
-REPORT = [*TWO, "--seeds", 5, "--keep", "figures", "-f", "few"]
+REPORT = [*TWO, "--seeds", 5, "--keep", "figures", "-f", "folded"]
 FEW = [*REPORT, "--no-report"]
 # Another threshold than before, and as many seeds, of the same study.
 LATER = "seeds: 5\nn_episodes: 30\nthreshold: 0.02\nagents: [qlearning, sarsa]\n"
@@ -68,14 +68,14 @@ def both(made, typed, own_folder, monkeypatch):
         monkeypatch.setattr("report.figures.write_figures", lambda *_: [])  # which take longest
         monkeypatch.setattr("report.films.film_of", lambda _: None)
         typed(*ALL)
-        shutil.copytree("all", "few")
+        shutil.copytree("all", "folded")
         said.append(typed(*REPORT))
         shutil.copytree("all", place / "all")
-        shutil.copytree("few", place / "few")
+        shutil.copytree("folded", place / "folded")
     else:
         shutil.copytree(place / "all", "all")
-        shutil.copytree(place / "few", "few")
-    return own_folder / "all" / NAME, own_folder / "few" / NAME, said[0]
+        shutil.copytree(place / "folded", "folded")
+    return own_folder / "all" / NAME, own_folder / "folded" / NAME, said[0]
 
 
 def test_tables_are_those_of_folders_to_the_bit_also_for_a_later_threshold(both, typed):
@@ -87,11 +87,11 @@ def test_tables_are_those_of_folders_to_the_bit_also_for_a_later_threshold(both,
     assert "FrozenLake-v1_1" in folders(few)
     assert len(folders(few)) < 5
     Path(f"{NAME}.yml").write_text(LATER)
-    for folder in ("few", "all"):
+    for folder in ("folded", "all"):
         typed(f"{NAME}.yml", "--no-report", "-f", folder)
     for name in ("summary.csv", "verdicts.md", "verdicts.tex"):
         texts = [(study / name).read_text(encoding="utf-8") for study in (all_there, few)]
-        assert texts[0] == texts[1].replace("few", "all"), name
+        assert texts[0] == texts[1].replace("folded", "all"), name
     table = summary(few)
     assert (table["threshold"] == 0.02).all()
     assert np.isfinite(table["steps_to_stay"]).any()
@@ -139,7 +139,7 @@ def test_what_a_kill_left_is_removed_and_stored_runs_stay_done_without_the_flag(
     shutil.copytree(all_there / "runs" / "qlearning" / name, few / "runs" / "qlearning" / name)
     assert "10 runs, 10 of them there already" in typed(*FEW)
     assert folders(few) == before
-    more = [*TWO, "--seeds", 6, "--no-report", "-f", "few"]
+    more = [*TWO, "--seeds", 6, "--no-report", "-f", "folded"]
     assert "12 runs, 10 of them there already" in typed(*more)
     assert folders(few) == [*before, "FrozenLake-v1_6"]
     table = summary(few)
@@ -156,7 +156,7 @@ def test_a_damaged_file_is_named_and_repaired(both, typed):
     for damaged in (path.read_bytes(), whole[: len(whole) // 2]):
         path.write_bytes(damaged)
         said = typed(*FEW, code=2)
-        assert "few/" + str(path.relative_to(few.parent)) + " is damaged: " in said
+        assert "folded/" + str(path.relative_to(few.parent)) + " is damaged: " in said
         assert "--repair" in said
         assert "Traceback" not in said
     assert "FrozenLake-v1.sqlite.damaged-1" in typed(*FEW, "--repair")

@@ -13,7 +13,6 @@ from rich.console import Console
 from pipeline.digests import RECORD, sealed
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
-from pipeline.unfinished_runs import SaveInterval, StateKeeping
 
 SECRET = b"GIF89a the key to everything"
 LAKE, CART = "FrozenLake-v1", "CartPole-v1"
@@ -24,7 +23,6 @@ AGENTS = {
 }
 READ = (RECORD, f"{CART}.zip", CART, f"{CART}/config.yml", f"{CART}/vecnormalize.pkl")
 READ += ("replay_buffer.pkl", "vec_normalize.pkl", "modules", "aaa.gif")
-BEGUN = (*READ, "0.monitor.csv", "evaluations.npz", ".lock", "state", "state/even.state")
 STUDY = ("--env", LAKE, "--algos", "random", "--seeds", "2", "-n", "20", "--no-report", "-j", "1")
 STUDY_NAMES = ("looks.json", "summary.csv", "curves.csv.gz", "report.html", "verdicts.md", ".lock")
 STUDY_NAMES += (".drafts", "failures", "figures", "films", "learning", "replaced", "runs")
@@ -32,7 +30,7 @@ STUDY_NAMES += (".drafts", "failures", "figures", "films", "learning", "replaced
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """A finished run of each kind of agent, with a state that the next training may go on from."""
+    """A finished run of each kind of agent."""
     from pipeline.training import train as do_training
 
     folder, found = tmp_path_factory.mktemp("runs"), {}
@@ -40,9 +38,7 @@ def runs(tmp_path_factory):
         raw = {"n_timesteps": 64, **settings}
         fields = {"eval_episodes": 1, "n_eval_envs": 1, "device": "cpu", "verbose": 0}
         spec = TrainSpec(algo, env_id, split(raw), raw, 0, log_folder=folder, **fields)
-        keeping = StateKeeping(SaveInterval(steps=16), stays=True)
-        found[kind] = do_training(spec, Console(quiet=True), {}, "train.py", keeping=keeping).run
-        assert list(found[kind].state_path.iterdir())
+        found[kind] = do_training(spec, Console(quiet=True), {}, "train.py").run
     return found
 
 
@@ -125,12 +121,6 @@ def rewrite(folder, **fields):
     return info
 
 
-def interrupted(genuine, folder):
-    """A copy of a run as if it had been interrupted, with a seal as anybody can make it."""
-    shutil.copytree(genuine, folder)
-    rewrite(folder, state="interrupted")
-
-
 # --- runs ----------------------------------------------------------------------------------------
 
 
@@ -156,24 +146,10 @@ def test_a_finished_run(runs, outside, type_command):
     attack(genuine, READ, outside, copy, act)
 
 
-def test_an_interrupted_run(runs, outside, type_command):
-    genuine = runs["network"].path
-    folder = Path.cwd() / "begun" / genuine.parent.name / genuine.name
-    interrupted(genuine, folder)
-    copy = Path.cwd() / "logs" / genuine.parent.name / genuine.name
-
-    def act(told):
-        code, said = type_command("train.py", "--resume", copy)
-        assert code == 2, told
-        check_untold(said, Path.cwd())
-
-    attack(folder, BEGUN, outside, copy, act)
-
-
 def test_a_run_of_a_stranger_is_begun_again_and_writes_over_no_page(runs, type_command, outside):
     copy = Path.cwd() / "logs" / "qlearning" / "FrozenLake-v1_1"
-    interrupted(runs["table"].path, copy)
-    shutil.rmtree(copy / "state")
+    shutil.copytree(runs["table"].path, copy)
+    rewrite(copy, state="interrupted")  # with a seal as anybody can make it
     spec = {**rewrite(copy)["spec"], "watch_learning": str(outside / "key")}
     events = outside / "events.out.tfevents.1"
     events.write_bytes(b"mine")

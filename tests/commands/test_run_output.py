@@ -1,4 +1,4 @@
-"""What is said of a run that seldom occurs, of engines, and of how far a study is."""
+"""What is said of a run that seldom occurs, and of how far a study is."""
 
 import io
 import sys
@@ -8,13 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rich.console import Console
-from stable_baselines3.common.callbacks import CallbackList
 
-from agents.networks import engine_setting
-from agents.networks.engine_setting import TOO_SHORT, EnginePlan, Work
 from commands import compare, terminal
 from commands.compare import StudyProgress
-from commands.terminal import TextConsole, training_line
+from commands.terminal import TextConsole
 from commands.train import print_outcome
 from experiments.launching import RunFailure
 from experiments.plan import plan
@@ -22,7 +19,6 @@ from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from machine_code import WorkTime
 from pipeline import signs_of_life
 from pipeline.evaluation.sampled import Evaluation
-from pipeline.preparation import EngineOutlook
 from pipeline.runs import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -58,36 +54,6 @@ def test_a_run_in_words(monkeypatch):
         "files        logs/qlearning/Lake-v1_3",
         "watch        python enjoy.py --algo qlearning --env Lake-v1 -f 'else where'",
     ]
-
-
-# --- engines: how long a training will take, known to a factor of two ---------------------------
-
-COMPILED, LIBRARY = EnginePlan(is_compiled=True, world=(1, 2)), EnginePlan(is_compiled=False)
-SHORT = EnginePlan(is_compiled=False, reason=TOO_SHORT)
-# 10,000 updates of 2 ms, as many calls of 0.3 ms, and steps of 0.05 ms; 10 rows each, compiled.
-WORK = Work("q", 10_000, 1, 10_000, 1000, 4, 0, 0)
-LOOP = "library (Stable-Baselines3's own loop)"
-AUTO = "--engine auto: the same networks and updates compiled"
-
-
-def line_of(chosen, auto=COMPILED):
-    return training_line(EngineOutlook(chosen, auto, WORK), None, CallbackList([]))
-
-
-def test_the_line_about_engines(monkeypatch):
-    # A machine of the pace of that on which the constants were measured.
-    monkeypatch.setattr(engine_setting, "machine_pace", lambda: 1.0)
-    monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: True)
-    found = [WORK.library_seconds, WORK.compiled_seconds, WORK.bridged_seconds]
-    assert found == pytest.approx([23.5, 1.515, 2.515])
-    assert line_of(LIBRARY) == f"{LOOP}, about 24 s of processor time; {AUTO}, about 2 s"
-    usual = "(Stable-Baselines3's own loop: about 24 s)"
-    assert line_of(COMPILED) == f"compiled, about 2 s of processor time {usual}"
-    assert line_of(SHORT, SHORT) == f"{LOOP}, about 24 s of processor time: {TOO_SHORT}"
-    # Compiling is told where it is still to be done.
-    monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: False)
-    start = "compiled, about 2 s of processor time and once about 9 s of compiling ("
-    assert line_of(COMPILED).startswith(start)
 
 
 # --- how far a study is, where there is no terminal ----------------------------------------------

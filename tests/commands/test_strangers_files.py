@@ -47,10 +47,10 @@ def evil_zip(own_folder, payload):
     """A zip of a genuine PPO agent with the payload in it, which says that it holds JSON."""
     folder = own_folder / "gift"
     folder.mkdir()
-    load_algorithm("ppo")("MlpPolicy", ENV, n_steps=8, batch_size=8).save(folder / "whole.zip")
+    load_algorithm("ppo")("MlpPolicy", ENV, n_steps=8, batch_size=8).save(own_folder / "whole.zip")
     text = base64.b64encode(payload).decode()
     with (
-        zipfile.ZipFile(folder / "whole.zip") as whole,
+        zipfile.ZipFile(own_folder / "whole.zip") as whole,
         zipfile.ZipFile(folder / f"{ENV}.zip", "w") as evil,
     ):
         for name in whole.namelist():
@@ -60,7 +60,6 @@ def evil_zip(own_folder, payload):
                 data["ep_info_buffer"] = {":type:": "deque", ":serialized:": text}
                 content = json.dumps(data)
             evil.writestr(name, content)
-    (folder / "whole.zip").unlink()
     write_run(folder, algo="ppo")
     return folder / f"{ENV}.zip"
 
@@ -99,6 +98,18 @@ def test_a_zip_is_played_trained_further_or_judged(type_in_own_folder, evil_zip,
     ):
         check_refused(type_in_own_folder(*words), mark, "ep_info_buffer", "posix.mkdir")
     assert not list((own_folder / "logs").rglob("run.json"))
+
+
+def test_what_a_zip_holds_is_told(type_command, evil_zip, mark, own_folder):
+    code, out, err = type_command("yardstick", "inspect", own_folder / "whole.zip")
+    assert (code, err) == (0, "")
+    assert "policy.action_net.weight" in out
+    assert "a pickle of stable_baselines3.common.policies.ActorCriticPolicy" in out
+    assert out.endswith("nothing in it is suspicious\n")
+    code, out, err = type_command("yardstick", "inspect", evil_zip)
+    assert (code, err) == (1, "")
+    assert f"{os.mkdir.__module__}.mkdir" in out.partition("suspicious\n")[2]
+    assert not mark.exists()
 
 
 # --- statistics and replay buffers ---------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 import errno
 import io
-import itertools
 import json
 import os
 import re
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from rich.table import Table
-from rich.text import Text
 
 from commands import compare, enjoy, train
 from commands.cli import go_on_unread, run_command
@@ -148,20 +146,17 @@ def test_control_characters_are_spelt_out():
 
 
 def test_the_console_obeys_its_own_colours_alone():
-    texts = (HOSTILE, "[/]", "[link=https://a.b]c[/link]", ":bomb:")
-    for text, is_terminal in itertools.product(texts, (False, True)):
+    for text in (HOSTILE, "[/]", "[link=https://a.b]c[/link]", ":bomb:"):
         file = io.StringIO()
-        console = TextConsole(file=file, width=200, force_terminal=is_terminal, _environ={})
-        table = Table(text, title=text, caption=text)
+        console = TextConsole(file=file, width=200, force_terminal=True, _environ={})
+        table = Table(text, title=text)
         table.add_row(text)
         console.print(text, style="red")
-        console.print(Text(text))
         console.print(table)
         print_rows(console, table)
-        printed = file.getvalue()
-        assert bool(re.search("\x1b\\[[0-9;]*31m", printed)) is is_terminal
-        plain = re.sub("\x1b[^a-z]*m", "", printed)
-        assert plain.count(r"\x1b[2J" if text == HOSTILE else text) == 10
+        plain = re.sub("\x1b[^a-z]*m", "", file.getvalue())
+        assert plain != file.getvalue()
+        assert plain.count(r"\x1b[2J" if text == HOSTILE else text) == 6
         assert "\x1b" not in plain
 
 

@@ -19,13 +19,11 @@ from report.conclusions import conclusion, pairs_both_ways
 from report.documents import duration, headline, standings, verdicts_as
 from report.terminal import shown, sign
 from report.words import (
-    interval_alone,
     look_sentences,
     number,
     optimum_words,
     ordinal,
     score_number,
-    seeds,
 )
 from tests.report import made_up
 from verdicts import Estimate, FailureCount, SpeedComparison, Summary, ThresholdSummary
@@ -34,17 +32,11 @@ NAN, INF = math.nan, math.inf
 
 
 FIGURES = [
-    *((number, [x], text) for x, text in ((None, "-"), (INF, "never"), (-0.00001, "0"))),
-    *((number, [x], text) for x, text in ((0.74421, "0.7442"), (-27427.3, "-27,427"))),
+    *((number, [x], text) for x, text in ((None, "-"), (INF, "never"), (-27427.3, "-27,427"))),
     *((ordinal, [n], text) for n, text in ((1, "first"), (11, "11th"), (103, "103rd"))),
-    (seeds, [1], "1 seed"),
-    (seeds, [10, 40, 22], "10 to 40 seeds"),
-    (optimum_words, [None, None], "-"),
-    (optimum_words, [79.0, None], "79"),
     (optimum_words, [99.94951, 99.94921], "99.949 to 99.950 (bracketed)"),
     (optimum_words, [-38, -60, False], "-60 to -38 (bracketed; the upper end is not proven)"),
-    *((duration, [x], text) for x, text in ((0.1249, "0.12 s"), (1234.0, "1,200 s"))),
-    (interval_alone, [Estimate(1.0, 0.5, 1.5, 4)], "0.5 to 1.5"),
+    (duration, [1234.0], "1,200 s"),
     # Two digits of half the interval; without one three digits behind the point.
     (shown, [Estimate(0.12345, 0.11, 0.1369, 50)], "0.123 ± 0.013"),
     (shown, [Estimate(0.5, 0.5, 0.5, 50)], "0.500 ± 0.000"),

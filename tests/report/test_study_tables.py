@@ -1,12 +1,11 @@
-"""A study as tables: in Markdown, in LaTeX, in the terminal; and the ranking on the page."""
+"""A study as tables: in Markdown and in LaTeX; and the ranking on the page.
 
-import io
+What the terminal prints, and the page's ranking, is recorded in ``tests/golden``.
+"""
+
 import math
 import re
 from dataclasses import replace
-
-import pytest
-from rich.console import Console
 
 from report.conclusions import conclusion
 from report.documents import (
@@ -25,7 +24,6 @@ from report.page import result_sections
 from report.page.frame import Report
 from report.ranking import COLUMNS, Row
 from report.series import StudySeries
-from report.terminal import print_analysis
 from tests.report import made_up
 from verdicts import Estimate, FailureCount, ThresholdSummary
 
@@ -150,134 +148,16 @@ def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
     assert "%" not in re.sub(r"\\%|\{%$", "", "\n".join(lines), flags=re.MULTILINE)
 
 
-# --- the terminal ---------------------------------------------------------------------------------
-
-ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
-
-
-def lines_of(write, *given, width=120, **options):
-    """What is printed, without colours, as lines without trailing blanks."""
-    file = io.StringIO()
-    write(Console(markup=False, file=file, width=width, **options), *given)
-    assert bool(ESCAPES.search(file.getvalue())) is bool(options)
-    return [line.rstrip() for line in ESCAPES.sub("", file.getvalue()).splitlines()]
-
-
-def cells(lines):
-    """The tables cell by cell, those of a row that goes over several lines joined."""
-    rows, before = [], ""
-    for line in lines:
-        if line.startswith(("┃", "│")):
-            parts = [part.strip() for part in re.split("[┃│]", line)[1:-1]]
-            if (line[0] == "┃" and before.startswith("┃")) or (line[0] == "│" and not parts[0]):
-                rows[-1] = [f"{a} {b}".strip() for a, b in zip(rows[-1], parts, strict=True)]
-            else:
-                rows.append(parts)
-        before = line
-    return rows
-
-
-def below(lines):
-    """Caption and sentences, whose lines are broken at the width, as one line."""
-    end = max(place for place, line in enumerate(lines) if line.startswith("└"))
-    return " ".join(" ".join(lines[end + 1 :]).split())
-
-
-TABLE = """
-agent  | mean            | IQM             | score          | training        | stays from | solved | CPU time
-first  | 90 [89.9, 90.2] | 92 [91.9, 92.2] | 0.9 [0.8, 1.1] | 95 [94.9, 95.2] | 100        | 75%    | 99 s
-second | 40 [39.9, 40.2] | 42 [41.9, 42.2] | 0.4 [0.3, 0.6] | 45 [44.9, 45.2] | 50         | 75%    | 49 s
-"""  # noqa: E501  # as wide as it is printed
-
-
-@pytest.mark.parametrize(("width", "options"), [(80, {"force_terminal": True}), (120, {})])
-def test_a_title_a_table_a_caption_and_sentences(width, options):
-    agents = (made_up.agent("first", 90.0), made_up.agent("second", 40.0))
-    pairs = (made_up.pair("first", "second", "better"),)
-    missing = {"first": 0, "second": 1, "third": 4}
-    place = made_up.environment(agents, pairs=pairs, missing=missing)
-    found = made_up.analysis([place], ["first", "second", "third"])
-    lines = lines_of(print_analysis, found, width=width, **options)
-    assert lines[1] == "lake: optimum 100, best random or constant policy 20"
-    expected = [[cell.strip() for cell in row.split("|")] for row in TABLE.split("\n")[1:-1]]
-    left_out = {2, 4} if width == 80 else {}
-    assert cells(lines) == [[c for n, c in enumerate(row) if n not in left_out] for row in expected]
-    assert max(map(len, lines)) <= width
-    told = below(lines)
-    assert ("a wider terminal shows training and IQM too" in told) is (width == 80)
-    for sentence in (*conclusion(found.study, place).everything, "Seeds 0 to 3: nothing was tuned"):
-        assert sentence in told
-
-
 # === the ranking on the page ======================================================================
 
 
-def table_of(agents, metric="final", **changes):
-    place = made_up.environment(agents, **changes)
-    found = made_up.analysis([place], [agent.agent for agent in agents], metric=metric)
-    (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
-    return table
-
-
-def ranked(agents, metric="final", **changes):
+def ranked(agents, **changes):
     """Headings of the page's table and its rows, of agents on an environment."""
-    table = table_of(agents, metric, **changes)
+    found = made_up.analysis(
+        [made_up.environment(agents, **changes)], [agent.agent for agent in agents]
+    )
+    (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
     return table["headings"], table["rows"]
-
-
-RANKING = """
-Mean       | over seeds          | descending | 90    89.9 to 90.2 | 40    39.9 to 40.2
-IQM        | middle half         | descending | 92    91.9 to 92.2 | 42    41.9 to 42.2
-Median     | over seeds          | descending | 91    90.9 to 91.2 | 41    40.9 to 41.2
-Score      | 1 is optimal        | descending | 0.9   0.8 to 1.1   | 0.4   0.3 to 0.6
-Gap        | to the optimum      | ascending  | 7     6.8 to 7.1   | 57    56.8 to 57.1
-Success    | in the end          | descending | 50.0% 25% to 62%   | 50.0% 25% to 62%
-Stays from | step, at 96         | ascending  | 100   75% of runs  | 50    75% of runs
-Episodes   | to stay at 96       | ascending  | 98    75% of runs  | 48    75% of runs
-CPU time   | seconds of training | ascending  | 99    98.9 to 99.2 | 49    48.9 to 49.2
-Runs       | finished            | descending | 4                  | 4     1 missing
-"""
-
-
-def test_figures_of_each_agent_the_best_first():
-    agents = [made_up.agent("first", 90.0), made_up.agent("second", 40.0, n_missing=1)]
-    headings, rows = ranked(agents)
-    assert [row.agent for row, _ in rows] == ["first", "second"]
-    expected = [[" ".join(x.split()) for x in row.split("|")] for row in RANKING.split("\n")[1:-1]]
-    assert [
-        [*each.values(), *(f"{cells[n].text} {cells[n].note}".strip() for _, cells in rows)]
-        for n, each in enumerate(headings)
-    ] == expected
-    # They are sorted by their figures.
-    cells = rows[0][1]
-    assert [cell.value for cell in cells] == pytest.approx(
-        [90, 92, 91, 0.9, 7, 0.5, 100, 98, 99, 4]
-    )
-    assert [cell.bar for cell in cells] == [None] * 3 + [(0.8, 0.9, 1.0)] + [None] * 6
-    assert cells[6].aside == (
-        "75% of runs are there at some evaluation, the median run first at step 97"
-    )
-    # The lowest regret is the best.
-    orders = [heading["order"] for heading in ranked(agents, metric="regret")[0]]
-    assert orders == ["ascending"] * 3 + ["descending", *[row[2] for row in expected[4:]]]
-
-
-def test_the_stochastic_policy_and_the_discounted_return_have_a_table_below():
-    known = {"stochastic": made_up.estimate(70.0), "acts_by": "epsilon 0.1"}
-    known |= {"discounted": made_up.estimate(50.0), "discount": 0.9, "discounted_optimum": 60.0}
-    agents = [
-        made_up.agent("learner", 80.0, **known),
-        made_up.agent("strange", 40.0, **{**known, "stochastic": None, "acts_by": ""}),
-        made_up.agent("random", 1.0, stochastic=made_up.estimate(1.0), acts_by="the same policy"),
-    ]
-    others = table_of(agents)["others"]
-    assert [each["title"] for each in others["headings"]] == ["Greedy", "Stochastic", "Discounted"]
-    assert [[f"{cell.text} {cell.note}" for cell in cells] for _, cells in others["rows"]] == [
-        ["83 82.9 to 83.2", "70 69.9 to 70.2; epsilon 0.1", "50 49.9 to 50.2; by 0.9; optimum 60"],
-        ["43 42.9 to 43.2", "unknown ", "50 49.9 to 50.2; by 0.9; optimum 60"],
-        ["4 3.9 to 4.2", "1 0.9 to 1.2; the same policy", "- "],
-    ]
-    assert table_of([made_up.agent("sampled", 1.0)])["others"] is None
 
 
 def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
