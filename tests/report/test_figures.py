@@ -14,9 +14,7 @@ from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 
 from experiments.analysis import OverallAnalysis
 from report.figures import (
-    FigureFiles,
     draw_learning_curves,
-    draw_sweeps,
     write_figures,
 )
 from report.series import (
@@ -352,30 +350,6 @@ def test_what_stands_beside_curves():
     assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]
 
 
-SCALES = [
-    ([0, 5, 49], "linear", "n"),
-    ([0, 1, 50], "symlog", "n (log scale beyond 1)"),
-    ([1, 10, 100], "log", "n (log scale)"),
-]
-
-
-def test_an_axis_of_values_says_what_scale_it_has():
-    for values, scale, words in SCALES:
-        axes = Figure().subplots()
-        sweep = Sweep("n", curve(values, [1, 2, 3]), ("a", "b", "c"))
-        draw_sweeps(axes, {"alone": sweep}, made_up.environment([made_up.agent("c", 3.0)]), "final")
-        assert (axes.get_xscale(), axes.get_xlabel()) == (scale, words)
-
-
 def test_no_two_of_many_agents_have_one_mark():
     marks = agent_marks(made_up.study([f"agent {n}" for n in range(28)])).values()
     assert len({(mark.colour, mark.dash) for mark in marks}) == 28
-
-
-def test_a_figure_is_written_in_each_format(tmp_path):
-    files = FigureFiles(tmp_path, ["pdf", "svg"])
-    with files.figure("two", n_columns=2) as axes:
-        assert len(axes) == 2
-    assert files.written == [tmp_path / f"two.{form}" for form in ("svg", "pdf")]
-    for path, start in zip(files.written, (b"<?xml", b"%PDF"), strict=True):
-        assert path.read_bytes().startswith(start)

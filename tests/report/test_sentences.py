@@ -16,38 +16,15 @@ from experiments.plan import plan
 from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.conclusions import conclusion, pairs_both_ways
-from report.documents import duration, headline, standings, verdicts_as
-from report.terminal import shown, sign
+from report.documents import headline, standings, verdicts_as
+from report.terminal import sign
 from report.words import (
     look_sentences,
-    number,
-    optimum_words,
-    ordinal,
-    score_number,
 )
 from tests.report import made_up
-from verdicts import Estimate, FailureCount, SpeedComparison, Summary, ThresholdSummary
+from verdicts import FailureCount, SpeedComparison, Summary, ThresholdSummary
 
 NAN, INF = math.nan, math.inf
-
-
-FIGURES = [
-    *((number, [x], text) for x, text in ((None, "-"), (INF, "never"), (-27427.3, "-27,427"))),
-    *((ordinal, [n], text) for n, text in ((1, "first"), (11, "11th"), (103, "103rd"))),
-    (optimum_words, [99.94951, 99.94921], "99.949 to 99.950 (bracketed)"),
-    (optimum_words, [-38, -60, False], "-60 to -38 (bracketed; the upper end is not proven)"),
-    (duration, [1234.0], "1,200 s"),
-    # Two digits of half the interval; without one three digits behind the point.
-    (shown, [Estimate(0.12345, 0.11, 0.1369, 50)], "0.123 ± 0.013"),
-    (shown, [Estimate(0.5, 0.5, 0.5, 50)], "0.500 ± 0.000"),
-    # Rounded down: 1 is the optimum and nothing less.
-    *((score_number, [x], text) for x, text in ((0.99996, "0.9999"), (1.0, "1"), (NAN, "-"))),
-]
-
-
-def test_figures_in_words():
-    for words, given_to, text in FIGURES:
-        assert words(*given_to) == text
 
 
 # --- how often a study was looked at --------------------------------------------------------------
