@@ -73,20 +73,6 @@ def test_agents_of_the_library_and_blind_ones_are_judged_too(judge, folder, tmp_
     assert "is in no run folder: its agent is not known" in err
 
 
-MISTAKES = {
-    "--logged second.csv": "--logged LOG.csv and --policy RUN go together",
-    f"--logged second.csv --policy {RUN} --env X": "not both",
-    "--logged second.csv --policy logs": "logs is no run folder",
-}
-
-
-def test_mistakes_are_one_line(judge):
-    for typed, message in MISTAKES.items():
-        code, _, err = judge(*typed.split())
-        assert (code, err.count("\n")) == (2, 1)
-        assert message in err
-
-
 def test_the_python_of_the_page_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     page = Path(compare.__file__).parent / "docs" / "bandits.md"

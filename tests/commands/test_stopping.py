@@ -1,6 +1,5 @@
 """What ends a command from outside: signals, and environments that exit."""
 
-import functools
 import json
 import os
 import signal
@@ -40,7 +39,6 @@ def signalling(owner, name, condition, signals):
     """Let the function send the signals before it begins, the first time that it is its turn."""
     function = getattr(owner, name)
 
-    @functools.wraps(function)
     def send(*args, **kwargs):
         if signals and condition(*args):
             while signals:

@@ -168,17 +168,6 @@ def test_pairs_with_one_verdict_stand_in_one_sentence_of_the_better_agent():
     )
 
 
-def test_the_matrix_has_each_pair_from_both_sides():
-    place = place_of({"ab": "<", "bc": "="})
-    verdicts = {names: pair.verdict for names, pair in pairs_both_ways(place).items()}
-    assert verdicts == {
-        ("a", "b"): "worse",
-        ("b", "a"): "better",
-        ("b", "c"): "equivalent",
-        ("c", "b"): "equivalent",
-    }
-
-
 def stays(share, steps):
     return ThresholdSummary(made_up.estimate(steps), made_up.estimate(share))
 
