@@ -216,7 +216,7 @@ def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tuning_record,
 
 ASKED = {
     "rows": ("Hostile-v0", "qlearning", {"n_timesteps": 300}),
-    "updates": ("FrozenLake-v1", "ppo", {"n_timesteps": 128, "n_steps": 64, "engine": "compiled"}),
+    "updates": ("FrozenLake-v1", "ppo", {"n_timesteps": 128, "n_steps": 64}),
 }
 
 
