@@ -137,24 +137,14 @@ def test_an_engine_is_a_setting_where_there_is_a_choice(tmp_path):
         assert {agent.settings.get("engine") for agent in agents} == expected
 
 
-REFUSED = [
-    ("ppo", "-params engine:compiled --engine auto",
-     "--engine auto and -params engine:compiled disagree: give one of them"),
-    ("qlearning", "--engine library",
-     "--engine library: qlearning has the engines auto, compiled, interpreted"),
-    ("qrdqn", "--engine compiled", "--engine compiled: qrdqn has one engine, which auto means"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("algo", "words", "complaint"), REFUSED)
-def test_what_is_refused_by_every_command(algo, words, complaint):
-    words = ["-n", "10", *words.split()]
+def test_what_is_refused_by_every_command():
+    complaint = "--engine auto and -params engine:compiled disagree: give one of them"
+    words = ["-n", "10", "-params", "engine:compiled", "--engine", "auto"]
     # Another agent of the study may have what this one has not.
-    algos = ["sarsa", algo] if "auto" in words else [algo]
     for ask in (
-        lambda: trained("--algo", algo, *words),
-        lambda: compared(*LAKE, "--algos", *algos, *words),
-        lambda: tuned("--algo", algo, *words),
+        lambda: trained("--algo", "ppo", *words),
+        lambda: compared(*LAKE, "--algos", "sarsa", "ppo", *words),
+        lambda: tuned("--algo", "ppo", *words),
     ):
         with pytest.raises(UserError, match=f"^{re.escape(complaint)}$"):
             ask()

@@ -85,7 +85,6 @@ def page(text):
 
 
 def test_settings_say_how_it_was_done_and_what_failed_and_not_where(page, report_study):
-    """Its other words are recorded in ``tests/golden``."""
     assert [*page.sections] == SECTION_NAMES
     settings, info = page.sections["settings"], report_study.planned[0].run.read_info()
     for part in ("python compare.py 'a & b.yml'", info["versions"]["numpy"]):

@@ -1,11 +1,13 @@
 """A study as tables: in Markdown and in LaTeX; and the ranking on the page.
 
-What the terminal prints, and the page's ranking, is recorded in ``tests/golden``.
+What the terminal prints is recorded in ``tests/golden``.
 """
 
 import math
 import re
 from dataclasses import replace
+
+import pytest
 
 from report.conclusions import conclusion
 from report.documents import (
@@ -158,6 +160,34 @@ def ranked(agents, **changes):
     )
     (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
     return table["headings"], table["rows"]
+
+
+RANKING = """
+Mean       | over seeds          | descending | 90    89.9 to 90.2 | 40    39.9 to 40.2
+IQM        | middle half         | descending | 92    91.9 to 92.2 | 42    41.9 to 42.2
+Median     | over seeds          | descending | 91    90.9 to 91.2 | 41    40.9 to 41.2
+Score      | 1 is optimal        | descending | 0.9   0.8 to 1.1   | 0.4   0.3 to 0.6
+Gap        | to the optimum      | ascending  | 7     6.8 to 7.1   | 57    56.8 to 57.1
+Success    | in the end          | descending | 50.0% 25% to 62%   | 50.0% 25% to 62%
+Stays from | step, at 96         | ascending  | 100   75% of runs  | 50    75% of runs
+Episodes   | to stay at 96       | ascending  | 98    75% of runs  | 48    75% of runs
+CPU time   | seconds of training | ascending  | 99    98.9 to 99.2 | 49    48.9 to 49.2
+Runs       | finished            | descending | 4                  | 4     1 missing
+"""
+
+
+def test_figures_of_each_agent_the_best_first():
+    agents = [made_up.agent("first", 90.0), made_up.agent("second", 40.0, n_missing=1)]
+    headings, rows = ranked(agents)
+    assert [row.agent for row, _ in rows] == ["first", "second"]
+    expected = [[" ".join(x.split()) for x in row.split("|")] for row in RANKING.split("\n")[1:-1]]
+    assert [
+        [*each.values(), *(f"{cells[n].text} {cells[n].note}".strip() for _, cells in rows)]
+        for n, each in enumerate(headings)
+    ] == expected
+    # They are sorted by their figures.
+    values = [cell.value for cell in rows[0][1]]
+    assert values == pytest.approx([90, 92, 91, 0.9, 7, 0.5, 100, 98, 99, 4])
 
 
 def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
