@@ -156,7 +156,7 @@ def test_the_console_obeys_its_own_colours_alone():
         print_rows(console, table)
         plain = re.sub("\x1b[^a-z]*m", "", file.getvalue())
         assert plain != file.getvalue()
-        assert plain.count(r"\x1b[2J" if text == HOSTILE else text) == 6
+        assert plain.count(r"\x1b[2J" if text == HOSTILE else text) == 7
         assert "\x1b" not in plain
 
 
