@@ -229,17 +229,3 @@ def report_study(tmp_path_factory):
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page
     )
-
-
-@pytest.fixture
-def one_environment(report_study):
-    """The same with its first environment alone."""
-    from experiments.analysis import analyse
-    from experiments.plan import plan
-    from experiments.results import read_results
-
-    study = dataclasses.replace(
-        report_study.study, environments=report_study.study.environments[:1]
-    )
-    planned = plan(study, report_study.root)
-    return analyse(read_results(study, planned, report_study.root))

@@ -1,6 +1,7 @@
 """train.py, enjoy.py and compare.py on agents and environments of a user's own."""
 
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -60,56 +61,32 @@ def test_a_run_does_not_have_modules_imported(in_own_folder, own_folder, monkeyp
     assert (code, err) == (0, "")
 
 
-def test_a_study_in_a_folder_full_of_names(own_folder):
-    """A new process, typed in a folder with modules that have the names of ours and Python's."""
-    (own_folder / "my_agents.py").write_text(AGENTS)
-    for name in ("agents", "envs", "json", "numpy", "experiments", "pipeline", "mdp", "typing"):
-        (own_folder / f"{name}.py").write_text("raise SystemExit('a module of the user was taken')")
-    (own_folder / "lazy.yml").write_text("my/Lake-v0:\n  n_timesteps: 40\n  weight: 0.25\n")
-    words = [sys.executable, compare.__file__, "--gym-packages", "./my_agents.py"]
-    words += ["--env", "my/Lake-v0", "--algos", "lazy", "--seeds", "1", "--no-report"]
-    words += ["--conf-file", "lazy:lazy.yml", "-n", "50"]
-    done = subprocess.run(words, cwd=own_folder, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    runs = sorted(own_folder.glob("logs/studies/*/runs/lazy/*/run.json"))
-    specs = [json.loads(run.read_text())["spec"] for run in runs]
-    assert [spec["hyperparams"] for spec in specs] == [{"n_timesteps": 50, "weight": 0.25}]
-
-
-# --- an environment that does other than its P says ----------------------------------------------
-
-
-WINDY = """
-import gymnasium as gym
-from gymnasium.envs.toy_text import FrozenLakeEnv
-
-
-class Windy(FrozenLakeEnv):
-    def step(self, action):
-        return super().step(0)
-
-
-gym.register("Windy-v0", Windy, max_episode_steps=100, kwargs={"is_slippery": False})
+STUDY = """
+title: Größer als ∞?
+seeds: 1
+n_timesteps: 50
+agents: {lazy: {algo: lazy, weight: 0.25}}
+environments: {'Eis, glatt': {id: my/Lake-v0}}
 """
-REFUSAL = "the environment's P is not what step does: state "
+NAMES = ("agents", "envs", "json", "numpy", "experiments", "pipeline", "mdp", "typing")
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
 
 
-def test_the_figures_are_those_of_step(type_in_own_folder, own_folder):
-    (own_folder / "windy_of_mine.py").write_text(WINDY)
-    words = ["train.py", "--env", "Windy-v0", "--gym-packages", "windy_of_mine", "--algo"]
-    code, out, err = type_in_own_folder(*words, "qlearning", "-n", "1000", "--seed", "0")
-    out = " ".join(out.split())
-    assert (code, err) == (0, "")
-    assert out.count(REFUSAL) == 2  # once for the figures, once for the engine
-    assert "; figures are sampled" in out
-    assert f"engine interpreted: {REFUSAL}" in out
-    assert "(exact)" not in out
-    info = json.loads((own_folder / "logs/qlearning/Windy-v0_1/run.json").read_text())
-    assert info["model_refused"].startswith(REFUSAL)
-    # The wind always blows to the left; without it six steps lead to the goal.
-    assert (info["final"]["exact"], info["final"]["mean_return"]) == (False, 0)
-    # A planner refuses in one line.
-    code, _, err = type_in_own_folder(*words, "optimal", "-n", "100")
-    assert (code, err.count("\n")) == (2, 1)
-    assert f"needs an environment whose transition model is known: {REFUSAL}" in err
-    assert not (own_folder / "logs" / "optimal").exists()
+def test_a_study_in_a_folder_full_of_names_on_a_machine_that_knows_ascii_alone(own_folder):
+    """The folder's modules have the names of ours and Python's; files are in UTF-8 all the same."""
+    (own_folder / "my_agents.py").write_text(AGENTS)
+    for name in NAMES:
+        (own_folder / f"{name}.py").write_text("raise SystemExit('a module of the user was taken')")
+    (own_folder / "s.yml").write_text(STUDY, encoding="utf-8")
+    words = [sys.executable, compare.__file__, "s.yml", "--gym-packages", "./my_agents.py"]
+    words += ["--no-report", "-j", "1"]
+    done = subprocess.run(
+        words, cwd=own_folder, env={**os.environ, **ASCII}, capture_output=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"Gr??er als inf?" in done.stdout
+    (run,) = own_folder.glob("logs/studies/s/runs/lazy/*/run.json")
+    spec = json.loads(run.read_text(encoding="utf-8"))["spec"]
+    assert spec["hyperparams"] == {"n_timesteps": 50, "weight": 0.25}
+    verdicts = own_folder / "logs" / "studies" / "s" / "verdicts.md"
+    assert "Größer als ∞?" in verdicts.read_text(encoding="utf-8")

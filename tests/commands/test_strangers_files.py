@@ -47,10 +47,10 @@ def evil_zip(own_folder, payload):
     """A zip of a genuine PPO agent with the payload in it, which says that it holds JSON."""
     folder = own_folder / "gift"
     folder.mkdir()
-    load_algorithm("ppo")("MlpPolicy", ENV, n_steps=8, batch_size=8).save(folder / "whole.zip")
+    load_algorithm("ppo")("MlpPolicy", ENV, n_steps=8, batch_size=8).save(own_folder / "whole.zip")
     text = base64.b64encode(payload).decode()
     with (
-        zipfile.ZipFile(folder / "whole.zip") as whole,
+        zipfile.ZipFile(own_folder / "whole.zip") as whole,
         zipfile.ZipFile(folder / f"{ENV}.zip", "w") as evil,
     ):
         for name in whole.namelist():
@@ -60,7 +60,6 @@ def evil_zip(own_folder, payload):
                 data["ep_info_buffer"] = {":type:": "deque", ":serialized:": text}
                 content = json.dumps(data)
             evil.writestr(name, content)
-    (folder / "whole.zip").unlink()
     write_run(folder, algo="ppo")
     return folder / f"{ENV}.zip"
 
@@ -101,6 +100,18 @@ def test_a_zip_is_played_trained_further_or_judged(type_in_own_folder, evil_zip,
     assert not list((own_folder / "logs").rglob("run.json"))
 
 
+def test_what_a_zip_holds_is_told(type_command, evil_zip, mark, own_folder):
+    code, out, err = type_command("yardstick", "inspect", own_folder / "whole.zip")
+    assert (code, err) == (0, "")
+    assert "policy.action_net.weight" in out
+    assert "a pickle of stable_baselines3.common.policies.ActorCriticPolicy" in out
+    assert out.endswith("nothing in it is suspicious\n")
+    code, out, err = type_command("yardstick", "inspect", evil_zip)
+    assert (code, err) == (1, "")
+    assert f"{os.mkdir.__module__}.mkdir" in out.partition("suspicious\n")[2]
+    assert not mark.exists()
+
+
 # --- statistics and replay buffers ---------------------------------------------------------------
 
 
@@ -130,11 +141,10 @@ def test_a_replay_buffer_beside_the_agent(type_in_own_folder, own_folder, payloa
 
 ASKING = {
     "the environment's id": {"env_id": f"gift.extra:{ENV}"},
-    "the folder, and a wrapper in it": {
+    "a wrapper in its folder": {
         "gym_packages": ["gift"],
         "hyperparams": {"env_wrapper": "gift.extra.Wrapper"},
     },
-    "a wrapper": {"hyperparams": {"env_wrapper": "gift.extra.Wrapper"}},
 }
 
 
@@ -147,67 +157,42 @@ def test_a_run_asks_for_a_module(type_in_own_folder, own_folder, way):
     check_refused(answer, run / "mark", "--gym-packages")
 
 
-@pytest.mark.parametrize("name", ["extra", "this"])
-def test_a_study_asks_for_a_module(type_in_own_folder, own_folder, name):
-    (own_folder / "extra.py").write_text(MODULE)
+def test_a_study_asks_for_a_module(type_in_own_folder, own_folder):
     (own_folder / "gift").mkdir()
     (own_folder / "gift" / "extra.py").write_text(MODULE)
-    study = (
-        f"environments:\n  one: {{id: '{name}:{ENV}', n_timesteps: 10}}\n"
+    study = own_folder / "gift" / "study.yml"
+    study.write_text(
+        f"environments:\n  one: {{id: 'extra:{ENV}', n_timesteps: 10}}\n"
         "agents:\n  random: {algo: random}\nseeds: 1\n"
     )
-    for path in (own_folder / "study.yml", own_folder / "gift" / "study.yml"):
-        path.write_text(study)
-        answer = type_in_own_folder("compare.py", path, "--no-report")
-        check_refused(answer, path.with_name("mark"), f"--gym-packages {name}")
-        assert name not in sys.modules
+    answer = type_in_own_folder("compare.py", study, "--no-report")
+    check_refused(answer, study.with_name("mark"), "--gym-packages extra")
+    assert "extra" not in sys.modules
 
 
-ZOO = ("rl_zoo3/wrappers.py", "rl_zoo3/__init__.py")
-INSTALLED = "one that says it is installed"
-STRANGERS = {
-    "a package": ("rl_zoo3.wrappers", ZOO),
-    INSTALLED: ("rl_zoo3.wrappers", (*ZOO, "rl_zoo3-2.9.2.dist-info/METADATA")),
-    "a part of a library": ("stable_baselines3.extra", ("stable_baselines3/extra.py",)),
-    "one of the same name as Python's": ("gymnasium.this", ("gymnasium/this.py",)),
+ZOO = ("rl_zoo3/wrappers.py", "rl_zoo3/__init__.py", "rl_zoo3-2.9.2.dist-info/METADATA")
+STRANGERS = {  # also one that says it is installed
+    "rl_zoo3.wrappers": ZOO,
+    "stable_baselines3.extra": ("stable_baselines3/extra.py",),
 }
-ROADS = ("beside a typed module", "PYTHONPATH", "loaded by a typed one")
+METADATA = "Metadata-Version: 2.1\nName: rl_zoo3\nVersion: 2.9.2\n"
 
 
-# Each way by one road, and what looks installed, which is the hardest to tell, by all.
-@pytest.mark.parametrize(
-    ("way", "road"),
-    [
-        ("a package", "PYTHONPATH"),
-        *((INSTALLED, road) for road in ROADS),
-        ("a part of a library", "beside a typed module"),
-        ("one of the same name as Python's", "PYTHONPATH"),
-    ],
-)
-def test_settings_name_a_class_of_a_strangers(
-    type_in_own_folder, own_folder, monkeypatch, way, road
-):
+@pytest.mark.parametrize("module", STRANGERS)
+def test_settings_name_a_class_of_a_strangers(type_in_own_folder, own_folder, monkeypatch, module):
     """A name in a file means a class of what is installed, or of a module that was typed."""
-    module, files = STRANGERS[way]
-    for name in files:
+    for name in STRANGERS[module]:
         path = own_folder / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("import gymnasium\nclass Stray(gymnasium.Wrapper): pass\n" + MODULE)
-    if way == INSTALLED:
-        record = "".join(f"{name},,\n" for name in files)
-        (own_folder / "rl_zoo3-2.9.2.dist-info" / "RECORD").write_text(record)
-        metadata = "Metadata-Version: 2.1\nName: rl_zoo3\nVersion: 2.9.2\n"
-        (own_folder / "rl_zoo3-2.9.2.dist-info" / "METADATA").write_text(metadata)
-    mine = "x = 1\n"
-    if road == "PYTHONPATH":
+    if path.name == "METADATA":
+        path.write_text(METADATA)
+        path.with_name("RECORD").write_text("".join(f"{name},,\n" for name in ZOO))
         monkeypatch.setattr(sys, "path", [str(own_folder), *sys.path])
-    elif road == "loaded by a typed one":
-        mine = f"try:\n    import {module}\nexcept ImportError:\n    pass\n"
-    (own_folder / "mine.py").write_text(mine)
+    (own_folder / "mine.py").write_text("x = 1\n")
     settings = f"CartPole-v1:\n  n_timesteps: 8\n  env_wrapper: {module}.Stray\n"
     (own_folder / "settings.yml").write_text(settings)
     words = ["--algo", "random", "--env", "CartPole-v1", "--conf-file", "settings.yml"]
     answer = type_in_own_folder("train.py", *words, "--gym-packages", "mine")
     check_refused(answer, own_folder / "logs", f"env_wrapper: {module}.Stray: ")
-    if road != "loaded by a typed one":
-        assert not list(own_folder.rglob("mark"))
+    assert not list(own_folder.rglob("mark"))

@@ -2,25 +2,19 @@
 
 import errno
 import io
-import itertools
 import json
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from rich.table import Table
-from rich.text import Text
 
 from commands import compare, enjoy, train
 from commands.cli import go_on_unread, run_command
 from commands.terminal import TextConsole, print_rows
 from pipeline.errors import UserError, visible
-
-ROOT = Path(__file__).parents[2]
-
 
 # --- readers that leave, and devices that are full --------------------------------------------
 
@@ -59,43 +53,28 @@ def run(monkeypatch):
 
 
 FULL = os.strerror(errno.ENOSPC)
-LOST = f"train.py: what it prints is lost: {FULL}\n"
-ENDS = [  # lines printed, whether work goes on unread, its code, the error; exit code, what is said
-    (2, False, 1, errno.EPIPE, 1, ""),  # all of it is read
-    (9, False, 1, errno.EPIPE, 0, ""),  # the output is the work, which ends with its reader
-    (9, True, 1, errno.EPIPE, 1, ""),  # the exit code is that of the work
-    (9, False, 1, errno.ENOSPC, 2, f"train.py: error: {FULL}\n"),
-    (9, True, 1, errno.ENOSPC, 1, LOST),
-    (9, True, 0, errno.ENOSPC, 2, LOST),
+ENDS = [  # whether work goes on unread, its code, the error; exit code, what is said
+    (False, 1, errno.EPIPE, 0, ""),  # the output is the work, which ends with its reader
+    (True, 1, errno.EPIPE, 1, ""),  # the exit code is that of the work
+    (False, 1, errno.ENOSPC, 2, f"train.py: error: {FULL}\n"),
+    (True, 0, errno.ENOSPC, 2, f"train.py: what it prints is lost: {FULL}\n"),
 ]
 
 
-@pytest.mark.parametrize(("n_lines", "goes_on", "ends", "number", "code", "said"), ENDS)
-def test_how_a_command_ends_whose_output_is_not_taken(
-    run, n_lines, goes_on, ends, number, code, said
-):
+@pytest.mark.parametrize(("goes_on", "ends", "number", "code", "said"), ENDS)
+def test_how_a_command_ends_whose_output_is_not_taken(run, goes_on, ends, number, code, said):
     work = []
 
     def main():
         if goes_on:
             go_on_unread()
-        for line in range(n_lines):
+        for line in range(9):
             sys.stdout.write(f"{line}\n")
         work.append("done")
         return ends
 
     assert run(main, number) == (code, "0\n1\n", said)
-    assert work == ["done"] * (goes_on or n_lines == 2)
-
-
-def test_a_mistake_is_told_where_nobody_hears_it(monkeypatch):
-    def main():
-        raise UserError("wrong")
-
-    monkeypatch.setattr(sys, "stderr", Refusing(errno.EPIPE, 0))
-    with pytest.raises(SystemExit) as stop:
-        run_command(main)
-    assert stop.value.code == 2
+    assert work == ["done"] * goes_on
 
 
 LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
@@ -122,34 +101,15 @@ def test_where_the_work_is_what_counts_it_goes_on_unread(run, tmp_path, monkeypa
     assert (tmp_path / "film.gif").stat().st_size > 0
 
 
-def test_a_process_whose_device_is_full_or_whose_streams_are_closed():
-    command = f'"{sys.executable}" "{ROOT / "train.py"}"'
-    said = b"train.py: error: No space left on device\n"
-    for words, expected in (
-        ("--list > /dev/full", (2, b"", said)),
-        ("--list <&- >&- 2>&-", (0, b"", b"")),
-    ):
-        shell = ["/bin/sh", "-c", f"exec {command} {words}"]
-        done = subprocess.run(shell, capture_output=True, check=False)
-        assert (done.returncode, done.stdout, done.stderr) == expected
-
-
 # --- a machine that has no more memory, threads or processes ----------------------------------
-
-
-NO_ROOM = "DefaultCPUAllocator: can't allocate memory:\nyou tried 9 bytes"
 
 
 @pytest.mark.parametrize(
     ("error", "line"),
     [
-        (MemoryError(), "this machine gives no more memory"),
         (MemoryError("Unable to allocate 4 GiB"), "no more memory: Unable to allocate 4 GiB"),
-        (RuntimeError(NO_ROOM), "no more memory: DefaultCPUAllocator: can't allocate memory: you"),
-        (ImportError("libtorch.so: failed to map segment from shared object"), "no more memory: "),
         (RuntimeError("can't start new thread"), "no more threads or processes: "),
         (RuntimeError("a bug"), None),
-        (ImportError("No module named 'x'"), None),
     ],
 )
 def test_what_runs_out_is_named_and_a_bug_is_not_hidden(error, line, capsys):
@@ -164,47 +124,6 @@ def test_what_runs_out_is_named_and_a_bug_is_not_hidden(error, line, capsys):
         assert line in said
 
 
-# --- terminals whose encoding has few signs ----------------------------------------------------
-
-
-STUDY = (
-    "title: Größer als ∞?\nseeds: 1\nn_episodes: 30\nagents: [qlearning]\n"
-    "environments: {'Eis, glatt': {id: FrozenLake-v1}}\n"
-)
-# Loading the library takes longer than many a study.
-WITHOUT_PYTORCH = """
-import sys
-import compare
-from commands.cli import run_command
-sys.argv = "compare.py s.yml -f studies".split()
-try:
-    run_command(compare.main)
-finally:
-    assert not {"stable_baselines3", "torch"} & sys.modules.keys()
-"""
-
-
-def test_a_machine_that_knows_ascii_alone(tmp_path):
-    """Files too are then opened as ASCII where nothing else is said; with figures and page.
-
-    Nor does the process that plans and tells a study load PyTorch, even for sentences about agents.
-    """
-    (tmp_path / "s.yml").write_text(STUDY, encoding="utf-8")
-    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_PYTORCH],
-        cwd=tmp_path,
-        env={**os.environ, **plain, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert b"Gr??er als inf?" in done.stdout
-    assert b"did not learn the task" in b" ".join(done.stdout.split())
-    page = (tmp_path / "studies" / "s" / "report.html").read_text(encoding="utf-8")
-    assert "Größer als ∞?" in page
-
-
 # --- what a terminal would obey is shown, wherever a text of a file or a name is printed ---------
 
 
@@ -212,36 +131,32 @@ TITLE, CLEAR = "\x1b]0;x\x07", "\x1b[2J"
 HOSTILE = TITLE + CLEAR
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("\u061cb\udce9", r"\u061cb\udce9"),
-        (HOSTILE, r"\x1b]0;x\x07\x1b[2J"),
-        ("\x9b2J", r"\x9b2J"),
-        ("a\u202eb\u2066", r"a\u202eb\u2066"),
-        ("ä 漢字 😀\ttab\nline", "ä 漢字 😀\ttab\nline"),
-    ],
-)
-def test_control_characters_are_spelt_out(text, shown):
-    assert visible(text) == shown
-    assert str(UserError(text)) == " ".join(shown.splitlines())
+SHOWN = {
+    HOSTILE: r"\x1b]0;x\x07\x1b[2J",
+    "\x9b2J": r"\x9b2J",
+    "a\u202eb\u2066\udce9": r"a\u202eb\u2066\udce9",
+    "ä 漢字 😀\ttab\nline": "ä 漢字 😀\ttab\nline",
+}
+
+
+def test_control_characters_are_spelt_out():
+    for text, shown in SHOWN.items():
+        assert visible(text) == shown
+        assert str(UserError(text)) == " ".join(shown.splitlines())
 
 
 def test_the_console_obeys_its_own_colours_alone():
-    texts = (HOSTILE, "[/]", "[link=https://a.b]c[/link]", ":bomb:")
-    for text, is_terminal in itertools.product(texts, (False, True)):
+    for text in (HOSTILE, "[/]", "[link=https://a.b]c[/link]", ":bomb:"):
         file = io.StringIO()
-        console = TextConsole(file=file, width=200, force_terminal=is_terminal, _environ={})
-        table = Table(text, title=text, caption=text)
+        console = TextConsole(file=file, width=200, force_terminal=True, _environ={})
+        table = Table(text, title=text)
         table.add_row(text)
         console.print(text, style="red")
-        console.print(Text(text))
         console.print(table)
         print_rows(console, table)
-        printed = file.getvalue()
-        assert bool(re.search("\x1b\\[[0-9;]*31m", printed)) is is_terminal
-        plain = re.sub("\x1b[^a-z]*m", "", printed)
-        assert plain.count(r"\x1b[2J" if text == HOSTILE else text) == 10
+        plain = re.sub("\x1b[^a-z]*m", "", file.getvalue())
+        assert plain != file.getvalue()
+        assert plain.count(r"\x1b[2J" if text == HOSTILE else text) == 7
         assert "\x1b" not in plain
 
 
@@ -249,12 +164,8 @@ TEXT = json.dumps(HOSTILE)  # which YAML reads as JSON does
 STUDY_OF = "agents: [{}]\nenvironments: [FrozenLake-v1]\n"
 NAMED = [
     (compare, "text.yml"),
-    (compare, "half.yml"),
-    (compare, f"{HOSTILE}.yml"),
     (compare, "--logged", "log.csv", "--policy", "uniform"),
     (enjoy, f"{HOSTILE}.zip"),
-    (train, *LAKE, "--conf-file", HOSTILE),
-    (train, *LAKE, "--gym-packages", HOSTILE),
     (train, *LAKE, "-params", f"{HOSTILE}:1"),
 ]
 
@@ -262,10 +173,8 @@ NAMED = [
 def test_what_a_strangers_texts_are_refused_with(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     Path("text.yml").write_text(STUDY_OF.format(TEXT))
-    Path("half.yml").write_text(STUDY_OF.format(TEXT.replace("\\u001b", "\\ud83d")))
     Path("log.csv").write_text(f"arm,{HOSTILE}\n0,1\n")
-    for name in (f"{HOSTILE}.zip", f"{HOSTILE}.yml"):
-        Path(name).write_text("junk")
+    Path(f"{HOSTILE}.zip").write_text("junk")
     for module, *words in NAMED:
         monkeypatch.setattr("sys.argv", ["program", *words])
         with pytest.raises(SystemExit) as stop:
@@ -273,4 +182,4 @@ def test_what_a_strangers_texts_are_refused_with(monkeypatch, capsys, tmp_path):
         out, err = capsys.readouterr()
         assert (stop.value.code, len(err.splitlines())) == (2, 1)
         assert not {"\x1b", "\x07"} & set(out + err)
-        assert re.search(r"\\x1b|\\ud83d", err)
+        assert r"\x1b" in err

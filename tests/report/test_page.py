@@ -6,19 +6,17 @@ import hashlib
 import json
 import platform
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from plotly.offline import get_plotlyjs
 
 from experiments.analysis import analyse
 from experiments.results import read_compared
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.films import MAX_BYTES, MAX_SIDE, film_of
-from report.page import SECTIONS, render, result_sections, write_report
-from report.page.frame import LearningPage, Report, breakable, inline_script, packed, plain
+from report.page import render, result_sections, write_report
+from report.page.frame import Report
 from report.series import (
     Curve,
     EnvironmentSeries,
@@ -32,8 +30,6 @@ from tests.report import made_up
 
 HOSTILE = "</script><script>document.title='taken'</script>"
 
-# Attributes that make a browser fetch something.
-LOADING = {"src", "srcset", "data", "poster", "action", "formaction", "background", "ping"}
 SECTION_NAMES = [
     *("verdict", "overview", "ranking", "curves", "comparison", "overall"),
     *("why", "policies", "films", "settings"),
@@ -88,42 +84,8 @@ def page(text):
     return Page(text)
 
 
-@pytest.fixture
-def written(tmp_path):
-    """The page of an analysis, or the pages that play its trainings."""
-
-    def write(analysis, **options):
-        path = tmp_path / "page.html"
-        write_report(Report(study_series(analysis), "compare.py", **options), path)
-        return Page(path.read_text(encoding="utf-8"))
-
-    return write
-
-
-# --- structure, also for those who hear it --------------------------------------------------------
-
-
-def test_sections_headings_and_descriptions(page):
-    assert [*page.sections] == SECTION_NAMES
-    assert len(SECTIONS) >= len(SECTION_NAMES)
-    assert page.all("html")[0][0]["lang"] == "en"
-    for tag in ("title", "h1"):
-        assert [text for _, text in page.all(tag)] == ["Small & <b>bold</b>"]
-    labelled = [attributes["aria-labelledby"] for attributes, _ in page.all("section")]
-    assert labelled == [attributes["id"] for attributes, _ in page.all("h2")]
-    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
-    assert len(ids) == len(set(ids))
-    assert {attributes["href"][1:] for attributes, _ in page.all("a")} <= set(ids)
-    assert len(page.all("figcaption")) == len(page.all("figure"))
-    plots = [a for a, _ in page.all("div") if "plot" in a.get("class", "").split()]
-    assert len(plots) == 4
-    assert all(a["role"] == "img" and len(a["aria-label"]) > 20 for a in plots)
-    sorted_headings = [a["aria-sort"] for a, _ in page.all("th") if "aria-sort" in a]
-    assert sorted_headings == ["descending"] * 2  # the ranking of each environment
-
-
 def test_settings_say_how_it_was_done_and_what_failed_and_not_where(page, report_study):
-    """Its other words are recorded in ``tests/golden``."""
+    assert [*page.sections] == SECTION_NAMES
     settings, info = page.sections["settings"], report_study.planned[0].run.read_info()
     for part in ("python compare.py 'a & b.yml'", info["versions"]["numpy"]):
         assert part in settings
@@ -131,26 +93,6 @@ def test_settings_say_how_it_was_done_and_what_failed_and_not_where(page, report
     assert platform.node() not in "".join(info["machine"].values())
     assert "looked at" not in settings  # nobody has, by the file
     assert re.search(r"on Warehouse-v0, seed 1:\s+ValueError: <the> disk & all is full", settings)
-
-
-def test_a_study_on_one_environment_compares_nothing_over_environments(one_environment, written):
-    page = written(one_environment)
-    assert [*page.sections] == [n for n in SECTION_NAMES if n not in {"overview", "overall"}]
-
-
-def test_links_to_pages_that_play_trainings(report_study, written):
-    lake, warehouse = (one.environment for one in report_study.analysis.environments)
-    place = "learning/a b&'\"<i>/x#1?.html"
-    pages = [
-        LearningPage(HOSTILE, lake, 3, place, "<b>words</b>", 1500),
-        LearningPage("sarsa", warehouse, 3, "", "<b>reason</b>"),
-    ]
-    found = written(report_study.analysis, learning=pages)
-    assert [*found.sections] == [*SECTION_NAMES[:-1], "watching", "settings"]
-    assert "<b>words</b>, 2 KB" in found.sections["watching"]
-    assert "No page: <b>reason</b>" in found.sections["watching"]
-    links = [a["href"] for a, _ in found.all("a") if a["href"].startswith("learning")]
-    assert links == ["learning/a%20b%26%27%22%3Ci%3E/x%231%3F.html"]
 
 
 # --- data of the figures --------------------------------------------------------------------------
@@ -208,13 +150,8 @@ def test_a_film_is_small_and_made_once_but_anew_where_it_is_none(report_study):
     with Image.open(film) as picture:
         assert max(picture.size) <= MAX_SIDE
         assert picture.n_frames > 1
-    for name, damage in (
-        ("episode.json", '{"frames": "x", "steps": 1, "return": 1.0}'),
-        ("episode.gif", "GIF89a"),
-    ):
-        (run.path / name).write_text(damage)
-        assert film_of(run).read_bytes() == content
-        assert json.loads((run.path / "episode.json").read_text())["frames"] > 1
+    (run.path / "episode.gif").write_text("GIF89a")
+    assert film_of(run).read_bytes() == content
 
 
 # --- nothing gets in, nothing gets out ------------------------------------------------------------
@@ -246,42 +183,11 @@ def test_the_policy_allows_the_scripts_of_the_page_and_nothing_from_outside(page
     assert len(hashes) == 4
 
 
-def test_nothing_is_loaded_and_the_page_is_not_too_heavy(page, report_study):
-    for tag, attributes in page.elements:
-        for name, value in attributes.items():
-            assert not name.startswith("on"), (tag, name)
-            if name in LOADING or (tag == "link" and name == "href"):
-                assert value.startswith("data:"), (tag, name, value[:80])
-        assert tag not in {"iframe", "object", "embed", "base"}
-    for _, style in page.all("style"):
-        assert not re.search(r"@import|url\(", style)
-    plotly = 2_000_000
-    assert report_study.page.stat().st_size < plotly + 1_500_000
-
-
-def test_pieces_of_a_page():
-    value = {"a": np.array([1.23456789, np.nan]), 2: (np.int64(3), np.float64(np.inf), "x", True)}
-    assert plain(value) == {"a": [1.2346, None], "2": [3, None, "x", True]}
-    for text in ("a</script>", "b</SCRIPT >", "<!-- c"):
-        with pytest.raises(ValueError, match="may not hold"):
-            inline_script(text)
-    assert breakable("<b>FrozenLake8x8-v1") == "&lt;b&gt;Frozen<wbr>Lake8x8-<wbr>v1"
-    assert breakable("ALE/Pong-v5") == "ALE/<wbr>Pong-<wbr>v5"
-    # The same page for the same study: no time of day is packed with it.
-    plotly = get_plotlyjs()
-    letters = packed(plotly)
-    assert gzip.decompress(base64.b64decode(letters)).decode() == plotly
-    assert len(letters) < 0.45 * len(plotly)
-    assert packed(plotly) == letters
-
-
 def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
     labels = ["a = 1", "a = 2", "a = 3", "other"]
     agents = [made_up.agent(label, 90.0 - 10 * n) for n, label in enumerate(labels)]
     places = [made_up.environment(agents, label) for label in ("lake", "island")]
     analysis = made_up.analysis(places, labels, tmp_path)
-    study = replace(analysis.study, description="Why?")
-    analysis = replace(analysis, results=replace(analysis.results, study=study))
     x, means = np.array([1.0, 2, 3]), np.array([[90.0, 80], [70, np.nan]])
     sweep = Sweep("a", Curve(x, np.array([90.0, 80, 70]), x, x), tuple(labels[:3]))
     grid = Grid(("a", "e"), ["1", "2"], ["3", "4"], means, [labels[:2], [labels[2], ""]])
@@ -291,7 +197,6 @@ def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
     )
     report = Report(StudySeries(analysis, agent_marks(analysis.study), series), "compare")
     page = Page(render(report, [result_sections.verdict(report)]))
-    assert [text for _, text in page.all("summary")] == ["What is asked"]
     (plot,) = [a for a, _ in page.all("div") if "data-card" in a]
     first, second = page.data("data-verdict")["sweeps"]
     assert (int(plot["data-card"]), list(first), second) == (0, ["swept"], {})
@@ -305,25 +210,26 @@ def test_a_sweep_and_a_heat_map_stand_on_top_with_their_best_value(tmp_path):
         "80": "--strength: 45%",
         "70": "--strength: 0%",
     }
-    captions = " ".join(text for _, text in page.all("figcaption"))
-    assert "by a (down) and e (across)" in captions
 
 
 # --- critics and gradients ------------------------------------------------------------------------
 
 
-def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_study, written):
+def test_what_runs_were_compared_with_has_a_curve_for_each_agent(tmp_path, do_study):
     agents = tuple(AgentSpec(name, name) for name in ("qlearning", "sarsa"))
     places = (EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 400}),)
     study = StudySpec("small", "", agents, places, 2, eval_freq=100, eval_episodes=1, diagnose=True)
     results = do_study(study, tmp_path / "runs")
-    planned = results.planned
-    page = written(analyse(results))
+    path = tmp_path / "page.html"
+    write_report(Report(study_series(analyse(results)), "compare.py"), path)
+    page = Page(path.read_text(encoding="utf-8"))
     lake = page.data("data-diagnosis-0")
     assert lake["v_error"].keys() == {"qlearning", "sarsa"}
     assert lake["overestimation"].keys() == {"qlearning"}
-    rows = [read_compared(one.run)["v_error"] for one in planned if one.labels == ("sarsa", "lake")]
+    runs = [one.run for one in results.planned if one.labels == ("sarsa", "lake")]
     curve = lake["v_error"]["sarsa"]
     assert curve["x"][-1] == 400
-    assert curve["y"][-1] == pytest.approx(np.mean([row[-1] for row in rows]), rel=1e-4)
+    assert curve["y"][-1] == pytest.approx(
+        np.mean([read_compared(run)["v_error"][-1] for run in runs]), rel=1e-4
+    )
     assert page.data("data-diagnosis").keys() >= lake.keys()
