@@ -6,10 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 
 import pytest
 
@@ -58,13 +55,7 @@ def dead():
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("links", [True, False], ids=["links", "no links"])
-def test_inside_nobody_else_is_let_in_and_afterwards_nothing_is_left(tmp_path, monkeypatch, links):
-    def refuse(source, target):
-        raise PermissionError(1, "Operation not permitted")
-
-    if not links:  # as on some network folders
-        monkeypatch.setattr(os, "link", refuse)
+def test_inside_nobody_else_is_let_in_and_afterwards_nothing_is_left(tmp_path):
     root = tmp_path / "logs" / "study"
     who = re.escape(f"{root}: process {os.getpid()} on {locks.mark()['host']} is at work")
     with lock(root):
@@ -76,8 +67,7 @@ def test_inside_nobody_else_is_let_in_and_afterwards_nothing_is_left(tmp_path, m
     assert_taken(tmp_path, r"since \\x1b\]0;taken\\x07$")
 
 
-OWNERS = {"dead": None, "silent": FOREIGN, "half": "{", "list": "[]"}
-OWNERS |= {"odd": '{"pid": "x"}'}
+OWNERS = {"dead": None, "silent": FOREIGN, "half": "{"}
 
 
 @pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
@@ -105,25 +95,6 @@ def test_one_elsewhere_that_shows_itself_is_at_work(tmp_path, monkeypatch):
         assert json.loads(path.read_text())["token"] != FOREIGN["token"]
 
 
-def test_of_many_at_once_one_gets_the_lock_of_the_dead(tmp_path):
-    """Whoever removes the dead one's lock must not remove the next one's."""
-    leave_lock(tmp_path, FOREIGN, seconds=61)
-    inside, most, begin = [], [], threading.Barrier(8)
-
-    def drive(_):
-        begin.wait()
-        with suppress(locks.FolderInUseError), lock(tmp_path):
-            inside.append(1)
-            most.append(len(inside))
-            time.sleep(0.05)
-            inside.pop()
-
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(drive, range(8)))
-    assert set(most) == {1}
-    assert list(tmp_path.iterdir()) == []
-
-
 def replace_lock(root):
     before = (root / LOCK).stat().st_mtime_ns
     wait_for(lambda: (root / LOCK).stat().st_mtime_ns > before)  # the owner's sign of life
@@ -142,9 +113,8 @@ def wait_for(condition):
     [
         (replace_lock, "on elsewhere is at work on it since .*: it took this one for dead$", True),
         (shutil.rmtree, "study: this folder is gone: somebody has removed or renamed it$", False),
-        (lambda root: (root / LOCK).unlink(), "lock: somebody has removed it, so others ma", False),
     ],
-    ids=["taken for dead", "removed", "unlocked"],
+    ids=["taken for dead", "removed"],
 )
 def test_who_loses_the_folder_learns_of_it_once(tmp_path, monkeypatch, lose, told, left):
     """A stop that comes of it is told as that, and nothing is made anew."""
@@ -191,36 +161,19 @@ def test_what_the_killed_have_half_written_is_removed_and_all_else_stays(tmp_pat
 # --- who is alive --------------------------------------------------------------------------------
 
 
-def test_a_process_that_has_ended_and_is_not_yet_waited_for_is_dead(dead):
-    code = [sys.executable, "-c", f"{SHOW_MARK}; input()"]
-    with subprocess.Popen(code, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        record = json.loads(process.stdout.readline())
-        assert locks.is_alive(record) is True
-        process.kill()
-        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        assert locks.is_alive(record) is False
-    assert locks.is_alive(dead) is False
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
         ({}, True),
         ({"began": 1}, False),  # its number is another's now
-        ({"began": None}, True),
         ({"boot": "earlier"}, False),
         ({"boot": "earlier", "host": "elsewhere"}, None),
-        ({"boot": "earlier", "machine": None}, None),
-        ({"boot": None}, None),
-        ({"host": "renamed"}, True),
         ({"namespace": "pid:[another container]", "pid": 1}, None),
-        *(({"pid": pid}, None) for pid in ("7", True, 0, 2**40)),
     ],
 )
 def test_a_number_alone_names_no_process(changes, expected):
     assert locks.is_alive({**locks.mark(), **changes}) is expected
-    for record in (None, [], "7", {}, {"pid": 7}):
-        assert locks.is_alive(record) is None
+    assert locks.is_alive({}) is None
 
 
 # --- runs ----------------------------------------------------------------------------------------
@@ -245,13 +198,6 @@ def test_a_run_whose_process_is_gone_was_interrupted(tmp_path, dead):
 
 DRAFT = f".run.json.{'0' * 16}.tmp"
 SET_UP = ("0.monitor.csv", "Taxi-v4/config.yml", "Taxi-v4/command.txt", DRAFT, "modules/mine.py")
-KEPT = [  # a folder and settings of the user's, a folder among modules, a link, a damaged record
-    lambda path: (path / "best_model.zip").mkdir(),
-    lambda path: (path / "Taxi-v4" / "mine.yml").mkdir(),
-    lambda path: (path / "modules" / "sub").mkdir(parents=True),
-    lambda path: (path / "0.monitor.csv").symlink_to(path.parent),
-    lambda path: (path / "run.json").write_text("{"),
-]
 
 
 def test_a_set_up_that_was_killed_is_cleared_away(tmp_path, dead):
@@ -260,15 +206,10 @@ def test_a_set_up_that_was_killed_is_cleared_away(tmp_path, dead):
     for name in SET_UP:
         (gone.path / name).parent.mkdir(exist_ok=True)
         (gone.path / name).touch()
-    claimed = Run(tmp_path / "sarsa" / f".Taxi-v4.{'a' * 16}.tmp", "Taxi-v4")
-    claimed.params_path.mkdir(parents=True)
-    claimed.info_path.write_text(json.dumps({"state": RUNNING, "process": dead}))
     elsewhere = {**dead, "boot": "x", "host": "elsewhere"}
     kept = [run_of(tmp_path, process) for process in (locks.mark(), elsewhere, None)]
-    kept += [run_of(tmp_path, dead, spec={"algo": "sarsa"})]
-    for put in KEPT:
-        kept.append(run_of(tmp_path, dead))
-        put(kept[-1].path)
+    kept += [run_of(tmp_path, dead, spec={"algo": "sarsa"}), run_of(tmp_path, dead)]
+    (kept[-1].path / "Taxi-v4" / "mine.yml").mkdir()
     before = {run.path: tree(run.path) for run in kept}
     # Half-written files go where nobody can be writing them.
     ended, busy = (run_of(tmp_path, process, spec={"a": 1}) for process in (dead, locks.mark()))

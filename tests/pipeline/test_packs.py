@@ -6,12 +6,10 @@ import gzip
 import hashlib
 import io
 import json
-import os
 import re
 import shlex
 import shutil
 import stat
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -21,12 +19,10 @@ import yaml
 
 from pipeline.digests import LOCK, sealed
 from pipeline.errors import UserError
-from pipeline.locks import mark
 from pipeline.model_card import fenced
 from pipeline.models.choose import ModelRequest
 from pipeline.packs import check_pack, is_study, pack, pack_study, unpacked
 from pipeline.scrubbing import check_untold, without_places
-from safe_files.files import UnsafeFileError
 from tests.pipeline.short_runs import CART, LAKE, choose_model, trained
 
 HOME = str(Path.home())
@@ -73,7 +69,7 @@ def members(path):
 # --- the pack of a run ---------------------------------------------------------------------------
 
 
-def test_the_card_says_what_the_run_came_to(packed, runs, changed, tmp_path):
+def test_the_card_says_what_the_run_came_to(packed, runs):
     folder = packed("table")
     final = json.loads((runs["table"].path / "run.json").read_text())["final"]
     data, text = front_matter(folder)
@@ -94,11 +90,6 @@ def test_the_card_says_what_the_run_came_to(packed, runs, changed, tmp_path):
     pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", text)
     assert pictures == ["replay.gif", "value_map.png", "learning_curve.png"]
     assert all((folder / name).is_file() for name in pictures)
-    # There is no script that would not do.
-    wrapper = {"env_wrapper": "envs.wrappers.ScaleReward"}
-    copy = changed(runs["ppo"], lambda _, settings: settings.update(wrapper))
-    _, text = front_matter(pack(copy, tmp_path / "wrapped"))
-    assert ("```python" in text, "yardstick enjoy" in text) == (False, True)
     # What is sampled, and measured by a bracket, is called so.
     final = json.loads((runs["dqn"].path / "run.json").read_text())["final"]
     data, text = front_matter(packed("dqn", "sampled"))
@@ -171,14 +162,13 @@ def test_what_is_not_packed(runs, changed, tmp_path, complaint):
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
-@pytest.mark.parametrize("form", ["plain", "pickled"])
-def test_zips_are_looked_into_and_paths_among_settings_are_names(runs, form):
+def test_zips_are_looked_into_and_paths_among_settings_are_names(runs):
     """Deflated, as some pack them, and in what is pickled as text."""
     place = f"{HOME}/notes".encode()
     pickled = b'{":serialized:": "' + base64.b64encode(place) + b'"}'
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("data", (place if form == "plain" else pickled) + bytes(1000))
+        archive.writestr("data", pickled + bytes(1000))
     assert place not in stream.getvalue()
     with pytest.raises(UserError, match=r"model\.zip names"):
         check_untold({"model.zip": stream.getvalue()}, runs["table"])
@@ -205,24 +195,17 @@ def test_a_card_quotes_what_a_strangers_run_says(runs, changed, tmp_path):
     assert fenced("yaml", "a: ```\n") == "````yaml\na: ```\n````\n"
 
 
-def test_scripts_play_without_this_project(packed, tmp_path):
-    """All in one process, which takes its time to import; from the folders, as a reader would."""
-    lines = ["import os, sys"]
-    for name in ("dqn", "table"):
-        folder = packed(name, name)
-        script = code_in((folder / "README.md").read_text(encoding="utf-8"), "python")
-        if name == "table":  # whose agent is of this project
-            lines.append("assert not {'agents', 'envs', 'pipeline', 'safe_files'} & {*sys.modules}")
-        lines += [f"os.chdir({str(folder)!r})", script]
-    program = tmp_path / "all.py"
-    program.write_text("\n".join(lines))
-    done = subprocess.run(
-        [sys.executable, "-I", str(program)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    pole, table = done.stdout.splitlines()
-    assert 8 <= float(pole.split()[1]) <= 500
-    assert table == "return 1.00 +/- 0.00"
+@pytest.mark.parametrize(("name", "least", "is_ours"), [("dqn", 8, False), ("table", 1, True)])
+def test_scripts_play_and_name_this_project_only_where_the_agent_is_of_it(
+    packed, monkeypatch, capsys, name, least, is_ours
+):
+    """From the folder, as a reader would."""
+    monkeypatch.chdir(packed(name))
+    script = code_in(Path("README.md").read_text(encoding="utf-8"), "python")
+    exec(script, {"__name__": "__main__"})  # noqa: S102  # of a pack of ours
+    assert least <= float(capsys.readouterr().out.split()[1]) <= 500
+    assert ("agents" in script) == is_ours
+    assert not re.search("envs |pipeline|safe_files", script)
 
 
 # --- the pack of a study -------------------------------------------------------------------------
@@ -293,26 +276,19 @@ def test_a_run_in_a_study_is_played(packed_study):
             unpacked(path).__enter__()
 
 
-LOCKED = json.dumps({**mark(), "token": "x"})
 NOT_PACKED_OF_A_STUDY = {
     "holds no finished run": lambda root: shutil.rmtree(root / "runs"),
-    "is no regular file": lambda root: os.mkfifo(root / "verdicts.md"),
     "has changed since the run wrote it": lambda root: (
         root / SARSA / "FrozenLake-v1.zip"
     ).write_bytes(b""),
-    "summary.csv is damaged": lambda root: (root / "summary.csv").write_text("a,b\n"),
-    r"z names .* nothing was": lambda root: (root / "curves.csv.gz").write_bytes(
-        gzip.compress(HOME.encode())
-    ),
     r"a\.png names .* nothing was": lambda root: (root / "figures/a.png").write_text(f"{HOME}/x"),
-    "is at work on it": lambda root: (root / LOCK).write_text(LOCKED),
 }
 
 
 @pytest.mark.parametrize("complaint", NOT_PACKED_OF_A_STUDY)
 def test_what_is_not_packed_of_a_study(study, tmp_path, complaint):
     NOT_PACKED_OF_A_STUDY[complaint](study)
-    with pytest.raises((UserError, UnsafeFileError), match=complaint):
+    with pytest.raises(UserError, match=complaint):
         pack_study(study, tmp_path / "study.zip", print)
     with pytest.raises(UserError, match=r"name it there\.zip"):
         pack_study(study, tmp_path / "there", print)
@@ -355,10 +331,9 @@ def test_a_changed_file_is_found(packed):
 ATTACKS = [
     *(
         ({name: b"evil"}, 0, f"{name!r}, which would lie elsewhere")
-        for name in ("../evil", "/evil", "C:\\evil", "con", "folder/", "", "runs/a/b/evil")
+        for name in ("../evil", "C:\\evil", "runs/a/b/evil")
     ),
     ({"link": b"/etc/passwd"}, stat.S_IFLNK | 0o777, ", which is no regular file"),
-    ({"pipe": b""}, stat.S_IFIFO | 0o600, ", which is no regular file"),
     ({"readme.md": b""}, 0, "two names that some systems take for one"),
     ({"README.md/a": b""}, 0, "a file that is a folder too"),
 ]
@@ -366,7 +341,6 @@ ON_A_RUN = [
     ({"a/b/evil": b"evil"}, 0, "'a/b/evil', which would lie elsewhere"),
     ({"more.py": b"print()"}, 0, "'more.py' is not among the files that run.json lists"),
     ({"zeros": bytes(80 << 20)}, 0, "would take more memory than"),
-    ({f"n{number}": b"" for number in range(1001)}, 0, "is no pack that may be opened"),
 ]
 ON_A_STUDY = [*ATTACKS, ({RUN: bytes(90 << 20)}, 0, "would take more memory than")]
 
@@ -396,21 +370,14 @@ def test_hostile_packs_of_runs_are_refused(packed, tmp_path):
         check_pack(tmp_path / "empty")
 
 
-def play(path):
-    unpacked(path / RUN).__enter__()
-
-
-@pytest.mark.parametrize("opened", [check_pack, play])
-def test_hostile_packs_of_studies_are_refused(packed_study, opened):
-    refuse_all(opened, packed_study, ON_A_STUDY, forged)
-    if opened is play:
-        forged(packed_study, {RUN: b"PK"})
-        with pytest.raises(UserError, match="is no pack that may be opened"):
-            play(packed_study)
-    else:
-        changed = [({"report.html": b"x"}, 0), ({"more.py": b""}, 0), ({"study.json": b"{"}, 0)]
-        attacks = [(*change, "is not as it was packed") for change in changed]
-        refuse_all(check_pack, packed_study, attacks, rewritten)
+def test_hostile_packs_of_studies_are_refused(packed_study):
+    refuse_all(check_pack, packed_study, ON_A_STUDY, forged)
+    changed = [({"report.html": b"x"}, 0), ({"more.py": b""}, 0), ({"study.json": b"{"}, 0)]
+    attacks = [(*change, "is not as it was packed") for change in changed]
+    refuse_all(check_pack, packed_study, attacks, rewritten)
+    forged(packed_study, {RUN: b"PK"})
+    with pytest.raises(UserError, match="is no pack that may be opened"):
+        unpacked(packed_study / RUN).__enter__()
 
 
 def test_a_forged_record_leads_nowhere_else_and_imports_nothing(packed, tmp_path, monkeypatch):

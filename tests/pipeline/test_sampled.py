@@ -60,9 +60,8 @@ def episodes(*returns, length=10, yardstick=None, successes=None):
 # --- seeds ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n_envs", [1, 4])
-def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile(n_envs):
-    model = agent_of("qlearning", LAKE).learn(2000)
+def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
+    n_envs, model = 4, agent_of("qlearning", LAKE).learn(2000)
     env = make_vec_env(LAKE, n_envs)
     first, more = (figures(evaluate(model, env, 12, seed)) for seed in (5, None))
     others = [figures(evaluate(model, env, 12, evaluation_seed(0, p))) for p in PURPOSES]
@@ -80,10 +79,7 @@ def seeds_of_run(n_envs, seed, n_eval_envs=TrainSpec.n_eval_envs):
     return {seed, *range(seed * n_envs, (seed + 1) * n_envs)}.union(*evaluations)
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings"), [("qlearning", {}), ("ppo", {"n_steps": 4, "batch_size": 4})]
-)
-def test_a_run_takes_the_seeds_that_are_said(algo, settings, monkeypatch):
+def test_a_run_takes_the_seeds_that_are_said(monkeypatch):
     taken, make = set(), seeding.np_random
 
     def watched(seed=None):
@@ -91,7 +87,7 @@ def test_a_run_takes_the_seeds_that_are_said(algo, settings, monkeypatch):
         return make(seed)
 
     monkeypatch.setattr(seeding, "np_random", watched)  # which environments draw theirs from
-    spec = spec_of(algo, LAKE, {**settings, "n_envs": 3}, seed=7)
+    spec = spec_of("qlearning", LAKE, {"n_envs": 3}, seed=7)
     model = make_model(spec, None, make_training_env(spec, None), algorithm_kwargs(spec))
     taken.clear()
     model.learn(12)
@@ -147,36 +143,26 @@ def test_successes_are_counted_where_the_environment_tells_them():
     np.testing.assert_array_equal(evaluation.returns[~failed], 101.0 - evaluation.lengths[~failed])
     assert (evaluation.lengths[failed] == 40).all()
     assert 0.05 < evaluation.success_rate == evaluation.successes.mean() < 0.95
-    # Together with others they are known where they are known of both.
-    twice, unknown = evaluation.joined(evaluation), replace(evaluation, successes=None)
-    assert (len(twice.returns), len(twice.lengths)) == (400, 400)
-    assert twice.success_rate == evaluation.success_rate
-    assert evaluation.joined(unknown).successes is unknown.joined(evaluation).successes is None
 
 
 NORMALIZED = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 32, "batch_size": 32}
 NORMALIZED |= {"n_epochs": 2, "n_envs": 2, "normalize": True}
 
 
-@pytest.mark.parametrize(
-    ("name", "env_id", "entry"), [("qlearning", LAKE, {}), ("ppo", CART, NORMALIZED)]
-)
-def test_training_is_the_same_with_and_without_evaluations(name, env_id, entry, tmp_path):
+def test_training_is_the_same_with_and_without_evaluations(tmp_path):
     def learnt(run):
-        weights = load_algorithm(name).load(run.model_path).policy.state_dict()
+        weights = load_algorithm("ppo").load(run.model_path).policy.state_dict()
         rows = [
             [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()[2:]]
             for path in sorted(run.path.glob("*.monitor.csv"))
         ]
         assert sum(map(len, rows)) > 5
-        statistics = run.vecnormalize_path.exists() and VecNormalize.load(
-            str(run.vecnormalize_path), make_vec_env(CART, 1)
-        )
-        kept = statistics and [*statistics.obs_rms.mean, statistics.ret_rms.var]
+        statistics = VecNormalize.load(str(run.vecnormalize_path), make_vec_env(CART, 1))
+        kept = [*statistics.obs_rms.mean, statistics.ret_rms.var]
         return rows, {key: value.tolist() for key, value in weights.items()}, kept
 
     common = {"n_timesteps": 400, "log_folder": tmp_path, "eval_episodes": 3}
-    often, never = (trained(name, env_id, entry, eval_freq=freq, **common) for freq in (40, -1))
+    often, never = (trained("ppo", CART, NORMALIZED, eval_freq=n, **common) for n in (40, -1))
     assert len(np.load(often.run.evaluations_path)["timesteps"]) >= 10
     assert not never.run.evaluations_path.exists()
     assert (often.final is None, never.final is None) == (False, True)
@@ -240,7 +226,6 @@ def steady(monkeypatch):
         ([1.0], 1, 10),
         ([0.0, 9.0], 1, 100),
         ([0.0, 9.0], 50, 25),  # the next 25 would make it 2,500 steps
-        ([0.0, 9.0], 100, 10),
         ([0.0, 9.0], 900, 5),  # five there are in any case
     ],
 )
@@ -253,19 +238,19 @@ def test_the_last_evaluation_ends_when_it_is_sure_or_dear(steady, returns, lengt
 
 
 def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path):
-    """Five episodes are 300 steps, and half of 2,400 are allowed over the whole training."""
-    spec = steady([1.0, 5.0], 60, n_timesteps=12_000, log_folder=tmp_path)
+    """Five episodes are 500 steps, and half of 2,000 are allowed over the whole training."""
+    spec = steady([1.0, 5.0], 100, n_timesteps=2000, log_folder=tmp_path)
     run = train(spec, Console(quiet=True), {}, "").run
     with np.load(run.evaluations_path) as evaluations:
-        assert evaluations["timesteps"].tolist() == [3000, 6000, 9000, 12_000]
-        assert evaluations["results"].shape == (4, 5)
+        assert evaluations["timesteps"].tolist() == [1000, 2000]
+        assert evaluations["results"].shape == (2, 5)
 
 
 def test_what_is_asked_for_is_done_and_a_run_says_what_its_evaluations_took(tmp_path):
     common = {"log_folder": tmp_path, "n_timesteps": 500}
-    run = trained("random", CART, eval_freq=10, eval_episodes=3, final_episodes=3, **common).run
+    run = trained("random", CART, eval_freq=100, eval_episodes=3, final_episodes=3, **common).run
     evaluations = np.load(run.evaluations_path)
-    assert evaluations["results"].shape == (50, 3)
+    assert evaluations["results"].shape == (5, 3)
     assert "n_episodes" not in evaluations, "all have as many as there are columns"
     assert json.loads(run.info_path.read_text())["final"]["n_episodes"] == 3
     entry = {"n_steps": 50, "batch_size": 50, "n_epochs": 1}
@@ -296,12 +281,7 @@ def test_the_upper_end_measures_and_the_lower_stands_beside_it():
     assert (figures["score"], figures["score_at_most"]) == (0.5, pytest.approx(240 / 460))
     assert not figures["exact"]
     assert "beats_optimum" not in figures
-    assert describe(found) == (
-        "return 260.00 ± 0.00 over 2 episodes, optimum between 480.00 and 500.00, "
-        "best random or constant policy 20.00, score 0.50 to 0.52 (bracketed)"
-    )
-    least = episodes(20.0, 20.0, yardstick=POLE)
-    assert describe(least).endswith("score 0.00 (bracketed)")
+    assert describe(found).endswith("score 0.50 to 0.52 (bracketed)")
     known = episodes(80.0, yardstick=Yardstick(100.0, 60.0)).summary()
     assert known["score"] == 0.5
     assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
@@ -311,8 +291,6 @@ def test_an_upper_end_without_a_proof_is_marked_wherever_its_score_is_told():
     guessed = episodes(*[260.0] * 10, yardstick=replace(POLE, is_proven=False))
     assert guessed.summary()["optimum_is_proven"] is False
     assert describe(guessed).endswith("(bracketed; the upper end is not proven)")
-    too_good = episodes(*[501.0] * 10, yardstick=replace(POLE, is_proven=False))
-    assert describe(too_good).endswith("or the bracket is wrong, whose upper end is not proven")
     spec = spec_of("random", "Acrobot-v1")
     assert bracketed_yardstick(spec) == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
 
@@ -322,8 +300,6 @@ def test_an_upper_end_without_a_proof_is_marked_wherever_its_score_is_told():
     [
         ([501.0] * 10, POLE, True),
         ([500.0000004] * 10, POLE, False),  # as Monitor rounds
-        ([490.0, 530.0] * 5, POLE, False),  # starts that were easy
-        ([530.0] * 9, POLE, False),  # of so few all may have been
         ([120.0] * 10, Yardstick(100.0, 60.0), False),  # a known optimum
     ],
 )
@@ -342,26 +318,13 @@ def test_more_than_any_policy_can_reach_is_said_aloud_and_not_clipped(returns, y
         ({}, True),
         ({"normalize": True, "frame_stack": 2}, True),
         ({"train_env_kwargs": {"g": 5.0}}, True),
-        ({"env_kwargs": {"g": 10.0}}, True),
-        ({"env_kwargs": {"g": 5.0}}, False),
         ({"eval_env_kwargs": {"g": 5.0}}, False),
         ({"env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 0.5}}}, False),
-        ({"vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan"}, False),
     ],
     ids=str,
 )
 def test_where_a_bracket_holds(entry, holds):
     assert (bracketed_yardstick(spec_of("random", SWING, entry)) is not None) == holds
-
-
-def test_a_bracket_is_recorded(tmp_path):
-    few = {"n_timesteps": 400, "eval_episodes": 2, "final_episodes": 10}
-    outcome = trained("random", SWING, log_folder=tmp_path, **few)
-    final, known = outcome.run.read_info()["final"], bracketed_yardstick(spec_of("random", SWING))
-    assert not final["exact"]
-    measured = known.figures(final["mean_return"])
-    assert "optimum_at_least" in measured
-    assert {name: final[name] for name in measured} == pytest.approx(measured)
 
 
 # --- in compiled code: the episodes that evaluation in Python plays ------------------------------

@@ -26,7 +26,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.common.callbacks import EpisodeBudget
 from commands.train import describe_pulls, print_outcome
 from envs.bandits import log_uniformly
-from pipeline import callbacks as callbacks_module
 from pipeline.callbacks import (
     EpisodeCheckpoint,
     EvaluationCallback,
@@ -38,7 +37,7 @@ from pipeline.callbacks import (
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.models.find import checkpoint_file
 from pipeline.runs import PULLS_FILE, Run
-from pipeline.stopping import close_environments, stops_noticed
+from pipeline.stopping import stops_noticed
 from pipeline.training import carry_out, prepare, train
 from pipeline.unfinished_runs import run_of_spec
 from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
@@ -60,7 +59,6 @@ def run(tmp_path):
 
 # Five moves to the goal: a return of 96 at best.
 SMALL_WAREHOUSE = ("envs:Warehouse-v0", {"desc": ["S...", ".##.", "...G"], "max_episode_steps": 20})
-CLIFF = ("CliffWalking-v1", {"max_episode_steps": 50})
 
 
 def train_with(callback, folder, env_id, env_kwargs, n_envs=1, steps=1000):
@@ -85,14 +83,8 @@ def both_callbacks(run, folder, env_id, env_kwargs, eval_freq):
     return EvaluationCallback(run, env, play, eval_freq=eval_freq), library
 
 
-@pytest.mark.parametrize(
-    ("world", "n_envs", "steps", "says_success"),
-    [(SMALL_WAREHOUSE, 3, 500, True), (CLIFF, 1, 6000, False)],
-    ids=["Warehouse", "CliffWalking"],
-)
-def test_evaluations_are_written_as_the_library_writes_them(
-    run, tmp_path, n_envs, world, steps, says_success
-):
+def test_evaluations_are_written_as_the_library_writes_them(run, tmp_path):
+    world, n_envs, steps = SMALL_WAREHOUSE, 3, 500
     freq = steps // n_envs // 15
     own, library = both_callbacks(run, tmp_path / "library", *world, eval_freq=freq)
     _, expected_log = train_with(library, tmp_path / "library", *world, n_envs, steps)
@@ -100,7 +92,7 @@ def test_evaluations_are_written_as_the_library_writes_them(
     expected = np.load(tmp_path / "library" / "evaluations.npz")
     written = np.load(run.evaluations_path)
     assert written.files == expected.files
-    assert ("successes" in written.files) == says_success
+    assert "successes" in written.files
     for name in expected.files:
         assert written[name].dtype == expected[name].dtype
         np.testing.assert_array_equal(written[name], expected[name])
@@ -115,40 +107,6 @@ def test_evaluations_are_written_as_the_library_writes_them(
     assert best.num_timesteps == expected_best.num_timesteps == own.best_timesteps
     means = expected["results"].mean(axis=1)
     assert own.best_timesteps == expected["timesteps"][means.argmax()]
-
-
-def scripted(run, evaluations, eval_freq=10, **kwargs):
-    """An evaluation callback that is told what comes out."""
-    outcomes = iter(evaluations)
-    env = make_vec_env("FrozenLake-v1", 1)
-    return EvaluationCallback(run, env, lambda model: next(outcomes), eval_freq, **kwargs)
-
-
-def test_evaluations_can_be_asked_for(run):
-    callback = scripted(run, [evaluation_of(2.0)], eval_freq=0)
-    agent_of("qlearning", LAKE).learn(50, callback=callback)
-    assert callback.last_evaluation is None
-    assert callback.evaluate_now() is True
-    assert callback.last_evaluation.mean_return == 2.0
-    assert np.load(run.evaluations_path)["timesteps"].tolist() == [50]
-
-
-def test_files_are_there_after_each_evaluation(run, monkeypatch):
-    """A run that is killed leaves what it has found until then."""
-    monkeypatch.setattr(callbacks_module, "SECONDS_BETWEEN_WRITES", 0.0)  # else once a second
-    seen = []
-
-    class Look(BaseCallback):
-        def _on_step(self):
-            path = run.evaluations_path
-            seen.append(len(np.load(path)["timesteps"]) if path.exists() else 0)
-            return True
-
-    callbacks = CallbackList([scripted(run, [evaluation_of(1), evaluation_of(0)]), Look()])
-    agent_of("qlearning", LAKE).learn(20, callback=callbacks)
-    assert seen == [0] * 9 + [1] * 10 + [2]
-    left = {"Warehouse-v0", "best_model.zip", "evaluations.npz", "run.json"}
-    assert {path.name for path in run.path.iterdir()} == left
 
 
 def test_evaluation_sees_the_normalisation_of_training(run):
@@ -224,9 +182,6 @@ def test_checkpoints_by_steps_and_by_episodes(tmp_path):
         expected = n_envs * np.flatnonzero(np.diff(np.array(record.ended) // every)) + n_envs
         assert checkpoint_steps(folder) == expected.tolist()
         assert len(expected) > 3
-    for kind, unit in ((StepCheckpoint, "steps"), (EpisodeCheckpoint, "episodes")):
-        with pytest.raises(ValueError, match=f"every_n_{unit} must be at least 1, not 0"):
-            kind(0, tmp_path)
 
 
 def test_epsilon_falls_with_each_update():
@@ -247,10 +202,6 @@ def test_epsilon_falls_with_each_update():
     assert seen[-1][0] >= 50
     for n_updates, epsilon in seen:
         assert epsilon == max(0.2, 0.9 * 0.97**n_updates)
-    for name in ("initial_eps", "final_eps", "decay"):
-        for value in (-0.1, 1.1, float("nan")):
-            with pytest.raises(ValueError, match=f"{name} must lie between 0 and 1, not {value}"):
-                ExponentialExploration(**{name: value})
 
 
 # --- how it ends ---------------------------------------------------------------------------------
@@ -292,17 +243,6 @@ def test_a_run_that_is_stopped_once_more_while_it_ends_can_be_gone_on_with(tmp_p
 
 
 # --- settings of the libraries -------------------------------------------------------------------
-
-
-def test_tiny_numbers_are_zero_where_settings_say_so_and_not_in_the_next_run(tmp_path):
-    for flushes in (True, False):
-        entry = {"flush_denormal": flushes, "n_steps": 8, "batch_size": 8}
-        training = prepare(
-            spec_of("ppo", LAKE, entry, log_folder=tmp_path), Console(quiet=True), {}, ""
-        )
-        assert (th.tensor([1e-39]) * 0.5 == 0).item() is flushes
-        close_environments(training.model.env)
-        close_environments(training.eval_env)
 
 
 def test_goals_are_replayed_in_hindsight_by_the_entry_that_rl_zoo3_has(tmp_path, monkeypatch):
