@@ -123,11 +123,9 @@ def test_a_strangers_file_is_refused_and_never_unpickled(tmp_path, attack):
     [
         (lambda key: key.chmod(0o640), "mode 600"),
         (lambda key: key.write_bytes(b"short"), "damaged"),
-        (lambda key: (key.unlink(), os.mkfifo(key, 0o600)), "no regular file"),
-        (lambda key: (key.unlink(), key.symlink_to("/dev/null")), "no regular file"),
         (lambda key: key.unlink(), "the key was replaced"),
     ],
-    ids=["readable", "short", "pipe", "device", "missing"],
+    ids=["readable", "short", "missing"],
 )
 def test_without_the_users_own_key_nothing_is_read(tmp_path, home, change, said):
     state_files.save_state(tmp_path / "state", 1, pickled({"it": 1}), {})
@@ -146,8 +144,6 @@ def test_a_key_is_one_for_all_processes_and_for_nobody_else(home):
     path = home / "a" / "snapshots.key"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert list(path.parent.iterdir()) == [path]
-    path.symlink_to(path.rename(home / "elsewhere"))
-    assert state_files.user_key("a") == key
 
 
 def test_without_room_on_the_disk_the_last_state_stays(tmp_path, home, small_disk):
@@ -205,21 +201,18 @@ def logs(tmp_path):
 
 
 def test_what_was_appended_since_is_removed(logs):
-    """But a wrapper of the settings begins its file anew."""
     run, log = logs
     positions = log_positions(run, log)
     for path in (run / "0.monitor.csv", *Path(log).iterdir()):
         path.write_bytes(path.read_bytes() + b"more")
     (run / "1.monitor.csv").touch()
-    (run / "all.monitor.csv").write_bytes(b"r\n")
     cut_back(run, log, positions)
     assert {path.name for path in run.iterdir()} == {"0.monitor.csv", "all.monitor.csv"}
     assert log_positions(run, log) == positions
     assert (run / "0.monitor.csv").read_bytes() == ROWS
-    assert (run / "all.monitor.csv").read_bytes() == b"r\n"
     # What was changed is refused and left alone.
     path = run / "0.monitor.csv"
-    for rows in (None, b"", ROWS[:-1], ROWS.replace(b"2.0", b"9.0")):
+    for rows in (None, ROWS.replace(b"2.0", b"9.0")):
         path.unlink()
         if rows is not None:
             path.write_bytes(rows)
@@ -231,16 +224,10 @@ def test_what_was_appended_since_is_removed(logs):
 
 SOURCE = """
 import random
-from functools import lru_cache
-from numpy import mean
 
 steps = 0
 seen = []
 rng = random.Random(1)
-
-@lru_cache
-def double(x):
-    return 2 * x
 
 class Thing:
     made = 0
@@ -262,13 +249,11 @@ def test_globals_of_the_users_modules_go_back(tmp_path, monkeypatch):
     thing = module.Thing()
     assert pickled({"it": user_state(modules)}).lost == []
     assert user_state(import_typed(["json"])) == {}  # what is installed is left alone
-    module.double(1)
     thing.step()
     held = pickled({"it": user_state(modules)})
     saved = replace(
         held, pickled=bytes(held.pickled), memories=[memory.copy() for memory in held.memories]
     )
-    assert [line.partition("]")[2] for line in saved.lost] == ["['double']"]
     thing.step()
     after = list(module.seen)
     put_back(modules, unpickled(saved, {"it": user_state(modules)})["it"])
