@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from rich.console import Console
+from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from mdp import TransitionModel, policy_return, state_visitation
@@ -138,14 +139,11 @@ def on_corridor(env_id, algo="ppo", limit=50, **settings):
     return agent, world, recorder
 
 
-def collect(agent, n_rollouts=1):
-    """Rollouts of an agent that never learns: its policy stays."""
-    from stable_baselines3.common.callbacks import CallbackList
-
+def collect(agent):
+    """A rollout of an agent that does not learn from it."""
     _, callback = agent._setup_learn(10**9, CallbackList([]))
-    for _ in range(n_rollouts):
-        agent.collect_rollouts(agent.env, callback, agent.rollout_buffer, agent.n_steps)
-        yield agent.rollout_buffer
+    agent.collect_rollouts(agent.env, callback, agent.rollout_buffer, agent.n_steps)
+    return agent.rollout_buffer
 
 
 def steps_left(episode_starts, limit):
@@ -160,32 +158,23 @@ def steps_left(episode_starts, limit):
 
 
 def test_estimates_of_rollouts_are_compared_with_what_is_expected_of_them(corridor_registered):
-    """And what is expected is their mean, by state and action: within 4.5 standard errors."""
     agent, world, recorder = on_corridor(corridor_registered, gae_lambda=0.7, engine="library")
-    errors, places = [], []
-    for buffer in collect(agent, 6):
-        found = recorder.rollout_figures(0)
-        states = buffer.observations.reshape(-1).astype(int)
-        actions = buffer.actions.reshape(-1).astype(int)
-        policy, critic = recorder.policy(), critics.own_values(agent, world.observations)
-        advantages = world.values(policy, 0.9).advantages[states, actions]
-        steps = states, actions, steps_left(buffer.episode_starts, 50).reshape(-1)
-        expected, shared = expected_estimates(world.model, policy, critic, 0.9, 0.7, steps)
-        errors.append(buffer.advantages.reshape(-1) - expected)
-        places.append(2 * states + actions)
-        for name, each in (
-            ("gae_bias", expected - shared - advantages),
-            ("gae_offset", shared),
-            ("gae_std", errors[-1]),
-        ):
-            assert found[name] == pytest.approx(np.sqrt((each**2).mean())), name
-    errors, places = np.concatenate(errors), np.concatenate(places)
-    assert len(np.unique(places)) >= 7
-    for place in np.unique(places):
-        of_pair = errors[places == place]
-        # Estimates of one episode depend on each other: counted as if a tenth were independent.
-        error = of_pair.std() / np.sqrt(max(len(of_pair) / 10, 1))
-        assert abs(of_pair.mean()) <= 4.5 * error + 1e-6, place
+    buffer = collect(agent)
+    found = recorder.rollout_figures(0)
+    states = buffer.observations.reshape(-1).astype(int)
+    actions = buffer.actions.reshape(-1).astype(int)
+    policy, critic = recorder.policy(), critics.own_values(agent, world.observations)
+    advantages = world.values(policy, 0.9).advantages[states, actions]
+    steps = states, actions, steps_left(buffer.episode_starts, 50).reshape(-1)
+    expected, shared = expected_estimates(world.model, policy, critic, 0.9, 0.7, steps)
+    for name, errors in (
+        ("gae_bias", expected - shared - advantages),
+        ("gae_offset", shared),
+        ("gae_std", buffer.advantages.reshape(-1) - expected),
+    ):
+        assert found[name] == pytest.approx(np.sqrt((errors**2).mean())), name
+    # Nothing but chance is left: the mean error of so many is small beside one error.
+    assert abs((buffer.advantages.reshape(-1) - expected).mean()) < 0.3 * found["gae_std"]
 
 
 def test_the_exact_gradient_is_that_of_finite_differences():
@@ -227,7 +216,7 @@ def test_the_exact_gradient_is_that_of_finite_differences():
 def test_the_gradient_of_a_minibatch_is_the_one_that_the_library_descends(corridor_registered):
     """At ratio 1 and without other terms, but for the scale of normalised advantages."""
     agent, world, _ = on_corridor(corridor_registered, batch_size=1024, engine="library")
-    buffer = next(collect(agent))
+    buffer = collect(agent)
     estimates = buffer.advantages.reshape(-1).astype(np.float64)
     ((steps, centred),) = minibatches(agent, estimates, 0)
     assert sorted(steps) == list(range(1024))
@@ -267,10 +256,6 @@ def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient(corridor_
 # --- a training -----------------------------------------------------------------------------------
 
 
-def prepared(spec, console=None):
-    return prepare(spec, console or Console(quiet=True), {}, "train.py")
-
-
 @pytest.mark.parametrize(
     ("algo", "settings", "eval_freq", "column"),
     [
@@ -301,12 +286,6 @@ def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_w
     assert run.diagnosis_path.read_bytes() == whole.run.diagnosis_path.read_bytes()
 
 
-def said(spec):
-    file = io.StringIO()
-    training = prepared(replace(spec, verbose=1), Console(file=file, width=1000))
-    return training, file.getvalue()
-
-
 HOT = {"env_wrapper": "envs.wrappers.OneHotObservation"}
 NO_DIAGNOSIS = [
     ("ppo", CART, {}, {}, "the exact model of CartPole-v1 is not known"),
@@ -321,8 +300,10 @@ def test_where_it_cannot_be_done_a_line_says_so(tmp_path, algo, env_id, settings
     spec = spec_of(
         algo, env_id, settings, n_timesteps=50, log_folder=tmp_path, diagnose=True, **fields
     )
-    training, text = said(spec)
-    (line,) = [line for line in text.splitlines() if line.startswith("no diagnosis")]
+    file = io.StringIO()
+    training = prepare(replace(spec, verbose=1), Console(file=file, width=1000), {}, "train.py")
+    lines = file.getvalue().splitlines()
+    (line,) = [line for line in lines if line.startswith("no diagnosis")]
     assert line.startswith(f"no diagnosis: {reason}")
     assert training.evaluation.critics is None
     close(training)

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -28,7 +27,6 @@ from pipeline.evaluation.sampled import (
     Shares,
     Yardstick,
     allowed_steps,
-    bracketed_yardstick,
     compiled_copy,
     evaluate,
     evaluate_compiled,
@@ -41,7 +39,7 @@ from pipeline.settings.hyperparams import TUNED_ON, split
 from pipeline.settings.yaml import read_yaml
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
-from tests.pipeline.short_runs import CART, LAKE, SWING, agent_of, spec_of, trained
+from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of, trained
 
 CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
@@ -264,8 +262,6 @@ def test_what_is_asked_for_is_done_and_a_run_says_what_its_evaluations_took(tmp_
     assert outcome.evaluation_steps == during + final["mean_length"] * final["n_episodes"]
     assert info["best_episodes"] in counts
     assert outcome.evaluating.cpu_seconds > 0
-    # Rows of fewer episodes are repeated, so that all tools read them.
-    assert set(n_columns % counts) == {0}
 
 
 # --- measured by a bracket -----------------------------------------------------------------------
@@ -287,14 +283,6 @@ def test_the_upper_end_measures_and_the_lower_stands_beside_it():
     assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
 
 
-def test_an_upper_end_without_a_proof_is_marked_wherever_its_score_is_told():
-    guessed = episodes(*[260.0] * 10, yardstick=replace(POLE, is_proven=False))
-    assert guessed.summary()["optimum_is_proven"] is False
-    assert describe(guessed).endswith("(bracketed; the upper end is not proven)")
-    spec = spec_of("random", "Acrobot-v1")
-    assert bracketed_yardstick(spec) == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
-
-
 @pytest.mark.parametrize(
     ("returns", "yardstick", "alarm"),
     [
@@ -310,21 +298,6 @@ def test_more_than_any_policy_can_reach_is_said_aloud_and_not_clipped(returns, y
     assert found.summary().get("beats_optimum", False) is alarm
     if alarm:
         assert found.summary()["score"] == pytest.approx(481 / 480)
-
-
-@pytest.mark.parametrize(
-    ("entry", "holds"),
-    [
-        ({}, True),
-        ({"normalize": True, "frame_stack": 2}, True),
-        ({"train_env_kwargs": {"g": 5.0}}, True),
-        ({"eval_env_kwargs": {"g": 5.0}}, False),
-        ({"env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 0.5}}}, False),
-    ],
-    ids=str,
-)
-def test_where_a_bracket_holds(entry, holds):
-    assert (bracketed_yardstick(spec_of("random", SWING, entry)) is not None) == holds
 
 
 # --- in compiled code: the episodes that evaluation in Python plays ------------------------------
