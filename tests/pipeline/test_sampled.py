@@ -236,11 +236,11 @@ def test_the_last_evaluation_ends_when_it_is_sure_or_dear(steady, returns, lengt
 
 
 def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path):
-    """Five episodes are 500 steps, and half of 2,000 are allowed over the whole training."""
-    spec = steady([1.0, 5.0], 100, n_timesteps=2000, log_folder=tmp_path)
+    """Five episodes are 600 steps, and half of 2,400 are allowed over the whole training."""
+    spec = steady([1.0, 5.0], 120, n_timesteps=12_000, log_folder=tmp_path)
     run = train(spec, Console(quiet=True), {}, "").run
     with np.load(run.evaluations_path) as evaluations:
-        assert evaluations["timesteps"].tolist() == [1000, 2000]
+        assert evaluations["timesteps"].tolist() == [6000, 12_000]
         assert evaluations["results"].shape == (2, 5)
 
 

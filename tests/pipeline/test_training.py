@@ -286,18 +286,6 @@ def test_regret_is_the_judgement_where_arms_are_drawn_anew(tmp_path):
     assert f"regret   {regret:,.2f} over 300 pulls; a best arm in" in text
 
 
-def test_a_compiled_loop_keeps_no_pulls(tmp_path):
-    """A tabular agent is asked after each pull, unless it was told to compile."""
-    arms = "BernoulliBandit-v0"
-    outcome, pulls, _, _ = train_on(tmp_path / "a", "qlearning", arms)
-    assert outcome.engine == "interpreted: PullRecorder must be asked after each step"
-    assert pulls is not None
-    outcome, pulls, _, text = train_on(tmp_path / "b", "qlearning", arms, engine="compiled")
-    assert (outcome.engine, outcome.pulls, pulls) == ("compiled", None, None)
-    assert "engine: compiled keeps no pulls, so that regret is not known" in text
-    assert "regret" not in outcome.run.read_info()
-
-
 def test_a_log_knows_no_regret(tmp_path):
     log_uniformly(gym.make("SegmentBandit-v0"), 300, 0, tmp_path / "log.csv")
     kwargs = {"log": str(tmp_path / "log.csv")}
