@@ -120,38 +120,19 @@ def test_what_is_damaged_is_refused(tmp_path):
 # --- algorithms that know nothing of this project ------------------------------------------------
 
 
-def odd_agent(name, answer):
-    """An agent of a stranger's with a way of its own to answer."""
+class Dice(A2C):
+    """Answers at random, whatever it is asked for."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        return answer(observation, state)
-
-    return type(name, (A2C,), {"predict": predict})
+        return np.random.default_rng().integers(4, size=len(observation)), None
 
 
-def one_by_one(observation, _):
-    return np.array([int(np.asarray(observation).item()) % 4]), None
-
-
-def dice(observation, _):
-    return np.random.default_rng().integers(4, size=len(observation)), None
-
-
-ODD = {
-    "onebyone": (one_by_one, "predict takes no batch of observations (ValueError)"),
-    "dice": (dice, "predict draws its actions at random"),
-}
-
-
-@pytest.mark.parametrize("algo", ODD)
-def test_what_cannot_be_asked_for_all_states_is_sampled(algo, tmp_path, monkeypatch, request):
-    answer, reason = ODD[algo]
-    monkeypatch.setitem(globals(), f"{algo}_agent", odd_agent(algo, answer))
-    agents.register(algo, f"{__name__}:{algo}_agent")
-    request.addfinalizer(lambda: ALGORITHMS.pop(algo))
-    fields = {"n_timesteps": 20, "log_folder": tmp_path, "final_episodes": 4}
-    outcome, printed = train_to(spec_for(algo, LAKE, {"policy_kwargs": TINY}, verbose=1, **fields))
-    assert f"evaluations are sampled, not exact: {reason}" in printed
+def test_what_cannot_be_asked_for_all_states_is_sampled(tmp_path, request):
+    agents.register("dice", f"{__name__}:Dice")
+    request.addfinalizer(lambda: ALGORITHMS.pop("dice"))
+    fields = {"n_timesteps": 20, "log_folder": tmp_path, "final_episodes": 4, "verbose": 1}
+    outcome, printed = train_to(spec_for("dice", LAKE, {"policy_kwargs": TINY}, **fields))
+    assert "evaluations are sampled, not exact: predict draws its actions at random" in printed
     assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 4)
 
 

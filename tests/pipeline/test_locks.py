@@ -14,7 +14,7 @@ from pipeline import locks
 from pipeline.digests import LOCK
 from pipeline.errors import UserError
 from pipeline.models.find import model_of
-from pipeline.runs import INTERRUPTED, RUNNING, Run, remove_leftovers
+from pipeline.runs import INTERRUPTED, RUNNING, Run
 
 FOREIGN = {**locks.mark(), "host": "elsewhere", "machine": "other", "boot": "other"}
 FOREIGN |= {"token": "t", "since": "2026-01-01 00:00:00"}
@@ -158,16 +158,13 @@ def test_what_the_killed_have_half_written_is_removed_and_all_else_stays(tmp_pat
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({}, True),
         ({"began": 1}, False),  # its number is another's now
         ({"boot": "earlier"}, False),
         ({"boot": "earlier", "host": "elsewhere"}, None),
-        ({"namespace": "pid:[another container]", "pid": 1}, None),
     ],
 )
 def test_a_number_alone_names_no_process(changes, expected):
     assert locks.is_alive({**locks.mark(), **changes}) is expected
-    assert locks.is_alive({}) is None
 
 
 # --- runs ----------------------------------------------------------------------------------------
@@ -188,23 +185,3 @@ def test_a_run_whose_process_is_gone_was_interrupted(tmp_path, dead):
     assert Run(tmp_path, "Taxi-v4").state is None
     with pytest.raises(UserError, match="its training was cut off before it was written"):
         model_of(run_of(tmp_path, dead))
-
-
-DRAFT = f".run.json.{'0' * 16}.tmp"
-SET_UP = ("0.monitor.csv", "Taxi-v4/config.yml", DRAFT, "modules/mine.py")
-
-
-def test_a_set_up_that_was_killed_is_cleared_away(tmp_path, dead):
-    """But not one that is at work, may be, or holds anything else."""
-    gone = run_of(tmp_path, dead)
-    for name in SET_UP:
-        (gone.path / name).parent.mkdir(exist_ok=True)
-        (gone.path / name).touch()
-    elsewhere = {**dead, "boot": "x", "host": "elsewhere"}
-    kept = [run_of(tmp_path, process) for process in (locks.mark(), elsewhere, None)]
-    kept += [run_of(tmp_path, dead, spec={"algo": "sarsa"}), run_of(tmp_path, dead)]
-    (kept[-1].path / "Taxi-v4" / "mine.yml").mkdir()
-    before = {run.path: tree(run.path) for run in kept}
-    remove_leftovers(tmp_path, "sarsa", "Taxi-v4")
-    assert {*(tmp_path / "sarsa").iterdir()} == {*before}
-    assert {run.path: tree(run.path) for run in kept} == before

@@ -7,10 +7,9 @@ import pipeline.evaluation.histories
 from agents import load_algorithm
 from pipeline.environments import make_evaluation_env
 from pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
-from pipeline.evaluation.histories import HistoryEvaluator, by_histories, world_of_memory
+from pipeline.evaluation.histories import by_histories, world_of_memory
 from pipeline.evaluation.sampled import evaluate
 from pipeline.evaluation.yardstick import HiddenState, Yardstick, with_memory
-from pipeline.train_spec import remembers
 from tests.pipeline.short_runs import LAKE, agent_of, spec_of, trained
 
 CORRIDOR, TIGER = "envs:ShortCorridor-v0", "envs:Tiger-v0"
@@ -88,13 +87,6 @@ def test_no_discounted_optimum_is_told_where_observations_hide_the_state():
     found = evaluator.other_returns(agent)
     assert found.discounted_return == pytest.approx(-(1 - 0.99**10) / 0.01)
     assert found.discounted_optimum is None
-
-
-def test_an_agent_remembers_by_its_kind_or_by_stacked_observations():
-    assert remembers(spec_of("ppo_lstm", TIGER))
-    assert remembers(spec_of("ppo", TIGER, STACKED))
-    assert not remembers(spec_of("ppo", TIGER, {**STACKED, "frame_stack": 1}))
-    assert not remembers(spec_of("qlearning", TIGER))
 
 
 # --- histories -----------------------------------------------------------------------------------
@@ -192,13 +184,6 @@ def test_runs_say_by_which_scale_they_are_measured(tmp_path):
     assert (final["measured_by"], final["optimum"], final["full_optimum"]) == (
         "observation", -10, 100,
     )  # fmt: skip
-
-
-def test_what_is_seen_has_one_scale_with_memory_too():
-    spec = spec_of("ppo_lstm", LAKE)
-    world = evaluator_of_single(spec)
-    assert world.scale is None
-    assert HistoryEvaluator(spec, make_evaluation_env(spec, 1), world).yardstick == world.yardstick
 
 
 def test_who_draws_its_actions_is_not_followed():

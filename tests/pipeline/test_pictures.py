@@ -3,14 +3,13 @@
 import json
 
 import numpy as np
-import pytest
 from matplotlib.figure import Figure
 
 from pipeline import map_pictures as drawing
 from pipeline.curve_pictures import read_monitors
 from pipeline.environments import make_training_env
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.value_maps import ValueMapRecorder, value_map
+from pipeline.evaluation.value_maps import value_map
 from pipeline.models.load import load_model
 from tests.pipeline.short_runs import WAREHOUSE, agent_of, spec_of, trained
 
@@ -20,10 +19,10 @@ MINUS = "\N{MINUS SIGN}"
 CORNER = {"desc": ["S..", ".#G"], "max_episode_steps": 10}
 
 
-def made(env_id, name="qlearning", env_kwargs=None, **arguments):
+def made(env_id, name="qlearning", env_kwargs=None):
     """An evaluator, and an agent that has learnt nothing."""
     spec = spec_of(name, env_id, {"env_kwargs": env_kwargs or {}})
-    return exact_evaluator(spec), agent_of(name, make_training_env(spec, None), **arguments)
+    return exact_evaluator(spec), agent_of(name, make_training_env(spec, None))
 
 
 def map_of(env_id, actions=(), **env_kwargs):
@@ -61,23 +60,6 @@ def test_an_action_among_several_best_ones_does_not_differ():
         assert not found.differs.any()
         assert found.values[6] == found.optimal_values[6] == 97
     assert found.optimal_actions[6].tolist() == [True, False, False, True]
-
-
-@pytest.mark.parametrize(
-    ("env_id", "name"),
-    [
-        ("Taxi-v4", "qlearning"),
-        (WAREHOUSE, "random"),
-    ],
-    ids=["no grid", "no one action"],
-)
-def test_where_there_is_no_map(env_id, name, tmp_path):
-    evaluator, agent = made(env_id, name)
-    assert value_map(evaluator, agent) is None
-    recorder = ValueMapRecorder(tmp_path / "maps.npz", evaluator)
-    recorder.record(agent, 1)
-    recorder.finish(agent, 2)
-    assert list(tmp_path.iterdir()) == []
 
 
 # --- over the training ---------------------------------------------------------------------------

@@ -57,20 +57,12 @@ def test_runs_are_numbered_from_one_and_gaps_are_not_filled(tmp_path):
             Run.find(tmp_path, "b", TAXI)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "name"),
-    [
-        ("envs:Warehouse-v0", "Warehouse-v0"),
-        ("ale_py:ALE/Pong-v5", "ALE-Pong-v5"),
-    ],
-)
-def test_names_of_environments_in_file_names(tmp_path, env_id, name):
-    assert environment_name(env_id) == name
-    assert claim_names(tmp_path, env_id, 2) == [f"{name}_1", f"{name}_2"]
-    run = Run.find(tmp_path, "sarsa", env_id)
-    assert run.path == tmp_path / "sarsa" / f"{name}_2"
-    assert run.model_path == run.path / f"{name}.zip"
-    assert run.vecnormalize_path == run.path / name / "vecnormalize.pkl"
+def test_names_of_environments_in_file_names(tmp_path):
+    assert environment_name("envs:Warehouse-v0") == "Warehouse-v0"
+    run = Run.claim(tmp_path, "sarsa", "ale_py:ALE/Pong-v5")
+    assert Run.find(tmp_path, "sarsa", "ale_py:ALE/Pong-v5").path == run.path
+    assert run.model_path == tmp_path / "sarsa" / "ALE-Pong-v5_1" / "ALE-Pong-v5.zip"
+    assert run.vecnormalize_path == run.path / "ALE-Pong-v5" / "vecnormalize.pkl"
 
 
 def test_checkpoints_are_ordered_by_steps(tmp_path):
@@ -208,20 +200,6 @@ def test_anything_else_is_refused_in_one_line(content, reason):
 
 
 # --- files that are there whole, or as before ----------------------------------------------------
-
-
-def test_the_draft_lies_beside_and_the_old_file_stays_until_the_end(tmp_path):
-    path = tmp_path / "model.zip"
-    path.write_text("old")
-    with files.replacing(path) as file:
-        file.write(b"new")
-        # Only a file of the same folder can be renamed into place in one step.
-        draft, other = names(tmp_path)
-        assert draft.startswith(".model.zip.")
-        assert other == "model.zip"
-        assert path.read_text() == "old"
-    assert path.read_text() == "new"
-    assert names(tmp_path) == ["model.zip"]
 
 
 def test_a_writer_that_is_stopped_changes_nothing(tmp_path):

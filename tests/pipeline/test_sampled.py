@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils import seeding
 from rich.console import Console
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -33,7 +32,6 @@ from pipeline.evaluation.sampled import (
     evaluation_seed,
     is_sure,
 )
-from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.settings import hyperparams
 from pipeline.settings.hyperparams import TUNED_ON, split
 from pipeline.settings.yaml import read_yaml
@@ -75,24 +73,6 @@ def seeds_of_run(n_envs, seed, n_eval_envs=TrainSpec.n_eval_envs):
     starts = [evaluation_seed(seed, purpose) for purpose in PURPOSES]
     evaluations = (range(start, start + n_eval_envs) for start in starts)
     return {seed, *range(seed * n_envs, (seed + 1) * n_envs)}.union(*evaluations)
-
-
-def test_a_run_takes_the_seeds_that_are_said(monkeypatch):
-    taken, make = set(), seeding.np_random
-
-    def watched(seed=None):
-        taken.update([] if seed is None else [seed])
-        return make(seed)
-
-    monkeypatch.setattr(seeding, "np_random", watched)  # which environments draw theirs from
-    spec = spec_of("qlearning", LAKE, {"n_envs": 3}, seed=7)
-    model = make_model(spec, None, make_training_env(spec, None), algorithm_kwargs(spec))
-    taken.clear()
-    model.learn(12)
-    assert taken == {21, 22, 23}
-    taken.clear()
-    evaluate(model, make_evaluation_env(spec, 2), 4, evaluation_seed(7, 1))
-    assert taken == {evaluation_seed(7, 1), evaluation_seed(7, 1) + 1}
 
 
 def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_stream():

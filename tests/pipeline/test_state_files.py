@@ -11,7 +11,6 @@ import stat
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from pipeline.errors import UserError
 from pipeline.runs import Run
 from pipeline.state_saver import StateSaver, put_back, user_state
 from pipeline.states import pickled, unpickled
-from pipeline.unfinished_runs import SaveInterval, StateKeeping, cut_back, log_positions
+from pipeline.unfinished_runs import SaveInterval, StateKeeping
 from pipeline.user_modules import import_typed
 
 KEY = b"k" * 32
@@ -183,41 +182,6 @@ def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
 
 
 # --- files that are only appended to, and what the user's modules hold ---------------------------
-
-ROWS = b"r,l,t\n1.0,5,0.1\n2.0,6,0.2\n"
-
-
-@pytest.fixture
-def logs(tmp_path):
-    run, log = tmp_path / "run", tmp_path / "log"
-    run.mkdir()
-    log.mkdir()
-    for name in ("0.monitor.csv", "all.monitor.csv"):
-        (run / name).write_bytes(ROWS)
-    (log / "events.out.tfevents.1").write_bytes(b"\x00events")
-    return run, str(log)
-
-
-def test_what_was_appended_since_is_removed(logs):
-    run, log = logs
-    positions = log_positions(run, log)
-    for path in (run / "0.monitor.csv", *Path(log).iterdir()):
-        path.write_bytes(path.read_bytes() + b"more")
-    (run / "1.monitor.csv").touch()
-    cut_back(run, log, positions)
-    assert {path.name for path in run.iterdir()} == {"0.monitor.csv", "all.monitor.csv"}
-    assert log_positions(run, log) == positions
-    assert (run / "0.monitor.csv").read_bytes() == ROWS
-    # What was changed is refused and left alone.
-    path = run / "0.monitor.csv"
-    for rows in (None, ROWS.replace(b"2.0", b"9.0")):
-        path.unlink()
-        if rows is not None:
-            path.write_bytes(rows)
-        with pytest.raises(UserError, match=r"0\.monitor\.csv has changed since the run wrote it"):
-            cut_back(run, log, positions)
-        assert (path.read_bytes() if path.exists() else None) == rows
-        path.touch()
 
 
 SOURCE = """

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import signal
 from functools import partial
 
 import gymnasium as gym
@@ -37,7 +36,6 @@ from pipeline.callbacks import (
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.models.find import checkpoint_file
 from pipeline.runs import PULLS_FILE, Run
-from pipeline.stopping import stops_noticed
 from pipeline.training import carry_out, prepare, train
 from pipeline.unfinished_runs import run_of_spec
 from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
@@ -205,28 +203,6 @@ def test_epsilon_falls_with_each_update():
 
 
 # --- how it ends ---------------------------------------------------------------------------------
-
-
-def test_results_are_told_before_anything_is_drawn(tmp_path):
-    """A stop while pictures are drawn costs the pictures, and nothing that was found out."""
-    told, file = [], io.StringIO()
-    fields = {"n_timesteps": 600, "log_folder": tmp_path, "pictures": True, "eval_freq": 300}
-
-    def tell(outcome):
-        run = outcome.run
-        told.append((outcome.state, run.read_info()["state"], run.curve_path.exists()))
-        signal.raise_signal(signal.SIGINT)
-
-    with stops_noticed():
-        spec = spec_of("qlearning", verbose=1, **fields)
-        training = prepare(spec, Console(file=file, width=200), {}, "train.py")
-        outcome = carry_out(training, tell)
-    assert told == [("finished", "running", False)]
-    info = outcome.run.read_info()
-    assert outcome.state == info["state"] == "interrupted"
-    assert not outcome.run.curve_path.exists()
-    assert info["final"]["mean_return"] == outcome.final.mean_return
-    assert "stopped while drawing: the run counts as interrupted" in file.getvalue()
 
 
 def test_a_run_that_is_stopped_once_more_while_it_ends_can_be_gone_on_with(tmp_path):

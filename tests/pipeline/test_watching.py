@@ -5,7 +5,6 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -27,21 +26,6 @@ from pipeline.watching import TERMINATED, TableRecorder
 from tests.pipeline.short_runs import CART, LAKE, spec_of
 
 
-class Corridor(gym.Env):
-    """Two steps forward, with rewards of 1 and 2; the third cell is the end."""
-
-    observation_space, action_space = gym.spaces.Discrete(3), gym.spaces.Discrete(1)
-
-    def reset(self, **options):
-        super().reset(**options)
-        self.cell = 0
-        return 0, {}
-
-    def step(self, action):
-        self.cell += 1
-        return self.cell, float(self.cell), self.cell == 2, False, {}
-
-
 def watched_spec(tmp_path, algo="qlearning", settings=None, **fields):
     """Of a run that is watched, for a page that nobody writes."""
     places = {"log_folder": tmp_path / "logs", "watch_learning": tmp_path / "page.html"}
@@ -54,28 +38,6 @@ def watched(env, name="qlearning", n_timesteps=300, n_episodes=0, **settings):
     recorder = TableRecorder(n_episodes)
     agent = load_algorithm(name)(env=env, seed=1, **settings).learn(n_timesteps, recorder)
     return agent, recorder
-
-
-def test_two_episodes_worked_by_hand():
-    """With step size and discount 1/2: targets 1, 2, then 1 + 1/2 = 1.5, 2."""
-    halves = {"learning_rate": 0.5, "gamma": 0.5}
-    _, recorder = watched(Corridor(), n_timesteps=9, n_episodes=2, **halves)
-    moves, changes = recorder.moves.rows, recorder.changes.rows
-    assert moves["target"].tolist() == [1.0, 2.0, 1.5, 2.0]
-    assert moves["td_error"].tolist() == [1.0, 2.0, 1.0, 1.0]
-    assert moves["obs"].tolist() == [0, 1, 0, 1]
-    assert moves["next_obs"].tolist() == [1, 2, 1, 2]
-    assert moves["reward"].tolist() == [1.0, 2.0, 1.0, 2.0]
-    assert moves["episode_return"].tolist() == [1.0, 3.0, 1.0, 3.0]
-    assert moves["episode"].tolist() == [0, 0, 1, 1]
-    assert moves["end"].tolist() == [0, TERMINATED, 0, TERMINATED]
-    assert changes["entry"].tolist() == [0, 1, 0, 1]
-    assert changes["after"].tolist() == [0.5, 1.0, 1.0, 1.5]
-    assert changes["step"].tolist() == [0, 1, 2, 3]
-    assert recorder.steps.rows["timesteps"].tolist() == [1, 2, 3, 4]
-    assert recorder.steps.rows["learning_rate"].tolist() == [0.5] * 4
-    # The two episodes are over: nothing was left out.
-    assert (recorder.is_full, recorder.is_cut) == (True, False)
 
 
 @pytest.mark.parametrize("engine", ["compiled", "interpreted"])
@@ -159,16 +121,6 @@ def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, st
     assert rows["exploration"][0] == (1.0 if algo == "dqn" else pytest.approx(np.nan, nan_ok=True))
     lengths = [float(row[0]) for row in episodes_of(outcome.run.path)]
     assert rows["training_return"][-1] == pytest.approx(np.mean(lengths[-100:]))
-
-
-def test_of_many_maps_every_second_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(watching, "MOST_MAPS", 4)  # so that there are soon too many
-    training, _ = done(watched_spec(tmp_path, "ppo", SMALL_PPO))
-    for _ in range(2):
-        training.watch.finish()
-    # Ten updates; the last one is kept though it is none of every fourth.
-    assert training.watch.moments.rows["number"].tolist() == [0, 4, 8, 10]
-    assert (training.watch.stride, training.watch.n_units) == (4, 10)
 
 
 def test_what_is_played_covers_the_rise_of_the_greedy_policys_return():
