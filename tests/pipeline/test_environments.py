@@ -19,7 +19,6 @@ from pipeline.environments import (
     with_maps_read,
 )
 from pipeline.errors import UserError
-from tests.pipeline.short_runs import CART, trained
 from tests.pipeline.short_runs import spec_of as spec_for
 
 
@@ -201,20 +200,3 @@ def test_a_log_is_found_from_other_folders(tmp_path):
 
 
 # --- memory --------------------------------------------------------------------------------------
-
-
-STACK = {"env_wrapper": {"gymnasium.wrappers.FrameStackObservation": {"stack_size": 10**9}}}
-
-
-@pytest.mark.parametrize(
-    ("env_id", "entry", "said"),
-    [
-        (CART, STACK, "stack_size must be at most 10,000"),
-        (CART, {"n_envs": 10**9}, "n_envs 1,000,000,000 would take 18,626 GB of memory at least"),
-    ],
-)
-def test_numbers_beyond_all_memory_end_in_one_line_and_leave_nothing(tmp_path, env_id, entry, said):
-    with pytest.raises(UserError, match=said) as caught:
-        trained("ppo", env_id, entry, n_timesteps=10, log_folder=tmp_path / "logs")
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "logs").exists()

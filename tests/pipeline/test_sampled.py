@@ -20,6 +20,7 @@ from commands.terminal import describe
 from envs.wrappers import DiscretizeObservation
 from pipeline.agent_settings import without_auto
 from pipeline.environments import make_evaluation_env, make_training_env
+from pipeline.evaluation import sampled
 from pipeline.evaluation.sampled import (
     Evaluation,
     SampledEvaluator,
@@ -215,12 +216,13 @@ def test_the_last_evaluation_ends_when_it_is_sure_or_dear(steady, returns, lengt
     assert evaluator.n_steps == n_episodes * length
 
 
-def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path):
-    """Five episodes are 600 steps, and half of 2,400 are allowed over the whole training."""
-    spec = steady([1.0, 5.0], 120, n_timesteps=12_000, log_folder=tmp_path)
+def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path, monkeypatch):
+    """Five episodes are 75 steps, and half of 300 are allowed over the whole training."""
+    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 0)  # in so short a training
+    spec = steady([1.0, 5.0], 15, n_timesteps=1500, log_folder=tmp_path)
     run = train(spec, Console(quiet=True), {}, "").run
     with np.load(run.evaluations_path) as evaluations:
-        assert evaluations["timesteps"].tolist() == [6000, 12_000]
+        assert evaluations["timesteps"].tolist() == [750, 1500]
         assert evaluations["results"].shape == (2, 5)
 
 

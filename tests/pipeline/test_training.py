@@ -8,16 +8,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.envs.registration import EnvSpec
 from rich.console import Console
-from stable_baselines3 import DQN, HerReplayBuffer
+from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
     EvalCallback,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
@@ -217,23 +215,6 @@ def test_a_run_that_is_stopped_once_more_while_it_ends_can_be_gone_on_with(tmp_p
 
 
 # --- settings of the libraries -------------------------------------------------------------------
-
-
-def test_goals_are_replayed_in_hindsight_by_the_entry_that_rl_zoo3_has(tmp_path, monkeypatch):
-    spec = EnvSpec("Bits-v0", partial(BitFlippingEnv, n_bits=3, max_steps=3))
-    monkeypatch.setitem(gym.registry, "Bits-v0", spec)
-    entry = {**TINY_DQN, "policy": "MultiInputPolicy", "replay_buffer_class": "HerReplayBuffer"}
-    entry["replay_buffer_kwargs"] = "dict(goal_selection_strategy='future', n_sampled_goal=4)"
-    run = prepare(
-        spec_of("dqn", "Bits-v0", entry, n_timesteps=60, log_folder=tmp_path),
-        *(Console(quiet=True), {}, ""),
-    )
-    assert carry_out(run).state == "finished"
-    buffer = run.model.replay_buffer
-    assert (type(buffer), buffer.n_sampled_goal) == (HerReplayBuffer, 4)
-    # What is sampled was asked for in part with a goal that was reached later.
-    sampled = buffer.sample(100).observations["desired_goal"]
-    assert len(np.unique(sampled, axis=0)) > 1
 
 
 # --- bandits: judged by regret, drawn by pull, kept when interrupted -----------------------------
