@@ -270,7 +270,7 @@ def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_w
     """Without ``eval_freq`` not every evaluation is compared."""
     monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 2e-3)
     monkeypatch.setattr(critics, "SECONDS_OF_NETWORKS", 5e-2)
-    spec = resumable(tmp_path / "plain", LAKE, algo, 600, settings, eval_freq=eval_freq)
+    spec = resumable(tmp_path / "plain", LAKE, algo, 400, settings, eval_freq=eval_freq)
     plain = carried_out(spec)
     spec = replace(spec, diagnose=True)
     whole = carried_out(replace(spec, log_folder=tmp_path / "whole"))
@@ -279,8 +279,8 @@ def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_w
         assert content(path) == content(again), path.name
     assert not plain.run.diagnosis_path.exists()
     rows = rows_of(whole.run)
-    assert len(rows) >= (1 if eval_freq is None else 6)
-    assert np.isfinite([row[column] for row in rows[:5]]).all()
+    assert len(rows) >= (1 if eval_freq is None else 4)
+    assert np.isfinite([row[column] for row in rows[:4]]).all()
     run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
     gone_on(run)
     assert run.diagnosis_path.read_bytes() == whole.run.diagnosis_path.read_bytes()

@@ -58,8 +58,8 @@ def briefly_trained(name, spec):
     ("name", "env_id", "entry", "n_episodes"),
     [
         ("qlearning", WAREHOUSE, SLIPPERY, 200),
-        ("ppo", WAREHOUSE, HOT, 200),
-        ("dqn", WAREHOUSE, POSITION, 200),
+        ("ppo", WAREHOUSE, HOT, 100),
+        ("dqn", WAREHOUSE, POSITION, 100),
     ],
 )
 def test_the_exact_return_is_that_of_the_agents_own_actions(name, env_id, entry, n_episodes):
@@ -493,7 +493,7 @@ def test_histories_that_an_agent_does_not_tell_apart_are_one(monkeypatch):
 
 def test_all_histories_say_what_many_episodes_say():
     memory = {**SHORT, "policy_kwargs": {"lstm_hidden_size": 4}}
-    spec = spec_for("ppo_lstm", TIGER, {**memory, "env_kwargs": {"max_episode_steps": 8}})
+    spec = spec_for("ppo_lstm", TIGER, {**memory, "env_kwargs": {"max_episode_steps": 5}})
     env = make_evaluation_env(spec, 8)
     agent = agent_of("ppo_lstm", env, device="cpu", **memory).learn(32)
     exact = by_histories(spec, agent, world_of_memory(spec, agent))
@@ -505,7 +505,8 @@ def test_all_histories_say_what_many_episodes_say():
 
 
 def test_runs_say_by_which_scale_they_are_measured(tmp_path):
-    outcome = trained("ppo_lstm", TIGER, SHORT, n_timesteps=32, log_folder=tmp_path)
+    brief = {**SHORT, "env_kwargs": {"max_episode_steps": 4}}
+    outcome = trained("ppo_lstm", TIGER, brief, n_timesteps=32, log_folder=tmp_path)
     assert outcome.final.is_exact
     assert outcome.run.read_info()["final"]["measured_by"] == "memory"
     plain = trained("qlearning", TIGER, n_timesteps=200, log_folder=tmp_path)

@@ -39,6 +39,8 @@ GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
 SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
 EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
 LAGGING = {"n_steps": 3, "train_freq": 4, "target_update_interval": 30, "tau": 0.7}
+BRIEF = {"env_kwargs": {"max_episode_steps": 25}}
+STACKED = {"normalize": True, "frame_stack": 2}
 NOISE = {"noise_type": "ornstein-uhlenbeck", "noise_std": 0.1}
 # Ten rewards of 0.1 are not 1: what Monitor adds up depends on the order.
 FINE = {"env_kwargs": {"reward_schedule": (1.7, -0.3, 0.1)}}
@@ -60,17 +62,17 @@ TRAININGS = [
     row(GRID, "n_step_sarsa", 600, {**COMPILED, "n_envs": 3}),
     row(GRID, "prioritized_sweeping", 600, {"initial_q_std": 1.0, "n_envs": 2}, trained_agent=200),
     row(GRID, "dqn", 300, {**EAGER, **LAGGING, **COMPILED}, watch_learning="page.html"),
-    row(LEFT_RIGHT, "ppo", 1500, {**SMALL, **COMPILED, "normalize": True}, log_interval=3),
-    row(SWING, "ppo", 400, {**SMALL, "use_sde": True, "normalize": True, "frame_stack": 2}),
-    row(SWING, "td3", 120, {**EAGER, **NOISE}),
-    row(GRID, "dqn", None, {"n_episodes": 30, **EAGER, **FALLING}, save_freq=50),
+    row(LEFT_RIGHT, "ppo", 900, {**SMALL, **COMPILED, "normalize": True}, log_interval=3),
+    row(SWING, "ppo", 400, {**BRIEF, **SMALL, **STACKED, "use_sde": True}),
+    row(SWING, "td3", 120, {**BRIEF, **EAGER, **NOISE}),
+    row(GRID, "dqn", None, {"n_episodes": 20, **EAGER, **FALLING}, save_freq=50),
 ]
 
 
 @pytest.fixture(autouse=True)
 def short_evaluations(monkeypatch):
     """As many steps as a test can wait for, shared out as ever."""
-    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 600)
+    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 200)
 
 
 class CutOffError(BaseException):
