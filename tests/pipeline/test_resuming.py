@@ -260,8 +260,12 @@ def test_cut_off_again_and_the_newest_state_damaged(parts, monkeypatch):
     assert "the state before it is taken" in line
 
 
-def test_without_a_state_the_run_begins_anew(parts):
+def test_a_changed_log_is_refused_and_without_a_state_the_run_begins_anew(parts):
     whole, run = parts
+    monitor = run.path / "0.monitor.csv"
+    monitor.write_bytes(monitor.read_bytes().replace(b"0.", b"9.", 1))
+    with pytest.raises(UserError, match=r"0\.monitor\.csv has changed since the run wrote it"):
+        gone_on(run)
     shutil.rmtree(run.state_path)
     with at_work_on(run, pytest.fail):
         keeping = go_on(run, StateKeeping(), pytest.fail)
