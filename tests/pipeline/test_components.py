@@ -9,11 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3 as sb3
-from gymnasium.wrappers import ClipReward, TimeLimit
 from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from torch import nn, optim
 
@@ -38,8 +36,6 @@ from pipeline.user_modules import (
 )
 from tests.pipeline.short_runs import spec_of
 
-TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
-CLIP = "gymnasium.wrappers.ClipReward"
 MONITOR = "stable_baselines3.common.monitor.Monitor"
 FRAME_STACK = "stable_baselines3.common.vec_env.VecFrameStack"
 CALLBACKS = "stable_baselines3.common.callbacks"
@@ -48,14 +44,6 @@ CHECKPOINT = f"{CALLBACKS}.CheckpointCallback"
 
 def cartpole():
     return gym.make("CartPole-v1").unwrapped
-
-
-def test_a_list_wraps_from_the_inside_out():
-    given = [{TIME_LIMIT: {"max_episode_steps": "1e2"}}, {CLIP: {"max_reward": 0}}, MONITOR]
-    env = wrapper_factory(given)(cartpole())
-    layers = [env, env.env, env.env.env]
-    assert [type(layer) for layer in layers] == [Monitor, ClipReward, TimeLimit]
-    assert layers[2]._max_episode_steps == 100
 
 
 def test_a_wrapper_of_a_vectorised_environment():

@@ -1,4 +1,4 @@
-"""What an agent is trained on and evaluated on: arguments, limits, wrappers, files, memory."""
+"""What an agent is trained on and evaluated on: arguments, limits, wrappers, files."""
 
 import gymnasium as gym
 import numpy as np
@@ -197,6 +197,3 @@ def test_a_log_is_found_from_other_folders(tmp_path):
     place = str(tmp_path / "pulls.csv")
     assert found == {"env_kwargs": {"log": place}, "eval_env_kwargs": {"log": "/a.csv"}}
     assert with_logs_located("FrozenLake-v1", settings) == settings
-
-
-# --- memory --------------------------------------------------------------------------------------
