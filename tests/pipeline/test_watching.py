@@ -89,7 +89,7 @@ SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradie
     ],
 )
 def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
-    spec = watched_spec(tmp_path, algo, settings)
+    spec = watched_spec(tmp_path, algo, settings, n_timesteps=160)
     _, alone = done(replace(spec, watch_learning=None))
     training, outcome = done(spec)
     assert outcome.engine == alone.engine
