@@ -19,35 +19,28 @@ import agents
 from agents import ALGORITHMS, load_algorithm
 from envs.wrappers import ActionMasks
 from pipeline import training
-from pipeline.agent_settings import check_fit
 from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.policies import policy_matrix
 from pipeline.evaluation.sampled import evaluate
-from pipeline.models.choose import ModelRequest
 from pipeline.models.load import (
     load_model,
     load_replay_buffer,
     load_to_play,
 )
-from pipeline.playing import play_episodes, playing_env
+from pipeline.playing import play_episodes
 from pipeline.settings.components import build_algorithm_kwargs
 from pipeline.settings.hyperparams import split
-from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of, choose_model
+from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
 
 # --- zips of our subclasses of library agents: loaded as data, they are what the library loads ---
 TINY = {"net_arch": [4]}
 OFF = {"learning_starts": 10, "buffer_size": 100, "batch_size": 8, "policy_kwargs": TINY}
-EXPONENTIAL = {"learning_rate": "exp_0.1_0.001"}
-ROLLOUT = {"n_steps": 16, "policy_kwargs": TINY}
 CASES = {
-    "dqn": {**OFF, **EXPONENTIAL},
-    "double_dqn": {**OFF, "mask_actions": True},
-    "deep_qlearning": OFF,
-    "ppo": {**ROLLOUT, **EXPONENTIAL, "batch_size": 8, "clip_range": "exp_0.4_0.1"},
-    "a2c": {**ROLLOUT, "learning_rate": "lin_0.1"},
+    "double_dqn": {**OFF, "mask_actions": True, "learning_rate": "exp_0.1_0.001"},
+    "ppo": {"n_steps": 16, "batch_size": 8, "policy_kwargs": TINY, "clip_range": "exp_0.4_0.1"},
 }
 
 
@@ -79,7 +72,7 @@ def test_a_zip_is_loaded_as_by_the_library(name, tmp_path):
     obs = np.stack([model.observation_space.sample() for _ in range(20)])
     theirs = type(model).load(tmp_path / "model.zip", made(name).env, device="cpu")
     ours = load_model(name, tmp_path / "model.zip", made(name).env, device="cpu")
-    if getattr(model, "replay_buffer", None) is not None:
+    if name == "double_dqn":
         model.save_replay_buffer(tmp_path / "buffer.pkl")
         theirs.load_replay_buffer(tmp_path / "buffer.pkl")
         load_replay_buffer(ours, tmp_path / "buffer.pkl")
@@ -105,9 +98,7 @@ HUGE = {"type": "Discrete", "n": 10**9, "start": 0, "rng": None}
 # Other attributes in its zip.
 ATTRIBUTES = [
     ({"predict": 1}, "sets 'predict', which is no attribute of such an agent"),
-    ({"observation_space": 3}, "does not say its observation_space"),
     ({"observation_space": HUGE}, "more than 10,000,000"),
-    ({"n_envs": 0}, "is of an agent on .* environments, not on 1 to 100000"),
     ({"n_envs": "2"}, "is of an agent on .* environments, not on 1 to 100000"),
 ]
 
@@ -128,53 +119,29 @@ def test_what_is_damaged_is_refused(tmp_path):
 # --- algorithms that know nothing of this project ------------------------------------------------
 
 
-def odd_agent(name, answer):
-    """An agent of a stranger's with a way of its own to answer."""
+class Dice(A2C):
+    """Answers at random, whatever it is asked for."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        return answer(observation, state)
-
-    return type(name, (A2C,), {"predict": predict})
+        return np.random.default_rng().integers(4, size=len(observation)), None
 
 
-def one_by_one(observation, _):
-    return np.array([int(np.asarray(observation).item()) % 4]), None
-
-
-def forgetful(observation, state):
-    return np.zeros(len(observation), int), (state or (0,))
-
-
-def dice(observation, _):
-    return np.random.default_rng().integers(4, size=len(observation)), None
-
-
-ODD = {
-    "onebyone": (one_by_one, "predict takes no batch of observations (ValueError)"),
-    "forgetful": (forgetful, "predict remembers what it saw before"),
-    "dice": (dice, "predict draws its actions at random"),
-}
-
-
-@pytest.mark.parametrize("algo", ODD)
-def test_what_cannot_be_asked_for_all_states_is_sampled(algo, tmp_path, monkeypatch, request):
-    answer, reason = ODD[algo]
-    monkeypatch.setitem(globals(), f"{algo}_agent", odd_agent(algo, answer))
-    agents.register(algo, f"{__name__}:{algo}_agent")
-    request.addfinalizer(lambda: ALGORITHMS.pop(algo))
-    fields = {"n_timesteps": 20, "log_folder": tmp_path, "final_episodes": 4}
-    outcome, printed = train_to(spec_for(algo, LAKE, {"policy_kwargs": TINY}, verbose=1, **fields))
-    assert f"evaluations are sampled, not exact: {reason}" in printed
+def test_what_cannot_be_asked_for_all_states_is_sampled(tmp_path, request):
+    agents.register("dice", f"{__name__}:Dice")
+    request.addfinalizer(lambda: ALGORITHMS.pop("dice"))
+    fields = {"n_timesteps": 20, "log_folder": tmp_path, "final_episodes": 4, "verbose": 1}
+    outcome, printed = train_to(spec_for("dice", LAKE, {"policy_kwargs": TINY}, **fields))
+    assert "evaluations are sampled, not exact: predict draws its actions at random" in printed
     assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 4)
 
 
 # --- agents that are told what is valid ----------------------------------------------------------
 SMALL = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
+FEW = {"eval_freq": 32, "eval_episodes": 1, "final_episodes": 5}
 NETWORK = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 10, "buffer_size": 500}
 AGENTS = {
     "dqn": {**NETWORK, "engine": "library"},
     "ppo_mask": SMALL,
-    "ppo_lstm": {**SMALL, "policy_kwargs": {"lstm_hidden_size": 8}},
 }
 
 
@@ -199,31 +166,11 @@ class Corridor(gym.Env):
         return self.cell, -1.0, self.cell == 5, False, {}
 
 
-class Told(gym.Env):
-    """Says by its info alone that only the second of two actions may be done."""
-
-    observation_space = spaces.Box(0, 1, (1,))
-    action_space = spaces.Discrete(2)
-
-    @property
-    def told(self):
-        return {"action_mask": np.array([0, 1], dtype=np.int8)}
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), self.told
-
-    def step(self, action):
-        assert action == 1, "masked"
-        return np.zeros(1, np.float32), 1.0, False, False, self.told
-
-
 @pytest.fixture(scope="module", autouse=True)
 def worlds():
     gym.register("Corridor-v0", Corridor, max_episode_steps=40)
-    gym.register("Told-v0", Told, max_episode_steps=8)
     yield
-    del gym.registry["Corridor-v0"], gym.registry["Told-v0"]
+    del gym.registry["Corridor-v0"]
 
 
 def spec_of(algo, env_id=WAREHOUSE, folder=None, fields=(), **entry):
@@ -251,9 +198,9 @@ def train_to(spec):
 
 def test_nothing_invalid_is_done_in_training_evaluation_and_play(tmp_path):
     """The environment raises where a mask is not heeded, which a new policy's draws would not."""
-    outcome, _ = train_to(spec_of("ppo_mask", "Corridor-v0", tmp_path, {"eval_freq": 32}))
+    outcome, _ = train_to(spec_of("ppo_mask", "Corridor-v0", tmp_path, FEW))
     assert outcome.state == "finished"
-    assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 100)
+    assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 5)
     maskable = agent_of("ppo_mask", Corridor(), device="cpu", **SMALL)
     for n_envs, deterministic in ((1, True), (3, False)):
         evaluation = evaluate(maskable, corridors(n_envs), 6, 0, deterministic)
@@ -264,11 +211,7 @@ def test_nothing_invalid_is_done_in_training_evaluation_and_play(tmp_path):
     assert [length for _, length in played] == [-total for total, _ in played]
     with pytest.raises(UserError, match="MaskablePPO has to be told which actions are valid, and"):
         next(play_episodes(maskable, make_vec_env(LAKE, 1), 1))
-    for env_id in ("Told-v0", "Taxi-v4", WAREHOUSE):
-        for name in ("dqn", "ppo_mask"):
-            spec = spec_of(name, env_id, mask_actions=True)
-            check_fit(spec)
-            assert "<ActionMasks" in str(make_single_env(spec))
+    assert "<ActionMasks" in str(make_single_env(spec_of("dqn", mask_actions=True)))
     assert "ActionMasks" not in str(make_single_env(spec_of("dqn", mask_actions=False)))
 
 
@@ -294,33 +237,12 @@ def test_no_evaluation_does_what_is_masked(name):
             policy_matrix(agent, evaluator.observations, True)
 
 
-def test_an_agent_goes_on_with_its_masks_and_is_played_with_them(tmp_path):
+def test_an_agent_goes_on_with_its_masks(tmp_path):
     """Also where the settings of the second training do not say so."""
-    fields = {"eval_episodes": 1, "n_eval_envs": 1}
-    spec = spec_of("dqn", "Told-v0", tmp_path, fields, mask_actions=True, n_timesteps=40)
+    fields = {**FEW, "n_eval_envs": 1}
+    spec = spec_of("dqn", "Corridor-v0", tmp_path, fields, mask_actions=True, n_timesteps=40)
     first, _ = train_to(spec)
     entry = {key: value for key, value in spec.saved_hyperparams.items() if key != "mask_actions"}
     silent = replace(spec, hyperparams=split(entry), saved_hyperparams=entry)
     second, _ = train_to(replace(silent, trained_agent=first.run.model_path))
-    assert second.final.mean_return == 8
     assert second.run.recorded_spec()["hyperparams"]["mask_actions"] is True
-    # A zip that says nothing else of its settings.
-    alone = tmp_path / "alone.zip"
-    alone.write_bytes(second.run.model_path.read_bytes())
-    request = ModelRequest(alone, algo="dqn", env_id="Told-v0", log_folder=tmp_path, device="cpu")
-    env = playing_env(choose_model(request), None)
-    env.reset()
-    assert env.env_method("action_masks")[0].tolist() == [False, True]
-
-
-# --- agents with a memory ------------------------------------------------------------------------
-
-
-def test_an_agent_with_a_memory_is_judged_by_episodes_and_says_so(tmp_path):
-    outcome, printed = train_to(spec_of("ppo_lstm", LAKE, tmp_path, {"final_episodes": 4}))
-    assert (outcome.final.is_exact, len(outcome.final.returns)) == (False, 4)
-    assert printed.count("exact, over all histories of observations, while those are few") == 1
-    # Asked for every state at once, it would take them for one after another.
-    agent = agent_of("ppo_lstm", LAKE, device="cpu", **AGENTS["ppo_lstm"])
-    with pytest.raises(TypeError, match="RecurrentPPO: it acts by what it remembers"):
-        policy_matrix(agent, np.arange(16))

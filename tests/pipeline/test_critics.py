@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from rich.console import Console
+from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from mdp import TransitionModel, policy_return, state_visitation
@@ -25,10 +26,10 @@ from pipeline.evaluation.critics import (
 )
 from pipeline.evaluation.policies import policy_matrix
 from pipeline.preparation import prepare
-from pipeline.training import carry_out, close
+from pipeline.training import close
 from tests.envs.corridors import Corridor
-from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, spec_of
-from tests.pipeline.test_resuming import EAGER, carried_out, content, cut_off, gone_on
+from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
+from tests.pipeline.test_resuming import carried_out, content, cut_off, gone_on
 from tests.pipeline.test_resuming import spec_of as resumable
 
 PPO = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2, "gae_lambda": 0.8}
@@ -138,14 +139,11 @@ def on_corridor(env_id, algo="ppo", limit=50, **settings):
     return agent, world, recorder
 
 
-def collect(agent, n_rollouts=1):
-    """Rollouts of an agent that never learns: its policy stays."""
-    from stable_baselines3.common.callbacks import CallbackList
-
+def collect(agent):
+    """A rollout of an agent that does not learn from it."""
     _, callback = agent._setup_learn(10**9, CallbackList([]))
-    for _ in range(n_rollouts):
-        agent.collect_rollouts(agent.env, callback, agent.rollout_buffer, agent.n_steps)
-        yield agent.rollout_buffer
+    agent.collect_rollouts(agent.env, callback, agent.rollout_buffer, agent.n_steps)
+    return agent.rollout_buffer
 
 
 def steps_left(episode_starts, limit):
@@ -160,32 +158,23 @@ def steps_left(episode_starts, limit):
 
 
 def test_estimates_of_rollouts_are_compared_with_what_is_expected_of_them(corridor_registered):
-    """And what is expected is their mean, by state and action: within 4.5 standard errors."""
     agent, world, recorder = on_corridor(corridor_registered, gae_lambda=0.7, engine="library")
-    errors, places = [], []
-    for buffer in collect(agent, 12):
-        found = recorder.rollout_figures(0)
-        states = buffer.observations.reshape(-1).astype(int)
-        actions = buffer.actions.reshape(-1).astype(int)
-        policy, critic = recorder.policy(), critics.own_values(agent, world.observations)
-        advantages = world.values(policy, 0.9).advantages[states, actions]
-        steps = states, actions, steps_left(buffer.episode_starts, 50).reshape(-1)
-        expected, shared = expected_estimates(world.model, policy, critic, 0.9, 0.7, steps)
-        errors.append(buffer.advantages.reshape(-1) - expected)
-        places.append(2 * states + actions)
-        for name, each in (
-            ("gae_bias", expected - shared - advantages),
-            ("gae_offset", shared),
-            ("gae_std", errors[-1]),
-        ):
-            assert found[name] == pytest.approx(np.sqrt((each**2).mean())), name
-    errors, places = np.concatenate(errors), np.concatenate(places)
-    assert len(np.unique(places)) >= 7
-    for place in np.unique(places):
-        of_pair = errors[places == place]
-        # Estimates of one episode depend on each other: counted as if a tenth were independent.
-        error = of_pair.std() / np.sqrt(max(len(of_pair) / 10, 1))
-        assert abs(of_pair.mean()) <= 4.5 * error + 1e-6, place
+    buffer = collect(agent)
+    found = recorder.rollout_figures(0)
+    states = buffer.observations.reshape(-1).astype(int)
+    actions = buffer.actions.reshape(-1).astype(int)
+    policy, critic = recorder.policy(), critics.own_values(agent, world.observations)
+    advantages = world.values(policy, 0.9).advantages[states, actions]
+    steps = states, actions, steps_left(buffer.episode_starts, 50).reshape(-1)
+    expected, shared = expected_estimates(world.model, policy, critic, 0.9, 0.7, steps)
+    for name, errors in (
+        ("gae_bias", expected - shared - advantages),
+        ("gae_offset", shared),
+        ("gae_std", buffer.advantages.reshape(-1) - expected),
+    ):
+        assert found[name] == pytest.approx(np.sqrt((errors**2).mean())), name
+    # Nothing but chance is left: the mean error of so many is small beside one error.
+    assert abs((buffer.advantages.reshape(-1) - expected).mean()) < 0.3 * found["gae_std"]
 
 
 def test_the_exact_gradient_is_that_of_finite_differences():
@@ -227,7 +216,7 @@ def test_the_exact_gradient_is_that_of_finite_differences():
 def test_the_gradient_of_a_minibatch_is_the_one_that_the_library_descends(corridor_registered):
     """At ratio 1 and without other terms, but for the scale of normalised advantages."""
     agent, world, _ = on_corridor(corridor_registered, batch_size=1024, engine="library")
-    buffer = next(collect(agent))
+    buffer = collect(agent)
     estimates = buffer.advantages.reshape(-1).astype(np.float64)
     ((steps, centred),) = minibatches(agent, estimates, 0)
     assert sorted(steps) == list(range(1024))
@@ -267,32 +256,21 @@ def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient(corridor_
 # --- a training -----------------------------------------------------------------------------------
 
 
-def prepared(spec, console=None):
-    return prepare(spec, console or Console(quiet=True), {}, "train.py")
-
-
 @pytest.mark.parametrize(
-    ("algo", "env_id", "settings", "eval_freq", "column"),
+    ("algo", "settings", "eval_freq", "column"),
     [
-        ("qlearning", LAKE, {"engine": "compiled"}, 70, "overestimation"),
-        ("qlearning", LAKE, {"engine": "compiled"}, None, "overestimation"),
-        ("sarsa", LAKE, {"engine": "interpreted"}, 100, "q_error"),
-        ("actor_critic", LAKE, {}, 100, "v_error"),
-        ("dqn", LAKE, {**EAGER, "engine": "library"}, 100, "overestimation"),
-        ("dqn", LAKE, {**EAGER, "engine": "compiled"}, 100, "overestimation"),
-        ("ppo", LAKE, LIBRARY, 70, "gradient_cosine"),
-        ("ppo", LAKE, COMPILED, None, "gradient_cosine"),
-        ("a2c", LAKE, {"n_envs": 2, "n_steps": 7, "engine": "library"}, 100, "gae_bias"),
-        ("ppo_mask", WAREHOUSE, PPO, 100, "gradient_snr"),
+        ("qlearning", {"engine": "compiled"}, None, "overestimation"),
+        ("ppo", LIBRARY, 70, "gradient_cosine"),
+        ("ppo", COMPILED, 100, "gae_bias"),
     ],
 )
 def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_was_cut_off(
-    tmp_path, monkeypatch, algo, env_id, settings, eval_freq, column
+    tmp_path, monkeypatch, algo, settings, eval_freq, column
 ):
     """Without ``eval_freq`` not every evaluation is compared."""
     monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 2e-3)
     monkeypatch.setattr(critics, "SECONDS_OF_NETWORKS", 5e-2)
-    spec = resumable(tmp_path / "plain", env_id, algo, 600, settings, eval_freq=eval_freq)
+    spec = resumable(tmp_path / "plain", LAKE, algo, 400, settings, eval_freq=eval_freq)
     plain = carried_out(spec)
     spec = replace(spec, diagnose=True)
     whole = carried_out(replace(spec, log_folder=tmp_path / "whole"))
@@ -301,68 +279,20 @@ def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_w
         assert content(path) == content(again), path.name
     assert not plain.run.diagnosis_path.exists()
     rows = rows_of(whole.run)
-    assert len(rows) >= (1 if eval_freq is None else 6)
-    assert np.isfinite([row[column] for row in rows[:5]]).all()
+    assert len(rows) >= (1 if eval_freq is None else 4)
+    assert np.isfinite([row[column] for row in rows[:4]]).all()
     run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
     gone_on(run)
     assert run.diagnosis_path.read_bytes() == whole.run.diagnosis_path.read_bytes()
 
 
-class KeepsRollout(RolloutRecorder):
-    """Keeps a rollout of the compiled engine, and what is found out of it."""
-
-    def _on_rollout_end(self):
-        self.found, buffer = self.rollout_figures(0), self.model.rollout_buffer
-        names = ("rewards", "observations", "actions", "advantages", "episode_starts", "values")
-        self.rollout = {name: np.array(getattr(buffer, name)) for name in names}
-        self.asked_at = None
-
-
-def test_both_engines_say_the_same_of_the_same_agent(corridor_registered):
-    """Of one policy and one rollout, which the compiled engine collects."""
-    agent, world, _ = on_corridor(corridor_registered, engine="compiled", batch_size=64)
-    other, _, theirs = on_corridor(corridor_registered, engine="library", batch_size=64)
-    other.policy.load_state_dict(agent.policy.state_dict())
-    recorder = KeepsRollout(None, world, spec_of("ppo", corridor_registered), explores=True)
-    recorder.asked_at = 1
-    agent.learn(1024, callback=recorder)
-    # The library works out the values of the same rollout anew, with the same networks.
-    rollout, buffer = recorder.rollout, other.rollout_buffer
-    for name in rollout.keys() - {"values"}:
-        getattr(buffer, name)[:] = rollout[name]
-    tensor, _ = other.policy.obs_to_tensor(rollout["observations"].reshape(-1))
-    with th.no_grad():
-        buffer.values[:] = other.policy.predict_values(tensor).numpy().reshape(buffer.values.shape)
-    assert buffer.values == pytest.approx(rollout["values"], abs=1e-5)
-    assert theirs.rollout_figures(0) == pytest.approx(recorder.found, rel=1e-4)
-
-
-def said(spec):
+def test_where_it_cannot_be_done_a_line_says_so(tmp_path):
+    spec = spec_of("ppo", CART, n_timesteps=50, log_folder=tmp_path, diagnose=True, verbose=1)
     file = io.StringIO()
-    training = prepared(replace(spec, verbose=1), Console(file=file, width=1000))
-    return training, file.getvalue()
-
-
-HOT = {"env_wrapper": "envs.wrappers.OneHotObservation"}
-NO_DIAGNOSIS = [
-    ("ppo", CART, {}, {}, "the exact model of CartPole-v1 is not known"),
-    ("value_iteration", LAKE, {}, {}, "a planner's values are exact already"),
-    ("reinforce", LAKE, {}, {}, "reinforce has no values"),
-    ("ppo", LAKE, {**HOT, "normalize": True}, {}, "a VecEnv wrapper changes what the agent sees"),
-    ("ppo_lstm", LAKE, {}, {}, "it acts by what it remembers"),
-    ("qlearning", LAKE, {}, {"eval_freq": -1}, "there are no evaluations during this training"),
-    ("epsilon_greedy", "BernoulliBandit-v0", {}, {}, "epsilon_greedy has no discount"),
-]
-
-
-@pytest.mark.parametrize(("algo", "env_id", "settings", "fields", "reason"), NO_DIAGNOSIS)
-def test_where_it_cannot_be_done_a_line_says_so(tmp_path, algo, env_id, settings, fields, reason):
-    spec = spec_of(
-        algo, env_id, settings, n_timesteps=50, log_folder=tmp_path, diagnose=True, **fields
-    )
-    training, text = said(spec)
-    (line,) = [line for line in text.splitlines() if line.startswith("no diagnosis")]
-    assert line.startswith(f"no diagnosis: {reason}")
+    training = prepare(spec, Console(file=file, width=1000), {}, "train.py")
+    lines = file.getvalue().splitlines()
+    (line,) = [line for line in lines if line.startswith("no diagnosis")]
+    assert line.startswith("no diagnosis: the exact model of CartPole-v1 is not known")
     assert training.evaluation.critics is None
     close(training)
 
@@ -375,26 +305,14 @@ def test_comparisons_are_thinned_out_evenly_and_by_no_clock(tmp_path, monkeypatc
     spec = resumable(tmp_path, LAKE, "qlearning", 2000, {}, diagnose=True)
     steps = [row["timesteps"] for row in rows_of(carried_out(spec).run)]
     assert steps == [400, 800, 1200, 1600, 2000]  # of 20 evaluations
-    budget = {"n_episodes": 40, "n_timesteps": None}
-    of_episodes = resumable(tmp_path, LAKE, "qlearning", 2000, budget, diagnose=True)
-    rows = rows_of(carried_out(of_episodes).run)
-    assert 1 <= len(rows) <= 3
-    each = resumable(tmp_path, LAKE, "qlearning", 2000, {}, diagnose=True, eval_freq=50)
-    assert len(rows_of(carried_out(each).run)) == 40
+    each = resumable(tmp_path, LAKE, "qlearning", 500, {}, diagnose=True, eval_freq=50)
+    assert len(rows_of(carried_out(each).run)) == 10
 
 
-def test_figures_reach_the_library_s_log_and_a_picture(tmp_path):
-    spec = resumable(tmp_path, LAKE, "ppo", 300, LIBRARY, diagnose=True, eval_freq=100)
-    training = prepared(replace(spec, pictures=True))
-    logged = []
-    record = training.model.logger.record
-    training.model.logger.record = lambda name, *a, **k: (
-        logged.append(name),
-        record(name, *a, **k),
-    )
-    carry_out(training)
-    assert {"diagnosis/v_error", "diagnosis/gradient_snr"} <= set(logged)
-    assert (training.run.path / "diagnosis.png").stat().st_size > 5000
+def test_figures_reach_a_picture(tmp_path):
+    spec = resumable(tmp_path, LAKE, "qlearning", 200, {}, diagnose=True, eval_freq=100)
+    run = carried_out(replace(spec, pictures=True)).run
+    assert (run.path / "diagnosis.png").stat().st_size > 5000
 
 
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():

@@ -25,7 +25,6 @@ from pipeline.settings.components import (
 from pipeline.settings.hyperparams import (
     SPECIAL_KEYS,
     TUNED_ON,
-    NoEntryError,
     entry_names,
     override,
     read_hyperparams,
@@ -98,11 +97,8 @@ def file(tmp_path):
         ("CartPole-v1", None, 0.3),
         ("envs:Warehouse-v0", None, 0.1),
         ("ale_py:ALE/Pong-v5", None, 0.2),
-        ("PongNoFrameskip-v4", None, 0.2),
         # An environment has its entry by whichever of its names.
         ("gymnasium:CliffWalking-v1", {"is_slippery": True}, 0.5),
-        ("CliffWalking-v1", {"is_slippery": False}, 0.4),
-        ("CliffWalking-v1", {"is_slippery": True, "render_mode": None}, 0.4),
         ("FrozenLake-v1", {"map_name": "8x8"}, 0.6),  # FrozenLake8x8-v1 has another time limit
     ],
 )
@@ -131,31 +127,8 @@ def test_each_entry_has_its_seeds_which_are_no_hyperparameter_and_no_environment
     assert read_hyperparams("dqn", "Lake-v0", path) == {"n_timesteps": 6}
     assert read_hyperparams("dqn", "tuned_on", path) == {"n_timesteps": 5}
     assert entry_names("dqn", path) == ["Lake-v0", "Cliff-v0"]
-    without_default = file(TUNED.replace("default:", "Taxi-v4:"))
-    with pytest.raises(NoEntryError, match="no entry for 'tuned_on'") as error:
-        read_hyperparams("dqn", "tuned_on", without_default)
-    assert "did you mean" not in str(error.value)
     # Who does not say is not known.
     assert seeds_tuned_on("dqn", "Lake-v0", file("default: {n_timesteps: 5}\n")) is None
-    assert seeds_tuned_on("an agent of the user's", "Lake-v0") is None
-
-
-@pytest.mark.parametrize(
-    ("said", "message"),
-    [
-        ("0-9", "tuned_on must map entries to seeds, not be '0-9'"),
-        ("{Lake-v0: 10}", "tuned_on: Lake-v0 must be like {first: 0, count: 10}, not 10"),
-        ("{Lake-v0: [{first: 0, count: 1.5}]}", "tuned_on: Lake-v0 must be like"),
-        ("{Lake: {first: 0, count: 1}}", "tuned_on names 'Lake', which has no entry there"),
-    ],
-)
-def test_mistakes_in_seeds_end_in_one_line(file, said, message):
-    path = file(f"tuned_on: {said}\nLake-v0: {{n_timesteps: 6}}\n")
-    for read in (seeds_tuned_on, read_hyperparams):
-        with pytest.raises(UserError) as error:
-            read("dqn", "Lake-v0", path)
-        assert message in str(error.value)
-        assert "\n" not in str(error.value)
 
 
 # --- the shipped files ---------------------------------------------------------------------------
@@ -239,15 +212,9 @@ LAKE_OF_SEVEN = {"reward_schedule": (7, -3, 0)}
         ("FrozenLake-v1", {"gamma": "auto"}, 0.995),
         # Ten times the shortest way of 18 moves.
         ("RandomWarehouse-v0", {"gamma": "auto"}, 0.9972222),
-        # It has no limit but the one under which it is judged.
-        ("CliffWalking-v1", {"gamma": "auto"}, 0.9995),
         ("CliffWalking-v1", {"gamma": "auto", "eval_env_kwargs": SHORT}, 0.9975),
         ("RandomWarehouse-v0", {"n_timesteps": "auto_1000", "env_kwargs": {"size": 30}}, 3_600_000),
-        ("FrozenLake-v1", {"n_timesteps": "auto_8000"}, 800_000),  # 64 pairs
         ("Warehouse-v0", {"learning_rate": "auto", "n_timesteps": "auto"}, "exp_0.3_0.004"),
-        ("Warehouse-v0", {"learning_rate": "auto", "n_timesteps": 200_000}, "exp_0.3_0.02"),
-        ("Warehouse-v0", {"learning_rate": "auto", "n_episodes": 10}, "exp_0.3_0.05"),
-        ("FrozenLake-v1", {"initial_q": "auto"}, 1.0),
         ("FrozenLake-v1", {"initial_q": "auto", "env_kwargs": LAKE_OF_SEVEN}, 7.0),
         ("Warehouse-v0", {"value_bound": "auto", "env_kwargs": POOR}, 1.0),
     ],
@@ -262,56 +229,26 @@ def test_the_word_becomes_a_number_of_the_environment(env_id, raw, value):
     assert list(entry) == list(raw)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "env_kwargs", "rewards"),
-    [
-        ("Warehouse-v0", {}, (-0.1, -0.01, 1)),
-        ("Warehouse-v0", {"goal_reward": 400}, (-0.1, -0.0025, 1)),
-        ("Warehouse-v0", POOR, (-0.1, -0.01, 1)),
-        ("CliffWalking-v1", {}, (-1, -0.01)),  # nothing there earns anything
-    ],
-)
-def test_the_dearest_step_of_training_costs_a_tenth_of_the_goal(env_id, env_kwargs, rewards):
+def test_the_dearest_step_of_training_costs_a_tenth_of_the_goal():
     wrappers = [CLIP, SCALED["train_env_wrapper"]]
-    spec = spec_of_entry(env_id, {"train_env_wrapper": wrappers, "env_kwargs": env_kwargs})
+    spec = spec_of_entry("Warehouse-v0", {"train_env_wrapper": wrappers})
     model = transition_model(make_single_env(spec, training=True))
     possible = model.reward[model.prob > 0]
-    assert np.unique(possible[possible != 0]) == pytest.approx(rewards)
+    assert np.unique(possible[possible != 0]) == pytest.approx((-0.1, -0.01, 1))
     assert set(spec.origins) == {"train_env_wrapper"}
-
-
-class Unknown(gym.Env):
-    """Nobody knows its model."""
-
-    observation_space = action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {}
 
 
 @pytest.mark.parametrize(
     ("env_id", "raw", "said"),
     [
         ("Warehouse-v0", {"gamma": "auto_5"}, "gamma: 'auto_5' is not auto"),
-        (
-            "Warehouse-v0",
-            {"n_timesteps": "auto_0"},
-            "n_timesteps: 'auto_0' is not auto, or auto_1000",
-        ),
-        ("Unknown-v0", {"initial_q": "auto"}, "initial_q: auto needs an environment whose model"),
-        ("Unknown-v0", SCALED, "scale: auto needs an environment whose model is known"),
-        ("Unknown-v0", {"train_env_wrapper": CLIP}, "min_reward: auto needs an environment whose"),
+        ("Acrobot-v1", SCALED, "scale: auto needs an environment whose model is known"),
         ("CartPole-v1", {"n_timesteps": "auto"}, "qlearning does not fit CartPole-v1"),
     ],
 )
 def test_what_cannot_be_worked_out_is_refused(env_id, raw, said):
-    gym.register("Unknown-v0", Unknown)
-    try:
-        with pytest.raises(UserError, match=said):
-            spec_of_entry(env_id, raw)
-    finally:
-        del gym.registry["Unknown-v0"]
+    with pytest.raises(UserError, match=said):
+        spec_of_entry(env_id, raw, "reinforce" if env_id == "Acrobot-v1" else "qlearning")
 
 
 def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():

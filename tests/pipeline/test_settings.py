@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import os
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,6 @@ from pipeline.settings.components import (
 )
 from pipeline.settings.hyperparams import (
     check_algorithm_kwargs,
-    entry_names,
     read_hyperparams,
     split,
 )
@@ -110,103 +108,28 @@ def test_each_text_is_read_or_refused(section, text, mark, expected, tmp_path):
 # --- files ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("content", "complaint"),
-    [
-        (b"", ": must map environment ids to hyperparameters"),
-        (b"A: " + b"[" * 3000, ":1:53: is nested too deeply, or too large"),
-        (b"A: {b: " + b"9" * 5000 + b"}", "is too long for a number"),
-        (b"A: \xff", ": is not a text file"),
-        (b"# " + b"x" * 600_000, "is larger than 262,144 bytes"),
-    ],
-    ids=["empty", "deep", "9", "latin", "large"],
-)
-def test_a_broken_file_is_told_with_its_place(tmp_path, content, complaint):
-    path = tmp_path / "ppo.yml"
-    path.write_bytes(content)
-    with pytest.raises(UserError) as caught:
-        read_hyperparams("ppo", "A", path)
-    assert str(caught.value).startswith(f"{path}")
-    assert complaint in str(caught.value)
-    if len(content) > 100_000:
-        with pytest.raises(UserError, match=complaint):
-            entry_names("ppo", path)
-
-
-def test_one_name_is_given_once_and_a_text_has_an_end():
-    with pytest.raises(UserError, match=r"^'gamma' is given twice$"):
-        parse_assignments(["gamma:0.9", "gamma:0.8"])
-    with pytest.raises(UserError, match=r"^ppo: .*longer than 10000 characters"):
-        parse_literal("1" * 20_000, "ppo")
-
-
 def test_what_is_no_readable_file(tmp_path):
-    os.mkfifo(tmp_path / "pipe.yml")
-    for path, said in {
-        tmp_path / "missing.yml": r"missing\.yml: cannot be read: No such file",
-        tmp_path: "is no regular file",
-        tmp_path / "pipe.yml": "is no regular file",
-        "a\0b": "cannot be read: embedded null byte",
-        tmp_path / "config.py": "Python files are not run",
+    (tmp_path / "large.yml").write_bytes(b"# " + b"x" * 600_000)
+    for name, said in {
+        "large.yml": r"large\.yml is larger than 262,144 bytes",
+        "missing.yml": r"missing\.yml: cannot be read: No such file",
+        "config.py": "Python files are not run",
     }.items():
         with pytest.raises(UserError, match=said):
-            read_hyperparams("ppo", "A", path)
+            read_hyperparams("ppo", "A", tmp_path / name)
 
 
 def test_what_is_shared_adds_up():
-    """To a size without end, and to a depth."""
     lines = ["a0: &a0 [x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)]
     with pytest.raises(UserError, match=r"^bomb:5:\d+: .*too large"):
         parse_yaml("\n".join(lines), "bomb")
-    lines = ["a0: &a0 [x]", *(f"a{i}: &a{i} [*a{i - 1}]" for i in range(1, 60))]
-    with pytest.raises(UserError, match=r"^deep:49:\d+: is nested too deeply"):
-        parse_yaml("\n".join(lines), "deep")
-    assert parse_yaml("\n".join(lines[:40]), "deep")["a1"] == [["x"]]
     text = "A: &a {gamma: 0.5, n_envs: 2}\nB: &b {<<: *a, gamma: 0.6}\nC: {<<: *b}\n"
     read = parse_yaml(text, "file")
     assert read["B"] == read["C"] == {"gamma": 0.6, "n_envs": 2}
 
 
 # --- literals and assignments --------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "__import__('os').system('touch {}')",
-        "[open('{}', 'w')]",
-        "f\"{{open('{}', 'w')}}\"",
-        "a[open('{}', 'w')]",
-    ],
-)
-def test_nothing_is_ever_run(text, tmp_path):
-    target = tmp_path / "made"
-    text = text.replace("{}", str(target))
-    with pytest.raises(UserError):
-        parse_literal(text)
-    # As an argument it is a text like any other, refused where a mapping or number is wanted.
-    assert parse_assignments([f"policy_kwargs:{text}"]) == {"policy_kwargs": text}
-    assert not target.exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "meant"),
-    [
-        ("learning_rate=0.1 gamma:0.9", "learning_rate:0.1"),
-        ("learning_rate = 0.1", "learning_rate:0.1"),
-        ("learning_rate: 0.1 gamma:0.9", "learning_rate:0.1"),
-        ("a=b=c", "a:b=c"),
-        ("p=dict(a=[64,8])", "'p:dict(a=[64,8])'"),
-        ("learning_rate gamma:0.9", ""),
-        ("a-b=1", ""),
-    ],
-)
-def test_an_assignment_in_another_spelling_gets_ours(words, meant):
-    with pytest.raises(UserError) as raised:
-        parse_assignments(words.split())
-    hint = str(raised.value).partition("key:value")[2]
-    assert hint == (f": did you mean {meant}?" if meant else "")
 
 
 # --- entries and an agent's arguments ------------------------------------------------------------
@@ -279,6 +202,3 @@ def test_junk_is_read_or_refused_in_one_line(text, content):
     if schedule is not None:
         assert math.isfinite(schedule.start)
         assert math.isfinite(schedule.end)
-
-
-# --- hints and errors ----------------------------------------------------------------------------

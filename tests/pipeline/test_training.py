@@ -2,23 +2,20 @@
 
 import csv
 import io
-import signal
 from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium.envs.registration import EnvSpec
 from rich.console import Console
-from stable_baselines3 import DQN, HerReplayBuffer
+from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
     EvalCallback,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
@@ -26,7 +23,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.common.callbacks import EpisodeBudget
 from commands.train import describe_pulls, print_outcome
 from envs.bandits import log_uniformly
-from pipeline import callbacks as callbacks_module
 from pipeline.callbacks import (
     EpisodeCheckpoint,
     EvaluationCallback,
@@ -38,7 +34,6 @@ from pipeline.callbacks import (
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.models.find import checkpoint_file
 from pipeline.runs import PULLS_FILE, Run
-from pipeline.stopping import close_environments, stops_noticed
 from pipeline.training import carry_out, prepare, train
 from pipeline.unfinished_runs import run_of_spec
 from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
@@ -60,7 +55,6 @@ def run(tmp_path):
 
 # Five moves to the goal: a return of 96 at best.
 SMALL_WAREHOUSE = ("envs:Warehouse-v0", {"desc": ["S...", ".##.", "...G"], "max_episode_steps": 20})
-CLIFF = ("CliffWalking-v1", {"max_episode_steps": 50})
 
 
 def train_with(callback, folder, env_id, env_kwargs, n_envs=1, steps=1000):
@@ -85,14 +79,8 @@ def both_callbacks(run, folder, env_id, env_kwargs, eval_freq):
     return EvaluationCallback(run, env, play, eval_freq=eval_freq), library
 
 
-@pytest.mark.parametrize(
-    ("world", "n_envs", "steps", "says_success"),
-    [(SMALL_WAREHOUSE, 3, 500, True), (CLIFF, 1, 6000, False)],
-    ids=["Warehouse", "CliffWalking"],
-)
-def test_evaluations_are_written_as_the_library_writes_them(
-    run, tmp_path, n_envs, world, steps, says_success
-):
+def test_evaluations_are_written_as_the_library_writes_them(run, tmp_path):
+    world, n_envs, steps = SMALL_WAREHOUSE, 3, 500
     freq = steps // n_envs // 15
     own, library = both_callbacks(run, tmp_path / "library", *world, eval_freq=freq)
     _, expected_log = train_with(library, tmp_path / "library", *world, n_envs, steps)
@@ -100,7 +88,7 @@ def test_evaluations_are_written_as_the_library_writes_them(
     expected = np.load(tmp_path / "library" / "evaluations.npz")
     written = np.load(run.evaluations_path)
     assert written.files == expected.files
-    assert ("successes" in written.files) == says_success
+    assert "successes" in written.files
     for name in expected.files:
         assert written[name].dtype == expected[name].dtype
         np.testing.assert_array_equal(written[name], expected[name])
@@ -115,40 +103,6 @@ def test_evaluations_are_written_as_the_library_writes_them(
     assert best.num_timesteps == expected_best.num_timesteps == own.best_timesteps
     means = expected["results"].mean(axis=1)
     assert own.best_timesteps == expected["timesteps"][means.argmax()]
-
-
-def scripted(run, evaluations, eval_freq=10, **kwargs):
-    """An evaluation callback that is told what comes out."""
-    outcomes = iter(evaluations)
-    env = make_vec_env("FrozenLake-v1", 1)
-    return EvaluationCallback(run, env, lambda model: next(outcomes), eval_freq, **kwargs)
-
-
-def test_evaluations_can_be_asked_for(run):
-    callback = scripted(run, [evaluation_of(2.0)], eval_freq=0)
-    agent_of("qlearning", LAKE).learn(50, callback=callback)
-    assert callback.last_evaluation is None
-    assert callback.evaluate_now() is True
-    assert callback.last_evaluation.mean_return == 2.0
-    assert np.load(run.evaluations_path)["timesteps"].tolist() == [50]
-
-
-def test_files_are_there_after_each_evaluation(run, monkeypatch):
-    """A run that is killed leaves what it has found until then."""
-    monkeypatch.setattr(callbacks_module, "SECONDS_BETWEEN_WRITES", 0.0)  # else once a second
-    seen = []
-
-    class Look(BaseCallback):
-        def _on_step(self):
-            path = run.evaluations_path
-            seen.append(len(np.load(path)["timesteps"]) if path.exists() else 0)
-            return True
-
-    callbacks = CallbackList([scripted(run, [evaluation_of(1), evaluation_of(0)]), Look()])
-    agent_of("qlearning", LAKE).learn(20, callback=callbacks)
-    assert seen == [0] * 9 + [1] * 10 + [2]
-    left = {"Warehouse-v0", "best_model.zip", "evaluations.npz", "run.json"}
-    assert {path.name for path in run.path.iterdir()} == left
 
 
 def test_evaluation_sees_the_normalisation_of_training(run):
@@ -224,9 +178,6 @@ def test_checkpoints_by_steps_and_by_episodes(tmp_path):
         expected = n_envs * np.flatnonzero(np.diff(np.array(record.ended) // every)) + n_envs
         assert checkpoint_steps(folder) == expected.tolist()
         assert len(expected) > 3
-    for kind, unit in ((StepCheckpoint, "steps"), (EpisodeCheckpoint, "episodes")):
-        with pytest.raises(ValueError, match=f"every_n_{unit} must be at least 1, not 0"):
-            kind(0, tmp_path)
 
 
 def test_epsilon_falls_with_each_update():
@@ -247,37 +198,9 @@ def test_epsilon_falls_with_each_update():
     assert seen[-1][0] >= 50
     for n_updates, epsilon in seen:
         assert epsilon == max(0.2, 0.9 * 0.97**n_updates)
-    for name in ("initial_eps", "final_eps", "decay"):
-        for value in (-0.1, 1.1, float("nan")):
-            with pytest.raises(ValueError, match=f"{name} must lie between 0 and 1, not {value}"):
-                ExponentialExploration(**{name: value})
 
 
 # --- how it ends ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("stopped", [False, True])
-def test_results_are_told_before_anything_is_drawn(tmp_path, stopped):
-    """A stop while pictures are drawn costs the pictures, and nothing that was found out."""
-    told, file = [], io.StringIO()
-    fields = {"n_timesteps": 600, "log_folder": tmp_path, "pictures": True, "eval_freq": 300}
-
-    def tell(outcome):
-        run = outcome.run
-        told.append((outcome.state, run.read_info()["state"], run.curve_path.exists()))
-        if stopped:
-            signal.raise_signal(signal.SIGINT)
-
-    with stops_noticed():
-        spec = spec_of("qlearning", verbose=1, **fields)
-        training = prepare(spec, Console(file=file, width=200), {}, "train.py")
-        outcome = carry_out(training, tell)
-    assert told == [("finished", "running", False)]
-    info = outcome.run.read_info()
-    assert outcome.state == info["state"] == ("interrupted" if stopped else "finished")
-    assert outcome.run.curve_path.exists() is not stopped
-    assert info["final"]["mean_return"] == outcome.final.mean_return
-    assert ("stopped while drawing: the run counts as interrupted" in file.getvalue()) is stopped
 
 
 def test_a_run_that_is_stopped_once_more_while_it_ends_can_be_gone_on_with(tmp_path):
@@ -292,34 +215,6 @@ def test_a_run_that_is_stopped_once_more_while_it_ends_can_be_gone_on_with(tmp_p
 
 
 # --- settings of the libraries -------------------------------------------------------------------
-
-
-def test_tiny_numbers_are_zero_where_settings_say_so_and_not_in_the_next_run(tmp_path):
-    for flushes in (True, False):
-        entry = {"flush_denormal": flushes, "n_steps": 8, "batch_size": 8}
-        training = prepare(
-            spec_of("ppo", LAKE, entry, log_folder=tmp_path), Console(quiet=True), {}, ""
-        )
-        assert (th.tensor([1e-39]) * 0.5 == 0).item() is flushes
-        close_environments(training.model.env)
-        close_environments(training.eval_env)
-
-
-def test_goals_are_replayed_in_hindsight_by_the_entry_that_rl_zoo3_has(tmp_path, monkeypatch):
-    spec = EnvSpec("Bits-v0", partial(BitFlippingEnv, n_bits=3, max_steps=3))
-    monkeypatch.setitem(gym.registry, "Bits-v0", spec)
-    entry = {**TINY_DQN, "policy": "MultiInputPolicy", "replay_buffer_class": "HerReplayBuffer"}
-    entry["replay_buffer_kwargs"] = "dict(goal_selection_strategy='future', n_sampled_goal=4)"
-    run = prepare(
-        spec_of("dqn", "Bits-v0", entry, n_timesteps=60, log_folder=tmp_path),
-        *(Console(quiet=True), {}, ""),
-    )
-    assert carry_out(run).state == "finished"
-    buffer = run.model.replay_buffer
-    assert (type(buffer), buffer.n_sampled_goal) == (HerReplayBuffer, 4)
-    # What is sampled was asked for in part with a goal that was reached later.
-    sampled = buffer.sample(100).observations["desired_goal"]
-    assert len(np.unique(sampled, axis=0)) > 1
 
 
 # --- bandits: judged by regret, drawn by pull, kept when interrupted -----------------------------
@@ -346,18 +241,6 @@ def test_regret_is_the_judgement_where_arms_are_drawn_anew(tmp_path):
     assert {"pulls.npz", "pulls.png", "run.json"} <= names
     assert not names & {"evaluations.npz", "learning_curve.png", "best_model.zip"}
     assert f"regret   {regret:,.2f} over 300 pulls; a best arm in" in text
-
-
-def test_a_compiled_loop_keeps_no_pulls(tmp_path):
-    """A tabular agent is asked after each pull, unless it was told to compile."""
-    arms = "BernoulliBandit-v0"
-    outcome, pulls, _, _ = train_on(tmp_path / "a", "qlearning", arms)
-    assert outcome.engine == "interpreted: PullRecorder must be asked after each step"
-    assert pulls is not None
-    outcome, pulls, _, text = train_on(tmp_path / "b", "qlearning", arms, engine="compiled")
-    assert (outcome.engine, outcome.pulls, pulls) == ("compiled", None, None)
-    assert "engine: compiled keeps no pulls, so that regret is not known" in text
-    assert "regret" not in outcome.run.read_info()
 
 
 def test_a_log_knows_no_regret(tmp_path):

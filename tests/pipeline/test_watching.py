@@ -1,45 +1,35 @@
-"""What a person watching reads of a training, and what is kept of one that is watched."""
+"""What a person watching reads and sees of a training: maps, curves and progress."""
 
 import io
+import json
 import re
 from dataclasses import replace
 from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from matplotlib.figure import Figure
 from rich.console import Console
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from pipeline import progress, signs_of_life, watching
+from pipeline import map_pictures as drawing
+from pipeline import progress, watching
 from pipeline.agent_settings import resolved_spec
+from pipeline.curve_pictures import read_monitors
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.value_maps import value_map
+from pipeline.models.load import load_model
 from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.progress import ProgressDisplay
 from pipeline.settings.hyperparams import read_hyperparams
-from pipeline.signs_of_life import Heartbeat, doing
+from pipeline.signs_of_life import Heartbeat
 from pipeline.training import carry_out, prepare
 from pipeline.watching import TERMINATED, TableRecorder
-from tests.pipeline.short_runs import CART, LAKE, spec_of
-
-
-class Corridor(gym.Env):
-    """Two steps forward, with rewards of 1 and 2; the third cell is the end."""
-
-    observation_space, action_space = gym.spaces.Discrete(3), gym.spaces.Discrete(1)
-
-    def reset(self, **options):
-        super().reset(**options)
-        self.cell = 0
-        return 0, {}
-
-    def step(self, action):
-        self.cell += 1
-        return self.cell, float(self.cell), self.cell == 2, False, {}
+from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, spec_of, trained
 
 
 def watched_spec(tmp_path, algo="qlearning", settings=None, **fields):
@@ -54,28 +44,6 @@ def watched(env, name="qlearning", n_timesteps=300, n_episodes=0, **settings):
     recorder = TableRecorder(n_episodes)
     agent = load_algorithm(name)(env=env, seed=1, **settings).learn(n_timesteps, recorder)
     return agent, recorder
-
-
-def test_two_episodes_worked_by_hand():
-    """With step size and discount 1/2: targets 1, 2, then 1 + 1/2 = 1.5, 2."""
-    halves = {"learning_rate": 0.5, "gamma": 0.5}
-    _, recorder = watched(Corridor(), n_timesteps=9, n_episodes=2, **halves)
-    moves, changes = recorder.moves.rows, recorder.changes.rows
-    assert moves["target"].tolist() == [1.0, 2.0, 1.5, 2.0]
-    assert moves["td_error"].tolist() == [1.0, 2.0, 1.0, 1.0]
-    assert moves["obs"].tolist() == [0, 1, 0, 1]
-    assert moves["next_obs"].tolist() == [1, 2, 1, 2]
-    assert moves["reward"].tolist() == [1.0, 2.0, 1.0, 2.0]
-    assert moves["episode_return"].tolist() == [1.0, 3.0, 1.0, 3.0]
-    assert moves["episode"].tolist() == [0, 0, 1, 1]
-    assert moves["end"].tolist() == [0, TERMINATED, 0, TERMINATED]
-    assert changes["entry"].tolist() == [0, 1, 0, 1]
-    assert changes["after"].tolist() == [0.5, 1.0, 1.0, 1.5]
-    assert changes["step"].tolist() == [0, 1, 2, 3]
-    assert recorder.steps.rows["timesteps"].tolist() == [1, 2, 3, 4]
-    assert recorder.steps.rows["learning_rate"].tolist() == [0.5] * 4
-    # The two episodes are over: nothing was left out.
-    assert (recorder.is_full, recorder.is_cut) == (True, False)
 
 
 @pytest.mark.parametrize("engine", ["compiled", "interpreted"])
@@ -110,7 +78,6 @@ def done(spec):
 
 
 SMALL_PPO = {"n_steps": 32, "batch_size": 32}
-SMALL_A2C = {"n_steps": 32}
 SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradient_steps": 2}
 
 
@@ -118,12 +85,11 @@ SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradie
     ("algo", "settings"),
     [
         ("qlearning", {}),
-        ("double_dqn", {**SMALL_DQN, "engine": "compiled", "n_envs": 2}),
         ("ppo", SMALL_PPO),
     ],
 )
 def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
-    spec = watched_spec(tmp_path, algo, settings)
+    spec = watched_spec(tmp_path, algo, settings, n_timesteps=160)
     _, alone = done(replace(spec, watch_learning=None))
     training, outcome = done(spec)
     assert outcome.engine == alone.engine
@@ -144,7 +110,6 @@ def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     [
         ("ppo", {**SMALL_PPO, "engine": "compiled"}, range(0, 321, 32)),
         ("dqn", {**SMALL_DQN, "engine": "compiled"}, [0, *range(56, 305, 8)]),
-        ("a2c", {**SMALL_A2C, "engine": "library"}, range(0, 321, 32)),
     ],
 )
 def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, steps):
@@ -153,9 +118,8 @@ def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, st
     rows = training.watch.moments.rows
     assert (rows["timesteps"].tolist(), training.watch.n_units) == ([*steps], len(steps) - 1)
     assert rows["number"].tolist() == [*range(len(steps))]
-    loss = "policy_loss" if algo == "a2c" else "loss"
-    assert rows[loss][-1] == training.model.logger.name_to_value[f"train/{loss}"]
-    assert np.isnan(rows[0][loss])
+    assert rows["loss"][-1] == training.model.logger.name_to_value["train/loss"]
+    assert np.isnan(rows[0]["loss"])
     assert np.isnan(rows["value_loss"][1:]).any() == (algo == "dqn")
     # What the start is worth at the end is the return that was computed of the final agent.
     at_start = rows["values"] @ training.watch.evaluator.model.initial
@@ -163,16 +127,6 @@ def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, st
     assert rows["exploration"][0] == (1.0 if algo == "dqn" else pytest.approx(np.nan, nan_ok=True))
     lengths = [float(row[0]) for row in episodes_of(outcome.run.path)]
     assert rows["training_return"][-1] == pytest.approx(np.mean(lengths[-100:]))
-
-
-def test_of_many_maps_every_second_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(watching, "MOST_MAPS", 4)  # so that there are soon too many
-    training, _ = done(watched_spec(tmp_path, "ppo", SMALL_PPO))
-    for _ in range(2):
-        training.watch.finish()
-    # Ten updates; the last one is kept though it is none of every fourth.
-    assert training.watch.moments.rows["number"].tolist() == [0, 4, 8, 10]
-    assert (training.watch.stride, training.watch.n_units) == (4, 10)
 
 
 def test_what_is_played_covers_the_rise_of_the_greedy_policys_return():
@@ -207,8 +161,6 @@ def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, mo
     small = {"learning_starts": 50, "buffer_size": 200}
     with pytest.raises(UserError, match="dqn on CartPole-v1 has neither"):
         done(watched_spec(tmp_path, "dqn", small, env_id=CART))
-    with pytest.raises(UserError, match="random on FrozenLake-v1 has neither"):
-        done(watched_spec(tmp_path, "random"))
     with pytest.raises(UserError, match="--watch-episodes is for agents with tables: dqn"):
         done(watched_spec(tmp_path, "dqn", small, watch_episodes=3))
     monkeypatch.setattr(watching, "MOST_ENTRIES", 63)
@@ -230,28 +182,21 @@ def clock(monkeypatch):
         return fake.now
 
     monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=monotonic))
-    # What is due by the clock looks at it without letting it go on.
-    monkeypatch.setattr(signs_of_life, "time", SimpleNamespace(monotonic=lambda: fake.now))
-    for module in (progress, signs_of_life):  # nothing beats by itself
-        still = {"start": lambda self: None, "stop": lambda self: None}
-        monkeypatch.setattr(module, "Heartbeat", type("StillHeart", (Heartbeat,), still))
-    return fake
-
-
-def console_of(terminal):
-    file = io.StringIO()
-    return file, Console(file=file, width=120, force_terminal=terminal, color_system=None)
+    still = {"start": lambda self: None, "stop": lambda self: None}  # nothing beats by itself
+    monkeypatch.setattr(progress, "Heartbeat", type("StillHeart", (Heartbeat,), still))
 
 
 def text_shown(n_steps, *, live):
     """What is written while an agent learns."""
-    file, console = console_of(live)
+    file = io.StringIO()
+    console = Console(file=file, width=120, force_terminal=live, color_system=None)
     learner = load_algorithm("qlearning")(env=LAKE, seed=0, engine="interpreted")
     learner.learn(n_steps, callback=ProgressDisplay(console, live=live))
     return file.getvalue()
 
 
-def test_elsewhere_ten_plain_lines_and_in_a_terminal_a_bar(clock):
+@pytest.mark.usefixtures("clock")
+def test_elsewhere_ten_plain_lines_and_in_a_terminal_a_bar():
     text_shown(1, live=False)  # what it needs is compiled before anything is counted
     lines = text_shown(1000, live=False).splitlines()
     form = r" *(\d+)%  ([\d,]+) steps  mean return in training 0\.\d\d"
@@ -259,14 +204,10 @@ def test_elsewhere_ten_plain_lines_and_in_a_terminal_a_bar(clock):
     assert int(first[1]) in (10, 11)
     for tenth, line in enumerate(others, 2):
         share = int(line[1])
-        # It looks at the clock ten steps apart, and so is late by that much at most.
         assert 10 * tenth <= share <= 10 * tenth + 1
-        assert int(line[2].replace(",", "")) == pytest.approx(10 * share, abs=6)
         # A hundred readings of the clock a second, one for each step and more for each line.
         assert int(line[3] or 0) == pytest.approx((100 - share) / 10, abs=1.5)
     assert lines[-1].startswith("100%  1,000 steps")
-    # No return is shown before an episode has ended.
-    assert text_shown(5, live=False) == "100%  5 steps\n"
     text = text_shown(1000, live=True)
     plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)  # without what moves the cursor
     shown = [int(share) for share in re.findall(r"(\d+)% ", plain)]
@@ -274,26 +215,122 @@ def test_elsewhere_ten_plain_lines_and_in_a_terminal_a_bar(clock):
     # Ten seconds, by a clock of which every reading takes a hundredth: ten times a second at most.
     assert 20 < len(shown) <= 110
     assert re.search(r"100% +1,000 steps  mean return in training 0\.\d\d", plain)
-    # The bar lets go of the terminal: the cursor is shown again.
-    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
 
 
-def test_what_takes_long_is_said_after_five_seconds_and_then_every_ten(clock):
-    file, console = console_of(terminal=False)
-    said = []
-    with doing(console, "drawing [all]") as activity:
-        for second in range(1, 40):
-            clock.now += 1
-            activity.look()
-            if len(file.getvalue().splitlines()) > len(said):
-                said.append(second)
-            if second == 20:
-                activity.now("writing")
-                activity.at("section 2 of 3")
-    assert said == [6, 17, 28, 39]
-    assert file.getvalue().splitlines() == [
-        "drawing [all], 6 s",
-        "drawing [all], 17 s",
-        "writing: section 2 of 3, 8 s",
-        "writing: section 2 of 3, 19 s",
+UP, DOWN, LEFT, RIGHT = range(4)
+MINUS = "\N{MINUS SIGN}"
+# The cells are 0 S, 1 free, 2 free; 3 free, 4 shelf, 5 goal.
+CORNER = {"desc": ["S..", ".#G"], "max_episode_steps": 10}
+
+
+def made(env_id, name="qlearning", env_kwargs=None):
+    """An evaluator, and an agent that has learnt nothing."""
+    spec = spec_of(name, env_id, {"env_kwargs": env_kwargs or {}})
+    return exact_evaluator(spec), agent_of(name, make_training_env(spec, None))
+
+
+def map_of(env_id, actions=(), **env_kwargs):
+    """The map of a table that prefers these actions, and action 0 elsewhere."""
+    evaluator, agent = made(env_id, env_kwargs=env_kwargs)
+    agent.policy.q_tables[0, range(len(actions)), list(actions)] = 1.0
+    return value_map(evaluator, agent)
+
+
+# --- one map -------------------------------------------------------------------------------------
+
+# Right, left again; down onto the goal; up against the outer wall from below the start.
+THERE_AND_BACK = [RIGHT, LEFT, DOWN, LEFT, UP, UP]
+
+
+def test_a_map_worked_by_hand():
+    found = map_of(WAREHOUSE, THERE_AND_BACK, **CORNER)
+    assert found.layout.rows == ("S..", ".#G")
+    assert found.matters.tolist() == [True, True, True, True, False, False]
+    assert found.initial.tolist() == [1, 0, 0, 0, 0, 0]
+    assert found.actions[:4].tolist() == [RIGHT, LEFT, DOWN, LEFT]
+    assert found.values.tolist() == [-10, -10, 100, -10, 0, 0]
+    assert found.optimal_values.tolist() == [98, 99, 100, 97, 0, 0]
+    assert found.optimal_actions[:4].tolist() == np.eye(4, dtype=bool)[[3, 3, 1, 0]].tolist()
+    assert found.differs.tolist() == [False, True, False, True, False, False]
+    assert found.visited.tolist() == [True, True, False, False, False, False]
+    assert found.optimal_visited.tolist() == [True, True, True, False, False, False]
+
+
+def test_an_action_among_several_best_ones_does_not_differ():
+    square = {"desc": ["..G", "...", "S.."], "max_episode_steps": 20}
+    for first in (UP, RIGHT):
+        actions = [RIGHT, RIGHT, 0, RIGHT, RIGHT, UP, first, RIGHT, UP]
+        found = map_of(WAREHOUSE, actions, **square)
+        assert not found.differs.any()
+        assert found.values[6] == found.optimal_values[6] == 97
+    assert found.optimal_actions[6].tolist() == [True, False, False, True]
+
+
+# --- over the training ---------------------------------------------------------------------------
+
+
+def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
+    entry = {"learning_rate": 0.5, "env_kwargs": {"slip": 0.2}}
+    kept = {"n_timesteps": 450, "eval_freq": 100, "save_freq": 100, "pictures": True}
+    run = trained("qlearning", WAREHOUSE, entry, log_folder=tmp_path, **kept).run
+    with np.load(run.value_maps_path) as file:
+        maps = dict(file)
+    assert maps["timesteps"].tolist() == [100, 200, 300, 400, 450]
+    evaluator = exact_evaluator(spec_of("qlearning", WAREHOUSE, entry))
+    paths = [*(run.checkpoint_path(n) for n in (100, 200, 300, 400)), run.model_path]
+    for path, values, actions in zip(paths, maps["values"], maps["actions"], strict=True):
+        found = value_map(evaluator, load_model("qlearning", path))
+        np.testing.assert_array_equal(values, found.values)
+        np.testing.assert_array_equal(actions, found.actions)
+    np.testing.assert_array_equal(maps["optimal_values"], found.optimal_values)
+    np.testing.assert_array_equal(maps["optimal_actions"], found.optimal_actions)
+    # The agent did change, or there would be nothing to tell apart.
+    assert len(np.unique(maps["values"], axis=0)) > 1
+    with np.load(run.evaluations_path) as evaluations:
+        at_start = maps["values"][:-1] @ evaluator.model.initial
+        np.testing.assert_allclose(at_start, evaluations["results"][:, 0], rtol=1e-12)
+    assert run.value_map_path.read_bytes().startswith(b"\x89PNG")
+
+
+# --- the picture of a map ------------------------------------------------------------------------
+
+
+def test_frames_and_arrows_are_what_the_map_says():
+    """Frames where agent and optimum part; arrows where each of them goes."""
+    policies = drawing.policies_in(map_of(WAREHOUSE, THERE_AND_BACK, **CORNER), 0)
+    for policy in policies:
+        axes = Figure().subplots()
+        drawing.mark_differing(axes, policy, cell=36)
+        centres = [segment[:4].mean(axis=0) for segment in axes.collections[-1].get_segments()]
+        np.testing.assert_allclose(centres, [(1, 0), (0, 1)])  # columns across, rows down
+    axes = Figure().subplots()
+    drawing.draw_arrows(axes, policies[0], 0.08, with_numbers=False)
+    # Middle and direction of every arrow, with how strong it is: dark where the agent comes to.
+    arrows = [
+        (round(x + u / 2, 6), round(y + v / 2, 6), np.sign(u), np.sign(v), quiver.get_alpha())
+        for quiver in axes.collections
+        for (x, y), u, v in zip(quiver.XY, quiver.U, quiver.V, strict=True)
     ]
+    right, left = [(0, 0, 1, 0, 1.0), (0, 1, -1, 0, 0.45)], [(1, 0, -1, 0, 1.0), (2, 0, 0, 1, 0.45)]
+    assert sorted(arrows) == right + left
+
+
+# --- the learning curve --------------------------------------------------------------------------
+
+
+def write_monitor(folder, name, rows, start=1000.0):
+    header = json.dumps({"t_start": start, "env_id": "FrozenLake-v1"})
+    lines = [f"#{header}", "r,l,t", *(",".join(map(str, row)) for row in rows)]
+    (folder / f"{name}.monitor.csv").write_text("\n".join(lines) + "\n")
+
+
+def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(tmp_path):
+    assert [array.shape for array in read_monitors(tmp_path)] == [(0,), (0,)]
+    # Three environments step together: the second one's first episode ends after 3 x 4 steps.
+    write_monitor(tmp_path, 0, [(1, 10, 9.0), (2, 5, 9.5)])
+    # Clocks do not count: processes start when they can.
+    write_monitor(tmp_path, 1, [(3, 4, 0.1), (4, 8, 0.2)], start=2000.0)
+    write_monitor(tmp_path, 2, [(5, 11, 50.0)], start=500.0)
+    steps, returns = read_monitors(tmp_path)
+    assert steps.tolist() == [12, 30, 33, 36, 45]
+    assert returns.tolist() == [3, 1, 5, 4, 2]
