@@ -235,7 +235,7 @@ BY_HAND = {  # an agent, a world, and what is done to it between two trainings
     "the last reward": ("sarsa", of(LAKE, TerminationReward, last_reward=-2.0)),
     "the time limit": ("sarsa", of(LAKE, TimeLimit, _max_episode_steps=7)),
     "a pole on the moon": ("semi_gradient_q", of("CartPole-v1", **MOON)),
-    "a car in hills": ("semi_gradient_q", of("MountainCar-v0", **HILLS)),
+    "a car in hills": ("semi_gradient_sarsa", of("MountainCar-v0", **HILLS)),
 }  # fmt: skip
 
 
