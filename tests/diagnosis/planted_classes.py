@@ -1,17 +1,12 @@
-"""Subclasses of the library's agents and of ours, each with the fault that ``FAULTS`` names."""
+"""Subclasses of the library's agents and of ours, each with one fault."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.utils import explained_variance
-from torch.nn.functional import mse_loss
-
-from agents.tabular.one_step import QLearning
 
 
 class DQNSharesMemory(DQN):
@@ -51,73 +46,41 @@ class DQNWithoutOptimizer(DQN):
         return ["q_net", "q_net_target"], []
 
 
-class WrittenOutPPO(PPO):
-    """The library's PPO with its loss written out, which the faults change."""
-
-    advantage_sign, entropy_sign, ratio_sign = 1, 1, 1
-
-    def train(self) -> None:
-        """Some epochs on the rollout."""
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
-        for _ in range(self.n_epochs):
-            for batch in self.rollout_buffer.get(self.batch_size):
-                actions = batch.actions.long().flatten()
-                values, log_prob, entropy = self.policy.evaluate_actions(
-                    batch.observations, actions
-                )
-                advantages = batch.advantages
-                if len(advantages) > 1:
-                    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-                advantages = advantages * self.advantage_sign
-                ratio = th.exp(self.ratio_sign * (log_prob - batch.old_log_prob))
-                clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
-                policy_loss = -th.min(advantages * ratio, advantages * clipped).mean()
-                value_loss = mse_loss(batch.returns, values.flatten())
-                assert entropy is not None
-                entropy_loss = -self.entropy_sign * entropy.mean()
-                loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
-                self.policy.optimizer.zero_grad()
-                loss.backward()  # type: ignore[no-untyped-call]
-                th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
-                self.policy.optimizer.step()
-        self._n_updates += self.n_epochs
-        buffer = self.rollout_buffer
-        self.logger.record(
-            "train/explained_variance",
-            explained_variance(buffer.values.flatten(), buffer.returns.flatten()),
-        )
-
-
-class PPOEntropy(WrittenOutPPO):
+class PPOEntropy(PPO):
     """Entropy is made small."""
 
-    entropy_sign = -1
+    def train(self) -> None:
+        """With the wrong sign."""
+        weight, self.ent_coef = self.ent_coef, -self.ent_coef
+        super().train()
+        self.ent_coef = weight
 
 
-class PPORatio(WrittenOutPPO):
+class PPORatio(PPO):
     """Old by new, instead of new by old."""
 
-    ratio_sign = -1
+    def train(self) -> None:
+        """With the logarithms of all probabilities turned round."""
+        evaluate = self.policy.evaluate_actions
+
+        def turned_round(*args: Any) -> tuple[Any, th.Tensor, Any]:
+            values, log_prob, entropy = evaluate(*args)
+            return values, -log_prob, entropy
+
+        self.policy.evaluate_actions = turned_round  # type: ignore[method-assign]
+        self.rollout_buffer.log_probs *= -1
+        super().train()
+        del self.policy.evaluate_actions
 
 
 class GAEWithoutLambda(RolloutBuffer):
     """Advantages that fade by gamma alone."""
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: Any) -> None:
-        """The library's loop, without lambda."""
-        last, next_values = 0.0, last_values.clone().cpu().numpy().flatten()
-        for step in reversed(range(self.buffer_size)):
-            if step == self.buffer_size - 1:
-                goes_on = 1.0 - dones.astype(np.float32)
-            else:
-                goes_on = 1.0 - self.episode_starts[step + 1]
-                next_values = self.values[step + 1]
-            error = self.rewards[step] + self.gamma * next_values * goes_on - self.values[step]
-            last = error + self.gamma * goes_on * last * (self.gae_lambda > 0)
-            self.advantages[step] = last
-        self.returns = self.advantages + self.values
+        """As if lambda were 1 wherever it is not 0."""
+        decay, self.gae_lambda = self.gae_lambda, float(self.gae_lambda > 0)
+        super().compute_returns_and_advantage(last_values, dones)
+        self.gae_lambda = decay
 
 
 class PPOTraces(PPO):
@@ -128,14 +91,14 @@ class PPOTraces(PPO):
         super().__init__(*args, **kwargs)
 
 
-class ForgetfulQLearning(QLearning):
-    """Its table is not in the file."""
+class ForgetfulDQN(DQN):
+    """Its weights are not in the file."""
 
     def get_parameters(self) -> dict[str, Any]:
-        """With an empty table."""
+        """With zeros instead."""
         parameters = super().get_parameters()
-        table = parameters["policy"]["q_tables"]
-        return {**parameters, "policy": {**parameters["policy"], "q_tables": th.zeros_like(table)}}
+        weights = parameters["policy"].items()
+        return {**parameters, "policy": {name: th.zeros_like(part) for name, part in weights}}
 
 
 class ForgetfulPPO(PPO):
@@ -143,16 +106,3 @@ class ForgetfulPPO(PPO):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "learning_rate", "lr_schedule"]
-
-
-FAULTS = {
-    "DQNNeverCopies": "target-never-copied",
-    "DQNAlwaysCopies": "target-always-copied",
-    "ForgetfulQLearning": "zip-forgets-tables",
-    "DQNSharesMemory": "shared-buffer",
-    "DQNWithoutOptimizer": "zip-forgets-optimizer",
-    "PPOEntropy": "entropy-sign",
-    "PPORatio": "importance-ratio",
-    "PPOTraces": "traces",
-    "ForgetfulPPO": "zip-forgets-schedules",
-}

@@ -1,13 +1,9 @@
-"""Hand-written tables in single files, as people write them, each right or with one fault.
-
-``FAULTS`` says which function has which fault; none of those in ``RIGHT`` has any.
-"""
+"""Hand-written tables in single files, as people write them, each right or with one fault."""
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -92,9 +88,7 @@ def one_step(
             value = epsilon * q[shown].mean() + (1 - epsilon) * q[shown].max()
         else:
             value = q[shown, next_action]
-        ended = done if fault == "no-bootstrap-at-truncation" else terminated
-        if fault == "bootstraps-at-terminal":
-            ended = False
+        ended = terminated and fault != "bootstraps-at-terminal"
         discount = {"discount-twice": gamma**2, "discount-missing": 1.0}.get(fault, gamma)
         goal = reward + (0.0 if ended else discount * value)
         q[obs, action] += 0.1 * (goal - q[obs, action])
@@ -158,11 +152,10 @@ def several_steps(
         ahead = 0.0 if terminated else q[following, next_action]
         while window and (done or len(window) >= n_steps):
             n = len(window)
-            powers = [0 if fault == "rewards" else k for k in range(n)]
-            total = sum(gamma**k * paid for k, (_, _, paid) in zip(powers, window, strict=True))
-            last = {"power-less": max(n - 1, 1), "power-one": 1}.get(fault, n)
+            faded = 1.0 if fault == "n-step-return" else gamma
+            total = sum(faded**k * paid for k, (_, _, paid) in enumerate(window))
             then, did, _ = window.pop(0)
-            q[then, did] += 0.1 * (total + gamma**last * ahead - q[then, did])
+            q[then, did] += 0.1 * (total + gamma**n * ahead - q[then, did])
         obs, action = following, next_action
         if done:
             obs, _ = env.reset()
@@ -202,7 +195,7 @@ def with_traces(
         error = reward + (0.0 if terminated else gamma * value) - q[obs, action]
         traces[obs, action] = 1.0
         q += learning_rate * error * traces
-        traces *= {"lambda-alone": lam, "gamma-alone": gamma}.get(fault, gamma * lam)
+        traces *= lam if fault == "lambda-alone" else gamma * lam
         if target == "max" and not is_greedy and fault != "never-cut":
             traces[:] = 0.0
         obs, action = following, next_action
@@ -239,64 +232,3 @@ def preferences(
             return v[[number(obs)]]
 
     return ActorCritic(likes)
-
-
-q_right = partial(one_step, target="max")
-sarsa_right = partial(one_step, target="next")
-expected_sarsa_right = partial(one_step, target="expected")
-memory_right = partial(from_memory)
-n_step_right = partial(several_steps)
-q_lambda_right = partial(with_traces, target="max")
-sarsa_lambda_right = partial(with_traces, target="next")
-actor_critic_right = partial(preferences)
-
-q_bootstraps = partial(one_step, fault="bootstraps-at-terminal")
-q_done_is_end = partial(one_step, fault="no-bootstrap-at-truncation")
-q_gamma_squared = partial(one_step, fault="discount-twice")
-sarsa_without_gamma = partial(one_step, target="next", fault="discount-missing")
-q_sees_reset = partial(one_step, fault="reset-observation")
-q_that_follows = partial(one_step, target="next")
-sarsa_that_maximises = partial(one_step, target="max")
-q_explores = partial(one_step, fault="explores-in-evaluation")
-q_global = partial(one_step, fault="global-generator")
-sarsa_unseeded = partial(one_step, target="next", fault="not-reproducible")
-q_epsilon_grows = partial(one_step, fault="schedule-backwards")
-q_epsilon_stays = partial(one_step, fault="schedule-constant")
-memory_of_references = partial(from_memory, fault="shared-buffer")
-memory_never_renewed = partial(from_memory, fault="stale-buffer")
-n_step_rewards_whole = partial(several_steps, fault="rewards")
-n_step_power_one = partial(several_steps, fault="power-one")
-q_lambda_never_cut = partial(with_traces, fault="never-cut")
-sarsa_lambda_fades_slowly = partial(with_traces, target="next", fault="lambda-alone")
-sarsa_lambda_goes_on = partial(with_traces, target="next", fault="kept-across-episodes")
-actor_critic_flees = partial(preferences, fault="advantage-sign")
-
-RIGHT = [name for name in list(globals()) if name.endswith("_right")]
-FAULTS = {
-    "q_bootstraps": "bootstraps-at-terminal",
-    "q_done_is_end": "no-bootstrap-at-truncation",
-    "q_gamma_squared": "discount-twice",
-    "sarsa_without_gamma": "discount-missing",
-    "q_sees_reset": "reset-observation",
-    "q_that_follows": "follows-instead-of-maximises",
-    "sarsa_that_maximises": "maximises-instead-of-follows",
-    "q_explores": "explores-in-evaluation",
-    "q_global": "global-generator",
-    "sarsa_unseeded": "not-reproducible",
-    "q_epsilon_grows": "schedule-backwards",
-    "q_epsilon_stays": "schedule-constant",
-    "memory_of_references": "shared-buffer",
-    "memory_never_renewed": "stale-buffer",
-    "n_step_rewards_whole": "n-step-return",
-    "n_step_power_one": "n-step-return",
-    "q_lambda_never_cut": "traces",
-    "sarsa_lambda_fades_slowly": "traces",
-    "sarsa_lambda_goes_on": "traces",
-    "actor_critic_flees": "advantage-sign",
-}
-KINDS = dict.fromkeys(("q_right", "memory_right", "q_lambda_right"), "q_learning")
-KINDS |= {name: "q_learning" for name in FAULTS if name.startswith(("q_", "memory"))}
-KINDS |= {name: "sarsa" for name in FAULTS if name.startswith(("sarsa", "n_step"))}
-KINDS |= dict.fromkeys(("sarsa_right", "n_step_right", "sarsa_lambda_right"), "sarsa")
-KINDS |= {"expected_sarsa_right": "expected_sarsa"}
-KINDS |= dict.fromkeys(("actor_critic_right", "actor_critic_flees"), "actor_critic")

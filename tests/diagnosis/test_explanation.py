@@ -79,7 +79,6 @@ def test_an_action_that_was_never_tried_is_told_from_one_of_wrong_value():
     wrong = {(14, 2): 0.0, (13, 2): 0.0, (9, 1): 0.0, (10, 1): 0.0}
     found = explained("qlearning", "FrozenLake-v1", LAKE, with_values(0.95, wrong, untried))
     assert parts_of(found)["never tried"] == pytest.approx(1.0)
-    assert "n_timesteps" in str(found.proposal) or found.proposal is None
 
 
 def test_a_discount_that_hides_the_goal_is_the_objective_s_part():
@@ -110,10 +109,8 @@ def test_what_cannot_be_observed_is_a_part_of_its_own():
 @pytest.mark.parametrize(
     ("algo", "env_id", "entry", "steps"),
     [
-        ("double_qlearning", "FrozenLake-v1", {}, 1000),
         ("r_max", "FrozenLake-v1", {}, 500),
-        ("semi_gradient_sarsa", "CliffWalking-v1", {}, 1000),
-        ("dqn", "FrozenLake-v1", {**SMALL, "buffer_size": 500, "learning_starts": 50}, 300),
+        ("semi_gradient_q", "FrozenLake-v1", {}, 1000),
         ("ppo", "FrozenLake-v1", {**SMALL, "n_steps": 64, "batch_size": 64}, 128),
     ],
 )

@@ -5,16 +5,13 @@ import pickle
 import shutil
 import subprocess
 import sys
-import tempfile
 import textwrap
-import time
 from pathlib import Path
 
 import pytest
 
 import agents
 from machine_code import cache as code_cache
-from machine_code import sources
 
 ROOT = Path(agents.__file__).resolve().parent.parent
 
@@ -102,43 +99,14 @@ def test_a_changed_rule_is_what_runs_and_files_that_do_not_serve_are_replaced(ch
     for text, value, is_compiled in ((first, 29, True), (second, 21, True), (first, 29, False)):
         rule.write_text(text)
         assert outcome(checkout) == (value, "compiled", is_compiled)
-    folder = checkout / "agents" / "__pycache__" / "machine_code"
-    files = sorted(folder.rglob("*.nb[ic]"))
-    for place, path in enumerate(files):
-        # Below the digest's folder; Numba writes each file under a longer name first.
-        name = path.relative_to(folder).as_posix().partition("/")[2] + ".tmp.0123456789abcdef"
-        assert len(name) < code_cache.LONGEST_NAME + 8
-        size = path.stat().st_size
-        path.write_bytes(b"" if place % 2 else path.read_bytes()[: size // 2])
-    assert outcome(checkout) == (29, "compiled", True)
+    files = sorted((checkout / "agents" / "__pycache__" / "machine_code").rglob("*.nb[ic]"))
     for path in files:  # that anyone may have written
         path.write_bytes(pickle.dumps(Payload(tmp_path / "mark")))
         path.chmod(0o666)
     said = f"{SMALL}print(sum('cannot be used' in name for name in names))"
     assert run(checkout, said).stdout.split() == ["29", "compiled", "1", "1"]
     assert not (tmp_path / "mark").exists()
-    assert outcome(checkout) == (29, "compiled", False)
     rule.write_text(RULE)
-
-
-def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
-    """It has the old sources or the new: the digest cannot tell, so nothing is kept."""
-    code = """
-    from pathlib import Path
-    import agents
-    from machine_code import cache
-    folder = cache.folder("agents")
-    source = Path("mdp/graph.py")
-    source.write_text(source.read_text() + "\\n")
-    from agents.small_loop import run_small
-    print(run_small(4.0), len(list(folder.rglob("*.nb[ic]"))))
-    """
-    before = (checkout / "mdp" / "graph.py").read_text()
-    (checkout / "mdp" / "graph.py").write_text(f"# Another digest.\n{before}")
-    try:
-        assert run(checkout, code).stdout.split() == ["13.0", "0"]
-    finally:
-        (checkout / "mdp" / "graph.py").write_text(before)
 
 
 OWN_RULE = """
@@ -168,40 +136,14 @@ def q(cls):
     return float(model.policy.q_table[0, 0])
 print(q(Own))
 """
-AGAIN = """
-import importlib, own_rules
-from pathlib import Path
-source = Path(own_rules.__file__)
-source.write_text(source.read_text().replace("9.0", "5.25"))
-print(q(importlib.reload(own_rules).Own))
-"""
 
 
 def test_a_rule_of_the_users_own_follows_its_source(checkout):
-    """From process to process, and in one where its class is defined anew, as in a notebook."""
     module = checkout / "own_rules.py"
-    module.write_text(OWN_RULE.format(worth=7.0))
-    assert run(checkout, USE).stdout.split() == ["7.0"]
-    module.write_text(OWN_RULE.format(worth=9.0))
-    printed = run(checkout, USE + AGAIN).stdout.split()
+    for worth in (7.0, 9.0):
+        module.write_text(OWN_RULE.format(worth=worth))
+        assert run(checkout, USE).stdout.split() == [str(worth)]
     module.unlink()
-    assert printed == ["9.0", "5.25"]
-
-
-def test_old_machine_code_goes_away(tmp_path, monkeypatch):
-    parent = tmp_path / "machine_code"
-    now = time.time()
-    for age in range(6):
-        (parent / f"old{age}").mkdir(parents=True)
-        os.utime(parent / f"old{age}", (now - 100 - age, now - 100 - age))
-    own = parent / code_cache.digest("agents")
-    own.mkdir()
-    os.utime(own, (now - 1000, now - 1000))
-    code_cache.remove_old(own)
-    left = {path.name for path in parent.iterdir()}
-    assert left >= {own.name, "old0", "old1"}
-    assert len(left) <= 2 + code_cache.KEPT_BESIDE
-    assert "old5" not in left
 
 
 # --- machine code that another user may have written ---------------------------------------------
@@ -217,28 +159,14 @@ def changed(path, mode=0o700, owner=0):
     return path
 
 
-def linked(path, target):
-    path.symlink_to(target)
-    return path
-
-
 # What makes the folder, and why it is refused; None where it serves.
 FOLDERS = {
     "not there yet": (lambda at: at / "yardstick", None),
     "the user's own": (lambda at: changed(at / "cache"), None),
-    "a link to one's own": (lambda at: linked(at / "link", changed(at / "cache")), None),
-    "in a sticky folder of all": (lambda at: changed(at / "tmp", 0o1777) / "cache", None),
-    "in a folder that others read": (lambda at: changed(at / "open", 0o755) / "cache", None),
     "of another": (lambda at: changed(at / "cache", owner=NOBODY), "belongs to another"),
     "writable by all": (lambda at: changed(at / "cache", 0o777), "mode 777"),
-    "readable by others": (lambda at: changed(at / "cache", 0o755), "mode 755"),
-    "in a folder of all": (lambda at: changed(at / "tmp", 0o777) / "cache", "mode 777"),
-    "in a folder of another": (
-        lambda at: changed(at / "home", 0o755, NOBODY) / "cache", "belongs to another"),
     "far below a folder of all": (
         lambda at: changed(changed(at / "tmp", 0o777) / "in", 0o700) / "cache", "mode 777"),
-    "a link to another's": (
-        lambda at: linked(at / "link", changed(at / "cache", owner=NOBODY)), "belongs to another"),
 }  # fmt: skip
 
 
@@ -255,40 +183,13 @@ def test_machine_code_lies_where_only_the_user_writes(case, tmp_path):
             code_cache.own_folder(path)
 
 
-def test_a_folder_of_root_is_not_a_users():
-    place = Path(tempfile.mkdtemp())
-    place.chmod(0o755)
-    root, users = changed(place / "root", 0o777), changed(place / "user", owner=NOBODY)
-    os.seteuid(NOBODY)
-    try:
-        with pytest.raises(code_cache.NotOwnError, match="root belongs to another user"):
-            code_cache.own_folder(root)
-        assert code_cache.own_folder(users / "cache") == users / "cache"
-    finally:
-        os.seteuid(0)
-        shutil.rmtree(place)
-
-
-CLOSED = "no folder for machine code can be written"
-UNSAFE = "no folder for machine code is safe: {} is open to other users, mode 777"
-
-
-@pytest.mark.parametrize(
-    ("is_open", "has_home", "reason"),
-    [(False, True, None), (False, False, CLOSED), (True, False, UNSAFE)],
-    ids=["a home", "nowhere", "open to all"],
-)
-def test_where_the_checkout_does_not_serve_a_home_does_or_memory(
-    is_open, has_home, reason, tmp_path, monkeypatch, caplog
+@pytest.mark.parametrize("has_home", [True, False])
+def test_where_the_checkout_cannot_be_written_a_home_serves_or_memory(
+    has_home, tmp_path, monkeypatch, caplog
 ):
-    beside = tmp_path / "agents" / "__pycache__"
-    beside.parent.mkdir()
     # A file where a folder is wanted stops root as well, whom permissions do not stop.
-    if is_open:
-        beside.mkdir()
-        changed(beside / "machine_code", 0o777)
-    else:
-        beside.write_text("")
+    (tmp_path / "agents").mkdir()
+    (tmp_path / "agents" / "__pycache__").write_text("")
     home = tmp_path / "home"
     if not has_home:
         home.write_text("")
@@ -297,47 +198,9 @@ def test_where_the_checkout_does_not_serve_a_home_does_or_memory(
     monkeypatch.setenv("XDG_CACHE_HOME", str(home))
     code_cache.warn_once.cache_clear()
     found = code_cache.folder.__wrapped__("agents")
-    if reason is None:
+    if has_home:
         assert found.parent == home / "yardstick" / "machine_code" / "agents"
         assert found.is_dir()
-        assert not caplog.messages
     else:
-        code_cache.folder.__wrapped__("agents")
-        line = reason.format(beside / "machine_code")
-        assert (found, caplog.messages) == (None, [f"{line}: it is compiled anew in each process"])
-
-
-# --- the sources themselves -----------------------------------------------------------------------
-
-
-def test_names_and_contents_count_and_other_files_do_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(sources, "ROOT", tmp_path)
-
-    def digest():
-        paths = sources.source_paths(["second", "first"])
-        return sources.digest_of(sources.content_lines(paths))
-
-    for name in ("first", "second", "third"):
-        (tmp_path / name / "deep").mkdir(parents=True)
-    rule = tmp_path / "first" / "deep" / "rule.py"
-    digests = []
-    for text in ("x = 1", "x = 2", "x = 1"):
-        rule.write_text(text)
-        (tmp_path / "third" / "rule.py").write_text(f"{text}{len(digests)}")
-        (tmp_path / "first" / "notes.txt").write_text(f"{text}{len(digests)}")
-        digests.append(digest())
-    moved = rule.rename(tmp_path / "first" / "rule.py")
-    assert digests[0] == digests[2]
-    assert len({*digests, digest()}) == 3
-    # As Windows would write it too.
-    assert sources.content_lines([moved])[0].startswith("first/rule.py ")
-
-
-def test_what_a_state_was_made_by_is_known_without_the_compiler():
-    code = """
-import sys
-from pipeline.digests import source_digest
-assert len(source_digest()) == 16 and source_digest() != source_digest("experiments")
-assert not {"numba", "scipy", "torch"} & sys.modules.keys()
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
+        assert found is None
+        assert "it is compiled anew in each process" in caplog.text

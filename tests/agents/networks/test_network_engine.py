@@ -12,7 +12,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
 from torch import nn
 
 import envs  # noqa: F401  # registers the environments
@@ -71,7 +70,7 @@ def made(name, env, policy="MlpPolicy", **kwargs):
 
 # --- which engine --------------------------------------------------------------------------------
 
-LONG, FEW, EPISODES = 200_000, 2_000, 10**12
+LONG, FEW = 200_000, 2_000
 TOO_SHORT = "library: so short a training is not worth compiling"
 BRIDGED = "compiled but for the environment: "
 AUTO = {"engine": "auto"}
@@ -79,23 +78,18 @@ PLANS = [
     # agent, settings, environment, callback, budget, what is chosen
     ("ppo", {}, lake, None, LONG, "library"),
     ("deep_qlearning", {}, lake, None, LONG, "compiled"),
-    ("double_dqn", {"engine": "library"}, lake, None, LONG, "library"),
     ("dqn", AUTO, lake, None, LONG, "compiled"),
-    *((name, AUTO, lake, None, FEW, TOO_SHORT) for name in ("dqn", "a2c")),
-    ("ppo", {**AUTO, "n_steps": 128}, lake, None, FEW, TOO_SHORT),
+    ("dqn", AUTO, lake, None, FEW, TOO_SHORT),
     # A rollout is collected to its end, which here takes 16,384 steps.
     ("ppo", AUTO, lake, None, FEW, "compiled"),
     ("double_dqn", {"engine": "compiled"}, lake, None, 1, "compiled"),
     # Not the steps count, but what is learnt from them.
     ("dqn", {**AUTO, "learning_starts": LONG}, pole, None, 10_000, TOO_SHORT),
-    ("dqn", {**AUTO, "train_freq": 1}, pole, None, 10_000, "compiled"),
-    ("ppo", {**AUTO, "n_epochs": 40}, lake, None, 12_000, "compiled"),
     # Callbacks move the environment to Python, and never the engine.
     ("double_dqn", {}, lake, Sparse, LONG, "compiled"),
     ("double_dqn", {}, lake, Plain, LONG, f"{BRIDGED}Plain must be asked after each step"),
-    ("double_dqn", {}, lake, lambda: [EpisodeBudget(10)], EPISODES, TOO_SHORT),
-    ("double_dqn", {}, lake, lambda: EpisodeBudget(10_000), EPISODES, "compiled"),
-]  # fmt: skip
+    ("double_dqn", {}, lake, lambda: [EpisodeBudget(10)], 10**12, TOO_SHORT),
+]
 
 
 @pytest.mark.parametrize("case", range(len(PLANS)))
@@ -116,7 +110,6 @@ class OwnDQN(load_algorithm("dqn")):
 
 
 DICT = spaces.Dict({"a": spaces.Discrete(2), "b": spaces.Discrete(3)})
-IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
 
 
 def policy(**kwargs):
@@ -127,21 +120,12 @@ REFUSALS = {  # reason: agent, environment, settings
     "it masks actions": (
         "dqn", lambda: ActionMasks(gym.make("Warehouse-v0")), {"mask_actions": True}),
     "actions are Box, not Discrete": ("ppo", lambda: gym.make("Pendulum-v1"), {}),
-    "observations are of uint8": ("dqn", lambda: Any(IMAGE), {"policy": "CnnPolicy", **SMALL}),
     "observations are Dict, not Box or Discrete": (
         "ppo", lambda: Any(DICT), {"policy": "MultiInputPolicy"}),
-    r"Discrete\(4, start=1\) does not begin with 0": (
-        "dqn", lambda: Any(actions=spaces.Discrete(4, start=1)), SMALL),
     "a network has a layer of Hardtanh": ("ppo", Any, policy(activation_fn=nn.Hardtanh)),
     "its optimizer is NAdam, not Adam or RMSprop": (
         "ppo", Any, policy(optimizer_class=th.optim.NAdam)),
-    "its optimizer has amsgrad True": ("dqn", Any, policy(optimizer_kwargs={"amsgrad": True})),
     "OwnDQN may do things in Python of its own": (OwnDQN, Any, {}),
-    "its replay buffer is of another kind": (
-        "dqn", Any, {"optimize_memory_usage": True,
-                     "replay_buffer_kwargs": {"handle_timeout_termination": False}, **SMALL}),
-    "train_freq counts the episodes of several environments": (
-        "dqn", lambda: make_vec_env(Any, 2), {"train_freq": (1, "episode"), **SMALL}),
     "some of its parameters are frozen": ("ppo", Any, {}),
 }  # fmt: skip
 
@@ -157,11 +141,9 @@ def test_compiled_says_why_not_and_auto_falls_back(reason):
     with pytest.raises(ValueError, match=f"^engine: compiled is not possible: {reason}$"):
         model.learn(30)
     assert model.num_timesteps == 0
-    if reason.endswith(("begin with 0", "several environments")):  # nor does the library
-        return
     model.engine = "auto"
     model.learn(30)
-    assert model.engine_in_use == f"library: {reason}".replace("\\", "")
+    assert model.engine_in_use == f"library: {reason}"
     assert model.num_timesteps >= 30
 
 
@@ -183,38 +165,12 @@ def test_a_training_that_diverges_is_ended():
     assert all(bool(p.isnan().all()) for p in model.q_net.parameters())
 
 
-# --- compiled but for the environment ------------------------------------------------------------
-
-FUNCTION, FORKS = {"learning_rate": lambda remaining: 0.01 * remaining}, {"start_method": "fork"}
-FALLBACKS = {
-    "the environment's transition model is not known": (Any, {}, None),
-    "a function must be asked after each step": (lambda: lake(1), {}, lambda: lambda *_: True),
-    "a schedule is a Python function": (lambda: lake(1), FUNCTION, None),
-    "SubprocVecEnv is not DummyVecEnv": (
-        lambda: make_vec_env(Any, 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=FORKS), {}, None),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("reason", "name"), [*zip(FALLBACKS, ["dqn", "ppo"] * 2, strict=True)])
-def test_environments_are_called_where_they_have_to_be(reason, name):
-    env, kwargs, callback = FALLBACKS[reason]
-    own = SHORT if name == "ppo" else SMALL
-    model = made(name, env(), engine="compiled", **own, **kwargs)
-    callback = callback and callback()
-    model.learn(64, callback=callback)
-    model.env.close()
-    assert model.engine_in_use == BRIDGED + reason
-    assert model._n_updates > 0
-    assert str(model.engine_plan(10**6, callback, "auto")) == model.engine_in_use
-
-
 # --- files ---------------------------------------------------------------------------------------
 
 Q = {"learning_starts": 50, "buffer_size": 400, "target_update_interval": 20}
 FALLING = library_schedule(ExponentialSchedule(0.001, 0.0001))
 AGENTS = {
     "double_dqn": ("DQN", "CartPole-v1", Q),
-    "deep_qlearning": ("DQN", "FrozenLake-v1", {**Q, "n_steps": 3}),
     "ppo": (
         "PPO", "FrozenLake-v1",
         {"n_steps": 64, "n_epochs": 2, "learning_rate": FALLING, "clip_range": FALLING}),
@@ -281,22 +237,12 @@ def test_files_open_where_this_project_is_not(tmp_path):
     assert done.stdout.splitlines() == expected
 
 
-@pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored")  # the library's, of its own choice
 @pytest.mark.parametrize(("name", "asked"), [("double_dqn", ()), ("ppo", (Plain,))])
-def test_files_are_like_the_librarys_and_go_on_in_either_engine(name, asked, tmp_path):
-    model = None
-    for engine in ("library", "compiled"):
-        callbacks = [kind() for kind in asked]
-        model = saved(name, tmp_path / engine, "CartPole-v1", engine, callbacks)
-    for file in ("rl_model_200_steps.zip", "after.zip"):
-        theirs, ours = tmp_path / "library" / file, tmp_path / "compiled" / file
-        # As large: no tensor drags along the memory of all.
-        assert ours.stat().st_size == pytest.approx(theirs.stat().st_size, rel=0.02)
-        for member in ("policy.pth", "policy.optimizer.pth"):
-            assert kinds_of(tensors(ours, member)) == kinds_of(tensors(theirs, member))
+def test_files_go_on_in_either_engine(name, asked, tmp_path):
+    model = saved(name, tmp_path, "CartPole-v1", "compiled", [kind() for kind in asked])
     for engine in ("library", "compiled"):
         env = make_vec_env("CartPole-v1", seed=1)
-        loaded = load_algorithm(name).load(tmp_path / "compiled" / "after", env, engine=engine)
+        loaded = load_algorithm(name).load(tmp_path / "after", env, engine=engine)
         weights = loaded.policy.state_dict(), model.policy.state_dict()
         assert all(map(th.equal, *(each.values() for each in weights)))
         before = steps_of(model.policy.optimizer.state)
@@ -304,10 +250,3 @@ def test_files_are_like_the_librarys_and_go_on_in_either_engine(name, asked, tmp
         loaded.learn(200, reset_num_timesteps=False)
         assert loaded.num_timesteps >= 500
         assert min(steps_of(loaded.policy.optimizer.state)) > max(before)
-
-
-def kinds_of(held):
-    """What a file of tensors holds, by names, shapes and kinds of numbers."""
-    if isinstance(held, dict):
-        return {name: kinds_of(part) for name, part in held.items()}
-    return (held.shape, held.dtype) if isinstance(held, th.Tensor) else type(held)

@@ -4,19 +4,16 @@ The library, made to draw the numbers that compiled code draws, agrees up to rou
 weight after every step. The others end in the same bits, wherever blocks of steps end.
 """
 
-from functools import partial
-
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from torch.distributions import Categorical
@@ -59,12 +56,10 @@ class Matrices(gym.Env):
         return obs, float(obs[0, action]), bool(obs[1, 0] < -0.8), bool(obs[1, 1] < -0.8), {}
 
 
-def normalised(env, **kwargs):
+def normalised(env):
     """Statistics as they might be after a while."""
-    env = VecNormalize(env, clip_obs=1.5, clip_reward=0.8, **kwargs)
-    if env.norm_obs:
-        rng = np.random.default_rng(4)
-        env.obs_rms.mean, env.obs_rms.var = rng.normal(size=(2, 3)), rng.uniform(0.3, 2, (2, 3))
+    env, rng = VecNormalize(env, clip_obs=1.5, clip_reward=0.8), np.random.default_rng(4)
+    env.obs_rms.mean, env.obs_rms.var = rng.normal(size=(2, 3)), rng.uniform(0.3, 2, (2, 3))
     env.ret_rms.var = 7.0
     return env
 
@@ -79,7 +74,6 @@ def policy(optimizer=None, net_arch=(16,), activation_fn=nn.Tanh, **kwargs):
 
 Q = {"learning_starts": 20, "buffer_size": 120, "batch_size": 8, "target_update_interval": 10}
 PPO = {"n_steps": 24, "batch_size": 16, "n_epochs": 2}
-UNLIMITED = {"replay_buffer_kwargs": {"handle_timeout_termination": False}, "gamma": 0.9}
 BY_A_FUNCTION = {"clip_range": lambda remaining: 0.05 + 0.2 * remaining}
 CASES = {  # agent, environment, how many, episodes between two records, settings
     "dqn": ("dqn", lake, 1, 3, Q),
@@ -90,25 +84,15 @@ CASES = {  # agent, environment, how many, episodes between two records, setting
     "steps, greedy at once": (
         "dqn", vectors, 2, 3,
         {**Q, "n_steps": 3, "train_freq": 3, "gradient_steps": 2, "exploration_fraction": 0.0}),
-    "double": ("double_dqn", pole, 2, 3, {**Q, "tau": 0.5}),
-    "deep": ("deep_qlearning", lake, 1, 3, {**Q, "exploration_fraction": 0.5}),
-    "narrow, no time limits": (
-        "dqn", lake, 1, 3,
-        {**Q, **UNLIMITED, **policy(net_arch=[70, 1, 3], activation_fn=nn.Identity)}),
+    "double, tau": ("double_dqn", pole, 2, 3, {**Q, "tau": 0.5}),
     "matrices": (
         "dqn", Matrices, 2, 3,
         {**Q, "n_steps": 3, "max_grad_norm": 0.1, "batch_size": 33,
          **policy(net_arch=[64, 64], activation_fn=nn.ReLU)}),
-    "normalised rewards": (
-        "deep_qlearning", Matrices, 1, 3, {**Q, "wrap": partial(normalised, norm_obs=False)}),
     "ppo, normalised": ("ppo", Matrices, 2, 3, {**PPO, **BY_A_FUNCTION, "wrap": normalised}),
-    "ppo": ("ppo", lake, 2, 3, {**PPO, "clip_range": LinearSchedule(0.3, 0.1, 1.0)}),
     "ppo, a remainder of one": (
         "ppo", vectors, 2, 1, {**PPO, "n_steps": 25, "batch_size": 7, "clip_range_vf": 0.1}),
     "ppo on poles": ("ppo", pole, 2, 3, {**PPO, "target_kl": 0.003}),
-    "ppo by Adam": (
-        "ppo", lake, 1, 3,
-        {**PPO, **policy(th.optim.Adam, betas=(0.5, 0.9), eps=1e-3, weight_decay=0.1)}),
     "ppo by AdamW": (
         "ppo", Matrices, 1, 3,
         {**PPO, "normalize_advantage": False, **policy(th.optim.AdamW, weight_decay=3.0)}),
@@ -118,9 +102,6 @@ CASES = {  # agent, environment, how many, episodes between two records, setting
          **policy(net_arch={"pi": [70, 1], "vf": []}, activation_fn=nn.ReLU)}),
     "a2c": (
         "a2c", lake, 2, 1, {"gamma": 0.9, "gae_lambda": 0.8, **policy(net_arch=[64, 64])}),
-    "a2c by RMSprop": (
-        "a2c", pole, 1, 3,
-        {"normalize_advantage": True, "ent_coef": 0.1, **policy(th.optim.RMSprop, eps=1e-5)}),
     "a2c with decay": (
         "a2c", pole, 1, 3, policy(RMSpropTFLike, eps=1e-5, weight_decay=0.1)),
 }  # fmt: skip
@@ -323,51 +304,18 @@ def test_compiled_training_does_what_the_library_does_wherever_blocks_end(case):
         np.testing.assert_allclose(end[name], value, rtol=TOLERANCE, atol=TOLERANCE, err_msg=name)
     if model.engine_in_use == "compiled":
         # Without a diary, blocks are longer and learn within the loop.
-        for callbacks in ([], [Every(7), Every(30)], [Plain()]):
+        for callbacks in ([Every(7), Every(30)], [Plain()]):
             again, found = followed(case, "compiled", *callbacks)
             assert_same(state(again), end)
             assert found == dumps
 
 
-@pytest.mark.parametrize("place", [(9, False), (9, True), (0, True), (29, True)])
-@pytest.mark.parametrize("n_steps", [2, 5, 40])
-def test_returns_over_several_steps(n_steps, place):
-    """Values of next states would hide what a minibatch holds: it is looked at itself."""
-    env = make_vec_env(lake, 2, seed=3)
-    model = load_algorithm("dqn")(
-        "MlpPolicy", env, seed=5, buffer_size=60, n_steps=n_steps, batch_size=400, engine="compiled"
-    )
-    model._setup_learn(1)
-    assert isinstance(model.replay_buffer, NStepReplayBuffer)
-    buffer, rng = model.replay_buffer, np.random.default_rng(3)
-    buffer.next_observations[:] = rng.integers(16, size=buffer.next_observations.shape)
-    buffer.rewards[:] = rng.normal(scale=2, size=buffer.rewards.shape)
-    # Some end episodes, by a time limit or not.
-    buffer.dones[:] = rng.random(buffer.dones.shape) < 0.3
-    buffer.timeouts[:] = buffer.dones * (rng.random(buffer.dones.shape) < 0.5)
-    buffer.pos, buffer.full = place
-    rng.bit_generator.state = model.rng.bit_generator.state
-    with model._learning_compiled():
-        held = model._shared_training().held
-        held.target[:] = 0  # where all values are zero, rewards stay what they were
-        model.train(1, 400)
-        batch = held.batch
-        ours = [each.copy() for each in (batch.rewards, batch.discounts, batch.next_states.indices)]
-    with pytest.MonkeyPatch.context() as patch:
-        draw_as_compiled(patch, model, rng)
-        samples = buffer.sample(400)
-    discounts = (samples.discounts * (1 - samples.dones)).numpy().ravel()
-    np.testing.assert_allclose(ours[0], samples.rewards.numpy().ravel(), rtol=0, atol=1e-5)
-    np.testing.assert_allclose(ours[1], discounts, rtol=1e-6)
-    np.testing.assert_array_equal(ours[2], samples.next_observations.numpy().ravel())
-
-
-# --- stops and changes ---------------------------------------------------------------------------
+# --- stops ---------------------------------------------------------------------------
 
 MODES = ("parts", "compiled")
 
 
-@pytest.mark.parametrize("case", ["steps, greedy at once", "episodes", "ppo on poles", "a2c"])
+@pytest.mark.parametrize("case", ["episodes", "ppo on poles"])
 def test_a_training_that_was_stopped_goes_on(case):
     ends = []
     for mode in MODES:
@@ -375,84 +323,3 @@ def test_a_training_that_was_stopped_goes_on(case):
         assert model.num_timesteps == 123 * model.n_envs
         ends.append(state(learn(model, mode, 300, reset_num_timesteps=False)))
     assert_same(*ends)
-
-
-def load_another_optimizer_state(model):
-    """As of an optimizer that has come far."""
-    optimizer, rng = model.policy.optimizer, np.random.default_rng(8)
-    state = optimizer.state_dict()
-    for kept in state["state"].values():
-        kept["step"] = kept["step"] + 1000
-        for name in ("exp_avg", "exp_avg_sq"):
-            noise = rng.random(tuple(kept[name].shape), np.float32)
-            kept[name] = th.from_numpy(noise).square() / 100
-    optimizer.load_state_dict(state)
-
-
-def weigh(factor):
-    def change(model):
-        for parameter in model.policy.parameters():
-            parameter.data = parameter.data * factor
-
-    return change
-
-
-def take(optimizer_class):
-    def change(model):
-        parameters = model.policy.optimizer.param_groups[0]["params"]
-        model.policy.optimizer = optimizer_class(parameters, lr=0.01)
-
-    return change
-
-
-def put(**attributes):
-    return lambda model: vars(model).update(attributes)
-
-
-CHANGES = {
-    "optimizer's state": load_another_optimizer_state,
-    "weights in place": weigh(0.7),
-    "another optimizer": take(th.optim.RMSprop),
-    "all parameters": lambda model: model.set_parameters(model.get_parameters()),
-    "gamma": put(gamma=0.3),
-    "rate": put(lr_schedule=FloatSchedule(0.03)),
-    "generator": lambda model: setattr(model, "rng", np.random.default_rng(5)),
-    "clipping": put(clip_range=FloatSchedule(0.01)),
-}
-
-
-@pytest.fixture(scope="module")
-def unchanged():
-    return {k: learn(make(k), "compiled", 250).policy.state_dict() for k in ("dqn", "ppo")}
-
-
-OF_DQN = ("optimizer's state", "weights in place", "gamma")
-
-
-@pytest.mark.parametrize(
-    ("what", "kind"), [*((what, "ppo") for what in CHANGES), *((what, "dqn") for what in OF_DQN)]
-)
-def test_a_change_counts_in_both_ways(what, kind, unchanged):
-    change = CHANGES[what]
-    models = [learn(make(kind), mode, 250, Every(90, change)) for mode in MODES]
-    assert_same(*map(state, models))
-    ours = models[0].policy.state_dict()
-    is_same = all(th.equal(value, unchanged[kind][name]) for name, value in ours.items())
-    assert is_same == (what == "all parameters")
-
-
-def freeze(model):
-    model.policy.action_net.weight.requires_grad_(False)
-
-
-FATAL = {
-    "its optimizer is SGD, not Adam or RMSp": ("dqn", take(th.optim.SGD), "parts"),
-    "some of its parameters are frozen": ("ppo", freeze, "compiled"),
-}
-
-
-@pytest.mark.parametrize("reason", FATAL)
-def test_what_cannot_be_gone_on_with_ends_the_training(reason):
-    kind, change, mode = FATAL[reason]
-    with pytest.raises(ValueError, match=f"cannot go on: {reason}"):
-        learn(make(kind), mode, 400, Every(150, change))
