@@ -5,7 +5,6 @@ import io
 import json
 import os
 import pickle
-import pickletools
 import struct
 import tracemalloc
 import warnings
@@ -24,7 +23,6 @@ from safe_files import UnsafeFileError, inspect_model, load_model, load_replay_b
 from safe_files.archives import first_look
 from safe_files.buffers_and_statistics import read_normalization
 from safe_files.known_objects import load_tensors, read_pickle
-from safe_files.pickles import PRICES
 
 UTILS = "stable_baselines3.common.utils"
 START = b"\x80\x04"
@@ -82,54 +80,35 @@ INSTRUCTIONS = {
     "an attribute that is no setting": with_state(CONSTANT, "__class__", b"K\x01"),
     "a schedule that is a class": with_state(FLOAT_SCHEDULE, "value_schedule", RELU),
     "lists in lists": b"]" * 5000 + b"a" * 4999,
-    "a huge index of the memo": b"Nr\xff\xff\xff\x0f0h\x01",
     "an array of gigabytes": name("numpy._core.multiarray", "_reconstruct")
     + name("numpy", "ndarray") + b"J\xff\xff\xff\x7f\x85C\x01b\x87R",
     "a key whose hash takes for ever": LAYERS + b"}" + TOP + b"K\x01s",
     "a value that is huge once it is written out": LAYERS + TOP,
-    "a length that is not there": b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f",
-    "a schedule of a huge number": with_state(CONSTANT, "val", b"\x8a\xff" + b"\x7f" * 255),
     # Calls of what calls return, and states of what is no new object.
     "a call of a call": DEQUE + b")R)R",
     "a call of a call that is huge once it is written out":
         SHORT_LAYERS + DEQUE + SHORT_TOP + b"\x85R)R",
-    "two states": CONSTANT + b")\x81}b}b",
     "the state of a name": name("builtins", "int") + b"}b",
     "a state that is its own object":
         FLOAT_SCHEDULE + b")\x81\x94}" + text("value_schedule") + b"h\x00sb",
     # Places of the stack and of the memo.
-    "an end before the beginning": b"0000",
     "an item of a name": name("os", "environ") + b"Na",
-    "a member of an object": DEQUE + b")R(K\x01\x90",
-    "a place of the memo that is empty": b"h\x07",
     "an object among its own items": DEQUE + b")R\x94h\x00a",
-    "an object in its own argument": b"]\x94" + DEQUE + b"h\x00\x85R\x94a",
     # Keys and members whose hash is not theirs alone, or takes for ever.
     "a key that is an object": b"}" + DEQUE + b")RNs",
     "members that are tuples": SHORT_LAYERS + b"\x8f(" + SHORT_TOP + b"\x90",
-    "frozen members that are tuples": SHORT_LAYERS + b"(" + SHORT_TOP + b"\x91",
     # The last byte makes it as long as it says.
     "a long number of a megabyte": b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f",
-    "a long number of -1 bytes": b"\x8b\xff\xff\xff\xff",
-    "a frame without an end": b"\x95" + b"\xff" * 8 + b"N",
-    "a frame in a frame": b"\x95" + struct.pack("<Q", 20) + b"\x95" + bytes(20) + b"N",
     # Sizes that are no numbers, or too large.
     "an array of no number": array(bytes(8), NAN + b"\x85"),
-    "an array of -1 numbers": array(bytes(8), b"J\xff\xff\xff\xff\x85"),
-    "an array of 33 dimensions": array(bytes(8), b"(" + b"K\x01" * 33 + b"t"),
     "a space of many values":
         space("discrete.Discrete", n=b"\x8a\x0c" + b"\x7f" * 12, start=b"K\0"),
-    "a space of no number of values": space("multi_binary.MultiBinary", n=NAN),
-    "a deque of a length below 0": DEQUE + b")J\xfb\xff\xff\xff\x86R",
 }  # fmt: skip
 # Each is read by everything that reads pickles, see `loaders`.
 ATTACKS = {attack: START + instructions + b"." for attack, instructions in INSTRUCTIONS.items()} | {
     "a call of the system in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
     "an array of objects": pickle.dumps(np.array([print], dtype=object)),
-    "a whole number of thousands of digits": pickle.dumps(10**5000),
-    "an infinite schedule": pickle.dumps(ConstantSchedule(float("inf"))),
     "a schedule that is no number": pickle.dumps(ConstantSchedule(float("nan"))),
-    "protocol 255": b"\x80\xff.",
 }
 
 
@@ -161,13 +140,6 @@ def test_attacks_by_pickle_are_refused(attack, loaders):
         finally:
             tracemalloc.stop()
         assert str(refusal.value).isprintable(), loader
-    assert ConstantSchedule(0.5)(1.0) == 0.5
-
-
-def test_no_other_instruction_makes_or_fetches_anything():
-    others = {op.name for op in pickletools.opcodes} - PRICES.keys()
-    assert others >= {"GLOBAL", "INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"}
-    assert others >= {"PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER", "INT", "LONG"}
 
 
 @pytest.fixture(scope="module")
@@ -225,18 +197,13 @@ def tensors(content, **options):
     return file.getvalue()
 
 
-NOT_A_NUMBER = float("nan")
 NO_ATTRIBUTE, NO_MEMBER = "no attribute of a model", "which no model file has"
 # What is changed in the settings, or put in place of a member; and what the refusal says.
 CHANGES = {
     "a method": ({"predict": 1}, NO_ATTRIBUTE),
-    "a class": ({"__class__": 1}, NO_ATTRIBUTE),
     "wide networks": ({"policy_kwargs": {"net_arch": [10**6, 10**6]}}, "memory"),
-    "layers of no number": ({"policy_kwargs": {"net_arch": [NOT_A_NUMBER]}}, "holds no such model"),
     "layers below zero": ({"policy_kwargs": {"net_arch": [-5]}}, "holds no such model"),
     "many steps": ({"n_steps": 10**15}, "n_steps"),
-    "steps below zero": ({"n_steps": -1}, "n_steps"),
-    "steps of no number": ({"n_steps": NOT_A_NUMBER}, "n_steps"),
     "many environments": ({"n_envs": 10**9}, "n_steps|n_envs"),
     "a script": ({"extra.py": b""}, NO_MEMBER),
     "a way out": ({"../escaped.pth": b""}, NO_MEMBER),
@@ -245,7 +212,6 @@ CHANGES = {
         {"pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})},
         r"policy\.predict",
     ),
-    "no settings": ({"data": b""}, "settings that are no JSON"),
     "settings in settings": ({"data": b"[" * 100_000}, "settings that are no JSON"),
     "settings of nothing": ({"data": b"{}"}, "does not say its policy's class"),
 }
@@ -260,23 +226,6 @@ def test_what_no_model_has_is_refused(genuine, change):
         load(members)
     named = {None, "n_steps", "policy_class", *changes}
     assert refusal.value.key in named - {"policy_kwargs"}
-
-
-def test_a_model_has_settings_and_tensors_and_may_have_more_of_these(genuine):
-    without = {name: held for name, held in genuine.items() if name != "data"}
-    with pytest.raises(UnsafeFileError, match="lacks its settings"):
-        load(without)
-    for members in (without, {"data": genuine["data"]}):
-        with pytest.raises(UnsafeFileError, match="lacks parts that a model has"):
-            first_look(zip_of(members))
-    assert first_look(zip_of({**genuine, "my_own.pth": genuine["policy.pth"]}))["n_steps"] == 2048
-    with pytest.raises(UnsafeFileError, match="no model file has"):
-        first_look(zip_of({**genuine, "my own.pth": genuine["policy.pth"]}))
-
-
-def test_an_environment_id_in_the_settings_imports_nothing(genuine, tmp_path):
-    model = load(with_settings(genuine, env="this:Zen-v0", tensorboard_log=str(tmp_path / "log")))
-    assert model.env is model.tensorboard_log is None
 
 
 def changed_tensor(content, change):
@@ -311,28 +260,15 @@ def group(member=ACTOR, **settings):
     return member, lambda held: held["param_groups"][0].update(settings)
 
 
-def entropy(change):
-    """Something is done to the entropy coefficient."""
-    key = "log_ent_coef"
-    return "pytorch_variables.pth", lambda held: held.update({key: change(held[key])})
-
-
 WRONG_TENSORS = {
     "a weight that is no number": weight(lambda w: w.fill_(th.nan)),
     "a weight of float64": weight(lambda w: w.double()),
-    "a complex weight": weight(lambda w: w + 1j),
     "a weight of another shape": weight(lambda w: th.zeros(2)),
-    "a weight that is a list": weight(lambda w: [0.0]),
     "an average of another kind": average(lambda s: s.update(exp_avg=s["exp_avg"].double())),
     "an average of another shape": average(
         lambda s: s.update(exp_avg=th.zeros(3)), "critic.optimizer.pth"
     ),
-    "a count of steps that is a text": average(lambda s: s.update(step="many")),
-    "averages of no parameter": (ACTOR, lambda o: o["state"].update({77: {"step": 1}})),
     "a learning rate that is a text": group(lr="fast"),
-    "one beta": group(betas=(0.9,)),
-    "an entropy coefficient of another kind": entropy(lambda v: v.double()),
-    "several entropy coefficients": entropy(lambda v: th.zeros(3)),
 }
 
 
@@ -368,14 +304,8 @@ def not_tensors(mark):
         "signs that a terminal obeys": (with_members(zeros, data=b"ca\x1b[2J\nb\n."), begin),
         "TorchScript": (with_members(zeros, constants=b""), "Missing key(s) in state_dict"),
         "a cut one": (zeros[:-30], no_zip),
-        "numbers of another machine": (
-            zip_of({"archive/data.pkl": b"\x80\x02}.", "archive/byteorder": b"big"}),
-            f"{begin}numbers in another order of bytes",
-        ),
         "one that was deflated": (zip_of(deflated, zipfile.ZIP_DEFLATED), "compressed"),
-        "one of no bytes": (b"", no_zip),
         "lists in lists": (with_members(zeros, data=deep), f"{begin}is nested more than 40 deep"),
-        "a tensor of nothing": (tensors({"x": th.ones(1, device="meta")}), may_not),
     }
 
 
@@ -432,10 +362,6 @@ def odd_zips(genuine):
         "a name with a zero in it": longer.replace(b"policy.pth!x", b"policy.pth\0x"),
         "a member at another's place": directory(raw, policy, 42, bytes(4)),
         "a smaller size": directory(raw, policy, 24, struct.pack("<L", 10)),
-        "a larger size": directory(raw, policy, 24, struct.pack("<L", 1 << 31)),
-        "a place behind the end": directory(raw, policy, 42, struct.pack("<L", 1 << 30)),
-        "bzip2": directory(raw, policy, 10, struct.pack("<H", 12)),
-        "another checksum": directory(raw, policy, 16, struct.pack("<L", 1)),
         "a bomb in a bomb": zip_of({**genuine, "policy.pth": bomb}, zipfile.ZIP_DEFLATED),
     }
 
@@ -478,15 +404,6 @@ def shared_array(n):
 
 
 ARRAY_MEMO, ARRAY = shared_array(4 * MB)
-NOISE = "stable_baselines3.common.noise"
-
-
-def noise(n):
-    """A noise of ``n`` actions."""
-    numbers = FROM_BUFFER + b"(" + long_bytes(8 * n) + FLOATS + b"J" + struct.pack("<i", n)
-    mean = numbers + b"\x85" + text("C") + b"tR"
-    fields = text("_mu") + mean + text("_sigma") + b"K\x01" + text("_dtype")
-    return name(NOISE, "NormalActionNoise") + b")\x81}(" + fields + name("numpy", "float32") + b"ub"
 
 
 M61 = (1 << 61) - 1  # whole numbers that it divides have one hash
@@ -494,21 +411,17 @@ LONGS = b"".join(b"\x8a\x0f" + (M61 * i).to_bytes(15, "little") + b"N" for i in 
 BOMBS = {
     "one text in many arrays": ARRAY_MEMO + b"](" + ARRAY * 150 + b"e.",
     "many lists": b"](" + b"]" * 4_000_000 + b"e.",
-    "many places of the memo": b"N" + b"\x94" * 4_000_000 + b".",
     "many calls": DEQUE + b"\x940](" + b"h\x00)R" * 1_000_000 + b"e.",
     "a wide text":
         b"X" + (16 * MB + 4).to_bytes(4, "little") + b"a" * 16 * MB + b"\xf0\x9f\x98\x80.",
-    "bytes that are not there": b"\x96" + (8 << 30).to_bytes(8, "little") + b".",
     "keys of one hash": b"}(" + LONGS + b"u.",
     # What reading them takes just fits the budget.
     "lists that just fit": b"](" + b"](Ne" * 230_000 + b"e.",
-    "calls that just fit": DEQUE + b"\x940](" + b"h\x00)R" * 140_000 + b"e.",
     "a list in lists in lists":
         b"](" + b"N" * 3000 + b"e\x940](" + b"h\x00" * 3000 + b"e\x940](" + b"h\x01" * 3000 + b"e.",
 }  # fmt: skip
 JSON_BOMBS = {
     "lists in JSON": "[" + "[]," * 3_000_000 + "[]]",
-    "numbers in JSON": "[" + "1," * 5_000_000 + "1]",
 }
 
 
@@ -575,22 +488,13 @@ def same_record_as_many_kinds(n):
 
 FOUR = bytes(16)  # four numbers of float32
 HUGE = b"h\x20"
-LONG = b"\x8a\x08" + struct.pack("<q", 1 << 62)
 STORAGES = {
     "a key that is huge once it is written out":
         file_of(OLD_LAYERS + storage(FLOAT, HUGE, b"K\x01"), bytes(4)),
-    "a size that is huge once it is written out":
-        file_of(OLD_LAYERS + storage(FLOAT, PATH, HUGE), bytes(4)),
-    "a kind that is huge once it is written out":
-        file_of(OLD_LAYERS + storage(HUGE, PATH, b"K\x01"), bytes(4)),
     "a size that is no number": file_of(storage(FLOAT, PATH, NAN), bytes(4)),
-    "a storage that is no tuple": file_of(b"NQ", bytes(4)),
     "a record elsewhere": file_of(storage(FLOAT, pickled_text("../x"), b"K\x01"), bytes(4)),
-    "the state of a storage": file_of(FEW + b"}b", FOUR),
     "a stride that is no number":
         file_of(REBUILT + FEW + b"K\x00K\x02\x85" + NAN + b"\x85\x89}tR", FOUR),
-    "a size that has no end":
-        file_of(REBUILT + FEW + b"K\x00" + LONG + b"\x85K\x01\x85\x89}tR", FOUR),
     "a record under two names": zip_of({
         "archive/data.pkl": b"\x80\x02" + FEW + b".",
         "archive/data/0": FOUR,
@@ -602,12 +506,10 @@ STORAGES = {
 
 # Stored numbers, those it says it has, and its place, shape and strides.
 VIEWS = {
-    "no stride": (1, 1, 0, (10**9,), (0,)),
     "no stride at all": (1, 1, 0, (10**15,), (0,)),
     "a view that overlaps": (10**6, 10**6, 0, (1000, 900_000), (1, 1)),
     "a storage that is not there": (1, 10**9, 0, (10**9,), (1,)),
     "a tensor beyond its storage": (1, 1, 0, (10**9,), (1,)),
-    "a place beyond its storage": (1, 1, 10**9, (1,), (1,)),
 }
 STORAGES |= {lie: view(*tensor) for lie, tensor in VIEWS.items()}
 
@@ -633,8 +535,7 @@ def hostile_zips(genuine):
         data = genuine["data"].decode().rstrip()[:-1] + f', "invented": {held}}}'
         yield bomb, zip_of({**genuine, "data": data}, zipfile.ZIP_DEFLATED)
     far = view(*VIEWS["no stride at all"])
-    for member in ("policy.pth", "policy.optimizer.pth", "pytorch_variables.pth"):
-        yield f"a lie in {member}", zip_of({**genuine, member: far})
+    yield "a lie in tensors", zip_of({**genuine, "policy.pth": far})
     for wish, kwargs in NETWORKS.items():
         yield wish, zip_of(with_settings(genuine, policy_kwargs=kwargs))
     yield "many members", zip_of({**genuine, **{f"x{i}": b"" for i in range(30_000)}})
@@ -712,14 +613,6 @@ def unframed(pickled):
     start = pickled.index(b"\x95")
     assert pickled.count(b"\x95") == 1
     return pickled[:start] + pickled[start + 9 :]
-
-
-def test_a_noise_is_not_copied_for_each_environment():
-    """Its constructor copies the noise for one environment as often as there are environments."""
-    fields = text("_base_noise") + noise(130_000) + text("_noises") + b"](" + b"h\x00" * 20_000
-    vectorized = name(NOISE, "VectorizedActionNoise") + b")\x81}(" + fields + b"eub."
-    content = START + noise(1) + b"\x940" + vectorized
-    assert check_peak("a noise", content, lambda stream: read_pickle(stream.read())) == ""
 
 
 @pytest.mark.parametrize("attack", BOMBS)

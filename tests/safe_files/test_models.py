@@ -86,21 +86,15 @@ def case(algorithm, env_id, *kwargs, policy="MlpPolicy", n_envs=1, around=None):
     return algorithm, policy, env_id, n_envs, around, together
 
 
-SEVERAL = {"n_steps": 3, "train_freq": (1, "episode")}
 ORNSTEIN, NORMAL = OrnsteinUhlenbeckActionNoise(*NOISE), NormalActionNoise(*NOISE)
 CART, SWING = "CartPole-v1", "Pendulum-v1"
 CASES = {
     "ppo with schedules, normalised": case(sb3.PPO, CART, ROLLOUT, SCHEDULES, around="normalize"),
-    "ppo with sde": case(sb3.PPO, SWING, ROLLOUT, SDE),
     "a2c on stacked frames": case(sb3.A2C, CART, STACKED, around="stack"),
-    "dqn of several steps": case(sb3.DQN, "FrozenLake-v1", FEW, SEVERAL),
     "dqn with hindsight": case(sb3.DQN, bits, FEW, HINDSIGHT, policy="MultiInputPolicy"),
     "sac with sde and noise": case(sb3.SAC, SWING, FEW, SDE, {"action_noise": ORNSTEIN}),
     "td3 with noise": case(sb3.TD3, SWING, FEW, {"action_noise": NORMAL}, n_envs=2),
-    "qrdqn": case(contrib.QRDQN, CART, FEW),
-    "tqc": case(contrib.TQC, SWING, FEW),
     "crossq": case(contrib.CrossQ, SWING, FEW),
-    "trpo": case(contrib.TRPO, CART, ROLLOUT),
     "ars": case(contrib.ARS, SWING, {"n_delta": 1}, policy="LinearPolicy"),
     "ppo_lstm": case(contrib.RecurrentPPO, CART, ROLLOUT, policy="MlpLstmPolicy"),
     "ppo_mask": case(contrib.MaskablePPO, Masked, ROLLOUT),
@@ -159,7 +153,6 @@ OURS = load_model, load_replay_buffer, load_vec_normalize
 
 
 # What the library says when it loads such models, by its own function too.
-@pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored:UserWarning")
 @pytest.mark.filterwarnings("ignore:The last trajectory in the replay buffer:UserWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_a_genuine_model_goes_on_as_the_library_would(name, tmp_path):
@@ -197,7 +190,6 @@ def test_statistics_keep_their_settings_and_are_refused_elsewhere(tmp_path):
 # What the file says of its schedules, and what stands in their place.
 OLD_SCHEDULES = {
     "dqn_2.3.2": (sb3.DQN, {"learning_rate": 1e-3}),
-    "ppo_2.0.0": (sb3.PPO, {"clip_range": 0.2}),
     "ppo_zoo_2.6.0": (sb3.PPO, {"clip_range": 0.2}),
 }
 
