@@ -15,12 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import DQN, PPO, SAC, HerReplayBuffer
-from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.utils import ConstantSchedule
 
 from safe_files import UnsafeFileError, inspect_model, load_model, load_replay_buffer
-from safe_files.archives import first_look
 from safe_files.buffers_and_statistics import read_normalization
 from safe_files.known_objects import load_tensors, read_pickle
 
@@ -282,30 +280,18 @@ def test_tensors_that_such_a_model_does_not_have_are_refused(trained, wrong):
         load(changed, SAC)
 
 
-def with_members(content, **members):
-    """A file of tensors with other members, or more of them."""
-    archive = zipfile.ZipFile(io.BytesIO(content))
-    old = {Path(name).stem: (name, archive.read(name)) for name in archive.namelist()}
-    new = {stem: (f"archive/{stem}.pkl", member) for stem, member in members.items()}
-    return zip_of(dict({**old, **new}.values()))
-
-
 def not_tensors(mark):
     """Files that stand in the place of tensors, and what is said of each."""
     zeros, old = tensors({BIAS: th.zeros(1)}), {"_use_new_zipfile_serialization": False}
     deflated = {"archive/data/0": bytes(10**6)}
-    deep = b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b"."
     begin, may_not = "holds tensors that cannot be read: ", ", which may not stand in such a file"
     no_zip = f"{begin}is no whole zip"
     return {
         "a call": (tensors(Attack(mark)), f"{begin}holds posix.mkdir{may_not}"),
         "a call in the old format": (tensors(Attack(mark), **old), no_zip),
         "a pickle": (pickle.dumps(Attack(mark)), no_zip),
-        "signs that a terminal obeys": (with_members(zeros, data=b"ca\x1b[2J\nb\n."), begin),
-        "TorchScript": (with_members(zeros, constants=b""), "Missing key(s) in state_dict"),
         "a cut one": (zeros[:-30], no_zip),
         "one that was deflated": (zip_of(deflated, zipfile.ZIP_DEFLATED), "compressed"),
-        "lists in lists": (with_members(zeros, data=deep), f"{begin}is nested more than 40 deep"),
     }
 
 
@@ -325,21 +311,6 @@ def test_what_is_no_tensor_is_told_in_one_line_of_ours(genuine, tmp_path, recwar
         assert not mark.exists()
 
 
-def test_a_zip_that_unpacks_out_of_proportion_is_refused(genuine, tmp_path):
-    path = tmp_path / "model.zip"
-    path.write_bytes(zip_of(genuine))
-    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("tensors.pth", bytes(80 << 20))
-    assert path.stat().st_size < 1 << 20
-    tracemalloc.start()
-    try:
-        with pytest.raises(UnsafeFileError, match="would take more memory"):
-            load_model(PPO, path)
-        assert tracemalloc.get_traced_memory()[1] < 20e6
-    finally:
-        tracemalloc.stop()
-
-
 def directory(raw, member, offset, packed):
     """A zip whose list of members says something else of one of them."""
     at = raw.find(b"PK\1\2")
@@ -355,11 +326,9 @@ def odd_zips(genuine):
     with zipfile.ZipFile(two, "w") as archive, warnings.catch_warnings(action="ignore"):
         for member, held in [*genuine.items(), ("policy.pth", b"another")]:
             archive.writestr(member, held)
-    longer = zip_of({**genuine, "policy.pth!x": b"another"})
     bomb = zip_of({"archive/data.pkl": bytes(100 * MB)}, zipfile.ZIP_DEFLATED)
     return {
         "a member twice": two.getvalue(),
-        "a name with a zero in it": longer.replace(b"policy.pth!x", b"policy.pth\0x"),
         "a member at another's place": directory(raw, policy, 42, bytes(4)),
         "a smaller size": directory(raw, policy, 24, struct.pack("<L", 10)),
         "a bomb in a bomb": zip_of({**genuine, "policy.pth": bomb}, zipfile.ZIP_DEFLATED),
@@ -417,8 +386,6 @@ BOMBS = {
     "keys of one hash": b"}(" + LONGS + b"u.",
     # What reading them takes just fits the budget.
     "lists that just fit": b"](" + b"](Ne" * 230_000 + b"e.",
-    "a list in lists in lists":
-        b"](" + b"N" * 3000 + b"e\x940](" + b"h\x00" * 3000 + b"e\x940](" + b"h\x01" * 3000 + b"e.",
 }  # fmt: skip
 JSON_BOMBS = {
     "lists in JSON": "[" + "[]," * 3_000_000 + "[]]",
@@ -468,22 +435,11 @@ def file_of(pickled, record):
     return zip_of({"archive/data.pkl": b"\x80\x02" + pickled + b".", "archive/data/0": record})
 
 
-NUMBERS = {"Byte": 1, "Char": 1, "Bool": 1, "Short": 2, "Int": 4, "Long": 8, "Half": 2} | {
-    "BFloat16": 2, "Float": 4, "Double": 8, "ComplexFloat": 8, "ComplexDouble": 16
-}  # fmt: skip
 PATH = pickled_text("0")
 FLOAT = b"ctorch\nFloatStorage\n"
 OLD_LAYERS = b"Nq\x000" + b"".join(b"h%ch%c\x86q%c0" % (i, i, i + 1) for i in range(32))
 REBUILT = b"ctorch._utils\n_rebuild_tensor_v2\n("
 FEW = storage(FLOAT, PATH, b"K\x04")
-
-
-def same_record_as_many_kinds(n):
-    kinds = b""
-    for kind, size in NUMBERS.items():
-        named, fitting = f"ctorch\n{kind}Storage\n".encode(), b"J" + struct.pack("<i", n // size)
-        kinds += REBUILT + storage(named, PATH, fitting) + b"K\x00K\x01\x85K\x01\x85\x89}tR"
-    return file_of(b"](" + kinds + b"e", bytes(n))
 
 
 FOUR = bytes(16)  # four numbers of float32
@@ -500,7 +456,6 @@ STORAGES = {
         "archive/data/0": FOUR,
         "other/data/0": b"\0\0\x80?" * 4,
     }),
-    "one record as many kinds of numbers": same_record_as_many_kinds(48 * MB),
 }  # fmt: skip
 
 
@@ -539,9 +494,9 @@ def hostile_zips(genuine):
     for wish, kwargs in NETWORKS.items():
         yield wish, zip_of(with_settings(genuine, policy_kwargs=kwargs))
     yield "many members", zip_of({**genuine, **{f"x{i}": b"" for i in range(30_000)}})
-    inflated = zip_of({**genuine, "tensors.pth": bytes(400 * MB)}, zipfile.ZIP_DEFLATED)
+    inflated = zip_of({**genuine, "tensors.pth": bytes(120 * MB)}, zipfile.ZIP_DEFLATED)
     yield "a member that inflates", inflated
-    size = (400 * MB).to_bytes(4, "little")
+    size = (120 * MB).to_bytes(4, "little")
     yield "a member that says less than it inflates to", inflated.replace(size, b"\x0a\0\0\0")
 
 
@@ -580,39 +535,12 @@ def check_peak(attack, content, load):
     return answer
 
 
-def look_into(stream):
-    first_look(stream.read())
-
-
 def test_memory_is_in_proportion_to_a_models_file(genuine, tmp_path):
     for attack, content in hostile_zips(genuine):
         path = tmp_path / "model.zip"
         path.write_bytes(content)
         assert check_peak(attack, content, partial(load_model, PPO)), attack
-        check_peak(attack, content, look_into)
         check_peak(attack, content, lambda stream: inspect_model(path))  # noqa: B023
-
-
-def test_a_hindsight_buffer_has_its_rows_in_the_file():
-    """Its constructor makes a dictionary for each row that the file says it has."""
-    env = BitFlippingEnv(n_bits=3, max_steps=3)
-    settings = {"replay_buffer_class": HerReplayBuffer, "buffer_size": 50, "device": "cpu"}
-    agent = DQN("MultiInputPolicy", env, **settings)
-    buffer = io.BytesIO()
-    agent.save_replay_buffer(buffer)
-    rows = b"K2"  # of `buffer_size`
-    where = buffer.getvalue().index(rows, buffer.getvalue().index(b"buffer_size"))
-    more = buffer.getvalue()[:where] + b"J" + struct.pack("<i", 30 * 10**6)
-    content = unframed(more + buffer.getvalue()[where + len(rows) :])
-    told = check_peak("a buffer", content, lambda stream: load_replay_buffer(agent, stream))
-    assert "wrong infos" in told
-
-
-def unframed(pickled):
-    """A pickle without the marks of how long its parts are."""
-    start = pickled.index(b"\x95")
-    assert pickled.count(b"\x95") == 1
-    return pickled[:start] + pickled[start + 9 :]
 
 
 @pytest.mark.parametrize("attack", BOMBS)

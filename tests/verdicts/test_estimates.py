@@ -39,14 +39,6 @@ def points(summary):
 # --- points --------------------------------------------------------------------------------------
 
 
-def test_statistics_worked_by_hand():
-    # Sorted 0 1 2 3 4 5 6 100: the middle half is 2 3 4 5.
-    summary = summarise([100, 0, 1, 6, 2, 5, 3, 4], seed=0)
-    assert points(summary) == [121 / 8, 3.5, 3.5]
-    # Five: one is left out at either end.
-    assert points(summarise([0, 10, 1, 2, 30], seed=0)) == pytest.approx([8.6, 2, 13 / 3])
-
-
 @given(st.lists(NUMBERS, min_size=1, max_size=30))
 def test_statistics_equal_the_plain_ones(scores):
     summary = summarise(scores, seed=0, n_resamples=10)
