@@ -1,7 +1,6 @@
 """Pulls of bandits: their record, figures worked the plain way, batches, the shipped studies."""
 
 import dataclasses
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,29 +72,6 @@ def test_any_agent_leaves_its_pulls(algorithm, kwargs, tmp_path):
 ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
 REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
 REGRETS = np.where(ARMS == 0, 0.3, 0.0)
-
-
-def test_contexts_on_paper():
-    """Arm 1 alone, which costs .4 in context 0 and nothing in context 1; there are three."""
-    contexts = np.array([[0, 1, 0, 1]])
-    regrets = np.where(contexts == 0, 0.4, 0.0)
-    arms, rewards = np.ones((1, 4), dtype=np.int16), np.zeros((1, 4), dtype=np.float32)
-    found = pull_statistics(arms, rewards, regrets, contexts, 2, 3)
-    # Each context weighs as often as it was seen.
-    assert found.simple_regret == pytest.approx([0.4, 0.4 / 2, 0.4 * 2 / 3, 0.4 / 2])
-    assert np.array_equal(found.shares, [[0, 1], [0, 1], [math.nan] * 2], equal_nan=True)
-    expected = [[math.nan, 0.4], [math.nan, 0], [math.nan] * 2]
-    assert found.context_regret == pytest.approx(np.array(expected), nan_ok=True)
-    assert found.cumulative_regret_sem.tolist() == [0, 0, 0, 0]  # of a single run
-    # What was never tried is left out of the mean of estimates.
-    nan = math.nan
-    estimates = np.array([[[1.0, nan, nan]], [[4.0, 2.0, nan]], [[nan, 5.0, nan]]])
-    none = np.zeros((3, 1))
-    found = pull_statistics(none.astype(np.int64), none, none, None, 3, estimates=estimates)
-    assert found.estimates == pytest.approx(np.array([[2.5, 3.5, nan]]), nan_ok=True)
-    assert found.estimates_std == pytest.approx(np.array([[1.5, 1.5, nan]]), nan_ok=True)
-    for name in ("true_means", "moments", "posteriors"):
-        assert getattr(found, name).size == 0, name
 
 
 def test_every_figure_at_every_point_the_plain_way():

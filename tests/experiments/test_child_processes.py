@@ -75,12 +75,6 @@ def end_program(words):
 def crash():
     ctypes.string_at(0)
 
-def write_and_wait(folder, text):
-    (Path(folder) / f"waiting_{os.getpid()}").touch()
-    while not (Path(folder) / "go").exists():
-        time.sleep(0.01)
-    return text
-
 def clean_up(folder):
     with (Path(folder) / "cleaned").open("a") as file:
         file.write(".")
@@ -105,23 +99,6 @@ def chores(tmp_path, monkeypatch):
 
     yield study_chores
     monkeypatch.delitem(sys.modules, "study_chores")
-
-
-@pytest.fixture
-def light_server(monkeypatch):
-    """What children are forked from has imported nothing, for tests that end it."""
-    preloaded, heavy = child_processes.PRELOADED, child_processes.server_pid()
-    child_processes.end_server()
-    monkeypatch.setattr(child_processes, "PRELOADED", [])
-
-    def is_there():
-        child_processes.start_server()
-        return child_processes.server_pid() != heavy
-
-    wait_for(is_there)  # one with threads is not gone as soon as it is a zombie
-    yield
-    child_processes.end_server()
-    multiprocessing.set_forkserver_preload(preloaded)
 
 
 def nothing():
@@ -201,21 +178,6 @@ def test_leaving_early_ends_the_children(chores, tmp_path):
         assert executor.submit(alone, chores.add, 1, 1).result()[0] == 2
         stop_all()
         assert isinstance(executor.submit(alone, chores.add, 1, 1).exception(), StoppedError)
-
-
-@pytest.mark.usefixtures("light_server")
-def test_when_the_server_is_killed_all_go_on(chores, tmp_path, caplog):
-    with local_executor(2) as executor:
-        first = executor.submit(alone, chores.write_and_wait, str(tmp_path), "first")
-        wait_for(lambda: waiting_in(tmp_path))
-        server = child_processes.server_pid()
-        child_processes.end_server()
-        wait_for(lambda: not is_alive(server))
-        assert executor.submit(alone, chores.add, 1, 1).result()[0] == 2
-        (tmp_path / "go").touch()
-        assert first.result() == "first"
-    told = "the process that forks runs was killed; it is started again"
-    assert caplog.messages == [told]
 
 
 def test_signals_of_a_whole_group_do_not_reach_the_children(chores):
@@ -311,11 +273,8 @@ def test_runs_in_one_process_leave_what_each_leaves_alone(tmp_path):
 HYPERPARAMS = runs_of(Path("x"))[0].spec.hyperparams
 NOT_PLAIN = [
     {"gym_packages": ("mine",)},
-    {"tensorboard_log": Path("t")},
     {"trained_agent": Path("a.zip")},
-    {"algo": "no_such_agent"},
     {"vec_env": "subproc"},
-    {"env_id": "Nowhere-v0"},
     *(
         {"hyperparams": replace(HYPERPARAMS, **{name: value})}
         for name, value in (
@@ -326,10 +285,7 @@ NOT_PLAIN = [
         )
     ),
     # Networks share a process in our engines alone.
-    *(
-        {"algo": algo, "hyperparams": replace(HYPERPARAMS, algorithm={"engine": engine})}
-        for algo, engine in (("ppo", "library"), ("sac", "compiled"))
-    ),
+    {"algo": "ppo", "hyperparams": replace(HYPERPARAMS, algorithm={"engine": "library"})},
 ]
 
 
@@ -364,9 +320,7 @@ def test_times_and_sizes():
         ({}, 1e9, ""),
         ({"seconds": 5}, 5, ""),
         ({"seconds": 5}, 5.1, "took longer than --run-timeout allows, 5 s"),
-        ({"memory": 10**15}, 1e9, ""),
         ({"memory": 2 * 10**6}, 3, "of memory after 3 s; --run-memory allows 2 MB"),
-        ({"is_wanted": lambda: True}, 1, ""),
         ({"is_wanted": lambda: False}, 1, "nobody waits for it any more"),
     ],
 )

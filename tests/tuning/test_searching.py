@@ -24,7 +24,6 @@ from tuning.retesting import (
     Candidate,
     Outcome,
     Retested,
-    _winner,
     best_trials,
     chosen_for_retest,
     concluded,
@@ -382,25 +381,6 @@ def test_optimism_is_how_much_better_it_looked_than_it_is(toy):
         best = retested(4, held_out, in_search=in_search)
         assert optimism(toy.tuning(figure=figure), best) == pytest.approx(fooled_by)
     assert optimism(toy.tuning(), replace(best, held_out=None)) is None
-
-
-WINNERS = [
-    ([(1, 0.8, "undecided"), (2, 0.9, "better")], "score", 2),
-    ([(1, 0.8, "better, as seen"), (2, 0.75, "better")], "score", 1),
-    ([(1, 0.8, "undecided"), (2, 0.9, "undecided")], "score", None),
-    ([(1, 0.7, "undecided"), (2, 0.6, "worse")], "score", None),  # no better than before
-    ([(1, None, "undecided")], "score", None),
-    ([(1, 0.9, "better", 0.9, 19), (2, 0.8, "better")], "score", 2),  # a run of it failed
-    ([(1, 0.65, "better"), (2, 0.6, "better")], "steps", 2),
-]
-
-
-@pytest.mark.parametrize(("others", "figure", "winner"), WINNERS)
-def test_what_wins_is_better_on_other_seeds_than_what_there_was(toy, others, figure, winner):
-    settings = [retested(0, 0.7, ""), *[retested(*each) for each in others]]
-    found, reason = _winner(toy.tuning(figure=figure), settings)
-    assert (found and found.number) == winner
-    assert bool(reason) == (winner is None)
 
 
 def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):

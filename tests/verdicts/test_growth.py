@@ -66,21 +66,6 @@ def test_who_is_told_from_all_others_gets_no_more_seeds():
     assert [each.mean.verdict for each in last.judged.values()] == ["better", "better", "undecided"]
 
 
-def test_against_one_agent_only_its_pairs_are_tested_and_grow():
-    near = np.tile([0.0, 1.0], 7)
-    scores = {"old": near, "far": np.arange(14.0) + 100, "near": near[::-1].copy()}
-    scores["far too"] = scores["far"] + 0.5
-    first = grow(cut(scores, dict.fromkeys(scores, 9)), (9, 14), 0.0, LEVEL, against="old")
-    assert first.seeds == {"old": 14, "far": 9, "near": 14, "far too": 9}
-    last = grow(cut(scores, first.seeds), (9, 14), 0.0, LEVEL, against="old")
-    assert last.is_done
-    said = {pair: each.mean.verdict for pair, each in last.judged.items()}
-    assert said["old", "far"] == said["old", "far too"] == "worse"
-    # The two that are far ahead are never compared, and nobody grows for them.
-    assert said["far", "far too"] == said["old", "near"] == "undecided"
-    assert (last.looks["old", "far"], last.looks["old", "near"]) == (1, 2)
-
-
 def test_an_agent_whose_runs_fail_makes_nobody_grow():
     scores = {"fails": np.full(6, np.nan), "runs": np.arange(6.0)}
     found = grow(scores, SIZES, 0.0, LEVEL)
