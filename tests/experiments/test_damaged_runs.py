@@ -5,8 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rich.console import Console
 
 from commands.compare import RunContext, repair, run_study
@@ -171,14 +169,3 @@ def test_a_monitor_file_of_no_form(tmp_path, text):
     with pytest.raises(DamagedFileError, match=r"0\.monitor\.csv is damaged: ") as error:
         read_episodes(Run(tmp_path, "x"))
     assert "\n" not in str(error.value)
-
-
-@given(st.lists(st.floats(-1e300, 1e300), max_size=20))
-def test_episodes_are_read_to_the_last_bit_whatever_stands_beside_them(tmp_path_factory, returns):
-    path = tmp_path_factory.mktemp("run") / "0.monitor.csv"
-    rows = [f'"left, or\nright",0.5,{value!r},3' for value in returns]
-    path.write_text("\n".join(['#{"t_start": 0}', "way,t,r,l", *rows, ""]))
-    episodes = read_episodes(Run(path.parent, "x"))
-    assert episodes.returns.tolist() == returns
-    assert episodes.steps.tolist() == [3 * n for n in range(1, len(returns) + 1)]
-    assert episodes.seconds.tolist() == [0.5] * len(returns)

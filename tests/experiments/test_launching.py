@@ -1,6 +1,5 @@
 """Doing the runs of a study: drafts, faults, order, time left; and runs that are in the way."""
 
-import json
 import math
 import os
 import platform
@@ -13,7 +12,6 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
-import yaml
 
 from experiments import child_processes
 from experiments.launching import (
@@ -57,7 +55,7 @@ def runs_of(root, **fields):
 # --- One run.
 
 
-def test_a_run_says_what_it_is(tmp_path):
+def test_a_run_stands_in_its_place_once_with_its_own_log(tmp_path):
     _, planned = runs_of(tmp_path, tensorboard=True)
     draft, old = draft_path(tmp_path, planned), planned.spec.tensorboard_log / "of an earlier try"
     old.mkdir(parents=True)
@@ -66,19 +64,14 @@ def test_a_run_says_what_it_is(tmp_path):
     assert not draft.exists()
     assert not old.exists()
     assert list(old.parent.rglob("events.out.tfevents.*"))
-    args = yaml.safe_load((planned.run.params_path / "args.yml").read_text())
-    given = {key: value for key, value in args.items() if value is not None}
-    assert given == {"algo": "qlearning", "env": "FrozenLake-v1", "seed": 1}
     assert "compare.py s.yml" in (planned.run.params_path / "command.txt").read_text()
-    info = json.loads(planned.run.info_path.read_text())
-    assert (info["state"], info["spec"]["seed"]) == ("finished", 1)
     # Another process was faster: what it has done stays.
     (planned.path / "mark").touch()
     do_run(planned, draft, "again")
     assert (planned.path / "mark").exists()
 
 
-# An environment that counts its steps in a file, and fails within the 15th as it is told.
+# An environment that counts its steps in a file, and fails within the fourth as it is told.
 COUNTING = """
 import errno, gymnasium as gym
 from pipeline.errors import UserError
@@ -103,7 +96,7 @@ class Counting(gym.Env):
         if self.fault:
             with open(self.path, "a") as steps:
                 steps.write(".")
-                if steps.tell() == 15:
+                if steps.tell() == 4:
                     error, cause = FAULTS[self.fault]
                     raise error from cause
         return 0, 0.0, False, False, {}
@@ -122,7 +115,7 @@ def counting_module(tmp_path_factory):
 
 @pytest.fixture
 def counting(tmp_path, counting_module):
-    """Runs of 20 steps each that fail so, or not at all."""
+    """Runs of six steps each that fail so, or not at all."""
 
     def runs(*faults):
         places = [
@@ -130,7 +123,7 @@ def counting(tmp_path, counting_module):
                 f"place {n}",
                 "Counting-v0",
                 {
-                    "n_timesteps": 20,
+                    "n_timesteps": 6,
                     "train_env_kwargs": {"fault": fault, "path": str(tmp_path / f"steps {n}")},
                 },
             )
@@ -145,19 +138,19 @@ def counting(tmp_path, counting_module):
 
 @pytest.mark.parametrize(
     ("fault", "is_of_others", "n_steps"),
-    [("disk", False, 6), ("memory", True, 20), ("library", False, 20)],
+    [("disk", False, 3), ("memory", True, 6), ("library", False, 6)],
 )
 def test_a_run_goes_on_where_another_try_may_help_from_states_of_its_own_sources(
     tmp_path, counting, monkeypatch, fault, is_of_others, n_steps
 ):
-    """A run that fails within the 15th step has saved 14."""
+    """A run that fails within the fourth step has saved three; each state takes long."""
     monkeypatch.setattr(state_saver, "SHARE_OF_TIME", math.inf)  # it saves whenever it may
     monkeypatch.setattr(state_saver, "SHORTEST_INTERVAL", 0.0)
     (planned,), steps = counting(fault), tmp_path / "steps 0"
     draft = draft_path(tmp_path / "study", planned)
     with pytest.raises(Exception, match=r".*"):
         do_run(planned, draft, "")
-    assert steps.stat().st_size == 15
+    assert steps.stat().st_size == 4
     leave_drafts(tmp_path / "study", run_name(planned))
     assert draft.exists() == (fault != "library")
     for path in draft.rglob("*.state") if is_of_others else ():
@@ -167,7 +160,7 @@ def test_a_run_goes_on_where_another_try_may_help_from_states_of_its_own_sources
             write_state(file, state.content, {**state.note, SOURCES: "older"}, state_key())
     do_run(planned, draft, "")
     assert planned.is_finished
-    assert steps.stat().st_size == 15 + n_steps
+    assert steps.stat().st_size == 4 + n_steps
 
 
 def test_every_run_is_told_of_and_failures_are_kept(tmp_path, counting):

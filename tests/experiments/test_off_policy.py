@@ -6,16 +6,12 @@ from contextlib import nullcontext
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
 from agents import load_algorithm
 from envs.bandits import ReplayBandit, log_uniformly, read_log
 from experiments.off_policy.estimators import (
     ArmMeans,
     ArmRegressions,
-    check_support,
     cross_fit,
     difference_in_value,
     direct_method,
@@ -144,18 +140,6 @@ def test_sensitivity_is_the_derivative(kind):
 # --- Laws.
 
 
-@given(st.data())
-def test_the_logging_policy_is_worth_what_the_log_says(data):
-    n = data.draw(st.integers(2, 30))
-    rewards = data.draw(arrays.arrays(np.float64, n, elements=st.floats(-100, 100, width=32)))
-    arms = data.draw(arrays.arrays(np.int64, n, elements=st.integers(0, 2)))
-    logging = np.random.default_rng(n).dirichlet(np.ones(3) * 5, size=n)
-    weights = importance_weights(logging, arms, logging[np.arange(n), arms])
-    assert ips(weights, rewards).mean() == pytest.approx(rewards.mean(), abs=1e-9)
-    assert snips(weights, rewards).mean() == pytest.approx(rewards.mean(), abs=1e-9)
-    assert effective_sample_size(weights) == pytest.approx(n)
-
-
 # --- Against the truth: the segments of SegmentBandit.
 
 # The best treatment for each segment, at .159 clicks a user.
@@ -206,72 +190,39 @@ def test_replay_of_a_uniform_log_is_the_self_normalised_estimate(tmp_path):
     assert effective_sample_size(weights) == pytest.approx(info["matched_pulls"])
 
 
-# --- Where a log stops being one: each limit from both of its sides.
+# --- Where a log stops being one, or holds too little of what a policy does.
 
-NO_PROPENSITY = r"propensity of pull 2 is .*, it must be above 0 and at most 1"
-NO_ARMS = "arms must lie between 0 and 1, as the policy's columns"
 NOT_1 = r"sum of the policy's probabilities of pull 2 is .*be 1$"
-SHAPES = r"a policy of shape \(3, 2\) needs 3 arms and propensities"
+NO_PROPENSITY = r"propensity of pull 2 is .*, it must be above 0 and at most 1"
+TOO_LITTLE = "the log holds too little of what the policy does: its weights are 0.979"
+TOO_SMALL = "the propensities are too small: the weights are 1.29 on average"
+# What stands where in a log of both arms in turn, and what is said of it.
+LOGS = [
+    *(("propensities", 1, value, NO_PROPENSITY) for value in (0.0, 1.5, np.nan)),
+    ("policy", 1, (0.5, 0.5 + 9e-7), None),
+    *(("policy", 1, row, NOT_1) for row in ((0.5, 0.5 + 2e-6), (0.5, np.nan), (1.5, -0.5))),
+    # Python would take -1 for the last arm.
+    ("arms", 2, -1, "arms must lie between 0 and 1, as the policy's columns"),
+    ("arms", slice(None), 0, r"arm 1 was never logged, and the policy chooses it for 50\.0%"),
+    ("rewards", 1, np.inf, "reward of pull 2 is inf, it must be finite"),
+    # Equal weights below 1 have no spread: what files round remains, 0.02.
+    ("propensities", slice(None), 0.5 / 0.981, None),
+    ("propensities", slice(None), 0.5 / 0.979, TOO_LITTLE),
+    # Above 1 by x, the variance for a mean of 1 is x: x = 5 sqrt(x / n) + 0.02.
+    ("propensities", slice(None), 0.5 / 1.288, None),
+    ("propensities", slice(None), 0.5 / 1.289, TOO_SMALL),
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "values", "refusal"),
-    [
-        *(("propensity", p, NO_PROPENSITY) for p in (0.0, 1.5, np.nan)),
-        ("row", (0.5, 0.5 + 9e-7), None),
-        *(("row", row, NOT_1) for row in ((0.5, 0.5 + 2e-6), (0.5, np.nan), (1.5, -0.5))),
-        # Python would take -1 for the last arm.
-        *(("arms", arms, NO_ARMS) for arms in ((0, 1, -1), (0, 1, 2))),
-        ("arms", (0, 1), SHAPES),
-    ],
-)
-def test_what_weights_are_made_of(name, values, refusal):
-    given = {"policy": [(0.5, 0.5)] * 3, "arms": (0, 1, 0), "propensities": [0.5] * 3}
-    if name == "row":
-        name, values = "policy", [(0.5, 0.5), values, (0.5, 0.5)]
-    elif name == "propensity":
-        name, values = "propensities", [0.5, values, 0.5]
-    policy, arms, propensities = map(np.array, {**given, name: values}.values())
-    if refusal is None:
-        expected = [policy[i, arms[i]] / propensities[i] for i in range(3)]
-        assert importance_weights(policy, arms, propensities).tolist() == expected
-    else:
-        with pytest.raises(ValueError, match=refusal):
-            importance_weights(policy, arms, propensities)
-
-
-TOO_LITTLE = "the log holds too little of what the policy does: its weights are "
-TOO_SMALL = "the propensities are too small: the weights are "
-
-
-@pytest.mark.parametrize(
-    ("weights", "outcome"),
-    [
-        # Equal weights below 1 have no spread: what files round remains, 0.02.
-        ([0.981] * 100, ""),
-        ([0.979] * 100, TOO_LITTLE + "0.979"),
-        # Above 1 by x, the variance for a mean of 1 is x: x = 5 sqrt(x / n) + 0.02.
-        ([1.288] * 100, ""),
-        ([1.289] * 100, TOO_SMALL + "1.29 on average"),
-        # Of weights 0 and 2 the variance for a mean of 1 is 1: 100 may miss it by 5 / 10 + 0.02.
-        ([2.0] * 23 + [0.0] * 77, TOO_LITTLE + "0.46"),
-        ([0.0] * 100, "the policy would have made none of the logged pulls"),
-    ],
-)
-def test_what_a_log_can_tell(weights, outcome):
-    policy, arms = np.full((100, 2), 0.5), np.arange(100) % 2
-    with pytest.raises(ValueError, match=outcome) if outcome else nullcontext():
-        check_support(policy, arms, np.array(weights))
-
-
-def test_a_policy_is_judged_on_what_is_a_log(each_by_the_others):
-    given = (ALWAYS_1, np.zeros(4, np.int64), REWARDS, PROPENSITIES)
-    with pytest.raises(ValueError, match=r"arm 1 was never logged, and .* chooses it for 100\.0%"):
-        evaluate_policy(*given, each_by_the_others)
-    with pytest.raises(ValueError, match="reward of pull 2 is inf, it must be finite"):
-        evaluate_policy(
-            ALWAYS_1, ARMS, np.array([1, np.inf, 0, 0]), PROPENSITIES, each_by_the_others
-        )
+@pytest.mark.parametrize(("name", "place", "value", "refusal"), LOGS)
+def test_what_a_policy_is_judged_on(name, place, value, refusal):
+    arms, rewards = np.arange(100) % 2, np.zeros(100)
+    model = cross_fit(np.zeros(100, np.int64), arms, rewards, 2)
+    given = {"policy": np.full((100, 2), 0.5), "arms": arms.copy(), "rewards": rewards.copy()}
+    given["propensities"] = np.full(100, 0.5)
+    given[name][place] = value
+    with pytest.raises(ValueError, match=refusal) if refusal else nullcontext():
+        evaluate_policy(**given, model=model)
 
 
 # --- Agents on logs: which can be judged, what they stand beside, and what is said of them.

@@ -7,13 +7,11 @@ same weights, to the last bit.
 import random
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import sb3_contrib as contrib
 import stable_baselines3 as sb3
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -31,25 +29,6 @@ from safe_files import (
 )
 
 OLD_MODELS = Path(__file__).parent / "old_models"
-
-
-class Masked(gym.Env):
-    """Four actions, of which one is never allowed."""
-
-    observation_space = spaces.Discrete(4)
-    action_space = spaces.Discrete(4)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return 0, {}
-
-    def step(self, action):
-        self.steps += 1
-        return self.steps % 4, float(action == self.steps % 4), False, self.steps == 10, {}
-
-    def action_masks(self):
-        return np.arange(4) != (self.steps + 1) % 4
 
 
 def bits():
@@ -97,7 +76,6 @@ CASES = {
     "crossq": case(contrib.CrossQ, SWING, FEW),
     "ars": case(contrib.ARS, SWING, {"n_delta": 1}, policy="LinearPolicy"),
     "ppo_lstm": case(contrib.RecurrentPPO, CART, ROLLOUT, policy="MlpLstmPolicy"),
-    "ppo_mask": case(contrib.MaskablePPO, Masked, ROLLOUT),
 }
 
 

@@ -99,10 +99,6 @@ def shipped(algo):
 # --- the files that come with the project ---------------------------------------------------------
 
 
-def test_every_agent_has_a_file():
-    assert {path.name for path in FOLDER.iterdir()} == {f"{name}.yml" for name in ALGORITHMS}
-
-
 # Ranges are chosen so that what ships lies inside, but for what no range should hold.
 WIDENED = {("qrdqn", "FrozenLake-v1"): ("policy_kwargs.net_arch",)}  # no hidden layer
 

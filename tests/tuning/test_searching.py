@@ -29,7 +29,6 @@ from tuning.retesting import (
     concluded,
     entry_text,
     is_settled,
-    optimism,
     retest_study,
     write_winner,
 )
@@ -337,14 +336,6 @@ def test_what_is_hopeless(method, scores, others, options, hopeless):
     assert found is hopeless
 
 
-def test_a_signed_rank_test_needs_four_seeds():
-    best = scored([1.0 - 0.01 * n for n in range(10)])
-    worse = [score - 0.1 * (seed + 1) for seed, score in best.items()]
-    ended = [is_hopeless(scored(worse[:n]), [best], "wilcoxon") for n in range(1, 11)]
-    # All of n differences on one side have a probability of 1 in 2^n: 1 in 16 is below 0.1.
-    assert ended.index(True) + 1 == 4
-
-
 # === what is tested again =========================================================================
 
 
@@ -372,15 +363,6 @@ def test_what_a_re_test_cannot_be(toy, changes, complaint):
         replace(tuning, study=replace(tuning.study, first_seed=first)).check()
     toy.tuning(first_retest_seed=3).check()
     toy.tuning(first_retest_seed=2, retest=0).check()
-
-
-def test_optimism_is_how_much_better_it_looked_than_it_is(toy):
-    for figure, in_search, held_out, fooled_by in (
-        *(("score", 0.9, 0.7, 0.2), ("score", 0.7, 0.9, -0.2), ("steps", 100.0, 130.0, 30.0)),
-    ):
-        best = retested(4, held_out, in_search=in_search)
-        assert optimism(toy.tuning(figure=figure), best) == pytest.approx(fooled_by)
-    assert optimism(toy.tuning(), replace(best, held_out=None)) is None
 
 
 def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):

@@ -1,12 +1,11 @@
 """Where trials are kept, as --storage says it, and drivers that share them."""
 
 import pytest
-from optuna.trial import TrialState
 
 from pipeline import locks
 from pipeline.errors import UserError
 from tuning import trial_storage
-from tuning.trial_storage import DRIVER, open_storage
+from tuning.trial_storage import open_storage
 from tuning.tuning_spec import failing_in_a_line, kind_of, without_secret
 
 
@@ -117,16 +116,3 @@ def test_one_elsewhere_counts_as_gone_once_it_has_been_silent(queue_of, elsewher
         if gives_sign:
             far.give_sign()
         assert here.free_dead() == freed
-
-
-def test_a_trial_is_given_back_by_whoever_has_it_and_freed_where_nobody_signs(queue_of, clock):
-    queue = queue_of(n_trials=4)
-    trial = queue.claim(lambda _: {})
-    trial.set_user_attr(DRIVER, {"token": "another"})
-    queue.give_back(trial)
-    assert queue.trials()[0].state == TrialState.RUNNING
-    # One that was taken and not signed is free after a while.
-    queue.storage.set_trial_state_values(queue.trials()[1]._trial_id, TrialState.RUNNING)
-    assert queue.free_dead() == []
-    clock[0] = 61.0
-    assert 1 in queue.free_dead()

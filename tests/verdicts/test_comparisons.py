@@ -101,20 +101,6 @@ def test_winning_always_leaves_a_doubt():
     assert [lost.point, *interval(lost)] == pytest.approx([0, 0, exact.high])
 
 
-def test_of_many_seeds_the_interval_is_that_of_leaving_one_out():
-    """The jackknife has the variance of DeLong; two environments alike halve it."""
-    n = 250
-    first, second = np.random.default_rng(0).normal([[0.3], [0]], 1, size=(2, n))
-    wins = first[:, None] > second
-    without = (wins.sum() - wins.sum(axis=0) - wins.sum(axis=1) + np.diag(wins)) / (n - 1) ** 2
-    half = stats.norm.isf(0.05) * np.sqrt((n - 1) * without.var())
-    for k in (1, 2):
-        several = (np.tile(each, (k, 1)).T for each in (first, second))
-        found = probability_of_improvement(*several, seed=0, confidence=0.9)
-        ends = wins.mean() - half / k**0.5, wins.mean() + half / k**0.5
-        assert interval(found) == pytest.approx(ends, abs=2e-4)
-
-
 # --- paired differences --------------------------------------------------------------------------
 
 
@@ -251,19 +237,6 @@ def test_looks_and_environments_spend_no_more_than_there_is():
     # Where there are several environments, all of them together are one more.
     shares = [level_of_environment(0.06, n) for n in (1, 2, 3)]
     assert shares == pytest.approx([0.06, 0.02, 0.015])
-
-
-@pytest.mark.parametrize(
-    ("scores", "options", "message"),
-    [
-        (([1, 2], [1, 2, 3]), {}, r"different shapes, .*'y': \(3,\)"),
-        (([1, 2], [1, 2]), {"confidence": 95}, "confidence is 95"),
-        (([1, 2], [1, 2]), {"ends": (1, 0)}, "ends are"),
-    ],
-)
-def test_wrong_arguments_are_named(scores, options, message):
-    with pytest.raises(ValueError, match=message):
-        compare_pairs(dict(zip("xy", scores, strict=True)), seed=0, **options)
 
 
 # === rank-sum tests ===============================================================================

@@ -24,7 +24,7 @@ from verdicts import (
     summarise,
     summarise_steps,
 )
-from verdicts.resampling import enough_resamples, interval_tail
+from verdicts.resampling import interval_tail
 
 STATISTICS = ("mean", "median", "iqm")
 PLAIN = {"mean": np.mean, "median": np.median, "iqm": lambda x: stats.trim_mean(x, 0.25)}
@@ -93,17 +93,6 @@ def test_the_tail_of_several_environments_has_the_degrees_of_freedom_of_welch():
     # Two alike add up their degrees of freedom.
     alike = stats.norm.cdf(-np.sqrt(3 / 2) * stats.t.ppf(0.975, 4))
     assert interval_tail([strata[0], strata[0]], 0.95) == pytest.approx(alike)
-
-
-def test_many_seeds_need_fewer_resamples():
-    found = [enough_resamples(10_000, n) for n in (5, 200, 500, 2000, 100_000)]
-    assert found == [10_000, 10_000, 4000, 1000, 1000]
-    assert enough_resamples(50, 2000) == 50
-    many = np.random.default_rng(0).normal(size=2000)
-    mean = estimate(many, "mean", seed=0)
-    assert mean == estimate(many, "mean", seed=0, n_resamples=1000)
-    half = stats.norm.isf(0.025) * stats.sem(many)
-    assert (mean.high - mean.low) / 2 == pytest.approx(half, rel=0.1)
 
 
 @pytest.mark.parametrize("scores", [[4.0], [4.0, np.nan], [[4.0, 1.0], [np.nan, 2.0]]])
