@@ -137,9 +137,6 @@ def test_sensitivity_is_the_derivative(kind):
         assert derivative == pytest.approx(sensitivity[first] - sensitivity[second])
 
 
-# --- Laws.
-
-
 # --- Against the truth: the segments of SegmentBandit.
 
 # The best treatment for each segment, at .159 clicks a user.

@@ -198,13 +198,6 @@ def test_what_no_model_has_is_refused(genuine, change):
     assert refusal.value.key in named - {"policy_kwargs"}
 
 
-def changed_tensor(content, change):
-    """The file of tensors after `change` had its way with what it holds."""
-    held = th.load(io.BytesIO(content), weights_only=True)
-    change(held)
-    return tensors(held)
-
-
 @pytest.fixture(scope="module")
 def trained():
     """The members of the zip of a SAC agent, whose optimizers have seen something."""
@@ -213,27 +206,12 @@ def trained():
 
 
 BIAS = "actor.mu.bias"
-
-
-def weight(change):
-    """Something is done to one weight."""
-    return "policy.pth", lambda held: held.update({BIAS: change(held[BIAS])})
-
-
-def optimizer(change):
-    """Something is done to an optimizer."""
-    return "actor.optimizer.pth", change
-
-
 WRONG_TENSORS = {
-    "a weight that is no number": weight(lambda w: w.fill_(th.nan)),
-    "a weight of float64": weight(lambda w: w.double()),
-    "a weight of another shape": weight(lambda w: th.zeros(2)),
-    "an average of another kind": optimizer(
-        lambda held: held["state"][0].update(exp_avg=held["state"][0]["exp_avg"].double())
-    ),
-    "a learning rate that is a text": optimizer(
-        lambda held: held["param_groups"][0].update(lr="fast")
+    "a weight that is no number": ("policy.pth", lambda held: held[BIAS].fill_(th.nan)),
+    "a weight of another shape": ("policy.pth", lambda held: held.update({BIAS: th.zeros(2)})),
+    "an average of another kind": (
+        "actor.optimizer.pth",
+        lambda held: held["state"][0].update(exp_avg=held["state"][0]["exp_avg"].double()),
     ),
 }
 
@@ -242,10 +220,11 @@ WRONG_TENSORS = {
 def test_tensors_that_such_a_model_does_not_have_are_refused(trained, wrong):
     assert isinstance(load(trained, SAC), SAC)
     member, change = WRONG_TENSORS[wrong]
-    changed = {**trained, member: changed_tensor(trained[member], change)}
-    reason = member.replace(".", r"\.") + "|size mismatch|holds no such model"
+    held = th.load(io.BytesIO(trained[member]), weights_only=True)
+    change(held)
+    reason = member.replace(".", r"\.") + "|size mismatch"
     with pytest.raises(UnsafeFileError, match=reason):
-        load(changed, SAC)
+        load({**trained, member: tensors(held)}, SAC)
 
 
 def not_tensors(mark):
@@ -324,7 +303,6 @@ LONGS = b"".join(b"\x8a\x0f" + (M61 * i).to_bytes(15, "little") + b"N" for i in 
 BOMBS = {
     "one text in many arrays": ARRAY_MEMO + b"](" + ARRAY * 150 + b"e.",
     "many lists": b"](" + b"]" * 4_000_000 + b"e.",
-    "many calls": DEQUE + b"\x940](" + b"h\x00)R" * 1_000_000 + b"e.",
     "a wide text":
         b"X" + (16 * MB + 4).to_bytes(4, "little") + b"a" * 16 * MB + b"\xf0\x9f\x98\x80.",
     "keys of one hash": b"}(" + LONGS + b"u.",

@@ -1,4 +1,4 @@
-"""Genuine files of every algorithm: loaded without unpickling, they are what the library loads.
+"""Genuine files of many algorithms: loaded without unpickling, they are what the library loads.
 
 The files are made here by the plain library. From both models training goes on, and ends in the
 same weights, to the last bit.
@@ -119,7 +119,7 @@ def go_on(name, folder, load, load_buffer, load_statistics):
     kinds = {attribute: type(value) for attribute, value in vars(model).items()}
     before = weights(model)
     reseed()
-    return model.learn(60, reset_num_timesteps=False), kinds, before
+    return model.learn(20, reset_num_timesteps=False), kinds, before
 
 
 LIBRARY = (
@@ -136,7 +136,7 @@ OURS = load_model, load_replay_buffer, load_vec_normalize
 def test_a_genuine_model_goes_on_as_the_library_would(name, tmp_path):
     reseed()
     model = make_model(name)
-    model.learn(60)
+    model.learn(30)
     model.save(tmp_path / "model")
     if CASES[name][4] == "normalize":
         model.get_vec_normalize_env().save(str(tmp_path / "statistics.pkl"))

@@ -185,7 +185,7 @@ def test_agents_without_chance_are_told_apart_by_what_they_are():
     assert said == [True, False]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(PAIRS, st.sampled_from([0, 0.5, 2]), st.sampled_from([0.25, 4]), st.integers(-100, 100))
 def test_what_holds_of_every_comparison(pair, margin, scale, shift):
     first, second = map(np.array, pair)
@@ -354,20 +354,20 @@ def test_runs_that_share_their_seeds_are_held_against_each_other(n, spread):
     assert paired_p_value(first, second) == pytest.approx(max(by_t, by_signs))
 
 
-@pytest.mark.parametrize(("n", "within"), [(5, 0.02), (50, 0.02), (3000, 0.002)])
+@pytest.mark.parametrize("n", [5, 50])
 @pytest.mark.parametrize("share", [0, 0.2])
-def test_of_zeros_and_ones_the_interval_is_that_of_clopper_and_pearson(n, within, share):
+def test_of_zeros_and_ones_the_interval_is_that_of_clopper_and_pearson(n, share):
     n_ones = round(share * n)
     scores = np.repeat([1.0, 0.0], [n_ones, n - n_ones])
     low = stats.beta.ppf(0.025, n_ones, n - n_ones + 1) if n_ones else 0.0
     high = stats.beta.isf(0.025, n_ones + 1, n - n_ones) if n_ones < n else 1.0
     # The quantiles come from 4,000 draws.
-    assert mean_interval(scores, 0.05) == pytest.approx((low, high), abs=within)
+    assert mean_interval(scores, 0.05) == pytest.approx((low, high), abs=0.02)
     # What does not depend on chance has no interval.
     assert mean_interval(np.full(n, share), 0.05, exact=True) == pytest.approx((share, share))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(SCORES, SCORES, st.sampled_from([0.05, 0.01]))
 def test_intervals_say_what_the_tests_say(first, second, level):
     found, said = compare_means(first, second, level), judge_means(first, second, level)
@@ -484,7 +484,7 @@ def test_few_seeds_claim_nothing():
     assert (one.verdict, one.typical) == ("undecided", "undecided")
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(st.lists(SCORES, min_size=3, max_size=5), st.floats(0.01, 0.2))
 def test_better_has_no_circles(runs, level):
     n = min(map(len, runs))

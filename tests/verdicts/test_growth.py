@@ -75,7 +75,7 @@ def test_an_agent_whose_runs_fail_makes_nobody_grow():
     assert grow(some, SIZES, 0.0, LEVEL).seeds == {"fails": 9, "runs": 9}
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(st.integers(0, 10**6), st.integers(2, 4), st.sampled_from([0.0, 0.5, 3.0]), st.booleans())
 def test_a_study_grows_as_settled_and_comes_out_the_same_however_it_is_interrupted(
     seed, n_agents, margin, fails
