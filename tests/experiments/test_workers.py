@@ -152,6 +152,7 @@ def test_a_cluster_does_what_this_machine_does_whatever_dies(tmp_path, monkeypat
 # Five steps: the return is five times the reward, which a module beside it says.
 MODULE = """
 import gymnasium as gym
+import iniconfig  # a distribution that is there, and that the project itself does not import
 from five_reward import REWARD
 
 class Five(gym.Env):
@@ -229,9 +230,9 @@ def check_done(runs, recorded, reward):
 
 def test_fit_workers_load_what_was_sent_and_others_are_set_aside(tmp_path, drivers, monkeypatch):
     """Where nobody fit is left the study ends; those who wait get the worker that comes."""
-    stale = tmp_path / "stale" / "scipy-1.16.0.dist-info"
+    stale = tmp_path / "stale" / "iniconfig-1.0.dist-info"
     stale.mkdir(parents=True)
-    (stale / "METADATA").write_text("Metadata-Version: 2.1\nName: scipy\nVersion: 1.16.0\n")
+    (stale / "METADATA").write_text("Metadata-Version: 2.1\nName: iniconfig\nVersion: 1.0\n")
     # Somebody changes a module since, and the fit worker finds others by itself.
     write_module(tmp_path / "new", 9)
     write_module(tmp_path / "path", 9)
@@ -267,5 +268,5 @@ def test_fit_workers_load_what_was_sent_and_others_are_set_aside(tmp_path, drive
                     root = tmp_path / "studies" / "new"
                     assert execute(runs, root, launchers["new"], lambda *_: None) == []
                     check_done(runs, recorded, 1)
-    told = f" on {os.uname().nodename}: scipy 1.16.0 instead of {version('scipy')}"
+    told = f" on {os.uname().nodename}: iniconfig 1.0 instead of {version('iniconfig')}"
     assert any("no runs" in line and told in line for line in said)

@@ -7,6 +7,7 @@ same weights, to the last bit.
 import random
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import sb3_contrib as contrib
@@ -20,6 +21,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch import nn, optim
 
+from envs.wrappers import ActionMasks
 from safe_files import (
     UnsafeFileError,
     inspect_model,
@@ -29,6 +31,10 @@ from safe_files import (
 )
 
 OLD_MODELS = Path(__file__).parent / "old_models"
+
+
+def masked():
+    return ActionMasks(gym.make("Warehouse-v0"))
 
 
 def bits():
@@ -75,6 +81,7 @@ CASES = {
     "td3 with noise": case(sb3.TD3, SWING, FEW, {"action_noise": NORMAL}, n_envs=2),
     "crossq": case(contrib.CrossQ, SWING, FEW),
     "ars": case(contrib.ARS, SWING, {"n_delta": 1}, policy="LinearPolicy"),
+    "ppo_mask": case(contrib.MaskablePPO, masked, ROLLOUT),
     "ppo_lstm": case(contrib.RecurrentPPO, CART, ROLLOUT, policy="MlpLstmPolicy"),
 }
 
