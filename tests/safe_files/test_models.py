@@ -126,7 +126,7 @@ def go_on(name, folder, load, load_buffer, load_statistics):
     kinds = {attribute: type(value) for attribute, value in vars(model).items()}
     before = weights(model)
     reseed()
-    return model.learn(20, reset_num_timesteps=False), kinds, before
+    return model.learn(40, reset_num_timesteps=False), kinds, before
 
 
 LIBRARY = (
