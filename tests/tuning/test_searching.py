@@ -1,7 +1,6 @@
 """Searches over a toy: what is tried, ended early, tested again, and what a kill changes."""
 
 import errno
-import json
 import math
 import os
 import statistics
@@ -33,9 +32,8 @@ from tuning.retesting import (
     write_winner,
 )
 from tuning.searching import RunOutcome, outcome_of
-from tuning.suggesting import make_sampler
 from tuning.trial_storage import FAILURE, FIGURES, SETTINGS
-from tuning.tuning_spec import SAMPLERS, judged
+from tuning.tuning_spec import judged
 from verdicts import Estimate, compare_means, level_of_look
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -54,7 +52,7 @@ def test_each_trial_is_the_mean_of_its_seeds_and_the_first_has_the_shipped_setti
     assert place.queue.trials()[0].user_attrs[SETTINGS] == toy.shipped
 
 
-@pytest.mark.parametrize(("sampler", "stops_after"), [("random", 29), ("gp", 14)])
+@pytest.mark.parametrize(("sampler", "stops_after"), [("tpe", 29), ("gp", 14)])
 def test_what_was_broken_off_goes_on_to_the_same_trials(toy, tmp_path, sampler, stops_after):
     tuning = toy.tuning(sampler=sampler)
     whole = toy.opened(tuning, tmp_path / "whole")
@@ -129,22 +127,6 @@ def test_scores_are_not_compared_with_those_of_another_search_before(toy, tmp_pa
         toy.opened(toy.tuning(objective="lower"), tmp_path)
 
 
-@pytest.mark.parametrize(("judged_by", "hopeless"), [("score", False), ("final", True)])
-def test_only_scores_have_1_to_hope_for_where_all_are_below_0(toy, tmp_path, judged_by, hopeless):
-    """Of returns nobody knows how high they go: those seen so far have to do."""
-    place = toy.opened(toy.tuning(n_trials=2, pruner="bound"), tmp_path)
-
-    def low(entry, seed):
-        return -1.0 - seed if entry == toy.shipped else -6.0
-
-    launcher = toy.search(place, toy.Launcher(), low, judged_by=judged_by)
-    assert toy.states(place)[0] == "COMPLETE"
-    assert place.hopeless(1, {0: -6.0}) is hopeless
-    # With 1 on the last seed they come to -11 / 3, and the mean to be beaten is -2.
-    assert place.hopeless(1, {0: -6.0, 1: -6.0})
-    assert len(launcher.done) == (4 if hopeless else 5)
-
-
 def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tmp_path):
     place = toy.opened(toy.tuning(), tmp_path)
 
@@ -193,35 +175,6 @@ def test_a_grid_goes_through_every_point_once(toy, tmp_path):
     assert place.study.best_value == 50.0  # a cost is made small
     with pytest.raises(UserError, match="4 settings with two values of each number"):
         toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path / "too few")
-
-
-# --- what suggests settings -----------------------------------------------------------------------
-
-
-def asked(study, number):
-    """The draws of the trial of a number, in a study that has those before it."""
-    while len(study.trials) <= number:
-        trial = study.ask()
-        values = [trial.suggest_float(name, 0.0, 1.0) for name in "abc"]
-        study.tell(trial, sum(values))
-    return study.trials[number].params
-
-
-def study_of(tuning):
-    return optuna.create_study(sampler=make_sampler(tuning), direction="maximize")
-
-
-@pytest.mark.parametrize("sampler", [name for name in SAMPLERS if name != "grid"])
-def test_a_trial_is_drawn_by_its_number_and_the_seed(toy, sampler):
-    tuning = toy.tuning(sampler=sampler)
-    study = study_of(tuning)
-    asked(study, 7)
-    other = study_of(tuning)
-    for trial in study.trials[:6]:
-        other.add_trial(trial)  # as another driver finds them
-    assert asked(other, 7) == asked(study, 7)
-    assert len({json.dumps(trial.params) for trial in study.trials}) > 5
-    assert asked(study_of(toy.tuning(sampler=sampler, seed=1)), 0) != asked(study, 0)
 
 
 # --- what a run and a setting are worth, worked out by hand ---------------------------------------
