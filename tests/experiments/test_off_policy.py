@@ -1,20 +1,17 @@
 """Off-policy estimates: by hand, against click rates known exactly, and of agents on logs."""
 
 import json
+from contextlib import nullcontext
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
 from agents import load_algorithm
 from envs.bandits import ReplayBandit, log_uniformly, read_log
 from experiments.off_policy.estimators import (
     ArmMeans,
     ArmRegressions,
-    check_support,
     cross_fit,
     difference_in_value,
     direct_method,
@@ -140,21 +137,6 @@ def test_sensitivity_is_the_derivative(kind):
         assert derivative == pytest.approx(sensitivity[first] - sensitivity[second])
 
 
-# --- Laws.
-
-
-@given(st.data())
-def test_the_logging_policy_is_worth_what_the_log_says(data):
-    n = data.draw(st.integers(2, 30))
-    rewards = data.draw(arrays.arrays(np.float64, n, elements=st.floats(-100, 100, width=32)))
-    arms = data.draw(arrays.arrays(np.int64, n, elements=st.integers(0, 2)))
-    logging = np.random.default_rng(n).dirichlet(np.ones(3) * 5, size=n)
-    weights = importance_weights(logging, arms, logging[np.arange(n), arms])
-    assert ips(weights, rewards).mean() == pytest.approx(rewards.mean(), abs=1e-9)
-    assert snips(weights, rewards).mean() == pytest.approx(rewards.mean(), abs=1e-9)
-    assert effective_sample_size(weights) == pytest.approx(n)
-
-
 # --- Against the truth: the segments of SegmentBandit.
 
 # The best treatment for each segment, at .159 clicks a user.
@@ -168,7 +150,7 @@ def test_estimates_hit_the_truth_and_intervals_cover_it_as_often_as_they_say():
     with gym.make("SegmentBandit-v0") as env:
         rates, shares = env.unwrapped.means, env.unwrapped.context_probabilities
     points, covered = [], []
-    for seed in range(250):
+    for seed in range(150):
         rng = np.random.default_rng(seed)
         contexts = rng.choice(2, size=1000, p=shares)
         arms = (uneven[contexts].cumsum(axis=1) < rng.random((1000, 1))).sum(axis=1)
@@ -178,13 +160,13 @@ def test_estimates_hit_the_truth_and_intervals_cover_it_as_often_as_they_say():
         intervals = [mean_reward(getattr(terms, name)) for name in ESTIMATORS]
         points.append([interval.point for interval in intervals])
         covered.append([interval.low <= TRUTH <= interval.high for interval in intervals])
-    error = np.std(points, axis=0) / np.sqrt(250)
+    error = np.std(points, axis=0) / np.sqrt(150)
     # The self-normalised one is biased, by order 1/n: it is held to the same tolerance here.
     assert (np.abs(np.mean(points, axis=0) - TRUTH) < 3.5 * error).all()
-    assert (error < 0.004).all()
-    # 95 % of 250 have a standard error of 1.4 %; clicks are rare, and so intervals a bit short.
-    assert (np.mean(covered, axis=0) > 0.9).all()
-    assert (np.mean(covered, axis=0) < 0.985).all()
+    assert (error < 0.005).all()
+    # 95 % of 150 have a standard error of 1.8 %; clicks are rare, and so intervals a bit short.
+    assert (np.mean(covered, axis=0) > 0.89).all()
+    assert (np.mean(covered, axis=0) < 0.995).all()
 
 
 def test_replay_of_a_uniform_log_is_the_self_normalised_estimate(tmp_path):
@@ -205,91 +187,39 @@ def test_replay_of_a_uniform_log_is_the_self_normalised_estimate(tmp_path):
     assert effective_sample_size(weights) == pytest.approx(info["matched_pulls"])
 
 
-# --- Where a log stops being one: each limit from both of its sides.
+# --- Where a log stops being one, or holds too little of what a policy does.
 
-TINY = 5e-324  # the smallest number above 0
-JUST_ABOVE_1 = np.nextafter(1, 2)
-NO_PROPENSITY = r"propensity of pull 2 is .*, it must be above 0 and at most 1"
-NO_ARMS = "arms must lie between 0 and 1, as the policy's columns"
 NOT_1 = r"sum of the policy's probabilities of pull 2 is .*be 1$"
-SHAPES = r"a policy of shape \(3, 2\) needs 3 arms and propensities"
+NO_PROPENSITY = r"propensity of pull 2 is .*, it must be above 0 and at most 1"
+TOO_LITTLE = "the log holds too little of what the policy does: its weights are 0.979"
+TOO_SMALL = "the propensities are too small: the weights are 1.29 on average"
+# What stands where in a log of both arms in turn, and what is said of it.
+LOGS = [
+    *(("propensities", 1, value, NO_PROPENSITY) for value in (0.0, 1.5, np.nan)),
+    ("policy", 1, (0.5, 0.5 + 9e-7), None),
+    *(("policy", 1, row, NOT_1) for row in ((0.5, 0.5 + 2e-6), (0.5, np.nan), (1.5, -0.5))),
+    # Python would take -1 for the last arm.
+    ("arms", 2, -1, "arms must lie between 0 and 1, as the policy's columns"),
+    ("arms", slice(None), 0, r"arm 1 was never logged, and the policy chooses it for 50\.0%"),
+    ("rewards", 1, np.inf, "reward of pull 2 is inf, it must be finite"),
+    # Equal weights below 1 have no spread: what files round remains, 0.02.
+    ("propensities", slice(None), 0.5 / 0.981, None),
+    ("propensities", slice(None), 0.5 / 0.979, TOO_LITTLE),
+    # Above 1 by x, the variance for a mean of 1 is x: x = 5 sqrt(x / n) + 0.02.
+    ("propensities", slice(None), 0.5 / 1.288, None),
+    ("propensities", slice(None), 0.5 / 1.289, TOO_SMALL),
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "values", "refusal"),
-    [
-        *(("propensity", value, None) for value in (1e-300, 1.0)),
-        *(("propensity", p, NO_PROPENSITY) for p in (0.0, JUST_ABOVE_1, np.nan)),
-        *(("row", row, None) for row in ((0, 1), (0.5, 0.5 + 9e-7), (0.5, 0.5 - 9e-7))),
-        *(("row", row, NOT_1) for row in ((0.5, 0.5 + 2e-6), (0.5, 0.5 - 2e-6), (0.5, np.nan))),
-        *(("row", row, NOT_1) for row in ((-TINY, 1), (1.5, -0.5))),
-        # Python would take -1 for the last arm.
-        *(("arms", arms, NO_ARMS) for arms in ((0, 1, -1), (0, 1, 2))),
-        *(("arms", arms, SHAPES) for arms in ((0, 1), [[0], [1], [0]])),
-        ("propensities", [0.5] * 4, SHAPES),
-    ],
-)
-def test_what_weights_are_made_of(name, values, refusal):
-    given = {"policy": [(0.5, 0.5)] * 3, "arms": (0, 1, 0), "propensities": [0.5] * 3}
-    if name == "row":
-        name, values = "policy", [(0.5, 0.5), values, (0.5, 0.5)]
-    elif name == "propensity":
-        name, values = "propensities", [0.5, values, 0.5]
-    policy, arms, propensities = map(np.array, {**given, name: values}.values())
-    if refusal is None:
-        expected = [policy[i, arms[i]] / propensities[i] for i in range(3)]
-        assert importance_weights(policy, arms, propensities).tolist() == expected
-    else:
-        with pytest.raises(ValueError, match=refusal):
-            importance_weights(policy, arms, propensities)
-
-
-TOO_LITTLE = "the log holds too little of what the policy does: its weights are "
-TOO_SMALL = "the propensities are too small: the weights are "
-
-
-@pytest.mark.parametrize(
-    ("weights", "outcome"),
-    [
-        # Equal weights below 1 have no spread: what files round remains, 0.02.
-        ([0.981] * 100, ""),
-        ([0.979] * 100, TOO_LITTLE + "0.979"),
-        # Above 1 by x, the variance for a mean of 1 is x: x = 5 sqrt(x / n) + 0.02.
-        ([1.288] * 100, ""),
-        ([1.289] * 100, TOO_SMALL + "1.29 on average"),
-        ([1.0206] * 1_000_000, ""),
-        ([1.0209] * 1_000_000, TOO_SMALL + "1.02 on average"),
-        # Of weights 0 and 2 the variance for a mean of 1 is 1: 100 may miss it by 5 / 10 + 0.02.
-        ([2.0] * 25 + [0.0] * 75, ""),
-        ([2.0] * 23 + [0.0] * 77, TOO_LITTLE + "0.46"),
-        ([0.0] * 100, "the policy would have made none of the logged pulls"),
-    ],
-    ids=lambda value: f"{len(value)} from {value[0]}" if isinstance(value, list) else None,
-)
-def test_what_a_log_can_tell(weights, outcome):
-    found = ""
-    try:
-        check_support(
-            np.full((len(weights), 2), 0.5), np.arange(len(weights)) % 2, np.array(weights)
-        )
-    except ValueError as error:
-        found = str(error)
-    assert found.startswith(outcome)
-    assert bool(found) == bool(outcome)
-
-
-def test_a_policy_is_judged_on_what_is_a_log(each_by_the_others):
-    given = (ALWAYS_1, np.zeros(4, np.int64), REWARDS, PROPENSITIES)
-    with pytest.raises(ValueError, match=r"arm 1 was never logged, and .* chooses it for 100\.0%"):
-        evaluate_policy(*given, each_by_the_others)
-    with pytest.raises(ValueError, match="reward of pull 2 is inf, it must be finite"):
-        evaluate_policy(
-            ALWAYS_1, ARMS, np.array([1, np.inf, 0, 0]), PROPENSITIES, each_by_the_others
-        )
-    # It matters where the policy chooses it, however rarely.
-    check_support(np.array([[1.0, 0.0]] * 2), np.zeros(2, int), np.ones(2))
-    with pytest.raises(ValueError, match="arm 1 was never logged, and the policy chooses it for"):
-        check_support(np.array([[1.0, TINY]] * 2), np.zeros(2, int), np.ones(2))
+@pytest.mark.parametrize(("name", "place", "value", "refusal"), LOGS)
+def test_what_a_policy_is_judged_on(name, place, value, refusal):
+    arms, rewards = np.arange(100) % 2, np.zeros(100)
+    model = cross_fit(np.zeros(100, np.int64), arms, rewards, 2)
+    given = {"policy": np.full((100, 2), 0.5), "arms": arms.copy(), "rewards": rewards.copy()}
+    given["propensities"] = np.full(100, 0.5)
+    given[name][place] = value
+    with pytest.raises(ValueError, match=refusal) if refusal else nullcontext():
+        evaluate_policy(**given, model=model)
 
 
 # --- Agents on logs: which can be judged, what they stand beside, and what is said of them.
@@ -297,7 +227,6 @@ def test_a_policy_is_judged_on_what_is_a_log(each_by_the_others):
 HEAD = "segment,arm,reward,propensity\n"
 NUMBERS = HEAD + "".join(f"{i % 2},{i % 3 % 2},{i % 5},0.5\n" for i in range(60))
 WORDS = NUMBERS.replace("\n0,", "\ncasual,").replace("\n1,", "\ncore,")
-OTHER_WORDS = NUMBERS.replace("\n0,", "\nnew,").replace("\n1,", "\nold,")
 
 
 @pytest.fixture
@@ -340,9 +269,8 @@ def test_the_policies_asked_about_stand_before_their_alternatives(log):
     [
         (NUMBERS, WORDS, "are numbers; those of {} are casual, core"),
         (WORDS, NUMBERS, "are casual, core; those of {} are numbers"),
-        (OTHER_WORDS, WORDS, "are new, old; those of {} are casual, core"),
     ],
-    ids=["numbers", "words", "other words"],
+    ids=["numbers", "words"],
 )
 def test_an_agent_that_numbered_contexts_otherwise_is_refused(log, trained_on, judged_on, told):
     theirs, ours = log(trained_on, "theirs.csv"), log(judged_on, "ours.csv")
@@ -367,10 +295,7 @@ def test_an_agent_is_read_with_the_log_it_was_trained_on(log, tmp_path):
         policy = read(place, env_kwargs={"log": str(path)})
         assert (policy.name, policy.log) == (str(place), path)
         assert isinstance(policy.agent, load_algorithm("linucb"))
-    # Agents that observe more than a log holds:
-    wrappers = {"env_wrapper": "a.B", "vec_env_wrapper": "a.B"}
-    for key, value in {"normalize": True, "frame_stack": 4, **wrappers}.items():
-        with pytest.raises(UserError, match=f"was trained with {key}: it observes more than a log"):
-            read(folder, **{key: value})
+    with pytest.raises(UserError, match="was trained with normalize: it observes more than a log"):
+        read(folder, normalize=True)
     (folder / "run.json").unlink()
     assert load_policy(find_policy(folder / "Lake.zip")).log is None

@@ -11,13 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import compare
-from experiments.plan import TuningSeeds, check_settings, plan, tuning_seeds
+from experiments.plan import check_settings, plan, tuning_seeds
 from experiments.study import (
-    AS_IT_COMES,
-    METRICS,
     AgentSpec,
     EnvironmentSpec,
-    QuickSpec,
     StudySpec,
     find_study,
     layered,
@@ -53,24 +50,14 @@ MISTAKES = [
     (BASE + "seed: 3\n", 3, "unknown key 'seed': did you mean 'seeds'?"),
     (BASE + "seeds: 1\nseeds: 2\n", 4, "key 'seeds' appears twice"),
     (BASE + "\nseeds: many\n", 4, "seeds must be a whole number, not 'many'"),
-    (BASE + "seeds: 0\n", 3, "seeds must be at least 1, not 0"),
-    (BASE + "seeds: {last: 3}\n", 3, "unknown key 'last'"),
     (BASE + "metric: finl\n", 3, "did you mean 'final'?"),
-    (BASE + "margin: -0.1\n", 3, "margin must be at least 0, not -0.1"),
     (BASE + "run_timeout: -1\n", 3, "run_timeout must be a time"),
-    (BASE + "settings: 3\n", 3, "settings must map names to values"),
     (BASE + "quick:\n  budget: 0\n", 4, "above 0 and up to 1"),
     (BASE + "n_timesteps: 5\nn_episodes: 5\n", 4, "give n_timesteps or n_episodes, not both"),
-    (TAXI + "agents:\n  sarsa:\n    n_timesteps: 5\n    n_episodes: 5\n", 5, "not both"),
     (BASE + "sweep:\n  gamma: []\n", 4, "gamma must be a list of values, not []"),
-    (TAXI + "agents: [dqn, dqn]\n", 2, "agents names one of them twice"),
     ("agents: [dqn]\n", 1, "environments must list at least one name"),
-    (TAXI + "agents:\n  - algo: dqn\n", 2, "agents must list names, or map them to settings"),
-    (TAXI + "agents:\n  mine:\n    algo: [dqn]\n", 4, "unknown agent"),
     (TAXI + "agents: [sarsa, qlerning]\n", 2, "'qlerning': did you mean 'qlearning'?"),
     (TAXI + "agents:\n  dqn:\n    conf_file: no.yml\n", 4, "conf_file: there is no file "),
-    (TAXI + "agents: {dqn: {conf_file: lakes.yml, tuned: false}}\n", 2, "contradict each other"),
-    ("agents: [dqn]\nenvironments:\n  lake: {id: 3}\n", 3, "id must be a text"),
     ("agents: [dqn]\nenvironments: {ice: {id: FrozenLak-v1}}\n", 2, "mean 'FrozenLake-v1'"),
     ("agents: [dqn]\nenvironments: ['no_such:Taxi-v4']\n", 2, "add --gym-packages no_such"),
 ]
@@ -108,31 +95,9 @@ def test_whatever_stands_in_a_file_is_a_study_or_a_mistake(tmp_path_factory, dat
         assert study.environments
 
 
-ONE_LINE = [
-    ("", "n_seeds", 10),
-    ("", "title", "lakes"),
-    ("", "run_timeout", None),
-    ("seeds: 3", "seeds", range(3)),
-    ("seeds: {first: 1000, count: 4}", "seeds", range(1000, 1004)),
-    ("seeds: {first: 7}", "seeds", range(7, 17)),
-    ("run_timeout: 10m", "run_timeout", 600),
-    ("run_timeout: 90", "run_timeout", 90),
-    ("run_memory: 1.5GB", "run_memory", 1_500_000_000),
-    ("quick: {seeds: 1, budget: 0.5}", "quick", QuickSpec(1, 0.5)),
-    ("description: Two lakes.", "description", "Two lakes."),
-    *((f"{name}: 20", name, 20) for name in ("eval_freq", "eval_episodes", "episodes_table")),
-    *((f"{name}: 0.5", name, 0.5) for name in ("margin", "threshold")),
-    *((f"metric: {metric}", "metric", metric) for metric in METRICS),
-]
-
-
-def test_what_one_line_says(read):
-    for line, name, value in ONE_LINE:
-        assert getattr(read(f"{BASE}{line}\n"), name) == value
-
-
 def test_agents_and_environments(read):
     study = read(
+        "seeds: {first: 1000, count: 4}\nrun_memory: 1.5GB\n"
         "n_timesteps: 500\ntuned: false\nsettings: {gamma: 0.9, env_kwargs: {map_name: 4x4}}\n"
         "agents:\n"
         "  slow: {algo: qlearning, learning_rate: 0.01, summary: creeps}\n"
@@ -141,11 +106,12 @@ def test_agents_and_environments(read):
         "  small: {id: FrozenLake-v1}\n"
         "  dry: {id: FrozenLake-v1, n_episodes: 7, gamma: 0.8, env_kwargs: {is_slippery: false}}\n"
     )
+    assert (study.seeds, study.run_memory) == (range(1000, 1004), 1_500_000_000)
     slow, sarsa = study.agents
     assert (slow.label, slow.algo, slow.tuned) == ("slow", "qlearning", False)
     assert (slow.summary, slow.settings) == ("creeps", {"learning_rate": 0.01})
     assert (sarsa.algo, sarsa.tuned) == ("sarsa", True)
-    assert slow.where.endswith("lakes.yml:5")
+    assert slow.where.endswith("lakes.yml:7")
     small, dry = study.environments
     usual = {"n_timesteps": 500, "gamma": 0.9, "env_kwargs": {"map_name": "4x4"}}
     assert (small.env_id, small.settings) == ("FrozenLake-v1", usual)
@@ -193,14 +159,13 @@ def test_sweeps_multiply_and_are_counted_before_they_are_made(read):
 def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = SHIPPED / "mine-maze.yml"
-    for name in ("mine-maze", "mine-maze.yml", "studies/mine-maze.yml", "./mine-maze.yml"):
+    for name in ("mine-maze", "studies/mine-maze.yml"):
         assert find_study(name) == shipped
     assert read_study(shipped).name == "mine-maze"
     # A file of the user's own comes first, and elsewhere ours are not looked for.
     Path("mine-maze.yml").touch()
     assert find_study("mine-maze.yml") == Path("mine-maze.yml")
     assert find_study("mine-maze") == shipped
-    assert find_study("other/mine-maze.yml") == Path("other/mine-maze.yml")
     with pytest.raises(UserError, match=r"mine-mase: cannot be read: .* did you mean 'mine-maze'"):
         find_study("mine-mase")
 
@@ -273,7 +238,7 @@ def test_every_agent_on_every_environment_with_every_seed(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_study_has_a_bearable_number_of_runs_and_a_batch_of_pulls(monkeypatch):
+def test_a_study_has_a_bearable_number_of_runs():
     study = study_of("qlearning", "sarsa", "dqn", environments=(LAKE, DRY), n_seeds=10**12)
     told = (
         "^lakes: 3 agents on 2 environments with 1,000,000,000,000 seeds are "
@@ -281,19 +246,10 @@ def test_a_study_has_a_bearable_number_of_runs_and_a_batch_of_pulls(monkeypatch)
     )
     with pytest.raises(UserError, match=told):
         plan(study, NOWHERE)
-    monkeypatch.setattr("pipeline.environments.memory_bytes", lambda: 10**6)  # a small machine
-    settings = {"n_timesteps": 1000, "env_kwargs": {"pulls": 1000}}
-    study = study_of("ucb", environments=[EnvironmentSpec("arms", "GaussianBandit-v0", settings)])
-    assert len(plan(replace(study, n_seeds=30), NOWHERE)) == 1
-    with pytest.raises(UserError, match=r"^ucb on arms: 50 seeds with n_timesteps 1,000 would"):
-        plan(replace(study, n_seeds=50), NOWHERE)
 
 
 def test_labels_that_would_share_a_folder():
-    for labels in (
-        *(("a b", "a/b"), ("Mine", "mine"), ("same", "same"), ("Straße", "STRASSE")),
-        ("\uf900", "\u8c48"),  # one sign under two numbers, which macOS makes one
-    ):
+    for labels in (("a b", "a/b"), ("Mine", "mine"), ("same", "same")):
         agents = [AgentSpec(label, "qlearning") for label in labels]
         with pytest.raises(UserError, match=r"agents: .* would share the folder"):
             plan(study_of(*agents), NOWHERE)
@@ -322,14 +278,10 @@ def test_the_agents_settings_go_over_the_environments_and_those_over_the_file():
 UNTRAINABLE = [
     ("qlearning", {"n_timesteps": None}, "how long to train"),
     ("linucb", {}, "does not fit FrozenLake-v1"),
-    ("qlearning", {"n_envs": 0}, "n_envs"),
-    ("qlearning", {"n_timesteps": 0}, "n_timesteps"),
     ("qlearning", {"env_kwargs": {"slipery": True}}, "slipery"),
-    ("qlearning", {"env_wrapper": "no.such.Wrapper"}, r"no\.such\.Wrapper"),
     # What the agent itself refuses is found with the libraries.
     ("qlearning", {"learning_rat": 0.1}, r"did you mean 'learning_rate'\?"),
     ("qlearning", {"gamma": 1.5}, "gamma"),
-    ("qlearning", {"callback": "pipeline.callbacks.NoSuchCallback"}, "NoSuchCallback"),
 ]
 
 
@@ -362,7 +314,11 @@ def test_a_run_is_finished_where_its_folder_says_so(tmp_path):
     assert not planned.is_finished
     record(planned)
     assert planned.is_finished
-    assert only(PLAIN, tmp_path).is_finished
+    assert only(replace(PLAIN, tensorboard=True), tmp_path).is_finished
+    # What is shown meanwhile is no part of it.
+    loud = replace(planned.spec, verbose=2, progress=True, log_interval=7, pictures=True)
+    record(replace(planned, spec=loud))
+    assert planned.is_finished
     planned.run.info_path.write_text("{")
     assert not planned.is_finished
     assert not planned.is_to_do
@@ -372,11 +328,9 @@ def test_a_run_is_finished_where_its_folder_says_so(tmp_path):
 
 OTHERS = {
     "setting": study_of(AgentSpec("qlearning", "qlearning", {"gamma": 0.123})),
-    "algorithm": study_of(AgentSpec("qlearning", "sarsa")),
     "budget": study_of("qlearning", environments=(replace(LAKE, settings={"n_timesteps": 101}),)),
     "environment": study_of("qlearning", environments=(replace(LAKE, env_id="FrozenLake8x8-v1"),)),
     "eval_freq": study_of("qlearning", eval_freq=50),
-    "eval_episodes": study_of("qlearning", eval_episodes=3),
 }
 
 
@@ -384,17 +338,6 @@ def test_a_run_of_other_settings_does_not_count(tmp_path):
     record(only(PLAIN, tmp_path))
     assert only(PLAIN, tmp_path).is_finished
     assert [name for name, study in OTHERS.items() if only(study, tmp_path).is_finished] == []
-
-
-def test_what_is_shown_meanwhile_is_no_part_of_a_run(tmp_path):
-    planned = only(PLAIN, tmp_path)
-    loud = replace(planned.spec, verbose=2, progress=True, log_interval=7, pictures=True)
-    record(replace(planned, spec=loud))
-    assert planned.is_finished
-    logged = only(replace(PLAIN, tensorboard=True), tmp_path)
-    assert logged.is_finished
-    folder = tmp_path / "tensorboard" / "qlearning" / "FrozenLake-v1_1"
-    assert logged.spec.tensorboard_log == folder
 
 
 def test_checkpoints_are_asked_of_the_first_seed_alone(tmp_path):
@@ -430,14 +373,14 @@ def test_a_field_that_came_later_counts_as_its_default(tmp_path):
 
 # --- Which seeds of a study its settings were tuned on, and how that is said.
 
-DQN, PPO, RANDOM, TABLE = (AgentSpec(name, name) for name in ("dqn", "ppo", "random", "sarsa"))
+DQN, PPO, RANDOM = (AgentSpec(name, name) for name in ("dqn", "ppo", "random"))
+
 PLAIN_DQN = replace(DQN, tuned=False, settings={"policy": "MlpPolicy", "n_timesteps": 100})
-SHORT = replace(DQN, settings={"n_timesteps": 9})
 MINE = AgentSpec("mine", "dqn", {"gamma": 0.9})
 
 
-def place(env_id, settings=None, **kwargs):
-    return EnvironmentSpec(env_id, env_id, {"env_kwargs": kwargs} if kwargs else settings or {})
+def place(env_id, **kwargs):
+    return EnvironmentSpec(env_id, env_id, {"env_kwargs": kwargs} if kwargs else {})
 
 
 TUNED, SLIPPERY, USUAL = place("FrozenLake-v1"), place("Warehouse-v0", slip=0.1), "Warehouse-v0"
@@ -448,20 +391,13 @@ ELSEWHERE = "the settings of dqn were tuned with other arguments of the environm
 SEEDS = [
     ((DQN, PPO, RANDOM), [TUNED], (0, 10), f"the shipped settings of dqn and ppo {THESE}"),
     ((DQN, PPO), [TUNED], (8, 10), "settings of dqn and ppo were tuned on 8 to 9 of"),
-    ((PPO,), [TUNED], (3, 1), "the shipped settings of ppo were tuned on it"),
-    # The constructor's defaults were tuned on nothing, and a budget is no tuning.
+    # The constructor's defaults were tuned on nothing.
     ((PLAIN_DQN,), [TUNED], (0, 10), NOTHING),
-    ((SHORT,), [TUNED], (0, 10), f"shipped settings of dqn {THESE}"),
     ((MINE,), [TUNED], (0, 10), f"the shipped settings of dqn {THESE}; {NOT_KNOWN}"),
     ((MINE,), [TUNED], (1000, 10), f"nothing is known to have been tuned on these; {NOT_KNOWN}"),
     # Other arguments of the environment make it another.
     ((DQN,), [SLIPPERY], (1000, 10), f": {ELSEWHERE}"),
-    ((DQN,), [SLIPPERY, TUNED], (0, 10), f"settings of dqn {THESE}; {ELSEWHERE}"),
     ((DQN,), [place(USUAL, slip=0.0)], (0, 10), f"the shipped settings of dqn {THESE}"),
-    ((DQN,), [place("RandomWarehouse-v0", size=10)], (0, 10), f"settings of dqn {THESE}"),
-    ((DQN,), [place(USUAL, AS_IT_COMES)], (0, 10), f": {ELSEWHERE}"),
-    # One environment may have two names.
-    ((TABLE,), [place("CliffWalking-v1", is_slippery=True)], (0, 10), f"of sarsa {THESE}"),
 ]
 
 
@@ -472,20 +408,7 @@ def tuned(agents, places=(TUNED,), first=0, count=10):
 @pytest.mark.parametrize(("agents", "places", "seeds", "sentence"), SEEDS)
 def test_what_is_said_of_the_seeds(agents, places, seeds, sentence):
     first, count = seeds
-    last = first + count - 1
-    said = seed_sentence(range(first, last + 1), tuned(agents, places, *seeds))
-    assert said.startswith(f"Seeds {first} to {last}: " if count > 1 else f"Seed {first}: ")
+    said = seed_sentence(range(first, first + count), tuned(agents, places, *seeds))
+    assert said.startswith(f"Seeds {first} to {first + count - 1}: ")
     assert sentence in said
     assert said.endswith(".")
-
-
-def test_settings_of_the_studys_own_are_not_known_of_and_each_environment_has_its_own():
-    own = tuned([DQN, RANDOM], [replace(TUNED, settings={"gamma": 0.9})])
-    assert own.unknown == ("dqn", "random")
-    sweep = [AgentSpec(f"g={g}", "dqn", {"gamma": g}, group="g") for g in (0.1, 0.2)]
-    assert tuned(sweep).unknown == ("g",)
-    both = tuned([PPO], [TUNED, place("Pendulum-v1")], count=101)
-    assert both.shipped == {"ppo": frozenset([*range(10), 100])}
-    # Many names are cut short.
-    told = seed_sentence(range(10), TuningSeeds({}, {}, tuple("abcdefgh")))
-    assert "of a, b, c, d, e, f and 2 more were" in told

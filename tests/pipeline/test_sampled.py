@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from pipeline.evaluation.sampled import (
     Shares,
     Yardstick,
     allowed_steps,
+    bracketed_yardstick,
     compiled_copy,
     evaluate,
     evaluate_compiled,

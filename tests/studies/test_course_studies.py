@@ -23,8 +23,6 @@ from experiments.study import read_study
 from mdp import value_iteration
 from pipeline.models.load import load_model
 from pipeline.preparation import algorithm_kwargs
-from pipeline.settings.hyperparams import read_hyperparams
-from tuning.search_spaces import read_search_space
 
 ROOT = Path(compare.__file__).parent
 # Bandits have a guide of their own.
@@ -93,16 +91,6 @@ def test_the_guide_gives_the_command_of_each_study():
     named = set(re.findall(r"python compare.py studies/([\w-]+\.yml)\n", GUIDE))
     assert named == {path.name for path in STUDIES}
     assert set(re.findall(r"studies/([\w-]+\.yml)", GUIDE)) == named
-
-
-def test_the_course_s_search_begins_inside_its_space():
-    folder = ROOT / "studies" / "search"
-    begun = read_hyperparams("qlearning", "Warehouse-v0", folder / "as-printed.yml")
-    space = read_search_space("qlearning", "Warehouse-v0", folder / "warehouse.yml")
-    assert space.including(begun) == space
-    # Three values of three settings, and what it begins with.
-    assert math.prod(map(len, space.grid(3).values())) + 1 == 28
-    assert GUIDE.count("--trials 28") == 2
 
 
 # Mean and standard deviation over 100 seeds of the mean return of 500 episodes, by the last one.

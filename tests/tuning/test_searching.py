@@ -1,19 +1,15 @@
 """Searches over a toy: what is tried, ended early, tested again, and what a kill changes."""
 
 import errno
-import json
 import math
 import os
 import statistics
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import optuna
 import pandas as pd
 import pytest
-from optuna.storages import InMemoryStorage
-from optuna.trial import TrialState
 
 from experiments.analysis import analyse
 from experiments.growing import remember, settled_looks, take_planned_looks
@@ -27,20 +23,17 @@ from tuning.retesting import (
     Candidate,
     Outcome,
     Retested,
-    _winner,
     best_trials,
     chosen_for_retest,
     concluded,
     entry_text,
     is_settled,
-    optimism,
     retest_study,
     write_winner,
 )
-from tuning.searching import RunOutcome, UnjudgedError, outcome_of
-from tuning.suggesting import make_sampler
+from tuning.searching import RunOutcome, outcome_of
 from tuning.trial_storage import FAILURE, FIGURES, SETTINGS
-from tuning.tuning_spec import SAMPLERS, judged
+from tuning.tuning_spec import judged
 from verdicts import Estimate, compare_means, level_of_look
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -59,7 +52,7 @@ def test_each_trial_is_the_mean_of_its_seeds_and_the_first_has_the_shipped_setti
     assert place.queue.trials()[0].user_attrs[SETTINGS] == toy.shipped
 
 
-@pytest.mark.parametrize(("sampler", "stops_after"), [("random", 29), ("gp", 14)])
+@pytest.mark.parametrize(("sampler", "stops_after"), [("tpe", 29), ("gp", 14)])
 def test_what_was_broken_off_goes_on_to_the_same_trials(toy, tmp_path, sampler, stops_after):
     tuning = toy.tuning(sampler=sampler)
     whole = toy.opened(tuning, tmp_path / "whole")
@@ -72,57 +65,6 @@ def test_what_was_broken_off_goes_on_to_the_same_trials(toy, tmp_path, sampler, 
     assert toy.states(again) == ["COMPLETE"] * 10
     assert toy.params(again) == toy.params(whole)
     assert len(rest.done) == 30 - stops_after
-
-
-WRITES = [
-    *("create_new_trial", "set_trial_param", "set_trial_state_values", "set_study_user_attr"),
-    *("set_trial_intermediate_value", "set_trial_user_attr", "set_trial_system_attr"),
-]
-
-
-class DyingStorage(InMemoryStorage):
-    """From its k-th write on its driver is dead, until it is revived."""
-
-    n_writes, dies_at = 0, math.inf
-
-    def revive(self):
-        self.dies_at = math.inf
-        for trial in self.get_all_trials(0, states=[TrialState.RUNNING]):
-            self.set_trial_state_values(trial._trial_id, TrialState.WAITING)
-
-
-def dying(name):
-    def write(self, *args, **options):
-        self.n_writes += 1
-        if self.n_writes >= self.dies_at:
-            raise KeyboardInterrupt
-        return getattr(InMemoryStorage, name)(self, *args, **options)
-
-    return write
-
-
-for name in WRITES:
-    setattr(DyingStorage, name, dying(name))
-
-
-def test_a_kill_at_any_write_to_the_storage_changes_no_trial(toy, tmp_path):
-    tuning = toy.tuning(sampler="tpe", pruner="racing", n_trials=8, n_seeds=4)
-
-    def searched(storage):
-        place = toy.opened(tuning, tmp_path, storage)
-        toy.search(place, toy.Launcher())
-        return [(t.state, t.value, t.params, t.user_attrs.get(FIGURES)) for t in place.study.trials]
-
-    whole = DyingStorage()
-    undisturbed = searched(whole)
-    assert TrialState.PRUNED in [state for state, *_ in undisturbed]
-    for k in range(10, whole.n_writes, 8):
-        storage = DyingStorage()
-        storage.dies_at = k
-        with suppress(KeyboardInterrupt):
-            searched(storage)
-        storage.revive()
-        assert searched(storage) == undisturbed, k
 
 
 def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path):
@@ -160,31 +102,6 @@ def test_a_saturated_search_ends_and_ranks_by_steps_to_the_threshold(toy, tmp_pa
     assert not toy.search(toy.opened(tuning, tmp_path), toy.Launcher(), at_once, steps=steps).done
 
 
-def test_other_drivers_trials_are_waited_for_where_a_search_is_saturated(
-    toy, tmp_path, monkeypatch
-):
-    tuning, waits = toy.tuning(n_trials=12, sampler="random"), []
-    other = toy.opened(tuning, tmp_path)
-    other.queue.add_places()
-    theirs = other.queue.claim(lambda _: {})
-
-    def ends_meanwhile(_):
-        waits.append(toy.states(other).count("RUNNING"))
-        other.queue.give_back(theirs)
-
-    place = toy.opened(tuning, tmp_path)
-    monkeypatch.setattr(searching.time, "sleep", ends_meanwhile)
-    toy.search(place, toy.Launcher(), lambda *_: 1.0, steps=steps)
-    assert waits == [1]
-    assert toy.states(place) == ["WAITING"] + ["COMPLETE"] * 10 + ["WAITING"]
-
-
-def test_returns_of_1_are_no_optimum(toy, tmp_path):
-    place = toy.opened(toy.tuning(n_trials=14, sampler="random"), tmp_path)
-    toy.search(place, toy.Launcher(), lambda *_: 1.0, judged_by="final")
-    assert (place.n_at_optimum, toy.states(place)) == (0, ["COMPLETE"] * 14)
-
-
 def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
     def full(**_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -208,22 +125,6 @@ def test_scores_are_not_compared_with_those_of_another_search_before(toy, tmp_pa
     # Nor is another search under the same name gone on with.
     with pytest.raises(UserError, match=r"toy: the tuning there is another .*objective: 'mean'"):
         toy.opened(toy.tuning(objective="lower"), tmp_path)
-
-
-@pytest.mark.parametrize(("judged_by", "hopeless"), [("score", False), ("final", True)])
-def test_only_scores_have_1_to_hope_for_where_all_are_below_0(toy, tmp_path, judged_by, hopeless):
-    """Of returns nobody knows how high they go: those seen so far have to do."""
-    place = toy.opened(toy.tuning(n_trials=2, pruner="bound"), tmp_path)
-
-    def low(entry, seed):
-        return -1.0 - seed if entry == toy.shipped else -6.0
-
-    launcher = toy.search(place, toy.Launcher(), low, judged_by=judged_by)
-    assert toy.states(place)[0] == "COMPLETE"
-    assert place.hopeless(1, {0: -6.0}) is hopeless
-    # With 1 on the last seed they come to -11 / 3, and the mean to be beaten is -2.
-    assert place.hopeless(1, {0: -6.0, 1: -6.0})
-    assert len(launcher.done) == (4 if hopeless else 5)
 
 
 def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tmp_path):
@@ -256,6 +157,14 @@ def test_how_many_runs_there_are(toy, tmp_path):
     assert toy.states(more) == ["COMPLETE"] * 6
 
 
+def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
+    place = toy.opened(toy.tuning(settings={"gamma": 0.9}), tmp_path)
+    toy.search(place, toy.Launcher())
+    assert place.suggestions.n_free == 1
+    assert {p["gamma"] for p in toy.params(place)} == {0.9}
+    assert len({p["learning_rate"] for p in toy.params(place)}) == 10
+
+
 def test_a_grid_goes_through_every_point_once(toy, tmp_path):
     place = toy.opened(toy.tuning(sampler="grid", n_trials=12, figure="steps"), tmp_path / "it")
     toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
@@ -266,43 +175,6 @@ def test_a_grid_goes_through_every_point_once(toy, tmp_path):
     assert place.study.best_value == 50.0  # a cost is made small
     with pytest.raises(UserError, match="4 settings with two values of each number"):
         toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path / "too few")
-
-
-# --- what suggests settings -----------------------------------------------------------------------
-
-
-def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
-    place = toy.opened(toy.tuning(settings={"gamma": 0.9}), tmp_path)
-    toy.search(place, toy.Launcher())
-    assert place.suggestions.n_free == 1
-    assert {p["gamma"] for p in toy.params(place)} == {0.9}
-    assert len({p["learning_rate"] for p in toy.params(place)}) == 10
-
-
-def asked(study, number):
-    """The draws of the trial of a number, in a study that has those before it."""
-    while len(study.trials) <= number:
-        trial = study.ask()
-        values = [trial.suggest_float(name, 0.0, 1.0) for name in "abc"]
-        study.tell(trial, sum(values))
-    return study.trials[number].params
-
-
-def study_of(tuning):
-    return optuna.create_study(sampler=make_sampler(tuning), direction="maximize")
-
-
-@pytest.mark.parametrize("sampler", [name for name in SAMPLERS if name != "grid"])
-def test_a_trial_is_drawn_by_its_number_and_the_seed(toy, sampler):
-    tuning = toy.tuning(sampler=sampler)
-    study = study_of(tuning)
-    asked(study, 7)
-    other = study_of(tuning)
-    for trial in study.trials[:6]:
-        other.add_trial(trial)  # as another driver finds them
-    assert asked(other, 7) == asked(study, 7)
-    assert len({json.dumps(trial.params) for trial in study.trials}) > 5
-    assert asked(study_of(toy.tuning(sampler=sampler, seed=1)), 0) != asked(study, 0)
 
 
 # --- what a run and a setting are worth, worked out by hand ---------------------------------------
@@ -339,9 +211,6 @@ FIGURES_OF_RUNS = [
     # Only an optimal score has steps.
     ("score", {"score": 1.0}, 1.0, 20.0),
     ("score", {"score": 1 - 1e-8, "threshold": 0.9}, 1 - 1e-8, 60.0),
-    ("score", {"score": 0.9999}, 0.9999, None),
-    ("score", {"score": 1.0, "threshold": None}, 1.0, None),
-    ("final", {"final": 1.0}, 1.0, None),
 ]
 
 
@@ -349,14 +218,6 @@ FIGURES_OF_RUNS = [
 def test_the_figure_of_a_run(toy, monkeypatch, figure, row, value, steps):
     found = outcome(toy, monkeypatch, figure, **row)
     assert (found.figure, found.seconds, found.steps) == (value, 2.0, steps)
-
-
-def test_a_run_without_the_figure_says_nothing(toy, monkeypatch):
-    for regret in (None, np.nan, np.inf):
-        with pytest.raises(UnjudgedError, match="no figure for regret"):
-            outcome(toy, monkeypatch, "regret", regret=regret)
-    with pytest.raises(UserError, match="give --threshold"):
-        outcome(toy, monkeypatch, "steps", threshold=None)
 
 
 # === what is ended early ==========================================================================
@@ -396,13 +257,11 @@ RACE = [[0.9, 0.2, 0.8]]
         # What is left counts as perfect: 0.9 and twice 1.0 is more than 2.8, with 0.8 it is a draw.
         ("bound", [0.8], TWO, {}, False),
         ("bound", [1.0, 0.79], TWO, {}, True),
-        ("bound", [1.0, 1.0, 0.1], TWO, {}, False),  # nothing is left to save
         # A trial under way is no measure.
         ("bound", [0.1], SHORT, {}, True),
         ("bound", [0.1], SHORT, {"n_seeds": 3}, False),
         # Perfect is the highest score that any trial has had.
         ("bound", [-115.0], [[-110.0, -110.0], [-100.0, -200.0]], {}, False),
-        ("bound", [-115.0], [[-110.0, -110.0], [-108.0, -200.0]], {}, True),
         # Where the optimum is known nothing less is.
         ("bound", [0.6], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, False),
         ("bound", [0.05], [[0.7, 0.7, 0.7]], {"ceiling": 1.0}, True),
@@ -412,7 +271,6 @@ RACE = [[0.9, 0.2, 0.8]]
         # Nothing is concluded from one seed, or from three others.
         ("median", [0.5, 0.5], FOUR, {}, True),
         ("median", [0.6, 0.5], FOUR, {}, False),
-        ("median", [0.0], FOUR, {}, False),
         ("median", [0.0, 0.0], FOUR[1:], {}, False),
         # Of six, two go on; two seeds are between the rungs.
         ("halving", [0.45], FIVE, {}, False),
@@ -424,26 +282,11 @@ RACE = [[0.9, 0.2, 0.8]]
         # The default takes ranks from ten seeds on.
         ("auto", WORSE, NINE, {}, False),
         ("auto", WORSE, TEN, {}, True),
-        ("bound", WORSE, TEN, {}, False),
     ],
 )
 def test_what_is_hopeless(method, scores, others, options, hopeless):
     found = is_hopeless(scored(scores), [scored(each) for each in others], method, **options)
     assert found is hopeless
-
-
-def test_what_is_compared_is_of_the_same_seeds_and_by_a_known_method():
-    assert not is_hopeless(scored([0.0, 0.0], first=1), [scored(each) for each in FOUR], "median")
-    with pytest.raises(UserError, match="'medain': did you mean 'median'"):
-        is_hopeless(scored([1.0]), [], "medain")
-
-
-def test_a_signed_rank_test_needs_four_seeds():
-    best = scored([1.0 - 0.01 * n for n in range(10)])
-    worse = [score - 0.1 * (seed + 1) for seed, score in best.items()]
-    ended = [is_hopeless(scored(worse[:n]), [best], "wilcoxon") for n in range(1, 11)]
-    # All of n differences on one side have a probability of 1 in 2^n: 1 in 16 is below 0.1.
-    assert ended.index(True) + 1 == 4
 
 
 # === what is tested again =========================================================================
@@ -459,11 +302,8 @@ def retested(number, held_out, verdict="undecided", in_search=0.9, n_runs=20, n_
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"max_retest_seeds": 30}, "--max-retest-seeds belongs to --until-decided"),
         ({"until_decided": True, "retest": 0}, "leave out --retest 0"),
-        ({"until_decided": True, "max_retest_seeds": 9}, "is 9, the re-test begins with 20"),
         ({"until_decided": True, "objective": "iqm"}, "decides means of scores, returns"),
-        ({"until_decided": True, "figure": "steps"}, "or --objective mean --metric steps"),
         ({"first_retest_seed": 2}, "seed 2 is one of the search and of the re-test"),
         # It may grow into the seeds of the search.
         ({"until_decided": True, "first_seed": 1049}, "seed 1049 is one of the search and of"),
@@ -476,35 +316,6 @@ def test_what_a_re_test_cannot_be(toy, changes, complaint):
         replace(tuning, study=replace(tuning.study, first_seed=first)).check()
     toy.tuning(first_retest_seed=3).check()
     toy.tuning(first_retest_seed=2, retest=0).check()
-
-
-def test_optimism_is_how_much_better_it_looked_than_it_is(toy):
-    for figure, in_search, held_out, fooled_by in (
-        *(("score", 0.9, 0.7, 0.2), ("score", 0.7, 0.9, -0.2), ("steps", 100.0, 130.0, 30.0)),
-    ):
-        best = retested(4, held_out, in_search=in_search)
-        assert optimism(toy.tuning(figure=figure), best) == pytest.approx(fooled_by)
-    assert optimism(toy.tuning(), replace(best, held_out=None)) is None
-
-
-WINNERS = [
-    ([(1, 0.8, "undecided"), (2, 0.9, "better")], "score", 2),
-    ([(1, 0.8, "better, as seen"), (2, 0.75, "better")], "score", 1),
-    ([(1, 0.8, "undecided"), (2, 0.9, "undecided")], "score", None),
-    ([(1, 0.7, "undecided"), (2, 0.6, "worse")], "score", None),  # no better than before
-    ([(1, 0.7 + 1e-15, "equivalent")], "score", None),
-    ([(1, None, "undecided")], "score", None),
-    ([(1, 0.9, "better", 0.9, 19), (2, 0.8, "better")], "score", 2),  # a run of it failed
-    ([(1, 0.65, "better"), (2, 0.6, "better")], "steps", 2),
-]
-
-
-@pytest.mark.parametrize(("others", "figure", "winner"), WINNERS)
-def test_what_wins_is_better_on_other_seeds_than_what_there_was(toy, others, figure, winner):
-    settings = [retested(0, 0.7, ""), *[retested(*each) for each in others]]
-    found, reason = _winner(toy.tuning(figure=figure), settings)
-    assert (found and found.number) == winner
-    assert bool(reason) == (winner is None)
 
 
 def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
@@ -603,7 +414,6 @@ OLD, NEAR = [0.3, 0.4] * 10, [0.3, 0.45] * 10
 GROWN = [
     (BETTER, NEAR, True),  # the other may be undecided
     (BETTER, HIGHEST, False),  # but not if it is ahead
-    (BETTER, [None, *HIGHEST[1:]], True),  # unless it cannot win
     (OLD, NEAR, False),
     ([None, *BETTER[1:]], NEAR, False),
 ]
@@ -628,7 +438,6 @@ def test_a_re_test_has_grown_enough_when_its_best_setting_is_decided(
     [
         # By their means they are alike; by the figure that was searched they are not.
         ({"objective": "lower"}, SKEWED, [0.36] * 20, "better, as seen"),
-        ({"objective": "iqm"}, [0.2] * 18 + [1.0] * 2, [0.28] * 20, "better, as seen"),
         ({"objective": "mean"}, SKEWED, [0.36] * 20, "undecided"),
         # Both reach the optimum, one of them sooner.
         ({"figure": "steps"}, [(1.0, 900.0 + k) for k in range(20)], [(1.0, 500.0)] * 20,
