@@ -1,10 +1,13 @@
 """Tiles, semi-gradient control and policy gradients: by hand, and against exact gradients."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
@@ -258,3 +261,64 @@ def test_the_corridor_is_left_by_chance_and_defeats_bootstrapping(name, settings
     right = model.action_probabilities()[0, 1]
     steps = (4 - 2 * right) / (right * (1 - right))
     assert steps < 1.1 * 11.66 if is_learnt else steps > 10 * 11.66
+
+
+def test_a_step_of_one_goes_along_the_gradient_of_the_logarithm():
+    """Against central differences; tiles share the step, so that it is a third at each."""
+    told = Told(
+        "reinforce", spaces.Box(0.0, 1.0, (2,)), 3, n_tilings=3, n_tiles=2, learning_rate=1.0
+    )
+    weights = told.agent.policy.weights.numpy()
+    weights[:] = before = np.random.default_rng(0).normal(size=weights.shape)
+    obs, action, tiny = np.array([0.3, 0.8], "f4"), 2, 1e-6
+
+    def log_probability():
+        return np.log(softmax(told.agent.policy.sums(obs[None])))[0, action]
+
+    gradient = np.zeros_like(weights)
+    for place in np.ndindex(*weights.shape):
+        weights[place] += tiny
+        above = log_probability()
+        weights[place] -= 2 * tiny
+        gradient[place] = (above - log_probability()) / (2 * tiny)
+        weights[place] = before[place]
+    before = weights.copy()
+    told.step(obs, action, 1.0, obs, "terminated")
+    np.testing.assert_allclose(weights - before, gradient / 3, atol=1e-9)
+    assert np.count_nonzero(np.abs(gradient) > 1e-6) == 3 * 3
+
+
+TILINGS = st.fixed_dictionaries(
+    {
+        "n_tilings": st.integers(1, 16),
+        "n_tiles": st.lists(st.integers(1, 9), min_size=2, max_size=2),
+    }
+)
+BOUNDS = spaces.Box(np.array([-1.2, -0.07], "f4"), np.array([0.6, 0.07], "f4"))
+PLACES = st.tuples(st.floats(-2, 2, width=32), st.floats(-0.125, 0.125, width=32))
+
+
+@given(TILINGS, PLACES, PLACES)
+def test_places_share_as_many_tiles_as_the_displacements_say(settings, first, second):
+    """In rationals: tiling t has an edge every tile, displaced by (2 d + 1) t / n tiles."""
+    tiles = make_tiles(BOUNDS, **settings)
+    n, shared = settings["n_tilings"], 0
+    for t in range(n):
+        cells = []
+        for place in (first, second):
+            steps = [
+                min(max(math.floor((x - low) * per_unit), 0), count * n - 1)
+                for x, low, per_unit, count in zip(
+                    place,
+                    BOUNDS.low.astype(float),
+                    tiles.dimensions["steps"],
+                    settings["n_tiles"],
+                    strict=True,
+                )
+            ]
+            cells.append([(step + t * (2 * d + 1) % n) // n for d, step in enumerate(steps)])
+        shared += cells[0] == cells[1]
+    one, other = active(tiles, first, second)
+    assert len(set(one) & set(other)) == shared
+    assert [tile // tiles.n_in_tiling for tile in one] == list(range(n))
+    assert max(one) < tiles.n_tiles

@@ -301,3 +301,12 @@ def test_r_max_plans_the_optimum_of_what_it_has_counted():
     )
     optimum = value_iteration(counted, 0.9).action_values
     np.testing.assert_allclose(agent.policy.q_table, optimum, atol=1e-8)
+
+
+def test_q_learning_chooses_after_the_update():
+    """Action 0 earns next to nothing, so that its value falls below that of action 1."""
+    tracer, settings = Tracer(), {"learning_rate": 0.5, "gamma": 0.0, "initial_q": 1.0}
+    settings |= {"exploration_decay": "constant", "exploration_initial_eps": 0.0}
+    model = load_algorithm("qlearning")(env="RiverSwim-v0", tie_breaking="first", **settings)
+    model.learn(2, callback=tracer)
+    assert tracer.actions == (0, 1)

@@ -12,8 +12,9 @@ from commands.cli import run_command
 from diagnosis import probes, subjects
 from diagnosis.audit import TITLES, Verdict, audit
 from diagnosis.faults import FAULTS
-from diagnosis.probes import Finding
-from diagnosis.subjects import ClassSubject, ScriptSubject, class_named
+from diagnosis.probe_worlds import Record, World
+from diagnosis.probes import Finding, watkins_table
+from diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
 from tests.diagnosis import planted_classes
 from tests.diagnosis.planted_tables import (
     from_memory,
@@ -265,3 +266,17 @@ def test_mistakes_end_in_one_line(type_audit, tmp_path, words, told):
     assert (code, out) == (2, "")
     assert told in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_table_of_watkins_by_hand():
+    """Two episodes; in the second, exploring in the middle state cuts what led there."""
+    world = World(((0, 0), (1, -1), (1, 1)))
+    record = Record(3, [0, 1, 2, 0, 1, 2], [0, 0, 0, 0, 1, 0], [0, 1, 1, 0, -1, 1])
+    first = [0.5 * 0.4 * 1 + 0.5 * 0.16 * 1, 0.5 + 0.5 * 0.4, 0.5]
+    cut = watkins_table(world, record, 0.5, is_cut=True)
+    whole = watkins_table(world, record, 0.5, is_cut=False)
+    start = first[0] + 0.5 * (GAMMA * first[1] - first[0])
+    np.testing.assert_allclose(cut[:, 0], [start, first[1], 0.75])
+    error = -1 + GAMMA * first[2]
+    moved = start + 0.5 * (0.4 * error + 0.16 * 0.5)
+    np.testing.assert_allclose(whole[:, 0], [moved, first[1], 0.75])

@@ -12,6 +12,7 @@ import pytest
 
 import agents
 from machine_code import cache as code_cache
+from machine_code import sources
 
 ROOT = Path(agents.__file__).resolve().parent.parent
 
@@ -204,3 +205,46 @@ def test_where_the_checkout_cannot_be_written_a_home_serves_or_memory(
     else:
         assert found is None
         assert "it is compiled anew in each process" in caplog.text
+
+
+def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
+    """It has the old sources or the new: the digest cannot tell, so nothing is kept."""
+    code = """
+    from pathlib import Path
+    import agents
+    from machine_code import cache
+    folder = cache.folder("agents")
+    source = Path("mdp/graph.py")
+    source.write_text(source.read_text() + "\\n")
+    from agents.small_loop import run_small
+    print(run_small(4.0), len(list(folder.rglob("*.nb[ic]"))))
+    """
+    before = (checkout / "mdp" / "graph.py").read_text()
+    (checkout / "mdp" / "graph.py").write_text(f"# Another digest.\n{before}")
+    try:
+        assert run(checkout, code).stdout.split() == ["13.0", "0"]
+    finally:
+        (checkout / "mdp" / "graph.py").write_text(before)
+
+
+def test_names_and_contents_count_and_other_files_do_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "ROOT", tmp_path)
+
+    def digest():
+        paths = sources.source_paths(["second", "first"])
+        return sources.digest_of(sources.content_lines(paths))
+
+    for name in ("first", "second", "third"):
+        (tmp_path / name / "deep").mkdir(parents=True)
+    rule = tmp_path / "first" / "deep" / "rule.py"
+    digests = []
+    for text in ("x = 1", "x = 2", "x = 1"):
+        rule.write_text(text)
+        (tmp_path / "third" / "rule.py").write_text(f"{text}{len(digests)}")
+        (tmp_path / "first" / "notes.txt").write_text(f"{text}{len(digests)}")
+        digests.append(digest())
+    moved = rule.rename(tmp_path / "first" / "rule.py")
+    assert digests[0] == digests[2]
+    assert len({*digests, digest()}) == 3
+    # As Windows would write it too.
+    assert sources.content_lines([moved])[0].startswith("first/rule.py ")

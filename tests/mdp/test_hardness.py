@@ -5,11 +5,13 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import TransitionModel, finite_horizon_optimum, hardness_of
 from mdp.hardness import action_gaps, diameter, hitting_times, looking_ahead, random_wait
-from tests.mdp.test_random_models import deterministic
+from tests.mdp.test_random_models import deterministic, models
 
 
 def corridor(n, *, ends):
@@ -97,3 +99,43 @@ def test_hitting_times_are_those_of_the_fastest_policy():
     assert hitting_times(model, 1).tolist() == pytest.approx([4, 0])
     assert hitting_times(model, 0).tolist() == pytest.approx([0, 1])
     assert diameter(model) == pytest.approx((4, 1))
+
+
+def worst_greedy_return(model, horizon, k):
+    """The least that a policy earns that is greedy for Q(k), by recursion over what is left."""
+
+    def after(state, action, value, left):
+        at = state, action
+        outcomes = zip(model.prob[at], model.next_state[at], strict=True)
+        ends, reward = model.terminated[at], model.reward[at]
+        return sum(
+            chance * (reward[j] + (0 if ends[j] or left == 1 else value(following, left - 1)))
+            for j, (chance, following) in enumerate(outcomes)
+        )
+
+    def q_values(state, left, depth):
+        def value(following, fewer):
+            values = q_values(following, fewer, max(depth - 1, 0))
+            return max(values) if depth > 1 else sum(values) / len(values)
+
+        return [after(state, action, value, left) for action in range(model.n_actions)]
+
+    def worst(state, left):
+        seems = q_values(state, left, k)
+        greedy = [a for a, one in enumerate(seems) if one >= max(seems) - 1e-9]
+        return min(after(state, action, worst, left) for action in greedy)
+
+    starts = np.flatnonzero(model.initial > 0)
+    return sum(model.initial[state] * worst(state, horizon) for state in starts)
+
+
+@given(models(states=3, actions=2, outcomes=2), st.integers(1, 4))
+def test_the_lookahead_is_the_first_depth_at_which_no_greedy_policy_fails(model, horizon):
+    lookahead, bound = looking_ahead(model, horizon)
+    optimum = finite_horizon_optimum(model, horizon).start_value
+    solved = [
+        worst_greedy_return(model, horizon, k) == pytest.approx(optimum, abs=1e-9)
+        for k in range(1, lookahead + 1)
+    ]
+    assert solved == [False] * (lookahead - 1) + [True]
+    assert bound is None or lookahead <= bound <= horizon

@@ -6,7 +6,10 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 
@@ -185,3 +188,22 @@ def test_a_run_whose_process_is_gone_was_interrupted(tmp_path, dead):
     assert Run(tmp_path, "Taxi-v4").state is None
     with pytest.raises(UserError, match="its training was cut off before it was written"):
         model_of(run_of(tmp_path, dead))
+
+
+def test_of_many_at_once_one_gets_the_lock_of_the_dead(tmp_path):
+    """Whoever removes the dead one's lock must not remove the next one's."""
+    leave_lock(tmp_path, FOREIGN, seconds=61)
+    inside, most, begin = [], [], threading.Barrier(8)
+
+    def drive(_):
+        begin.wait()
+        with suppress(locks.FolderInUseError), lock(tmp_path):
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.05)
+            inside.pop()
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(drive, range(8)))
+    assert set(most) == {1}
+    assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from uuid import uuid4
 
@@ -229,3 +230,9 @@ def test_what_is_no_json_is_written_as_the_nearest_that_is():
         "array": [0, 1, 2],
         "1": True,
     }
+
+
+def test_claims_at_the_same_time_never_share_a_folder(tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        claimed = pool.map(lambda _: claim_names(tmp_path, TAXI, 1), range(40))
+    assert sorted(claimed) == sorted([f"Taxi-v4_{n}"] for n in range(1, 41))

@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -334,3 +335,40 @@ def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(t
     steps, returns = read_monitors(tmp_path)
     assert steps.tolist() == [12, 30, 33, 36, 45]
     assert returns.tolist() == [3, 1, 5, 4, 2]
+
+
+class Corridor(gym.Env):
+    """Two steps forward, with rewards of 1 and 2; the third cell is the end."""
+
+    observation_space, action_space = gym.spaces.Discrete(3), gym.spaces.Discrete(1)
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.cell = 0
+        return 0, {}
+
+    def step(self, action):
+        self.cell += 1
+        return self.cell, float(self.cell), self.cell == 2, False, {}
+
+
+def test_two_episodes_worked_by_hand():
+    """With step size and discount 1/2: targets 1, 2, then 1 + 1/2 = 1.5, 2."""
+    halves = {"learning_rate": 0.5, "gamma": 0.5}
+    _, recorder = watched(Corridor(), n_timesteps=9, n_episodes=2, **halves)
+    moves, changes = recorder.moves.rows, recorder.changes.rows
+    assert moves["target"].tolist() == [1.0, 2.0, 1.5, 2.0]
+    assert moves["td_error"].tolist() == [1.0, 2.0, 1.0, 1.0]
+    assert moves["obs"].tolist() == [0, 1, 0, 1]
+    assert moves["next_obs"].tolist() == [1, 2, 1, 2]
+    assert moves["reward"].tolist() == [1.0, 2.0, 1.0, 2.0]
+    assert moves["episode_return"].tolist() == [1.0, 3.0, 1.0, 3.0]
+    assert moves["episode"].tolist() == [0, 0, 1, 1]
+    assert moves["end"].tolist() == [0, TERMINATED, 0, TERMINATED]
+    assert changes["entry"].tolist() == [0, 1, 0, 1]
+    assert changes["after"].tolist() == [0.5, 1.0, 1.0, 1.5]
+    assert changes["step"].tolist() == [0, 1, 2, 3]
+    assert recorder.steps.rows["timesteps"].tolist() == [1, 2, 3, 4]
+    assert recorder.steps.rows["learning_rate"].tolist() == [0.5] * 4
+    # The two episodes are over: nothing was left out.
+    assert (recorder.is_full, recorder.is_cut) == (True, False)
