@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from agents.common.callbacks import BlockCallback, Horizon
 from machine_code import WorkTime
+from machine_code.sources import ROOT
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.critics import KnownWorld
 from pipeline.evaluation.exact import ExactEvaluator
@@ -336,8 +337,7 @@ def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
     if name == top or name.startswith(f"{top}."):
         return True
     file, folder = getattr(module, "__file__", None), Path(user.path or "").parent
-    ours = Path(__file__).resolve().parents[1]
-    return bool(file) and Path(str(file)).parent == folder and folder != ours
+    return bool(file) and Path(str(file)).parent == folder and folder != ROOT
 
 
 def _values(holder: ModuleType | type) -> dict[str, Any]:

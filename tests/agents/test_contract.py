@@ -1,5 +1,6 @@
 """What every hand-written agent keeps to, as a Stable-Baselines3 algorithm."""
 
+import inspect
 import json
 import pickle
 import zipfile
@@ -28,7 +29,10 @@ def env_of(name, n_envs=2, seed=5):
 
 
 def make(name, env=None, **settings):
-    return make_in(name, env or env_of(name), **{**AGENTS[name][1], **settings})
+    """Interpreted, as compiling takes long: that both loops agree is seen in `test_engines.py`."""
+    has_engines = "engine" in inspect.signature(load_algorithm(name)).parameters
+    engine = {"engine": "interpreted"} if has_engines else {}
+    return make_in(name, env or env_of(name), **{**AGENTS[name][1], **engine, **settings})
 
 
 def steady(name):
