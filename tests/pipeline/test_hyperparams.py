@@ -262,7 +262,7 @@ def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
         entry = {**typed, "train_env_kwargs": variant}
         found, told = training_follows(entry, typed)
         assert found == {**entry, "train_env_kwargs": kept}
-        line = "without shelf_reward: -10, since"
+        line = "without shelf_reward: -10, because"
         assert told["train_env_kwargs"].startswith(line) if is_told else told is None
 
 

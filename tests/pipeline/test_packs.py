@@ -138,7 +138,7 @@ def changed(tmp_path):
 
 WRONG_DIGEST = {"FrozenLake-v1.zip": "0" * 64}
 NOT_PACKED = {
-    "is interrupted, and a pack is of a fin": lambda info, _: info.update(state="interrupted"),
+    "is interrupted: only finished runs can": lambda info, _: info.update(state="interrupted"),
     "kwargs.api_key looks like a secret": lambda _, set_: set_.update(env_kwargs={"api_key": "x"}),
     "names .*, a place on this machine": lambda _, set_: set_.update(note=f"see {HOME}/notes"),
     "cannot be packed: 'std_return'": lambda info, _: info["final"].pop("std_return"),
