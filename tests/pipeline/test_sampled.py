@@ -264,6 +264,16 @@ def test_the_upper_end_measures_and_the_lower_stands_beside_it():
     assert not {"optimum_at_least", "gap_at_least", "score_at_most"} & known.keys()
 
 
+def test_an_upper_end_without_a_proof_is_marked_wherever_its_score_is_told():
+    guessed = episodes(*[260.0] * 10, yardstick=replace(POLE, is_proven=False))
+    assert guessed.summary()["optimum_is_proven"] is False
+    assert describe(guessed).endswith("(bracketed; the upper end is not proven)")
+    too_good = episodes(*[501.0] * 10, yardstick=replace(POLE, is_proven=False))
+    assert describe(too_good).endswith("or is wrong; its upper end is not proven")
+    spec = spec_of("random", "Acrobot-v1")
+    assert bracketed_yardstick(spec) == Yardstick(-38.0, -498.625, -60.408, is_proven=False)
+
+
 @pytest.mark.parametrize(
     ("returns", "yardstick", "alarm"),
     [
