@@ -46,7 +46,7 @@ from mdp.transition_model import Bools, Floats, Ints
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation.advice import how_episodes_end, still_running
-from pipeline.evaluation.critics import EXPLORING
+from pipeline.evaluation.critics import learns_exploring_values
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.policies import believed_values
 from pipeline.train_spec import TrainSpec
@@ -233,7 +233,8 @@ def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _
     if model.prob.size > MOST_OUTCOMES:
         return None
     epsilon = 0.0
-    if spec.algo in EXPLORING and getattr(agent, "exploration", "") == "epsilon_greedy":
+    explores = learns_exploring_values(spec, agent)
+    if explores and getattr(agent, "exploration", "") == "epsilon_greedy":
         epsilon = float(getattr(agent, "exploration_rate", 0.0))
     lived = _noisy(model, epsilon) if epsilon > 0 else model
     return _Task(model, float(discount), epsilon, lived)

@@ -54,7 +54,7 @@ from pipeline.train_spec import TrainSpec
 
 SECONDS_BETWEEN_WRITES = 1.0
 
-# Agents that learn the values of their exploring policy.
+# Agents that always learn the values of their exploring policy.
 EXPLORING = frozenset(
     {
         "sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo",
@@ -172,13 +172,17 @@ def recorder_of(
     world = known_world(spec, agent)
     if isinstance(world, str):
         return world
-    explores = spec.algo in EXPLORING or isinstance(agent, SoftmaxAlgorithm)
-    explores |= getattr(agent, "target_policy", "") == "exploring"
+    explores = learns_exploring_values(spec, agent) or isinstance(agent, SoftmaxAlgorithm)
     if not isinstance(agent, OnPolicyAlgorithm):
         return CriticRecorder(path, world, spec, explores=explores)
     has_rollouts = type(agent.rollout_buffer) is RolloutBuffer or takes_masks(agent)
     is_seen = has_rollouts and world.tells_states_apart
     return (RolloutRecorder if is_seen else CriticRecorder)(path, world, spec, explores=True)
+
+
+def learns_exploring_values(spec: TrainSpec, agent: BaseAlgorithm) -> bool:
+    """Whether a table or tiles learn the values of the exploring policy, not of the greedy one."""
+    return spec.algo in EXPLORING or getattr(agent, "target_policy", "") == "exploring"
 
 
 class CriticRecorder(BlockCallback):

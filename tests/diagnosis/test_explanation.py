@@ -90,12 +90,20 @@ def test_a_discount_that_hides_the_goal_is_the_objective_s_part():
     assert found.proposal.startswith("gamma:auto")
 
 
-def test_sarsa_walks_around_the_cliff_because_it_explores():
+@pytest.mark.parametrize(
+    ("algo", "more", "lost"),
+    [
+        ("sarsa", {}, 2.0),
+        ("n_step_tree_backup", {"target_policy": "exploring"}, 2.0),
+        ("n_step_tree_backup", {"target_policy": "greedy"}, 0.0),
+    ],
+)
+def test_what_learns_while_exploring_walks_around_the_cliff(algo, more, lost):
     """Sutton and Barto, example 6.6: with epsilon 0.1 the best is the safer way, here of 15."""
-    entry = {"exploration_initial_eps": 0.1, "exploration_final_eps": 0.1, "gamma": 1.0}
-    found = explained("sarsa", "CliffWalking-v1", entry, steps=2000)
+    entry = {"exploration_initial_eps": 0.1, "exploration_final_eps": 0.1, "gamma": 1.0, **more}
+    found = explained(algo, "CliffWalking-v1", entry, steps=2000)
     assert found.optimum == pytest.approx(-13)
-    assert parts_of(found)["exploring"] == pytest.approx(2.0)
+    assert parts_of(found).get("exploring", 0.0) == pytest.approx(lost)
 
 
 def test_what_cannot_be_observed_is_a_part_of_its_own():
