@@ -355,7 +355,7 @@ def _beat(path: Path, token: str, lose: Callable[[UserError], object]) -> None:
         with contextlib.suppress(OSError):
             give_sign(path)
     elif owner:
-        lose(FolderInUseError(f"{_words(path.parent, owner)}: it took this one for dead"))
+        lose(FolderInUseError(f"{_words(path.parent, owner)}: it has taken over the lock"))
     elif is_gone(path.parent):
         lose(FolderGoneError(path.parent))
     elif is_gone(path):

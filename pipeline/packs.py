@@ -62,7 +62,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     """The files of a pack of a finished run, by name, checked and without private data."""
     run = run_in(folder)
     if not run.recorded_spec():
-        raise UserError(f"{folder} does not say what was trained: it is no run of ours")
+        raise UserError(f"{folder} has no record of a training of this project")
     info = run.read_info()
     if info.get("state") != FINISHED:
         raise UserError(f"{folder} is {info.get('state')}: only finished runs can be packed")

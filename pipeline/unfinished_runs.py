@@ -100,7 +100,7 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
     """The spec of a run; its user modules have to be typed again."""
     recorded = run.recorded_spec()
     if not recorded:
-        raise UserError(f"{run.path} does not say what it was asked for: it is no run of ours")
+        raise UserError(f"{run.path} has no record of a training of this project")
     data, typed = completed(recorded), tuple(modules)
     missing = [name for name in data["gym_packages"] if name not in {m.name for m in typed}]
     if missing:

@@ -68,8 +68,7 @@ def player(model: BaseAlgorithm, env: VecEnv) -> Any:
         check_masks_exist(env)
     except ValueError as error:
         raise UserError(
-            f"{type(model).__name__} has to be told which actions are valid, and the environment "
-            "has no action masks"
+            f"{type(model).__name__} needs action masks, and the environment has none"
         ) from error
     return MaskTold(model, env)
 
@@ -153,7 +152,7 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
     if first.shape != observations.shape[:1]:
         return f"predict returns actions of shape {first.shape} for {len(observations)} states"
     if any(state is not None for _, state in asked):
-        return "predict remembers what it saw before"
+        return "predict depends on earlier observations"
     return "" if np.array_equal(first, second) else "predict draws its actions at random"
 
 
@@ -256,7 +255,7 @@ def _n_inputs(agent: BaseAlgorithm) -> int:
 
 def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
     if has_memory(agent):
-        return "it acts by what it remembers, not by the state alone"
+        return "its actions depend on earlier observations, not on the state alone"
     if masks is None and takes_masks(agent):
         return "which actions are valid in each state is not known"
     return ""

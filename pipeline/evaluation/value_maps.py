@@ -74,7 +74,7 @@ def map_refusal(evaluator: ExactEvaluator) -> str | None:
     n_states = evaluator.model.n_states
     if evaluator.layout is None or n_states <= MAX_STATES:
         return None
-    return f"no value map: {n_states:,} states are too many to see, it has up to {MAX_STATES:,}"
+    return f"no value map: {n_states:,} states, the limit is {MAX_STATES:,}"
 
 
 def _can_be_drawn(evaluator: ExactEvaluator) -> bool:

@@ -209,7 +209,7 @@ def test_nothing_invalid_is_done_in_training_evaluation_and_play(tmp_path):
         assert (evaluation.lengths >= 5).all()
     played = list(play_episodes(maskable, corridors(1), 3, deterministic=False))
     assert [length for _, length in played] == [-total for total, _ in played]
-    with pytest.raises(UserError, match="MaskablePPO has to be told which actions are valid, and"):
+    with pytest.raises(UserError, match="MaskablePPO needs action masks, and the env"):
         next(play_episodes(maskable, make_vec_env(LAKE, 1), 1))
     assert "<ActionMasks" in str(make_single_env(spec_of("dqn", mask_actions=True)))
     assert "ActionMasks" not in str(make_single_env(spec_of("dqn", mask_actions=False)))

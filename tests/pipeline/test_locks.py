@@ -111,7 +111,7 @@ def wait_for(condition):
 @pytest.mark.parametrize(
     ("lose", "told", "left"),
     [
-        (replace_lock, "on elsewhere is at work on it since .*: it took this one for dead$", True),
+        (replace_lock, "on elsewhere is at work on it since .*: it has taken over the lock$", True),
         (shutil.rmtree, "study: this folder is gone: somebody has removed or renamed it$", False),
     ],
     ids=["taken for dead", "removed"],
