@@ -104,9 +104,12 @@ def installed(library: str) -> str:
 
 def record(found: Found, patterns: list[str]) -> None:
     """Write the file of results, a line for each entry or for each line of its text."""
-    holds, values = found.holds, found.values
+    holds, values, here = found.holds, found.values, facts()
     if patterns != ["*"] and GOLDEN.exists():  # those that were not looked at stay
         before = json.loads(GOLDEN.read_text(encoding="utf-8"))
+        if blocked(before["facts"]) & set(holds.values()):
+            raise SystemExit("the other entries are of another machine: record all, without --only")
+        here = before["facts"]
         for where, entries in before["entries"].items():
             for name, value in entries.items():
                 if not matches(name, patterns):
@@ -115,9 +118,16 @@ def record(found: Found, patterns: list[str]) -> None:
         where: {name: values[name] for name in sorted(values) if holds[name] == where}
         for where in ("anywhere", "python", "here")
     }
-    text = json.dumps({"facts": facts(), "entries": entries}, indent=0, ensure_ascii=False)
+    text = json.dumps({"facts": here, "entries": entries}, indent=0, ensure_ascii=False)
     GOLDEN.write_text(f"{text}\n", encoding="utf-8")
     print(f"{GOLDEN.name}: {len(text) / 1000:.0f} kB")
+
+
+def blocked(recorded: dict[str, str]) -> set[str]:
+    """Where entries hold that cannot be compared with recorded facts."""
+    now = facts()
+    python = {"python"} if now["python"] != recorded["python"] else set()
+    return python | ({"here"} if now != recorded else set())
 
 
 def matches(name: str, patterns: list[str]) -> bool:
@@ -129,7 +139,7 @@ def differences(recorded: dict[str, Any], found: Found, patterns: list[str]) -> 
     """A line for each difference, and for each thing that cannot be compared here."""
     here = facts()
     changed_facts = [name for name, value in recorded["facts"].items() if here[name] != value]
-    blocked = {"anywhere": False, "python": "python" in changed_facts, "here": bool(changed_facts)}
+    incomparable = blocked(recorded["facts"])
     left = dict(found.values)
     for where, entries in recorded["entries"].items():
         skipped = 0
@@ -137,7 +147,7 @@ def differences(recorded: dict[str, Any], found: Found, patterns: list[str]) -> 
             if not matches(name, patterns):
                 continue
             lines = list(changes(name, was, left.pop(name, None)))
-            if blocked[where] and lines:
+            if where in incomparable and lines:
                 skipped += 1
             else:
                 yield from lines
