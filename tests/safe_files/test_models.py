@@ -1,4 +1,4 @@
-"""Genuine files of many algorithms: loaded without unpickling, they are what the library loads.
+"""Genuine files of every algorithm: loaded without unpickling, they are what the library loads.
 
 The files are made here by the plain library. From both models training goes on, and ends in the
 same weights, to the last bit.
@@ -79,6 +79,9 @@ CASES = {
     "dqn with hindsight": case(sb3.DQN, bits, FEW, HINDSIGHT, policy="MultiInputPolicy"),
     "sac with sde and noise": case(sb3.SAC, SWING, FEW, SDE, {"action_noise": ORNSTEIN}),
     "td3 with noise": case(sb3.TD3, SWING, FEW, {"action_noise": NORMAL}, n_envs=2),
+    "qrdqn": case(contrib.QRDQN, CART, FEW),
+    "tqc": case(contrib.TQC, SWING, FEW),
+    "trpo": case(contrib.TRPO, CART, ROLLOUT),
     "crossq": case(contrib.CrossQ, SWING, FEW),
     "ars": case(contrib.ARS, SWING, {"n_delta": 1}, policy="LinearPolicy"),
     "ppo_mask": case(contrib.MaskablePPO, masked, ROLLOUT),
@@ -175,6 +178,7 @@ def test_statistics_keep_their_settings_and_are_refused_elsewhere(tmp_path):
 # What the file says of its schedules, and what stands in their place.
 OLD_SCHEDULES = {
     "dqn_2.3.2": (sb3.DQN, {"learning_rate": 1e-3}),
+    "ppo_2.0.0": (sb3.PPO, {"clip_range": 0.2}),
     "ppo_zoo_2.6.0": (sb3.PPO, {"clip_range": 0.2}),
 }
 
