@@ -1,5 +1,6 @@
 """Comparisons of two agents: pairs, rank-sum tests and means, by hand, by SciPy, in simulation."""
 
+from functools import partial
 from itertools import combinations, product
 
 import numpy as np
@@ -11,9 +12,12 @@ from scipy import stats
 
 from verdicts import (
     Ends,
+    ahead_p_value,
     apart_p_value,
     compare_means,
     compare_pairs,
+    describe_pairs,
+    equivalent_p_value,
     fewest_seeds,
     holm,
     judge_means,
@@ -34,7 +38,7 @@ from verdicts.means import (
     seen_p_value,
     welch_p_value,
 )
-from verdicts.rank_tests import interval_places, rank_sum_p_value, share_p_value
+from verdicts.rank_tests import interval_places, rank_sum_p_value, share_p_value, wins_of
 from verdicts.resampling import interval_tail
 
 NAN = np.nan
@@ -61,6 +65,7 @@ def interval(found):
         ([0.3], [0.1 + 0.2], 0.5, 1, 0),  # in the last bits alone
         # Environments are averaged.
         ([[1, 5], [2, 5], [3, NAN]], [[0, 5], [0, 5], [0, 5]], 0.75, 5, 1),
+        ([[0, 5], [0, 5], [0, 5]], [[1, 5], [2, 5], [3, NAN]], 0.25, 5, 1),
     ],
 )
 def test_who_wins(first, second, point, n, n_missing):
@@ -101,6 +106,34 @@ def test_winning_always_leaves_a_doubt():
     assert [lost.point, *interval(lost)] == pytest.approx([0, 0, exact.high])
 
 
+def test_of_many_seeds_the_interval_is_that_of_leaving_one_out():
+    """The jackknife has the variance of DeLong; two environments alike halve it."""
+    n = 250
+    first, second = np.random.default_rng(0).normal([[0.3], [0]], 1, size=(2, n))
+    wins = first[:, None] > second
+    without = (wins.sum() - wins.sum(axis=0) - wins.sum(axis=1) + np.diag(wins)) / (n - 1) ** 2
+    half = stats.norm.isf(0.05) * np.sqrt((n - 1) * without.var())
+    for k in (1, 2):
+        several = (np.tile(each, (k, 1)).T for each in (first, second))
+        found = probability_of_improvement(*several, seed=0, confidence=0.9)
+        ends = wins.mean() - half / k**0.5, wins.mean() + half / k**0.5
+        assert interval(found) == pytest.approx(ends, abs=2e-4)
+
+
+@pytest.mark.parametrize(("truth", "n"), [(0.95, 5), (0.7, 30)])
+def test_the_interval_of_the_probability_covers(truth, n):
+    rng = np.random.default_rng(0)
+    ahead = stats.norm.ppf(truth) * np.sqrt(2)
+    hits = []
+    for trial in range(500):
+        first, second = rng.normal(size=(2, n))
+        found = probability_of_improvement(first + ahead, second, seed=trial, n_resamples=500)
+        hits.append(found.low <= truth <= found.high)
+    # Standard error 0.01. Beside 1 the interval is cautious.
+    assert np.mean(hits) >= 0.915
+    assert np.mean(hits) <= (1 if truth > 0.9 else 0.985)
+
+
 # --- paired differences --------------------------------------------------------------------------
 
 
@@ -120,6 +153,7 @@ def test_the_paired_interval_is_scipys():
         ([1, NAN, 5, np.inf, 8, 7], [0, 3, 2, 1, 3, -np.inf], (3, -1.968, 7.968), 3),
         ([1, 2, 3], [1, 2, 3], (0, 0, 0), 0),
         ([0.4, 0.4], [0.1, 0.1], (0.3, 0.3, 0.3), 0),
+        ([0.3, 0.6], [0.1 + 0.2, 0.2 + 0.4], (0, 0, 0), 0),  # in the last bits alone
         ([3], [1], (2, NAN, NAN), 0),
         ([NAN], [1], (NAN, NAN, NAN), 1),
     ],
@@ -142,7 +176,24 @@ def test_holm_worked_by_hand():
     assert holm([0.02, NAN, 0.01]).tolist() == pytest.approx([0.02, NAN, 0.02], nan_ok=True)
 
 
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=12))
+def test_holm_keeps_the_order_and_lies_between_raw_and_bonferroni(p_values):
+    raw, adjusted = np.array(p_values), holm(p_values)
+    order = np.argsort(raw, kind="stable")
+    assert (np.diff(adjusted[order]) >= 0).all()
+    assert (adjusted >= raw).all()
+    assert (adjusted <= np.minimum(1, raw * len(raw))).all()
+    assert adjusted[order[0]] == min(1, raw.min() * len(raw))
+
+
 # --- verdicts ------------------------------------------------------------------------------------
+
+NOISE = np.array([-0.3, 0.2, 0.1, -0.2, 0.3, -0.1])
+
+
+def verdicts(scores, margin=0.0, **arguments):
+    found = compare_pairs(scores, margin, **QUICK, **arguments)
+    return {(one.first, one.second): one.verdict for one in found}
 
 
 def test_a_comparison_holds_its_parts_together():
@@ -158,6 +209,14 @@ def test_a_comparison_holds_its_parts_together():
     assert one.seeds_needed > 7
 
 
+def test_a_sure_difference_within_the_margin_is_equivalent():
+    scores = {"x": 0.4 + 0.01 * NOISE, "y": np.zeros(6)}
+    assert verdicts(scores) == {("x", "y"): "better"}
+    (one,) = compare_pairs(scores, 0.5, ends=(-1, 1), **QUICK)
+    assert one.verdict == "equivalent"
+    assert 0.19 < one.mean.seen_low <= one.mean.seen_high < 0.25
+
+
 def test_the_typical_run_is_another_question_than_the_mean():
     steady, failing = np.full(40, 0.95), np.where(np.arange(40) < 4, 0.0, 0.98)
     (one,) = compare_pairs({"x": steady, "y": failing}, ends=(0, 1), **QUICK)
@@ -166,6 +225,20 @@ def test_the_typical_run_is_another_question_than_the_mean():
     # A typical run lies within the margin, but one in four lies beyond it, always on one side.
     often = {"x": np.repeat([0.0, 5.0], [30, 10]), "y": np.zeros(40)}
     assert compare_pairs(often, 1.0, **QUICK)[0].typical == "better"
+
+
+def test_many_pairs_and_later_looks_ask_for_more():
+    first, second = np.arange(6) + 4.5, np.arange(6.0)
+    (alone,) = compare_pairs({"x": first, "y": second}, **QUICK)
+    crowd = {name: second + 0.01 * k for k, name in enumerate("abcde")}
+    among = compare_pairs({"x": first, "y": second, **crowd}, **QUICK)[0]
+    assert among.mean.seen_low < alone.mean.seen_low
+    scores = {"x": np.arange(6) + 3.5, "y": np.arange(6.0)}
+    pair = ("x", "y")
+    assert verdicts(scores)[pair] == "better"
+    assert verdicts(scores, look=2)[pair] == "undecided"
+    with pytest.raises(ValueError, match="look is 3, it must lie between 1 and 2"):
+        verdicts(scores, look=3, n_looks=2)
 
 
 def test_agents_without_chance_are_told_apart_by_what_they_are():
@@ -185,7 +258,7 @@ def test_agents_without_chance_are_told_apart_by_what_they_are():
     assert said == [True, False]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=40)
 @given(PAIRS, st.sampled_from([0, 0.5, 2]), st.sampled_from([0.25, 4]), st.integers(-100, 100))
 def test_what_holds_of_every_comparison(pair, margin, scale, shift):
     first, second = map(np.array, pair)
@@ -239,6 +312,27 @@ def test_looks_and_environments_spend_no_more_than_there_is():
     assert shares == pytest.approx([0.06, 0.02, 0.015])
 
 
+@pytest.mark.parametrize(
+    ("scores", "options", "message"),
+    [
+        (([1, 2], [1, 2, 3]), {}, r"different shapes, .*'y': \(3,\)"),
+        (([[1, 2]], [[1, 2]]), {}, r"they must have \(n_seeds,\)"),
+        (([1, 2], [1, 2]), {"margin": -1}, "margin is -1"),
+        (([1, 2], [1, 2]), {"confidence": 95}, "confidence is 95"),
+        (([1, 2], [1, 2]), {"ends": (1, 0)}, "ends are"),
+    ],
+)
+def test_wrong_arguments_are_named(scores, options, message):
+    with pytest.raises(ValueError, match=message):
+        compare_pairs(dict(zip("xy", scores, strict=True)), seed=0, **options)
+
+
+def test_scores_that_do_not_pair_up_are_refused():
+    for compare in (partial(probability_of_improvement, seed=0), paired_difference):
+        with pytest.raises(ValueError, match="do not pair up"):
+            compare([1, 2], [1, 2, 3])
+
+
 # === rank-sum tests ===============================================================================
 
 
@@ -266,6 +360,11 @@ def test_many_scores_with_ties_are_tested_as_counted_ones():
     assert rank_sum_p_value(first, second) == pytest.approx(expected)
 
 
+def test_scores_that_differ_in_the_last_bits_are_equal():
+    assert wins_of(np.array([0.3]), np.array([0.1 + 0.2])).item() == 0.5
+    assert rank_sum_p_value(np.full(9, 0.1 + 0.2), np.full(9, 0.3)) == 1
+
+
 def test_a_share_of_won_pairs_is_no_surer_than_a_sign_test():
     steady, erratic = np.zeros(7), np.array([1.0, 1, 1, 1, 1, 1, -1])
     # Six of seven: (7 + 1) / 2**7.
@@ -279,15 +378,36 @@ def test_a_share_of_won_pairs_is_no_surer_than_a_sign_test():
     assert 2 * rank_sum_p_value(erratic, steady) < 0.05 < apart_p_value(erratic, steady)
 
 
+def test_the_larger_of_two_p_values_counts():
+    rng = np.random.default_rng(0)
+    first, second = rng.normal([[0.8], [0]], 1, size=(2, 12))
+    both = rank_sum_p_value(first, second), share_p_value(first, second)
+    assert ahead_p_value(first, second) == max(both)
+    assert apart_p_value(first, second) == apart_p_value(second, first) == 2 * max(both)
+    sides = ahead_p_value(first + 2, second), ahead_p_value(second + 2, first)
+    assert equivalent_p_value(first, second, 2.0) == max(sides)
+    assert np.isnan(ahead_p_value(first, second[:0]))
+
+
 def test_the_interval_of_a_median_of_differences_worked_by_hand():
     # Two-sided 0.05 leaves out two of the 25 on each side: 2 (1 + 1) / 252, (1 + 1 + 2) is 0.032.
     assert interval_places(5, 5, 0.05) == (2, 22)
     assert interval_places(4, 4, 0.05) is None
 
 
+@pytest.mark.parametrize("n", [8, 30])
+def test_the_interval_of_a_median_of_differences_covers(n):
+    rng = np.random.default_rng(n)
+    pairs = rng.exponential(size=(2000, 2, n))
+    apart = np.sort([np.subtract.outer(*pair).ravel() for pair in pairs])
+    low, high = apart[:, interval_places(n, n, 0.05)].T
+    # Standard error 0.5 %; steps of the exact test make it a little cautious.
+    assert 0.025 < ((low > 0) | (high < 0)).mean() < 0.065
+
+
 # --- error rates ---------------------------------------------------------------------------------
 
-STUDIES = 150
+STUDIES = 250
 TYPICAL_LEVEL = 0.5  # of which a tenth is for typical runs
 # A right test at 5 % exceeds this in one of 10,000 such checks.
 MOST_WRONG = stats.binom.isf(1e-4, STUDIES, 0.05) / STUDIES
@@ -296,10 +416,15 @@ MOST_WRONG = stats.binom.isf(1e-4, STUDIES, 0.05) / STUDIES
 WORLDS = {
     "log-normal": lambda rng, shape: rng.lognormal(size=shape),
     "tied": lambda rng, shape: rng.choice([0.0, 0.5, 1.0], size=shape, p=[0.2, 0.2, 0.6]),
+    "a steady agent beside one around it": lambda rng, shape: (
+        np.array([[0.0], [1.0]]) * rng.choice([-1.0, 1.0], size=shape)
+    ),
 }
 
 
-@pytest.mark.parametrize(("world", "n"), [("log-normal", 12), ("tied", 5)])
+@pytest.mark.parametrize(
+    ("world", "n"), [("log-normal", 12), ("tied", 5), ("a steady agent beside one around it", 5)]
+)
 def test_agents_are_rarely_told_apart_or_called_equal_wrongly(world, n):
     rng, apart, equal = np.random.default_rng(0), 0, 0
     for _ in range(STUDIES):
@@ -334,15 +459,16 @@ def every_split(first, second):
     return np.mean(np.array(statistic) >= statistic[0] - 1e-9)
 
 
-def test_of_runs_that_were_seen_the_larger_of_two_p_values_counts():
-    x, y = np.random.default_rng(0).normal([[1.0], [0]], 1, size=(2, 5))
+@pytest.mark.parametrize("seed", range(3))
+def test_of_runs_that_were_seen_the_larger_of_two_p_values_counts(seed):
+    x, y = np.random.default_rng(seed).normal([[1.0], [0]], 1, size=(2, 5))
     by_t = stats.ttest_ind(x, y, equal_var=False, alternative="greater").pvalue
     assert welch_p_value(x, y) == pytest.approx(by_t)
     assert permutation_p_value(x, y) == pytest.approx(every_split(x, y))
     assert seen_p_value(x, y) == pytest.approx(max(by_t, every_split(x, y)))
 
 
-@pytest.mark.parametrize("n", [5, 12])
+@pytest.mark.parametrize("n", [5, 8, 11, 12])
 @pytest.mark.parametrize("spread", [0.1, 1.0])
 def test_runs_that_share_their_seeds_are_held_against_each_other(n, spread):
     """Their signs are flipped in all ways, where that can show as much as the t test."""
@@ -354,20 +480,20 @@ def test_runs_that_share_their_seeds_are_held_against_each_other(n, spread):
     assert paired_p_value(first, second) == pytest.approx(max(by_t, by_signs))
 
 
-@pytest.mark.parametrize("n", [5, 50])
-@pytest.mark.parametrize("share", [0, 0.2])
-def test_of_zeros_and_ones_the_interval_is_that_of_clopper_and_pearson(n, share):
+@pytest.mark.parametrize(("n", "within"), [(5, 0.02), (10, 0.02), (50, 0.02), (3000, 0.002)])
+@pytest.mark.parametrize("share", [0, 0.2, 0.5, 1])
+def test_of_zeros_and_ones_the_interval_is_that_of_clopper_and_pearson(n, within, share):
     n_ones = round(share * n)
     scores = np.repeat([1.0, 0.0], [n_ones, n - n_ones])
     low = stats.beta.ppf(0.025, n_ones, n - n_ones + 1) if n_ones else 0.0
     high = stats.beta.isf(0.025, n_ones + 1, n - n_ones) if n_ones < n else 1.0
     # The quantiles come from 4,000 draws.
-    assert mean_interval(scores, 0.05) == pytest.approx((low, high), abs=0.02)
+    assert mean_interval(scores, 0.05) == pytest.approx((low, high), abs=within)
     # What does not depend on chance has no interval.
     assert mean_interval(np.full(n, share), 0.05, exact=True) == pytest.approx((share, share))
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=40)
 @given(SCORES, SCORES, st.sampled_from([0.05, 0.01]))
 def test_intervals_say_what_the_tests_say(first, second, level):
     found, said = compare_means(first, second, level), judge_means(first, second, level)
@@ -386,11 +512,18 @@ def test_intervals_say_what_the_tests_say(first, second, level):
 CASES = {
     # name: scores of two agents, the verdict on the first, and whether it has a condition
     "far apart": ([0.95, 0.94, 0.96, 0.95, 0.95], [0.2, 0.25, 0.22, 0.2, 0.2], "better", False),
+    "three seeds": ([0.95, 0.94, 0.96], [0.2, 0.25, 0.22], "undecided", False),
     "a standard deviation apart": (
         normal_scores(20, 0.66),
         normal_scores(20),
         "better",
         True,
+    ),
+    "steady, and one of ten fails": (
+        normal_scores(10, 0.95, 0.01),
+        [*normal_scores(9, 0.9856, 0.004), 0],
+        "undecided",
+        False,
     ),
     "none against three of ten": ([0.95] * 10, [0.95] * 7 + [0.0] * 3, "undecided", False),
     "a fair coin that fell on one side": ([1.0] * 5, [0.5] * 5, "better", True),
@@ -400,6 +533,7 @@ CASES = {
         "better",
         False,
     ),
+    "all alike": ([0.86] * 5, [0.86] * 5, "equivalent", True),
     "the same at 200 seeds": (
         normal_scores(200, 0.95, 0.01),
         normal_scores(200, 0.95, 0.01),
@@ -450,6 +584,30 @@ def test_against_one_agent_the_others_are_not_tested():
     few = judge_pairs(close, 0.0, 0.05, ends=UNIT, against="old")
     assert few["old", "a"].mean == MeanVerdict("worse", is_conditional=True)
     assert few["old", "a"].mean == judge_means(old, close["a"], 0.05 * 0.75 / 3)
+    described = describe_pairs(
+        {pair: (each, 20) for pair, each in judged.items()},
+        scores,
+        0.0,
+        (0.05, 0.05),
+        UNIT,
+        seed=0,
+        against="old",
+    )
+    untested = next(pair for pair in described if (pair.first, pair.second) == ("far", "further"))
+    assert (untested.mean.low, untested.mean.high, untested.seeds_needed) == (-1, 1, None)
+
+
+def test_who_is_best_may_have_a_condition_too():
+    # So far ahead that it shows against each, if not against all pairs at once, nor with the guard.
+    best, others = normal_scores(10, 0.66), [normal_scores(10, mean) for mean in (0.58, 0.579)]
+    scores = dict(zip("abc", [best, *others], strict=True))
+    assert rank_by_mean([*scores.values()], 0.02) == 0
+    assert rank_by_mean([*scores.values()], 0.02, seen_only=True) == 1
+    for pair in compare_pairs(scores, ends=(0, 1), seed=0)[:2]:
+        assert judge_means(best, scores[pair.second], 0.05 / 3) == MeanVerdict("better", True)
+        assert pair.said == MeanVerdict("better", True)
+        assert 0 < pair.mean.seen_low < 0.08 < pair.mean.seen_high
+        assert pair.mean.most_outside > 0
 
 
 @pytest.mark.parametrize(
@@ -484,7 +642,7 @@ def test_few_seeds_claim_nothing():
     assert (one.verdict, one.typical) == ("undecided", "undecided")
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=40)
 @given(st.lists(SCORES, min_size=3, max_size=5), st.floats(0.01, 0.2))
 def test_better_has_no_circles(runs, level):
     n = min(map(len, runs))

@@ -24,7 +24,7 @@ from verdicts import (
     summarise,
     summarise_steps,
 )
-from verdicts.resampling import interval_tail
+from verdicts.resampling import enough_resamples, interval_tail
 
 STATISTICS = ("mean", "median", "iqm")
 PLAIN = {"mean": np.mean, "median": np.median, "iqm": lambda x: stats.trim_mean(x, 0.25)}
@@ -37,6 +37,14 @@ def points(summary):
 
 
 # --- points --------------------------------------------------------------------------------------
+
+
+def test_statistics_worked_by_hand():
+    # Sorted 0 1 2 3 4 5 6 100: the middle half is 2 3 4 5.
+    summary = summarise([100, 0, 1, 6, 2, 5, 3, 4], seed=0)
+    assert points(summary) == [121 / 8, 3.5, 3.5]
+    # Five: one is left out at either end.
+    assert points(summarise([0, 10, 1, 2, 30], seed=0)) == pytest.approx([8.6, 2, 13 / 3])
 
 
 @given(st.lists(NUMBERS, min_size=1, max_size=30))
@@ -95,18 +103,55 @@ def test_the_tail_of_several_environments_has_the_degrees_of_freedom_of_welch():
     assert interval_tail([strata[0], strata[0]], 0.95) == pytest.approx(alike)
 
 
+def test_many_seeds_need_fewer_resamples():
+    found = [enough_resamples(10_000, n) for n in (5, 200, 500, 2000, 100_000)]
+    assert found == [10_000, 10_000, 4000, 1000, 1000]
+    assert enough_resamples(50, 2000) == 50
+    many = np.random.default_rng(0).normal(size=2000)
+    mean = estimate(many, "mean", seed=0)
+    assert mean == estimate(many, "mean", seed=0, n_resamples=1000)
+    half = stats.norm.isf(0.025) * stats.sem(many)
+    assert (mean.high - mean.low) / 2 == pytest.approx(half, rel=0.1)
+
+
+def test_equal_scores_have_the_point_as_interval():
+    summary = summarise([0.1] * 7, seed=0)
+    for name in STATISTICS:
+        found = getattr(summary, name)
+        assert (found.point, found.low, found.high) == (0.1, 0.1, 0.1)
+        assert found.has_interval
+
+
 @pytest.mark.parametrize("scores", [[4.0], [4.0, np.nan], [[4.0, 1.0], [np.nan, 2.0]]])
-def test_a_single_seed_has_no_interval(scores):
-    found = estimate(scores, "iqm", seed=0)
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_a_single_seed_has_no_interval(scores, statistic):
+    found = estimate(scores, statistic, seed=0)
     assert np.isfinite(found.point)
     assert np.isnan([found.low, found.high]).all()
     assert not found.has_interval
 
 
+@pytest.mark.parametrize("scores", [[np.nan], [np.nan, np.inf], [[1.0, np.nan], [2.0, np.nan]]])
+def test_without_a_score_there_is_no_figure(scores):
+    found = estimate(scores, "iqm", seed=0)
+    assert np.isnan([found.point, found.low, found.high]).all()
+    assert found.n_missing == np.sum(~np.isfinite(scores))
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(ValueError, match=r"shape \(1, 1, 1\), they must have"):
+        summarise([[[1.0]]], seed=0)
+    with pytest.raises(ValueError, match=r"shape \(0,\)"):
+        summarise([], seed=0)
+    for confidence in (-0.1, 0, 1, 95, float("nan")):
+        with pytest.raises(ValueError, match="it must lie between 0 and 1, as 0"):
+            summarise([1.0, 2.0], seed=0, confidence=confidence)
+
+
 # --- coverage ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("statistic", "n"), [("mean", 5), ("iqm", 30)])
+@pytest.mark.parametrize(("statistic", "n"), [("mean", 5), ("median", 10), ("iqm", 5), ("iqm", 30)])
 def test_intervals_over_normal_scores_cover(statistic, n):
     """Of 600 intervals; the standard error is 0.009 at 0.95."""
     rng = np.random.default_rng(7)
@@ -132,6 +177,13 @@ def test_scores_are_those_of_the_yardstick():
         assert scores[index] == yardstick.score(value)
 
 
+def test_scores_where_the_blind_policy_is_optimal():
+    assert optimum_score([1.0, 0.5, np.nan], 1.0, 1.0).tolist() == pytest.approx(
+        [1, 0, np.nan], nan_ok=True
+    )
+    assert np.isnan(optimum_score(np.nan, 1.0, 0.0))
+
+
 def test_a_profile_worked_by_hand():
     scores = [[0.0, 1.0], [0.5, 1.0], [1.0, np.nan]]
     profile = performance_profile(scores, [-1, 0, 0.5, 1], seed=0)
@@ -142,6 +194,13 @@ def test_a_profile_worked_by_hand():
     assert (profile.low[0], profile.high[0], profile.low[3], profile.high[3]) == (1, 1, 0, 0)
     # The second environment adds a half, the first a share of three draws.
     assert {round(6 * x, 6) for x in (profile.low[2], profile.high[2])} <= {3, 4, 5, 6}
+
+
+def test_a_profile_has_no_band_over_one_seed_and_no_share_over_none():
+    single = performance_profile([[0.2, 0.8]], [0.5], seed=0)
+    assert single.point.tolist() == [0.5]
+    assert np.isnan([single.low, single.high]).all()
+    assert np.isnan(performance_profile([[0.2, np.nan]], [0.5], seed=0).point).all()
 
 
 # === learning curves ==============================================================================
@@ -174,6 +233,15 @@ def test_areas_worked_by_hand():
 def test_steps_to_a_threshold(values, threshold, steps):
     found = steps_to_threshold([10, 20, 30, 40], values, threshold)
     assert found == pytest.approx(steps, nan_ok=True)
+
+
+def test_curves_that_are_none_are_refused():
+    with pytest.raises(ValueError, match="fall after step 20"):
+        area_under_curve([10, 20, 15], [0, 0, 0])
+    with pytest.raises(ValueError, match=r"steps of shape \(2,\) and values of shape \(3,\)"):
+        on_grid([0, 1], [0, 0, 0], [0])
+    with pytest.raises(ValueError, match="shape"):
+        steps_to_threshold([], [], 1)
 
 
 # --- several curves ------------------------------------------------------------------------------
@@ -211,6 +279,14 @@ def test_a_band_is_the_estimate_at_each_point():
     assert (band.low[2], band.point[2], band.high[2]) == (0.1, 0.1, 0.1)
 
 
+def test_a_band_has_nothing_where_no_run_has():
+    band = curve_band([[1.0, NAN], [3.0, NAN]], seed=0)
+    assert (band.point[0], np.isnan(band.point[1]), np.isnan(band.low[1])) == (2, True, True)
+    alone = curve_band([[1.0, 2.0]], seed=0)
+    assert alone.point.tolist() == [1, 2]
+    assert np.isnan(alone.low).all()
+
+
 # --- censored steps ------------------------------------------------------------------------------
 
 
@@ -233,6 +309,13 @@ def test_the_share_that_reaches_has_wilsons_interval():
     assert [share.low, share.high] == pytest.approx([middle - half, middle + half])
 
 
+def test_medians_that_are_never_reached():
+    assert summarise_steps([INF, 5, INF, 7, INF]).median.point == INF
+    assert summarise_steps([5, 7, INF, INF]).median.point == INF
+    assert summarise_steps([INF] * 4).share_reached.point == 0
+    assert summarise_steps([INF] * 8).median.low == INF
+
+
 def test_five_seeds_cannot_give_an_interval_for_a_median():
     few, enough = summarise_steps([1, 2, 3, 4, 5]).median, summarise_steps(range(6)).median
     assert few.point == 3
@@ -243,7 +326,7 @@ def test_five_seeds_cannot_give_an_interval_for_a_median():
     assert nothing.median.n_missing == 2
 
 
-@pytest.mark.parametrize("n", [6, 30])
+@pytest.mark.parametrize("n", [6, 9, 16, 30])
 def test_the_interval_of_the_median_covers_and_is_the_shortest_that_does(n):
     ordered = np.arange(n)
     cut = int(summarise_steps(ordered).median.low)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from verdicts import (
     fewest_seeds,
     grow,
+    judge_pairs,
     look_sizes,
 )
 
@@ -43,7 +44,9 @@ def grown(scores, margin=0.5, certain=()):
         (10, 50, 5, (10, 15, 22, 33, 50)),
         (5, 50, 2, (6, 9, 14, 21, 33, 50)),  # 5 seeds cannot tell two agents apart in six looks
         (10, 11, 2, (10, 11)),
+        (10, 10, 2, (10,)),
         (3, 6, 10, (6,)),
+        (10, 50, 1, (10, 15, 22, 33, 50)),
     ],
 )
 def test_looks_are_evenly_apart_and_none_is_lost(first, most, n_agents, sizes):
@@ -51,6 +54,14 @@ def test_looks_are_evenly_apart_and_none_is_lost(first, most, n_agents, sizes):
     assert found == sizes
     n_pairs = max(n_agents * (n_agents - 1) // 2, 1)
     assert found == (most,) or found[0] >= fewest_seeds(LEVEL / len(found), n_pairs)
+
+
+@given(st.integers(1, 60), st.integers(1, 200), st.integers(1, 30))
+def test_sizes_grow_from_the_first_to_the_most(first, most, n_agents):
+    sizes = look_sizes(first, max(first, most), n_agents, LEVEL)
+    assert sizes[-1] == max(first, most)
+    assert sizes[0] >= first
+    assert list(sizes) == sorted(set(sizes))
 
 
 def test_who_is_told_from_all_others_gets_no_more_seeds():
@@ -66,6 +77,21 @@ def test_who_is_told_from_all_others_gets_no_more_seeds():
     assert [each.mean.verdict for each in last.judged.values()] == ["better", "better", "undecided"]
 
 
+def test_against_one_agent_only_its_pairs_are_tested_and_grow():
+    near = np.tile([0.0, 1.0], 7)
+    scores = {"old": near, "far": np.arange(14.0) + 100, "near": near[::-1].copy()}
+    scores["far too"] = scores["far"] + 0.5
+    first = grow(cut(scores, dict.fromkeys(scores, 9)), (9, 14), 0.0, LEVEL, against="old")
+    assert first.seeds == {"old": 14, "far": 9, "near": 14, "far too": 9}
+    last = grow(cut(scores, first.seeds), (9, 14), 0.0, LEVEL, against="old")
+    assert last.is_done
+    said = {pair: each.mean.verdict for pair, each in last.judged.items()}
+    assert said["old", "far"] == said["old", "far too"] == "worse"
+    # The two that are far ahead are never compared, and nobody grows for them.
+    assert said["far", "far too"] == said["old", "near"] == "undecided"
+    assert (last.looks["old", "far"], last.looks["old", "near"]) == (1, 2)
+
+
 def test_an_agent_whose_runs_fail_makes_nobody_grow():
     scores = {"fails": np.full(6, np.nan), "runs": np.arange(6.0)}
     found = grow(scores, SIZES, 0.0, LEVEL)
@@ -75,7 +101,17 @@ def test_an_agent_whose_runs_fail_makes_nobody_grow():
     assert grow(some, SIZES, 0.0, LEVEL).seeds == {"fails": 9, "runs": 9}
 
 
-@settings(deadline=None, max_examples=25)
+def test_a_decided_pair_keeps_its_verdict():
+    rng = np.random.default_rng(0)
+    scores = {name: rng.normal(size=9) + shift for name, shift in [("a", 9), ("b", 0), ("c", 0.8)]}
+    judged = judge_pairs(scores, 0.0, 0.05)
+    decided = {pair: each for pair, each in judged.items() if each.is_decided}
+    assert {("a", "b"), ("a", "c")} <= set(decided)
+    found = judge_pairs(scores, 1.0, 0.05, (), decided)
+    assert {pair: found[pair] for pair in decided} == decided
+
+
+@settings(deadline=None, max_examples=40)
 @given(st.integers(0, 10**6), st.integers(2, 4), st.sampled_from([0.0, 0.5, 3.0]), st.booleans())
 def test_a_study_grows_as_settled_and_comes_out_the_same_however_it_is_interrupted(
     seed, n_agents, margin, fails
@@ -106,7 +142,7 @@ def test_a_study_grows_as_settled_and_comes_out_the_same_however_it_is_interrupt
 
 def test_a_study_that_grows_until_decided_is_rarely_wrong():
     """Three times the same agent; 5 % and three standard deviations of so many studies."""
-    rng, studies, sizes = np.random.default_rng(7), 120, (9, 14, 20)
+    rng, studies, sizes = np.random.default_rng(7), 200, (9, 14, 20)
     wrong = 0
     for _ in range(studies):
         tied = rng.choice([0.0, 0.9, 1.0], size=(3, sizes[-1]), p=[0.1, 0.3, 0.6])
