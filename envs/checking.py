@@ -181,7 +181,9 @@ def _copy_of(base: Env) -> Env:
         if base.spec is None:
             raise ValueError(f"it cannot {reason}") from error
         try:
-            twin = gym.make(base.spec, render_mode=None).unwrapped
+            spec = copy.deepcopy(base.spec)
+            spec.kwargs.pop("render_mode", None)  # not every class has this argument
+            twin = gym.make(spec).unwrapped
         except Exception as new:
             raise ValueError(f"it can neither {reason} nor made anew ({one_line(new)})") from new
     if twin.render_mode is not None:

@@ -199,10 +199,10 @@ class NetworkEnvStates(EnvStates):
 
     def _state_of(self, shown: Any, state: int) -> int:
         """A state with this observation: ``state`` if its observation fits, else the first such."""
-        table = self.seen.table
-        if np.array_equal(table[state], shown):
-            return state
-        return int(np.argmax((table == shown).all(axis=1)))
+        fits = (self.seen.table == shown.astype(np.float32)).all(axis=1)
+        if not fits.any():
+            raise ValueError("no state has the observation that the training is to go on from")
+        return state if fits[state] else int(np.argmax(fits))
 
 
 def network_playground(vec_env: VecEnv) -> tuple[Any, NetworkEnvStates, Any]:

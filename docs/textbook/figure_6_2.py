@@ -17,7 +17,7 @@ LABELS = {"qlearning": "TD", "monte_carlo": "Monte Carlo"}
 
 def main() -> None:
     """Draw the figure, and compare it with the book."""
-    args = arguments("Figure 6.2 of Sutton and Barto: TD(0) and Monte Carlo.", 100)
+    args = arguments("Example 6.2 of Sutton and Barto, right: TD(0) and Monte Carlo.", 100)
     figure, axes = canvas("RandomWalk-v0, 5 states", "episodes", "root mean square error")
     ends, sums = {}, {}
     for algo, step_sizes in STEP_SIZES.items():

@@ -174,10 +174,10 @@ def test_the_caller_notices_nothing():
 
 
 class Locked(Corridor):
-    """Cannot be copied."""
+    """Cannot be copied, and does not know what rendering is."""
 
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
+    def __init__(self, true=None):
+        super().__init__(true=true)
         self.lock = threading.Lock()
 
 

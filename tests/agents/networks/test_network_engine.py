@@ -18,7 +18,7 @@ import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from agents.common.callbacks import BlockCallback, EpisodeBudget
 from agents.common.schedules import ExponentialSchedule, library_schedule
-from envs.wrappers import ActionMasks
+from envs.wrappers import ActionMasks, OneHotObservation
 
 SMALL = {"buffer_size": 100, "learning_starts": 10}
 SHORT = {"n_steps": 32, "batch_size": 32}
@@ -153,6 +153,15 @@ def test_states_that_networks_have_no_weights_for_are_refused(name, at_end):
     model = made(name, Any(spaces.Discrete(3), shown=3, ends=float(at_end)), engine="compiled")
     with pytest.raises(ValueError, match=r"observation 3 is not in Discrete\(3\)"):
         model.learn(100)
+
+
+def test_an_observation_of_no_state_is_refused():
+    env = OneHotObservation(gym.make("FrozenLake-v1"))
+    model = load_algorithm("ppo")("MlpPolicy", env, engine="compiled", n_steps=8, batch_size=8)
+    model.learn(8)
+    model._last_obs[:] = 0.5
+    with pytest.raises(ValueError, match="no state has the observation"):
+        model.learn(8, reset_num_timesteps=False)
 
 
 def test_a_training_that_diverges_is_ended():
