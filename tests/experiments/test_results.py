@@ -59,6 +59,9 @@ def write_run(planned, evaluations, episodes=((10, 1.0),) * 10, **info):
         if is_known:
             final |= {"optimum": 100.0, "baseline": 0.0}
             final |= {"gap": 100.0 - values[-1], "score": values[-1] / 100}
+            final |= {"acts_by": "epsilon 0.1", "stochastic_return": values[-1] - 5}
+            final |= {"discount": 0.9, "discounted_return": values[-1] / 2}
+            final |= {"discounted_optimum": 50.0}
     record = {"state": FINISHED, "spec": planned.spec.as_data(), "final": final}
     record |= {"best_mean_return": max((v for _, v in evaluations), default=None)}
     record |= {"best_timesteps": 50 if evaluations else 0, "n_timesteps": 100, "engine": "compiled"}
@@ -206,6 +209,9 @@ def test_ranks_estimates_and_pairs(tmp_path):
     best = environment.agents[0]
     figures = [best.metric.mean, best.score.mean, best.area, best.success_rate, best.seconds]
     assert [figure.point for figure in figures] == pytest.approx([91, 0.91, 0.75 * 91, 1, 2.5])
+    others = best.stochastic.point, best.discounted.point
+    assert others == pytest.approx((86, 45.5))
+    assert (best.acts_by, best.discount, best.discounted_optimum) == ("epsilon 0.1", 0.9, 50)
     (pair,) = environment.pairs
     assert (pair.first, pair.second, pair.verdict) == ("sarsa", "qlearning", "better")
     assert pair.mean.point == pytest.approx(0.79)

@@ -153,12 +153,18 @@ def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
 # === the ranking on the page ======================================================================
 
 
-def ranked(agents, **changes):
-    """Headings of the page's table and its rows, of agents on an environment."""
+def tables_of(agents, **changes):
+    """What the page shows of agents on an environment."""
     found = made_up.analysis(
         [made_up.environment(agents, **changes)], [agent.agent for agent in agents]
     )
     (table,) = result_sections.ranking(Report(StudySeries(found, {}, ()), "")).context["tables"]
+    return table
+
+
+def ranked(agents, **changes):
+    """Headings of the ranking and its rows."""
+    table = tables_of(agents, **changes)
     return table["headings"], table["rows"]
 
 
@@ -210,3 +216,32 @@ def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():
     for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
         cell = absent[titles.index(title)]
         assert (cell.text, cell.value, cell.note, cell.aside) == ("-", None, "", ""), title
+
+
+def test_returns_beside_that_of_the_greedy_policy_stand_below_the_ranking():
+    explores = {"stochastic": made_up.estimate(70.0), "acts_by": "epsilon 0.1"}
+    discounts = {"discount": 0.9, "discounted": made_up.estimate(30.0), "discounted_optimum": 34.5}
+    agents = [
+        made_up.agent("both", 90.0, **explores, **discounts),
+        made_up.agent("plans", 80.0, discount=0.5),
+        made_up.agent("plain", 40.0),
+    ]
+    table = tables_of(agents)["others"]
+    shown = [
+        [agent.agent, *(f"{cell.text} {cell.note}".strip() for cell in cells)]
+        for agent, cells in table["rows"]
+    ]
+    assert [heading["title"] for heading in table["headings"]] == [
+        *("Greedy", "Stochastic", "Discounted"),
+    ]
+    assert shown == [
+        [
+            "both",
+            "93 92.9 to 93.2",
+            "70 69.9 to 70.2; epsilon 0.1",
+            "30 29.9 to 30.2; by 0.9; optimum 34.5",
+        ],
+        ["plans", "83 82.9 to 83.2", "unknown", "unknown"],
+        ["plain", "43 42.9 to 43.2", "unknown", "-"],
+    ]
+    assert tables_of(agents[1:])["others"] is None
