@@ -207,10 +207,12 @@ class Copy:
         places = [place for place in self.entering if place.startswith(f"{mutant.path}:")]
         entering = covering or set().union(*map(self.entering.get, places))
         files = {test.split("::")[0] for test in entering}
+        own = f"tests/{mutant.path.split('/')[0]}/"
 
-        def rank(test: str) -> tuple[bool, bool, bool, float]:
+        def rank(test: str) -> tuple[bool, bool, bool, bool, float]:
             file = test.partition("::")[0]
-            return test not in covering, file not in files, stem not in file, self.costs[test]
+            is_far = file not in files, stem not in file, not test.startswith(own)
+            return test not in covering, *is_far, self.costs[test]
 
         return sorted(self.costs, key=rank), not covering
 

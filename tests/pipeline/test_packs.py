@@ -252,6 +252,25 @@ def test_a_run_in_a_study_is_played(packed_study):
         unpacked(packed_study).__enter__()
 
 
+def test_runs_of_one_pack_were_trained_with_the_same_modules(study, tmp_path):
+    folders = study / RUN.removesuffix(".zip"), study / SARSA
+
+    def put(folder, text):
+        (folder / "modules").mkdir(exist_ok=True)
+        (folder / "modules" / "own.py").write_text(text)
+        info = json.loads((folder / "run.json").read_text())
+        info["files"]["modules/own.py"] = hashlib.sha256(text.encode()).hexdigest()
+        (folder / "run.json").write_text(json.dumps(sealed(info)))
+
+    for folder in folders:
+        put(folder, "a = 1")
+    pack_study(study, tmp_path / "study.zip", print)
+    assert members(tmp_path / "study.zip")["modules/own.py"] == b"a = 1"
+    put(folders[1], "a = 2")
+    with pytest.raises(UserError, match=r"was trained with another modules/own\.py than"):
+        pack_study(study, tmp_path / "study.zip", print)
+
+
 def test_what_is_not_packed_of_a_study(study, tmp_path):
     (study / "figures/a.png").write_text(f"{HOME}/x")
     with pytest.raises(UserError, match=r"a\.png names .* nothing was"):
