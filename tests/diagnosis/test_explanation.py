@@ -1,5 +1,7 @@
 """Explanations of agents whose tables are written by hand, and sums that hold for all agents."""
 
+import re
+
 import pytest
 import torch as th
 
@@ -71,6 +73,28 @@ def test_one_wrong_action_is_named_with_what_mending_it_regains():
     ]
     assert "last wrong turn is at row 4, column 3: up, where right is best" in found.road
     assert found.own_gap == pytest.approx(0.95**5)  # six moves, the last of which pays
+
+
+def test_values_that_have_not_come_to_the_start_are_not_settled():
+    """All zero, though every pair was tried: one look ahead sees the goal from cell 14 alone."""
+    found = explained(
+        "qlearning", "FrozenLake-v1", LAKE, lambda agent: agent.policy.visit_counts.fill_(10)
+    )
+    parts = {name: loss for name, loss in parts_of(found).items() if abs(loss) > 1e-9}
+    assert parts == {"not settled": pytest.approx(1.0)}
+    assert not found.is_concentrated  # it is caught where it starts
+
+
+def test_a_loss_in_few_states_is_told_state_by_state():
+    entry = {"gamma": 0.999}
+    found = explained("qlearning", "FrozenLake-v1", entry, with_values(0.999, {(14, 0): 9.0}))
+    assert found.is_concentrated
+    states = [line for line in why_lines(found) if line.startswith("  row")]
+    assert re.match(
+        "  row 4, column 3: 97% of the gap, .*; it does left, where down is b", states[0]
+    )
+    assert re.match("  row 1, column 3: 3% of the gap, ", states[1])
+    assert not explained("qlearning", "FrozenLake-v1", LAKE, with_values(0.95)).is_concentrated
 
 
 def test_an_action_that_was_never_tried_is_told_from_one_of_wrong_value():
