@@ -157,6 +157,11 @@ def test_the_treasure_is_worth_99_hundredths(size, map_seed):
     best = goes_well[-1] - 0.01 / size * goes_well.sum()
     slippery = optimum_of("DeepSea-v0", deterministic=False, **kwargs)
     assert slippery == pytest.approx(best, abs=1e-12)
+    # From the top left, to the right: one row below, in the next column or in the same.
+    model = transition_model(gym.make("DeepSea-v0", deterministic=False, **kwargs))
+    right = 1 if map_seed is None else int(model.prob[0, 1, 1] > 0)
+    assert model.next_state[0, right].tolist() == [size + 1, size]
+    assert model.prob[0, right].tolist() == [1 - 1 / size, 1 / size]
 
 
 # --- Racetrack ------------------------------------------------------------------------------------
