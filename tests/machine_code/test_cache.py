@@ -101,6 +101,10 @@ def test_a_changed_rule_is_what_runs_and_files_that_do_not_serve_are_replaced(ch
         rule.write_text(text)
         assert outcome(checkout) == (value, "compiled", is_compiled)
     files = sorted((checkout / "agents" / "__pycache__" / "machine_code").rglob("*.nb[ic]"))
+    for place, path in enumerate(files):
+        path.write_bytes(path.read_bytes()[: place % 2 * path.stat().st_size // 2])
+    for is_compiled in (True, False):
+        assert outcome(checkout) == (29, "compiled", is_compiled)
     for path in files:  # that anyone may have written
         path.write_bytes(pickle.dumps(Payload(tmp_path / "mark")))
         path.chmod(0o666)
@@ -145,6 +149,18 @@ def test_a_rule_of_the_users_own_follows_its_source(checkout):
         module.write_text(OWN_RULE.format(worth=worth))
         assert run(checkout, USE).stdout.split() == [str(worth)]
     module.unlink()
+
+
+def test_old_machine_code_goes_away(tmp_path):
+    for age in range(code_cache.KEPT_BESIDE + 3):
+        (tmp_path / f"old{age}").mkdir()
+        os.utime(tmp_path / f"old{age}", (1000 - age, 1000 - age))
+    used = tmp_path / "used"
+    used.mkdir()
+    os.utime(used, (0, 0))
+    code_cache.remove_old(used)
+    kept = {f"old{age}" for age in range(code_cache.KEPT_BESIDE + 1)}
+    assert {path.name for path in tmp_path.iterdir()} == {"used", *kept}
 
 
 # --- machine code that another user may have written ---------------------------------------------

@@ -1,4 +1,4 @@
-"""What runs where nothing is compiled, and what compiling takes."""
+"""Compiled functions: parts are compiled once, and what compiling takes is told."""
 
 import os
 import subprocess
@@ -6,9 +6,58 @@ import sys
 
 import numpy as np
 import pytest
+from numba.core import event
 
 from machine_code import WorkTime
-from machine_code.compiling import compile_timer, compiled
+from machine_code.compiling import called, compile_timer, compiled, inlined, kernel
+
+
+@called
+def scale(numbers, factor):
+    for i in range(len(numbers)):
+        numbers[i] *= factor
+
+
+@inlined
+def total(numbers, times):
+    result = 0.0
+    for i in range(len(numbers)):
+        result += numbers[i]
+    return times * result
+
+
+@kernel
+def scaled_total(numbers, times):
+    scale(numbers, 2)
+    scale(numbers, times)
+    return total(numbers, 1) + total(numbers, times)
+
+
+class Compiled(event.Listener):
+    """Names of what is compiled."""
+
+    names = ()
+
+    def on_start(self, event):
+        self.names += (event.data["dispatcher"].py_func.__name__,)
+
+    def on_end(self, event):
+        pass
+
+
+def test_parts_are_compiled_once_and_only_python_is_refused():
+    numbers = np.array([1.0, 2.5])
+    with pytest.raises(TypeError, match="only compiled functions can call scale"):
+        scale(numbers, 2)
+    noted = Compiled()
+    with event.install_listener("numba:compile", noted):
+        assert scaled_total(numbers, 3) == 4 * 6 * 3.5
+    # Numbers that are written out are none of their own type.
+    assert sorted(noted.names) == ["scale", "scaled_total", "total"]
+    assert numbers.tolist() == [6.0, 15.0]
+    with pytest.raises(TypeError, match="only compiled functions can call scale"):
+        scale(numbers, 2)
+    assert total(numbers, 2) == 42
 
 
 def test_without_the_compiler_python_plans_and_evaluates():
