@@ -61,9 +61,14 @@ def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(type
     assert "better on average than the shipped settings" in out
     record = json.loads(Path("logs/tuning/FrozenLake-v1_qlearning/tuning.json").read_text())
     assert len(record["trials"]) == 4
-    _, winner = [each["label"] for each in record["retest"]["settings"]]
+    for trial in record["trials"]:
+        assert sorted(trial["figures"]) == [str(seed) for seed in record["seeds"]]
+        assert [trial["value"]] == [*trial["figures"].values()]  # one seed
+    _, best = record["retest"]["settings"]
+    winner = best["label"]
     assert winner != "trial 0"
     assert record["retest"]["winner"] == winner
+    assert record["retest"]["optimism"] == best["in_search"] - best["held_out"]
     assert record["held_out_seeds"] == [*range(1000, 1008)]
     code, again, _ = type_study(*words, program="tune.py")
     assert code == 0

@@ -298,6 +298,7 @@ def test_a_grid_goes_from_end_to_end(space):
         ("CartPole-v1: {gamma: [0.9, 1.0]}", "no entry for 'Foo-v0', and no default"),
         ("default: {lerning_rate: {low: 0.1, high: 1.0}}", "did you mean 'learning_rate'"),
         ("default: {gamma: {lo: 0.1, high: 1.0}}", "gamma: unknown key 'lo': did you mean 'low'"),
+        ("default: {gamma: {low: 0.9, scale: log}}", "gamma: high is missing"),
         ("default: {gamma: {low: 0.9, high: 0.1}}", "low must be below high"),
         ("default: {gamma: {low: 0.9, high: 1.5}}", "gamma must be between 0 and 1, not 1.5"),
         ("default: {batch_size: {low: 30, high: 64, scale: powers_of_two}}", "powers of two"),

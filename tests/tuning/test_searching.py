@@ -279,6 +279,8 @@ RACE = [[0.9, 0.2, 0.8]]
         # A paired t test sees a steady difference at two seeds.
         ("racing", [0.8, 0.1], RACE, {}, True),
         ("racing", [0.8, 0.2], RACE, {}, False),
+        # t = -3 with one degree of freedom: p = 0.102, and hopeless is what is below 0.1.
+        ("racing", [0.8, 0.0], RACE, {}, False),
         # The default takes ranks from ten seeds on.
         ("auto", WORSE, NINE, {}, False),
         ("auto", WORSE, TEN, {}, True),

@@ -47,6 +47,8 @@ QUICK = {"seed": 0, "n_resamples": 50}
 PAIRS = st.integers(2, 9).flatmap(
     lambda n: st.tuples(*[st.lists(st.integers(-3, 3), min_size=n, max_size=n)] * 2)
 )
+# Scores of an agent on several seeds.
+SCORES = arrays(float, st.integers(5, 12), elements=st.floats(0, 1, width=16))
 
 
 def interval(found):
@@ -276,13 +278,29 @@ def test_what_holds_of_every_comparison(pair, margin, scale, shift):
     mean = one.mean
     assert -1 <= mean.low <= mean.seen_low <= mean.seen_high <= mean.high <= 1
     low, high = (mean.seen_low, mean.seen_high) if one.is_conditional else (mean.low, mean.high)
-    assert {"better": low >= 0, "worse": high <= 0}.get(one.verdict, True)
+    within = -margin <= low <= high <= margin
+    assert {"better": low >= 0, "worse": high <= 0, "equivalent": within}.get(one.verdict, True)
     if one.verdict == "undecided":
         assert mean.seen_low <= 1e-4
         assert mean.seen_high >= -1e-4
         assert one.seeds_needed is None or one.seeds_needed > len(first)
     else:
         assert one.seeds_needed is None
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(SCORES, min_size=3, max_size=4), st.sampled_from([0.0, 0.5]))
+def test_intervals_lie_on_the_side_of_their_verdicts_among_many_too(runs, margin):
+    """Holm tests a pair at a level that its interval need not have."""
+    n = min(map(len, runs))
+    scores = {str(k): each[:n] for k, each in enumerate(runs)}
+    for pair in compare_pairs(scores, margin, ends=(0, 1), **QUICK):
+        mean, claimed = pair.mean, pair.said.verdict
+        low, high = (mean.seen_low, mean.seen_high) if pair.is_conditional else interval(mean)
+        least, most = {
+            "better": (0, 1), "worse": (-1, 0), "equivalent": (-margin, margin)
+        }.get(claimed, (-1, 1))  # fmt: skip
+        assert least <= low <= high <= most
 
 
 def test_each_pair_has_its_share_of_the_error_rate():
@@ -319,7 +337,7 @@ def test_looks_and_environments_spend_no_more_than_there_is():
         (([[1, 2]], [[1, 2]]), {}, r"they must have \(n_seeds,\)"),
         (([1, 2], [1, 2]), {"margin": -1}, "margin is -1"),
         (([1, 2], [1, 2]), {"confidence": 95}, "confidence is 95"),
-        (([1, 2], [1, 2]), {"ends": (1, 0)}, "ends are"),
+        *((([1, 2], [1, 2]), {"ends": ends}, "ends are") for ends in ((1, 0), (-np.inf, 0))),
     ],
 )
 def test_wrong_arguments_are_named(scores, options, message):
@@ -440,7 +458,6 @@ def test_agents_are_rarely_told_apart_or_called_equal_wrongly(world, n):
 
 
 UNIT = Ends(0.0, 1.0)
-SCORES = arrays(float, st.integers(5, 12), elements=st.floats(0, 1, width=16))
 
 
 def normal_scores(n, mean=0.6, deviation=0.06):
