@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
-from stable_baselines3 import A2C
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
@@ -31,6 +31,14 @@ SMALL_A2C = {"policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}
 SMALL_DQN = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 10, "buffer_size": 500}
 SMALL_DQN |= {"batch_size": 4}
 BRIEFLY = {"eval_episodes": 2, "n_eval_envs": 1}
+
+
+class Policy:
+    """Of a stranger."""
+
+
+def fallen(progress):
+    return 1e-3 * progress
 
 
 def train_to(folder, algo, entry, n_timesteps=200, **fields):
@@ -290,6 +298,25 @@ def test_what_does_not_go_together(zoo, tmp_path, settings, given, complaint):
     with pytest.raises(UserError, match=complaint) as refused:
         returns_of(ModelRequest(folder, **given), 1)
     assert "\n" not in str(refused.value)
+
+
+WAYS_OUT = {  # setting: what stands in its place, and what the complaint ends with
+    "policy_class": (Policy, "to admit a class of yours, name its module: --gym-packages MODULE"),
+    "learning_rate": (fallen, "continues with another value: -params learning_rate:3e-4"),
+    "clip_range": (fallen, "continues with another value: -params clip_range:VALUE"),
+    "_n_updates": (Policy, "test_chosen_models.Policy, which may not stand in such a file"),
+}
+
+
+@pytest.mark.parametrize("key", WAYS_OUT)
+def test_a_setting_that_is_code_is_refused_with_a_way_out(tmp_path, key):
+    value, end = WAYS_OUT[key]
+    model = PPO("MlpPolicy", CART, policy_kwargs={"net_arch": [4]}, device="cpu")
+    setattr(model, key, value)
+    model.save(tmp_path / "model")
+    with pytest.raises(UserError) as refused:
+        load_model("ppo", tmp_path / "model.zip", device="cpu")
+    assert str(refused.value).endswith(end)
 
 
 def read_config(tmp_path, text):

@@ -68,6 +68,13 @@ def test_targets_are_those_of_the_rule_to_the_last_bit(engine):
     assert table.any()
 
 
+@pytest.mark.parametrize("name", ["double_qlearning", "dyna_q"])
+def test_tables_with_a_number_for_each_action_come_first(name):
+    _, recorder = watched(LAKE, name)
+    assert recorder.names[0] == "q_tables"
+    assert recorder.has_actions
+
+
 def episodes_of(folder):
     rows = (folder / "0.monitor.csv").read_text().splitlines()[2:]
     return [row.split(",")[:2] for row in rows]
