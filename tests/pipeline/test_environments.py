@@ -166,6 +166,25 @@ def test_normalisation_learns_in_training_alone_and_rewards_are_evaluated_as_the
     assert type(plain) is DummyVecEnv
 
 
+MISTAKES = [
+    (
+        "FrozenLake-v1",
+        {"slippery": True},
+        "unknown argument 'slippery': did you mean 'is_slippery'?",
+    ),
+    ("FrozenLake-v1", {"map_name": "9x9"}, "unknown map_name '9x9': known are 4x4, 8x8"),
+    ("envs:Warehouse-v0", {"slip": 2}, "slip must be a finite number from 0 to 1, not 2"),
+    ("envs:Warehouse-v0", {"desc": []}, "the map is empty (with desc=[])"),
+]
+
+
+@pytest.mark.parametrize(("env_id", "kwargs", "complaint"), MISTAKES)
+def test_a_mistaken_argument_is_told_in_a_line(env_id, kwargs, complaint):
+    with pytest.raises(UserError) as refused:
+        make_single_env(spec_of(env_id, {"env_kwargs": kwargs}), training=True)
+    assert str(refused.value) == f"{env_id}: {complaint}"
+
+
 # --- files that arguments name -------------------------------------------------------------------
 
 ROWS = ["S..", ".#.", "..G"]
