@@ -71,7 +71,10 @@ def test_one_wrong_action_is_named_with_what_mending_it_regains():
     assert [(name, pytest.approx(value)) for name, value in found.repairs] == [
         ("row 4, column 3", pytest.approx(1.0))
     ]
-    assert "last wrong turn is at row 4, column 3: up, where right is best" in found.road
+    assert found.road == (
+        "on the best road of 6 states it reaches the end from 0; its last wrong turn is at "
+        "row 4, column 3: up, where right is best"
+    )
     assert found.own_gap == pytest.approx(0.95**5)  # six moves, the last of which pays
 
 

@@ -246,11 +246,30 @@ def test_cosine_and_signal_to_noise_of_multiples_of_the_exact_gradient(corridor_
     _, _, recorder = on_corridor(corridor_registered)
     true = np.random.default_rng(0).normal(size=(5, 2)) / 10
     states, actions, steps = np.repeat(np.arange(5), 2), np.tile([0, 1], 5), np.arange(10)
-    for multiples, cosine, ratio in (((2,), 1, 1), ((-1,), -1, 1 / 4), ((2, -1), 0, 1 / 2.5)):
+    for multiples, cosine, ratio in (
+        *(((2,), 1, 1), ((-1,), -1, 1 / 4), ((2, -1), 0, 1 / 2.5)),
+        ((2, 0), 1, 1),  # a gradient of zero has no direction
+    ):
         batches = [(steps, 10 * multiple * true.reshape(-1)) for multiple in multiples]
         found = recorder.gradient_figures(true, states, actions, batches)
         assert found["gradient_cosine"] == pytest.approx(cosine, abs=1e-4)
         assert found["gradient_snr"] == pytest.approx(ratio, rel=1e-3)
+
+
+def test_a_state_without_advantages_counts_by_what_was_estimated_there(corridor_registered):
+    """Met once, or twice with half of it each time: the sum is the same."""
+    _, _, recorder = on_corridor(corridor_registered)
+    true = np.random.default_rng(0).normal(size=(5, 2)) / 10
+    true[4] = 0
+    found = []
+    for times in (1, 2):
+        states = np.append(np.repeat(np.arange(4), 2), [4] * times)
+        actions = np.append(np.tile([0, 1], 4), [0] * times)
+        estimates = np.append(true[:4].reshape(-1), [0.2 / times] * times) * len(states)
+        batch = np.arange(len(states)), estimates
+        found.append(recorder.gradient_figures(true, states, actions, [batch]))
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+    assert found[0]["gradient_cosine"] < 0.99
 
 
 # --- a training -----------------------------------------------------------------------------------

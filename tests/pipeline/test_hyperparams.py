@@ -122,6 +122,7 @@ Cliff-v0: {n_timesteps: 7}
 def test_each_entry_has_its_seeds_which_are_no_hyperparameter_and_no_environment(file):
     path = file(TUNED)
     assert seeds_tuned_on("dqn", "Lake-v0", path) == (range(10),)
+    assert seeds_tuned_on("an_agent_without_a_file", "Lake-v0") is None
     assert seeds_tuned_on("dqn", "module:Cliff-v0", path) == (range(1), range(100, 102))
     assert seeds_tuned_on("dqn", "Elsewhere-v0", path) == ()
     assert read_hyperparams("dqn", "Lake-v0", path) == {"n_timesteps": 6}

@@ -15,6 +15,7 @@ from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 from experiments.analysis import OverallAnalysis
 from report.figures import (
     draw_learning_curves,
+    label_ends,
     write_figures,
 )
 from report.series import (
@@ -348,6 +349,18 @@ def test_what_stands_beside_curves():
     assert f"{title} | episodes | return" in lines
     ticks = [tick for tick in left.get_yticks() if abs(tick) < 2000]
     assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]
+
+
+def test_names_at_the_ends_of_lines_never_overlap_and_make_the_figure_as_tall_as_they_need():
+    figure = Figure(figsize=(6, 3))
+    axes = figure.subplots()
+    axes.set_ylim(0, 1)
+    label_ends(axes, [(f"agent {n}", 1.0, 0.5, "black") for n in range(40)])
+    places = sorted(text.xyann[1] for text in axes.texts)  # shares of the height of the axes
+    assert len(places) == 40
+    inches = axes.get_position().height * figure.get_figheight()
+    assert min(np.diff(places)) * inches > 0.11  # eight points of print
+    assert 0 <= places[0] < places[-1] <= 1
 
 
 def test_no_two_of_many_agents_have_one_mark():

@@ -264,6 +264,8 @@ def test_settings_outside_widen_the_space(space):
     }
     with pytest.raises(UserError, match=r"learning_rate: the search space does not hold 0\.5"):
         space.params_of(entry)
+    with pytest.raises(UserError, match="does not hold 'falling'"):  # which is no schedule
+        space.params_of({**entry, "learning_rate": "falling"})
     wider = space.including(entry)
     params = wider.params_of(entry)
     assert params["learning_rate"] == 0.5
