@@ -15,6 +15,7 @@ import pytest
 
 from experiments import child_processes
 from experiments.launching import (
+    BUSY,
     TimeLeft,
     execute,
     failure_log,
@@ -362,3 +363,20 @@ def test_after_a_tenth_of_the_runs_the_time_left_is_right_within_a_factor_of_two
         if n_ended >= 4 and n_ended % n_workers == 0:
             truth = 10.0 * (len(runs) - n_ended) / n_workers
             assert 0.5 < left.seconds(now, n_workers) / truth < 2
+
+
+def test_what_is_expected_of_an_agent_is_corrected_by_its_own_runs_else_by_its_kind():
+    """Of 10 s each, Q-learning took 20 and SARSA 80; PPO and DQN are of another kind."""
+    algos = {"one": "qlearning", "two": "sarsa", "three": "qlearning", "four": "r_max"}
+    agents = tuple(AgentSpec(label, algo) for label, algo in {**algos, "five": "dqn"}.items())
+    runs = plan(StudySpec("s", "S", agents, (LAKE,), n_seeds=1), Path("nowhere"))
+    left = TimeLeft(runs, dict.fromkeys((run.labels for run in runs), 10.0))
+    now = 0.0
+    for run, seconds in zip(runs, (20, 80), strict=False):
+        left.start(now, 1)
+        now += seconds
+        left.end(run, now)
+    # The third as the first, the fourth as both, the last as a busy machine would have it.
+    both = (2 + 8) / 2
+    busy = (min(2, BUSY) + min(8, BUSY)) / 2
+    assert left.seconds(now, 1) == pytest.approx(10 * (2 + both + busy))
