@@ -3,6 +3,8 @@
 import copy
 import enum
 import json
+import re
+import zipfile
 from collections import OrderedDict, deque
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from agents import load_algorithm
 from agents.common.model_files import CODECS, UnknownTypeError, decode, encode
 from agents.common.schedules import ExponentialSchedule
 
@@ -215,3 +218,24 @@ OUT_OF_RANGE = [
 def test_what_is_not_in_the_table_or_out_of_range_is_not_built(damage):
     with pytest.raises(ValueError, match=r"."):
         decode(damage)
+
+
+@pytest.mark.parametrize("name", ["qlearning", "reinforce", "ucb", "optimal"])
+def test_custom_objects_replace_what_the_file_holds_and_nothing_else(name, tmp_path):
+    model = load_algorithm(name)(env="SegmentBandit-v0" if name == "ucb" else "FrozenLake-v1")
+    model.save(tmp_path / "whole")
+    with (
+        zipfile.ZipFile(tmp_path / "whole.zip") as whole,
+        zipfile.ZipFile(tmp_path / "agent.zip", "w") as damaged,
+    ):
+        for member in whole.namelist():
+            size = rb'("_stats_window_size"): \d+'
+            damaged.writestr(member, re.sub(size, rb'\1: {"type": "?"}', whole.read(member)))
+    with pytest.raises(ValueError, match="unknown type '\\?'"):  # what is replaced is not read
+        type(model).load(tmp_path / "agent")
+    replaced = {"_stats_window_size": 7, "predict": "shadowed", "no_such_thing": 1}
+    loaded = type(model).load(tmp_path / "agent", custom_objects=replaced)
+    assert loaded._stats_window_size == 7
+    assert not {"predict", "no_such_thing"} & set(vars(loaded))
+    with pytest.raises(ValueError, match="custom_objects must be a dictionary"):
+        type(model).load(tmp_path / "agent", custom_objects=["learning_rate"])
