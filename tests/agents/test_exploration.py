@@ -8,6 +8,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from agents import load_algorithm
 from agents.common.exploration import (
@@ -21,7 +22,7 @@ from agents.common.exploration import (
     greedy_action,
     noisy_greedy_action,
 )
-from agents.common.schedules import ExponentialSchedule
+from agents.common.schedules import ExponentialSchedule, schedule_row, schedule_value
 from tests.agents.hand_fed import Spaces
 
 VALUES = np.array([1.0, 3.0, 3.0, 2.0])
@@ -98,6 +99,18 @@ def test_probabilities_row_by_row(rate):
     np.testing.assert_allclose(agent.action_probabilities(), softmax, rtol=1e-12)
 
 
+def test_tied_actions_share_or_the_first_has_all():
+    values = np.array([[1.0, 2, 2, 0], [3, 3, 3, 3], [5, 4, 5, 5], [0, 0, 0, 9]])
+    greedy = {
+        "random": [[0, 1 / 2, 1 / 2, 0], [1 / 4] * 4, [1 / 3, 0, 1 / 3, 1 / 3], [0, 0, 0, 1]],
+        "first": [[0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]],
+    }
+    for ties, shares in greedy.items():
+        arguments = {"exploration_initial_eps": 0.4, "exploration_final_eps": 0.4}
+        found = agent_of(values, tie_breaking=ties, **arguments).action_probabilities()
+        np.testing.assert_allclose(found, 0.1 + 0.6 * np.array(shares), rtol=1e-14)
+
+
 EXPONENTIALLY = {"exploration_decay": "exponential", "exploration_fraction": 1.0}
 RATES = [  # settings, and the rates at the beginning, half-way and at the end
     ({"exploration_decay": "constant", "exploration_initial_eps": 0.3}, [0.3, 0.3, 0.3]),
@@ -124,6 +137,28 @@ def test_how_much_agents_explore(arguments, rates):
 
 
 # --- schedules ------------------------------------------------------------------------------------
+
+# Training may run past its end, by a rollout or an episode.
+progress = st.floats(-0.5, 1)
+values = st.floats(-1e6, 1e6)
+positive = st.floats(1e-9, 1e9)
+
+linear = st.builds(LinearSchedule, values, values, st.floats(1e-3, 1))
+exponential = st.builds(ExponentialSchedule, positive, positive, st.floats(1e-3, 1))
+constant = st.builds(ConstantSchedule, values)
+parts = linear | exponential | constant
+schedules = parts | st.builds(FloatSchedule, values | st.integers(-9, 9) | parts)
+
+
+@given(schedules, st.lists(progress, min_size=20, max_size=20))
+def test_a_row_gives_what_the_schedule_gives_bit_for_bit(schedule, points):
+    row = schedule_row(schedule)
+    for foreign in (lambda point: point, FloatSchedule(lambda point: point), "lin_0.1"):
+        assert schedule_row(foreign) is None
+    # Of one type, so that compiled code takes them all.
+    assert [type(number) for number in row] == [float] * 4
+    for point in [*points, 0.0, 0.5, 1.0]:
+        assert schedule_value(row, point) == schedule(point)
 
 
 def test_exponential_decay_worked_by_hand():
