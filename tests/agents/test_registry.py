@@ -82,6 +82,29 @@ def test_which_agents_fit(env_id, names):
         assert [name for name in BANDITS if not ALGORITHMS[name].env_misfit(env)] == bandits
 
 
+ANY = "Box or Discrete or MultiDiscrete or MultiBinary"
+MISFITS = [  # agent, observations, actions, and why it does not fit
+    ("qlearning", DISCRETE, DISCRETE, ""),
+    ("ppo", spaces.Dict({"a": BOX}), DISCRETE, ""),
+    ("angle", BOX, spaces.Discrete(2), ""),
+    ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
+    ("qlearning", BOX, DISCRETE, f"it observes Discrete spaces, not {BOX}"),
+    ("sarsa", spaces.Discrete(4, start=1), DISCRETE,
+     "it needs Discrete spaces that start at 0, not Discrete(4, start=1)"),
+    ("a2c", BOX, spaces.Discrete(2, start=-1),
+     "it needs Discrete spaces that start at 0, not Discrete(2, start=-1)"),
+    ("random", spaces.Tuple([DISCRETE]), DISCRETE,
+     f"it observes {ANY} or Dict spaces, not Tuple(Discrete(4))"),
+    ("angle", spaces.Box(-1, 1, (2,)), DISCRETE,
+     "it needs observations of shape (4,), not (2,)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "observations", "actions", "misfit"), MISFITS)
+def test_why_an_agent_does_not_fit(name, observations, actions, misfit):
+    assert ALGORITHMS[name].misfit(observations, actions) == misfit
+
+
 def test_an_optional_package_that_is_missing(monkeypatch):
     find_spec = importlib.util.find_spec
     assert all(entry.is_installed for entry in ALGORITHMS.values())
