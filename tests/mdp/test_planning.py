@@ -90,6 +90,20 @@ def test_a_time_limit_out_of_reach_costs_no_memory():
     np.testing.assert_array_equal(found.actions(0), found.actions(10**6 - 40))
 
 
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "discount", "sweeps"),
+    [
+        # On the shortest ways, in the order of the distances, one sweep does it.
+        ("RandomWarehouse-v0", {"size": 30, "slip": 0.0}, 1.0, 1),
+        ("RandomWarehouse-v0", {"size": 30, "slip": 0.1}, 1.0, 12),
+        # Where the greedy policy is not evaluated between them, 500 sweeps are needed.
+        ("FrozenLake-v1", {"map_name": "8x8"}, 0.99, 30),
+    ],
+)
+def test_few_sweeps_are_enough(env_id, kwargs, discount, sweeps):
+    assert value_iteration(model_of(env_id, **kwargs), discount).iterations <= sweeps
+
+
 def test_sweeps_that_contract_slowly_are_helped_out():
     """Far from the goal standing still is best, and forgets by the discount alone."""
     model = model_of("RandomWarehouse-v0", size=100, slip=0.1)
