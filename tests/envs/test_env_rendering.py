@@ -108,13 +108,20 @@ def arms_of_two_contexts():
     return render_chart(tally, np.linspace(-1, 2, 18).reshape(2, 9), 1)
 
 
-@pytest.mark.parametrize("name", ["map", "arms"])
+SCENES = {
+    # Every thing there is; a trail that bends; a power source that was collected.
+    "map": Scene(("SP#M", "...G", "M.P#"), 6, [(0, 1), (1, 5), (5, 6)], [1], 3),
+    # A robot on the mine that it has driven down to.
+    "burst": Scene(("S.", "M#"), 2, [(0, 2)], [], 1),
+}
+
+
+@pytest.mark.parametrize("name", [*SCENES, "arms"])
 def test_a_picture_is_as_it_was(name, tmp_path):
     if name == "arms":
         found = ChartRenderer(10, "arms").pixels(arms_of_two_contexts())
-    else:  # every thing there is; a trail that bends; a power source that was collected
-        scene = Scene(("SP#M", "...G", "M.P#"), 6, [(0, 1), (1, 5), (5, 6)], [1], 3)
-        found = GridRenderer(scene.rows, 10, "a map").pixels(scene)
+    else:
+        found = GridRenderer(SCENES[name].rows, 10, "a map").pixels(SCENES[name])
     Image.fromarray(found).save(tmp_path / f"{name}.png", optimize=True)
     known = np.asarray(Image.open(HERE / "pictures" / f"{name}.png").convert("RGB"))
     assert found.shape == known.shape
