@@ -14,12 +14,14 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from envs import checking as model_checks
 from envs.known_models import transition_model
+from envs.wrappers import DiscretizeObservation
 from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
 
@@ -39,6 +41,10 @@ class Curious(BaseCallback):
 
 def lake(**kwargs):
     return make_vec_env("FrozenLake-v1", 1, seed=0, **kwargs)
+
+
+def pole(wrapper=lambda env: env, **kwargs):
+    return DiscretizeObservation(wrapper(gym.make("CartPole-v1", **kwargs)), bins=4, low=-1, high=1)
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +69,11 @@ INTERPRETED = {  # reason: environment, settings, callback
     "RecordEpisodeStatistics must see every step": (
         partial(lake, wrapper_class=gym.wrappers.RecordEpisodeStatistics),),
     "the environment is shown on the screen": (partial(lake, env_kwargs={"render_mode": "human"}),),
+    "a time limit lies outside Monitor": (
+        partial(lake, wrapper_class=partial(TimeLimit, max_episode_steps=9)),),
+    "more than one Monitor": (partial(lake, wrapper_class=Monitor),),
+    "under DiscretizeObservation and Monitor alone": (partial(pole, gym.wrappers.Autoreset),),
+    "with its default reward alone": (partial(pole, sutton_barto_reward=True),),
     "does not continue from the state": (lambda: TimeLimit(Deaf(), 10),),
     "the environment's P is not what step does: state ": (calm,),
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),

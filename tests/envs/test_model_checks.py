@@ -89,6 +89,13 @@ def ladder(reward):
     return table
 
 
+def with_spaces(n_states, n_actions):
+    env = Corridor()
+    env.observation_space = gym.spaces.Discrete(n_states)
+    env.action_space = gym.spaces.Discrete(n_actions)
+    return env
+
+
 LADDER = ladder(2.0), ladder(1.0), np.eye(16)[0]
 SAYS = r"^the environment's P is not what step does: state 3, action 1: P says state "
 FALSE = {
@@ -108,6 +115,10 @@ FALSE = {
     "pair": (lambda: Odd("pair"), r"the observation is \(0, 0\), not the number of a state"),
     "a short outcome": (
         lambda: with_p({0: {0: [(1.0,)]}}), "the environment's P is no model"),
+    "three actions": (lambda: with_spaces(5, 3),
+        r"P is no model: it has 2 actions, where the space is Discrete\(3\)$"),
+    "six states": (lambda: with_spaces(6, 2),
+        r"P is no model: it has 5 states, where the space is Discrete\(6\)$"),
 }  # fmt: skip
 
 
