@@ -239,17 +239,38 @@ def test_the_dearest_step_of_training_costs_a_tenth_of_the_goal():
     assert set(spec.origins) == {"train_env_wrapper"}
 
 
+class Unknown(gym.Env):
+    """Nobody knows its model."""
+
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+
 @pytest.mark.parametrize(
     ("env_id", "raw", "said"),
     [
         ("Warehouse-v0", {"gamma": "auto_5"}, "gamma: 'auto_5' is not auto"),
-        ("Acrobot-v1", SCALED, "scale: auto needs an environment whose model is known"),
+        (
+            "Warehouse-v0",
+            {"n_timesteps": "auto_0"},
+            "n_timesteps: 'auto_0' is not auto, or auto_1000",
+        ),
+        ("Unknown-v0", {"initial_q": "auto"}, "initial_q: auto needs an environment whose model"),
+        ("Unknown-v0", SCALED, "scale: auto needs an environment whose model is known"),
+        ("Unknown-v0", {"train_env_wrapper": CLIP}, "min_reward: auto needs an environment whose"),
         ("CartPole-v1", {"n_timesteps": "auto"}, "qlearning does not fit CartPole-v1"),
     ],
 )
 def test_what_cannot_be_worked_out_is_refused(env_id, raw, said):
-    with pytest.raises(UserError, match=said):
-        spec_of_entry(env_id, raw, "reinforce" if env_id == "Acrobot-v1" else "qlearning")
+    gym.register("Unknown-v0", Unknown)
+    try:
+        with pytest.raises(UserError, match=said):
+            spec_of_entry(env_id, raw)
+    finally:
+        del gym.registry["Unknown-v0"]
 
 
 def test_what_is_asked_for_wins_over_an_entrys_variant_for_training():
