@@ -366,7 +366,7 @@ def test_after_a_tenth_of_the_runs_the_time_left_is_right_within_a_factor_of_two
 
 
 def test_what_is_expected_of_an_agent_is_corrected_by_its_own_runs_else_by_its_kind():
-    """Of 10 s each, Q-learning took 20 and SARSA 80; PPO and DQN are of another kind."""
+    """Of 10 s each, Q-learning took 20 and SARSA 80; DQN is of another kind."""
     algos = {"one": "qlearning", "two": "sarsa", "three": "qlearning", "four": "r_max"}
     agents = tuple(AgentSpec(label, algo) for label, algo in {**algos, "five": "dqn"}.items())
     runs = plan(StudySpec("s", "S", agents, (LAKE,), n_seeds=1), Path("nowhere"))
