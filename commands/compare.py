@@ -47,15 +47,14 @@ if TYPE_CHECKING:
     from experiments.analysis import StudyAnalysis
     from experiments.cluster.schedulers import Cluster
     from experiments.figures_store import FigureStore
-    from experiments.growing import Step
     from experiments.launching import EarlyResults, Launcher, RunFailure
-    from experiments.looks import Standing
     from experiments.plan import PlannedRun
     from experiments.results import StudyResults
     from experiments.run_limits import RunLimits
     from experiments.study import StudySpec
     from pipeline.signs_of_life import Activity
     from report.page.frame import LearningPage
+    from verdicts import Study
 
 # --- flags ----------------------------------------------------------------------------------------
 
@@ -172,7 +171,7 @@ def _compare(args: argparse.Namespace) -> int:
     """Do a study under the lock of its folder."""
     study = study_spec(args)
     from experiments.child_processes import end_server
-    from experiments.looks import read_looks
+    from experiments.growing import looks_of
     from experiments.plan import plan
     from experiments.run_limits import RunLimits
     from pipeline.locks import folder_lock, told_if_gone
@@ -197,7 +196,7 @@ def _compare(args: argparse.Namespace) -> int:
                 return make_again(context, study, to_make_again)
             if args.until_decided:
                 return _grow_study(args, study, context)
-            read_looks(root)  # fails early if the record of looks cannot be read
+            looks_of(root)  # fails early if the plan of looks cannot be read
             if args.repair:
                 repair(console, study, planned, context.store)
             _prepare(study, planned, context, args.replace)
@@ -293,51 +292,48 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
 
     The numbers of seeds of all looks are fixed before the first look.
     """
-    from experiments.growing import counts_of, grown, remember, settled_looks
-    from experiments.looks import read_looks
+    from experiments.growing import first_counts, plan_of_looks, write_looks
     from experiments.plan import plan
     from report.words import seeds
 
-    looks = settled_looks(study, context.root, args.max_seeds)
-    counts = counts_of(study, looks)
-    now = grown(study, counts)
-    planned = plan(now, context.root, counts)
+    looks = plan_of_looks(study, context.root, args.max_seeds)
+    counts = first_counts(study)
+    planned = plan(study, context.root, counts)
     if args.repair:
-        repair(context.console, now, planned, context.store)
-    _prepare(now, planned, context)
-    remember(context.root, read_looks(context.root), looks)  # before the first run is done
-    results, steps, failures = look_by_look(context, study, counts)
-    code = conclude(context, results, failures, {each.environment: each.standing for each in steps})
+        repair(context.console, study, planned, context.store)
+    _prepare(study, planned, context)
+    write_looks(context.root, looks)
+    results, said, failures = look_by_look(context, study, looks["looks"])
+    code = conclude(context, results, failures)
     # The number of runs, compared with a design that gives every agent all seeds.
-    counts = counts_of(study, read_looks(context.root))
-    most = max((step.design.sizes[-1] for step in steps), default=0)
     undecided = [
-        f"{first} and {second} on {step.environment}"
-        for step in steps
-        for first, second in step.undecided
+        f"{pair.first} and {pair.second} on {pair.environment}"
+        for pair in said.pairs
+        if pair.word == "undecided"
     ]
     left = f"undecided: {'; '.join(undecided)}" if undecided else "all is decided"
+    most, n_runs = looks["looks"][-1], sum(sum(by.values()) for by in said.seeds.values())
     design = f"{seeds(most)} of each agent would be {most * len(counts):,}"
-    say(context.console, f"{sum(counts.values()):,} runs, where {design}; {left}")
+    say(context.console, f"{n_runs:,} runs, where {design}; {left}")
     return code
 
 
 def look_by_look(
     context: RunContext,
     study: StudySpec,
-    counts: Mapping[tuple[str, str], int],
-    is_enough: Callable[[StudyResults, Sequence[Step]], bool] = lambda results, steps: False,
-) -> tuple[StudyResults, list[Step], list[RunFailure]]:
+    looks: Sequence[int],
+    is_enough: Callable[[Study], bool] = lambda said: False,
+) -> tuple[StudyResults, Study, list[RunFailure]]:
     """Do the runs of one planned look after another, until no agent needs seeds or ``is_enough``.
 
-    ``counts`` are the numbers of seeds of the first look, by agent and environment.
+    It begins with the first look: finished runs may already be enough.
     """
-    from experiments.growing import grown, take_planned_looks
+    from experiments.growing import first_counts, grown, looked, next_counts
     from experiments.launching import EarlyResults
     from experiments.plan import plan
 
     failures: list[RunFailure] = []
-    said: set[tuple[str, int]] = set()
+    counts, n_said = first_counts(study), 0
     with context.held():  # keep the launcher open from one look to the next
         while True:
             now = grown(study, counts)
@@ -346,32 +342,34 @@ def look_by_look(
             early = EarlyResults(now)
             failures += do_missing(context, planned, early, given_up)
             results = read(context, now, planned, early)
-            steps = take_planned_looks(results)
-            is_over = all(step.growth.is_done for step in steps) or is_enough(results, steps)
-            for step in steps:
-                if (step.environment, step.growth.n_looks) not in said:
-                    said.add((step.environment, step.growth.n_looks))
-                    say(context.console, _on_look(step, is_over=is_over))
+            said = looked(results, tuple(looks))
+            is_over = said.is_done or is_enough(said)
+            if said.n_looks != n_said:
+                n_said = said.n_looks
+                say(context.console, _on_look(said, looks, is_over=is_over))
             if is_over:
-                return results, steps, failures
-            seeds = {(name, s.environment): n for s in steps for name, n in s.growth.seeds.items()}
-            counts = {**counts, **seeds}
+                return results, said, failures
+            counts = {**counts, **next_counts(said)}
 
 
-def _on_look(step: Step, *, is_over: bool) -> str:
-    """The result of a look: the number of decided pairs, and which agents get more seeds."""
+def _on_look(said: Study, looks: Sequence[int], *, is_over: bool) -> str:
+    """The result of a look: the number of undecided pairs, and which agents get more seeds."""
     from report.words import enumeration, seeds
 
-    growth, sizes = step.growth, step.design.sizes
-    text = f"{step.environment}, look {growth.n_looks} of {len(sizes)}: "
-    n, n_undecided = len(step.asked), len(step.undecided)
+    text = f"look {said.n_looks} of {len(looks)}, at {seeds(looks[max(said.n_looks - 1, 0)])}: "
+    n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
     if not n_undecided:
         return f"{text}all pairs are decided"
-    text += f"{n_undecided} of {n} pairs {'is' if n_undecided == 1 else 'are'} undecided"
-    if is_over or growth.is_done:
+    text += f"{n_undecided} of {len(said.pairs)} pairs undecided"
+    if is_over:
         return text
-    size = sizes[growth.n_looks]
-    names = [name for name, wanted in growth.seeds.items() if wanted == size]
+    size = looks[said.n_looks]
+    names = [
+        f"{name} on {environment}" if len(said.seeds) > 1 else name
+        for environment, by in said.seeds.items()
+        for name, wanted in by.items()
+        if wanted == size
+    ]
     return f"{text}; {enumeration(names)} {'goes' if len(names) == 1 else 'go'} on to {seeds(size)}"
 
 
@@ -445,12 +443,8 @@ def conclude(
     context: RunContext,
     results: StudyResults,
     failures: Sequence[RunFailure],
-    looks: Mapping[str, Standing] | None = None,
 ) -> int:
-    """Judge the finished runs, and say which are missing and why; return the exit code.
-
-    ``looks`` are looks already taken, by environment; None to take one now.
-    """
+    """Judge the finished runs, and say which are missing and why; return the exit code."""
     from experiments.results import mixed_versions
 
     tell = partial(say, context.console)
@@ -459,7 +453,7 @@ def conclude(
     results = replace(results, failures={one.planned.path: one.details for one in failures})
     try:
         if len(results.summary):
-            _judge(context, results, looks)
+            _judge(context, results)
             note = mixed_versions(info for *_, info in results.infos())
             if note:
                 tell(note)
@@ -485,17 +479,15 @@ def conclude(
     return 1 if n_missing or more or not is_same else 0
 
 
-def _judge(
-    context: RunContext, results: StudyResults, looks: Mapping[str, Standing] | None
-) -> None:
+def _judge(context: RunContext, results: StudyResults) -> None:
     """Print the judgement, and write tables, figures and page."""
     console = context.console
     with doing(console, "judging the agents") as activity:
         from experiments.analysis import analyse, with_advice
-        from experiments.growing import take_looks
+        from experiments.growing import looks_of
         from report.terminal import print_analysis, print_episodes_table
 
-        analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
+        analysis = analyse(results, activity.at, looks_of(context.root))
         activity.now("looking at runs that failed")
         analysis = with_advice(analysis)
     print_analysis(console, analysis)

@@ -294,7 +294,7 @@ def _retest(context: RunContext, opened: OpenTuning) -> int:
         how = f"{called_as('train')} {shlex.join([*words, '--conf-file', str(path)])}"
         tell(f"winner: {winner.label}, in {path}: {how}")
         assert outcome.winner is not None
-        tell(f"  {outcome.winner.said}")
+        tell(f"  {outcome.winner.verdict} than the shipped settings, on average")
         entry, shipped = winner.entry, opened.suggestions.shipped
         for key in {**shipped, **entry}:
             if entry.get(key) != shipped.get(key):
@@ -308,32 +308,27 @@ def _retested(
 ) -> tuple[int, Outcome]:
     """Do the re-test; return the exit code and the outcome."""
     from experiments.analysis import analyse
-    from experiments.growing import first_counts, remember, settled_looks, take_looks
+    from experiments.growing import looks_of, plan_of_looks, write_looks
     from experiments.launching import EarlyResults
-    from experiments.looks import read_looks
     from experiments.plan import plan
     from tuning.retesting import concluded, is_settled, retest_study
 
     tuning = opened.tuning
     study = retest_study(tuning, opened.root, candidates)
     planned = plan(study, context.root)
-    looks = None
     if tuning.until_decided:
-        settled = settled_looks(study, context.root, tuning.max_retest_seeds)
-        remember(context.root, read_looks(context.root), settled)  # before the first run is done
+        looks = plan_of_looks(study, context.root, tuning.max_retest_seeds)
         context.get_ready(planned)
-        # From the first look on, because finished runs may already be enough.
-        counts = first_counts(study, settled)
-        results, steps, failures = look_by_look(context, study, counts, is_settled)
-        looks = {step.environment: step.standing for step in steps}
+        write_looks(context.root, looks)
+        results, _, failures = look_by_look(context, study, looks["looks"], is_settled)
     else:
         context.get_ready(planned)
         early = EarlyResults(study)
         failures = do_missing(context, planned, early)
         results = read(context, study, planned, early)
-    code = conclude(context, results, failures, looks)
+    code = conclude(context, results, failures)
     with doing(context.console, "judging the winner") as activity:
-        analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
+        analysis = analyse(results, activity.at, looks_of(context.root))
         return code, concluded(tuning, ranked, candidates, analysis)
 
 
@@ -484,11 +479,12 @@ def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> Non
         table.add_column(heading)
     for each in outcome.retested:
         interval = each.interval
+        ends = "" if interval is None else f"{interval.low:.4g} to {interval.high:.4g}"
         table.add_row(
             each.label,
             "" if each.in_search is None else f"{each.in_search:.4g}",
             "" if each.held_out is None else f"{each.held_out:.4g}",
-            "" if math.isnan(interval.low) else f"{interval.low:.4g} to {interval.high:.4g}",
+            ends,
             each.verdict,
             str(each.n_runs),
             "" if each.n_failed is None else str(each.n_failed),

@@ -39,7 +39,7 @@ def optimum_bracket(env: gym.Env[Any, Any]) -> OptimumBracket | None:
     base = env.unwrapped
     entry = known_entries().get(f"{type(base).__module__}:{type(base).__qualname__}", {})
     found = entry.get(time_limit(env))
-    if found is None or not _is_plain(env) or constants_of(base) != found["constants"]:
+    if found is None or not is_plain(env) or constants_of(base) != found["constants"]:
         return None
     baseline, is_proven = found["baseline"]["mean"], found["upper_is_proven"]
     return OptimumBracket(found["lower"], found["upper"], baseline, is_proven)
@@ -87,7 +87,7 @@ _NO_DYNAMICS = (
 )
 
 
-def _is_plain(env: gym.Env[Any, Any]) -> bool:
+def is_plain(env: gym.Env[Any, Any]) -> bool:
     """Whether wrappers change only observations, and no method was replaced by hand."""
     while isinstance(env, gym.Wrapper):
         kind = type(env)

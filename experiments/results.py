@@ -33,12 +33,13 @@ from pipeline.signs_of_life import Tell, tell_nobody
 from safe_files.archives import read_members
 from safe_files.files import UnsafeFileError
 from verdicts import (
+    UNBOUNDED,
     Band,
+    Bounds,
     area_under_curve,
     curve_band,
     on_grid,
     shared_grid,
-    steps_to_stay,
     steps_to_threshold,
 )
 
@@ -663,7 +664,7 @@ def speed_figures(
     reached = stayed = float("nan")
     if threshold is not None and len(steps):
         reached = steps_to_threshold(steps, values, threshold)
-        stayed = steps_to_stay(steps, values, threshold)
+        stayed = steps_to_threshold(steps, values, threshold, to_stay=True)
 
     def episodes_by(step: float) -> float:
         there = np.isfinite(step)
@@ -680,7 +681,6 @@ def speed_figures(
 
 # --- Agents over their seeds.
 
-RESAMPLING_SEED = 0  # so that the same runs give the same figures
 CURVE_POINTS = TRAINING_POINTS  # the most points of a run, and of a curve in a figure
 
 
@@ -717,13 +717,14 @@ def stored_curves(
 
 
 def mean_curve(
-    curves: Sequence[Mapping[str, Any] | pd.DataFrame], by: str
+    curves: Sequence[Mapping[str, Any] | pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED
 ) -> tuple[Floats, Band] | None:
     """The mean learning curve of an agent over its seeds.
 
     Args:
         curves: the curves of its runs, from `curves_by_agent`.
         by: ``"step"``, ``"episode"`` or ``"seconds"``.
+        bounds: the least and the greatest possible return.
 
     Returns:
         The points, shape (n,), and the means there with intervals; None without runs, or if a run
@@ -737,7 +738,7 @@ def mean_curve(
         return None
     grid = shared_grid([points for points, _ in runs], CURVE_POINTS)
     values = np.array([on_grid(points, returns, grid) for points, returns in runs])
-    return grid, curve_band(values, seed=RESAMPLING_SEED)
+    return grid, curve_band(values, bounds)
 
 
 # --- Comparing two runs.

@@ -9,27 +9,33 @@ import math
 import re
 import unicodedata
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
+import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from experiments.analysis import EnvironmentAnalysis, StudyAnalysis, not_behind
+from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.plan import tuning_seeds
 from experiments.results import CURVE_COLUMNS, Curve, StudyResults
-from experiments.study import METRIC_WORDS, StudySpec
+from experiments.study import METRIC_WORDS
 from pipeline.errors import visible
-from pipeline.files import replacing, write_text
-from report.conclusions import conclusion, none_has_learnt, on_changes, unproven_sentences
+from pipeline.files import replacing, write_json, write_text
+from report.conclusions import (
+    conclusion,
+    none_has_learnt,
+    on_changes,
+    unproven_sentences,
+    unseen_sentence,
+)
 from report.words import (
     enumeration,
     interval,
     number,
     score_number,
-    score_with_interval,
     seed_sentence,
-    seeds,
 )
 
 # A markup is named by the suffix of its files and of its templates.
@@ -168,6 +174,7 @@ def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
         title=study.title,
         command=visible(command),
         seeds=seed_sentence(study.seeds, tuning_seeds(study)),
+        unseen=unseen_sentence(analysis),
         headline=headline(analysis),
         environments=[
             {
@@ -216,9 +223,8 @@ def _legend(analysis: StudyAnalysis) -> str:
     else:
         what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
     text = (
-        f"{what} ±: the standard deviation of runs. Bold: shown to be best on average, several "
-        "where they are shown to be equal, or the same in all runs of all agents. ?: "
-        f"{seeds(study.n_seeds)} do not show that another agent is better on average."
+        f"{what} ±: the standard deviation of runs. Bold: no other agent is shown to be better on "
+        "average."
     )
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
@@ -227,39 +233,22 @@ def _legend(analysis: StudyAnalysis) -> str:
 
 def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Cell]:
     """The cell of each agent that has a run."""
-    places = standings(analysis.study, environment)
+    best = () if none_has_learnt(analysis.study, environment) else environment.best.agents
     costs = processor_seconds(analysis.results)
     cells = {}
     for agent in environment.agents:
         figure = number(agent.metric.mean.point)
         if environment.is_score:
             figure = score_number(agent.judged.point)
-        place = places.get(agent.agent)
         cost = costs.get((agent.agent, environment.environment))
-        count = environment.failures.get(agent.agent)
+        runs = agent.runs
         spread = number(float(f"{agent.spread:.2g}"))
         notes = "" if spread == "0" else f" ± {spread}"
-        notes += " ?" if place == "open" else ""
         notes += "" if cost is None else f" ({duration(cost)})"
-        notes += f", {count.n_failed} of {count.n} failed" if count and count.n_failed else ""
+        notes += f", {runs.failed} of {runs.n} failed" if runs.failed else ""
         notes += f", {agent.n_missing} missing" if agent.n_missing else ""
-        cells[agent.agent] = Cell(figure, place == "best", notes)
+        cells[agent.agent] = Cell(figure, agent.agent in best, notes)
     return cells
-
-
-def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, str]:
-    """Each agent's standing by its mean: ``best``, ``open`` (undecided) or ``behind``.
-
-    Empty if no agent has learnt anything, or there is no figure.
-    """
-    known = [a.agent for a in environment.agents if not math.isnan(a.judged.point)]
-    if none_has_learnt(study, environment):
-        return {}
-    if environment.is_same:
-        return dict.fromkeys(known, "best")
-    ahead = not_behind(known, environment.pairs)
-    places = {name: "open" if name in ahead else "behind" for name in known}
-    return places | dict.fromkeys(environment.best, "best")
 
 
 def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
@@ -267,13 +256,13 @@ def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
     costs = processor_seconds(results)
     rows = []
     for agent in environment.agents:
-        count, stays = environment.failures.get(agent.agent), agent.steps_to_stay
+        runs, stays = agent.runs, agent.steps_to_stay
         cost = costs.get((agent.agent, environment.environment))
         figures = [
             interval(agent.metric.mean),
             number(agent.metric.median.point),
-            NOTHING if agent.score is None else score_with_interval(agent.score.mean),
-            NOTHING if count is None else f"{count.n_failed} of {count.n}",
+            NOTHING if agent.score is None else interval(agent.score, score_number),
+            NOTHING if runs.failed is None else f"{runs.failed} of {runs.n}",
             NOTHING if stays is None else number(stays.median.point),
             NOTHING if cost is None else duration(cost),
         ]
@@ -310,6 +299,11 @@ def duration(time: float) -> str:
 
 # A study as files: comma-separated values, and verdicts as Markdown and LaTeX.
 
+PAIR_COLUMNS = (
+    *("environment", "first", "second", "verdict", "word", "so_far", "difference", "low", "high"),
+    *("p_different", "p_tied", "n", "seeds_needed"),
+)
+
 
 def write_tables(results: StudyResults) -> list[Path]:
     """Write ``summary.csv``, a row for each run, and ``curves.csv.gz``, all learning curves."""
@@ -336,8 +330,18 @@ def _rows_of(curve: Curve) -> str:
 
 
 def write_verdicts(analysis: StudyAnalysis, command: str) -> list[Path]:
-    """Write ``verdicts.md`` and ``verdicts.tex``: the study's verdicts, to paste into a text."""
-    written = []
+    """Write the verdicts: as Markdown and LaTeX for texts, as CSV and JSON for programs."""
+    said, root = analysis.verdicts, analysis.results.root
+    rows = [
+        {**asdict(pair), "verdict": pair.text, "low": pair.interval[0], "high": pair.interval[1]}
+        for pair in said.pairs
+    ]
+    written = [root / "verdicts.csv", root / "verdicts.json"]
+    with replacing(written[0]) as file:
+        table = pd.DataFrame(rows, columns=PAIR_COLUMNS)
+        table.to_csv(file, mode="wb", index=False, lineterminator="\n")
+    best = {environment: {**asdict(b), "text": str(b)} for environment, b in said.best.items()}
+    write_json(written[1], {**asdict(said), "pairs": rows, "best": best})
     for markup in MARKUPS:
         written.append(analysis.results.root / f"verdicts.{markup}")
         write_text(written[-1], verdicts_as(markup, analysis, command))

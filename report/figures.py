@@ -597,14 +597,14 @@ def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark) -> None:
 
 def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
     """The share of runs whose score is higher than each threshold."""
-    x, found = overall.thresholds, overall.profiles
-    curves = {agent: Curve(x, band.point, band.low, band.high) for agent, band in found.items()}
-    _draw_curves(axes, curves, marks)
+    for agent, shares in overall.profiles.items():
+        style = line_style(marks[agent])
+        axes.plot(overall.thresholds, shares, label=agent, linewidth=1.5, **style)
     axes.set_ylim(0, 1.02)
     axes.yaxis.set_major_formatter(PercentFormatter(1))
     title = "Performance profiles over environments"
     lettering(axes, title=title, x="score", y="share of runs with a higher score")
-    shared_legend(axes, band=band_words(len(curves)))
+    shared_legend(axes)
 
 
 # Which figures a study has, and their files.

@@ -12,7 +12,7 @@ import numpy as np
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
 from experiments.bandits import QUANTILES, PullStatistics
 from experiments.study import COSTS, StudySpec
-from report.words import interval, interval_alone, number, score_number, score_with_interval
+from report.words import Format, interval, interval_alone, number, score_number
 from verdicts import Estimate, ThresholdSummary
 
 
@@ -31,8 +31,7 @@ class Cell:
 
 def bar(score: Estimate) -> tuple[float, float, float]:
     """Low end, point and high end of a score, clipped to [0, 1]."""
-    low, high = (score.low, score.high) if score.has_interval else (score.point, score.point)
-    return (_share(low), _share(score.point), _share(high))
+    return (_share(score.low), _share(score.point), _share(score.high))
 
 
 def _share(value: float) -> float:
@@ -43,10 +42,10 @@ def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def estimate_cell(estimate: Estimate) -> Cell:
-    """A figure with its interval."""
-    point = estimate.point
-    return Cell(number(point), _known(point), interval_alone(estimate), interval(estimate))
+def estimate_cell(estimate: Estimate, as_text: Format = number) -> Cell:
+    """A figure with its interval, or with the range of few runs."""
+    note, in_line = interval_alone(estimate, as_text), interval(estimate, as_text)
+    return Cell(as_text(estimate.point), _known(estimate.point), note, in_line)
 
 
 def threshold_cell(stays: ThresholdSummary | None) -> Cell | None:
@@ -106,11 +105,9 @@ def filled(columns: Sequence[Column], rows: Sequence[Row]) -> list[tuple[Column,
 def _score(row: Row) -> Cell | None:
     if row.agent.score is None:
         return None
-    mean = row.agent.score.mean
-    cell = replace(
-        estimate_cell(mean), text=score_number(mean.point), in_line=score_with_interval(mean)
-    )
-    return replace(cell, bar=None if math.isnan(mean.point) else bar(mean))
+    mean = row.agent.score
+    cell = estimate_cell(mean, score_number)
+    return cell if math.isnan(mean.point) else replace(cell, bar=bar(mean))
 
 
 def _gap(row: Row) -> Cell | None:
@@ -133,12 +130,13 @@ def _success(row: Row) -> Cell | None:
     return Cell(f"{rate.point:.1%}", rate.point, note)
 
 
-def _solved(row: Row) -> Cell | None:
-    summary = row.agent.steps_to_stay
-    if summary is None:
+def _failed(row: Row) -> Cell | None:
+    """How many runs failed, and the interval of their share."""
+    runs = row.agent.runs
+    if runs.failed is None:
         return None
-    share = summary.share_reached.point
-    return Cell("-", None) if math.isnan(share) else Cell(f"{share:.0%}", share)
+    low, high = runs.failed_interval
+    return Cell(f"{runs.failed} of {runs.n}", runs.failed / runs.n, f"{low:.0%} to {high:.0%}")
 
 
 def _stays_from(row: Row) -> Cell | None:
@@ -185,17 +183,23 @@ COLUMNS = (
         terminal="mean",
         cell=lambda row: estimate_cell(row.agent.metric.mean),
     ),
+    Column(page="IQM", help="middle half", cell=lambda row: number_cell(row.agent.metric.iqm)),
     Column(
-        page="IQM",
-        help="middle half",
-        terminal="IQM",
-        cell=lambda row: estimate_cell(row.agent.metric.iqm),
-    ),
-    Column(
-        page="Median", help="over seeds", cell=lambda row: estimate_cell(row.agent.metric.median)
+        page="Median",
+        help="over seeds",
+        terminal="median",
+        cell=lambda row: estimate_cell(row.agent.metric.median),
     ),
     Column(
         page="Score", help="1 is optimal", terminal="score", best_first="descending", cell=_score
+    ),
+    Column(
+        page="Failed",
+        help="runs below {failed}",
+        terminal="failed",
+        caption="runs with a score below {failed}, half the best median",
+        best_first="ascending",
+        cell=_failed,
     ),
     Column(page="Gap", help="to the optimum", best_first="ascending", cell=_gap),
     Column(
@@ -208,7 +212,7 @@ COLUMNS = (
         page="Stays from",
         help="step, at {threshold}",
         terminal="stays from",
-        caption="step from which on the median run stays at a return of {threshold}",
+        caption="median step from which the return stays above {threshold}",
         best_first="ascending",
         cell=_stays_from,
     ),
@@ -218,7 +222,6 @@ COLUMNS = (
         best_first="ascending",
         cell=lambda row: threshold_cell(row.agent.episodes_to_stay),
     ),
-    Column(terminal="solved", best_first="descending", cell=_solved),
     Column(
         page="CPU time",
         help="seconds of training",

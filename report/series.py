@@ -27,7 +27,7 @@ from experiments.study import AgentSpec, StudySpec, symbol
 from mdp.transition_model import Floats, Ints
 from pipeline.environments import make_single_env
 from pipeline.signs_of_life import Tell, tell_nobody
-from verdicts import Estimate
+from verdicts import UNBOUNDED, Bounds, Estimate
 
 # One colour and one line style for each agent, the same in every figure of a study.
 
@@ -104,21 +104,23 @@ def learning_curves(
     runs = curves_by_agent(results, environment.environment)
     for kind in KINDS:
         by_axis: dict[str, dict[str, Curve]] = {by: {} for by in AXES}
+        # Training returns of a changed environment have other bounds.
+        bounds = UNBOUNDED if kind == "training" and variants else environment.bounds
         for agent in (each.agent for each in environment.agents):
             of_agent: list[Any] = runs.get((agent, kind), [])
             if stored := stored_curves(results, environment.environment, agent, kind):
                 of_agent = [*of_agent, *stored]
             for by in AXES:
-                if (curve := _curve(of_agent, by)) is not None:
+                if (curve := _curve(of_agent, by, bounds)) is not None:
                     by_axis[by][agent] = curve
         scale = linear_up_to([curve.y for curve in by_axis["step"].values()], environment.optimum)
         found[kind] = LearningCurves(by_axis, scale, variants if kind == "training" else ())
     return found
 
 
-def _curve(runs: Sequence[Any], by: str) -> Curve | None:
+def _curve(runs: Sequence[Any], by: str, bounds: Bounds) -> Curve | None:
     try:
-        found = mean_curve(runs, by)
+        found = mean_curve(runs, by, bounds)
     except ValueError:
         return None  # the clock was set back, so wall times decrease
     if found is None:

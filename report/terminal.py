@@ -15,45 +15,19 @@ from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.off_policy.estimators import difference_in_value, mean_reward
 from experiments.plan import tuning_seeds
 from experiments.study import METRIC_WORDS, StudySpec
-from report.conclusions import conclusion, overall_sentences, pairs_both_ways, seeds_of
+from report.conclusions import (
+    conclusion,
+    overall_sentences,
+    pairs_both_ways,
+    seeds_of,
+    unseen_sentence,
+)
 from report.ranking import BANDIT_COLUMNS, COLUMNS, Cell, Column, Row, filled
 from report.words import enumeration, number, optimum_words, seed_sentence
-from verdicts import Estimate, PairComparison, Verdict
+from verdicts import FEW, Estimate
 
 if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
     from experiments.off_policy.logged_policies import Comparison, Judged
-
-# All verdicts on an environment at a glance: a row and a column for each agent.
-
-SIGNS: dict[Verdict, str] = {"better": ">", "worse": "<", "equivalent": "=", "undecided": "?"}
-PHRASES: dict[Verdict, str] = {
-    "better": "is better on average than",
-    "worse": "is worse on average than",
-    "equivalent": "is equivalent to",
-    "undecided": "is undecided against",
-}
-LEGEND = (
-    "> better on average than the agent of the column, < worse, = equivalent, ? undecided; "
-    "in brackets: as long as further runs are like those that were seen"
-)
-
-
-def sign(pair: PairComparison) -> str:
-    """The verdict on a pair as a sign, in brackets if it is conditional."""
-    return f"({SIGNS[pair.verdict]})" if pair.is_conditional else SIGNS[pair.verdict]
-
-
-def phrase(pair: PairComparison) -> str:
-    """The verdict on a pair in words, without the agents."""
-    seen = ", as far as was seen" if pair.is_conditional else ""
-    return f"{PHRASES[pair.verdict]}{seen}"
-
-
-def says_more(environment: EnvironmentAnalysis) -> bool:
-    """Whether to show a matrix of verdicts: for three agents or more, if a pair is decided."""
-    decided = [pair for pair in environment.pairs if pair.verdict != "undecided"]
-    return len(environment.agents) > 2 and bool(decided)
-
 
 # A study in the terminal.
 
@@ -61,8 +35,8 @@ MOST_AGENT_WIDTH = 20
 UNBOUNDED = 10_000  # columns
 # Columns to drop, in this order, while a table is wider than the terminal; the page has all.
 FIRST_LEFT_OUT = (
-    *("training", "IQM", "solved", "stays from"),
-    *("simple regret", "reward", "CPU time", "score", "best arm"),
+    *("training", "median", "stays from", "simple regret", "reward"),
+    *("CPU time", "score", "best arm"),
 )
 
 
@@ -76,34 +50,36 @@ def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
         _print_ranking(console, analysis, environment)
         _print_conclusion(console, analysis.study, environment)
     console.print()
+    if unseen := unseen_sentence(analysis):
+        console.print(unseen, highlight=False)
     origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
     console.print(origin, highlight=False)
 
 
 def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
-    """Print the lead, the pairs (as a matrix for three agents or more), and the notes."""
+    """Print the lead, the pairs (as a table of words for three agents or more), and the notes."""
     said = conclusion(study, environment)
     told: list[str | Table] = [said.lead]
-    if says_more(environment):
-        told += [_matrix(environment), LEGEND, *([said.failed] if said.failed else [])]
-    elif len(environment.agents) == 2:
-        told += said.pairs
+    table = _words_of_pairs(environment)
+    fits = len(environment.agents) > 2 and _width(console, table) <= console.width
+    told += [table] if fits else said.pairs
     for each in (*told, *said.notes):
         console.print(each, highlight=False)
 
 
-def _matrix(environment: EnvironmentAnalysis) -> Table:
+def _words_of_pairs(environment: EnvironmentAnalysis) -> Table:
+    """The word on the agent of each row, against the agents below it in the ranking."""
     names = [agent.agent for agent in environment.agents]
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("")
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("", overflow="fold", max_width=MOST_AGENT_WIDTH)
-    numbers = [str(place) for place in range(1, len(names) + 1)]
-    for place in numbers:
-        table.add_column(place, justify="right", no_wrap=True)
-    pairs = pairs_both_ways(environment)
-    for place, name in zip(numbers, names, strict=True):
-        signs = [sign(pairs[name, n]) if (name, n) in pairs else "·" for n in names]
-        table.add_row(place, name, *signs)
+    for name in names[1:]:
+        table.add_column(f"vs {name}", overflow="fold", max_width=MOST_AGENT_WIDTH)
+    pairs = pairs_both_ways(environment.pairs)
+    for place, name in enumerate(names[:-1], start=1):
+        words = [
+            pairs[name, other].text if (name, other) in pairs else "" for other in names[place:]
+        ]
+        table.add_row(name, *[""] * (place - 1), *words)
     return table
 
 
@@ -169,12 +145,14 @@ def _caption(
     on_variant = any(agent.on_variant for agent in environment.agents)
     words = {
         "threshold": number(environment.threshold),
+        "failed": number(environment.failure_threshold),
         "variants": " (*: on a variant of the environment)" if on_variant else "",
     }
-    means = ", ".join(name for name in ("mean", "IQM") if name not in left_out)
-    metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals"
-    of_means = "those of means allow for runs that were not seen"
-    told = [f"{means}: {metric} over {seeds_of(study, environment)}; {of_means}"]
+    n_runs = [agent.n_runs for agent in environment.agents]
+    what = "the range of the runs" if max(n_runs, default=0) < FEW else "95 % intervals"
+    told = [f"mean: {METRIC_WORDS[study.metric]} over {seeds_of(study, environment)}, with {what}"]
+    if any(agent.metric.mean.low == agent.metric.mean.high for agent in environment.agents):
+        told[0] += " (none where all runs are equal)"
     for column, _ in filled(COLUMNS, rows):
         if column.terminal and column.caption and column.terminal not in left_out:
             told.append(f"{column.terminal}: {column.caption.format(**words)}")

@@ -1,19 +1,16 @@
-"""Numbers as text, and sentences on seeds and looks."""
+"""Numbers as text, and sentences on seeds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 
-from experiments.looks import Look, Looks
 from experiments.plan import Seeds, TuningSeeds
 from pipeline.evaluation.yardstick import bracket_mark
 from verdicts import Estimate
 
 SIGNIFICANT = 4  # digits
-
-_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
 
 
 def number(value: float | None) -> str:
@@ -29,13 +26,6 @@ def number(value: float | None) -> str:
     return "0" if text == "-0" else text
 
 
-def interval(estimate: Estimate) -> str:
-    """A figure with its interval in brackets, where it has one."""
-    if math.isnan(estimate.low) or estimate.low == estimate.high:
-        return number(estimate.point)
-    return f"{number(estimate.point)} [{number(estimate.low)}, {number(estimate.high)}]"
-
-
 def score_number(value: float | None) -> str:
     """A score, rounded down: 1 is the optimum and nothing less."""
     if value is None or math.isnan(value):
@@ -44,19 +34,25 @@ def score_number(value: float | None) -> str:
     return number(math.floor(value * digits + 1e-6) / digits)
 
 
-def score_with_interval(estimate: Estimate) -> str:
-    """A score with its interval in brackets, where it has one."""
+Format = Callable[[float | None], str]
+
+
+def interval(estimate: Estimate, as_text: Format = number) -> str:
+    """A mean with its interval in brackets, or with the range of few runs in parentheses.
+
+    The mean alone where all runs are equal.
+    """
+    point, low, high = map(as_text, (estimate.point, estimate.low, estimate.high))
     if math.isnan(estimate.low) or estimate.low == estimate.high:
-        return score_number(estimate.point)
-    ends = f"[{score_number(estimate.low)}, {score_number(estimate.high)}]"
-    return f"{score_number(estimate.point)} {ends}"
+        return point
+    return f"{point} ({low} to {high})" if estimate.is_range else f"{point} [{low}, {high}]"
 
 
-def interval_alone(estimate: Estimate) -> str:
-    """The interval of a figure, empty where it has none."""
+def interval_alone(estimate: Estimate, as_text: Format = number) -> str:
+    """The interval or range of a mean, empty where all runs are equal."""
     if math.isnan(estimate.low) or estimate.low == estimate.high:
         return ""
-    return f"{number(estimate.low)} to {number(estimate.high)}"
+    return f"{as_text(estimate.low)} to {as_text(estimate.high)}"
 
 
 def optimum_words(optimum: float | None, at_least: float | None, is_proven: bool = True) -> str:
@@ -89,14 +85,6 @@ def seeds(*counts: int) -> str:
     """A number of seeds, or a range of numbers."""
     least, most = min(counts), max(counts)
     return f"{'' if least == most else f'{least:,} to '}{most:,} seed{'s' if most != 1 else ''}"
-
-
-def ordinal(n: int) -> str:
-    """The ordinal of a number, as a word up to the ninth."""
-    if n <= len(_ORDINALS):
-        return _ORDINALS[n - 1]
-    ending = "th" if 10 < n % 100 < 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
-    return f"{n:,}{ending}"
 
 
 # On which seeds the settings of a study were tuned, in one line.
@@ -153,32 +141,3 @@ def spans(numbers: Iterable[int]) -> str:
     starts = ordered[:1] + [two for one, two in pairwise(ordered) if two != one + 1]
     pairs = zip(starts, ends, strict=True)
     return ", ".join(f"{low} to {high}" if low != high else str(low) for low, high in pairs)
-
-
-# Looks (analyses of the runs on an environment so far), and their seeds.
-
-
-def look_sentences(looks: Looks) -> list[str]:
-    """Say how many looks there were, and then of each its date, its seeds and its level."""
-    if not looks.taken:
-        return []
-    n = len(looks.taken)
-    times = {1: "once", 2: "twice"}.get(n, f"{n:,} times")
-    told = [f"These runs have been looked at {times}."]
-    if looks.design is not None:
-        sizes = [f"{size:,}" for size in looks.design.sizes]
-        told.append(f"Fixed before the first of them: looks at {enumeration(sizes)} seeds.")
-    for look in looks.taken:
-        level = f"{100 * look.level:.2g} %"
-        told.append(f"{look.date[:10]}: {'; '.join(_seeds(look))}; claims at {level}.")
-    return told
-
-
-def _seeds(look: Look) -> Iterable[str]:
-    """Agents with the same seeds in one clause, without their names where all have them."""
-    first = look.question.first_seed
-    for count in sorted({*look.seeds.values()}):
-        seeds = range(first, first + count)
-        names = [name for name, n in look.seeds.items() if n == count]
-        whose = f"{enumeration(names)}, " if len(names) < len(look.seeds) else ""
-        yield f"{whose}seed{'s' if count != 1 else ''} {spans(seeds)}"

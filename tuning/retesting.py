@@ -20,9 +20,7 @@ import yaml
 from optuna.trial import FrozenTrial, TrialState
 
 from envs.brackets import upper_is_proven
-from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis, evidence_on
-from experiments.growing import Step
-from experiments.results import RESAMPLING_SEED, StudyResults
+from experiments.analysis import StudyAnalysis
 from experiments.study import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.digests import DamagedFileError
 from pipeline.files import plain, write_json, write_text
@@ -37,9 +35,8 @@ from tuning.trial_storage import (
     figures_of,
     seconds_of,
 )
-from tuning.tuning_spec import SHIPPED, Floats, TuningSpec, judged, judged_rows
-from verdicts import FEWEST_SEEDS, Estimate, level_of_claim
-from verdicts.resampling import N_RESAMPLES, interval_tail, percentile_interval
+from tuning.tuning_spec import COST_OF_THRESHOLD, SHIPPED, Floats, TuningSpec, judged
+from verdicts import Estimate, Study, judge, mean_over_runs
 
 FOLDER, WINNER, RECORD = "retest", "winner.yml", "tuning.json"
 
@@ -117,22 +114,23 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
     )
 
 
-def is_settled(results: StudyResults, steps: Sequence[Step]) -> bool:
-    """Whether the best setting of a growing re-test is decided to be better than the initial one.
+def is_settled(said: Study) -> bool:
+    """Whether the best setting of a growing re-test is shown to be better than the initial one.
 
-    Settings that are decided not to be better, and those with missing runs, do not count.
+    Settings that are shown not to be better, and those with missing runs, do not count.
     """
-    for step in steps:
-        evidence = evidence_on(results, step.environment)
-        runs = {} if evidence is None else evidence.given
-        is_better = {
-            name: each.mean.verdict == "worse"  # the initial setting is
-            for (first, name), each in step.growth.judged.items()
-            if first == SHIPPED and each.mean.verdict in ("worse", "undecided")
-        }
-        there = [name for name in is_better if np.isfinite(runs[name]).all()]
-        best = max(there, key=lambda name: float(runs[name].mean()), default=None)
-        if best is None or not is_better[best]:
+    runs = {(one.environment, one.name): one for one in said.agents}
+    for environment in said.best:
+        pairs = [pair for pair in said.pairs if pair.environment == environment]
+        words = {p.first: p.word for pair in pairs for p in (pair, pair.swapped())}
+        words.pop(SHIPPED, None)
+        there = [
+            runs[environment, name]
+            for name, word in words.items()
+            if word in ("better", "undecided") and not runs[environment, name].n_missing
+        ]
+        best = max(there, key=lambda one: one.mean, default=None)
+        if best is None or words[best.name] != "better":
             return False
     return True
 
@@ -145,14 +143,13 @@ class Retested:
     number: int  # number of its trial; 0 for the initial settings
     in_search: float | None  # its value in the search, if its trial is complete
     held_out: float | None  # its value on held-out seeds; None without runs
-    interval: Estimate  # the confidence interval of ``held_out``
-    verdict: str  # the comparison with the initial settings; empty for the initial settings
+    interval: Estimate | None  # the mean of its figures with its interval; None without runs
+    verdict: str  # its word against the initial settings; empty for the initial settings
     n_runs: int  # number of runs
     # Number of failed runs, which got less than half as far as the best typical run; None if
     # that is not defined.
     n_failed: int | None
     n_missing: int = 0  # number of runs that are missing
-    said: str = ""  # the verdict in words, with its condition
 
 
 @dataclass(frozen=True)
@@ -184,8 +181,9 @@ def concluded(
     in_search = {each.number: _value(tuning, each.figures, least) for each in ranked}
     numbers = {SHIPPED: 0} | {each.label: each.number for each in candidates}
     figures = {label: np.maximum(_figures(tuning, label, analysis), least) for label in numbers}
+    words = _words(tuning, figures, analysis)
     retested = [
-        _retested(tuning, label, number, in_search.get(number), figures, analysis)
+        _retested(tuning, label, number, in_search.get(number), figures[label], words, analysis)
         for label, number in numbers.items()
     ]
     winner, reason = _winner(tuning, retested)
@@ -224,95 +222,43 @@ def _retested(
     label: str,
     number: int,
     in_search: float | None,
-    figures: Mapping[str, Floats],
+    figures: Floats,
+    words: Mapping[str, str],
     analysis: StudyAnalysis,
 ) -> Retested:
     environment = next(iter(analysis.environments), None)
     agents = () if environment is None else environment.agents
     agent = next((agent for agent in agents if agent.agent == label), None)
-    failures = None if environment is None else environment.failures.get(label)
-    own = figures[label]
-    verdict, said = "", ""
-    if number and environment is not None:
-        compare = _by_study if tuning.is_judged_by_study else _by_resampling
-        verdict, said = compare(tuning, label, figures, environment)
+    value = None
+    if len(figures):
+        value = judged(figures, tuning.objective, is_cost=tuning.is_cost)
     return Retested(
         label=label,
         number=number,
         in_search=in_search,
-        held_out=judged(own, tuning.objective, is_cost=tuning.is_cost) if len(own) else None,
-        interval=_interval(tuning, own, agent),
-        verdict=verdict,
+        held_out=value,
+        interval=mean_over_runs(figures) if len(figures) else None,
+        verdict=words.get(label, ""),
         n_runs=0 if agent is None else agent.n_runs,
-        n_failed=None if failures is None else failures.n_failed,
+        n_failed=None if agent is None else agent.runs.failed,
         n_missing=0 if agent is None else agent.n_missing,
-        said=said,
     )
 
 
-def _interval(tuning: TuningSpec, figures: Floats, agent: AgentAnalysis | None) -> Estimate:
-    if agent is None or not len(figures):
-        return Estimate(math.nan, math.nan, math.nan, 0)
-    if tuning.is_judged_by_study:
-        return ((agent.score if tuning.figure == "score" else None) or agent.metric).mean
-    tail = interval_tail([figures], 0.95)
-    low, high = percentile_interval(_resampled(tuning, figures, 0), tail)
-    value = judged(figures, tuning.objective, is_cost=tuning.is_cost)
-    return Estimate(value, float(low), float(high), len(figures))
+def _words(
+    tuning: TuningSpec, figures: Mapping[str, Floats], analysis: StudyAnalysis
+) -> dict[str, str]:
+    """The word on each setting against the initial ones: on the mean of the searched figure.
 
-
-AS_SEEN = ", as seen"
-
-
-def _by_study(
-    _: TuningSpec, label: str, __: Mapping[str, Floats], environment: EnvironmentAnalysis
-) -> tuple[str, str]:
-    """The verdict of the re-test's study on the mean of its metric, and the same in words."""
-    pairs = [seen for pair in environment.pairs for seen in (pair, pair.swapped())]
-    pair = next((p for p in pairs if (p.first, p.second) == (label, SHIPPED)), None)
-    if pair is None or pair.verdict == "undecided":
-        return "undecided", ""
-    than = "to" if pair.verdict == "equivalent" else "than"
-    said = f"{pair.verdict} on average {than} the shipped settings"
-    if not pair.is_conditional:
-        return pair.verdict, said
-    most, condition = pair.mean.most_outside, "further runs are like those that were seen"
-    if most > 0:
-        condition = f"fewer than {100 * most:.2g} % of further runs lie outside of those seen"
-    return f"{pair.verdict}{AS_SEEN}", f"{said}, as long as {condition}"
-
-
-def _by_resampling(
-    tuning: TuningSpec,
-    label: str,
-    figures: Mapping[str, Floats],
-    environment: EnvironmentAnalysis,
-) -> tuple[str, str]:
-    """The same for other statistics and figures: whether an interval of the difference excludes 0.
-
-    The interval is a percentile bootstrap's, widened for few seeds. The settings of the re-test
-    share its error rate equally. The verdict has a condition, because only seen runs are resampled.
+    They are those of the re-test's study where it compares the same figure.
     """
-    own, shipped = figures[label], figures[SHIPPED]
-    if min(len(own), len(shipped)) < FEWEST_SEEDS:
-        return "undecided", ""
-    level = level_of_claim(environment.look.level, "means") / (len(figures) - 1)
-    apart = _resampled(tuning, own, 1) - _resampled(tuning, shipped, 2)
-    ends = percentile_interval(apart, interval_tail([own, shipped], 1 - level))
-    low, high = sorted((-1 if tuning.is_cost else 1) * float(end) for end in ends)
-    if low <= 0 <= high:
-        return "undecided", ""
-    verdict = "better" if low > 0 else "worse"
-    of_what = f"{statistic_of(tuning)} of {tuning.figure}"
-    condition = "as long as further runs are like those that were seen"
-    return f"{verdict}{AS_SEEN}", f"{verdict} than the shipped settings by {of_what}, {condition}"
-
-
-def _resampled(tuning: TuningSpec, figures: Floats, stream: int) -> Floats:
-    """The value of a setting in each resample of its runs."""
-    n, rng = len(figures), np.random.default_rng([RESAMPLING_SEED, stream])
-    drawn = figures[rng.integers(n, size=(N_RESAMPLES, n))]
-    return judged_rows(drawn, tuning.objective, is_cost=tuning.is_cost)
+    said = analysis.verdicts
+    if tuning.figure in COST_OF_THRESHOLD:
+        sign = -1.0 if tuning.is_cost else 1.0
+        scores = {SHIPPED: {label: sign * values for label, values in figures.items()}}
+        said = judge(scores, margin=0, baseline=None, against=SHIPPED)
+    pairs = [one for pair in said.pairs for one in (pair, pair.swapped())]
+    return {pair.first: pair.text for pair in pairs if pair.second == SHIPPED}
 
 
 def statistic_of(tuning: TuningSpec) -> str:
@@ -331,13 +277,13 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     enough = tuning.retest_seeds
     there = [each for each in others if each.n_runs >= enough and not each.n_missing]
     if not there:
-        return None, "none has run on all other seeds"
+        return None, "no setting finished all runs on held-out seeds"
     sign = -1 if tuning.is_cost else 1
     if shipped.held_out is None:
         return None, "the shipped settings did not run"
     better = [each for each in there if each.verdict.startswith("better")]
     if not better:
-        return None, "none is shown to be better than the shipped settings on other seeds"
+        return None, "no setting beat the shipped settings on held-out seeds"
     return max(better, key=lambda each: sign * (each.held_out or 0.0)), ""
 
 
@@ -416,7 +362,7 @@ def _provenance(
         f"{unproven_mark(tuning)} over the seeds {seeds.start} to {seeds.stop - 1}: "
         f"{_figure(winner.in_search)}. On the seeds {held_out.start} to {held_out.stop - 1}, which "
         f"the search has not seen{chosen}: {_held_out(winner)}; "
-        f"the settings before, there: {_held_out(shipped)}. Verdict: {winner.said}."
+        f"the settings before, there: {_held_out(shipped)}. Verdict on means: {winner.verdict}."
         f"{'' if is_one_engine else engines}"
     )
     return textwrap.wrap(text, LONGEST_LINE - len("# "))
@@ -433,13 +379,13 @@ def unproven_mark(tuning: TuningSpec) -> str:
 
 
 def _held_out(each: Retested) -> str:
-    """The held-out figure with an interval, in words."""
+    """The held-out figure, and the interval of the mean, in words."""
     found, text = each.interval, _figure(each.held_out)
-    if math.isnan(found.low):
+    if found is None or found.low == found.high:
         return text
     ends = f"{found.low:.4g} to {found.high:.4g}"
     failed = f", {each.n_failed} of them failed" if each.n_failed else ""
-    return f"{text} (95 % interval: {ends}, {each.n_runs} runs{failed})"
+    return f"{text} (95 % interval of the mean: {ends}, {each.n_runs} runs{failed})"
 
 
 # The record.

@@ -161,16 +161,11 @@ def judged(figures: Sequence[float] | Floats, objective: Objective, *, is_cost: 
             side of the worst runs.
         is_cost: whether a lower figure is better; ``lower`` is then the upper quartile.
     """
-    return float(judged_rows(np.asarray(figures, np.float64), objective, is_cost=is_cost))
-
-
-def judged_rows(figures: Floats, objective: Objective, *, is_cost: bool) -> Floats:
-    """The values of many sets of runs, shape (..., n_runs); see `judged`."""
-    values = np.sort(figures, axis=-1)
+    values = np.sort(np.asarray(figures, np.float64))
     if objective == "lower":
-        return np.asarray(np.quantile(values, 1 - LOWER if is_cost else LOWER, axis=-1))
-    cut = values.shape[-1] // 4 if objective == "iqm" else 0
-    return np.asarray(values[..., cut : values.shape[-1] - cut].mean(axis=-1))
+        return float(np.quantile(values, 1 - LOWER if is_cost else LOWER))
+    cut = len(values) // 4 if objective == "iqm" else 0
+    return float(values[cut : len(values) - cut].mean())
 
 
 # The type of ``--storage``, and one-line messages for its failures: Optuna itself is loaded later.

@@ -257,7 +257,7 @@ def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
     The interval is valid for many terms without dominating ones: check the effective sample size.
     It does not cover the bias of an estimator.
     """
-    return paired_difference(terms, np.zeros_like(terms), confidence)
+    return paired_difference(terms, np.zeros_like(terms), 1 - confidence)
 
 
 def difference_in_value(
@@ -276,7 +276,7 @@ def difference_in_value(
             simultaneously with 95 %.
     """
     confidence = 1 - 0.05 / n_comparisons
-    found = paired_difference(first.doubly_robust, second.doubly_robust, confidence)
+    found = paired_difference(first.doubly_robust, second.doubly_robust, 1 - confidence)
     apart = first.weights - second.weights
     variance = float((apart**2).mean() * (first.errors**2).mean()) / len(apart)
     half = float(stats.t.isf(0.05 / n_comparisons / 2, len(apart) - 1)) * np.sqrt(variance)

@@ -9,19 +9,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.analysis import EnvironmentAnalysis
-from experiments.looks import Looks, read_looks
 from experiments.plan import tuning_seeds
 from experiments.results import StudyResults, mixed_versions
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from mdp.transition_model import Floats
 from report.conclusions import (
-    amounts,
     conclusion,
     on_changes,
     overall_sentences,
     pairs_both_ways,
     places_without_a_run,
     unproven_sentences,
+    unseen_sentence,
 )
 from report.documents import MARKUPS, verdicts_as
 from report.page.frame import Report, Section, setting
@@ -35,8 +34,7 @@ from report.series import (
     mean_regret,
     with_best_mean,
 )
-from report.terminal import LEGEND, phrase, says_more, sign
-from report.words import look_sentences, number, seed_sentence
+from report.words import number, seed_sentence
 
 WIDTH, HEIGHT = 200, 100  # of a small figure, in the drawing's own unit
 
@@ -111,7 +109,7 @@ def verdict(report: Report) -> Section | None:
         {
             "environment": one.environment,
             "conclusion": conclusion(study, one.environment),
-            "pairs": pairs_both_ways(one.environment) if says_more(one.environment) else None,
+            "pairs": pairs_both_ways(one.environment.pairs),
             "has_sweeps": bool(one.sweeps),
             "grids": {name: _grid(one, grid, study.metric) for name, grid in one.grids.items()},
         }
@@ -120,9 +118,7 @@ def verdict(report: Report) -> Section | None:
     context = {
         "general": [*overall_sentences(report.analysis), *places_without_a_run(report.analysis)],
         "cards": cards,
-        "sign": sign,
-        "phrase": phrase,
-        "legend": LEGEND,
+        "unseen": unseen_sentence(report.analysis),
         "metric": metric,
     }
     files = {name: verdicts_as(name, report.analysis, report.command) for name in MARKUPS}
@@ -181,12 +177,15 @@ def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, An
 def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
     """The headings, and each agent's cells."""
     shown = filled(columns, rows)
-    threshold = number(rows[0].environment.threshold) if rows else ""
+    of = rows[0].environment if rows else None
+    words = {"threshold": "", "failed": ""}
+    if of is not None:
+        words = {"threshold": number(of.threshold), "failed": number(of.failure_threshold)}
     return {
         "headings": [
             {
                 "title": column.page,
-                "help": column.help.format(threshold=threshold),
+                "help": column.help.format(**words),
                 "order": column.order(study),
             }
             for column, _ in shown
@@ -237,18 +236,13 @@ def comparison(report: Report) -> Section | None:
     metric = METRIC_WORDS[analysis.study.metric]
     context = {
         "metric": metric,
-        "phrase": phrase,
-        "amounts": amounts,
         "most_dots": MOST_DOTS,
         "lower_is_better": analysis.study.metric in COSTS,
-        "probabilities": [
-            {k: pair.probability_of_improvement for k, pair in pairs_both_ways(one).items()}
-            for one in analysis.environments
-        ],
     }
     places = [
         {
             "intervals": [_runs(agent) for agent in one.runs],
+            "words": {f"{p.first} | {p.second}": p.text for p in one.environment.pairs},
             "linear": linear_up_to((runs.values for runs in one.runs), one.environment.optimum),
         }
         for one in report.series.environments
@@ -271,23 +265,20 @@ def overall(report: Report) -> Section | None:
         return None
     agents = list(overall.scores)
     scores = [
-        {agent.agent: agent.score.mean for agent in one.agents if agent.score is not None}
+        {agent.agent: agent.score for agent in one.agents if agent.score is not None}
         for one in report.analysis.environments
     ]
     context = {
         "agents": agents,
         "scores": scores,
-        "probabilities": overall.improvement,
+        "pairs": pairs_both_ways(overall.pairs),
         "unproven": unproven_sentences(report.analysis.environments),
     }
     data = {
         "agents": agents,
         "means": [{"agent": agent, **vars(overall.scores[agent].mean)} for agent in agents],
         "thresholds": overall.thresholds,
-        "profiles": {
-            agent: {"y": band.point, "low": band.low, "high": band.high}
-            for agent, band in overall.profiles.items()
-        },
+        "profiles": overall.profiles,
     }
     return Section("overall", "Overall", context, data)
 
@@ -309,7 +300,6 @@ def settings(report: Report) -> Section | None:
     results, environments = report.analysis.results, report.analysis.environments
     done = list(results.infos())
     infos = [info for *_, info in done]
-    looks = read_looks(results.root)
     context = {
         "command": report.command,
         "seeds": seed_sentence(results.study.seeds, tuning_seeds(results.study)),
@@ -320,7 +310,6 @@ def settings(report: Report) -> Section | None:
         ],
         "versions": recorded("versions", infos),
         "machine": recorded("machine", infos),
-        "looks": [look_sentences(looks.get(e.environment, Looks())) for e in environments],
         "mixed": mixed_versions(infos),
         "missing": _missing_runs(results),
     }

@@ -8,9 +8,13 @@ report.section("overall", (root, data) => {
     };
   });
   report.figure(root.querySelector("#profiles"), () => ({
-    traces: data.agents.flatMap((label) =>
-      report.band(label, { x: data.thresholds, ...data.profiles[label] }, (value) => value),
-    ),
+    traces: data.agents.map((label) => ({
+      x: data.thresholds,
+      y: data.profiles[label],
+      name: report.text(label),
+      mode: "lines",
+      line: { color: report.colour(label), width: 2.2, dash: report.mark(label).dash },
+    })),
     layout: {
       height: Math.max(74 + 46 * data.agents.length, 320),
       hovermode: "x unified",
