@@ -106,7 +106,7 @@ def _score(row: Row) -> Cell | None:
     if row.agent.score is None:
         return None
     mean = row.agent.score
-    cell = estimate_cell(mean, score_number)
+    cell = replace(estimate_cell(mean, score_number), in_line="")  # the mean has its interval
     return cell if math.isnan(mean.point) else replace(cell, bar=bar(mean))
 
 

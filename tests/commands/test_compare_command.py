@@ -99,7 +99,8 @@ def wait_for(condition, seconds=60):
         time.sleep(0.05)
 
 
-FILES = ["curves.csv.gz", "runs", "study.yml", "summary.csv", "verdicts.md", "verdicts.tex"]
+FILES = ["curves.csv.gz", "runs", "study.yml", "summary.csv"]
+FILES += [f"verdicts.{suffix}" for suffix in ("csv", "json", "md", "tex")]
 
 
 def records(study):

@@ -243,4 +243,4 @@ def test_regret_of_ten_thousand_pulls(do_study, tmp_path, name, expected):
         (environment,) = analyse(results).environments
         assert [agent.agent for agent in environment.agents] == list(expected)
         assert environment.agents[0].regret == environment.agents[0].metric.mean
-        assert {pair.verdict for pair in environment.pairs} == {"better"}
+        assert {pair.word for pair in environment.pairs} == {"better"}

@@ -53,7 +53,7 @@ def tuning_record(tuning_trial):
     retested |= {"n_runs": 4, "n_failed": 1}
     retested["interval"] = {"point": 0.5, "low": 0.4, "high": 0.6, "n": 4, "n_missing": 0}
     winner = {**retested, "label": "trial 2", "number": 2, "held_out": 0.7}
-    winner |= {"verdict": "better, as seen", "said": "better <on average>, as long as it holds"}
+    winner |= {"verdict": "better so far"}
     space = {
         name: json.dumps({"name": f"{kind}Distribution", "attributes": attributes})
         for name, (kind, attributes) in SEARCH_SPACE.items()

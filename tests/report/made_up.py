@@ -10,19 +10,12 @@ from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalys
 from experiments.bandits import PullStatistics
 from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from verdicts import (
-    Estimate,
-    MeanDifference,
-    MeanVerdict,
-    PairComparison,
-    Summary,
-    ThresholdSummary,
-)
+from verdicts import AgentRuns, Best, Estimate, Pair, Study, Summary, ThresholdSummary
 
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
-def estimate(point, low=None, high=None, n=4):
+def estimate(point, low=None, high=None, n=20):
     """With an interval from a tenth below the point to a fifth above by default."""
     low = point - 0.1 if low is None else low
     return Estimate(point, low, point + 0.2 if high is None else high, n)
@@ -30,16 +23,18 @@ def estimate(point, low=None, high=None, n=4):
 
 def agent(label, mean, **changes):
     """An agent whose figures are the mean plus 1, 2, 3 and so on, so that none is another."""
-    share = estimate(0.75, 0.5, 0.9)
+    share = estimate(0.75, 0.5, 0.9, n=4)
+    ends = (0.0, 1.0)
     figures = AgentAnalysis(
         agent=label,
         algo="qlearning",
+        runs=AgentRuns("lake", label, 4, 0, mean / 100, ends, mean / 100, ends, 0, ends, 0.5),
         judged=estimate(mean / 100),
         spread=0.0,
         n_runs=4,
         n_missing=0,
-        metric=Summary(estimate(mean), estimate(mean + 1), estimate(mean + 2)),
-        score=Summary(estimate(mean / 100), estimate(mean / 50), estimate(mean / 25)),
+        metric=Summary(estimate(mean), estimate(mean + 1), mean + 2),
+        score=estimate(mean / 100),
         final=estimate(mean + 3),
         area=estimate(mean + 4),
         last_episodes=estimate(mean + 5),
@@ -53,26 +48,34 @@ def agent(label, mean, **changes):
     return replace(figures, **changes)
 
 
-def pair(first, second, verdict, difference=0.1, *, is_conditional=False, **changes):
-    mean = MeanDifference(
-        difference, difference - 0.05, difference + 0.05, difference - 0.02, difference + 0.02, 0.01
-    )
-    found = PairComparison(
-        first,
-        second,
-        said=MeanVerdict(verdict, is_conditional),
-        mean=mean,
-        typical="undecided",
-        probability_of_improvement=estimate(0.5, 0.25, 0.75),
-        seeds_needed=None,
-        n_seeds=4,
-    )
+def failing(one, n_failed, n):
+    """An agent of whose runs so many failed."""
+    return replace(one, runs=replace(one.runs, failed=n_failed, n=n))
+
+
+def pair(first, second, word, difference=0.1, **changes):
+    ends = (difference - 0.05, difference + 0.05)
+    found = Pair("lake", first, second, word, False, difference, ends, 0.5, 0.5, 4)
     return replace(found, **changes)
 
 
 def environment(agents=(), label="lake", **changes):
-    known = EnvironmentAnalysis(label, "Lake-v0", 100.0, 20.0, 96.0, 1.6, True, tuple(agents), ())
-    return replace(known, **{"fewest": 4, **changes})
+    known = EnvironmentAnalysis(
+        environment=label,
+        env_id="Lake-v0",
+        optimum=100.0,
+        baseline=20.0,
+        threshold=96.0,
+        is_score=True,
+        margin=0.02,
+        bounds=(0.0, 100.0),
+        exact=True,
+        agents=tuple(agents),
+        pairs=(),
+        best=Best((), False, False),
+        failure_threshold=0.4,
+    )
+    return replace(known, **changes)
 
 
 def study(labels, metric="final", places=("lake",), n_seeds=4):
@@ -93,7 +96,11 @@ def analysis(environments, labels, root=None, pulls=None, overall=None, cpu=(), 
     runs = runs.reindex(columns=RUN_COLUMNS)
     curves = pd.DataFrame(columns=CURVE_COLUMNS)
     results = StudyResults(asked, root, runs, curves, (), pulls or {})
-    return StudyAnalysis(results, tuple(environments), overall)
+    agents = [replace(a.runs, environment=e.environment) for e in environments for a in e.agents]
+    pairs = [replace(p, environment=e.environment) for e in environments for p in e.pairs]
+    best = {one.environment: one.best for one in environments}
+    said = Study(agents, pairs, best, dict.fromkeys(best, 0.4), 0.01, {})
+    return StudyAnalysis(results, said, tuple(environments), overall)
 
 
 def pulls(start, n=(1, 10, 100), n_runs=4):

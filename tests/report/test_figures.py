@@ -35,7 +35,6 @@ from report.series import (
     agent_marks,
 )
 from tests.report import made_up
-from verdicts import Band
 
 GREY = "#595959"
 NAMED = {**dict(zip(COLOURS, ("blue", "orange", "green"), strict=False)), GREY: "grey"}
@@ -89,8 +88,8 @@ def whole_study(root, names, label, linear_up_to=None, on_variant=()):
     densities = np.arange(12.0).reshape(1, 2, 2, 3)
     belief = Belief(names[1], np.array([2000]), THIRD, densities, [[0.25, 0.75], [None, 0.5]])
     pulls = {name: made_up.pulls(10.0 + 40 * n) for n, name in enumerate(names)}
-    profiles = {name: Band(1 - THIRD, (1 - THIRD) / 2, 1 - THIRD / 2) for name in names}
-    overall = OverallAnalysis({}, {}, (), THIRD, profiles)
+    profiles = dict.fromkeys(names, 1 - THIRD)
+    overall = OverallAnalysis({}, (), None, THIRD, profiles)
     learnt = curves_of(names, linear_up_to, on_variant)
     places = (
         EnvironmentSeries(lake, learnt, runs_of(names), None, swept, {"swept": grid}),
@@ -293,9 +292,7 @@ Performance profiles over environments | score | share of runs with a higher sco
 y axis: 50%
 first: orange -- (0 1) (0.5 0.5) (1 0)
 second: blue - (0 1) (0.5 0.5) (1 0)
-band orange 0.2 (0 0.5 1) (0.5 0.25 0.75) (1 0 0.5)
-band blue 0.2 (0 0.5 1) (0.5 0.25 0.75) (1 0 0.5)
-names first, second, 95 % interval
+names first, second
 """  # noqa: E501  # as it is drawn
 
 

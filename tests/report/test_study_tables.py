@@ -18,7 +18,6 @@ from report.documents import (
     name_of,
     processor_seconds,
     ranking,
-    standings,
     table_as,
     verdicts_as,
 )
@@ -27,7 +26,7 @@ from report.page.frame import Report
 from report.ranking import COLUMNS, Row
 from report.series import StudySeries
 from tests.report import made_up
-from verdicts import Estimate, FailureCount, ThresholdSummary
+from verdicts import Best, Estimate, ThresholdSummary
 
 NAMES = ["low", "same", "open", "first"]
 CHANGES = ("random starts", "rewards x 0.01")
@@ -36,18 +35,11 @@ CPU += [("low", "lake", 1.0), ("low", "lake", None)]  # which was not measured
 
 
 def lake(**changes):
-    """One with the highest mean, one equivalent to it, one undecided, one worse."""
+    """One with the highest mean, one tied with it, one undecided, one worse."""
     agents = [made_up.agent(name, mean) for name, mean in zip(NAMES, (30, 89, 80, 90), strict=True)]
-    agents[2] = replace(agents[2], spread=0.1234)
-    pairs = (
-        made_up.pair("first", "same", "equivalent"),
-        made_up.pair("open", "first", "undecided"),
-        made_up.pair("low", "first", "worse"),
-        made_up.pair("same", "low", "better"),
-    )
-    failed = {"first": FailureCount(0, 4, 0.6), "open": FailureCount(1, 4, 0.8)}
-    known = {"agents": agents[::-1], "pairs": pairs, "failures": failed}
-    return made_up.environment(**{**known, **changes})
+    agents[2] = made_up.failing(replace(agents[2], spread=0.1234), 1, 4)
+    best = Best(("first", "same", "open"), tied=False, so_far=False)
+    return made_up.environment(**{"agents": agents[::-1], "best": best, **changes})
 
 
 def of_lake(cpu=(), metric="final", **changes):
@@ -58,9 +50,8 @@ def of_lake(cpu=(), metric="final", **changes):
 
 LEGEND = (
     "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts as 0. "
-    "±: the standard deviation of runs. Bold: shown to be best on average, several where they are "
-    "shown to be equal, or the same in all runs of all agents. ?: 4 seeds do not show that another "
-    "agent is better on average. In brackets: processor time of the median run."
+    "±: the standard deviation of runs. Bold: no other agent is shown to be better on average. "
+    "In brackets: processor time of the median run."
 )
 
 
@@ -70,9 +61,9 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
         "|  | lake |",
         "| --- | --- |",
         "| `low` | 0.3 |",
-        "| `same` | 0.89 ? (0.12 s) |",
-        "| `open` | 0.8 ± 0.12 ?, 1 of 4 failed |",
-        "| `first` | 0.9 ? (40 s) |",
+        "| `same` | **0.89** (0.12 s) |",
+        "| `open` | **0.8** ± 0.12, 1 of 4 failed |",
+        "| `first` | **0.9** (40 s) |",
     ]
     assert legend == LEGEND
     assert processor_seconds(of_lake(cpu=CPU).results) == {
@@ -81,17 +72,10 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost():
     }
 
 
-def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure():
-    study = made_up.study(NAMES)
-    seen = {"first": "open", "same": "open", "open": "open", "low": "behind"}
-    assert standings(study, lake()) == seen
-    two = lake(
-        agents=lake().agents[0:1] + lake().agents[2:], pairs=lake().pairs[:1] + lake().pairs[2:]
-    )
-    assert standings(study, two) == {"first": "best", "same": "best", "low": "behind"}
-    assert set(standings(study, lake(is_same=True)).values()) == {"best"}
-    assert standings(study, lake(baseline=95.0)) == {}
-    assert standings(study, made_up.environment([made_up.agent("first", math.nan)])) == {}
+def test_nobody_leads_where_none_has_learnt():
+    for changes, n_bold in (({}, 3), ({"baseline": 95.0}, 0)):
+        rows = headline(of_lake(**changes)).rows
+        assert sum(cell.is_bold for row in rows for cell in row.cells) == n_bold
 
 
 def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_footnote():
@@ -130,7 +114,7 @@ def test_nothing_of_a_text_is_markup():
 def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
     names = [r"\end{table}", "a_b & 50%", "[1]", "*$x^2$", "中"]
     agents = [made_up.agent(name, 90 - 10 * n) for n, name in enumerate(names)]
-    pairs = (made_up.pair(names[0], names[1], "equivalent"),)
+    pairs = (made_up.pair(names[0], names[1], "tied"),)
     found = made_up.analysis([made_up.environment(agents, "lake #1", pairs=pairs)], names)
     text = verdicts_as("tex", found, "python compare.py 'a_b & 50%' --x")
     plain = re.sub(r"\\[{}$&#%_]", "", text)
@@ -140,8 +124,8 @@ def test_whatever_labels_say_every_group_and_environment_of_latex_is_closed():
     assert sorted(begun) == sorted(ended)
     assert begun.count("table") == 2  # the headline, and one environment
     for rows in re.findall(r"\\midrule\n(.*?)\\bottomrule", plain, re.DOTALL):
-        # What no agent has is left out: runs that failed, and the processor time.
-        assert {line.count("&") for line in rows.splitlines()} <= {1, 4}
+        # What no agent has is left out: the processor time.
+        assert {line.count("&") for line in rows.splitlines()} <= {1, 5}
         assert all(line.endswith(r"\\") for line in rows.splitlines())
     # Comments stand at the top alone, and say what the text needs.
     needs, signs, *lines = text.splitlines()
@@ -170,9 +154,10 @@ def ranked(agents, **changes):
 
 RANKING = """
 Mean       | over seeds          | descending | 90    89.9 to 90.2 | 40    39.9 to 40.2
-IQM        | middle half         | descending | 92    91.9 to 92.2 | 42    41.9 to 42.2
+IQM        | middle half         | descending | 92                 | 42
 Median     | over seeds          | descending | 91    90.9 to 91.2 | 41    40.9 to 41.2
 Score      | 1 is optimal        | descending | 0.9   0.8 to 1.1   | 0.4   0.3 to 0.6
+Failed     | runs below 0.4      | ascending  | 0 of 4 0% to 100%  | 2 of 4 0% to 100%
 Gap        | to the optimum      | ascending  | 7     6.8 to 7.1   | 57    56.8 to 57.1
 Success    | in the end          | descending | 50.0% 25% to 62%   | 50.0% 25% to 62%
 Stays from | step, at 96         | ascending  | 100   75% of runs  | 50    75% of runs
@@ -183,7 +168,10 @@ Runs       | finished            | descending | 4                  | 4     1 mis
 
 
 def test_figures_of_each_agent_the_best_first():
-    agents = [made_up.agent("first", 90.0), made_up.agent("second", 40.0, n_missing=1)]
+    agents = [
+        made_up.agent("first", 90.0),
+        made_up.failing(made_up.agent("second", 40.0, n_missing=1), 2, 4),
+    ]
     headings, rows = ranked(agents)
     assert [row.agent for row, _ in rows] == ["first", "second"]
     expected = [[" ".join(x.split()) for x in row.split("|")] for row in RANKING.split("\n")[1:-1]]
@@ -193,7 +181,7 @@ def test_figures_of_each_agent_the_best_first():
     ] == expected
     # They are sorted by their figures.
     values = [cell.value for cell in rows[0][1]]
-    assert values == pytest.approx([90, 92, 91, 0.9, 7, 0.5, 100, 98, 99, 4])
+    assert values == pytest.approx([90, 92, 91, 0.9, 0, 7, 0.5, 100, 98, 99, 4])
 
 
 def test_a_bracket_a_curve_that_falls_again_and_agents_without_figures():

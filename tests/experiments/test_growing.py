@@ -1,0 +1,118 @@
+"""Studies that get more seeds until they are decided, and the file with their planned looks."""
+
+import pandas as pd
+import pytest
+
+from experiments.analysis import analyse
+from experiments.growing import (
+    LOOKS_FILE,
+    first_counts,
+    grown,
+    looked,
+    looks_of,
+    next_counts,
+    plan_of_looks,
+    write_looks,
+)
+from experiments.plan import plan
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
+
+LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
+TWO, THREE = ("qlearning", "sarsa"), ("qlearning", "sarsa", "expected_sarsa")
+# The first is far ahead; the others overlap, and need more seeds.
+ENDS = {
+    "qlearning": [90 + k % 7 for k in range(60)],
+    "sarsa": [(37 * k) % 50 for k in range(60)],
+    "expected_sarsa": [(29 * k) % 50 + 1 for k in range(60)],
+}
+
+
+def study_of(agents=TWO, n_seeds=10, **fields):
+    specs = tuple(AgentSpec(name, name) for name in agents)
+    return StudySpec("s", "S", specs, fields.pop("environments", (LAKE,)), n_seeds, **fields)
+
+
+def results_of(study, root, ends=ENDS, counts=None):
+    """A study whose runs ended so, by agent and seed; None for one that is missing."""
+    planned = plan(study, root, counts)
+    rows = []
+    for run in planned:
+        end = ends[run.agent][run.seed]
+        if end is not None:
+            row = {"agent": run.agent, "environment": run.environment, "env_id": run.spec.env_id}
+            row |= {"seed": run.seed, "final": float(end), "area": float(end), "score": end / 100}
+            rows.append({**row, "exact": True, "optimum": 100.0, "baseline": 0.0})
+    tables = pd.DataFrame(rows, columns=RUN_COLUMNS), pd.DataFrame(columns=CURVE_COLUMNS)
+    return StudyResults(study, root, *tables, tuple(planned))
+
+
+def grow(study, root, most=None, steps=99, ends=ENDS):
+    """What the command does, with made-up runs; the verdicts after each look."""
+    root.mkdir(exist_ok=True)
+    looks = plan_of_looks(study, root, most)
+    write_looks(root, looks)
+    counts, found = first_counts(study), []
+    for _ in range(steps):
+        now = results_of(grown(study, counts), root, ends, counts)
+        found.append(looked(now, looks_of(root)))
+        if found[-1].is_done:
+            break
+        counts = next_counts(found[-1])
+    return found
+
+
+def test_a_study_grows_where_it_is_undecided(tmp_path):
+    found = grow(study_of(THREE), tmp_path, most=40)
+    assert looks_of(tmp_path) == (10, 20, 40)
+    assert [each.n_looks for each in found] == [1, 2, 3]
+    assert [each.seeds["lake"]["sarsa"] for each in found] == [20, 40, 40]
+    assert {each.seeds["lake"]["qlearning"] for each in found} == {10}
+    undecided = [(p.first, p.second) for p in found[-1].pairs if p.word == "undecided"]
+    assert undecided == [("sarsa", "expected_sarsa")]
+    # The same command goes on from the first look, with the runs that are there.
+    assert grow(study_of(THREE), tmp_path)[-1] == found[-1]
+
+
+def test_a_growing_study_is_judged_by_its_looks_wherever_it_is_shown(tmp_path):
+    said = grow(study_of(THREE), tmp_path, most=40)[-1]
+    counts = next_counts(said)
+    results = results_of(grown(study_of(THREE), counts), tmp_path, counts=counts)
+    shown = analyse(results, looks=looks_of(tmp_path))
+    assert shown.verdicts == said
+    assert {agent.n_runs for agent in shown.environments[0].agents} == {10, 40}
+
+
+PLANNED = [
+    ({}, 60, "looks [10, 20, 40], now [10, 20, 40, 60]"),
+    ({"n_seeds": 12}, None, "looks [10, 20, 40], now [12, 24, 40]"),
+    ({"metric": "area"}, None, "metric final, now area"),
+    ({"margin": 1.0}, None, "margin None, now 1.0"),
+    ({"agents": TWO}, None, "agents ['expected_sarsa', 'qlearning', 'sarsa'], now "),
+]
+
+
+def test_what_was_planned_cannot_change(tmp_path):
+    grow(study_of(THREE), tmp_path, most=40, steps=1)
+    for changes, most, words in PLANNED:
+        with pytest.raises(UserError, match="looks were planned before the first") as refusal:
+            plan_of_looks(study_of(**{"agents": THREE, **changes}), tmp_path, most)
+        assert words in str(refusal.value)
+
+
+def test_a_plan_that_cannot_be_read_is_refused(tmp_path):
+    assert looks_of(tmp_path) == ()
+    for text in ("", "{", "[]", '{"looks": []}', '{"looks": ["a"]}'):
+        (tmp_path / LOOKS_FILE).write_text(text)
+        with pytest.raises(UserError, match=r"looks\.json cannot be read .*: remove it"):
+            looks_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("agents", "most", "complaint"),
+    [(TWO[:1], None, "takes two agents or more"), (TWO, 9, "--max-seeds is 9, the study begins")],
+)
+def test_what_cannot_grow(tmp_path, agents, most, complaint):
+    with pytest.raises(UserError, match=complaint):
+        plan_of_looks(study_of(agents), tmp_path, most)
