@@ -22,9 +22,6 @@ from verdicts.estimates import (
     Estimate,
     Summary,
     mean_over_runs,
-    median_over_runs,
-    paired_difference,
-    share_interval,
     summarise,
     unseen_share,
 )
@@ -39,33 +36,8 @@ from verdicts.judging import (
     look_sizes,
 )
 
-__all__ = [
-    "FEW",
-    "UNBOUNDED",
-    "AgentRuns",
-    "Band",
-    "Best",
-    "Bounds",
-    "Estimate",
-    "Pair",
-    "Study",
-    "Summary",
-    "ThresholdSummary",
-    "Word",
-    "area_under_curve",
-    "curve_band",
-    "failure_threshold",
-    "judge",
-    "look_sizes",
-    "mean_over_runs",
-    "median_over_runs",
-    "on_grid",
-    "paired_difference",
-    "performance_profile",
-    "share_interval",
-    "shared_grid",
-    "steps_to_threshold",
-    "summarise",
-    "summarise_steps",
-    "unseen_share",
-]
+__all__ = ["FEW", "UNBOUNDED", "AgentRuns", "Band", "Best", "Bounds", "Estimate", "Pair", "Study"]
+__all__ += ["Summary", "ThresholdSummary", "Word", "area_under_curve", "curve_band"]
+__all__ += ["failure_threshold", "judge", "look_sizes", "mean_over_runs", "on_grid"]
+__all__ += ["performance_profile", "shared_grid", "steps_to_threshold", "summarise"]
+__all__ += ["summarise_steps", "unseen_share"]

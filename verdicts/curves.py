@@ -1,4 +1,8 @@
-"""Learning curves: shared steps, bands, areas, thresholds, and performance profiles."""
+"""Learning curves: shared steps, bands, areas, thresholds, and performance profiles.
+
+A curve has steps of shape (n_points,), non-decreasing, and values of shape (n_points,), or
+(n_curves, n_points) for several; others are refused with a ValueError.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +24,6 @@ from verdicts.estimates import (
     t_reach,
 )
 
-MOST_POINTS = 500  # the largest number of points that a figure can show
-
 
 @dataclass(frozen=True)
 class Band:
@@ -36,9 +38,7 @@ class Band:
 class ThresholdSummary:
     """How soon runs reach a threshold, where some never do."""
 
-    #: Median steps to the threshold. Runs that never reach it count as later than all others; so it
-    #: is infinite where half of the runs or more never do.
-    median: Estimate
+    median: Estimate  #: of the steps; a run that never reaches it counts as later than all others
     share_reached: Estimate  #: the share of runs that reach it
 
 
@@ -52,33 +52,18 @@ def _curve(steps: ArrayLike, values: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
-    """The mean height of a curve over its span: the trapezoidal rule, divided by the span.
-
-    Args:
-        steps: shape (n_points,), non-decreasing.
-        values: shape (n_points,) or (n_curves, n_points).
-
-    Returns:
-        Shape () or (n_curves,); the last value where the span is 0.
-
-    Raises:
-        ValueError: for decreasing steps, or shapes that do not fit; likewise below.
-    """
+    """The mean height of each curve, by the trapezoidal rule; shape () or (n_curves,)."""
     x, y = _curve(steps, values)
     if x[-1] == x[0]:
         return y[..., -1]
     return np.asarray(np.trapezoid(y, x, axis=-1) / (x[-1] - x[0]))
 
 
-def shared_grid(curves: Sequence[ArrayLike], n_points: int = MOST_POINTS) -> Floats:
-    """Steps at which several curves can be compared, ``n_points`` at most.
+def shared_grid(curves: Sequence[ArrayLike], n_points: int = 500) -> Floats:
+    """Steps at which curves with these steps can be compared.
 
-    They are the evaluation points of all curves within the span that all of them cover; evenly
-    spaced points of that span where those are too many.
-
-    Args:
-        curves: the steps of each curve, non-decreasing.
-        n_points: the largest number of steps.
+    They are the points of all curves within the span that all of them cover; evenly spaced points
+    of that span where those are more than ``n_points``.
     """
     steps = [np.asarray(curve, np.float64) for curve in curves]
     if not steps or min(map(len, steps)) == 0:
@@ -92,16 +77,7 @@ def shared_grid(curves: Sequence[ArrayLike], n_points: int = MOST_POINTS) -> Flo
 
 
 def on_grid(steps: ArrayLike, values: ArrayLike, grid: ArrayLike) -> Floats:
-    """A curve at other steps: at each the latest evaluation so far, NaN before the first.
-
-    Args:
-        steps: shape (n_points,), non-decreasing.
-        values: shape (n_points,) or (n_curves, n_points).
-        grid: shape (n_grid,).
-
-    Returns:
-        Shape (n_grid,) or (n_curves, n_grid).
-    """
+    """Curves at other steps, of shape (n_grid,): the latest value so far, NaN before the first."""
     x, y = _curve(steps, values)
     latest = np.searchsorted(x, np.asarray(grid, np.float64), side="right") - 1
     return np.where(latest < 0, np.nan, y[..., np.maximum(latest, 0)])
@@ -115,17 +91,16 @@ def curve_band(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Band:
         bounds: the least and the greatest possible value.
     """
     table = np.asarray(values, np.float64)
-    table = np.where(np.isfinite(table), table, np.nan)
-    n = np.isfinite(table).sum(axis=0)
-    least, most = (find(table, axis=0) for find in (np.fmin.reduce, np.fmax.reduce))
+    known = np.isfinite(table)
+    table, n = np.where(known, table, np.nan), known.sum(axis=0)
+    least, most = np.fmin.reduce(table), np.fmax.reduce(table)
     # Relative to the smallest value, so that the mean of equal values is exact.
-    above = np.where(np.isfinite(table), table - least, 0.0)
+    above = np.where(known, table - least, 0.0)
     offset = above.sum(axis=0) / np.maximum(n, 1)
     equal = most - least <= SAME * np.maximum(1.0, np.abs(most))
     mean = np.where(equal, least, least + offset)
-    spread = np.where(np.isfinite(table), above - offset, 0.0)
-    variance = np.where(equal, 0.0, (spread**2).sum(axis=0) / np.maximum(n - 1, 1))
-    reach = t_reach(np.maximum(n, 2), variance)
+    squares = (np.where(known, above - offset, 0.0) ** 2).sum(axis=0)
+    reach = t_reach(np.maximum(n, 2), np.where(equal, 0.0, squares / np.maximum(n - 1, 1)))
     low = np.where(n < FEW, least, np.minimum(mean, np.maximum(mean - reach, bounds[0])))
     high = np.where(n < FEW, most, np.maximum(mean, np.minimum(mean + reach, bounds[1])))
     return Band(mean, low, high)
@@ -134,35 +109,21 @@ def curve_band(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Band:
 def steps_to_threshold(
     steps: ArrayLike, values: ArrayLike, threshold: float, *, to_stay: bool = False
 ) -> float:
-    """The step of the first evaluation whose value is at least the threshold.
+    """The step of the first evaluation that reaches a threshold, or from which all later ones do.
 
-    Args:
-        steps: shape (n_points,), non-decreasing.
-        values: shape (n_points,).
-        threshold: in the unit of the values.
-        to_stay: whether all later evaluations have to reach it too. A fluctuating curve crosses a
-            threshold by luck long before.
-
-    Returns:
-        The step; infinity if the threshold is never reached, NaN if there is no evaluation.
+    ``to_stay`` chooses the latter: a fluctuating curve crosses a threshold by luck long before.
+    Infinity if it is never reached, NaN without evaluations.
     """
     x, y = _curve(steps, values)
-    if np.isnan(y).all():
-        return float("nan")
     x, y = x[~np.isnan(y)], y[~np.isnan(y)]
     reached = y >= threshold
     if to_stay:
         reached = np.logical_and.accumulate(reached[::-1])[::-1]
-    return float(x[reached.argmax()]) if reached.any() else float("inf")
+    return float(x[reached.argmax()]) if reached.any() else np.inf if len(y) else np.nan
 
 
 def summarise_steps(steps: ArrayLike) -> ThresholdSummary:
-    """How soon runs reach a threshold, and how many do.
-
-    Args:
-        steps: the result of ``steps_to_threshold`` for each run, shape (n_runs,): infinity for a
-            run that never reaches the threshold, NaN for a missing run.
-    """
+    """How soon runs reach a threshold, and how many do, from ``steps_to_threshold`` of each."""
     median = median_over_runs(steps)
     if not median.n:
         return ThresholdSummary(median, median)
@@ -177,15 +138,11 @@ def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
 
     Args:
         scores: shape (n_runs, n_envs), on a scale that the environments share; NaN is missing.
-        thresholds: shape (n_thresholds,).
-
-    Returns:
-        Shape (n_thresholds,).
+        thresholds: shape (n_thresholds,), as is the result.
 
     Source: Agarwal et al. (2021), section 4.2, "run-score distributions".
     """
     table, marks = np.asarray(scores, np.float64), np.asarray(thresholds, np.float64)
-    known = np.isfinite(table)
-    above = ((table[..., None] > marks) & known[..., None]).sum(axis=0)
-    shares: Floats = (above / known.sum(axis=0)[:, None]).mean(axis=0)
+    above = (table[..., None] > marks).sum(axis=0)
+    shares: Floats = (above / np.isfinite(table).sum(axis=0)[:, None]).mean(axis=0)
     return shares

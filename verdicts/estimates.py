@@ -127,18 +127,3 @@ def share_interval(count: int, n: int) -> tuple[float, float]:
 def unseen_share(n: int) -> float:
     """The largest share of further runs that may be of a kind that none of ``n`` runs showed."""
     return 1 - LEVEL ** (1 / n) if n else 1.0
-
-
-def paired_difference(first: ArrayLike, second: ArrayLike, level: float = LEVEL) -> Estimate:
-    """The mean of ``first`` - ``second`` over pairs, both (n,), with Student's t interval.
-
-    Raises:
-        ValueError: for shapes that do not pair up.
-    """
-    x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    if x.ndim != 1 or x.shape != y.shape:
-        raise ValueError(f"values of shapes {x.shape} and {y.shape} do not pair up")
-    apart = finite(x - y)
-    mean, variance = mean_and_variance(apart)
-    reach = float(t_reach(len(apart), variance, level)) if len(apart) > 1 else np.nan
-    return Estimate(mean, mean - reach, mean + reach, len(apart), x.size - len(apart))

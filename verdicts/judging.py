@@ -137,12 +137,10 @@ class Study:
 
 
 class _Evidence(NamedTuple):
-    """A pair's smallest p-values over all looks so far, and the runs behind each."""
+    """A pair's smallest p-values over all looks so far, each with the runs behind it."""
 
-    p_different: float
-    different: Difference
-    p_tied: float
-    tied: Difference
+    different: tuple[float, Difference]
+    tied: tuple[float, Difference]
     last: Difference
 
 
@@ -235,15 +233,9 @@ def _evidence(
             if rules.against not in ("", a, b) or words.get(key, "undecided") != "undecided":
                 continue
             now = student(runs[a], runs[b]) if rules.paired else welch(samples[a], samples[b])
-            new = _Evidence(p_different(now), now, p_tied(now, margin), now, now)
+            new = _Evidence((p_different(now), now), (p_tied(now, margin), now), now)
             old = before.get(key, new)
-            apart, close = (
-                min(old, new, key=lambda e: e.p_different),
-                min(old, new, key=lambda e: e.p_tied),
-            )
-            found[key] = _Evidence(
-                apart.p_different, apart.different, close.p_tied, close.tied, now
-            )
+            found[key] = _Evidence(min(old[0], new[0]), min(old[1], new[1]), now)
     return found
 
 
@@ -260,8 +252,8 @@ class _Words(NamedTuple):
 
 
 def _words(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> _Words:
-    apart = holm({key: each.p_different for key, each in evidence.items()})
-    close = holm({key: each.p_tied for key, each in evidence.items()})
+    apart = holm({key: each.different[0] for key, each in evidence.items()})
+    close = holm({key: each.tied[0] for key, each in evidence.items()})
     levels = (1 - FOR_TIES) * rules.level, FOR_TIES * rules.level
     words: dict[Key, Word] = {}
     for environment, runs in scores.items():
@@ -270,7 +262,7 @@ def _words(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
         here = [(key, place[key[1]], place[key[2]]) for key in evidence if key[0] == environment]
         for key, a, b in here:
             if apart[key] <= levels[0]:
-                ahead[(a, b) if evidence[key].different.apart > 0 else (b, a)] = True
+                ahead[(a, b) if evidence[key].different[1].apart > 0 else (b, a)] = True
             same[a, b] = same[b, a] = close[key] <= levels[1]
         _close(ahead, same)
         for key, a, b in here:
@@ -314,7 +306,7 @@ def _study(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
 
 def _pair(rules: _Rules, key: Key, evidence: _Evidence, found: _Words) -> Pair:
     word, margin = found.words[key], _of(rules.margin, key[0])
-    shown = {"tied": evidence.tied, "undecided": evidence.last}.get(word, evidence.different)
+    shown = {"tied": evidence.tied[1], "undecided": evidence.last}.get(word, evidence.different[1])
     low, high = difference_interval(shown, found.levels[0], rules.ends(key[0]))
     least = {"better": 0.0, "tied": -margin}.get(word, -np.inf)
     most = {"worse": 0.0, "tied": margin}.get(word, np.inf)

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from verdicts.estimates import SAME, UNBOUNDED, Bounds, finite, mean_and_variance, t_reach
+from verdicts.estimates import (
+    SAME,
+    UNBOUNDED,
+    Bounds,
+    Floats,
+    finite,
+    mean_and_variance,
+    t_reach,
+)
 
 MOST_NEEDED = 10_000  # the largest number of seeds to propose
 K = TypeVar("K", bound=Hashable)
@@ -26,7 +34,7 @@ class Sample(NamedTuple):
         """Student's t interval of the mean, cut at the bounds."""
         if self.n < 2:
             return ends
-        reach = float(t_reach(self.n, self.variance, level)) if self.variance > 0 else 0.0
+        reach = float(t_reach(self.n, self.variance, level))
         return max(self.mean - reach, ends[0]), min(self.mean + reach, ends[1])
 
 
@@ -71,15 +79,14 @@ def student(first: ArrayLike, second: ArrayLike) -> Difference:
     return Difference(len(x), apart, error, len(x) - 1, (sample(x), sample(y)))
 
 
-def lowest_p(n: ArrayLike) -> np.float64:
-    """The lowest one-sided p-value from n runs of both agents, elementwise.
+def lowest_p(n: ArrayLike) -> Floats:
+    """The lowest one-sided p-value from n runs of both agents, elementwise; n is at least 2.
 
     Equal runs must not prove everything: it is as if one run in 5 (n + 1) scored like the other
     agent. So 3 runs decide 7 pairs at most, 4 runs 99, 5 runs 1,600.
     """
-    runs = np.maximum(n, 2.0)
-    lowest = special.stdtr(2 * runs - 2, -np.sqrt(2.5 * runs * (runs + 1)))
-    return np.float64(np.where(np.asarray(n) < 2, 0.5, lowest)) if np.ndim(n) == 0 else lowest
+    runs = np.asarray(n, np.float64)
+    return np.asarray(special.stdtr(2 * runs - 2, -np.sqrt(2.5 * runs * (runs + 1))))
 
 
 def p_above(found: Difference, least: float, sign: float = 1.0) -> float:
@@ -89,11 +96,10 @@ def p_above(found: Difference, least: float, sign: float = 1.0) -> float:
     apart = sign * found.apart - least
     if abs(apart) <= SAME * max(1.0, *(abs(each.mean) for each in found.samples)):
         return 0.5
+    p = float(apart < 0)
     if found.error > 0:
         p = float(special.stdtr(found.freedom, -apart / found.error))
-    else:
-        p = float(apart < 0)
-    return max(p, 0.0 if np.isinf(found.n) else float(lowest_p(found.n)))
+    return max(p, float(lowest_p(found.n)))
 
 
 def p_different(found: Difference) -> float:
@@ -120,10 +126,8 @@ def holm(p_values: Mapping[K, float]) -> dict[K, float]:
 def difference_interval(found: Difference, level: float, ends: Bounds) -> Bounds:
     """The differences that the test does not reject at a level, cut at what is possible."""
     low, high = UNBOUNDED
-    if np.isinf(found.n) or 2 * lowest_p(found.n) <= level:
-        reach = 0.0
-        if found.error > 0:
-            reach = float(special.stdtrit(found.freedom, 1 - level / 2)) * found.error
+    if found.n > 1 and 2 * lowest_p(found.n) <= level:
+        reach = float(special.stdtrit(found.freedom, 1 - level / 2) * found.error)
         low, high = found.apart - reach, found.apart + reach
     (a_low, a_high), (b_low, b_high) = (each.interval(level, ends) for each in found.samples)
     low, high = max(low, a_low - ends[1], ends[0] - b_high), min(high, a_high - ends[0])
@@ -133,13 +137,8 @@ def difference_interval(found: Difference, level: float, ends: Bounds) -> Bounds
 def seeds_needed(found: Difference, levels: tuple[float, float], margin: float) -> int | None:
     """How many seeds of each would decide a pair, if further runs have these means and variances.
 
-    Args:
-        found: the pair.
-        levels: those of this pair, for a difference and for a tie.
-        margin: the largest difference that does not matter.
-
-    Returns:
-        The number, to one per cent; None for fewer than two runs, or where more than 10,000 would.
+    To one per cent; None for fewer than two runs, or where more than 10,000 would. ``levels`` are
+    those of this pair, for a difference and for a tie.
     """
     if found.n < 2 or np.isinf(found.n):
         return None

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from mdp.transition_model import Bools, Floats, Ints
-from verdicts import Estimate, paired_difference
+from verdicts import Estimate
 
 N_FOLDS = 5
 # The weight of each coefficient's prior, in pulls.
@@ -257,7 +257,9 @@ def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
     The interval is valid for many terms without dominating ones: check the effective sample size.
     It does not cover the bias of an estimator.
     """
-    return paired_difference(terms, np.zeros_like(terms), 1 - confidence)
+    mean = float(terms.mean())
+    reach = float(stats.t.isf((1 - confidence) / 2, len(terms) - 1) * stats.sem(terms))
+    return Estimate(mean, mean - reach, mean + reach, len(terms))
 
 
 def difference_in_value(
@@ -276,7 +278,7 @@ def difference_in_value(
             simultaneously with 95 %.
     """
     confidence = 1 - 0.05 / n_comparisons
-    found = paired_difference(first.doubly_robust, second.doubly_robust, 1 - confidence)
+    found = mean_reward(first.doubly_robust - second.doubly_robust, confidence)
     apart = first.weights - second.weights
     variance = float((apart**2).mean() * (first.errors**2).mean()) / len(apart)
     half = float(stats.t.isf(0.05 / n_comparisons / 2, len(apart) - 1)) * np.sqrt(variance)

@@ -10,16 +10,14 @@ from verdicts import (
     area_under_curve,
     curve_band,
     mean_over_runs,
-    median_over_runs,
     on_grid,
-    paired_difference,
     performance_profile,
-    share_interval,
     shared_grid,
     steps_to_threshold,
     summarise,
     summarise_steps,
 )
+from verdicts.estimates import median_over_runs, share_interval
 
 INF, NAN = math.inf, math.nan
 
@@ -87,18 +85,6 @@ def test_a_share_has_the_interval_of_clopper_and_pearson():
     for count, n in ((0, 10), (3, 10), (10, 10), (1, 200)):
         exact = stats.binomtest(count, n).proportion_ci(0.95, method="exact")
         assert share_interval(count, n) == pytest.approx((exact.low, exact.high))
-
-
-def test_paired_differences_have_students_interval():
-    first, second = np.random.default_rng(0).random((2, 12))
-    second[3] = NAN
-    found = paired_difference(first, second, 0.1)
-    apart = np.delete(first - second, 3)
-    expected = stats.t.interval(0.9, 10, apart.mean(), stats.sem(apart))
-    assert ends(found) == pytest.approx(expected)
-    assert (found.n, found.n_missing) == (11, 1)
-    with pytest.raises(ValueError, match="do not pair up"):
-        paired_difference([1, 2], [1, 2, 3])
 
 
 @pytest.mark.parametrize("n", [5, 30])
