@@ -289,29 +289,25 @@ def play(console: Console, chosen: ChosenModel, args: argparse.Namespace) -> Non
 def print_returns(
     console: Console, spec: TrainSpec, show: _Show | LiveShow, *, are_normalised: bool = False
 ) -> None:
-    """Print the mean return, and compare it with the optimum if a bracket of it is known."""
+    """Print the mean return, beside the optimum if a bracket of that is known."""
     if not show.returns:
         console.print("no episode came to its end: raise --n-timesteps")
         return
     import numpy as np
 
-    from commands.terminal import describe_measured, episodes
+    from commands.terminal import figures, result_lines
     from pipeline.evaluation.sampled import Evaluation, bracketed_yardstick
 
-    mean, std, length = np.mean(show.returns), np.std(show.returns), np.mean(show.lengths)
-    over = episodes(len(show.returns))
-    console.print(f"return {mean:.2f} ± {std:.2f} over {over}, length {length:.1f}")
-    if are_normalised:
-        return
     played = Evaluation(np.array(show.returns), np.array(show.lengths), None)
-    measured = describe_measured(played.measured_by(bracketed_yardstick(spec)))
-    if measured:
-        console.print(measured)
+    if not are_normalised:
+        played = played.measured_by(bracketed_yardstick(spec))
+    for line in result_lines(played, f"length {figures(played.mean_length)[0]}"):
+        console.print(line)
 
 
 def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: bool) -> None:
     """Print the expected return of the policy, if it can be computed."""
-    from commands.terminal import describe, print_refusal
+    from commands.terminal import print_refusal, result_lines
     from pipeline.evaluation.exact import exact_evaluator, model_refusal
     from pipeline.evaluation.histories import by_histories, world_of_memory
     from pipeline.evaluation.policies import why_not_exact
@@ -322,7 +318,8 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
         if world is not None:
             remembering = by_histories(spec, model, world)
             if remembering is not None:
-                console.print(describe(remembering))
+                for line in result_lines(remembering):
+                    console.print(line)
                 return
         evaluator = exact_evaluator(spec)
         if evaluator is None:
@@ -339,7 +336,8 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
         except (TypeError, ValueError):
             # The agent's action probabilities are not known.
             return
-    console.print(describe(evaluation))
+    for line in result_lines(evaluation):
+        console.print(line)
 
 
 @dataclass

@@ -17,6 +17,7 @@ from rich.segment import Segment
 from rich.text import Text
 
 from pipeline.errors import visible
+from pipeline.evaluation.yardstick import rounding
 from pipeline.signs_of_life import (
     SECONDS_BETWEEN_LINES,
     SECONDS_BETWEEN_LOOKS,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from pipeline.preparation import EngineOutlook
 
 UNBOUNDED = 10_000  # columns
+APART = "   "  # between the figures of a result
 
 
 class TextConsole(Console):
@@ -184,62 +186,115 @@ class LiveProgress(ABC):
 # --- evaluations in words -------------------------------------------------------------------------
 
 
-def describe(evaluation: Evaluation) -> str:
-    """An evaluation in a few words."""
-    text = f"return {evaluation.mean_return:.2f}"
-    if evaluation.is_exact:
-        text += " (exact)"
-    else:
-        text += f" ± {evaluation.std_return:.2f} over {episodes(len(evaluation.returns))}"
+def result_lines(evaluation: Evaluation, *more: str) -> list[str]:
+    """Score, return and success in a line, with ``more`` behind them; then lines on the scale."""
+    yardstick = evaluation.yardstick
+    n_episodes = 0 if evaluation.is_exact else len(evaluation.returns)
+    told = judged(evaluation.mean_return, yardstick, n_episodes)
     if evaluation.success_rate is not None:
-        text += f", success {evaluation.success_rate:.1%}"
-    measured = describe_measured(evaluation)
-    return f"{text}, {measured}" if measured else text
-
-
-def describe_others(others: OtherReturns) -> str:
-    """The exact returns beside that of the greedy policy in a few words; empty for none."""
-    told = []
-    if others.stochastic_return is not None and others.acts_by != "the same policy":
-        told.append(f"return {others.stochastic_return:.2f} with {others.acts_by}, as in training")
-    if others.discounted_return is not None and others.discount != 1:
-        told.append(f"discounted by {others.discount:g}: {others.discounted_return:.4g}")
-        if others.discounted_optimum is not None:
-            told[-1] += f", optimum {others.discounted_optimum:.4g}"
-    return f"{'; '.join(told)} (exact)" if told else ""
-
-
-def describe_measured(evaluation: Evaluation) -> str:
-    """The return compared with the optimum; empty if the optimum is neither known nor bracketed."""
-    yardstick, value = evaluation.yardstick, evaluation.mean_return
-    if yardstick is None:
-        return ""
-    optimum, score = f"optimum {yardstick.optimum:.2f}", f"score {_score(yardstick, value)}"
-    if yardstick.at_least is not None:
-        optimum = f"optimum between {yardstick.at_least:.2f} and {yardstick.optimum:.2f}"
-        most = _score(yardstick.lower_end, value)
-        score += f" {yardstick.mark}" if score.endswith(most) else f" to {most} {yardstick.mark}"
-    if (hidden := yardstick.hidden) is not None:
-        optimum += " with memory (" if hidden.with_memory else " without memory ("
-        if not hidden.with_memory:
-            lower, upper = hidden.memory_optimum
-            optimum += f"{lower:.2f} to " * (lower < upper) + f"{upper:.2f} with, "
-        optimum += f"{hidden.full_optimum:.2f} by the state)"
-    if not yardstick.has_scale:
-        score = f"{yardstick.gap(value):.3g} below the optimum"
-    text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"
+        told.append(f"success {percent(evaluation.success_rate)}")
+    lines = [APART.join([*told, *more]), *([] if yardstick is None else _scale_lines(yardstick))]
     if evaluation.beats_optimum:
-        text += (
-            ". THIS IS MORE THAN ANY POLICY CAN REACH: the bracket belongs to another environment, "
+        lines.append(
+            "THIS IS MORE THAN ANY POLICY CAN REACH: the bracket belongs to another environment, "
             "or is wrong"
         )
-        text += "" if yardstick.is_proven else "; its upper end is not proven"
-    return text
+    return lines
+
+
+def judged(value: float, yardstick: Yardstick | None, n_episodes: int = 0) -> list[str]:
+    """The score of a return, if there is one, and the return beside the optimum.
+
+    ``n_episodes`` is the number of sampled episodes, 0 for an exact return.
+    """
+    notes = [f"sampled, {episodes(n_episodes)}"] if n_episodes else []
+    if yardstick is None:
+        return [_returned(value, None, notes)]
+    if yardstick.at_least is None:
+        returned = _returned(value, yardstick.optimum, notes)
+    else:
+        notes = notes if yardstick.is_proven else ["not proven", *notes]
+        mine, most = figures(value, yardstick.optimum)
+        returned = f"return {mine} of {most} at most{_in_brackets(notes)}"
+    scores = {_score(yardstick, value), _score(yardstick.lower_end, value)}
+    told = [f"score {' to '.join(sorted(scores, key=float))}"] if yardstick.has_scale else []
+    return [*told, returned]
+
+
+def describe_others(others: OtherReturns) -> list[str]:
+    """The exact returns beside that of the greedy policy, a line for each."""
+    told = []
+    if others.stochastic_return is not None and others.acts_by != "the same policy":
+        told.append(f"{_returned(others.stochastic_return)} with {others.acts_by}, as in training")
+    if others.discounted_return is not None and others.discount != 1:
+        returned = _returned(others.discounted_return, others.discounted_optimum)
+        told.append(f"{returned}, discounted by {others.discount:g}")
+    return told
+
+
+def _returned(value: float, optimum: float | None = None, notes: Sequence[str] = ()) -> str:
+    """A return, beside the optimum with the gap between them if that is known."""
+    if optimum is None:
+        return f"return {figures(value)[0]}{_in_brackets(notes)}"
+    gap = optimum - value
+    mine, best, apart = figures(value, optimum, gap)
+    if gap > rounding(optimum):
+        apart = apart if float(apart) else f"{gap:.2g}"
+        notes = [f"gap {apart}", *notes]
+    return f"return {mine} of {best}{_in_brackets(notes)}"
+
+
+def _in_brackets(notes: Sequence[str]) -> str:
+    return f" ({'; '.join(notes)})" if notes else ""
+
+
+def _scale_lines(yardstick: Yardstick) -> list[str]:
+    """What a score of 0 is; and the optimum, if it is bracketed or there are several."""
+    baseline = f"return {figures(yardstick.baseline)[0]}{APART}best random or constant policy"
+    lines = [f"score 0{APART}{baseline}" if yardstick.has_scale else f"no score{APART}{baseline}"]
+    hidden, ends = yardstick.hidden, (yardstick.at_least, yardstick.optimum)
+    optima = [_between(*ends)]
+    if not yardstick.is_proven:
+        optima[0] += " (the upper end is not proven)"
+    if hidden is not None:
+        optima[0] += " with memory" if hidden.with_memory else " without memory"
+        memory = [] if hidden.with_memory else [f"{_between(*hidden.memory_optimum)} with memory"]
+        optima += [*memory, f"{_between(None, hidden.full_optimum)} by the state"]
+    if hidden is not None or yardstick.at_least is not None:
+        lines.append(f"optimum{APART}{', '.join(optima)}")
+    return lines
+
+
+def _between(lower: float | None, upper: float) -> str:
+    """The two ends of a bracket; one number if they are equal, or only one is given."""
+    return " to ".join(figures(*dict.fromkeys([upper if lower is None else lower, upper])))
 
 
 def _score(yardstick: Yardstick, value: float) -> str:
     """The score, rounded down: only the optimum is 1."""
-    return f"{math.floor(100 * yardstick.score(value) + 1e-6) / 100:.2f}"
+    hundredths = math.floor(100 * yardstick.score(value) + 1e-6)
+    if yardstick.gap(value) > rounding(yardstick.optimum):
+        hundredths = min(hundredths, 99)
+    return "1" if hundredths == 100 else f"{hundredths / 100:.2f}"
+
+
+def figures(*values: float) -> list[str]:
+    """Numbers without decimals if they are whole; of the others, all with equally many.
+
+    That is as many as give the largest four digits.
+    """
+    whole = [math.isclose(value, round(value), rel_tol=1e-9, abs_tol=1e-9) for value in values]
+    decimals = max(4 - len(str(int(max(map(abs, values))))), 0)
+    decimals += all(abs(value) < 1 for value in values)  # a zero before the point is no digit
+    return [
+        f"{value:z.{0 if is_whole else decimals}f}"
+        for value, is_whole in zip(values, whole, strict=True)
+    ]
+
+
+def percent(share: float) -> str:
+    """A share in percent, rounded down: only all is 100 %."""
+    return f"{math.floor(1000 * share + 1e-6) / 10:g} %"
 
 
 def episodes(n: int) -> str:

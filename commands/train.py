@@ -40,6 +40,7 @@ from pipeline.stopping import StopRequest, stops_noticed
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
     from pipeline.callbacks import PullSummary
     from pipeline.preparation import Training
@@ -402,6 +403,8 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     """Print the agent, the environment, the budget and the hyperparameters."""
     from rich.text import Text
 
+    from pipeline.signs_of_life import in_lines
+
     budget = spec.hyperparams.n_timesteps or spec.hyperparams.n_episodes or 0
     unit = "steps" if spec.hyperparams.n_timesteps else "episodes"
     agent, environment = Text(spec.algo, "bold"), Text(spec.env_id, "bold")
@@ -422,7 +425,7 @@ def print_header(console: Console, spec: TrainSpec) -> None:
         else:
             plain.append(text)
     for line in ["  ".join(plain), *explained] if plain else explained:
-        console.print(line, style="dim", highlight=False)
+        console.print(in_lines(console, line), style="dim", highlight=False)
 
 
 def _is_choice(algo: str, policy: str) -> bool:
@@ -452,55 +455,62 @@ def print_engine(console: Console, training: Training) -> None:
     """Print the engine of the training, and its expected time."""
     from commands.terminal import say, training_line
     from pipeline.preparation import engine_outlook
+    from pipeline.signs_of_life import in_lines
 
     model, callback = training.model, training.callback
     line = training_line(engine_outlook(model, training.spec, [callback]), model, callback)
     if line:
-        say(console, f"engine  {line}", style="dim")
+        say(console, in_lines(console, f"engine  {line}"), style="dim")
 
 
 def print_result(console: Console, training: Training, outcome: Outcome) -> None:
-    """Print the results, and if the agent has failed, what it does instead and what to try."""
-    print_outcome(console, training.spec, outcome)
-    if outcome.final is None or console.quiet:
+    """Print the results, what a failed agent does instead, and commands to type next."""
+    print_outcome(console, outcome)
+    if console.quiet:
         return
     from commands.terminal import say
     from pipeline.evaluation.advice import advice
+    from pipeline.evaluation.exact import ExactEvaluator
+    from pipeline.signs_of_life import in_lines
 
-    evaluator = training.evaluation.evaluator
-    found = advice(training.spec, training.model, evaluator, outcome.final, outcome.n_steps)
-    if found is not None:
-        more = "docs/not-learning.md"
-        tried = f"try      {found.try_first}; more: {more}"
-        say(console, f"instead  {found.instead}")
-        say(console, tried if found.try_first else f"more     {more}")
+    spec, model, evaluator = training.spec, training.model, training.evaluation.evaluator
+    if outcome.final is not None:
+        found = advice(spec, model, evaluator, outcome.final, outcome.n_steps)
+        if found is not None:
+            more = "more     docs/not-learning.md"
+            tried = [f"try      {found.try_first}"] if found.try_first else []
+            for line in (f"instead  {found.instead}", *tried, more):
+                say(console, in_lines(console, line))
+    is_bandit = bool(training.eval_env.has_attr("n_arms"))
+    other = other_agent(spec, model, is_bandit=is_bandit)
+    has_model = isinstance(evaluator, ExactEvaluator)
+    say(console, "")
+    for label, command in next_commands(spec, outcome.run, other, has_model=has_model):
+        say(console, f"{label:<9}{command}")  # however long, so that it can be copied
 
 
-def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
-    """Print the results and the run folder."""
+def print_outcome(console: Console, outcome: Outcome) -> None:
+    """Print what was done, and below it the result."""
     from rich.table import Table
 
-    from commands.terminal import describe, describe_others, episodes, print_rows, say
+    from commands.terminal import APART, describe_others, judged, print_rows, result_lines, say
     from pipeline.runs import FINISHED
 
-    taken = outcome.taken.cpu_seconds
+    taken, final = outcome.taken.cpu_seconds, outcome.final
     speed = outcome.n_steps / max(taken, 1e-9)
     done = "trained" if outcome.state == FINISHED else "interrupted"
     text = f"{outcome.n_steps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
     rows = [(done, text)]
     if outcome.engine:
         rows.append(("engine", outcome.engine))
-    if outcome.pulls is not None:
-        rows.append(("regret", describe_pulls(outcome.pulls)))
-    if outcome.final is not None:
-        rows.append(("final", describe(outcome.final)))
-        if outcome.final.others is not None and (others := describe_others(outcome.final.others)):
-            rows.append(("beside", others))
+    if final is not None and final.others is not None:
+        rows += [("beside", line) for line in describe_others(final.others)]
     if outcome.best_return is not None:
-        over = f" over {episodes(outcome.best_episodes)}" if outcome.best_episodes else ""
-        best = f"return {outcome.best_return:.2f}{over}, first at step {outcome.best_timesteps:,}"
-        rows.append(("best", best))
-    if outcome.final is not None:
+        yardstick = None if final is None else final.yardstick
+        best = judged(outcome.best_return, yardstick, outcome.best_episodes)
+        when = f"at step {outcome.best_timesteps:,}"
+        rows.append(("best", APART.join([*best, when])))
+    if final is not None:
         tests = f"{outcome.evaluating.cpu_seconds:.1f} s of processor time"
         share = outcome.evaluation_steps / max(outcome.n_steps, 1)
         played = f"{outcome.evaluation_steps:,} steps beside training ({share:.0%} of it)"
@@ -511,45 +521,76 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     for row in rows:
         table.add_row(*row)
     print_rows(console, table)
-    # On one line, however long, so that it can be copied.
-    width = max(len(label) for label, _ in rows) + 2
-    say(console, f"{'watch':<{width}}{watch_command(spec, outcome.run)}")
+    results = [] if outcome.pulls is None else [describe_pulls(outcome.pulls)]
+    results += [] if final is None else result_lines(final)
+    for line in [""] * bool(results) + results:
+        say(console, line)
 
 
 def describe_pulls(pulls: PullSummary) -> str:
-    """The pulls of a training in a few words."""
+    """The regret of a training in a few words."""
+    from commands.terminal import APART, percent
     from pipeline.runs import LAST_PULLS
 
-    if pulls.regret is not None:
+    if pulls.regret is not None and pulls.optimal is not None:
         last = min(LAST_PULLS, pulls.n_pulls)
-        return (
-            f"{pulls.regret:,.2f} over {pulls.n_pulls:,} pulls; "
-            f"a best arm in {pulls.optimal:.0%} of the last {last}"
-        )
+        best = f"best arm in {percent(pulls.optimal)} of the last {last}"
+        return f"regret {pulls.regret:,.2f} over {pulls.n_pulls:,} pulls{APART}{best}"
     if pulls.reward is None:
-        return f"not known: none of {pulls.n_pulls:,} pulls is in the log"
+        return f"regret not known: none of {pulls.n_pulls:,} pulls is in the log"
     return (
-        f"not known; reward {pulls.reward:.4f} a pull over the {pulls.n_matched:,} "
+        f"regret not known{APART}reward {pulls.reward:.4f} a pull over the {pulls.n_matched:,} "
         f"of {pulls.n_pulls:,} that are in the log"
     )
 
 
-def watch_command(spec: TrainSpec, run: Run) -> str:
-    """The command that plays a run's agent, for the working directory of the training."""
+def next_commands(
+    spec: TrainSpec, run: Run, other: str | None, *, has_model: bool
+) -> list[tuple[str, str]]:
+    """Labels and commands: play the agent, explain it, compare it with another one over seeds.
+
+    They are for the working directory of the training.
+    """
     from pipeline.runs import numbered_runs
+    from pipeline.settings.hyperparams import entry_names
     from pipeline.user_modules import as_flag
 
-    command: list[str] = []
+    chosen: list[str] = []
     numbers = [number for number, _ in numbered_runs(run.path.parent, run.env_name)]
     if numbers.count(run.number) > 1:  # only their unique suffixes differ
-        command.append(str(run.path))
+        chosen.append(str(run.path))
     else:
-        command += ["--algo", spec.algo, "--env", spec.env_id]
-        command += [] if str(spec.log_folder) == "logs" else ["-f", str(spec.log_folder)]
+        chosen += ["--algo", spec.algo, "--env", spec.env_id]
+        chosen += [] if str(spec.log_folder) == "logs" else ["-f", str(spec.log_folder)]
         newest = max(numbers, default=run.number)
-        command += [] if run.number == newest else ["--exp-id", str(run.number)]
+        chosen += [] if run.number == newest else ["--exp-id", str(run.number)]
+    special = spec.hyperparams
+    compared = ["--env", spec.env_id, "--algos", spec.algo, *filter(None, [other])]
+    if special.env_kwargs:
+        words = [f"{key}:{value}" for key, value in special.env_kwargs.items()]
+        compared += ["--env-kwargs", *words]
+    if not entry_names(spec.algo):  # no shipped settings say how long to train
+        is_steps, budget = special.n_timesteps is not None, special.n_timesteps
+        compared += ["-n", str(budget)] if is_steps else ["--n-episodes", str(special.n_episodes)]
+    compared += ["--seeds", "10"]
+    compared += ["--engine", "auto"] if special.algorithm.get("engine") == "auto" else []
+    found = [("watch", "enjoy", chosen), ("explain", "explain", chosen)]
+    found = [*found[: 1 + has_model], ("compare", "compare", compared)]
     flag = as_flag(spec.user_modules, spec.env_id)
-    return f"{called_as('enjoy')} {shlex.join(command)}{flag}"
+    return [(label, f"{called_as(name)} {shlex.join(words)}{flag}") for label, name, words in found]
+
+
+def other_agent(spec: TrainSpec, model: BaseAlgorithm, *, is_bandit: bool) -> str | None:
+    """The first other agent that fits the environment, if possible one with settings for it."""
+    from agents import ALGORITHMS, fitting_algorithms
+    from pipeline.settings.hyperparams import entry_names
+
+    fitting = fitting_algorithms(model.observation_space, model.action_space, is_bandit)
+    entries = {name: ALGORITHMS[name] for name in fitting if name != spec.algo}
+    others = [name for name, each in entries.items() if each.for_bandits is is_bandit]
+    others = [name for name in others if entries[name].is_installed]
+    shipped = (name for name in others if spec.env_id in entry_names(name))
+    return next(shipped, others[0] if others else None)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from experiments.plan import PlannedRun
 from experiments.results import StudyResults, values_over_seeds
 from experiments.study import COSTS, OF_TRAINING, StudySpec
 from mdp.transition_model import Floats
-from pipeline.environments import make_single_env, training_changes, trains_on_variant
+from pipeline.environments import make_single_env, training_changes
 from pipeline.errors import UserError
 from pipeline.evaluation.yardstick import FAILED, Yardstick
 from pipeline.signs_of_life import Tell, tell_nobody
@@ -143,11 +143,10 @@ def _bounds(results: StudyResults, environment: str, optimum: float | None) -> B
     study = results.study
     if study.metric in COSTS:
         return 0.0, np.inf
-    planned = next(run for run in results.planned if run.environment == environment)
-    changed = any(training_changes(run.spec) for run in results.planned)
-    if study.metric in OF_TRAINING and changed:
+    first = {run.agent: run for run in results.planned if run.environment == environment}
+    if study.metric in OF_TRAINING and any(training_changes(r.spec) for r in first.values()):
         return -np.inf, np.inf  # returns of training on a changed environment
-    env = make_single_env(planned.spec)
+    env = make_single_env(next(iter(first.values())).spec)
     try:
         low, high = return_bounds(env)
     finally:
@@ -489,7 +488,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         success_rate=mean("success_rate", UNIT) if table["success_rate"].notna().any() else None,
         seconds=mean("cpu_seconds", (0.0, np.inf)),
         on_variant=any(
-            trains_on_variant(run.spec)
+            training_changes(run.spec)
             for run in results.planned
             if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
         ),

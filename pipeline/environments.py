@@ -84,27 +84,23 @@ def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
     return kwargs
 
 
-def trains_on_variant(spec: TrainSpec) -> bool:
-    """Whether training has other environment arguments than evaluation; ignores wrappers."""
-    special = spec.hyperparams
-    changes = special.train_env_kwargs, special.eval_env_kwargs
-    if not any(changes):
-        return False
-    usual = {**usual_kwargs(spec.env_id), **special.env_kwargs}
-    training, evaluation = ({**usual, **changed} for changed in changes)
-    return training != evaluation
-
-
 def training_changes(spec: TrainSpec) -> tuple[str, ...]:
-    """The changes of the environment that apply to training only, in words."""
-    special = spec.hyperparams
+    """How training's environment differs from the one of evaluations, in words; often empty.
+
+    The returns of a training with changes are not compared with the optimum.
+    """
+    special, told = spec.hyperparams, []
     usual = {**usual_kwargs(spec.env_id), **special.env_kwargs}
-    told = []
-    for key, value in special.train_env_kwargs.items():
-        if usual.get(key) != value:
-            words = {"max_episode_steps": f"episodes of {value} steps"}
-            words |= {"random_start": "random starts"} if value is True else {}
-            told.append(words.get(key, f"{key} {value}"))
+    training, evaluation = special.train_env_kwargs, special.eval_env_kwargs
+    for key in {**training, **evaluation}:
+        value, other = (kwargs.get(key, usual.get(key)) for kwargs in (training, evaluation))
+        if key == "max_episode_steps":  # for Gymnasium, -1 means no limit
+            value, other = (None if limit == -1 else limit for limit in (value, other))
+            words = f"episodes of {value} steps" if value else "no time limit"
+        else:
+            words = "random starts" if (key, value) == ("random_start", True) else f"{key} {value}"
+        if value != other:
+            told.append(words)
     for wrapper in special.train_env_wrapper:
         given = (wrapper.kwargs.get(key) for key in ("min_reward", "max_reward"))
         bounds = [f"{bound:g}" for bound in given if bound is not None]

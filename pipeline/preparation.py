@@ -36,7 +36,7 @@ from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
-    trains_on_variant,
+    training_changes,
 )
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.critics import CriticRecorder, recorder_of
@@ -77,7 +77,7 @@ from pipeline.settings.components import (
     needs_policy,
 )
 from pipeline.settings.values import algorithm_parameters
-from pipeline.signs_of_life import can_move
+from pipeline.signs_of_life import can_move, in_lines
 from pipeline.state_saver import StateSaver, resumed_logger
 from pipeline.stopping import close_environments, current, end_workers_after_stop
 from pipeline.train_spec import NETWORKS, TrainSpec
@@ -210,7 +210,7 @@ def _set_up(
         n_eval_envs = n_environments(spec.n_eval_envs, spec.eval_episodes)
     eval_env = make_evaluation_env(spec, n_eval_envs)
     undo.callback(close_environments, eval_env)
-    display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
+    display = ProgressDisplay(console, can_move(console), bool(training_changes(spec)))
     intervals = evaluation_intervals(spec, env.num_envs, is_bandit and exact is None)
     critics = _critics(spec, model, run, console, is_evaluated=max(intervals) > 0)
     evaluation = EvaluationCallback(
@@ -279,7 +279,7 @@ def _record_beginning(
 
 
 def _say(console: Console, line: str) -> None:
-    console.print(line, style="dim", markup=False)
+    console.print(in_lines(console, line), style="dim", markup=False)
 
 
 def _exact_evaluator(

@@ -157,7 +157,7 @@ class ProgressDisplay(BlockCallback):
         episodes = self.model.ep_info_buffer
         if episodes:
             mean_return = np.mean([episode["r"] for episode in episodes])
-            where = " (there the environment is changed)" if self.on_variant else ""
+            where = " (on a variant)" if self.on_variant else ""
             figures += f"  mean return in training{where} {mean_return:.2f}"
         left = self._seconds_left()
         return figures if left is None else f"{figures}  about {duration(left)} left by the clock"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import contextlib
 import logging
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,12 +26,22 @@ SPINNER = "line"  # ASCII, which every terminal can show
 # A function that receives the progress in a few words.
 Tell = Callable[[str], object]
 
+MOST_COLUMNS = 100  # of a line of text
+
 COMPILING = "compiling (the first time, some seconds)"
 
 
 def can_move(console: Console) -> bool:
     """Whether a console can replace its output; plain terminals and files cannot."""
     return console.is_terminal and not console.is_dumb_terminal
+
+
+def in_lines(console: Console, text: str) -> str:
+    """The text in lines of at most 100 columns, broken between words."""
+    width = min(console.width, MOST_COLUMNS)
+    return textwrap.fill(
+        text, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    )
 
 
 def tell_nobody(detail: str) -> None:

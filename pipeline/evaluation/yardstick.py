@@ -15,6 +15,11 @@ ROUNDING = 1e-12
 LEAST_WAY = 0.01
 
 
+def rounding(optimum: float) -> float:
+    """The error of exact returns: a smaller gap is none."""
+    return ROUNDING * max(1.0, abs(optimum))
+
+
 def bracket_mark(is_proven: bool) -> str:
     """The remark behind figures of a bracketed optimum."""
     return "(bracketed)" if is_proven else "(bracketed; the upper end is not proven)"
@@ -54,9 +59,9 @@ class Yardstick:
 
         With a bracket, 1 is its upper end, so that a score between 0 and 1 is never too high.
         """
-        rounding = ROUNDING * max(1.0, abs(self.optimum))
-        if self.optimum - self.baseline <= rounding:
-            return 1.0 if expected_return >= self.optimum - rounding else 0.0
+        error = rounding(self.optimum)
+        if self.optimum - self.baseline <= error:
+            return 1.0 if expected_return >= self.optimum - error else 0.0
         return (expected_return - self.baseline) / (self.optimum - self.baseline)
 
     @property
@@ -69,11 +74,6 @@ class Yardstick:
     def lower_end(self) -> Yardstick:
         """This yardstick with the lower end of the bracket as optimum."""
         return self if self.at_least is None else Yardstick(self.at_least, self.baseline)
-
-    @property
-    def mark(self) -> str:
-        """The remark behind figures of a bracket; empty without one."""
-        return "" if self.at_least is None else bracket_mark(self.is_proven)
 
     def figures(self, expected_return: float) -> dict[str, Any]:
         """Score and gap of a return as JSON; with a bracket, for both of its ends."""

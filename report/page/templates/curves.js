@@ -25,7 +25,7 @@ report.section("curves", (root, _, place) => {
     const height = symlog?.height ?? ((value) => value);
     const curves = Object.entries(byAxis[by]).filter(([label]) => isShown(label));
     detail.textContent = onVariant.length
-      ? `Circles: trained on a variant of the environment, to which the optimum does not apply: ${onVariant.join(", ")}.`
+      ? `Circles: trained on a variant of the environment, whose optimum may be another: ${onVariant.join(", ")}.`
       : "";
     return {
       traces: curves.flatMap(([label, curve]) => report.band(label, curve, height, {}, noteOf(label))),
