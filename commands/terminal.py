@@ -237,10 +237,11 @@ def _returned(value: float, optimum: float | None = None, notes: Sequence[str] =
     if optimum is None:
         return f"return {figures(value)[0]}{_in_brackets(notes)}"
     gap = optimum - value
-    mine, best, apart = figures(value, optimum, gap)
+    mine, best = figures(value, optimum)
     if gap > rounding(optimum):
-        apart = apart if float(apart) else f"{gap:.2g}"
-        notes = [f"gap {apart}", *notes]
+        decimals = max(len(text.partition(".")[2]) for text in (mine, best))
+        apart = f"{gap:.{decimals}f}"
+        notes = [f"gap {apart if float(apart) else f'{gap:.2g}'}", *notes]
     return f"return {mine} of {best}{_in_brackets(notes)}"
 
 
@@ -279,13 +280,14 @@ def _score(yardstick: Yardstick, value: float) -> str:
 
 
 def figures(*values: float) -> list[str]:
-    """Numbers without decimals if they are whole; of the others, all with equally many.
+    """Numbers without decimals if they are whole; the others with as many as the smallest needs.
 
-    That is as many as give the largest four digits.
+    It gets four digits, or four decimals if it is below 1.
     """
     whole = [math.isclose(value, round(value), rel_tol=1e-9, abs_tol=1e-9) for value in values]
-    decimals = max(4 - len(str(int(max(map(abs, values))))), 0)
-    decimals += all(abs(value) < 1 for value in values)  # a zero before the point is no digit
+    broken = [abs(value) for value, is_whole in zip(values, whole, strict=True) if not is_whole]
+    smallest = min(broken, default=0.0)
+    decimals = 4 if smallest < 1 else max(4 - len(str(int(smallest))), 0)
     return [
         f"{value:z.{0 if is_whole else decimals}f}"
         for value, is_whole in zip(values, whole, strict=True)

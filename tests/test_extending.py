@@ -27,7 +27,7 @@ def test_the_document_can_be_followed(type_in_own_folder, own_folder):
         code, out, err = type_in_own_folder(*shlex.split(short))
         assert (code, err) == (0, ""), f"{command}\n{out}{err}"
         if "--algo cautious" in command:  # as the page says of it; its state can be kept
-            assert "return -15.00 (exact), success 100.0%" in out
+            assert "   return -15 of -13 (gap 2)   success 100 %" in out
             assert "no state can be kept" not in out
     assert gym.make("my/Corridor-v0").unwrapped.length == 6
     logs = own_folder / "logs"

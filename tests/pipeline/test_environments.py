@@ -13,8 +13,8 @@ from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
+    training_changes,
     training_kwargs,
-    trains_on_variant,
     with_logs_located,
     with_maps_read,
 )
@@ -82,20 +82,29 @@ SHAPED = {"shelf_reward": -10}
 SCALED = {"envs.wrappers.ScaleReward": {"scale": 0.01}}
 
 
+UNLIMITED = {"max_episode_steps": -1}
+
+
 @pytest.mark.parametrize(
-    ("entry", "is_variant"),
+    ("entry", "changes"),
     [
-        ({"train_env_kwargs": SHAPED}, True),
-        ({"eval_env_kwargs": SHAPED}, True),
-        # Wrappers lie above Monitor, and normalisation above them.
-        ({"env_wrapper": SCALED, "normalize": {"norm_reward": True}}, False),
-        ({"env_kwargs": SHAPED, "train_env_kwargs": {"shelf_reward": -1}}, True),
+        ({"train_env_kwargs": SHAPED}, ("shelf_reward -10",)),
+        ({"eval_env_kwargs": SHAPED}, ("shelf_reward -100",)),  # training is as usual
+        ({"train_env_kwargs": SHAPED, "eval_env_kwargs": SHAPED}, ()),
+        ({"env_kwargs": SHAPED, "train_env_kwargs": {"shelf_reward": -1}}, ("shelf_reward -1",)),
+        ({"train_env_kwargs": UNLIMITED}, ("no time limit",)),
+        ({"env_kwargs": UNLIMITED, "train_env_kwargs": {"max_episode_steps": None}}, ()),
+        ({"eval_env_kwargs": {"max_episode_steps": 9}}, ("episodes of 1000 steps",)),
+        ({"train_env_kwargs": {"random_start": True}}, ("random starts",)),
+        ({"train_env_wrapper": SCALED}, ("rewards x 0.01",)),
+        # In evaluations, too.
+        ({"env_wrapper": SCALED, "normalize": {"norm_reward": True}}, ()),
         # What is usual may be said or left out.
-        ({"train_env_kwargs": {"slip": 0.0, "max_episode_steps": 1000}}, False),
+        ({"train_env_kwargs": {"slip": 0.0, "max_episode_steps": 1000}}, ()),
     ],
 )
-def test_what_makes_training_returns_those_of_a_variant(entry, is_variant):
-    assert trains_on_variant(spec_of("Warehouse-v0", entry)) is is_variant
+def test_what_training_changes(entry, changes):
+    assert training_changes(spec_of("Warehouse-v0", entry)) == changes
 
 
 # --- time limits ---------------------------------------------------------------------------------

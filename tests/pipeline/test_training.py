@@ -226,7 +226,7 @@ def train_on(folder, algo, env_id, **settings):
     spec = spec_of(algo, env_id, settings, n_timesteps=300, **fields)
     console = Console(width=160, file=io.StringIO())
     outcome = train(spec, console, {}, "train.py")
-    print_outcome(console, spec, outcome)
+    print_outcome(console, outcome)
     path = outcome.run.path
     pulls = dict(np.load(path / PULLS_FILE)) if (path / PULLS_FILE).exists() else None
     return outcome, pulls, {file.name for file in path.iterdir()}, console.file.getvalue()
@@ -240,7 +240,7 @@ def test_regret_is_the_judgement_where_arms_are_drawn_anew(tmp_path):
     assert (outcome.final, outcome.best_return, info["pulls"]["n_pulls"]) == (None, None, 300)
     assert {"pulls.npz", "pulls.png", "run.json"} <= names
     assert not names & {"evaluations.npz", "learning_curve.png", "best_model.zip"}
-    assert f"regret   {regret:,.2f} over 300 pulls; a best arm in" in text
+    assert f"regret {regret:,.2f} over 300 pulls   best arm in" in text
 
 
 def test_a_log_knows_no_regret(tmp_path):
@@ -264,8 +264,8 @@ def test_pulls_summed_up_by_hand():
     }
     found = summarise_pulls(pulls)
     assert found == PullSummary(n_pulls=4, n_matched=4, reward=0.5, regret=0.75, optimal=0.5)
-    assert describe_pulls(found) == "0.75 over 4 pulls; a best arm in 50% of the last 4"
+    assert describe_pulls(found) == "regret 0.75 over 4 pulls   best arm in 50 % of the last 4"
     unknown = pulls | {"regrets": np.full((1, 4), np.nan), "matched": np.zeros((1, 4), dtype=bool)}
     found = summarise_pulls(unknown)
     assert (found.reward, found.regret, found.optimal) == (None, None, None)
-    assert describe_pulls(found) == "not known: none of 4 pulls is in the log"
+    assert describe_pulls(found) == "regret not known: none of 4 pulls is in the log"
