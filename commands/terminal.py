@@ -17,7 +17,7 @@ from rich.segment import Segment
 from rich.text import Text
 
 from pipeline.errors import visible
-from pipeline.evaluation.yardstick import rounding
+from pipeline.evaluation.yardstick import ROUNDING, rounding
 from pipeline.signs_of_life import (
     SECONDS_BETWEEN_LINES,
     SECONDS_BETWEEN_LOOKS,
@@ -295,8 +295,9 @@ def figures(*values: float) -> list[str]:
 
 
 def percent(share: float) -> str:
-    """A share in percent, rounded down: only all is 100 %."""
-    return f"{math.floor(1000 * share + 1e-6) / 10:g} %"
+    """A share in percent, of which only all is 100 %."""
+    most = 100.0 if share > 1 - ROUNDING else 99.9
+    return f"{min(round(100 * share, 1), most):g} %"
 
 
 def episodes(n: int) -> str:
