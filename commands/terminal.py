@@ -195,27 +195,20 @@ def result_lines(evaluation: Evaluation, *more: str) -> list[str]:
         told.append(f"success {percent(evaluation.success_rate)}")
     lines = [APART.join([*told, *more]), *([] if yardstick is None else _scale_lines(yardstick))]
     if evaluation.beats_optimum:
-        lines.append(
-            "THIS IS MORE THAN ANY POLICY CAN REACH: the bracket belongs to another environment, "
-            "or is wrong"
-        )
+        why = "the bracket belongs to another environment, or is wrong"
+        lines.append(f"THIS IS MORE THAN ANY POLICY CAN REACH: {why}")
     return lines
 
 
 def judged(value: float, yardstick: Yardstick | None, n_episodes: int = 0) -> list[str]:
-    """The score of a return, if there is one, and the return beside the optimum.
-
-    ``n_episodes`` is the number of sampled episodes, 0 for an exact return.
-    """
+    """The score of a return and the return; with 0 episodes it is exact."""
     notes = [f"sampled, {episodes(n_episodes)}"] if n_episodes else []
     if yardstick is None:
         return [_returned(value, None, notes)]
-    if yardstick.at_least is None:
-        returned = _returned(value, yardstick.optimum, notes)
-    else:
-        notes = notes if yardstick.is_proven else ["not proven", *notes]
-        mine, most = figures(value, yardstick.optimum)
-        returned = f"return {mine} of {most} at most{_in_brackets(notes)}"
+    if not yardstick.is_proven:
+        notes = ["not proven", *notes]
+    is_bracket = yardstick.at_least is not None
+    returned = _returned(value, yardstick.optimum, notes, is_bracket=is_bracket)
     scores = {_score(yardstick, value), _score(yardstick.lower_end, value)}
     told = [f"score {' to '.join(sorted(scores, key=float))}"] if yardstick.has_scale else []
     return [*told, returned]
@@ -225,50 +218,45 @@ def describe_others(others: OtherReturns) -> list[str]:
     """The exact returns beside that of the greedy policy, a line for each."""
     told = []
     if others.stochastic_return is not None and others.acts_by != "the same policy":
-        told.append(f"{_returned(others.stochastic_return)} with {others.acts_by}, as in training")
+        returned = _returned(others.stochastic_return, None)
+        told.append(f"{returned} with {others.acts_by}, as in training")
     if others.discounted_return is not None and others.discount != 1:
         returned = _returned(others.discounted_return, others.discounted_optimum)
         told.append(f"{returned}, discounted by {others.discount:g}")
     return told
 
 
-def _returned(value: float, optimum: float | None = None, notes: Sequence[str] = ()) -> str:
-    """A return, beside the optimum with the gap between them if that is known."""
-    if optimum is None:
-        return f"return {figures(value)[0]}{_in_brackets(notes)}"
-    gap = optimum - value
-    mine, best = figures(value, optimum)
-    if gap > rounding(optimum):
-        decimals = max(len(text.partition(".")[2]) for text in (mine, best))
-        apart = f"{gap:.{decimals}f}"
-        notes = [f"gap {apart if float(apart) else f'{gap:.2g}'}", *notes]
-    return f"return {mine} of {best}{_in_brackets(notes)}"
-
-
-def _in_brackets(notes: Sequence[str]) -> str:
-    return f" ({'; '.join(notes)})" if notes else ""
+def _returned(
+    value: float, optimum: float | None, notes: Sequence[str] = (), *, is_bracket: bool = False
+) -> str:
+    """A return, beside the optimum with the gap between them, or beside its upper bound."""
+    mine, *best = figures(value, *([] if optimum is None else [optimum]))
+    if optimum is not None and not is_bracket and optimum - value > rounding(optimum):
+        decimals = max(len(text.partition(".")[2]) for text in (mine, *best))
+        gap = f"{optimum - value:.{decimals}f}"
+        notes = [f"gap {gap if float(gap) else f'{optimum - value:.2g}'}", *notes]
+    beside = " of ".join([mine, *best]) + " at most" * is_bracket
+    return f"return {beside}" + (f" ({'; '.join(notes)})" if notes else "")
 
 
 def _scale_lines(yardstick: Yardstick) -> list[str]:
     """What a score of 0 is; and the optimum, if it is bracketed or there are several."""
     baseline = f"return {figures(yardstick.baseline)[0]}{APART}best random or constant policy"
-    lines = [f"score 0{APART}{baseline}" if yardstick.has_scale else f"no score{APART}{baseline}"]
-    hidden, ends = yardstick.hidden, (yardstick.at_least, yardstick.optimum)
-    optima = [_between(*ends)]
-    if not yardstick.is_proven:
-        optima[0] += " (the upper end is not proven)"
+    lines = [f"{'score 0' if yardstick.has_scale else 'no score'}{APART}{baseline}"]
+    hidden, most = yardstick.hidden, yardstick.optimum
+    if hidden is None and yardstick.at_least is None:
+        return lines
+    optima = [_between(most if yardstick.at_least is None else yardstick.at_least, most)]
+    optima[0] += "" if yardstick.is_proven else " (the upper end is not proven)"
     if hidden is not None:
         optima[0] += " with memory" if hidden.with_memory else " without memory"
         memory = [] if hidden.with_memory else [f"{_between(*hidden.memory_optimum)} with memory"]
-        optima += [*memory, f"{_between(None, hidden.full_optimum)} by the state"]
-    if hidden is not None or yardstick.at_least is not None:
-        lines.append(f"optimum{APART}{', '.join(optima)}")
-    return lines
+        optima += [*memory, f"{figures(hidden.full_optimum)[0]} by the state"]
+    return [*lines, f"optimum{APART}{', '.join(optima)}"]
 
 
-def _between(lower: float | None, upper: float) -> str:
-    """The two ends of a bracket; one number if they are equal, or only one is given."""
-    return " to ".join(figures(*dict.fromkeys([upper if lower is None else lower, upper])))
+def _between(lower: float, upper: float) -> str:
+    return " to ".join(dict.fromkeys(figures(lower, upper)))
 
 
 def _score(yardstick: Yardstick, value: float) -> str:
@@ -280,18 +268,13 @@ def _score(yardstick: Yardstick, value: float) -> str:
 
 
 def figures(*values: float) -> list[str]:
-    """Numbers without decimals if they are whole; the others with as many as the smallest needs.
-
-    It gets four digits, or four decimals if it is below 1.
-    """
+    """Whole numbers without decimals; of the others, the smallest has four digits or decimals."""
     whole = [math.isclose(value, round(value), rel_tol=1e-9, abs_tol=1e-9) for value in values]
     broken = [abs(value) for value, is_whole in zip(values, whole, strict=True) if not is_whole]
     smallest = min(broken, default=0.0)
     decimals = 4 if smallest < 1 else max(4 - len(str(int(smallest))), 0)
-    return [
-        f"{value:z.{0 if is_whole else decimals}f}"
-        for value, is_whole in zip(values, whole, strict=True)
-    ]
+    places = [0 if is_whole else decimals for is_whole in whole]
+    return [f"{value:z.{n}f}" for value, n in zip(values, places, strict=True)]
 
 
 def percent(share: float) -> str:

@@ -547,10 +547,7 @@ def describe_pulls(pulls: PullSummary) -> str:
 def next_commands(
     spec: TrainSpec, run: Run, other: str | None, *, has_model: bool
 ) -> list[tuple[str, str]]:
-    """Labels and commands: play the agent, explain it, compare it with another one over seeds.
-
-    They are for the working directory of the training.
-    """
+    """Labels and commands, for the working directory of the training."""
     from pipeline.runs import numbered_runs
     from pipeline.settings.hyperparams import entry_names
     from pipeline.user_modules import as_flag
@@ -566,9 +563,8 @@ def next_commands(
         chosen += [] if run.number == newest else ["--exp-id", str(run.number)]
     special = spec.hyperparams
     compared = ["--env", spec.env_id, "--algos", spec.algo, *filter(None, [other])]
-    if special.env_kwargs:
-        words = [f"{key}:{value}" for key, value in special.env_kwargs.items()]
-        compared += ["--env-kwargs", *words]
+    words = [f"{key}:{value}" for key, value in special.env_kwargs.items()]
+    compared += ["--env-kwargs", *words] if words else []
     if not entry_names(spec.algo):  # no shipped settings say how long to train
         is_steps, budget = special.n_timesteps is not None, special.n_timesteps
         compared += ["-n", str(budget)] if is_steps else ["--n-episodes", str(special.n_episodes)]
