@@ -281,13 +281,13 @@ def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:
 
 
 def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Agents trained on a variant of the environment, if the verdicts are on training returns."""
+    """Agents trained on a changed environment, if the verdicts are on training returns."""
     names = [agent.agent for agent in environment.agents if agent.on_variant]
     if names and study.metric in OF_TRAINING:
         verb = "was" if len(names) == 1 else "were"
         yield (
-            f"{enumeration(names)} {verb} trained on a variant of the environment, with returns of "
-            "its own."
+            f"{enumeration(names)} {verb} trained on a changed environment: training returns are "
+            "those of that one."
         )
 
 
