@@ -2,17 +2,20 @@
 
 A memoryless policy depends on the current observation alone. The best one is hard to find
 (Littman, Memoryless Policies: Theoretical Limitations and Practical Results, 1994), and may have to
-be stochastic. Gradient ascent from several starts finds a policy. Branch and bound over boxes of
-policies (each probability between two bounds) then bounds the return of all others, in two ways: by
-an agent that observes the state and chooses from the box anew at each step, and by bounds on the
-derivatives of the return in each probability. Smaller boxes give closer bounds; with few
-observations and actions they meet the return that was found.
+be stochastic. Gradient ascent from several starts finds a policy. All deterministic policies are
+tried; where they are too many, those that the ascents lead to are improved by hill climbing over
+changes of the action at one observation. Branch and bound over boxes of policies (each probability
+between two bounds) then bounds the return of all others, in two ways: by an agent that observes the
+state and chooses from the box anew at each step, and by bounds on the derivatives of the return in
+each probability. Smaller boxes give closer bounds; with few observations and actions they meet the
+return that was found.
 """
 
 from __future__ import annotations
 
 import heapq
-from itertools import count, product
+from collections.abc import Callable
+from itertools import count, cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -25,10 +28,11 @@ from mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
 
 # Limits for a search of some seconds. Work is in outcomes and choices of all states at all steps.
 MOST_OUTCOMES_CLIMBED = 100_000_000  # for one return; above, there is no search
-MOST_WORK = 100_000_000  # for all returns of the ascents, and again for those of the bounds
+# For all returns of the ascents, again for those of the bounds, and of deterministic policies.
+MOST_WORK = 100_000_000
 RANDOM_STARTS = 4
 MOST_RETURNS = 100_000  # for the bounds
-MOST_FIRM = 256  # deterministic policies; up to this number, all are tried
+MOST_FIRM = 100_000  # deterministic policies; up to this number, all are tried
 # Logit of an almost deterministic policy; ascents start from half of it.
 STEEP = 6.0
 # Bounds within this of the return found, relative to it, count as meeting it.
@@ -42,12 +46,12 @@ class BestMemoryless(NamedTuple):
     lower: float  # the return of `policy`
     upper: float  # no memoryless policy returns more; ``lower`` where proved within 1e-6
     policy: Floats  # probabilities of actions, by observation, shape (G, A)
-    firm: float  # the highest return found of a deterministic policy
+    firm: float  # the highest return of the deterministic policies tried
     is_firm_known: bool  # whether all deterministic policies were tried
 
     @property
     def needs_chance(self) -> bool:
-        """Whether a stochastic policy was found that beats all deterministic ones found."""
+        """Whether a stochastic policy was found that beats all deterministic ones tried."""
         return self.lower > self.firm + 10 * PROVED * max(1.0, abs(self.firm))
 
 
@@ -90,7 +94,7 @@ def best_memoryless(
         return None
     n_groups, n_actions = int(groups.max()) + 1, model.n_actions
     n_calls = max(int(MOST_WORK / size), 10)
-    found, firm = _Best(model, groups, horizon), -np.inf
+    found = _Best(model, groups, horizon)
 
     def downhill(flat: Floats) -> tuple[float, Floats]:
         logits = flat.reshape(n_groups, n_actions)
@@ -102,11 +106,18 @@ def best_memoryless(
         return -value, -(shares * (by_group - mean)).ravel()
 
     seen = np.unique(groups[states])
-    is_firm_known = n_actions ** len(seen) <= min(MOST_FIRM, n_calls)
-    for choice in product(range(n_actions), repeat=len(seen)) if is_firm_known else ():
-        actions = np.zeros(n_groups, np.int64)
-        actions[seen] = choice
-        firm = max(firm, found.take(np.eye(n_actions)[actions]))
+    arrays = model.prob, model.next_state, model.terminated, model.expected_reward
+
+    def returns(choices: Ints) -> Floats:
+        return _firm_returns(*arrays, model.initial, states, groups, choices, horizon)
+
+    n_firm, per_firm = n_actions ** len(seen), len(states) * model.n_outcomes * horizon
+    is_firm_known = n_firm <= MOST_FIRM and n_firm * per_firm <= MOST_WORK
+    firm, ends = -np.inf, []
+    if is_firm_known:
+        choices = np.zeros((n_firm, n_groups), np.int64)
+        choices[:, seen] = np.indices((n_actions,) * len(seen)).reshape(len(seen), n_firm).T
+        firm = found.take(np.eye(n_actions)[choices[returns(choices).argmax()]])
     rng = np.random.default_rng(0)
     starts = [np.zeros((n_groups, n_actions))]
     starts += [np.tile(STEEP * row, (n_groups, 1)) / 2 for row in np.eye(n_actions)]
@@ -119,7 +130,11 @@ def best_memoryless(
         n_calls -= int(end.nfev)
         logits = end.x.reshape(n_groups, n_actions)
         found.take(_softmax(logits))
-        firm = max(firm, found.take(np.eye(n_actions)[logits.argmax(axis=1)]))
+        ends.append(logits.argmax(axis=1))
+    most_returns = MOST_WORK // per_firm // max(len(ends), 1)
+    for end in () if is_firm_known else ends:
+        top = _hill_top(returns, end, seen, n_actions, most_returns)
+        firm = max(firm, found.take(np.eye(n_actions)[top]))
     work = min(MOST_RETURNS, int(MOST_WORK / size))
     upper = min(most, _bound_of_all(found, seen, horizon, work))
     if upper <= found.value + PROVED * max(1.0, abs(found.value)):
@@ -140,6 +155,24 @@ class _Best:
         if value > self.value:
             self.value, self.policy = value, policy
         return value
+
+
+def _hill_top(
+    returns: Callable[[Ints], Floats], actions: Ints, seen: Ints, n_actions: int, most_returns: int
+) -> Ints:
+    """Change the action at one observation (G,) after another, until no change is better."""
+    best, unchanged = -np.inf, 0
+    for group in cycle(seen):
+        choices = np.tile(actions, (n_actions, 1))
+        choices[:, group] = np.arange(n_actions)
+        values = returns(choices)
+        unchanged += 1
+        if values.max() > best:
+            best, actions, unchanged = values.max(), choices[values.argmax()], 0
+        most_returns -= n_actions
+        if unchanged == len(seen) or most_returns <= 0:
+            break
+    return actions
 
 
 def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
@@ -248,6 +281,40 @@ def _return_in_box(
         if not changed:
             break
     return later
+
+
+@compiled
+def _firm_returns(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    initial: Floats,
+    states: Ints,
+    groups: Ints,
+    choices: Ints,
+    horizon: int,
+) -> Floats:
+    """The returns (P,) of deterministic policies, as actions by observation (P, G)."""
+    returns, later, now = np.zeros(len(choices)), np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
+    for row in range(len(choices)):
+        later[:] = 0.0
+        for _ in range(horizon):
+            changed = False
+            for state in states:
+                action = choices[row, groups[state]]
+                value = mean_reward[state, action]
+                for k in range(prob.shape[2]):
+                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                        value += prob[state, action, k] * later[next_state[state, action, k]]
+                changed = changed or value != later[state]
+                now[state] = value
+            now, later = later, now
+            if not changed:
+                break
+        for state in states:
+            returns[row] += initial[state] * later[state]
+    return returns
 
 
 @compiled

@@ -43,10 +43,11 @@ class HiddenScale:
         best = self.best
         if best is None or not best.needs_chance:
             return None
-        most = "at most" if best.is_firm_known else "as far as was found"
+        found = "" if best.lower == best.upper else " found"
+        firm_found = "" if best.is_firm_known else " found"
         return (
-            f"the best policy without memory is random here and returns {best.lower:.2f}; always "
-            f"the same action at an observation, as in evaluations, {most} {best.firm:.2f}"
+            f"the best memoryless policy{found} is stochastic and returns {best.lower:.2f}; "
+            f"the best deterministic one{firm_found}, as in evaluations, returns {best.firm:.2f}"
         )
 
 

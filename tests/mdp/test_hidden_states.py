@@ -1,5 +1,7 @@
 """What can be had where states are hidden: with memory, and by the present observation alone."""
 
+from itertools import product
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -122,6 +124,24 @@ def test_no_policy_of_a_fine_grid_is_above_the_bound(seed):
     assert found.lower == found.upper
     firm = max(value(one, two) for one in (0.0, 1.0) for two in (0.0, 1.0))
     assert found.firm == pytest.approx(firm, abs=1e-12)
+
+
+@pytest.mark.parametrize("most_tried", [100_000, 0], ids=["all tried", "hill climbing"])
+def test_the_best_deterministic_policy_is_that_of_brute_force(most_tried, monkeypatch):
+    monkeypatch.setattr(mdp.memoryless, "MOST_FIRM", most_tried)
+    monkeypatch.setattr(mdp.memoryless, "MOST_RETURNS", 1)
+    for seed in range(3):
+        model, groups = random_world(seed, n_states=6, n_actions=3, n_groups=4)
+        found = best_memoryless(model, groups, 6)
+        choices = (np.array(each)[groups] for each in product(range(3), repeat=4))
+        best = max(policy_return(model, choice, 6).expected_return for choice in choices)
+        assert found.firm == pytest.approx(best)
+        assert found.is_firm_known == (most_tried > 0)
+    # Of 16,384 policies, as counted by another program; with the goal in the third aisle too.
+    for last_row, best in (("#S#G#.#", -47.0667), ("#S#.#G#", -33.9333)):
+        desc = [".......", "#.#.#.#", "#.#.#.#", last_row]
+        found = best_memoryless(*hidden_of("DarkWarehouse-v0", desc=desc), 100)
+        assert found.firm == pytest.approx(best, abs=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(2))
