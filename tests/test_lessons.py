@@ -168,6 +168,72 @@ def regrets(answer):
     return checker.check_regret(MEANS, ARMS, answer)
 
 
+def ahead(values, discount=DISCOUNT, **more):
+    return checker.looked_ahead(MODEL, discount, values, **more)
+
+
+def q_values(answer):
+    return checker.check_action_values(MODEL, DISCOUNT, answer)
+
+
+def improvable_states(answer):
+    return checker.check_improvable(MODEL, DISCOUNT, solved(RANDOM), answer)
+
+
+SLIPPERY = transition_model(gym.make("Warehouse-v0", slip=0.1, shelf_reward=-5))
+
+
+def moves(values, discount, **more):
+    return checker.looked_ahead(SLIPPERY, discount, values, **more)
+
+
+def greedy_policies(answer):
+    return checker.check_greedy(SLIPPERY, answer)
+
+
+def thresholds(answer):
+    return checker.check_threshold(SLIPPERY, 90, answer)
+
+
+def sweeps(answer):
+    return checker.check_sweep(MODEL, DISCOUNT, answer)
+
+
+def swept(values, order):
+    for state in order:
+        values[state] = ahead(values)[state].max()
+    return list(values)
+
+
+CLIFF = transition_model(gym.make("CliffWalking-v1"))
+
+
+def ways(answer):
+    return checker.check_ways(CLIFF, answer)
+
+
+def table_of(epsilon):
+    """The best action values of somebody who stumbles."""
+    table = np.zeros((48, 4))
+    for _ in range(400):
+        follows = (1 - epsilon) * table.max(axis=1) + epsilon * table.mean(axis=1)
+        table = checker.looked_ahead(CLIFF, 1.0, follows)
+    return table
+
+
+def optimist(n, e):
+    """The treasure's chance, and the cost of moves to the right before and after the first left."""
+    right = 1 - e / 2
+    on_the_way = sum(right**k for k in range(n)) * right
+    off = (e / 2) * (n - sum(right**k for k in range(n)))
+    return right**n - 0.01 / n * (on_the_way + off)
+
+
+def choices(answer):
+    search = np.array([[0.1, 0.3], [0.5, 0.7], [0.2, 0.2]])
+    return figures.check_choice(search, answer[0], [0.4, 0.5, 0.3], answer[1])
+
+
 def means_of_returns(answer):
     return traces.check_lambda_targets(WALK, 0.8, ZEROS, answer)
 
@@ -178,6 +244,27 @@ CASES = {
         (lambda mean, n, t: mean + np.sqrt(2 * np.log(t) / n), "Right."),
         (lambda mean, n, t: mean + np.log(t) / n, "With four times as many pulls"),
         (lambda mean, n, t: mean + np.sqrt(np.log(t) / n), "The form is right, but a factor"),
+    ],
+    checker.check_epsilon: [
+        (lambda t: 10 / t, "Right."),
+        (lambda t: min(1, 50 / (1 + t)), "Right."),
+        (lambda t: np.log(t) / t, "Right."),
+        (lambda t: max(0.01, 1 / t), "It does not fall for ever"),
+        (lambda t: t**-0.5, "It falls too slowly: regret grows like the power 0.5 of the pulls."),
+        (lambda t: t**-2.0, "It falls too fast"),
+        (lambda t: 0.99**t, "From some pull on it never explores"),
+    ],
+    exploration.check_returns: [
+        (optimist, "Right."),
+        (lambda n, e: (1 - e / 2) ** n, "For 3 rows and epsilon 0: that is the chance of the"),
+        (lambda n, e: (1 - e / 2) ** n - 0.01 * (1 - e / 2), "For 3 rows and epsilon 0.5: out of"),
+        (lambda n, e: optimist(n, min(2 * e, 1)), "For 3 rows and epsilon 0.5: a random action"),
+    ],
+    traces.check_trace_length: [
+        (lambda e, n: n / (e * (n - 1)), "Right."),
+        (lambda e, n: 1 / e, "A random action can be a best one too"),
+        (lambda e, n: n / (e * (n - 1)) - 1, "The step of the visit itself counts"),
+        (lambda e, n: 1 / (1 - e * (n - 1) / n), "The wrong way round"),
     ],
     exploration.check_divergence: [
         (divergence, "Right."),
@@ -236,6 +323,57 @@ CASES = {
         (value_iteration(MODEL, DISCOUNT).values, "They are those of an agent that always takes"),
         (solved(RANDOM, discount=1 - 1e-12), "The discount is missing"),
     ],
+    q_values: [
+        (ahead, "Right."),
+        (lambda v: ahead(v).tolist(), "Right."),
+        (lambda v: ..., "Not done yet"),
+        (lambda v: ahead(v, endless=True), "They go on after the end"),
+        (lambda v: ahead(v, 1.0), "The discount is missing."),
+        (lambda v: ahead(v) / 4, "The probability of the action counts"),
+        (
+            lambda v: ahead(v) - np.eye(16, 4, -12),
+            "The two sides of the equation differ at 2 of 64",
+        ),
+        (lambda v: ahead(v).max(axis=1), "The shape has to be (16, 4)"),
+    ],
+    greedy_policies: [
+        (lambda v, d: moves(v, d).argmax(axis=1), "Right."),
+        (lambda v, d: [row.argmax() for row in moves(v, d)], "Right."),
+        (lambda v, d: moves(v, 0.9).argmax(axis=1), "It is greedy for another discount"),
+        (lambda v, d: moves(v, 0.99).argmax(axis=1), "It is greedy for another discount"),
+        (lambda v, d: moves(v, d, endless=True).argmax(axis=1), "It goes on after the end"),
+        (lambda v, d: moves(v, d).argmin(axis=1), "61 states have a better action"),
+        (lambda v, d: moves(v, d).max(axis=1), "Actions are the numbers 0 to 3."),
+    ],
+    improvable_states: [
+        ([14, 0, 1, 2, 3, 4, 6, 8, 9, 10, 13], "Right."),
+        ([14, 10, 13], "8 states are missing."),
+        ([15], "In some of these states no episode goes on"),
+    ],
+    sweeps: [
+        (swept, "Right."),
+        (lambda v, order: ahead(v).max(axis=1), "Each state sees old values only."),
+        (lambda v, order: swept(v, range(16)), "It goes from first to last"),
+        (lambda v, order: swept(v, order[::-1]), "A new value is not the best"),
+    ],
+    thresholds: [
+        (0.77, "Right."),
+        (0.75, "A little above it, the best robot still never"),
+        (0.8, "A little below it, the goal is still worth the way."),
+        (77, "A discount lies between 0 and 1."),
+    ],
+    ways: [
+        ([table_of(0.0)] * 5, "Right."),
+        ([table_of(0.0)] * 4 + [table_of(0.1)], "On 1 of 5 seeds the way is longer"),
+        (np.zeros((5, 48, 4)), "On seed 0 the greedy policy never arrives."),
+        ([table_of(0.0)], "One table may be luck"),
+    ],
+    choices: [
+        ((1, 0.2), "Right."),
+        ((1, -0.2), "The sign is wrong"),
+        ((1, 0.3), "It is not the mean in the search less"),
+        ((0, 0.2), "Another setting has the higher mean"),
+    ],
     follows_the_best: [
         (q_target, "Right."),
         (lambda r, d, t, v: r + d * v.max(), "When the episode has terminated"),
@@ -264,9 +402,9 @@ CASES = {
 @pytest.mark.parametrize(
     ("check", "answer", "said"),
     [
-        pytest.param(check, answer, said, id=f"{check.__name__}: {said}")
+        pytest.param(check, answer, said, id=f"{check.__name__} {place}: {said}")
         for check, rows in CASES.items()
-        for answer, said in rows
+        for place, (answer, said) in enumerate(rows)
     ],
 )
 def test_what_is_said_of_an_answer(check, answer, said):
@@ -295,28 +433,10 @@ def test_optimal_values():
     assert said.startswith("They are those of random actions")
 
 
-def test_action_values():
+def test_a_reply_does_not_hold_the_answer():
     values = solved(RANDOM)
     wrong = values + 0.5 * np.eye(16)[9]
-    # The reply does not hold the answer.
     assert f"{values[9]:.3f}" not in checker.check_policy_values(MODEL, RANDOM, DISCOUNT, wrong)
-    right = checker.looked_ahead(MODEL, DISCOUNT, values)
-    assert checker.check_action_values(MODEL, DISCOUNT, values, right) == "Right."
-    undiscounted = checker.looked_ahead(MODEL, 1.0, values)
-    said = checker.check_action_values(MODEL, DISCOUNT, values, undiscounted)
-    assert said == "The discount is missing."
-    right[14, 2] -= 1
-    said = checker.check_action_values(MODEL, DISCOUNT, values, right)
-    assert "at 1 of 64 places, most in state 14, action 2: yours is lower" in said
-
-
-def test_greedy_policies():
-    plan = value_iteration(MODEL, DISCOUNT)
-    assert checker.check_greedy(MODEL, DISCOUNT, plan.values, plan.policy) == "Right."
-    worse = plan.policy.copy()
-    worse[14] = 0
-    said = checker.check_greedy(MODEL, DISCOUNT, plan.values, worse)
-    assert said.startswith("1 states have a better action by these values. In state 14 the action")
 
 
 def test_means_of_the_lambda_return():

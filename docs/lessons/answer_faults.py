@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mdp import TransitionModel
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 RIGHT = "Right."
 TOLERANCE = 1e-6
 

@@ -15,13 +15,16 @@ from answer_faults import (
     RIGHT,
     TOLERANCE,
     Floats,
+    answering,
     compared,
     fault_of_array,
+    given_back,
     looked_ahead,
+    number_from,
     probabilities,
 )
 
-from mdp import TransitionModel
+from mdp import TransitionModel, finite_horizon_optimum, policy_return, value_iteration
 
 
 def check_policy_values(model: TransitionModel, policy: Any, discount: float, values: Any) -> str:
@@ -87,56 +90,160 @@ def check_optimal_values(model: TransitionModel, discount: float, values: Any) -
     return said
 
 
+@answering
 def check_action_values(
-    model: TransitionModel, discount: float, values: Any, action_values: Any
+    model: TransitionModel, discount: float, action_values: Callable[..., Any]
 ) -> str:
-    """Whether values of actions follow from values of states, by one step ahead.
+    """Whether a function gives action values, by one step ahead; tried on values drawn at random.
 
     Args:
         model: the decision process.
         discount: from 0 to 1.
-        values: of the states, shape (S,).
-        action_values: the answer, shape (S, A).
+        action_values: called with the values of the states, shape (S,); gives shape (S, A).
     """
+    # States in which an episode ends have values too, and these must not count.
+    known = np.random.default_rng(0).normal(size=model.n_states)
+    given = given_back(action_values, known.copy())
     shape = (model.n_states, model.n_actions)
-    wrong = fault_of_array(action_values, shape, "one for each state and action")
+    wrong = fault_of_array(given, shape, "one for each state and action")
     if wrong:
         return wrong
-    found, known = np.asarray(action_values, dtype=float), np.asarray(values, dtype=float)
+    ahead = looked_ahead(model, discount, known)
     mistakes = {
         "They go on after the end: when an outcome terminates, nothing follows it.": looked_ahead(
             model, discount, known, endless=True
         ),
         "The discount is missing.": looked_ahead(model, 1.0, known),
+        "The reward is discounted too: only what follows it is.": (
+            discount * looked_ahead(model, 1.0, known)
+        ),
+        "The probability of the action counts. It must not: the action is taken.": (
+            ahead / model.n_actions
+        ),
     }
-    return compared(found, looked_ahead(model, discount, known), model.reachable, mistakes)
+    return compared(np.asarray(given, dtype=float), ahead, model.reachable, mistakes)
 
 
-def check_greedy(model: TransitionModel, discount: float, values: Any, policy: Any) -> str:
-    """Whether a policy is greedy in some values.
+def check_improvable(model: TransitionModel, discount: float, values: Any, states: Any) -> str:
+    """Whether these are the states in which one action, taken once, beats random actions.
+
+    Args:
+        model: the decision process.
+        discount: from 0 to below 1.
+        values: those of random actions, shape (S,).
+        states: the answer, numbers of states.
+    """
+    if states is None or states is Ellipsis:
+        return "Not done yet."
+    named = np.unique(np.asarray(states))
+    if not np.isin(named, np.flatnonzero(model.reachable)).all():
+        return "In some of these states no episode goes on, or there are no such states."
+    ahead = looked_ahead(model, discount, np.asarray(values, dtype=float))
+    gains = np.where(model.reachable, ahead.max(axis=1) - values, 0.0)
+    better = np.flatnonzero(gains > TOLERANCE)
+    if not np.isin(named, better).all():
+        return f"In state {np.setdiff1d(named, better)[0]} no action beats random actions."
+    if len(named) < len(better):
+        return f"{len(better) - len(named)} states are missing. Small gains count too."
+    return RIGHT
+
+
+@answering
+def check_greedy(model: TransitionModel, greedy: Callable[..., Any]) -> str:
+    """Whether a function gives greedy policies, tried on values drawn at random.
+
+    Args:
+        model: the decision process.
+        greedy: called with values, shape (S,), and a discount; gives an action for each state.
+    """
+    values, states = 50 * np.random.default_rng(0).normal(size=model.n_states), model.reachable
+
+    def lost(chosen: Floats, discount: float, *, endless: bool = False) -> Floats:
+        ahead = looked_ahead(model, discount, values, endless=endless)
+        taken = ahead[np.arange(model.n_states), chosen.astype(int)]
+        return np.where(states, ahead.max(axis=1) - taken, 0.0)
+
+    for discount in (0.9, 0.1):
+        given = given_back(greedy, values.copy(), discount)
+        wrong = fault_of_array(given, (model.n_states,), "one action for each state")
+        if wrong:
+            return wrong
+        chosen = np.asarray(given, dtype=float)
+        if not np.isin(chosen, np.arange(model.n_actions)).all():
+            return f"Actions are the numbers 0 to {model.n_actions - 1}."
+        losses = lost(chosen, discount)
+        if losses.max() <= TOLERANCE:
+            continue
+        if lost(chosen, discount, endless=True).max() <= TOLERANCE:
+            return "It goes on after the end: when an outcome terminates, nothing follows it."
+        if any(lost(chosen, other).max() <= TOLERANCE for other in (0.9, 0.99, 1.0)):
+            return "It is greedy for another discount than the one that it is called with."
+        worst = int(losses.argmax())
+        return (
+            f"{(losses > TOLERANCE).sum()} states have a better action by these values. "
+            f"In state {worst} the action {int(chosen[worst])} gives away {losses[worst]:.4g}."
+        )
+    return RIGHT
+
+
+@answering
+def check_sweep(model: TransitionModel, discount: float, sweep: Callable[..., Any]) -> str:
+    """Whether a function is a sweep of Gauss-Seidel, tried on values and orders drawn at random.
 
     Args:
         model: the decision process.
         discount: from 0 to 1.
-        values: of the states, shape (S,).
-        policy: the answer, an action for each state, shape (S,).
+        sweep: called with values, shape (S,), and the order of the states; gives new values.
     """
-    wrong = fault_of_array(policy, (model.n_states,), "one action for each state")
+    rng, states = np.random.default_rng(0), np.flatnonzero(model.reachable)
+    old, order = rng.normal(size=model.n_states), rng.permutation(states)
+    given = given_back(sweep, old.copy(), order.copy())
+    wrong = fault_of_array(given, old.shape, "one value for each state")
     if wrong:
         return wrong
-    chosen = np.asarray(policy)
-    if not np.isin(chosen, np.arange(model.n_actions)).all():
-        return f"Actions are the numbers 0 to {model.n_actions - 1}."
-    ahead = looked_ahead(model, discount, np.asarray(values, dtype=float))
-    missed = ahead.max(axis=1) - ahead[np.arange(model.n_states), chosen.astype(int)]
-    missed[~model.reachable] = 0
-    worst = int(missed.argmax())
-    if missed[worst] <= TOLERANCE:
+    new = np.asarray(given, dtype=float)
+
+    def agrees(order: Any, *, at_once: bool = False) -> bool:
+        known, is_same = old.copy(), True
+        for state in order:
+            best = looked_ahead(model, discount, known)[state].max()
+            is_same &= bool(abs(best - new[state]) < TOLERANCE)
+            known[state] = old[state] if at_once else new[state]
+        return is_same
+
+    if agrees(order):
         return RIGHT
-    return (
-        f"{(missed > TOLERANCE).sum()} states have a better action by these values. "
-        f"In state {worst} the action {int(chosen[worst])} gives away {missed[worst]:.4g}."
-    )
+    if agrees(order, at_once=True):
+        return "Each state sees old values only. It has to see the new ones of the states before."
+    if agrees(states):
+        return "It goes from first to last, whatever the order that it is called with."
+    return "A new value is not the best of one step ahead, from new values before and old ones."
+
+
+@answering
+def check_threshold(model: TransitionModel, start: int, threshold: Any) -> str:
+    """Whether below a discount it is best never to arrive, and above it is not; to 0.005.
+
+    Args:
+        model: a decision process in which the cheapest step costs 1.
+        start: the state where episodes begin.
+        threshold: the answer.
+    """
+    if threshold is None or threshold is Ellipsis:
+        return "Not done yet."
+    answer = number_from(lambda: threshold)
+    if not 0 < answer < 1:
+        return "A discount lies between 0 and 1."
+
+    def gain(discount: float) -> float:
+        """The optimal value less that of a robot that never arrives."""
+        return float(value_iteration(model, discount).values[start] + 1 / (1 - discount))
+
+    if gain(max(answer - 0.005, 0.0)) > 1e-9:
+        return "A little below it, the goal is still worth the way. What do the best actions do?"
+    if gain(min(answer + 0.005, 0.999)) <= 1e-9:
+        return "A little above it, the best robot still never arrives. Let it pay 1 for each step."
+    return RIGHT
 
 
 def check_target(target: Callable[..., float], kind: str) -> str:
@@ -260,3 +367,56 @@ def check_index(index: Callable[..., float]) -> str:
     if abs(float(index(0.0, 1, np.e**2)) - 2.0) > 1e-3:
         return "The form is right, but a factor is not: what stands before the logarithm in UCB1?"
     return RIGHT
+
+
+@answering
+def check_epsilon(epsilon: Callable[..., float]) -> str:
+    """Whether epsilon falls as fast as a regret like a logarithm needs, by its exponent.
+
+    Args:
+        epsilon: called with the number of the pull, from 1 on.
+    """
+    pulls = np.array([1e2, 1e3, 1e6, 1e8])
+    found = np.array([number_from(epsilon, pull) for pull in pulls])
+    if (found < 0).any():
+        return "A probability is not below 0."
+    if (found == 0).any():
+        return "From some pull on it never explores: a run on a bad arm stays there for ever."
+    exponent = np.log(found[3] / found[2]) / np.log(pulls[3] / pulls[2])
+    if exponent > -0.05:
+        return "It does not fall for ever, so regret grows along a straight line in the end."
+    if exponent > -0.9:
+        return f"It falls too slowly: regret grows like the power {1 + exponent:.2g} of the pulls."
+    if exponent < -1.1:
+        return (
+            "It falls too fast: even in endless runs the random pulls add up to a finite number, "
+            "and some runs stay on a bad arm."
+        )
+    return RIGHT
+
+
+def check_ways(model: TransitionModel, tables: Any) -> str:
+    """Whether the greedy policies of tables are optimal, one table for each seed.
+
+    Args:
+        model: the decision process.
+        tables: the answer, shape (seeds, S, A).
+    """
+    shape = (np.shape(tables)[0] if np.ndim(tables) == 3 else 5, model.n_states, model.n_actions)
+    wrong = fault_of_array(tables, shape, "a table for each seed")
+    if wrong:
+        return wrong
+    if shape[0] < 5:
+        return "One table may be luck: take five seeds."
+    returns = np.array(
+        [policy_return(model, table.argmax(axis=1), 1000).expected_return for table in tables]
+    )
+    lost = finite_horizon_optimum(model, 1000).start_value - returns
+    if lost.max() <= TOLERANCE:
+        return RIGHT
+    if (returns <= -1000 + TOLERANCE).any():
+        return f"On seed {int(returns.argmin())} the greedy policy never arrives."
+    return (
+        f"On {(lost > TOLERANCE).sum()} of {len(lost)} seeds the way is longer than the shortest: "
+        "how often does SARSA still try another way, once it has a safe one?"
+    )

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import gymnasium as gym
 import numpy as np
-from answer_faults import RIGHT, TOLERANCE, answering, number_from
+from answer_faults import RIGHT, TOLERANCE, Ints, answering, number_from
 from checker import check_target
 
 from envs.known_models import transition_model
-from mdp import policy_return
+from mdp import TransitionModel, policy_return, value_iteration
 
 SIZES, EPSILONS = (3, 5), (1.0, 0.5, 0.1)
 
@@ -144,4 +144,36 @@ def fault_of_bonus(once: float, rarely: float, often: float, doubled: float) -> 
         return "With four times as many visits the bonus has to be half as large."
     if abs(once - 1) > TOLERANCE:
         return "The form is right, but a factor is not: with scale 1, what is the first bonus?"
+    return RIGHT
+
+
+@answering
+def check_returns(returns: Callable[..., float]) -> str:
+    """Whether a function gives the expected return of an optimist who makes random actions.
+
+    Args:
+        returns: called with the size of the sea, and epsilon.
+    """
+    for size in SIZES:
+        model = transition_model(gym.make("DeepSea-v0", size=size, map_seed=None))
+        best = value_iteration(model, 0.999).policy
+        always_right = np.ones_like(best)
+
+        def expected(actions: Ints, epsilon: float, model: TransitionModel = model) -> float:
+            chances = epsilon / 2 + (1 - epsilon) * np.eye(2)[actions]
+            return policy_return(model, chances, model.n_states).expected_return
+
+        for epsilon in (0.0, 0.5, 0.1, 1.0):
+            found, chance = number_from(returns, size, epsilon), (1 - epsilon / 2) ** size
+            if abs(found - expected(best, epsilon)) < TOLERANCE:
+                continue
+            place = f"For {size} rows and epsilon {epsilon:g}"
+            if abs(found - chance) < TOLERANCE:
+                return f"{place}: that is the chance of the treasure. Moves to the right cost too."
+            if abs(found - expected(always_right, epsilon)) < TOLERANCE:
+                return f"{place}: out of reach of the treasure, the best action is to the left."
+            if abs(found - expected(best, 2 * epsilon if epsilon <= 0.5 else 1)) < TOLERANCE:
+                return f"{place}: a random action is the greedy one in half of the cases."
+            side = "high" if found > expected(best, epsilon) else "low"
+            return f"{place} it is too {side}."
     return RIGHT

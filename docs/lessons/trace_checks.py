@@ -142,3 +142,26 @@ def fault_of_fading(found: Floats, before: Floats, discount: float, decay: float
         if np.abs(found - factor * before).max() < TOLERANCE:
             return f"The traces of the other states do not fade enough: {missing} is missing."
     return "The traces of the other states do not fade by the right factor."
+
+
+@answering
+def check_trace_length(length: Callable[..., float]) -> str:
+    """Whether a function gives the mean number of steps for which Q(lambda) keeps a trace.
+
+    Args:
+        length: called with epsilon and the number of actions.
+    """
+    for epsilon, n_actions in ((0.5, 4), (0.1, 4), (1.0, 2), (0.2, 3)):
+        found = number_from(length, epsilon, n_actions)
+        cut = epsilon * (n_actions - 1) / n_actions
+        # One step for certain, and as many as before wherever the next action does not cut.
+        if abs(found - (1 + (1 - cut) * found)) < TOLERANCE:
+            continue
+        if abs(found - (1 + (1 - epsilon) * found)) < TOLERANCE:
+            return "A random action can be a best one too, and cuts nothing then."
+        if abs(found - (1 - cut) * (1 + found)) < TOLERANCE:
+            return "The step of the visit itself counts as well."
+        if abs(found - (1 + cut * found)) < TOLERANCE:
+            return "The wrong way round: actions that are not the best cut the trace."
+        return f"For epsilon {epsilon:g} and {n_actions} actions: how probable is a cut at a step?"
+    return RIGHT

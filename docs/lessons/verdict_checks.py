@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from answer_faults import RIGHT, TOLERANCE, answering, number_from
+from answer_faults import RIGHT, TOLERANCE, answering, fault_of_array, number_from
 
 
 @answering
@@ -116,4 +117,35 @@ def fault_of_share(told: Callable[..., float], won: float) -> str:
         return "Three runs against three are nine pairs. Does each of them count, and all alike?"
     if abs(told([1.0, 4.0, 5.0], [2.0, 3.0]) - 2 / 3) > TOLERANCE:
         return "It is right where both have the same number of seeds, and only there."
+    return RIGHT
+
+
+@answering
+def check_choice(search: Any, choice: Any, retest: Any, loss: Any) -> str:
+    """Whether a setting is the best of a search, and loses that much on held-out seeds.
+
+    Args:
+        search: scores, a row for each setting and a column for each seed.
+        choice: the answer, a row.
+        retest: scores of the chosen setting on other seeds, shape (n,).
+        loss: the answer, by how much the mean falls.
+    """
+    shape = np.shape(search) if np.ndim(search) == 2 else (4, 5)
+    n_seeds = np.shape(retest) if np.ndim(retest) == 1 else (10,)
+    wrong = fault_of_array(search, shape, "a row for each setting")
+    wrong = wrong or fault_of_array(retest, n_seeds, "one score for each seed")
+    if wrong or choice is Ellipsis or loss is Ellipsis:
+        return wrong or "Not done yet."
+    row, lost = number_from(lambda: choice), number_from(lambda: loss)
+    means, known = np.mean(search, axis=1), np.asarray(retest, dtype=float)
+    if row not in range(len(means)):
+        return f"The choice is the number of a row, 0 to {len(means) - 1}."
+    if means[int(row)] < means.max() - TOLERANCE:
+        return "Another setting has the higher mean in the search."
+    if np.isin(known, np.asarray(search)[int(row)]).all():
+        return "These are the scores of the search. The retest needs seeds that had no part in it."
+    if abs(lost + means.max() - known.mean()) < TOLERANCE < abs(lost):
+        return "The sign is wrong: a loss is above 0 where the new seeds are worse."
+    if abs(lost - (means.max() - known.mean())) > TOLERANCE:
+        return "It is not the mean in the search less the mean on the new seeds, of this setting."
     return RIGHT
