@@ -269,11 +269,14 @@ def _retest(context: RunContext, opened: OpenTuning) -> int:
 
     tuning, tell = opened.tuning, partial(say, context.console)
     ranked = best_trials(opened.queue.trials(), is_cost=tuning.is_cost)
-    candidates = chosen_for_retest(ranked, tuning.retest)
+    candidates = chosen_for_retest(ranked, tuning.retest, is_cost=tuning.is_cost)
     if not candidates:
         if tuning.retest:
             which = "no settings but the shipped ones" if ranked else "no settings"
-            tell(f"{which} were judged to the end: no re-test")
+            why = f"{which} were judged to the end"
+            if any(each.number for each in ranked):
+                why = "the best settings are clearly below the shipped settings in the search"
+            tell(f"{why}: no re-test")
         _write_down(context, opened, None)
         return 0 if ranked or not opened.queue.is_done() else 1
     again = replace(context, root=opened.root / FOLDER)

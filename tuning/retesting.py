@@ -84,9 +84,23 @@ def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candida
     return sorted(found.values(), key=order)
 
 
-def chosen_for_retest(ranked: Sequence[Candidate], k: int) -> list[Candidate]:
-    """The best ``k`` settings without the initial ones, which are re-tested anyway."""
-    return [each for each in ranked if each.number][:k]
+def chosen_for_retest(ranked: Sequence[Candidate], k: int, *, is_cost: bool) -> list[Candidate]:
+    """The best ``k`` settings, without those that are clearly below the initial ones in the search.
+
+    The initial settings are not among them: they are re-tested anyway.
+    """
+    shipped = next((each for each in ranked if not each.number), None)
+    best = [each for each in ranked if each.number][:k]
+    return [each for each in best if shipped is None or not _is_below(each, shipped, is_cost)]
+
+
+def _is_below(one: Candidate, other: Candidate, is_cost: bool) -> bool:
+    """Whether its mean in the search is lower by over two standard errors of the difference."""
+    first, second = np.array(one.figures), np.array(other.figures)
+    if min(len(first), len(second)) < 2:
+        return False
+    error = math.sqrt(sum(each.var(ddof=1) / len(each) for each in (first, second)))
+    return bool((first.mean() - second.mean()) * (1 if is_cost else -1) > 2 * error)
 
 
 def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]) -> StudySpec:

@@ -327,7 +327,7 @@ def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
     assert [each.value for each in ranked] == sorted((e.value for e in ranked), reverse=True)
     twice = best_trials([*place.queue.trials(), *place.queue.trials()], is_cost=False)
     assert twice == ranked
-    chosen = chosen_for_retest(ranked, 3)
+    chosen = chosen_for_retest(ranked, 3, is_cost=False)
     assert len(chosen) == 3
     assert all(each.number for each in chosen)
     study = retest_study(place.tuning, tmp_path, chosen)
@@ -335,6 +335,31 @@ def test_the_best_of_a_search_are_run_again_each_once(toy, tmp_path):
     assert [agent.label for agent in study.agents] == ["shipped", *[e.label for e in chosen]]
     for agent, each in zip(study.agents[1:], chosen, strict=True):
         assert read_hyperparams("qlearning", "FrozenLake-v1", agent.conf_file) == each.entry
+
+
+@pytest.mark.parametrize(
+    ("figures", "is_below"),
+    [
+        ((0.1, 0.2, 0.3), True),  # the means differ by 0.6, the standard error is 0.082
+        ((0.6, 0.7, 0.8), False),  # by 0.1
+        ((0.8, 0.8, 0.8), False),  # equal means
+        ((1.1, 1.2, 1.3), False),
+        ((0.1,), False),
+    ],
+)
+def test_settings_clearly_below_the_shipped_ones_are_not_run_again(figures, is_below):
+    def candidate(number, figures):
+        return Candidate(number, {}, float(np.mean(figures)), figures)
+
+    shipped, other = candidate(0, (0.7, 0.8, 0.9)), candidate(1, figures)
+    assert chosen_for_retest([shipped, other], 3, is_cost=False) == [other][is_below:]
+    assert chosen_for_retest([other], 3, is_cost=False) == [other]
+    # Costs are mirrored.
+    costs = [candidate(each.number, tuple(-f for f in each.figures)) for each in (shipped, other)]
+    assert chosen_for_retest(costs, 3, is_cost=True) == costs[1:][is_below:]
+    # Without spread, any difference counts.
+    level, lower = candidate(0, (0.8, 0.8)), candidate(1, (0.79, 0.79))
+    assert chosen_for_retest([level, lower], 3, is_cost=False) == []
 
 
 ENTRY = {
