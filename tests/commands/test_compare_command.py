@@ -285,7 +285,7 @@ def test_it_grows_until_decided_and_remembers_its_looks(type_command, folder):
     words = ["bandits.yml", "--until-decided", "--no-report", "--max-seeds", 14, "-j", 2, "-f", "s"]
     code, whole, err = type_command(*words)
     assert (code, err) == (0, "")
-    assert "BernoulliBandit-v0, look 1 of " in whole
+    assert "look 1 of 3, at 6 seeds: " in whole
     study = folder / "s" / "bandits"
     n_runs, looks = len(rows(study)), (study / "looks.json").read_bytes()
     last = f"{n_runs} runs, where 14 seeds of each agent would be 42; "

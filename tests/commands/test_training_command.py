@@ -57,8 +57,8 @@ def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(type
     words = SEARCH.split()
     code, out, err = type_study(*words, program="tune.py")
     assert (code, err) == (0, "")
-    assert "FrozenLake-v1, look 1 of 2: all pairs are decided" in out
-    assert "better on average than the shipped settings" in out
+    assert "look 1 of 2, at 8 seeds: all pairs are decided" in out
+    assert "better than the shipped settings, on average" in out
     record = json.loads(Path("logs/tuning/FrozenLake-v1_qlearning/tuning.json").read_text())
     assert len(record["trials"]) == 4
     for trial in record["trials"]:
@@ -75,4 +75,4 @@ def test_a_search_finds_better_settings_and_its_re_test_grows_until_decided(type
     assert "16 runs, 16 of them there already" in again
     code, _, err = type_study(*words, "--max-retest-seeds", "20", program="tune.py")
     assert (code, err.count("\n")) == (2, 1)
-    assert "the looks were fixed before the first of them and cannot change" in err
+    assert "the looks were planned before the first of them and cannot change" in err
