@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from experiments.plan import PlannedRun
     from experiments.results import StudyResults
     from experiments.run_limits import RunLimits
-    from experiments.study import StudySpec
+    from experiments.study import AgentSpec, StudySpec
     from pipeline.signs_of_life import Activity
     from report.page.frame import LearningPage
     from verdicts import Study
@@ -765,10 +765,16 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
 
     files = _conf_files(study, args.conf_file)
     changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed_settings(args)}
+    is_free = args.is_quick and "engine" not in changes
+
+    def engine(agent: AgentSpec) -> str | None:
+        is_slow = agent.settings.get("engine") != "compiled"
+        return "auto" if is_free and is_slow and args.engine is None else args.engine
+
     agents = tuple(
         replace(
             agent,
-            settings=layered(agent.settings, with_engine(agent.algo, changes, args.engine)),
+            settings=layered(agent.settings, with_engine(agent.algo, changes, engine(agent))),
             conf_file=files.get(agent.algo, agent.conf_file),
         )
         for agent in study.agents

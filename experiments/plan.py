@@ -18,6 +18,7 @@ from experiments.study import (
     MERGED,
     AgentSpec,
     EnvironmentSpec,
+    QuickSpec,
     StudySpec,
     file_name,
     layered,
@@ -42,7 +43,7 @@ from pipeline.settings.hyperparams import (
     seeds_tuned_on,
     split,
 )
-from pipeline.train_spec import TrainSpec, completed, remembers
+from pipeline.train_spec import NETWORKS, TrainSpec, completed, remembers
 
 # Fields in which runs with the same settings may differ: output paths, display, and the location
 # of modules.
@@ -371,11 +372,27 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
         raise UserError(f"{place}: how long to train? give n_timesteps or n_episodes")
     if study.is_quick:
-        raw = dict(spec.saved_hyperparams)
-        for key in raw.keys() & {"n_timesteps", "n_episodes"}:
-            raw[key] = max(round(raw[key] * study.quick.budget), 1)
+        raw = _quickened(spec, study.quick)
         spec = replace(spec, hyperparams=split(raw, place), saved_hyperparams=raw)
     return spec
+
+
+# The longest runs of a quick look, in steps: of tables in compiled code, and of all other agents.
+# In half of the steps, some networks would train in the library's loop, and take longer.
+QUICK_TABLE_STEPS, QUICK_STEPS = 200_000, 20_000
+STEPS_OF_EPISODE = 100
+
+
+def _quickened(spec: TrainSpec, quick: QuickSpec) -> dict[str, Any]:
+    """The hyperparameters with a small budget."""
+    raw = dict(spec.saved_hyperparams)
+    is_table = spec.algo not in NETWORKS and "compiled" in ALGORITHMS[spec.algo].engines
+    steps = QUICK_TABLE_STEPS if is_table else QUICK_STEPS
+    for key, most in (("n_timesteps", steps), ("n_episodes", steps // STEPS_OF_EPISODE)):
+        if key in raw:
+            less = min(raw[key], most) if quick.budget is None else round(raw[key] * quick.budget)
+            raw[key] = max(less, 1)
+    return raw
 
 
 def _raw_hyperparams(

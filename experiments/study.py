@@ -125,8 +125,11 @@ class EnvironmentSpec:
 class QuickSpec:
     """The reduction of a study for a quick look."""
 
-    seeds: int = 2  #: the number of seeds
-    budget: float = 0.1  #: share of each run's steps or episodes
+    #: The number of seeds; None for 2, or 1 with more than ten pairs of agent and environment.
+    seeds: int | None = None
+    #: Share of each run's steps or episodes; None for 200,000 steps at most, or 20,000 where the
+    #: agent is no table. An episode counts as 100 steps.
+    budget: float | None = None
 
 
 @dataclass(frozen=True)
@@ -183,10 +186,11 @@ class StudySpec:
 
     def quickened(self) -> StudySpec:
         """The study with few seeds and a small budget, in a separate folder."""
+        n_pairs = len(self.agents) * len(self.environments)
         return replace(
             self,
             name=f"{self.name}-quick",
-            n_seeds=min(self.quick.seeds, self.n_seeds),
+            n_seeds=min(self.quick.seeds or (1 if n_pairs > MOST_PAIRS else 2), self.n_seeds),
             is_quick=True,
         )
 
@@ -197,6 +201,7 @@ class StudySpec:
 _SHIPPED = Path(__file__).resolve().parents[1] / "studies"
 
 MOST_AGENTS = 10_000
+MOST_PAIRS = 10  # of agent and environment, for two seeds of each in a quick look
 
 BUDGETS = ("n_timesteps", "n_episodes")
 
@@ -361,7 +366,7 @@ def write_study(root: Path, study: StudySpec) -> None:
     data = {key: getattr(study, key) for key in _STUDY_VALUES if hasattr(study, key)}
     limits = {key: str(limit) for key in _LIMITS if (limit := getattr(study, key)) is not None}
     data |= {"seeds": {key: getattr(study, name) for key, name in _SEEDS.items()}, **limits}
-    data["quick"] = vars(study.quick)
+    data["quick"] = {key: value for key, value in vars(study.quick).items() if value is not None}
     data["environments"] = {
         environment.label: {
             "id": environment.env_id,

@@ -5,6 +5,7 @@ from dataclasses import fields
 
 import pytest
 
+from agents import ALGORITHMS
 from commands import compare, enjoy, train, tune
 from commands.cli import INSTEAD
 from commands.compare import study_spec
@@ -75,6 +76,12 @@ def test_flags_of_compare_reach_the_study(tmp_path):
     assert {name: getattr(study, name) for name in given} == given
     quick = compared(*PAIR, "--quick")
     assert (quick.is_quick, quick.n_seeds) == (True, 2)
+    shorter = ["--quick", "-n", "300000", "--env", "MineMaze-v0"]
+    planned = plan(compared(*shorter, "--algos", "ppo", "qlearning", "random"), tmp_path)
+    budgets = {run.agent: run.spec.hyperparams.n_timesteps for run in planned}
+    assert budgets == {"ppo": 20_000, "qlearning": 200_000, "random": 20_000}
+    assert planned[0].spec.hyperparams.algorithm["engine"] == "auto"
+    assert compared(*shorter, "Taxi-v4", "--algos", *list(ALGORITHMS)[:6]).n_seeds == 1
     words = ["--env", "Warehouse-v0", "--algos", "ppo", "qlearning"]
     for flags, changed in ((), {"ppo"}), (["--as-it-comes"], set()):
         planned = plan(compared(*words, *flags), tmp_path)
