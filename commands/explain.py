@@ -40,8 +40,8 @@ def build_parser() -> argparse.ArgumentParser:
     add_model_flags(parser)
     group = parser.add_argument_group("explaining")
     add = group.add_argument
-    test = "train four seeds with this change (KEY:VALUE ...) and four without; repeat the flag "
-    test += "to try several changes; without a change, a few common ones are tried"
+    test = "train four seeds with this change (KEY:VALUE ...), with the shipped settings and as it "
+    test += "is; repeat the flag to try several changes; without a change, try the proposed ones"
     add("--test", nargs="*", action="append", metavar="KEY:VALUE", help=test)
     other = "another agent on the same environment: where the two first differ, and what it costs"
     add("--against", type=filled, metavar="MODEL", help=other)
@@ -58,7 +58,7 @@ def main() -> int:
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes(), ExitStack() as stack:
         from commands.terminal import TextConsole, say
-        from report.why import why_lines
+        from report.why import as_words, why_lines
 
         console = TextConsole(highlight=False)
         wanted = model_request(args)
@@ -66,8 +66,9 @@ def main() -> int:
         explained = one.explanation()
         for line in why_lines(explained):
             say(console, line)
-        if explained.proposal is not None and args.test is None:
-            say(console, f"to see what helps: --test {explained.proposal}, or --test alone")
+        if explained.proposals and args.test is None:
+            likeliest = ", ".join(f"--test {as_words(one)}" for one in explained.proposals[:2])
+            say(console, f"to see what helps: {likeliest}, or --test alone")
         data = explained.as_data()
         if args.against is not None:
             other = replace(wanted, path=Path(args.against), algo=None, env_id=None)
@@ -190,25 +191,30 @@ def _course(console: Console, one: Asked, stack: ExitStack, last: Explanation) -
 def _test(
     console: Console, args: argparse.Namespace, one: Asked, explained: Explanation
 ) -> list[Any]:
-    """Train four seeds without and with each change, and print the best; return JSON data."""
+    """Train four seeds as shipped, as it is and with each change; return the returns as JSON."""
     from commands.compare import RunContext, results_of
-    from commands.terminal import say
-    from experiments.interventions import AS_IT_IS, intervention_study, tried, usual_changes
+    from commands.terminal import about, say
+    from experiments.interventions import intervention_study, relative_length, tried
     from experiments.launching import available_cores
+    from experiments.plan import plan
     from experiments.run_limits import RunLimits
     from report.why import tried_lines
 
     spec, run = one.chosen.spec, one.chosen.run
-    changes = [" ".join(change) for change in args.test if change]
-    if not changes:
-        changes = usual_changes(spec, explained.proposal, one.agent.num_timesteps)
+    changes = [" ".join(change) for change in args.test if change] or explained.proposals
     name = one.chosen.path.stem if run is None else f"{spec.algo}_{run.path.name}"
     study = intervention_study(spec, changes, name)
     root = Path(args.folder) / "explain" / study.name
     workers = max(args.jobs, 0) or available_cores()
+    runs = [planned for planned in plan(study, root) if planned.is_to_do]
+    seconds = (run.read_info() if run is not None else {}).get("cpu_seconds")
+    if runs and seconds is not None:
+        length = relative_length(runs, spec, one.agent.num_timesteps)
+        time = about(seconds * length / min(workers, len(runs)))
+        say(console, f"{len(runs)} runs, {time} at the pace of this run")
     context = RunContext(root, command_line(), RunLimits(), console, n_workers=workers)
     found = tried(results_of(study, context))
-    for line in tried_lines(found, AS_IT_IS):
+    for line in tried_lines(found, explained.optimum):
         say(console, line)
     return [{"change": each.change, "returns": each.returns.tolist()} for each in found]
 

@@ -13,7 +13,8 @@ may be negative.
 5. Values not settled: one exact look-ahead with the agent's own values.
 6. Look-ahead: the agent itself.
 
-A part says where the return is lost, not why. `experiments.interventions` tries what helps.
+A part says where the return is lost, not why. `diagnosis.proposals` says what may help, and
+`experiments.interventions` tries it.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
+from diagnosis.proposals import proposals
 from envs.known_models import transition_model
 from envs.layout import action_names, state_name
 from mdp import (
@@ -61,11 +63,6 @@ MOST_STATES, MOST_OF_GAP = 3, 0.5
 SURELY = 0.99
 # Repairs that regain less than this share of the gap are not worth a line.
 WORTH_A_LINE = 0.05
-# The share from which on a change is proposed; parts that more training may reduce, and its factor.
-LARGE = 0.25
-SMALL = 0.1  # of the gap: a gap in the agent's own objective below this is small
-UNFINISHED = ("never tried", "not settled", "look-ahead", "learning")
-MORE_TRAINING = 4
 # Returns within this of each other, relative to them, count as equal.
 ROUNDING = 1e-9
 
@@ -116,7 +113,7 @@ class Explanation:
     road: str = ""
     is_caught: bool = False  #: whether most of its episodes run out of time
     looks_alike: bool = False  #: whether it cannot tell states apart
-    proposal: str | None = None  #: a change that may help, as ``--test`` takes it
+    proposals: tuple[str, ...] = ()  #: changes to try with ``--test``, the likeliest first
 
     @property
     def gap(self) -> float:
@@ -154,7 +151,7 @@ class Explanation:
             "discount": self.discount,
             "gap_in_own_objective": self.own_gap,
             "road": self.road,
-            "proposal": self.proposal,
+            "proposals": self.proposals,
         }
 
 
@@ -203,7 +200,7 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
         if explained.is_optimal:
             return explained
         task = _task(spec, agent, evaluator)
-        found = _Found(evaluator, agent, policy, split, task)
+        found = Found(evaluator, agent, policy, split, task)
         explained = replace(
             explained,
             parts=found.parts(),
@@ -218,7 +215,8 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
             explained = replace(explained, road=alike, repairs=(), looks_alike=True)
         elif not explained.is_concentrated:
             explained = replace(explained, road=found.road(words))
-        return replace(explained, proposal=found.proposal(explained.parts))
+        changes = proposals(spec, found, explained.parts)
+        return replace(explained, proposals=tuple(one.change for one in changes))
 
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:
@@ -256,7 +254,7 @@ class _Words:
         return self._actions[action] if action < len(self._actions) else f"action {action}"
 
 
-class _Found:
+class Found:
     """The analysis of one agent's gap."""
 
     def __init__(
@@ -302,11 +300,11 @@ class _Found:
                 found.append(Part(name, reached - value, meaning))
                 reached = value
 
-        best = self._best_of(self.for_discount)
+        best = self.best_of(self.for_discount)
         known = f"the best policy for discount {task.discount:g} returns {best:.4g}"
         down_to(best, "objective", known)
         if task.epsilon > 0:
-            best = self._best_of(self.own_values)
+            best = self.best_of(self.own_values)
             told = f"the best policy that explores with epsilon {task.epsilon:g}"
             down_to(best, "exploring", f"{told} returns {best:.4g}")
         if self.groups is not None:
@@ -342,7 +340,7 @@ class _Found:
         seen = self._worth(ahead.argmax(axis=1))
         down_to(seen, "not settled", f"one exact look ahead with its own values returns {seen:.4g}")
 
-    def _best_of(self, values: Floats) -> float:
+    def best_of(self, values: Floats) -> float:
         """The return of the best policy whose actions are all greedy in some values (S, A)."""
         top = values.max(axis=1, keepdims=True)
         greedy = values >= top - TIE * np.maximum(1.0, np.abs(top))
@@ -372,26 +370,7 @@ class _Found:
             return self.split.value
         taken = np.eye(self.model.n_actions, dtype=np.bool_)[self.taken]
         allowed = np.where(unknown[:, None], taken, tried)
-        return self._best_of(np.where(allowed, plan.action_values, -np.inf))
-
-    def proposal(self, parts: tuple[Part, ...]) -> str | None:
-        """The change to one setting that the largest part suggests, as ``--test`` takes it."""
-        gap, own_gap = self.split.gap, self.own_gap()
-        lost = {part.name: part.loss / gap for part in parts}
-        suggested: dict[str, float] = {}
-        if self.task is not None:
-            nearer = 1 - 0.5 / self.horizon  # what `gamma: auto` stands for
-            values = policy_iteration(self.task.model, nearer).action_values
-            if nearer > self.task.discount and self._best_of(values) > self.split.value:
-                # There is little reason to learn what the agent's own objective hardly rewards.
-                is_small = own_gap is not None and own_gap < SMALL * gap
-                suggested["gamma:auto"] = 1.0 if is_small else lost.get("objective", 0.0)
-        suggested["exploration_final_eps:0"] = lost.get("exploring", 0.0)
-        steps = f"{MORE_TRAINING * self.agent.num_timesteps:.2g}"
-        unfinished = sum(lost.get(name, 0.0) for name in UNFINISHED)
-        suggested[f"n_timesteps:{float(steps):.0f}"] = unfinished
-        change = max(suggested, key=lambda one: suggested[one])
-        return change if suggested[change] >= LARGE else None
+        return self.best_of(np.where(allowed, plan.action_values, -np.inf))
 
     # --- in its own objective ---------------------------------------------------------------------
 

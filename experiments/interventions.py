@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
+from itertools import count
 from typing import Any
 
+import numpy as np
+
+from diagnosis.proposals import shipped_settings
+from experiments.plan import PlannedRun
 from experiments.results import StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from mdp.transition_model import Floats
 from pipeline.agent_settings import with_engine
+from pipeline.files import plain
 from pipeline.settings.values import parse_assignments
 from pipeline.train_spec import TrainSpec
 
 SEEDS = 4
-AS_IT_IS = "as it is"
-# Default factors for the step size and for the number of steps.
-FACTORS = (0.25, 4)
-MORE_TRAINING = 4
-# Settings that keep the initial exploration during the whole training.
-EXPLORES_ON = "exploration_fraction:1"
+SHIPPED, AS_IT_IS = "as shipped", "as it is"
+_RANKS = {SHIPPED: 0, AS_IT_IS: 1}
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,27 +30,17 @@ class Tried:
     """A change and its results."""
 
     change: str  #: as typed, or ``"as it is"``
-    returns: Floats  #: of the final policies of finished runs, shape (n,)
-    scores: Floats  #: on the yardstick's scale, NaN without one, shape (n,)
+    returns: Floats  #: of the final policy by seed, NaN for runs that did not finish
 
-
-def usual_changes(spec: TrainSpec, proposal: str | None, n_steps: int) -> list[str]:
-    """The default changes: the proposal first, then one setting at a time."""
-    settings = spec.saved_hyperparams
-    found = [proposal] if proposal else []
-    if isinstance(settings.get("gamma"), int | float):
-        found.append("gamma:auto")
-    found.append(f"n_timesteps:{float(f'{MORE_TRAINING * n_steps:.2g}'):.0f}")
-    rate = settings.get("learning_rate")
-    if isinstance(rate, int | float):
-        found += [f"learning_rate:{factor * rate:g}" for factor in FACTORS if factor * rate <= 1]
-    if "exploration_final_eps" in settings:
-        found += [EXPLORES_ON, "exploration_final_eps:0"]
-    return list(dict.fromkeys(found))
+    @property
+    def mean(self) -> float:
+        """The mean return of the runs that finished; -inf without one."""
+        finished = self.returns[~np.isnan(self.returns)]
+        return float(finished.mean()) if len(finished) else -np.inf
 
 
 def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> StudySpec:
-    """Make a study of a run's agent, unchanged and with each of the changes.
+    """Make a study of a run's agent, as shipped, unchanged and with each of the changes.
 
     Args:
         spec: the spec of the run.
@@ -57,17 +50,25 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
     Raises:
         UserError: if a change cannot be parsed.
     """
-    own = dict(spec.saved_hyperparams)
-    read: Mapping[str, Mapping[str, Any]] = {
-        change: parse_assignments(change.split(), "--test") for change in changes
+    own, shipped = dict(spec.saved_hyperparams), shipped_settings(spec)
+    settings = {
+        change: layered(own, parse_assignments(change.split(), "--test")) for change in changes
     }
-    settings = {AS_IT_IS: own} | {one: layered(own, change) for one, change in read.items()}
-    agents = [
-        AgentSpec(label, spec.algo, _fast(spec.algo, values), tuned=False)
-        for label, values in settings.items()
-    ]
+    first = dict([*settings.items()][:1])  # the likeliest change is trained first
+    unchanged = {SHIPPED: shipped, AS_IT_IS: own}
+    if {**own, "engine": None} == {**shipped, "engine": None}:
+        unchanged = {f"{SHIPPED}, {AS_IT_IS}": own}
+    labels: dict[str, str] = {}  # by folder, where some systems ignore case
+    agents = []
+    for change, values in {**first, **unchanged, **settings}.items():
+        names = (change if n == 1 else f"{change} ({n})" for n in count(1))
+        label = next(name for name in names if file_name(name).casefold() not in labels)
+        labels[file_name(label).casefold()] = label
+        agents.append(AgentSpec(label, spec.algo, _fast(spec.algo, values), tuned=False))
+    # Two models of one name share a folder only if their settings are the same.
+    digest = sha256(repr(sorted(plain(own).items())).encode()).hexdigest()[:8]
     return StudySpec(
-        name=file_name(f"explain_{name}"),
+        name=file_name(f"explain_{name}_{digest}"),
         title=f"What helps {spec.algo} on {spec.env_id}",
         agents=tuple(agents),
         environments=(EnvironmentSpec(spec.env_id, spec.env_id),),
@@ -82,12 +83,18 @@ def _fast(algo: str, settings: dict[str, Any]) -> dict[str, Any]:
     return settings if "engine" in settings else with_engine(algo, settings, "auto")
 
 
+def relative_length(runs: Sequence[PlannedRun], spec: TrainSpec, steps: int) -> float:
+    """The length of all runs, in runs of ``spec``, which took so many steps."""
+    episode = steps / (spec.hyperparams.n_episodes or steps)  # 1 where the length is unknown
+    budgets = [run.spec.hyperparams for run in runs]
+    return sum((one.n_timesteps or (one.n_episodes or 0) * episode) / steps for one in budgets)
+
+
 def tried(results: StudyResults) -> list[Tried]:
-    """The results of each change, highest mean return first."""
-    table = results.summary
+    """The results of each change: as shipped, as it is, then by falling mean return."""
     found = []
     for agent in results.study.agents:
-        rows = table[table["agent"] == agent.label]
-        returns, scores = rows["final"].to_numpy(), rows["score"].to_numpy()
-        found.append(Tried(agent.label, returns, scores))
-    return sorted(found, key=lambda one: -one.returns.mean() if len(one.returns) else float("inf"))
+        rows = results.summary[results.summary["agent"] == agent.label].set_index("seed")["final"]
+        found.append(Tried(agent.label, rows.reindex(results.study.seeds).to_numpy(float)))
+    by_return = sorted(found, key=lambda one: -one.mean)
+    return sorted(by_return, key=lambda one: _RANKS.get(one.change.partition(",")[0], len(_RANKS)))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.train_spec import TrainSpec
@@ -17,6 +20,8 @@ if TYPE_CHECKING:
 
 # A part below this share of the gap has no line.
 LEAST_SHARE = 0.02
+# The least share of the gap that a change closes to count as a remedy.
+REMEDY = 0.05
 MOST_STATES = 3
 
 
@@ -70,7 +75,7 @@ def _why_of(spec: TrainSpec, path: Path) -> Why | None:
         if evaluator is not None:
             agent = load_model(spec.algo, path, modules=spec.user_modules, device="cpu")
             found = explanation(spec, agent, evaluator)
-            return Why(why_lines(found), found.proposal)
+            return Why(why_lines(found), next(map(as_words, found.proposals), None))
     return None
 
 
@@ -129,19 +134,39 @@ def course_lines(course: Mapping[int, Explanation]) -> list[str]:
     return ["  ".join(map(str.rjust, row, widths)) for row in rows]
 
 
-def tried_lines(tried: Sequence[Tried], as_it_is: str) -> list[str]:
-    """The returns of each change over its seeds, the best first, and that this is no verdict."""
+def as_words(change: str) -> str:
+    """A change as it is typed in a shell."""
+    return " ".join(map(shlex.quote, change.split()))
+
+
+def tried_lines(tried: Sequence[Tried], optimum: float) -> list[str]:
+    """The returns of each change by seed, and which change helps most; a hint and no verdict."""
+    from experiments.interventions import AS_IT_IS, SHIPPED
+
     width = max(len(one.change) for one in tried)
     told = []
     for one in tried:
-        returns = " ".join(f"{value:.5g}" for value in one.returns) or "no run finished"
-        mean = f"mean {one.returns.mean():.5g}, " if len(one.returns) else ""
-        told.append(f"  {one.change:<{width}}  {mean}{returns}")
-    best = tried[0]
-    before = next(one for one in tried if one.change == as_it_is)
-    n_runs = len(before.returns)
-    if best is before or not len(best.returns) or best.returns.mean() <= before.returns.mean():
-        return [*told, "no change that was tried is better on average"]
-    n_above = sum(best.returns > before.returns.max()) if n_runs else 0
-    said = f"{best.change} is best on average: {n_above} of its {len(best.returns)} runs are above "
-    return [*told, f"{said}every run as it is; four seeds are a hint, compare.py gives a verdict"]
+        returns = " ".join(f"{value:.5g}" for value in one.returns[~np.isnan(one.returns)])
+        mean = f"mean {one.mean:.5g}, {returns}" if returns else "no run finished"
+        told.append(f"  {one.change:<{width}}  {mean}")
+    before = next(one for one in tried if one.change.endswith(AS_IT_IS))
+    gap, n_seeds = optimum - before.mean, len(before.returns)
+    if not 1e-9 * max(1.0, abs(optimum)) < gap < np.inf:
+        return [
+            *told,
+            "as it is, every run is optimal" if gap < np.inf else "nothing to compare with",
+        ]
+    helpful: dict[str, tuple[float, int]] = {}
+    for one in tried:
+        least = np.minimum(before.returns + REMEDY * gap, optimum - REMEDY * gap)
+        closed, n_better = (one.mean - before.mean) / gap, int((one.returns >= least).sum())
+        if closed >= REMEDY and 2 * n_better >= n_seeds:
+            helpful[one.change] = closed, n_better
+    changes = {change: found for change, found in helpful.items() if change != SHIPPED}
+    if not changes:
+        told.append(f"no change closes {REMEDY:.0%} of the gap and helps half of the seeds")
+    for change in [max(changes or helpful, key=helpful.__getitem__)] if helpful else []:
+        closed, n_better = helpful[change]
+        share = f"closes {closed:.0%} of the gap on average"
+        told.append(f"{change} helps most: it {share}, in {n_better} of {n_seeds} seeds")
+    return [*told, "four seeds are a hint, compare.py gives a verdict"]

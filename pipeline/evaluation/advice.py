@@ -126,7 +126,7 @@ def _try_first(
     if not isinstance(gamma, float) or trained_on is None:
         return None
     model, observations = trained_on
-    is_near = _share_of_standing_still(agent, model, observations, gamma) >= NEAR_STANDING_STILL
+    is_near = share_of_standing_still(agent, model, observations, gamma) >= NEAR_STANDING_STILL
     nearer = max(1 - 0.5 / evaluator.horizon, gamma)
     score, reached = (_planned(evaluator, model, discount) for discount in (gamma, nearer))
     raises_gamma = nearer > gamma and (is_near or score < reached - MATTERS)
@@ -180,7 +180,7 @@ def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) ->
     return evaluator.yardstick.score(found.expected_return)
 
 
-def _share_of_standing_still(
+def share_of_standing_still(
     agent: BaseAlgorithm, model: TransitionModel, observations: Any, gamma: float
 ) -> float:
     """The agent's start value divided by the value of standing still; 0 if free or unknown."""
