@@ -216,7 +216,7 @@ def _test(
     found = tried(results_of(study, context))
     for line in tried_lines(found, explained.optimum):
         say(console, line)
-    return [{"change": each.change, "returns": each.returns.tolist()} for each in found]
+    return [{"change": each.change, "returns": each.finished.tolist()} for each in found]
 
 
 def _draw(console: Console, one: Asked, explained: Explanation, path: Path) -> None:

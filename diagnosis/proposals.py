@@ -89,7 +89,7 @@ def shipped_settings(spec: TrainSpec) -> dict[str, Any]:
 
 def proposals(spec: TrainSpec, found: Found, parts: tuple[Part, ...]) -> tuple[Proposal, ...]:
     """Changes that may close the gap of a run, the likeliest first; none for planners."""
-    if isinstance(found.agent, PlanningAgent | RandomAgent) or found.agent.num_timesteps < 1:
+    if isinstance(found.agent, PlanningAgent | RandomAgent):
         return ()
     case = _Case(spec, found, parts)
     scores: dict[str, float] = {}
@@ -221,7 +221,8 @@ class _Case:
 
     def _budget(self) -> Iterator[_Change]:
         """More steps or episodes: four times as many, and at least the shipped ones."""
-        key, steps = EPISODES if self.own.get(EPISODES) else STEPS, self.found.agent.num_timesteps
+        key = EPISODES if self.own.get(EPISODES) else STEPS
+        steps = max(self.found.agent.num_timesteps, 1)
         now = self.own.get(key) or steps
         usual = self.usual.get(key) or (self.usual.get(STEPS) or 0) * now / steps
         more = int(float(f"{max(FACTOR * now, usual):.2g}"))
@@ -300,8 +301,8 @@ class _Case:
         for _ in range(min(self.limit, model.n_states) - 1):
             here[model.next_state[here][goes[here]]] = True
         meets = ~here[model.next_state] & goes
-        counted = {"terminated": model.terminated | meets, "reward": meets * 1.0}
-        ends = replace(model, reward_variance=None, **counted)
+        ends = replace(model, terminated=model.terminated | meets, reward=meets * 1.0)
+        ends = replace(ends, reward_variance=None)
         return policy_return(ends, self.best, self.found.horizon).expected_return
 
     def _expected(self, epsilons: Floats | None) -> Floats:

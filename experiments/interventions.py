@@ -33,10 +33,14 @@ class Tried:
     returns: Floats  #: of the final policy by seed, NaN for runs that did not finish
 
     @property
+    def finished(self) -> Floats:
+        """The returns of the runs that finished."""
+        return self.returns[~np.isnan(self.returns)]
+
+    @property
     def mean(self) -> float:
         """The mean return of the runs that finished; -inf without one."""
-        finished = self.returns[~np.isnan(self.returns)]
-        return float(finished.mean()) if len(finished) else -np.inf
+        return float(self.finished.mean()) if len(self.finished) else -np.inf
 
 
 def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> StudySpec:

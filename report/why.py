@@ -146,7 +146,7 @@ def tried_lines(tried: Sequence[Tried], optimum: float) -> list[str]:
     width = max(len(one.change) for one in tried)
     told = []
     for one in tried:
-        returns = " ".join(f"{value:.5g}" for value in one.returns[~np.isnan(one.returns)])
+        returns = " ".join(f"{value:.5g}" for value in one.finished)
         mean = f"mean {one.mean:.5g}, {returns}" if returns else "no run finished"
         told.append(f"  {one.change:<{width}}  {mean}")
     before = next(one for one in tried if one.change.endswith(AS_IT_IS))

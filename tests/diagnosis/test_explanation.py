@@ -114,7 +114,7 @@ def test_a_discount_that_hides_the_goal_is_the_objective_s_part():
     found = explained("qlearning", "Warehouse-v0", entry, with_values(0.5))
     assert parts_of(found)["objective"] == pytest.approx(found.gap)
     assert found.own_gap == pytest.approx(0.0, abs=1e-9)
-    assert found.proposal.startswith("gamma:auto")
+    assert found.proposals[0] == "gamma:auto"
 
 
 @pytest.mark.parametrize(
