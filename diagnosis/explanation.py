@@ -215,8 +215,7 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
             explained = replace(explained, road=alike, repairs=(), looks_alike=True)
         elif not explained.is_concentrated:
             explained = replace(explained, road=found.road(words))
-        changes = proposals(spec, found, explained.parts)
-        return replace(explained, proposals=tuple(one.change for one in changes))
+        return replace(explained, proposals=proposals(spec, found, explained.parts))
 
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:

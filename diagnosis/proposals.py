@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import bdtr
@@ -22,21 +22,17 @@ from agents.reference import RandomAgent
 from envs.known_models import time_limit
 from mdp import TransitionModel, policy_iteration, policy_return, state_values, state_visitation
 from mdp.transition_model import Floats, Ints
-from pipeline.agent_settings import resolved_spec, training_follows, without_auto
+from pipeline.agent_settings import shipped_settings
 from pipeline.environments import make_single_env, trains_on_variant
-from pipeline.errors import UserError
 from pipeline.evaluation.advice import share_of_standing_still
 from pipeline.evaluation.policies import is_network
-from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.settings.values import algorithm_parameters, parse_literal, parse_schedule
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from diagnosis.explanation import Found, Part
 
-# Settings of the task, on which the shipped settings are tried too.
-TASK = ("env_kwargs", "eval_env_kwargs", "env_wrapper")
-STEPS, EPISODES = BUDGETS = ("n_timesteps", "n_episodes")
+STEPS, EPISODES = "n_timesteps", "n_episodes"
 VARIANT = ("train_env_kwargs", "train_env_wrapper")
 FIRST, LAST, FRACTION, DECAY = EXPLORATION = (
     *("exploration_initial_eps", "exploration_final_eps"),
@@ -51,8 +47,7 @@ FACTOR = 4  # for more steps, another step size, a larger network
 ENOUGH = 10  # updates of an action
 LEARNING = ("never tried", "not settled", "look-ahead", "learning")  # parts with causes in learning
 MOMENTS = np.array([0.1, 0.3, 0.5, 0.7, 0.9])  # of the training, at which schedules are compared
-# Action values this near to the best count as equal, relative to the spread of values: for agents
-# whose estimates have errors, and for the others.
+# Relative to the spread of action values: what counts as equal where estimates have errors, or not.
 BLUR, TIE = 0.02, 1e-9
 # The agent's value of the start, as a share of the value of standing still, if it stands still.
 STANDS_STILL = (0.8, 1.2)
@@ -60,35 +55,12 @@ MOST_OTHERS = 3  # settings that are proposed only because the shipped ones diff
 DIFFERENT = 0.4  # the least distance from the shipped value
 
 
-class Proposal(NamedTuple):
-    """A change of settings that may help."""
-
-    change: str  # as ``--test`` takes it
-    score: float  # the share of the gap that it may close, roughly
-
-
 # A change, its weight among the causes in learning, and the share of the gap that planning gives.
 _Change = tuple[Mapping[str, Any], float, float]
 
 
-def shipped_settings(spec: TrainSpec) -> dict[str, Any]:
-    """The shipped settings of a run's agent on its task; the class's defaults without an entry."""
-    task = {key: spec.saved_hyperparams[key] for key in TASK if key in spec.saved_hyperparams}
-    entry: dict[str, Any] = {}
-    with suppress(UserError):
-        entry |= read_hyperparams(spec.algo, spec.env_id, env_kwargs=task.get("env_kwargs"))
-    raw, _ = training_follows({k: v for k, v in entry.items() if k not in TASK}, task)
-    if not any(raw.get(key) for key in BUDGETS):
-        raw |= {k: v for k, v in spec.saved_hyperparams.items() if k in BUDGETS}
-    raw = {**raw, **task}
-    named = {key: getattr(spec, key) for key in ("algo", "env_id", "gym_packages", "user_modules")}
-    with suppress(UserError):  # if an automatic value does not exist here
-        return resolved_spec(raw, seed=0, **named).saved_hyperparams
-    return without_auto(raw)
-
-
-def proposals(spec: TrainSpec, found: Found, parts: tuple[Part, ...]) -> tuple[Proposal, ...]:
-    """Changes that may close the gap of a run, the likeliest first; none for planners."""
+def proposals(spec: TrainSpec, found: Found, parts: tuple[Part, ...]) -> tuple[str, ...]:
+    """Changes as ``--test`` takes them, the likeliest first; none for planners."""
     if isinstance(found.agent, PlanningAgent | RandomAgent):
         return ()
     case = _Case(spec, found, parts)
@@ -99,7 +71,7 @@ def proposals(spec: TrainSpec, found: Found, parts: tuple[Part, ...]) -> tuple[P
         score = min(max(share, 0.0), 1.0) + case.rest * weight / (1 + weight)
         if kept:
             scores[text] = max(score, scores.get(text, 0.0))
-    return tuple(Proposal(*one) for one in sorted(scores.items(), key=lambda one: -one[1]))
+    return tuple(sorted(scores, key=lambda one: -scores[one]))
 
 
 class _Case:
@@ -176,27 +148,24 @@ class _Case:
 
     def _objective(self) -> Iterator[_Change]:
         """Training on the task as it is, a discount nearer to 1, higher initial values."""
-        own, task, reach = self.own, self.found.task, self.model.reachable
+        own, found, task = self.own, self.found, self.found.task
+        values, before = found.own_values, found.for_discount
         differs = {VARIANT[0]: trains_on_variant(self.spec), VARIANT[1]: True}
         if changed := [key for key in VARIANT if own.get(key) and differs[key]]:
-            odd = sum(own[key] != self.usual.get(key) for key in changed)
-            before = self.found.for_discount
-            share = 0.0 if task is None else self._gain(self.found.model, task.discount, before)
+            odd, share = sum(own[key] != self.usual.get(key) for key in changed), 0.0
+            if task is not None and before is not None:
+                share = self._gain(found.model, task.discount, before)
             yield dict.fromkeys(changed), odd + 8 * self.out_of_reach, share
-        if task is None or self.found.own_values is None:
+        if task is None or values is None:
             return
-        nearer = round(1 - 0.5 / self.found.horizon, 7)
+        nearer = round(1 - 0.5 / found.horizon, 7)
         if "gamma" in self.known and task.discount < nearer:
-            seen = self.found.evaluator.observations
-            still = share_of_standing_still(self.found.agent, task.model, seen, task.discount)
-            stands = STANDS_STILL[0] <= still <= STANDS_STILL[1]
-            yield (
-                {"gamma": "auto"},
-                4.0 * stands,
-                self._gain(task.lived, nearer, self.found.own_values),
-            )
+            seen = found.evaluator.observations
+            still = share_of_standing_still(found.agent, task.model, seen, task.discount)
+            weight = 4.0 * (STANDS_STILL[0] <= still <= STANDS_STILL[1])
+            yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, values)
         if "initial_q" in self.known:
-            best = self.found.own_values.max(axis=1)[reach]
+            best = values.max(axis=1)[task.model.reachable]
             high = max(float(f"{best.max():.3g}"), self.usual["initial_q"])
             # Values below all true ones hide every action that was not tried.
             far = (best.min() - own["initial_q"]) / max(high - best.min(), TIE)
@@ -204,14 +173,14 @@ class _Case:
             if high > own["initial_q"]:
                 yield {"initial_q": high}, (1 - self.out_of_reach) * weight, 0.0
 
-    def _gain(self, model: TransitionModel, discount: float, before: Floats | None) -> float:
+    def _gain(self, model: TransitionModel, discount: float, before: Floats) -> float:
         """The share of the gap that planning with another model or discount closes."""
         try:
             after = policy_iteration(model, discount).action_values
         except ValueError:  # without a discount, where episodes need not end
             return 0.0
         returns = []
-        for values in (after, after if before is None else before):
+        for values in (after, before):
             near = np.ptp(values.max(axis=1)[model.reachable]) * (BLUR if self.has_errors else TIE)
             equal = (values >= values.max(axis=1, keepdims=True) - near) * 1.0
             policy = equal / equal.sum(axis=1, keepdims=True)
@@ -301,7 +270,7 @@ class _Case:
         for _ in range(min(self.limit, model.n_states) - 1):
             here[model.next_state[here][goes[here]]] = True
         meets = ~here[model.next_state] & goes
-        ends = replace(model, terminated=model.terminated | meets, reward=meets * 1.0)
+        ends = replace(model, terminated=model.terminated | meets, reward=meets.astype(np.float64))
         ends = replace(ends, reward_variance=None)
         return policy_return(ends, self.best, self.found.horizon).expected_return
 

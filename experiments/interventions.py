@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.proposals import shipped_settings
 from experiments.plan import PlannedRun
 from experiments.results import StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from mdp.transition_model import Floats
-from pipeline.agent_settings import with_engine
+from pipeline.agent_settings import shipped_settings, with_engine
 from pipeline.files import plain
 from pipeline.settings.values import parse_assignments
 from pipeline.train_spec import TrainSpec

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, get_args
 
@@ -19,7 +19,7 @@ from envs.known_models import time_limit, transition_model
 from envs.wrappers import has_masks
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError, shown, unknown
-from pipeline.settings.hyperparams import component_specs, split
+from pipeline.settings.hyperparams import component_specs, read_hyperparams, split
 from pipeline.settings.values import algorithm_parameters
 from pipeline.train_spec import TrainSpec
 
@@ -268,6 +268,27 @@ def resolved_spec(
         saved_hyperparams=numbers,
         origins={**(origins or {}), **told},
     )
+
+
+# Settings of the task: a run's shipped settings are those for its own task.
+_TASK = ("env_kwargs", "eval_env_kwargs", "env_wrapper")
+
+
+def shipped_settings(spec: TrainSpec) -> dict[str, Any]:
+    """The shipped settings of a run's agent on its task; the class's defaults without an entry."""
+    saved, entry = spec.saved_hyperparams, dict[str, Any]()
+    task = {key: saved[key] for key in _TASK if key in saved}
+    with suppress(UserError):
+        entry |= read_hyperparams(spec.algo, spec.env_id, env_kwargs=task.get("env_kwargs"))
+    raw, _ = training_follows({k: v for k, v in entry.items() if k not in _TASK}, task)
+    budgets = ("n_timesteps", "n_episodes")
+    if not any(raw.get(key) for key in budgets):
+        raw |= {key: saved[key] for key in budgets if key in saved}
+    raw = {**raw, **task}
+    named = {key: getattr(spec, key) for key in ("algo", "env_id", "gym_packages", "user_modules")}
+    with suppress(UserError):  # if an automatic value does not exist here
+        return resolved_spec(raw, seed=0, **named).saved_hyperparams
+    return without_auto(raw)
 
 
 def _word(key: str, value: Any) -> re.Match[str] | None:

@@ -7,7 +7,7 @@ needs more steps. A change is proposed only if exact planning shows that it can 
 
 from __future__ import annotations
 
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,13 +19,11 @@ from agents.reference import RandomAgent
 from envs.known_models import observations_of_states, transition_model
 from mdp import TransitionModel, policy_return, state_visitation, value_iteration
 from mdp.transition_model import Floats
-from pipeline.agent_settings import resolved_spec
+from pipeline.agent_settings import shipped_settings
 from pipeline.environments import make_single_env
-from pipeline.errors import UserError
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation.yardstick import FAILED, NEARLY_ALL
-from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.train_spec import TrainSpec
 
 SOLVED = 0.5  # planning must reach this score for a recommendation
@@ -142,7 +140,8 @@ def _try_first(
         enough = max(MANY_STEPS * n_pairs, 4 * n_steps)
         unit: int = 10 ** max(len(str(enough)) - 2, 0)
         enough = -(-enough // unit) * unit  # rounded up to two digits
-        flags.append(f"-n {max(enough, _shipped_steps(spec))}")
+        shipped = shipped_settings(spec).get("n_timesteps") or 0
+        flags.append(f"-n {max(enough, shipped)}")
         instead = ", instead of --n-episodes" if spec.hyperparams.n_episodes else ""
         now.append(f"{n_steps / n_pairs:.3g} for each state and action{instead}")
     if raises_gamma:
@@ -152,16 +151,6 @@ def _try_first(
         flags.append(f"-params gamma:{nearer:.6g}")
         now.append(f"gamma {gamma:.6g}{even}")
     return f"{' '.join(flags)} (now {'; '.join(now)})"
-
-
-def _shipped_steps(spec: TrainSpec) -> int:
-    """The training steps in the shipped settings of the environment; 0 if there are none."""
-    with suppress(UserError):
-        steps = read_hyperparams(spec.algo, spec.env_id).get("n_timesteps")
-        asked = {"n_timesteps": steps, "env_kwargs": dict(spec.hyperparams.env_kwargs)}
-        shipped = resolved_spec(asked, algo=spec.algo, env_id=spec.env_id, seed=0)
-        return shipped.hyperparams.n_timesteps or 0
-    return 0
 
 
 def _trained_on(spec: TrainSpec, evaluator: ExactEvaluator) -> tuple[TransitionModel, Any] | None:
