@@ -53,7 +53,7 @@ BLUR, TIE = 0.02, 1e-9
 STANDS_STILL = (0.8, 1.2)
 MOST_OTHERS = 3  # settings that are proposed only because the shipped ones differ
 DIFFERENT = 0.4  # the least distance from the shipped value
-
+MOST_OUTCOMES = 20_000_000  # of all states at all steps, in which to predict updates
 
 # A change, its weight among the causes in learning, and the share of the gap that planning gives.
 _Change = tuple[Mapping[str, Any], float, float]
@@ -131,7 +131,8 @@ class _Case:
         yield from self._objective()
         own, usual = (_policy_kwargs(one) for one in (self.own, self.usual))
         widths, wide = own["net_arch"], usual["net_arch"]
-        if self.is_network and isinstance(widths, list) and isinstance(wide, list):
+        is_plain = all(isinstance(one, list) for one in (widths, wide))
+        if self.is_network and is_plain and all(isinstance(one, int) for one in widths + wide):
             lacks = max(_distance(sum(wide), sum(widths)), 0.0)
             wide = wide if lacks > DIFFERENT else [FACTOR * max(one, 16) for one in widths or [16]]
             told = ",".join(f"{k}={_text(v)}" for k, v in {**own, "net_arch": wide}.items())
@@ -139,7 +140,7 @@ class _Case:
         others = [(self._away(key), key) for key in (self.known | {*VARIANT}) - _WITH_RULE]
         others = [one for one in others if abs(one[0]) > DIFFERENT and self.usual.get(one[1])]
         others = [one for one in others if one[0] < 0 or one[1] not in _HARMLESS_ABOVE]
-        for away, key in sorted(others, key=lambda one: -abs(one[0]))[:MOST_OTHERS]:
+        for away, key in sorted(others, key=lambda one: (-abs(one[0]), one[1]))[:MOST_OTHERS]:
             yield {key: self.usual[key]}, 0.5 * abs(away), 0.0
 
     def _away(self, key: str) -> float:
@@ -166,9 +167,10 @@ class _Case:
             yield {"gamma": "auto"}, weight, self._gain(task.lived, nearer, values)
         if "initial_q" in self.known:
             best = values.max(axis=1)[task.model.reachable]
-            high = max(float(f"{best.max():.3g}"), self.usual["initial_q"])
+            usual, high = self.usual["initial_q"], float(f"{best.max():.3g}")
+            high = usual if usual > own["initial_q"] else high
             # Values below all true ones hide every action that was not tried.
-            far = (best.min() - own["initial_q"]) / max(high - best.min(), TIE)
+            far = (best.min() - own["initial_q"]) / max(np.ptp(best), TIE)
             weight = self.starved + self.lost.get("never tried", 0.0) + min(max(far, 0.0), 4.0)
             if high > own["initial_q"]:
                 yield {"initial_q": high}, (1 - self.out_of_reach) * weight, 0.0
@@ -215,7 +217,7 @@ class _Case:
         if self.is_network:
             smaller = usual if away > DIFFERENT else _scaled(own, 1 / FACTOR)
             yield {key: smaller}, 0.3 + 0.7 * max(away, 0.0), 0.0
-        elif self.has_errors or "exploring" in self.lost:
+        elif rates[-1] > 0 and (self.has_errors or "exploring" in self.lost):
             ends, falls = _course(usual), f"exp_{rates.max():.2g}_{rates[-1] / 10:.2g}"
             lower = np.log(rates[-1] / ends[-1]) if ends is not None and ends[-1] > 0 else 0.0
             yield {key: usual if lower > DIFFERENT else falls}, 0.1 + max(lower, 0.0), 0.0
@@ -231,13 +233,12 @@ class _Case:
                 yield {key: more}, 3 * self.starved + max(-away, 0.0), 0.0
         if self.epsilons is None:
             return
+        raised, ends = {FIRST: 1.0, FRACTION: 1.0}, {DECAY: "linear", LAST: 0.0}
         if own.get(DECAY) == "constant":
             raised = {FIRST: min(max(round(3 * own[FIRST], 3), 0.3), 1.0)}
-            ends = {DECAY: "linear", LAST: 0.0}
-        else:
-            raised, ends = {FIRST: 1.0, FRACTION: 1.0}, {LAST: 0.0}
-            if all(own[key] == value for key, value in raised.items()):
-                raised = {LAST: min(max(round(3 * own[LAST], 3), 0.3), 1.0)}
+        elif all(own[key] == value for key, value in raised.items()):
+            raised = {LAST: min(max(round(3 * own[LAST], 3), 0.3), 1.0)}
+        ends = {key: value for key, value in ends.items() if key in self.known}
         usual = {key: self.usual[key] for key in EXPLORATION if key in self.known}
         for change in (raised, ends, usual):
             then = self._epsilons(change)
@@ -278,6 +279,8 @@ class _Case:
         """Expected updates of the best actions with exploration around the present policy, (S,)."""
         n_actions, greedy = self.model.n_actions, np.eye(self.model.n_actions)[self.found.taken]
         policies = [greedy]
+        if self.model.prob.size * self.limit > MOST_OUTCOMES:  # these many take seconds
+            return np.full(len(greedy), float(self.found.agent.num_timesteps))
         if epsilons is not None:
             policies = [(1 - epsilon) * greedy + epsilon / n_actions for epsilon in epsilons]
         else:

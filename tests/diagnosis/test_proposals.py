@@ -46,7 +46,7 @@ CAUSES = {
     "low values at the start": (
         "qlearning", TAXI,
         {"initial_q": -500.0, "exploration_initial_eps": 0.1, "n_timesteps": 100_000},
-        ("initial_q:20", "exploration_initial_eps:1"),
+        ("initial_q:0",),
     ),
     "a network's large steps": (
         "dqn", LAKE, {"learning_rate": 0.3, "n_timesteps": 10_000}, ("learning_rate:lin_0.001",),
