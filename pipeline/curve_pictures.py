@@ -50,6 +50,8 @@ GREY = "#9A9A9A"
 MOVING_AVERAGE_EPISODES = 100
 MAX_POINTS = 5000
 MOST_POWERS = 12  # powers of ten on an axis
+# From this ratio on, the largest values flatten the rest of a linear axis: two decades.
+DWARFED = 100
 
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
@@ -93,7 +95,7 @@ def _compress_outliers(axes: Axes, returns: Floats) -> None:
     if not len(returns):
         return
     settled = max(float(np.abs(returns[-len(returns) // 4 :]).max()), 1.0)
-    if np.abs(returns).max() > 10 * settled:
+    if np.abs(returns).max() >= DWARFED * settled:
         axes.set_yscale("symlog", linthresh=settled)
         axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(settled)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))

@@ -23,11 +23,12 @@ from matplotlib.ticker import (
     NullLocator,
     PercentFormatter,
 )
+from matplotlib.transforms import offset_copy
 
 from experiments.analysis import EnvironmentAnalysis, OverallAnalysis
 from experiments.study import COSTS, METRIC_WORDS, file_name
 from mdp.transition_model import Floats, Ints
-from pipeline.curve_pictures import symlog_ticks
+from pipeline.curve_pictures import DWARFED, symlog_ticks
 from pipeline.files import replacing
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.series import (
@@ -191,6 +192,9 @@ def shared_legend(*places: Axes, band: str = "") -> None:
     found = {name: handle for some in named for handle, name in zip(*some, strict=True)}
     if not found:
         return
+    # Agents before references.
+    grey = {name for name in found if getattr(found[name], "get_color", str)() == REFERENCE}
+    found = {name: found[name] for name in sorted(found, key=grey.__contains__)}
     figure = _figure_of(places[0])
     found |= {band: Patch(color=REFERENCE, alpha=0.2, linewidth=0)} if band else {}
     names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in found]
@@ -387,13 +391,12 @@ NAMES = 2.1  # inches, the width of the names of agents beside their runs
 LONGEST = 20  # letters of a value on an axis
 MOST_TICKS = 8  # the largest number of values of a parameter with a tick each
 FEW = 3  # the largest number of names in a legend's entry
-FAR = 10  # from this ratio of the largest to the smallest value, an axis is logarithmic
 BLOCKS = {"average": "-", "minimum": ":", "maximum": "--"}
 
 
 def panels(curves: Mapping[str, LearningCurves]) -> list[tuple[str, str]]:
-    """The kind of curve and the x axis of each panel: evaluations by step, training by episode."""
-    both = (("evaluation", "step"), ("training", "episode"))
+    """The kind of curve and the x axis of each panel: that of the budget, and episodes."""
+    both = (("evaluation", curves["evaluation"].budget), ("training", "episode"))
     return [(kind, by) for kind, by in both if curves[kind].by_axis[by]]
 
 
@@ -405,10 +408,16 @@ def draw_learning_curves(
 ) -> None:
     """Draw each of the `panels` on its axes, with intervals for the first (best) agents."""
     title = f"{environment.environment}: "
-    for place, (kind, by) in zip(places, panels(curves), strict=True):
+    kinds = panels(curves)
+    scales = {kind: curves[kind].linear_up_to for kind, _ in kinds}
+    # Returns on a variant are another metric, with an axis of its own.
+    if is_shared := not curves["training"].on_variant:
+        known = [scale for scale in scales.values() if scale is not None]
+        scales = dict.fromkeys(scales, known[0] if known else None)
+    for place, (kind, by) in zip(places, kinds, strict=True):
         found = curves[kind]
         # Before the lines, because the limits depend on the scale.
-        words = _set_scale(place, found.linear_up_to)
+        words = _set_scale(place, scales[kind])
         _draw_curves(place, found.by_axis[by], marks)
         for agent, curve in found.by_axis[by].items():
             if agent in found.on_variant:
@@ -429,7 +438,16 @@ def draw_learning_curves(
     if curves["training"].on_variant:
         # The legend's entry for the circles.
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
+    if is_shared:
+        _same_limits(places)
     shared_legend(*places, band=band_words(len(environment.agents)))
+
+
+def _same_limits(places: Sequence[Axes]) -> None:
+    """Give all panels the y axis that shows what is in any of them."""
+    low, high = np.transpose([axes.get_ylim() for axes in places])
+    for axes in places:
+        axes.set_ylim(low.min(), high.max())
 
 
 def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
@@ -482,7 +500,10 @@ def draw_runs(
         spread = np.linspace(-0.18, 0.18, n) if n > 1 else np.zeros(n)
         axes.plot(agent.values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
         mean = agent.mean
-        axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=5, alpha=0.35)
+        if mean.low < mean.high:
+            axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=5, alpha=0.35)
+        elif mean.has_interval:  # a bar of no length is invisible
+            axes.plot([mean.point], [row], "D", color=colour, markersize=7, alpha=0.35)
         axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
     names = [wrapped(agent.agent, NAMES) for agent in upwards]
     axes.set_yticks(range(len(upwards)), names)
@@ -499,6 +520,8 @@ def draw_runs(
             title += "; the optimum lies between the lines"
             title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
     x = f"{METRIC_WORDS[metric]}; mean, 95 % interval, each seed"
+    x += "; diamond: interval of one point" if any(a.mean.low == a.mean.high for a in runs) else ""
+    x += "" if all(a.mean.has_interval for a in runs) else "; a mean alone has no interval"
     widest = max(width_of(line) for name in names for line in name.split("\n"))
     lettering(axes, title=title, x=x, beside=widest + 0.3)
 
@@ -515,8 +538,13 @@ def draw_sweeps(
         x, y = sweep.means.x, sweep.means.y
         label = group if len(names) == 1 else f"{group}, {sweep.parameter}"
         axes.plot(x, y, marker="o", label=label, markersize=4, **line_style(mark))
-        if place < MOST_BANDS:
-            fill_band(axes, sweep.means, mark)
+        if place < MOST_BANDS:  # a bar each: a band needs two neighbours with an interval
+            aside = 5 * (place - (min(len(sweeps), MOST_BANDS) - 1) / 2)
+            at = offset_copy(axes.transData, _figure_of(axes), x=aside, units="points")
+            ends, colour = (sweep.means.low, sweep.means.high), COLOURS[mark.colour]
+            axes.vlines(x, *ends, color=colour, alpha=0.35, linewidth=4, transform=at)
+            axes.update_datalim(np.column_stack([np.tile(x, 2), np.concatenate(ends)]))
+    axes.autoscale_view()
     best = with_best_mean(
         environment, [label for sweep in sweeps.values() for label in sweep.labels]
     )
@@ -528,21 +556,37 @@ def draw_sweeps(
     ]
     if rings:
         x, y = np.transpose(rings)
-        label = f"best mean: {enumeration(best)}" if len(best) <= FEW else "best mean"
+        prefix = f"{next(iter(sweeps))} with " if len(sweeps) == 1 else ""
+        told = enumeration([label.removeprefix(prefix) for label in best])
+        label = f"best mean: {told}" if len(best) <= FEW else "best mean"
         axes.scatter(x, y, 90, "none", edgecolor="black", label=label, zorder=3)
     if len(values) <= MOST_TICKS:
-        axes.xaxis.set_major_locator(FixedLocator(values.tolist()))
+        axes.xaxis.set_major_locator(FixedLocator(_ticks_apart(axes, values)))
         axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
     across = names[0] if len(names) == 1 else "value of the parameter"
     lettering(axes, title=environment.environment, x=across + words, y=METRIC_WORDS[metric])
-    shared_legend(axes, band=band_words(len(sweeps)))
+    is_there = any(np.isfinite(sweep.means.low).any() for sweep in sweeps.values())
+    shared_legend(axes, band=band_words(len(sweeps)) if is_there else "")
+
+
+def _ticks_apart(axes: Axes, values: Floats) -> list[float]:
+    """The values, in order, whose numbers do not touch on the x axis."""
+    places = axes.xaxis.get_transform().transform(values)
+    inches = (WIDTH - 1.3) * (places - places[0]) / ((places[-1] - places[0]) or 1.0)
+    kept, end = [], -np.inf
+    for value, place in zip(values.tolist(), inches, strict=True):
+        half = width_of(f"{value:.4g}") / 2
+        if place - half > end:
+            kept.append(value)
+            end = place + half + 0.08
+    return kept
 
 
 def _set_scale_of_values(axes: Axes, values: Floats) -> str:
-    """Make the x axis logarithmic if values span a ratio of `FAR`; return words for its label."""
+    """Make the x axis logarithmic if values span two decades; return words for its label."""
     least = float(values[values > 0].min(initial=np.inf))
-    if values.min() < 0 or values.max() < FAR * least:
+    if values.min() < 0 or values.max() < DWARFED * least:
         return ""
     if values.min() > 0:
         axes.set_xscale("log")
@@ -585,9 +629,8 @@ def _brief(text: str) -> str:
     return wrapped(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…", 1.0)
 
 
-def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark) -> None:
+def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark, scale: float | None) -> None:
     """Average, minimum and maximum of each block of an agent's episodes."""
-    scale = linear_up_to([rows[column].to_numpy(float) for column in BLOCKS], None)
     words = _set_scale(axes, scale)
     colour = COLOURS[mark.colour]
     for column, style in BLOCKS.items():
@@ -669,8 +712,11 @@ def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Mark
         n_columns = min(len(agents), 2 if len(agents) <= MOST_IN_PAIRS else 3)
         n_rows = -(-len(agents) // n_columns)
         with files.figure(name, n_columns, n_rows, height=2.2) as places:
-            for axes, agent in zip(places, agents, strict=False):
-                draw_blocks(axes, rows[rows["agent"] == agent], marks[agent])
+            found = {agent: rows[rows["agent"] == agent] for agent in agents}
+            curves = [each[column].to_numpy(float) for each in found.values() for column in BLOCKS]
+            for axes, (agent, blocks) in zip(places, found.items(), strict=False):
+                draw_blocks(axes, blocks, marks[agent], linear_up_to(curves, None))
+            _same_limits(places[: len(agents)])
             for axes in places[len(agents) :]:
                 axes.set_visible(False)
             for label, style in BLOCKS.items():

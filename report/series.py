@@ -25,6 +25,7 @@ from experiments.results import (
 )
 from experiments.study import AgentSpec, StudySpec, symbol
 from mdp.transition_model import Floats, Ints
+from pipeline.curve_pictures import DWARFED
 from pipeline.environments import make_single_env
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import UNBOUNDED, Bounds, Estimate
@@ -68,9 +69,6 @@ def agent_marks(study: StudySpec) -> dict[str, Mark]:
 KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
 
-# Returns this many times larger than the optimum flatten a linear axis.
-DWARFED = 10
-
 
 @dataclass(frozen=True)
 class Curve:
@@ -93,13 +91,17 @@ class LearningCurves:
     # Agents with returns on a variant of the environment, which cannot be compared with the
     # optimum.
     on_variant: tuple[str, ...] = ()
+    # The axis in the unit of the runs' budget: "step" or "episode".
+    budget: str = "step"
 
 
 def learning_curves(
     results: StudyResults, environment: EnvironmentAnalysis
 ) -> dict[str, LearningCurves]:
-    """The curves on an environment, by kind."""
+    """The curves on an environment, by kind; none where each would be a single point."""
     found = {}
+    here = [run.spec for run in results.planned if run.environment == environment.environment]
+    by_episode = here and all(spec.hyperparams.n_timesteps is None for spec in here)
     variants = tuple(agent.agent for agent in environment.agents if agent.on_variant)
     runs = curves_by_agent(results, environment.environment)
     for kind in KINDS:
@@ -113,8 +115,13 @@ def learning_curves(
             for by in AXES:
                 if (curve := _curve(of_agent, by, bounds)) is not None:
                     by_axis[by][agent] = curve
+        for by, curves in by_axis.items():
+            if all(len(curve.x) == 1 for curve in curves.values()):
+                by_axis[by] = {}
         scale = linear_up_to([curve.y for curve in by_axis["step"].values()], environment.optimum)
-        found[kind] = LearningCurves(by_axis, scale, variants if kind == "training" else ())
+        budget = "episode" if by_episode and by_axis["episode"] else "step"
+        on_variant = variants if kind == "training" else ()
+        found[kind] = LearningCurves(by_axis, scale, on_variant, budget)
     return found
 
 
@@ -141,7 +148,7 @@ def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | Non
     if optimum is None:
         optimum = max(float(np.abs(curve[-max(len(curve) // 4, 1) :]).max()) for curve in known)
     scale = max(abs(optimum), 1.0)
-    return scale if max(float(np.abs(curve).max()) for curve in known) > DWARFED * scale else None
+    return scale if max(float(np.abs(curve).max()) for curve in known) >= DWARFED * scale else None
 
 
 # Training returns, summed up by blocks of episodes.

@@ -66,10 +66,11 @@ def _small_figure(one: EnvironmentSeries) -> SmallFigure:
         what = "cumulative regret by pull"
         curves = {agent: mean_regret(found) for agent, found in one.pulls.pulls.items()}
     else:
-        what, optimum = "return of evaluations by step", one.environment.optimum
+        what, optimum = "return of evaluations", one.environment.optimum
         if one.curves is not None:
-            curves = one.curves["evaluation"].by_axis["step"]
-            linear = one.curves["evaluation"].linear_up_to
+            found = one.curves["evaluation"]
+            what += f" by {found.budget}"
+            curves, linear = found.by_axis[found.budget], found.linear_up_to
     heights = {agent: _compressed(curve.y, linear) for agent, curve in curves.items()}
     best = _compressed(np.array([] if optimum is None else [optimum]), linear)
     known = np.concatenate([best, *heights.values()])
@@ -207,14 +208,19 @@ def curves(report: Report) -> Section | None:
     curves = [one.curves for one in report.series.environments]
     if not (report.analysis.results.has_curves and any(curves)):
         return None
-    by_step = [{} if item is None else item["evaluation"].by_axis["step"] for item in curves]
+    units = ["step" if item is None else item["evaluation"].budget for item in curves]
+    shown = [
+        {} if item is None else item["evaluation"].by_axis[unit]
+        for item, unit in zip(curves, units, strict=True)
+    ]
     context = {
         "has_curves": [item is not None for item in curves],
         "stages": STAGES,
+        "units": units,
         # For readers who cannot see the figure.
         "tables": [
             [(agent, [_at(curve, share) for share in STAGES]) for agent, curve in of_agents.items()]
-            for of_agents in by_step
+            for of_agents in shown
         ],
     }
     return Section("curves", "Learning curves", context, places=curves, by_environment=True)

@@ -1,5 +1,6 @@
 """What figures show, asked of Matplotlib's axes: numbers, colours, words; and nothing is cut."""
 
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 from experiments.analysis import OverallAnalysis
 from report.figures import (
     draw_learning_curves,
+    draw_runs,
     label_ends,
     write_figures,
 )
@@ -233,11 +235,11 @@ arm 1: orange - (0 9) (0.5 10) (1 11)
 orange : (0.5 0) (0.5 1)
 # lake_sweep
 lake | value of the parameter (log scale) | return of the final policy
-x axis: log, 0.01, 0.1, 0.9, 0.95, 1
+x axis: log, 0.01, 0.1, 0.9
 first, α: blue -o (0.01 30) (0.1 90) (0.9 3)
 second, γ: orange --o (0.9 1) (0.95 2) (1 3)
-band blue 0.2 (0.01 29 32) (0.1 89 92) (0.9 2 5)
-band orange 0.2 (0.9 0 3) (0.95 1 4) (1 2 5)
+across (0.01 29 0.01 32) (0.1 89 0.1 92) (0.9 2 0.9 5)
+across (0.9 0 0.9 3) (0.95 1 0.95 4) (1 2 1 5)
 rings (0.1 90)
 names first, α, second, γ, best mean: first, 95 % interval
 # lake_swept_grid
@@ -346,6 +348,39 @@ def test_what_stands_beside_curves():
     assert f"{title} | episodes | return" in lines
     ticks = [tick for tick in left.get_yticks() if abs(tick) < 2000]
     assert ticks == [-1000, -300, -100, -50, 0, 50, 100, 300, 1000]
+
+
+def test_panels_of_one_metric_have_one_y_axis_and_evaluations_the_axis_of_the_budget():
+    for on_variant, scale, is_shared in (
+        ((), None, True),
+        ((), 79.0, True),
+        (("first",), 79.0, False),
+    ):
+        left, right = Figure().subplots(1, 2)
+        curves = curves_of(["first", "second"], scale, on_variant)
+        curves["evaluation"] = replace(curves["evaluation"], budget="episode")
+        draw_learning_curves([left, right], curves, made_up.environment(), MARKS)
+        assert (left.get_ylim() == right.get_ylim()) == is_shared
+        assert (left.get_yscale() == right.get_yscale()) == is_shared
+        assert left.get_xlabel() == "episodes"
+
+
+def test_an_interval_of_one_point_has_a_mark_and_a_missing_one_leaves_the_mean():
+    nan = np.nan
+    for low, high, expected, said in (
+        (80, 95, "orange - (80 0) (95 0)", "each seed"),
+        (90, 90, "orange D (90 0)", "; diamond: interval of one point"),
+        (nan, nan, None, "; a mean alone has no interval"),
+    ):
+        axes = Figure().subplots()
+        runs = AgentRuns(
+            "first", made_up.estimate(90.0, low, high), np.arange(2), np.array([88, 92])
+        )
+        draw_runs(axes, [runs], made_up.environment(), "final", MARKS)
+        dots, *interval, mean, _ = map(line_words, axes.get_lines())
+        assert (dots, mean) == ("orange . (88 -0.18) (92 0.18)", "orange | (90 0)")
+        assert interval == ([] if expected is None else [expected])
+        assert axes.get_xlabel().replace("\n", " ").endswith(said)
 
 
 def test_names_at_the_ends_of_lines_never_overlap_and_make_the_figure_as_tall_as_they_need():

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +13,10 @@ from scipy import integrate
 import envs  # noqa: F401  # registers the bandits
 from experiments.analysis import analyse
 from experiments.bandits import pull_statistics
+from experiments.plan import PlannedRun
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
 from report.series import (
     auer_bound,
     best_expected_reward,
@@ -45,7 +49,7 @@ def lake():
         curve_rows("a", "evaluation", 0, [1, 5]),
         curve_rows("a", "evaluation", 1, [3, 7]),
         curve_rows("b", "evaluation", 0, [2, 8]),
-        curve_rows("b", "training", 0, [-5000, 9]),
+        curve_rows("b", "training", 0, [-10_000, 9]),
     ]
     summary = pd.DataFrame(
         [("a", 0, 4.0), ("a", 2, 6.0), ("b", 0, 8.0), ("b", 1, np.nan)],
@@ -73,6 +77,23 @@ def test_mean_curves_the_best_agent_first(lake):
     assert (found["evaluation"].on_variant, found["training"].on_variant) == ((), ("b",))
 
 
+def test_a_curve_of_single_points_is_left_out_and_episodes_are_the_axis_of_their_budget(lake):
+    results, place = lake
+    first = results.curves[results.curves["step"] == 10]
+    found = learning_curves(replace(results, curves=first), place)
+    assert not any(of_agents for each in found.values() for of_agents in each.by_axis.values())
+    for budget, expected in (({"n_episodes": 9}, "episode"), ({"n_timesteps": 9}, "step")):
+        spec = TrainSpec("qlearning", "FrozenLake-v1", split(budget), budget, 0)
+        planned = (
+            PlannedRun("b", "lake", 0, spec, Path()),
+            PlannedRun("b", "other", 0, spec, Path()),
+        )
+        assert (
+            learning_curves(replace(results, planned=planned), place)["evaluation"].budget
+            == expected
+        )
+
+
 def test_runs_with_a_figure_by_seed(lake):
     found = [
         (r.agent, r.seeds.tolist(), r.values.tolist(), r.mean.point) for r in run_series(*lake)
@@ -82,11 +103,11 @@ def test_runs_with_a_figure_by_seed(lake):
 
 def test_where_an_axis_ceases_to_be_linear():
     for curves, optimum, expected in (
-        ([[-5000.0, -50.0, 70.0]], 79.0, 79.0),  # early returns dwarf the optimum
-        ([[-500.0, -50.0, 70.0]], 79.0, None),
+        ([[-7900.0, -50.0, 70.0]], 79.0, 79.0),  # two decades beyond the optimum
+        ([[-7899.0, -50.0, 70.0]], 79.0, None),
         ([[-300.0, 1.0, 2.0, 2.0]], None, 2.0),  # the end of the curve stands for the optimum
         ([[np.nan, 1.0], [np.nan]], None, None),
-        ([[-9.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below ten
+        ([[-99.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below 100
     ):
         assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected
 

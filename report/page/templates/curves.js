@@ -41,12 +41,18 @@ report.section("curves", (root, _, place) => {
       },
     };
   };
+  let isChosen = false;
   const isThere = () => {
+    // The axis of the budget, until the reader chooses another.
+    if (!isChosen && place() !== null) root.querySelector(`input[name="by"][value="${place().evaluation.budget}"]`).checked = true;
+    const isNone = place() !== null && Object.keys(place()[chosen("kind")].by_axis[chosen("by")]).length === 0;
+    root.querySelector(".none").hidden = !isNone;
     root.querySelector(".controls").hidden = place() === null;
     scale.hidden = (place()?.[chosen("kind")].linear_up_to ?? null) === null;
-    return place() !== null;
+    return place() !== null && !isNone;
   };
   redraw = report.figure(figure, build, isThere);
+  root.querySelectorAll('input[name="by"]').forEach((input) => input.addEventListener("change", () => (isChosen = true)));
   root.querySelectorAll(".controls input").forEach((input) => input.addEventListener("change", redraw));
   root.querySelectorAll('input[name="kind"]').forEach((input) => input.addEventListener("change", fill));
 });

@@ -237,11 +237,13 @@
       const place = rows.length - 1 - i;
       const colour = report.colour(row.agent);
       if (row.low !== null) {
+        // A bar of no length is invisible: a diamond.
         traces.push({
           x: [height(row.low), height(row.high)],
           y: [place, place],
-          mode: "lines",
+          mode: row.low < row.high ? "lines" : "markers",
           line: { color: report.fade(colour, 0.35), width: 12 },
+          marker: { symbol: "diamond", size: 15, color: report.fade(colour, 0.35) },
           hoverinfo: "skip",
         });
       }

@@ -3,7 +3,7 @@ report.section("verdict", (root, { files, metric, sweeps }) => {
   root.querySelectorAll(".plot").forEach((element) => {
     const curves = Object.entries(sweeps[element.dataset.card]);
     const values = [...new Set(curves.flatMap(([, curve]) => curve.x))].sort((a, b) => a - b);
-    const isLog = values[0] > 0 && values.at(-1) >= 10 * values[0];
+    const isLog = values[0] > 0 && values.at(-1) >= 100 * values[0]; // two decades, as on paper
     const names = [...new Set(curves.map(([, curve]) => curve.parameter))];
     const reach = (middle, ends) => middle.map((y, i) => (ends[i] === null ? 0 : Math.abs(ends[i] - y)));
     report.figure(element, () => ({
