@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ from report.conclusions import (
     seeds_of,
     unseen_sentence,
 )
-from report.ranking import BANDIT_COLUMNS, COLUMNS, Cell, Column, Row, filled
+from report.ranking import BANDIT_COLUMNS, COLUMNS, Column, Row, filled
 from report.words import enumeration, number, optimum_words, seed_sentence
 from verdicts import FEW, Estimate
 
@@ -31,9 +32,10 @@ if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
 
 # A study in the terminal.
 
-MOST_AGENT_WIDTH = 20
+MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
 UNBOUNDED = 10_000  # columns
-# Columns to drop, in this order, while a table is wider than the terminal; the page has all.
+# Columns to drop, in this order, while a table is wider than the terminal, and then all but the
+# first, from the right; the page has all.
 FIRST_LEFT_OUT = (
     *("training", "median", "stays from", "simple regret", "reward"),
     *("CPU time", "score", "best arm"),
@@ -113,29 +115,64 @@ def _print_fitting(
     console: Console, title: str, columns: Sequence[Column], rows: Sequence[Row]
 ) -> list[str]:
     """Print a table with the columns that fit; return the headings of the others."""
-    shown = filled(columns, rows)
-    left_out: list[str] = []
-    there = [column.terminal for column, _ in shown]
-    to_leave_out = [heading for heading in FIRST_LEFT_OUT if heading in there]
-    while _width(console, table := _table(title, shown, rows)) > console.width and to_leave_out:
-        left_out.append(to_leave_out.pop(0))
-        shown = [(column, cells) for column, cells in shown if column.terminal != left_out[-1]]
-    console.print(table)
+    shown = {column.terminal: cells for column, cells in filled(columns, rows)}
+    names = [row.agent.marked for row in rows]
+    cells = {
+        heading: [cell.in_line or cell.text for cell in found] for heading, found in shown.items()
+    }
+    last = [heading for heading in list(cells)[:0:-1] if heading not in FIRST_LEFT_OUT]
+    table, left_out = _fitting(
+        console, {"agent": names} | cells, (*FIRST_LEFT_OUT, *last), MOST_AGENT_WIDTH
+    )
+    table.title = title
+    console.print(table, crop=False)
     return left_out
 
 
-def _table(title: str, shown: Sequence[tuple[Column, list[Cell]]], rows: Sequence[Row]) -> Table:
-    table = Table(title=title, title_justify="left")
-    names = [row.agent.marked for row in rows]
-    # Longer names wrap.
-    width = min(max(map(len, names)), MOST_AGENT_WIDTH)
-    table.add_column("agent", overflow="fold", min_width=width, max_width=MOST_AGENT_WIDTH)
-    for column, _ in shown:
-        table.add_column(column.terminal, justify="right")
-    for place, name in enumerate(names):
-        cells = [cells[place] for _, cells in shown]
-        table.add_row(name, *(cell.in_line or cell.text for cell in cells))
-    return table
+def _fitting(
+    console: Console, cells: dict[str, list[str]], order: Sequence[str], most: int = UNBOUNDED
+) -> tuple[Table, list[str]]:
+    """A table with the columns that fit, and the headings of the others, left out in this order.
+
+    Numbers never wrap. Names, in the first column, wrap at ``most``, and earlier where all columns
+    that may be left out are. A table that still does not fit runs beyond the edge of the terminal.
+    """
+    heading, *_ = cells
+    longest = max(map(len, [heading, *cells[heading]]))
+    left_out: list[str] = []
+    to_leave_out = [each for each in order if each in cells]
+
+    def table(width: int) -> Table:
+        kept = {each: column for each, column in cells.items() if each not in left_out}
+        made = Table(title_justify="left")
+        made.add_column(heading, no_wrap=True, width=width)
+        for each in list(kept)[1:]:
+            made.add_column(each, justify="right", no_wrap=True)
+        for name, *row in zip(*kept.values(), strict=True):
+            made.add_row(folded(name, width), *row)
+        return made
+
+    def room() -> int:
+        return console.width - _width(console, table(LEAST_AGENT_WIDTH)) + LEAST_AGENT_WIDTH
+
+    while to_leave_out and min(longest, MOST_AGENT_WIDTH) > room():
+        left_out.append(to_leave_out.pop(0))
+    result = table(min(longest, most, max(room(), LEAST_AGENT_WIDTH)))
+    needed = _width(console, result)
+    result.width = needed if needed > console.width else None
+    return result, left_out
+
+
+def folded(name: str, width: int, ends: Sequence[str] = (r"[\s/,]", "[_=-]")) -> str:
+    """A name in lines of at most ``width`` letters, which end at the first ``ends`` if possible."""
+    if len(name) <= width or not ends:
+        return "\n".join(name[k : k + width] for k in range(0, len(name), width))
+    lines = [""]
+    for word in re.split(f"(?<={ends[0]})", name):
+        if lines[-1] and len(lines[-1] + word.rstrip()) > width:
+            lines.append("")
+        lines[-1] += word
+    return "\n".join(folded(line.rstrip(), width, ends[1:]) for line in lines)
 
 
 def _caption(
@@ -177,10 +214,11 @@ def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> N
         while left:
             for n in range(len(left), 0, -1):
                 printed = _episodes(title, rows, left[:n])
-                if _width(console, printed) <= console.width:
+                if (needed := _width(console, printed)) <= console.width:
                     break
+            printed.width = needed if needed > console.width else None
             console.print()
-            console.print(printed)
+            console.print(printed, crop=False)
             left = left[n:]
 
 
@@ -188,7 +226,7 @@ def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
     printed = Table(title=title, title_justify="left")
     printed.add_column("episode", justify="right")
     for agent in agents:
-        printed.add_column(str(agent), justify="right", overflow="fold")
+        printed.add_column(folded(str(agent), MOST_AGENT_WIDTH), justify="right", no_wrap=True)
     cells = {
         (row["episode"], row["agent"]): "  ".join(
             number(row[name]) for name in ("average", "minimum", "maximum")
@@ -209,33 +247,39 @@ def _width(console: Console, table: Table) -> int:
 # With a smaller effective sample size, the interval of an estimate is unreliable.
 FEW_PULLS = 100
 SHORT, MOST_DECIMALS = 3, 6
+# Columns to drop, in this order, while the table is wider than the terminal.
+OFF_POLICY_LEFT_OUT = ("IPS", "self-normalised", "direct", "effective")
 
 
 def print_comparison(console: Console, comparison: Comparison) -> None:
     """Print the table, sentences on it, and the notes."""
-    console.print(_off_policy_table(comparison))
+    data = comparison.data
+    title = f"{data.source}: {len(data):,} pulls, {data.n_arms} arms"
+    console.print(title, style="italic", highlight=False)
+    table, left_out = _fitting(console, _off_policy_cells(comparison), OFF_POLICY_LEFT_OUT)
+    console.print(table, crop=False)
+    explained = ["mean reward a pull, ± half the 95 % interval"]
+    if "effective" not in left_out:
+        explained.append("effective: effective sample size in pulls")
+    explained.append("differences below: simultaneous 95 % intervals")
+    if left_out:
+        explained.append(f"a wider terminal shows {enumeration(left_out)} too")
+    console.print("; ".join(explained), style="italic dim", highlight=False)
     for sentence in [*sentences(comparison), *comparison.notes]:
         console.print(f"  {sentence}")
 
 
-def _off_policy_table(comparison: Comparison) -> Table:
-    data = comparison.data
-    table = Table(
-        title=f"{data.source}: {len(data):,} pulls, {data.n_arms} arms",
-        caption="mean reward a pull, ± half the 95 % interval; effective: effective sample size "
-        "in pulls; differences below: simultaneous 95 % intervals",
-        title_justify="left",
-        caption_justify="left",
-    )
-    table.add_column("policy", overflow="fold", min_width=12)
-    for heading in ("IPS", "self-normalised", "direct", "doubly robust", "effective"):
-        table.add_column(heading, justify="right")
-    for row in comparison.rows:
-        terms = row.terms
-        columns = (terms.ips, terms.snips, terms.direct, terms.doubly_robust)
-        cells = [shown(mean_reward(column)) for column in columns]
-        table.add_row(row.name, *cells, f"{terms.effective:,.0f}")
-    return table
+def _off_policy_cells(comparison: Comparison) -> dict[str, list[str]]:
+    """The cells of the table by heading."""
+    terms = [row.terms for row in comparison.rows]
+    return {
+        "policy": [row.name for row in comparison.rows],
+        "IPS": [shown(mean_reward(one.ips)) for one in terms],
+        "self-normalised": [shown(mean_reward(one.snips)) for one in terms],
+        "direct": [shown(mean_reward(one.direct)) for one in terms],
+        "doubly robust": [shown(mean_reward(one.doubly_robust)) for one in terms],
+        "effective": [f"{one.effective:,.0f}" for one in terms],
+    }
 
 
 def sentences(comparison: Comparison) -> list[str]:
