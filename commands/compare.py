@@ -661,7 +661,7 @@ def give_way() -> None:
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
     """The study that the arguments select, with their changes."""
-    from experiments.study import METRICS, StudySpec, find_study, read_study
+    from experiments.study import METRICS, StudySpec, find_study, read_study, with_maps_named
     from pipeline.user_modules import import_typed
 
     if args.max_seeds is not None and not args.until_decided:
@@ -688,7 +688,10 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     names = tuple(module.name for module in modules)
     changes = {**named, "n_seeds": args.seeds, "gym_packages": names, "user_modules": modules}
     changes = {key: value for key, value in changes.items() if value is not None}
-    study = replace(_with_settings(study, args), **changes)
+    study = with_maps_named(replace(_with_settings(study, args), **changes))
+    if not args.study:
+        environments = ", ".join(each.label for each in study.environments)
+        study = replace(study, title=f"{', '.join(args.algos)} on {environments}")
     if study.keep == "figures" and (study.episodes_table or study.tensorboard):
         what = "--episodes-table" if study.episodes_table else "--tensorboard"
         raise UserError(
@@ -713,11 +716,10 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
     for flag, names in (("--env", args.env), ("--algos", args.algos)):
         if len(set(names)) < len(names):
             raise UserError(f"{flag} names one of them twice")
-    agents, environments = ", ".join(args.algos), ", ".join(args.env)
     folders = "-".join(map(environment_name, args.env))
     return StudySpec(
         name=file_name(f"{folders}_{'-'.join(args.algos)}", LONGEST_FOLDER_NAME),
-        title=f"{agents} on {environments}",
+        title="",
         agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
         environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),
     )

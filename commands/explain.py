@@ -222,6 +222,7 @@ def _test(
 def _draw(console: Console, one: Asked, explained: Explanation, path: Path) -> None:
     """Draw the cost of each cell."""
     from commands.terminal import say
+    from pipeline.environments import titled
     from pipeline.evaluation.value_maps import map_refusal, value_map
     from pipeline.map_pictures import draw_cost_map
 
@@ -231,6 +232,7 @@ def _draw(console: Console, one: Asked, explained: Explanation, path: Path) -> N
     if found is None:
         reason = map_refusal(one.evaluator) or "only grid worlds have a map"
         raise UserError(f"--map: {reason}")
-    title = f"{one.chosen.spec.algo} on {one.chosen.spec.env_id}"
+    spec = one.chosen.spec
+    title = f"{spec.algo} on {titled(spec.env_id, spec.map_name)}"
     draw_cost_map(path, title, found, explained.losses)
     say(console, f"map: {path}")

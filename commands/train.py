@@ -307,7 +307,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     from secrets import randbelow
 
     from pipeline.agent_settings import check_algorithm, check_fit, resolved_spec
-    from pipeline.environments import check_env_id, with_logs_located, with_maps_read
+    from pipeline.environments import check_env_id, map_name, with_logs_located, with_maps_read
     from pipeline.train_spec import TrainSpec
     from pipeline.user_modules import import_typed
 
@@ -317,6 +317,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     check_tensorboard(args.tensorboard_log)
     check_device(args.device)
     raw, typed = _raw_hyperparams(args)
+    of_map = map_name(args.env, raw)
     raw = with_logs_located(args.env, with_maps_read(args.env, raw))
     trained_agent = None
     if args.trained_agent:
@@ -328,6 +329,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     named = {name: getattr(args, name) for name in names if name in args}
     changed = {
         "env_id": args.env,
+        "map_name": of_map,
         "seed": args.seed if args.seed >= 0 else randbelow(2**31),
         "log_folder": Path(args.log_folder),
         "tensorboard_log": Path(args.tensorboard_log) if args.tensorboard_log else None,
@@ -628,8 +630,8 @@ def _write_watched(console: Console, training: Training) -> None:
     from report.page.learning import write_learning_page
 
     with doing(console, "writing the page that plays the training"):
-        write_learning_page(training.spec, training.watch, path)
-    say(console, f"learning {path}")
+        words = write_learning_page(training.spec, training.watch, path)
+    say(console, f"learning {path}: {words}")
 
 
 # --- the lists ------------------------------------------------------------------------------------

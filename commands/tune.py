@@ -357,7 +357,7 @@ def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     """The tuning that the arguments ask for."""
     from agents import ALGORITHMS
-    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name
+    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, with_maps_named
     from pipeline.agent_settings import with_engine
     from pipeline.environments import check_env_id
     from pipeline.runs import environment_name
@@ -381,7 +381,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     study = StudySpec(
         name=args.name
         or file_name(f"{environment_name(args.env)}_{args.algo}", LONGEST_FOLDER_NAME),
-        title=f"{args.algo} on {args.env}: a search for settings",
+        title="",
         agents=(AgentSpec(SHIPPED, args.algo, settings, conf_file=conf_file),),
         environments=(EnvironmentSpec(args.env, args.env),),
         n_seeds=args.seeds_per_trial,
@@ -394,6 +394,9 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         run_timeout=args.run_timeout,
         run_memory=args.run_memory,
     )
+    study = with_maps_named(study)
+    title = f"{args.algo} on {study.environments[0].label}: a search for settings"
+    study = replace(study, title=title)
     # A flag with the name of a field sets that field.
     named = {key.name: getattr(args, key.name) for key in fields(TuningSpec) if key.name in args}
     named["search_space"] = None if args.search_space is None else Path(args.search_space)

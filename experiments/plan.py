@@ -29,6 +29,7 @@ from pipeline.environments import (
     check_env_id,
     check_memory,
     make_single_env,
+    map_name,
     usual_kwargs,
     with_maps_read,
 )
@@ -49,6 +50,7 @@ from pipeline.train_spec import NETWORKS, TrainSpec, completed, remembers
 # of modules.
 _MAY_DIFFER = (
     "origins",
+    "map_name",
     "log_folder",
     "tensorboard_log",
     "gym_packages",
@@ -223,7 +225,7 @@ def plan(
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders(
         "environments",
-        [(e.label, _environment_folder(e.label, e.env_id)) for e in study.environments],
+        [(environment.label, environment.folder) for environment in study.environments],
     )
     specs = {}
     for environment in study.environments:
@@ -265,7 +267,7 @@ def _planned_run(
     n_in_batch: int,
 ) -> PlannedRun:
     # From 1, because 0 means the newest run in rl_zoo3's tools.
-    folder = _environment_folder(environment, spec.env_id)
+    folder = next(one.folder for one in study.environments if one.label == environment)
     place = Path(file_name(agent), f"{folder}_{seed + 1}")
     spec = replace(
         spec,
@@ -275,11 +277,6 @@ def _planned_run(
     )
     path, is_batch = root / "runs" / place, n_in_batch > 0
     return PlannedRun(agent, environment, seed, spec, path, is_batch, max(n_in_batch, 1))
-
-
-def _environment_folder(label: str, env_id: str) -> str:
-    """The label as a file name; for an id, the same name as in `train.py`."""
-    return file_name(environment_name(label) if label == env_id else label)
 
 
 def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
@@ -364,6 +361,7 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
         origins=gave_way,
         algo=agent.algo,
         env_id=environment.env_id,
+        map_name=map_name(environment.env_id, raw),
         seed=0,
         verbose=0,
         pictures=False,

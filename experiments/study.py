@@ -17,9 +17,10 @@ import yaml
 
 from agents import ALGORITHMS
 from experiments import run_limits
-from pipeline.environments import check_env_id, with_maps_read
+from pipeline.environments import check_env_id, map_name, titled, with_maps_read
 from pipeline.errors import UserError, shown, unknown
 from pipeline.files import LONGEST_NAME, plain, portable_name, write_text
+from pipeline.runs import environment_name
 from pipeline.settings.hyperparams import override
 from pipeline.settings.values import coerce
 from pipeline.settings.yaml import key_lines, read_yaml
@@ -119,6 +120,13 @@ class EnvironmentSpec:
     #: Hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``, which
     #: override those of the agents' files.
     settings: dict[str, Any] = field(default_factory=dict)
+    map_name: str = ""  #: the file of its map, if the label names it
+
+    @property
+    def folder(self) -> str:
+        """The label as a file name; for an id, the same name as in `train.py`."""
+        is_id = self.label == titled(self.env_id, self.map_name)
+        return file_name(environment_name(self.env_id) if is_id else self.label)
 
 
 @dataclass(frozen=True)
@@ -337,6 +345,16 @@ def read_study(path: Path) -> StudySpec:
         source=path,
         **values,
     )
+
+
+def with_maps_named(study: StudySpec) -> StudySpec:
+    """The study with the file of its map in the label of an environment, where that is its id."""
+    environments = []
+    for one in study.environments:
+        found = {map_name(one.env_id, layered(one.settings, a.settings)) for a in study.agents}
+        name = found.pop() if one.label == one.env_id and len(found) == 1 else ""
+        environments.append(replace(one, label=titled(one.label, name), map_name=name))
+    return replace(study, environments=tuple(environments))
 
 
 def write_study(root: Path, study: StudySpec) -> None:

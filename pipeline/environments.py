@@ -305,6 +305,19 @@ def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**settings, **read}
 
 
+def map_name(env_id: str, settings: Mapping[str, Any]) -> str:
+    """The file name of the grid world map that is evaluated on; empty if it is in no file."""
+    named = _naming(settings, "desc", env_id, GridWorld)
+    given = {key: Path(settings[key]["desc"]).name for key in named if key != "train_env_kwargs"}
+    name = given.get("eval_env_kwargs", given.get("env_kwargs", ""))
+    return "" if "\n" in name else name
+
+
+def titled(environment: str, map_name: str) -> str:
+    """The name of an environment for titles, with the file of its map."""
+    return f"{environment} ({map_name})" if map_name else environment
+
+
 def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The hyperparameters with absolute paths of the logs of a ReplayBandit."""
     named = _naming(settings, "log", env_id, ReplayBandit)

@@ -55,6 +55,7 @@ class TrainSpec:
     diagnose: bool = False  #: compare values and gradients with exact ones at evaluations
     watch_learning: Path | None = None  #: file of a page that replays the training step by step
     watch_episodes: int = 0  #: episodes on that page, for agents with tables; 0: automatic
+    map_name: str = ""  #: the file of the environment's map, for titles
     #: the origin of values that are not in the entry: ``"auto: 1 - 1/(2 x time limit ..."``
     origins: dict[str, str] | None = None
 

@@ -15,6 +15,7 @@ from machine_code.compiling import compile_timer
 from pipeline import loading_libraries
 from pipeline.callbacks import PullSummary, summarise_pulls
 from pipeline.curve_pictures import draw_diagnosis, draw_learning_curve, draw_pulls
+from pipeline.environments import titled
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
@@ -261,7 +262,7 @@ def _stoppable(state: str) -> Iterator[None]:
 def draw(training: Training, final: Evaluation | None) -> None:
     """Draw the pulls, the learning curve and the map of the final policy, if they exist."""
     run, spec, recorder = training.run, training.spec, training.pulls
-    title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
+    title = f"{spec.algo} on {titled(run.env_name, spec.map_name)}, seed {spec.seed}"
     has_pulls = recorder is not None and recorder.n_calls > 0
     if recorder is not None and has_pulls:
         draw_pulls(run.path / "pulls.png", title, recorder.arrays())

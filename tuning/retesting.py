@@ -116,7 +116,7 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
     return replace(
         tuning.study,
         name=FOLDER,
-        title=f"{tuning.agent.algo} on {tuning.environment.env_id}: "
+        title=f"{tuning.agent.algo} on {tuning.environment.label}: "
         f"the best settings of a search, on other seeds",
         description=f"Settings that a search found on the seeds {seeds}, beside those that it "
         "began with, on seeds that it has not seen. Each is compared with these alone.",
@@ -413,6 +413,7 @@ def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> di
         "command": command,
         "asked": place.study.user_attrs.get(ASKED),
         "figure": tuning.figure,
+        **({"map_name": name} if (name := tuning.environment.map_name) else {}),
         **({"figure_mark": mark} if (mark := unproven_mark(tuning)) else {}),
         "objective": tuning.objective,
         "lower_is_better": tuning.is_cost,

@@ -169,6 +169,7 @@ def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) 
         env_id=env_id,
         hyperparams=replace(hyperparams, eval_env_kwargs=env_kwargs),
         saved_hyperparams=raw,
+        map_name="" if "desc" in request.env_kwargs else recorded.map_name,
         seed=request.seed,
         device=request.device,
         gym_packages=tuple(module.name for module in request.user_modules),

@@ -45,6 +45,7 @@ class RecordedRun:
     hyperparams: dict[str, Any] | None = None
     # modules that were imported because they register environments
     gym_packages: tuple[str, ...] = ()
+    map_name: str = ""  # the file of the environment's map
 
 
 def run_of(path: Path) -> Run | None:
@@ -98,6 +99,7 @@ def recorded_run(run: Run | None) -> RecordedRun:
             _text(spec.get("env_id")),
             entry if isinstance(entry, dict) else None,
             _texts(spec.get("gym_packages")),
+            _text(spec.get("map_name")) or "",
         )
     if not _has_settings(run.params_path):
         return RecordedRun()

@@ -26,7 +26,7 @@ from experiments.plan import PlannedRun
 from experiments.results import difference
 from experiments.run_limits import RunLimits
 from mdp.transition_model import Floats
-from pipeline.environments import make_single_env
+from pipeline.environments import make_single_env, titled
 from pipeline.errors import UserError
 from pipeline.evaluation.value_maps import MAX_STATES
 from pipeline.files import write_json, write_text
@@ -68,11 +68,14 @@ def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
         asked = _count(spec.watch_episodes, "episode")
         note = f"a page has room for {n_steps:,} steps, and ends before the first {asked} do"
     elif data["begin"]:
-        first = int(data["steps"]["timesteps"][0])
-        note = f"from step {first:,} on, as the return of the greedy policy rises"
+        note = "these steps, as the return of the greedy policy rises in them"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
-    extent = f"{_count(n_steps, 'step')}, {_count(n_episodes, 'whole episode')}"
+    extent, n_in_all = _count(n_steps, "step"), data["n_timesteps"]
+    first, last = (int(data["steps"]["timesteps"][place]) for place in (0, -1))
+    if data["begin"] or data["is_longer"]:
+        extent = f"steps {first:,} to {last:,} of {n_in_all:,}"
+    extent += f", {_count(n_episodes, 'whole episode')}"
     return {"kind": "step by step", "extent": extent, "note": note}
 
 
@@ -110,6 +113,7 @@ def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
         "changes": _columns(_between(recorder.changes.rows, begin, end)),
         "begin": begin,
         "is_cut": recorder.is_cut or end - begin < len(recorder.steps),
+        "n_timesteps": recorder.model.num_timesteps,
         "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
     }
 
@@ -216,7 +220,7 @@ def write_learning_page(
     The default title names the agent and the environment.
     """
     place = place_data(spec, recorder)
-    title = title or f"{spec.algo} on {spec.env_id}"
+    title = title or f"{spec.algo} on {titled(spec.env_id, spec.map_name)}"
     for data in _ever_less(recorder):
         words = page_words(spec, data)
         text = _render({"title": title, "seed": spec.seed, **words}, {**data, **place})

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipeline.environments import titled
 from pipeline.files import write_text
 from report.page.frame import (
     SHARED,
@@ -307,9 +308,10 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     sections = _sections(trials, shares, winner)
     data: dict[str, Any] = {"page": {"agents": [], "environments": []}}
     data |= {section.name: section.data for section in sections if section.data}
+    environment = titled(asked.get("env", "an environment"), record.get("map_name", ""))
     template = templates("tuning").get_template("tuning.html")
     text = template.render(
-        title=f"{asked.get('algo', 'an agent')} on {asked.get('env', 'an environment')}",
+        title=f"{asked.get('algo', 'an agent')} on {environment}",
         record=record,
         asked=asked,
         sections=sections,
