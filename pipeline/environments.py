@@ -307,10 +307,12 @@ def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def map_name(env_id: str, settings: Mapping[str, Any]) -> str:
     """The file name of the grid world map that is evaluated on; empty if it is in no file."""
-    named = _naming(settings, "desc", env_id, GridWorld)
-    given = {key: Path(settings[key]["desc"]).name for key in named if key != "train_env_kwargs"}
-    name = given.get("eval_env_kwargs", given.get("env_kwargs", ""))
-    return "" if "\n" in name else name
+    parts = [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]
+    given = {key: value for part in parts if isinstance(part, dict) for key, value in part.items()}
+    desc = given.get("desc")
+    is_path = isinstance(desc, str) and "\n" not in desc
+    is_grid = _naming({"env_kwargs": given}, "desc", env_id, GridWorld)
+    return Path(desc).name if is_path and is_grid else ""
 
 
 def titled(environment: str, map_name: str) -> str:

@@ -211,6 +211,12 @@ def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
     )
 
 
+def return_number(value: float) -> str:
+    """A return with four significant digits, as in the tables of a study."""
+    text = f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
 def short_number(value: float, decimals: int) -> str:
     """Format a value briefly: no decimals from 100 on, ``k`` for thousands, ``M`` for millions."""
     size = abs(value)
@@ -253,8 +259,8 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     figure, pairs = _panels(found.layout, len(layers), cell)
     names = (("agent", found.values), ("optimum, all best actions", found.optimal_values))
     for axes, (name, values) in zip(pairs[0], names, strict=True):
-        start_value = f"{found.initial @ values:,.2f}".replace("-", "\N{MINUS SIGN}")
-        axes.set_title(f"{name}: return {start_value}", fontsize=10, loc="left")
+        told = f"{name}: return {return_number(float(found.initial @ values))}"
+        axes.set_title(told, fontsize=10, loc="left")
     for pair, layer in zip(pairs, layers, strict=True):
         if found.layout.prizes:
             pair[0].set_ylabel(layer_name(found.layout, layer))
@@ -293,7 +299,8 @@ def draw_cost_map(path: Path, title: str, found: ValueMap, losses: Floats) -> No
     cost_scale = Normalize(0, max(float(shares.max()), 1e-12))
     cost_colours = LinearSegmentedColormap.from_list("costs", COST_COLOURS)
     figure, pairs = _panels(found.layout, len(layers), cell)
-    pairs[0][0].set_title(f"agent: return {found.initial @ found.values:,.5g}", fontsize=10)
+    start_value = return_number(float(found.initial @ found.values))
+    pairs[0][0].set_title(f"agent: return {start_value}", fontsize=10)
     pairs[0][1].set_title(f"loss of its actions: {losses.sum():,.4g} in total", fontsize=10)
     for pair, layer in zip(pairs, layers, strict=True):
         if found.layout.prizes:
@@ -333,11 +340,13 @@ def cell_inches(layout: GridLayout) -> float:
 
 
 def decimals_for(found: ValueMap) -> int:
-    """Decimals that distinguish the values: none if all values are integers."""
+    """Decimals that distinguish the values: none for integers, three for shares of 1."""
     values = np.concatenate([found.values[found.matters], found.optimal_values[found.matters]])
     if np.abs(values - np.round(values)).max() < 1e-9:
         return 0
     best = found.optimal_values[found.matters]
+    if np.abs(best).max() <= 1:
+        return 3
     return 2 if np.ptp(best) < 10 else 1
 
 

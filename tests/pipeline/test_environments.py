@@ -13,6 +13,7 @@ from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
+    map_name,
     training_changes,
     training_kwargs,
     with_logs_located,
@@ -216,6 +217,21 @@ def test_a_maps_rows_take_the_place_of_its_path():
     assert with_maps_read("FrozenLake-v1", settings) == settings
     with pytest.raises(UserError, match=r"Warehouse-v0: desc: cannot read the map file no\.txt"):
         with_maps_read("Warehouse-v0", {"env_kwargs": {"desc": "no.txt"}, "eval_env_kwargs": None})
+
+
+def test_a_maps_name_is_that_of_the_file_that_is_evaluated_on():
+    path, other, rows = {"desc": "maps/depot.txt"}, {"desc": "b.txt"}, {"desc": "S.\n.G"}
+    for kwargs, expected in (
+        ({"env_kwargs": path}, "depot.txt"),
+        ({"env_kwargs": path, "eval_env_kwargs": other}, "b.txt"),
+        ({"env_kwargs": path, "eval_env_kwargs": {"slip": 0.1}}, "depot.txt"),
+        ({"env_kwargs": path, "eval_env_kwargs": {"desc": ["SG"]}}, ""),
+        ({"train_env_kwargs": path}, ""),
+        ({"env_kwargs": rows}, ""),
+        ({}, ""),
+    ):
+        assert map_name("Warehouse-v0", kwargs) == expected, kwargs
+    assert map_name("CartPole-v1", {"env_kwargs": path}) == ""
 
 
 @pytest.mark.usefixtures("map_file")

@@ -303,6 +303,15 @@ def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
 # --- the picture of a map ------------------------------------------------------------------------
 
 
+def test_numbers_on_a_map_are_returns_with_three_digits_or_more():
+    for value, told in ((0.74019, "0.7402"), (79.0, "79"), (-1234.5, "\N{MINUS SIGN}1,234")):
+        assert drawing.return_number(value) == told
+    for best, decimals in (([0.47, 0.924], 3), ([1.5, 9.25], 2), ([-30.5, 79.0], 1), ([79, 80], 0)):
+        one = np.array(best)
+        found = SimpleNamespace(values=one, optimal_values=one, matters=np.ones(2, dtype=bool))
+        assert drawing.decimals_for(found) == decimals
+
+
 def test_frames_and_arrows_are_what_the_map_says():
     """Frames where agent and optimum part; arrows where each of them goes."""
     policies = drawing.policies_in(map_of(WAREHOUSE, THERE_AND_BACK, **CORNER), 0)

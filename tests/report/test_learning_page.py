@@ -99,6 +99,9 @@ def test_a_page_is_no_larger_than_three_megabytes(watch, monkeypatch):
     said = r"a page has room for [\d,]+ steps, and ends before the first 3,000 episodes do"
     assert re.search(said, text)
     n_steps = len(cut["steps"]["timesteps"])
+    assert re.search(
+        rf"· steps {801 - n_steps} to 800 of 800, \d+ whole episodes?<", again(training)[1]
+    )
     assert 1 < n_steps < 800
     assert len(cut["moves"]["step"]) == n_steps
     assert max(cut["changes"]["step"]) < n_steps
