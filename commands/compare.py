@@ -88,7 +88,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--first-seed", type=FIRST_SEED, metavar="N", help=first)
     decided = "give agents in undecided pairs more seeds, at looks that are fixed beforehand"
     add("--until-decided", action="store_true", help=decided)
-    add("--max-seeds", type=SEEDS, metavar="N", help="the most seeds for that (default: 50)")
+    add("--max-seeds", type=SEEDS, metavar="N", help="the most seeds for that (default: 80)")
     add_shared(parser, "--n-timesteps", "--n-episodes")
     add_shared(parser, "--hyperparams", help="hyperparameters to change in every agent")
     add_shared(parser, "--engine")
@@ -133,7 +133,7 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("judgement and output")
     add = group.add_argument
     add("--metric", help="the figure that verdicts compare: final, best, area, regret, ...")
-    margin = "difference within which agents count as equivalent"
+    margin = "difference of the means within which agents are tied"
     add("--margin", type=number_at_least_zero, help=margin)
     add("--episodes-table", type=COUNT, metavar="N", help="average, min, max of every N episodes")
     filmed = "film one episode after every N episodes"

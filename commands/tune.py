@@ -146,7 +146,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--first-retest-seed", type=FIRST_SEED, default=1000, metavar="N", help=first)
     decided = "add seeds, at looks fixed beforehand, until the best setting is decided to be better"
     add("--until-decided", action="store_true", help=decided)
-    most = "the most other seeds for that (50)"
+    most = "the most other seeds for that (80)"
     add("--max-retest-seeds", type=SEEDS, metavar="N", help=most)
 
     group = parser.add_argument_group("runs")

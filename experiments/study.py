@@ -154,8 +154,8 @@ class StudySpec:
     eval_freq: int | None = None
     eval_episodes: int = 20  #: episodes of each sampled evaluation
     metric: Metric = "final"  #: the metric of the verdicts
-    #: Difference of the metric within which two agents count as equivalent; None for 2 % of the gap
-    #: between the best random or constant policy and the optimum, if that is known.
+    #: Difference of the metric within which two agents are tied; None: 0.02 of the score;
+    #: nothing is tied where there is no score.
     margin: float | None = None
     #: Whether runs of different agents with the same seed share their randomness, as on bandits
     #: whose arms and rewards are drawn by the seed; if so, they are compared seed by seed.
