@@ -80,44 +80,23 @@ def fault_of_bounds(told: Callable[..., float]) -> str:
 
 
 @answering
-def check_wins(wins: Callable[..., float]) -> str:
-    """Whether a function is the probability of improvement.
+def check_unseen(unseen: Callable[..., float]) -> str:
+    """Whether a function gives the largest share of failing runs that n runs can miss.
 
     Args:
-        wins: called with the scores of two agents, arrays of any two lengths.
+        unseen: called with the number of runs.
     """
-
-    def told(first: list[float], second: list[float]) -> float:
-        return number_from(wins, np.array(first), np.array(second))
-
-    if not -TOLERANCE <= told([2.0, 4.0], [1.0, 3.0]) <= 1 + TOLERANCE:
-        return "A share lies between 0 and 1: divide by the number of pairs."
-    if abs(told([3.0, 1.0], [2.0, 0.0]) - told([1.0, 3.0], [2.0, 0.0])) > TOLERANCE:
-        return (
-            "It depends on the order of the seeds. Each run of the one is to meet each run of the "
-            "other, and not just the one beside it."
-        )
-    ties = told([1.0, 1.0], [1.0, 1.0])
-    if abs(ties - 0.5) > TOLERANCE:
-        return f"Two agents that always tie win half each; yours says {ties:.4g}."
-    if told([3.0, 4.0], [1.0, 2.0]) < told([1.0, 2.0], [3.0, 4.0]):
-        return "It is the share that the second agent wins."
-    lost, won = told([1.0, 2.0, 2.0], [0.0, 2.0, 3.0]), told([0.0, 2.0, 3.0], [1.0, 2.0, 2.0])
-    if abs(lost + won - 1) > TOLERANCE:
-        return "What the first wins the second loses: the two shares have to make 1."
-    return fault_of_share(told, won)
-
-
-def fault_of_share(told: Callable[..., float], won: float) -> str:
-    """What is wrong with a share that is symmetrical and in bounds."""
-    other = [3.0, 4.0, 5.0]
-    if abs(told([1.0, 2.0, 9.0], other) - told([1.0, 2.0, 6.0], other)) > TOLERANCE:
-        return "How far a run is ahead must not count, only that it is."
-    if abs(won - 5 / 9) > TOLERANCE:
-        return "Three runs against three are nine pairs. Does each of them count, and all alike?"
-    if abs(told([1.0, 4.0, 5.0], [2.0, 3.0]) - 2 / 3) > TOLERANCE:
-        return "It is right where both have the same number of seeds, and only there."
-    return RIGHT
+    counts = (2, 10, 30)
+    shares = np.array([number_from(unseen, n) for n in counts])
+    if not ((shares > 0) & (shares < 1)).all():
+        return "A share of runs lies between 0 and 1."
+    if np.allclose(missed := (1 - shares) ** counts, 0.05, atol=TOLERANCE):
+        return RIGHT
+    if np.allclose(shares**counts, 0.05, atol=TOLERANCE):
+        return "That is the share of runs that do not fail."
+    if np.allclose(missed, 0.95, atol=TOLERANCE):
+        return "With that share, 95 % of all sets of runs show no failure: it can be larger."
+    return f"With yours, {counts[1]} runs show no failure with a probability of {missed[1]:.2g}."
 
 
 @answering
