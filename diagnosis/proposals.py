@@ -23,7 +23,7 @@ from envs.known_models import time_limit
 from mdp import TransitionModel, policy_iteration, policy_return, state_values, state_visitation
 from mdp.transition_model import Floats, Ints
 from pipeline.agent_settings import shipped_settings
-from pipeline.environments import make_single_env, trains_on_variant
+from pipeline.environments import make_single_env, training_changes
 from pipeline.evaluation.advice import share_of_standing_still
 from pipeline.evaluation.policies import is_network
 from pipeline.settings.values import algorithm_parameters, parse_literal, parse_schedule
@@ -151,7 +151,7 @@ class _Case:
         """Training on the task as it is, a discount nearer to 1, higher initial values."""
         own, found, task = self.own, self.found, self.found.task
         values, before = found.own_values, found.for_discount
-        differs = {VARIANT[0]: trains_on_variant(self.spec), VARIANT[1]: True}
+        differs = {VARIANT[0]: bool(training_changes(self.spec)), VARIANT[1]: True}
         if changed := [key for key in VARIANT if own.get(key) and differs[key]]:
             odd, share = sum(own[key] != self.usual.get(key) for key in changed), 0.0
             if task is not None and before is not None:

@@ -310,9 +310,9 @@ def map_name(env_id: str, settings: Mapping[str, Any]) -> str:
     parts = [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]
     given = {key: value for part in parts if isinstance(part, dict) for key, value in part.items()}
     desc = given.get("desc")
-    is_path = isinstance(desc, str) and "\n" not in desc
-    is_grid = _naming({"env_kwargs": given}, "desc", env_id, GridWorld)
-    return Path(desc).name if is_path and is_grid else ""
+    if not isinstance(desc, str) or "\n" in desc:
+        return ""
+    return Path(desc).name if _naming({"env_kwargs": given}, "desc", env_id, GridWorld) else ""
 
 
 def titled(environment: str, map_name: str) -> str:

@@ -502,7 +502,7 @@ def draw_runs(
         mean = agent.mean
         if mean.low < mean.high:
             axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=5, alpha=0.35)
-        elif mean.has_interval:  # a bar of no length is invisible
+        else:  # a bar of no length is invisible
             axes.plot([mean.point], [row], "D", color=colour, markersize=7, alpha=0.35)
         axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
     names = [wrapped(agent.agent, NAMES) for agent in upwards]
@@ -519,9 +519,10 @@ def draw_runs(
             axes.axvline(environment.optimum_at_least, color=REFERENCE, linewidth=1)
             title += "; the optimum lies between the lines"
             title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
-    x = f"{METRIC_WORDS[metric]}; mean, 95 % interval, each seed"
-    x += "; diamond: interval of one point" if any(a.mean.low == a.mean.high for a in runs) else ""
-    x += "" if all(a.mean.has_interval for a in runs) else "; a mean alone has no interval"
+    ends = "range" if all(a.mean.is_range for a in runs) else "95 % interval"
+    x = f"{METRIC_WORDS[metric]}; mean, {ends}, each seed"
+    x += "; diamond: all runs are equal" if any(a.mean.low == a.mean.high for a in runs) else ""
+    title += f"; best: {environment.best}" if len(runs) > 1 else ""
     widest = max(width_of(line) for name in names for line in name.split("\n"))
     lettering(axes, title=title, x=x, beside=widest + 0.3)
 

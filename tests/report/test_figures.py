@@ -267,7 +267,7 @@ band orange 0.2 (1 6 9) (2 7 10)
 band blue 0.2 (2 7 10)
 names first, second, optimum, best random or constant policy, 95 % interval
 # lake_intervals
-lake; the line is the optimum | return of the final policy; mean, 95 % interval, each seed | -
+lake; the line is the optimum; best: none | return of the final policy; mean, 95 % interval, each seed | -
 y axis: second, first
 blue . (40 0)
 blue - (39.9 0) (40.2 0)
@@ -365,21 +365,18 @@ def test_panels_of_one_metric_have_one_y_axis_and_evaluations_the_axis_of_the_bu
         assert left.get_xlabel() == "episodes"
 
 
-def test_an_interval_of_one_point_has_a_mark_and_a_missing_one_leaves_the_mean():
-    nan = np.nan
-    for low, high, expected, said in (
-        (80, 95, "orange - (80 0) (95 0)", "each seed"),
-        (90, 90, "orange D (90 0)", "; diamond: interval of one point"),
-        (nan, nan, None, "; a mean alone has no interval"),
+def test_an_interval_of_one_point_has_a_mark_and_few_runs_have_their_range():
+    for low, high, n, expected, said in (
+        (80, 95, 5, "orange - (80 0) (95 0)", "mean, 95 % interval, each seed"),
+        (90, 90, 5, "orange D (90 0)", "95 % interval, each seed; diamond: all runs are equal"),
+        (88, 92, 2, "orange - (88 0) (92 0)", "mean, range, each seed"),
     ):
-        axes = Figure().subplots()
-        runs = AgentRuns(
-            "first", made_up.estimate(90.0, low, high), np.arange(2), np.array([88, 92])
-        )
+        axes, mean = Figure().subplots(), made_up.estimate(90.0, low, high, n)
+        runs = AgentRuns("first", mean, np.arange(2), np.array([88, 92]))
         draw_runs(axes, [runs], made_up.environment(), "final", MARKS)
-        dots, *interval, mean, _ = map(line_words, axes.get_lines())
-        assert (dots, mean) == ("orange . (88 -0.18) (92 0.18)", "orange | (90 0)")
-        assert interval == ([] if expected is None else [expected])
+        dots, interval, tick, _ = map(line_words, axes.get_lines())
+        assert (dots, tick) == ("orange . (88 -0.18) (92 0.18)", "orange | (90 0)")
+        assert interval == expected
         assert axes.get_xlabel().replace("\n", " ").endswith(said)
 
 
