@@ -357,9 +357,9 @@ def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     """The tuning that the arguments ask for."""
     from agents import ALGORITHMS
-    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, with_maps_named
+    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name
     from pipeline.agent_settings import with_engine
-    from pipeline.environments import check_env_id
+    from pipeline.environments import check_env_id, map_name, titled
     from pipeline.runs import environment_name
     from pipeline.user_modules import import_typed
 
@@ -378,12 +378,14 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         raise UserError("how long to train? give -n or --n-episodes, not both")
     conf_file = None if args.conf_file is None else Path(args.conf_file)
     settings = with_engine(args.algo, settings, args.engine)
+    of_map = map_name(args.env, settings)
+    label = titled(args.env, of_map)
     study = StudySpec(
         name=args.name
         or file_name(f"{environment_name(args.env)}_{args.algo}", LONGEST_FOLDER_NAME),
-        title="",
+        title=f"{args.algo} on {label}: a search for settings",
         agents=(AgentSpec(SHIPPED, args.algo, settings, conf_file=conf_file),),
-        environments=(EnvironmentSpec(args.env, args.env),),
+        environments=(EnvironmentSpec(label, args.env, map_name=of_map),),
         n_seeds=args.seeds_per_trial,
         first_seed=args.first_seed,
         eval_freq=args.eval_freq,
@@ -394,9 +396,6 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         run_timeout=args.run_timeout,
         run_memory=args.run_memory,
     )
-    study = with_maps_named(study)
-    title = f"{args.algo} on {study.environments[0].label}: a search for settings"
-    study = replace(study, title=title)
     # A flag with the name of a field sets that field.
     named = {key.name: getattr(args, key.name) for key in fields(TuningSpec) if key.name in args}
     named["search_space"] = None if args.search_space is None else Path(args.search_space)

@@ -307,12 +307,12 @@ def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def map_name(env_id: str, settings: Mapping[str, Any]) -> str:
     """The file name of the grid world map that is evaluated on; empty if it is in no file."""
-    parts = [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]
-    given = {key: value for part in parts if isinstance(part, dict) for key, value in part.items()}
-    desc = given.get("desc")
-    if not isinstance(desc, str) or "\n" in desc:
+    parts = [settings.get(key) for key in ("eval_env_kwargs", "env_kwargs")]
+    given = [part["desc"] for part in parts if isinstance(part, dict) and "desc" in part]
+    if not given or not isinstance(given[0], str) or "\n" in given[0]:
         return ""
-    return Path(desc).name if _naming({"env_kwargs": given}, "desc", env_id, GridWorld) else ""
+    is_map = _naming({"env_kwargs": {"desc": given[0]}}, "desc", env_id, GridWorld)
+    return Path(given[0]).name if is_map else ""
 
 
 def titled(environment: str, map_name: str) -> str:

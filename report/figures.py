@@ -411,9 +411,11 @@ def draw_learning_curves(
     kinds = panels(curves)
     scales = {kind: curves[kind].linear_up_to for kind, _ in kinds}
     # Returns on a variant are another metric, with an axis of its own.
-    if is_shared := not curves["training"].on_variant:
+    if not curves["training"].on_variant:
         known = [scale for scale in scales.values() if scale is not None]
         scales = dict.fromkeys(scales, known[0] if known else None)
+        for place in places[1:]:
+            place.sharey(places[0])
     for place, (kind, by) in zip(places, kinds, strict=True):
         found = curves[kind]
         # Before the lines, because the limits depend on the scale.
@@ -438,16 +440,7 @@ def draw_learning_curves(
     if curves["training"].on_variant:
         # The legend's entry for the circles.
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
-    if is_shared:
-        _same_limits(places)
     shared_legend(*places, band=band_words(len(environment.agents)))
-
-
-def _same_limits(places: Sequence[Axes]) -> None:
-    """Give all panels the y axis that shows what is in any of them."""
-    low, high = np.transpose([axes.get_ylim() for axes in places])
-    for axes in places:
-        axes.set_ylim(low.min(), high.max())
 
 
 def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
@@ -500,10 +493,8 @@ def draw_runs(
         spread = np.linspace(-0.18, 0.18, n) if n > 1 else np.zeros(n)
         axes.plot(agent.values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
         mean = agent.mean
-        if mean.low < mean.high:
-            axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=5, alpha=0.35)
-        else:  # a bar of no length is invisible
-            axes.plot([mean.point], [row], "D", color=colour, markersize=7, alpha=0.35)
+        bar = "D" if mean.low == mean.high else "-"  # a bar of no length is invisible
+        axes.plot([mean.low, mean.high], [row, row], bar, color=colour, lw=5, ms=7, alpha=0.35)
         axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
     names = [wrapped(agent.agent, NAMES) for agent in upwards]
     axes.set_yticks(range(len(upwards)), names)
@@ -715,9 +706,10 @@ def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Mark
         with files.figure(name, n_columns, n_rows, height=2.2) as places:
             found = {agent: rows[rows["agent"] == agent] for agent in agents}
             curves = [each[column].to_numpy(float) for each in found.values() for column in BLOCKS]
+            for axes in places[1 : len(agents)]:
+                axes.sharey(places[0])
             for axes, (agent, blocks) in zip(places, found.items(), strict=False):
                 draw_blocks(axes, blocks, marks[agent], linear_up_to(curves, None))
-            _same_limits(places[: len(agents)])
             for axes in places[len(agents) :]:
                 axes.set_visible(False)
             for label, style in BLOCKS.items():

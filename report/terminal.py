@@ -115,15 +115,11 @@ def _print_fitting(
     console: Console, title: str, columns: Sequence[Column], rows: Sequence[Row]
 ) -> list[str]:
     """Print a table with the columns that fit; return the headings of the others."""
-    shown = {column.terminal: cells for column, cells in filled(columns, rows)}
-    names = [row.agent.marked for row in rows]
-    cells = {
-        heading: [cell.in_line or cell.text for cell in found] for heading, found in shown.items()
-    }
-    last = [heading for heading in list(cells)[:0:-1] if heading not in FIRST_LEFT_OUT]
-    table, left_out = _fitting(
-        console, {"agent": names} | cells, (*FIRST_LEFT_OUT, *last), MOST_AGENT_WIDTH
-    )
+    cells = {"agent": [row.agent.marked for row in rows]}
+    for column, found in filled(columns, rows):
+        cells[column.terminal] = [cell.in_line or cell.text for cell in found]
+    order = (*FIRST_LEFT_OUT, *(column.terminal for column in columns[:0:-1]))
+    table, left_out = _fitting(console, cells, order, MOST_AGENT_WIDTH)
     table.title = title
     console.print(table, crop=False)
     return left_out
@@ -140,7 +136,7 @@ def _fitting(
     heading, *_ = cells
     longest = max(map(len, [heading, *cells[heading]]))
     left_out: list[str] = []
-    to_leave_out = [each for each in order if each in cells]
+    to_leave_out = list(dict.fromkeys(each for each in order if each in cells))
 
     def table(width: int) -> Table:
         kept = {each: column for each, column in cells.items() if each not in left_out}
@@ -258,13 +254,12 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     console.print(title, style="italic", highlight=False)
     table, left_out = _fitting(console, _off_policy_cells(comparison), OFF_POLICY_LEFT_OUT)
     console.print(table, crop=False)
-    explained = ["mean reward a pull, ± half the 95 % interval"]
-    if "effective" not in left_out:
-        explained.append("effective: effective sample size in pulls")
-    explained.append("differences below: simultaneous 95 % intervals")
-    if left_out:
-        explained.append(f"a wider terminal shows {enumeration(left_out)} too")
-    console.print("; ".join(explained), style="italic dim", highlight=False)
+    explained = (
+        "mean reward a pull, ± half the 95 % interval; effective: effective sample size in pulls; "
+        "differences below: simultaneous 95 % intervals"
+    )
+    explained += f"; a wider terminal shows {enumeration(left_out)} too" if left_out else ""
+    console.print(explained, style="italic dim", highlight=False)
     for sentence in [*sentences(comparison), *comparison.notes]:
         console.print(f"  {sentence}")
 

@@ -71,10 +71,10 @@ def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
         note = "these steps, as the return of the greedy policy rises in them"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
-    extent, n_in_all = _count(n_steps, "step"), data["n_timesteps"]
-    first, last = (int(data["steps"]["timesteps"][place]) for place in (0, -1))
+    extent = _count(n_steps, "step")
     if data["begin"] or data["is_longer"]:
-        extent = f"steps {first:,} to {last:,} of {n_in_all:,}"
+        first, last = (int(data["steps"]["timesteps"][place]) for place in (0, -1))
+        extent = f"steps {first:,} to {last:,} of {data['n_timesteps']:,}"
     extent += f", {_count(n_episodes, 'whole episode')}"
     return {"kind": "step by step", "extent": extent, "note": note}
 

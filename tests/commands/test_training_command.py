@@ -29,7 +29,7 @@ def test_a_run_that_fails_leaves_the_page_of_what_it_came_to(type_command, tmp_p
     code, out, err = type_command("train.py", *words.split())
     assert (code, err.count("\n")) == (2, 1)
     assert "q_tables of the agent at step 3,000 is nan" in err
-    assert out.splitlines()[-1] == "learning page.html"
+    assert out.splitlines()[-1] == "learning page.html: step by step, 3,000 steps, 3 whole episodes"
     assert "3,000 steps" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
