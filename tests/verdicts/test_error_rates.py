@@ -12,7 +12,7 @@ from verdicts import judge
 BANK = Path(__file__).parents[2] / "benchmarks" / "verdict_bank.npz"
 MARGIN = 0.02
 N_STUDIES = 200
-# With an error rate of 5 %, 200 studies have more false ones than this in 1 of 1,000 cases.
+# At an error rate of 5 %, more of 200 studies are false with a probability of 0.0012 (binomial).
 MOST_FALSE = 20
 KINDS = ("different agents", "the same agent")
 
