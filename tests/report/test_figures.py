@@ -368,7 +368,7 @@ def test_panels_of_one_metric_have_one_y_axis_and_evaluations_the_axis_of_the_bu
 def test_an_interval_of_one_point_has_a_mark_and_few_runs_have_their_range():
     for low, high, n, expected, said in (
         (80, 95, 5, "orange - (80 0) (95 0)", "mean, 95 % interval, each seed"),
-        (90, 90, 5, "orange D (90 0) (90 0)", "95 % interval, each seed; diamond: all runs are equal"),
+        (90, 90, 5, "orange D (90 0) (90 0)", "each seed; diamond: all runs are equal"),
         (88, 92, 2, "orange - (88 0) (92 0)", "mean, range, each seed"),
     ):
         axes, mean = Figure().subplots(), made_up.estimate(90.0, low, high, n)
