@@ -27,7 +27,6 @@ from verdicts.estimates import (
     Bounds,
     finite,
     mean_over_runs,
-    median_over_runs,
     share_interval,
     unseen_share,
 )
@@ -65,7 +64,6 @@ class AgentRuns:
     mean: float
     mean_interval: Bounds  #: Student's t, cut at the bounds; the range below five runs
     median: float
-    median_interval: Bounds  #: from one run to another
     failed: int | None  #: runs below ``Study.failure_threshold``; None where that is not known
     failed_interval: Bounds  #: of the share of runs that fail
     unseen: float  #: the largest share of further runs of a kind that no run showed
@@ -196,10 +194,7 @@ def judge(
     Raises:
         ValueError: for a level, a margin or a number of looks out of range.
 
-    Source: Welch (1947), "The generalization of 'Student's' problem when several different
-    population variances are involved", Biometrika 34; Schuirmann (1987), "A comparison of the two
-    one-sided tests procedure and the power approach", J. Pharmacokinet. Biopharm. 15; Holm (1979),
-    "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6.
+    Source: Welch (1947); Schuirmann (1987); Holm (1979). docs/statistics.md has the titles.
     """
     n_looks = len(looks) or n_looks
     if not (0 < level < 0.5 and n_looks >= 1):
@@ -243,8 +238,6 @@ def _evidence(
 
 
 class _Words(NamedTuple):
-    """The words of all pairs, and what the tests say."""
-
     words: dict[Key, Word]
     p_different: dict[Key, float]  # corrected
     p_tied: dict[Key, float]
@@ -252,6 +245,7 @@ class _Words(NamedTuple):
 
 
 def _words(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> _Words:
+    """The words of all pairs, and what the tests say."""
     apart = holm({key: each.different[0] for key, each in evidence.items()})
     close = holm({key: each.tied[0] for key, each in evidence.items()})
     levels = (1 - FOR_TIES) * rules.level, FOR_TIES * rules.level
@@ -340,7 +334,7 @@ def failure_threshold(baseline: float | None, scores: Iterable[ArrayLike]) -> fl
 def _agent_runs(
     environment: str, name: str, values: ArrayLike, ends: Bounds, threshold: float
 ) -> AgentRuns:
-    runs, mean, median = finite(values), mean_over_runs(values, ends), median_over_runs(values)
+    runs, mean = finite(values), mean_over_runs(values, ends)
     failed = None if np.isnan(threshold) else int((runs < threshold).sum())
     return AgentRuns(
         environment,
@@ -349,8 +343,7 @@ def _agent_runs(
         n_missing=mean.n_missing,
         mean=mean.point,
         mean_interval=(mean.low, mean.high),
-        median=median.point,
-        median_interval=(median.low, median.high),
+        median=float(np.median(runs)) if len(runs) else np.nan,
         failed=failed,
         failed_interval=(0.0, 1.0) if failed is None else share_interval(failed, len(runs)),
         unseen=unseen_share(len(runs)),
@@ -385,29 +378,24 @@ def _grown(rules: _Rules, scores: Scores, looks: Sequence[int]) -> Study:
     seeds = {env: dict.fromkeys(runs, looks[0]) for env, runs in scores.items()}
     evidence: dict[Key, _Evidence] = {}
     words: dict[Key, Word] = {}
-    n_looks = 0
+    shown, n_looks, is_done = scores, 0, False
     for size in looks:
-        # An agent whose runs all crash would never be decided.
-        open_ = [
-            key for key, word in words.items() if word == "undecided" and evidence[key].last.n > 1
-        ]
+        open_ = [key for key, word in words.items() if word == "undecided"]
         for environment, *names in open_:
-            seeds[environment] |= dict.fromkeys(names, size)
-        if (n_looks and not open_) or not _are_there(scores, seeds):
+            # An agent whose runs all crash would never be decided.
+            if evidence[environment, names[0], names[1]].last.n > 1:
+                seeds[environment] |= dict.fromkeys(names, size)
+        shown = {
+            e: {name: np.ravel(scores[e][name])[:n] for name, n in by.items()}
+            for e, by in seeds.items()
+        }
+        is_done = all(len(shown[e][name]) == n for e, by in seeds.items() for name, n in by.items())
+        if not is_done or (
+            n_looks and size not in {n for by in seeds.values() for n in by.values()}
+        ):
             break
-        shown = _first(scores, seeds)
         evidence = _evidence(rules, shown, evidence, words)
         words = _words(rules, shown, evidence).words
         n_looks += 1
-    study = _study(rules, _first(scores, seeds), evidence)
-    return replace(study, seeds=seeds, n_looks=n_looks, is_done=_are_there(scores, seeds))
-
-
-def _are_there(scores: Scores, seeds: Mapping[str, Mapping[str, int]]) -> bool:
-    """Whether all agents have run with their seeds."""
-    return all(np.size(scores[e][name]) >= n for e, by in seeds.items() for name, n in by.items())
-
-
-def _first(scores: Scores, seeds: Mapping[str, Mapping[str, int]]) -> Scores:
-    """The scores of the first seeds of each agent."""
-    return {e: {a: np.ravel(scores[e][a])[:n] for a, n in by.items()} for e, by in seeds.items()}
+    study = _study(rules, shown, evidence)
+    return replace(study, seeds=seeds, n_looks=n_looks, is_done=is_done)
