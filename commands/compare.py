@@ -770,8 +770,8 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     is_free = args.is_quick and "engine" not in changes
 
     def engine(agent: AgentSpec) -> str | None:
-        is_slow = agent.settings.get("engine") != "compiled"
-        return "auto" if is_free and is_slow and args.engine is None else args.engine
+        is_own = "engine" in agent.settings
+        return "auto" if is_free and not is_own and args.engine is None else args.engine
 
     agents = tuple(
         replace(
