@@ -2,6 +2,7 @@
 
 import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -20,7 +21,7 @@ LARGE = -12_345_678.0
 def agents_table(console):
     far = [made_up.estimate(LARGE, LARGE - 7654, LARGE + 1234) for _ in range(4)]
     figures = dict(zip(("metric", "judged", "final", "area"), far, strict=True))
-    figures["metric"] = made_up.Summary(*far[:3])
+    figures["metric"] = replace(made_up.agent("x", 1.0).metric, mean=far[0], median=far[1])
     agents = [made_up.agent(name, 1000.0 * n, **figures) for n, name in enumerate(NAMES)]
     place = made_up.environment(agents, optimum=123_456.0)
     print_analysis(console, made_up.analysis([place], NAMES))
