@@ -15,6 +15,7 @@ from experiments.results import StudyResults
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from mdp.transition_model import Floats
 from pipeline.agent_settings import shipped_settings, with_engine
+from pipeline.environments import titled
 from pipeline.files import plain
 from pipeline.settings.values import parse_assignments
 from pipeline.train_spec import TrainSpec
@@ -70,11 +71,12 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
         agents.append(AgentSpec(label, spec.algo, _fast(spec.algo, values), tuned=False))
     # Two models of one name share a folder only if their settings are the same.
     digest = sha256(repr(sorted(plain(own).items())).encode()).hexdigest()[:8]
+    environment = titled(spec.env_id, spec.map_name)
     return StudySpec(
         name=file_name(f"explain_{name}_{digest}"),
-        title=f"What helps {spec.algo} on {spec.env_id}",
+        title=f"What helps {spec.algo} on {environment}",
         agents=tuple(agents),
-        environments=(EnvironmentSpec(spec.env_id, spec.env_id),),
+        environments=(EnvironmentSpec(environment, spec.env_id, map_name=spec.map_name),),
         n_seeds=SEEDS,
         gym_packages=spec.gym_packages,
         user_modules=spec.user_modules,

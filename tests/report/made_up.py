@@ -28,7 +28,7 @@ def agent(label, mean, **changes):
     figures = AgentAnalysis(
         agent=label,
         algo="qlearning",
-        runs=AgentRuns("lake", label, 4, 0, mean / 100, ends, mean / 100, ends, 0, ends, 0.5),
+        runs=AgentRuns("lake", label, 4, 0, mean / 100, ends, mean / 100, 0, ends, 0.5),
         judged=estimate(mean / 100),
         spread=0.0,
         n_runs=4,
