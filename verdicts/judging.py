@@ -389,7 +389,9 @@ def _grown(rules: _Rules, scores: Scores, looks: Sequence[int]) -> Study:
             e: {name: np.ravel(scores[e][name])[:n] for name, n in by.items()}
             for e, by in seeds.items()
         }
-        is_done = all(len(shown[e][name]) == n for e, by in seeds.items() for name, n in by.items())
+        is_done = all(
+            np.size(shown[e][name]) == n for e, by in seeds.items() for name, n in by.items()
+        )
         if not is_done or (
             n_looks and size not in {n for by in seeds.values() for n in by.values()}
         ):
