@@ -160,8 +160,7 @@ class Retested:
     interval: Estimate | None  # the mean of its figures with its interval; None without runs
     verdict: str  # its word against the initial settings; empty for the initial settings
     n_runs: int  # number of runs
-    # Number of failed runs, which got less than half as far as the best typical run; None if
-    # that is not defined.
+    # Number of failed runs, with a score below half the best median; None if that is not defined.
     n_failed: int | None
     n_missing: int = 0  # number of runs that are missing
 
