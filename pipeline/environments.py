@@ -93,6 +93,8 @@ def training_changes(spec: TrainSpec) -> tuple[str, ...]:
     usual = {**usual_kwargs(spec.env_id), **special.env_kwargs}
     training, evaluation = special.train_env_kwargs, special.eval_env_kwargs
     for key in {**training, **evaluation}:
+        if key == "max_episode_steps" and key not in training:
+            continue  # evaluations need a limit where the environment has none
         value, other = (kwargs.get(key, usual.get(key)) for kwargs in (training, evaluation))
         if key == "max_episode_steps":  # for Gymnasium, -1 means no limit
             value, other = (None if limit == -1 else limit for limit in (value, other))
