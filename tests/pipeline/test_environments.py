@@ -95,7 +95,7 @@ UNLIMITED = {"max_episode_steps": -1}
         ({"env_kwargs": SHAPED, "train_env_kwargs": {"shelf_reward": -1}}, ("shelf_reward -1",)),
         ({"train_env_kwargs": UNLIMITED}, ("no time limit",)),
         ({"env_kwargs": UNLIMITED, "train_env_kwargs": {"max_episode_steps": None}}, ()),
-        ({"eval_env_kwargs": {"max_episode_steps": 9}}, ("episodes of 1000 steps",)),
+        ({"eval_env_kwargs": {"max_episode_steps": 9}}, ()),
         ({"train_env_kwargs": {"random_start": True}}, ("random starts",)),
         ({"train_env_wrapper": SCALED}, ("rewards x 0.01",)),
         # In evaluations, too.
