@@ -19,7 +19,7 @@ from experiments.study import StudySpec
 from pipeline.errors import UserError, one_line
 from pipeline.files import write_json
 from safe_files.files import UnsafeFileError, read_file
-from verdicts import Study, look_sizes
+from verdicts import Study
 
 MOST_SEEDS = 80
 LOOKS_FILE = "looks.json"
@@ -92,6 +92,14 @@ def _planned_before(root: Path) -> dict[str, Any]:
             f"{path} cannot be read ({one_line(error)}): remove it, and the looks are planned again"
         ) from error
     return dict(plan)
+
+
+def look_sizes(first: int, most: int) -> tuple[int, ...]:
+    """The number of seeds of an agent at each look: twice as many as before, up to ``most``."""
+    sizes = [first]
+    while sizes[-1] < most:
+        sizes.append(min(2 * sizes[-1], most))
+    return tuple(sizes)
 
 
 def first_counts(study: StudySpec) -> Counts:

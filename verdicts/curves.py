@@ -1,4 +1,4 @@
-"""Learning curves: shared steps, bands, areas, thresholds, and performance profiles.
+"""Learning curves: shared steps, bands, thresholds, and performance profiles.
 
 A curve has steps of shape (n_points,), non-decreasing, and values of shape (n_points,), or
 (n_curves, n_points) for several; others are refused with a ValueError.
@@ -49,14 +49,6 @@ def _curve(steps: ArrayLike, values: ArrayLike) -> tuple[Floats, Floats]:
     if (np.diff(x) < 0).any():
         raise ValueError(f"the steps of a curve fall after step {x[:-1][np.diff(x) < 0][0]:g}")
     return x, y
-
-
-def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
-    """The mean height of each curve, by the trapezoidal rule; shape () or (n_curves,)."""
-    x, y = _curve(steps, values)
-    if x[-1] == x[0]:
-        return y[..., -1]
-    return np.asarray(np.trapezoid(y, x, axis=-1) / (x[-1] - x[0]))
 
 
 def shared_grid(curves: Sequence[ArrayLike], n_points: int = 500) -> Floats:

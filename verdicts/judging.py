@@ -365,14 +365,6 @@ def _best(agents: Sequence[AgentRuns], pairs: Sequence[Pair]) -> Best:
 # Studies that add seeds until their pairs are decided.
 
 
-def look_sizes(first: int, most: int) -> tuple[int, ...]:
-    """The number of seeds of an agent at each look: twice as many as before, up to ``most``."""
-    sizes = [first]
-    while sizes[-1] < most:
-        sizes.append(min(2 * sizes[-1], most))
-    return tuple(sizes)
-
-
 def _grown(rules: _Rules, scores: Scores, looks: Sequence[int]) -> Study:
     """The verdicts after all looks that the runs allow; see ``judge``."""
     seeds = {env: dict.fromkeys(runs, looks[0]) for env, runs in scores.items()}

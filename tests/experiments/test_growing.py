@@ -8,6 +8,7 @@ from experiments.growing import (
     LOOKS_FILE,
     first_counts,
     grown,
+    look_sizes,
     looked,
     looks_of,
     next_counts,
@@ -82,6 +83,12 @@ def test_a_growing_study_is_judged_by_its_looks_wherever_it_is_shown(tmp_path):
     shown = analyse(results, looks=looks_of(tmp_path))
     assert shown.verdicts == said
     assert {agent.n_runs for agent in shown.environments[0].agents} == {10, 40}
+
+
+def test_sizes_of_looks():
+    assert look_sizes(10, 80) == (10, 20, 40, 80)
+    assert look_sizes(10, 50) == (10, 20, 40, 50)
+    assert look_sizes(5, 5) == (5,)
 
 
 PLANNED = [

@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 from verdicts import (
-    area_under_curve,
     curve_band,
     mean_over_runs,
     on_grid,
@@ -98,14 +97,6 @@ def test_intervals_over_normal_runs_cover(n):
 # --- one curve ------------------------------------------------------------------------------------
 
 
-def test_areas_worked_by_hand():
-    # Trapezoids 10 x 1 and 30 x 3 over a span of 40.
-    assert area_under_curve([0, 10, 40], [0, 2, 4]) == 2.5
-    assert area_under_curve([10, 20], [[0, 2], [5, 5]]).tolist() == [1, 5]
-    assert area_under_curve([7], [3]) == 3
-    assert np.isnan(area_under_curve([0, 1, 2], [0, NAN, 1]))
-
-
 @pytest.mark.parametrize(
     ("values", "threshold", "first", "to_stay"),
     [
@@ -128,7 +119,7 @@ def test_steps_to_a_threshold(values, threshold, first, to_stay):
 
 def test_curves_that_are_none_are_refused():
     with pytest.raises(ValueError, match="fall after step 20"):
-        area_under_curve([10, 20, 15], [0, 0, 0])
+        on_grid([10, 20, 15], [0, 0, 0], [0])
     with pytest.raises(ValueError, match=r"steps of shape \(2,\) and values of shape \(3,\)"):
         on_grid([0, 1], [0, 0, 0], [0])
     with pytest.raises(ValueError, match="shape"):

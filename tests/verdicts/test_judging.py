@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from verdicts import judge, look_sizes
+from verdicts import judge
 
 NAN = math.nan
 
@@ -228,12 +228,6 @@ def test_arguments_out_of_range_are_named():
 
 
 # --- growing studies ------------------------------------------------------------------------------
-
-
-def test_sizes_of_looks():
-    assert look_sizes(10, 80) == (10, 20, 40, 80)
-    assert look_sizes(10, 50) == (10, 20, 40, 50)
-    assert look_sizes(5, 5) == (5,)
 
 
 def test_looks_share_the_level_and_decided_pairs_keep_their_word():
