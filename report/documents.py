@@ -223,8 +223,8 @@ def _legend(analysis: StudyAnalysis) -> str:
     else:
         what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
     text = (
-        f"{what} ±: the standard deviation of runs. Bold: no other agent is shown to be better on "
-        "average."
+        f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is shown "
+        "to be worse on average."
     )
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
@@ -233,7 +233,9 @@ def _legend(analysis: StudyAnalysis) -> str:
 
 def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Cell]:
     """The cell of each agent that has a run."""
-    best = () if none_has_learnt(analysis.study, environment) else environment.best.agents
+    best = environment.best.agents
+    if none_has_learnt(analysis.study, environment) or len(best) == len(environment.agents):
+        best = ()  # nobody is shown to be worse
     costs = processor_seconds(analysis.results)
     cells = {}
     for agent in environment.agents:
