@@ -125,6 +125,9 @@ def holm(p_values: Mapping[K, float]) -> dict[K, float]:
 
 def difference_interval(found: Difference, level: float, ends: Bounds) -> Bounds:
     """The differences that the test does not reject at a level, cut at what is possible."""
+    # Means outside of the bounds show that these are wrong.
+    means = [each.mean for each in found.samples if each.n]
+    ends = min(ends[0], *means, np.inf), max(ends[1], *means, -np.inf)
     low, high = UNBOUNDED
     if found.n > 1 and 2 * lowest_p(found.n) <= level:
         reach = float(special.stdtrit(found.freedom, 1 - level / 2) * found.error)

@@ -215,6 +215,12 @@ def test_the_figures_of_an_agent():
     assert unseen == pytest.approx([0.451, 0.259, 0.139, 0.095], abs=5e-4)
 
 
+def test_bounds_that_runs_contradict_leave_differences_in_their_intervals():
+    scores = {"w": {"x": [3.0, 2.0, 4.0, 3.0, 2.5], "y": [0.5, 0.2, 0.1, 0.4, 0.3]}}
+    low, high = only(judge(scores, bounds=(0, 1), margin=0)).interval
+    assert low <= only(judge(scores, margin=0)).difference <= high
+
+
 def test_failures_need_a_baseline_that_somebody_beats():
     for baseline, n_failed in ((0.0, 1), (None, None), (2.0, None)):
         study = judge({"w": {"x": [1.0, 0.4, 1.0]}}, baseline=baseline)
