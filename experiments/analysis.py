@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -75,7 +76,7 @@ class Evidence:
     is_cost: bool  #: whether a lower metric is better
     margin: float  #: the largest difference that does not matter, in scores or else in the metric
 
-    @property
+    @cached_property
     def scores(self) -> dict[str, Floats]:
         """By agent, what verdicts compare, one for each of its seeds; higher is better.
 
