@@ -20,11 +20,11 @@ def main():
         place = Path(folder).resolve()
         os.chdir(place)
         # Before the first fork: what the children would import one by one.
+        import results
         import stable_baselines3  # noqa: F401
         import trained
-        import typed
 
-        things = [*typed.things(Path(root).resolve(), place), *trained.things(place)]
+        things = [*results.things(Path(root).resolve(), place), *trained.things(place)]
         wanted = {
             thing.name
             for thing in things
