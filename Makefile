@@ -7,8 +7,8 @@ PACKAGE ?= mdp
 N ?= 25
 SEED ?= 0
 
-# The installed packages, which have to work on other systems too.
-PACKAGES := safe_files machine_code mdp verdicts envs agents pipeline diagnosis experiments tuning report commands
+# What is installed, which has to work on other systems too.
+PACKAGES := rl_yardstick
 
 BIN := .venv/bin
 STAMP := .venv/.installed

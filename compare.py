@@ -1,8 +1,8 @@
 """Compare agents over seeds: ``python compare.py --env FrozenLake-v1 --algos qlearning dqn``."""
 
 try:
-    from commands.cli import run_command
-    from commands.compare import main
+    from rl_yardstick.commands.cli import run_command
+    from rl_yardstick.commands.compare import main
 except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 

@@ -1,8 +1,8 @@
 """Play a trained agent: ``python enjoy.py --env Warehouse-v0 --algo ppo``."""
 
 try:
-    from commands.cli import run_command
-    from commands.enjoy import main
+    from rl_yardstick.commands.cli import run_command
+    from rl_yardstick.commands.enjoy import main
 except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 

@@ -1,8 +1,8 @@
 """Train an agent on an environment: ``python train.py --env Warehouse-v0 --algo ppo``."""
 
 try:
-    from commands.cli import run_command
-    from commands.train import main
+    from rl_yardstick.commands.cli import run_command
+    from rl_yardstick.commands.train import main
 except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 

@@ -1,8 +1,8 @@
 """Search for an agent's hyperparameters: ``python tune.py --env Warehouse-v0 --algo ppo``."""
 
 try:
-    from commands.cli import run_command
-    from commands.tune import main
+    from rl_yardstick.commands.cli import run_command
+    from rl_yardstick.commands.tune import main
 except KeyboardInterrupt:  # during the imports
     raise SystemExit(130) from None
 

@@ -42,7 +42,7 @@ PLANNERS = {"optimal", "value_iteration", "policy_iteration"}
 
 def prepared_folder(folder: Path) -> None:
     """Make the files that pages tell their readers to make."""
-    from envs.bandits import log_uniformly
+    from rl_yardstick.envs.bandits import log_uniformly
 
     page = (ROOT / "docs" / "own-map.md").read_text(encoding="utf-8")
     found = re.search(r"```\n(S.*?)```", page, re.DOTALL)
@@ -58,8 +58,8 @@ def outcome(training: str, seed: int, folder: Path) -> dict[str, Any]:
     """The results of one run: its return, its score if there is one, and its processor time."""
     from rich.console import Console
 
-    from commands.train import build_parser, train_spec
-    from pipeline.training import train
+    from rl_yardstick.commands.train import build_parser, train_spec
+    from rl_yardstick.pipeline.training import train
 
     words = [*shlex.split(training), "--seed", str(seed), "--verbose", "0", "-f", str(folder)]
     parser = build_parser()
@@ -119,7 +119,7 @@ def n_solved(training: str, runs: list[dict[str, Any]]) -> int | None:
     """How many runs reach a score of 0.9 or, if the optimum is not known, the threshold."""
     import gymnasium as gym
 
-    import envs  # noqa: F401
+    import rl_yardstick.envs  # noqa: F401
 
     if all(run["score"] is not None and not run["bracketed"] for run in runs):
         # If the best constant policy is optimal, the score is meaningless.

@@ -16,11 +16,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from experiments.analysis import StudyAnalysis, analyse
-from experiments.plan import plan
-from experiments.results import read_results
-from experiments.study import read_study
-from report.documents import headline, table_as
+from rl_yardstick.experiments.analysis import StudyAnalysis, analyse
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.results import read_results
+from rl_yardstick.experiments.study import read_study
+from rl_yardstick.report.documents import headline, table_as
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDY = ROOT / "studies" / "library-vs-hand-rolled.yml"

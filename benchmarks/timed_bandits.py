@@ -16,9 +16,9 @@ import numpy as np
 from mabwiser.mab import MAB, LearningPolicy
 from stable_baselines3.common.monitor import Monitor
 
-import envs  # noqa: F401  # registers the bandits
-from agents import load_algorithm
-from agents.bandits.runs import run_batch
+import rl_yardstick.envs  # noqa: F401  # registers the bandits
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.bandits.runs import run_batch
 from timing import Benchmark, Rows, speed
 
 PULLS = 1000

@@ -19,11 +19,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents import load_algorithm
-from agents.common.callbacks import BlockCallback
-from commands.train import build_parser, train_spec
-from envs.wrappers import DiscretizeObservation
-from pipeline.training import train
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import BlockCallback
+from rl_yardstick.commands.train import build_parser, train_spec
+from rl_yardstick.envs.wrappers import DiscretizeObservation
+from rl_yardstick.pipeline.training import train
 from timing import Benchmark, Contender, Rows
 
 N_STEPS = 20_000

@@ -14,8 +14,8 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-import envs  # noqa: F401  # registers the warehouse
-from agents import load_algorithm
+import rl_yardstick.envs  # noqa: F401  # registers the warehouse
+from rl_yardstick.agents import load_algorithm
 from timing import Benchmark, Rows
 
 LAKE = {"n_steps": 128, "batch_size": 512, "n_epochs": 10, "learning_rate": 1e-3, "ent_coef": 0.01}

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from experiments.study import read_study
+from rl_yardstick.experiments.study import read_study
 from tests.peers.peer_environment import peer_folder, peer_python
 from timing import ROOT, Benchmark, Contender, Rows
 

@@ -20,12 +20,12 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from agents import load_algorithm
-from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
-from agents.tabular.one_step import QLearning
-from envs.known_models import time_limit, transition_model
-from envs.warehouse import DEFAULT_MAP
-from envs.wrappers import DiscretizeObservation
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
+from rl_yardstick.agents.tabular.one_step import QLearning
+from rl_yardstick.envs.known_models import time_limit, transition_model
+from rl_yardstick.envs.warehouse import DEFAULT_MAP
+from rl_yardstick.envs.wrappers import DiscretizeObservation
 from timing import Benchmark, Contender, Rows, speed
 
 EPSILON, STEP_SIZE, GAMMA = 0.1, 0.1, 0.99

@@ -97,8 +97,8 @@ PLANNABLE = 0.95
 
 
 def _spec(member: Member, algo: str, seed: int) -> Any:
-    from pipeline.agent_settings import resolved_spec
-    from pipeline.settings.hyperparams import override, read_hyperparams
+    from rl_yardstick.pipeline.agent_settings import resolved_spec
+    from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
 
     raw = override(read_hyperparams(algo, member.env_id), {"env_kwargs": member.env_kwargs})
     return resolved_spec(raw, algo=algo, env_id=member.env_id, seed=seed)
@@ -106,14 +106,14 @@ def _spec(member: Member, algo: str, seed: int) -> Any:
 
 @cache
 def _evaluator(name: str) -> Any:
-    from pipeline.evaluation.exact import exact_evaluator
+    from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 
     return exact_evaluator(_spec(family()[name], "qlearning", 0))
 
 
 def planning_score(name: str, discount: float) -> float:
     """The undiscounted score of the best policy under the discount."""
-    from mdp import policy_iteration, policy_return
+    from rl_yardstick.mdp import policy_iteration, policy_return
 
     judge = _evaluator(name)
     plan = policy_iteration(judge.model, discount)
@@ -123,9 +123,9 @@ def planning_score(name: str, discount: float) -> float:
 
 def family_score(name: str, algo: str, seed: int) -> float:
     """Train a table in this process; return the exact score of its greedy policy."""
-    from agents import load_algorithm
-    from pipeline.environments import make_training_env
-    from pipeline.preparation import algorithm_kwargs
+    from rl_yardstick.agents import load_algorithm
+    from rl_yardstick.pipeline.environments import make_training_env
+    from rl_yardstick.pipeline.preparation import algorithm_kwargs
 
     spec = _spec(family()[name], algo, seed)
     env = make_training_env(spec, None)

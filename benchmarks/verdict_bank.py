@@ -28,12 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
-from commands.train import build_parser, train_spec
-from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation.exact import evaluator_of
-from pipeline.evaluation.sampled import SampledEvaluator
-from pipeline.preparation import algorithm_kwargs, make_model
-from pipeline.train_spec import NETWORKS
+from rl_yardstick.commands.train import build_parser, train_spec
+from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
+from rl_yardstick.pipeline.evaluation.exact import evaluator_of
+from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator
+from rl_yardstick.pipeline.preparation import algorithm_kwargs, make_model
+from rl_yardstick.pipeline.train_spec import NETWORKS
 
 BANK = Path(__file__).with_name("verdict_bank.npz")
 N_RUNS, N_NETWORKS = 1500, 100

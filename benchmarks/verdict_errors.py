@@ -30,7 +30,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import special
 
-from verdicts import judge
+from rl_yardstick.verdicts import judge
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "docs" / "scripts"))
 

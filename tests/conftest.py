@@ -16,9 +16,9 @@ from types import SimpleNamespace
 import hypothesis
 import pytest
 
-from experiments.child_processes import PRELOADED
-from pipeline.stopping import SIGNALS
-from safe_files import files as unsafe_files
+from rl_yardstick.experiments.child_processes import PRELOADED
+from rl_yardstick.pipeline.stopping import SIGNALS
+from rl_yardstick.safe_files import files as unsafe_files
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -63,7 +63,7 @@ def pytest_collection_finish():
 @pytest.fixture(autouse=True, scope="session")
 def shipped_settings_are_parsed_once():
     """Each run asks for them, and to parse a file takes longer than to check what it says."""
-    from pipeline.settings import hyperparams as entries
+    from rl_yardstick.pipeline.settings import hyperparams as entries
 
     read, parsed = entries.read_yaml, cache(entries.read_yaml)
 
@@ -117,7 +117,7 @@ HOSTILE = "</script><script>document.title='taken'</script>"
 
 def small_study():
     """Three agents, one of them with a name that is an attack, on two maps with two seeds."""
-    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+    from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 
     agents = (
         AgentSpec("Q-learning & co", "qlearning"),
@@ -143,7 +143,7 @@ def own_folder(monkeypatch, tmp_path):
     """A user's folder, in which commands are typed; what is imported from there goes afterwards."""
     import gymnasium as gym
 
-    from agents import ALGORITHMS
+    from rl_yardstick.agents import ALGORITHMS
 
     (tmp_path / "own").mkdir()
     folder = (tmp_path / "own").resolve()
@@ -168,7 +168,7 @@ def type_in_own_folder(own_folder, monkeypatch, capsys):
     import enjoy
     import train
     import tune
-    from commands.cli import run_command
+    from rl_yardstick.commands.cli import run_command
 
     commands = {f"{each.__name__}.py": each.main for each in (train, enjoy, compare, tune)}
 
@@ -185,10 +185,10 @@ def type_in_own_folder(own_folder, monkeypatch, capsys):
 @pytest.fixture(scope="session")
 def do_study():
     """Does the runs of a study that are missing, in this process, and reads its results."""
-    from experiments.plan import plan
-    from experiments.results import read_results
-    from experiments.run_folders import draft_path
-    from experiments.run_in_child import do_run
+    from rl_yardstick.experiments.plan import plan
+    from rl_yardstick.experiments.results import read_results
+    from rl_yardstick.experiments.run_folders import draft_path
+    from rl_yardstick.experiments.run_in_child import do_run
 
     def do(study, root):
         planned = plan(study, root)
@@ -203,15 +203,15 @@ def do_study():
 @pytest.fixture(scope="session")
 def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
-    from experiments.analysis import analyse
-    from experiments.plan import plan
-    from experiments.results import read_results
-    from experiments.run_folders import draft_path
-    from experiments.run_in_child import do_run
-    from report import films
-    from report.page import world_sections, write_report
-    from report.page.frame import Report
-    from report.series import study_series
+    from rl_yardstick.experiments.analysis import analyse
+    from rl_yardstick.experiments.plan import plan
+    from rl_yardstick.experiments.results import read_results
+    from rl_yardstick.experiments.run_folders import draft_path
+    from rl_yardstick.experiments.run_in_child import do_run
+    from rl_yardstick.report import films
+    from rl_yardstick.report.page import world_sections, write_report
+    from rl_yardstick.report.page.frame import Report
+    from rl_yardstick.report.series import study_series
 
     study, root = small_study(), tmp_path_factory.mktemp("study")
     planned = plan(study, root)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from commands import audit, compare, enjoy, explain, shaping, train, tune
-from commands.compare import study_spec
-from commands.train import train_spec
-from commands.tune import tuning_spec
-from experiments.plan import plan
-from experiments.study import _STUDY_KEYS, read_study
+from rl_yardstick.commands import audit, compare, enjoy, explain, shaping, train, tune
+from rl_yardstick.commands.compare import study_spec
+from rl_yardstick.commands.train import train_spec
+from rl_yardstick.commands.tune import tuning_spec
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.study import _STUDY_KEYS, read_study
 
 ROOT = Path(__file__).parent.parent
 sys.path += [str(ROOT / "benchmarks"), str(ROOT / "docs" / "scripts")]

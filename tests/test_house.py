@@ -14,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from machine_code.sources import kept_packages
+from rl_yardstick.machine_code.sources import kept_packages
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = (

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import strategies as st
 from scipy import special
 
-from envs.known_models import transition_model
-from mdp import value_iteration
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import value_iteration
 
 # A lesson imports them as a script in its folder does.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs" / "lessons"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from agents import ALGORITHMS
+from rl_yardstick.agents import ALGORITHMS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 FORM = ["Idea", "Update", "Pseudo-code, and the code that runs", "By hand", "When it fails"]

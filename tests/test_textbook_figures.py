@@ -7,8 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs.known_models import transition_model
-from mdp import policy_iteration
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import policy_iteration
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "textbook"
 

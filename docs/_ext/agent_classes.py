@@ -12,7 +12,7 @@ class AgentClasses(SphinxDirective):
     """``.. agent-classes::``, the documentation of each class that the registry names."""
 
     def run(self) -> list[nodes.Node]:
-        from agents import ALGORITHMS
+        from rl_yardstick.agents import ALGORITHMS
 
         places = [entry.entry_point.replace(":", ".") for entry in ALGORITHMS.values()]
         own = [place for place in dict.fromkeys(places) if place.startswith("agents.")]

@@ -82,7 +82,7 @@ def filled(text: str, folder: Path) -> str:
 
 def pictured_environments() -> dict[str, dict[str, object]]:
     """The environments that pages show, with their arguments."""
-    from pipeline.settings.values import parse_assignments
+    from rl_yardstick.pipeline.settings.values import parse_assignments
 
     found = {}
     for path in sorted(DOCS.rglob("*.md")):

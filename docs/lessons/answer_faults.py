@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp import TransitionModel
+from rl_yardstick.mdp import TransitionModel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -24,7 +24,7 @@ from answer_faults import (
     probabilities,
 )
 
-from mdp import TransitionModel, finite_horizon_optimum, policy_return, value_iteration
+from rl_yardstick.mdp import TransitionModel, finite_horizon_optimum, policy_return, value_iteration
 
 
 def check_policy_values(model: TransitionModel, policy: Any, discount: float, values: Any) -> str:

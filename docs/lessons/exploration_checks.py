@@ -9,8 +9,8 @@ import numpy as np
 from answer_faults import RIGHT, TOLERANCE, Ints, answering, number_from
 from checker import check_target
 
-from envs.known_models import transition_model
-from mdp import TransitionModel, policy_return, value_iteration
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import TransitionModel, policy_return, value_iteration
 
 SIZES, EPSILONS = (3, 5), (1.0, 0.5, 0.1)
 

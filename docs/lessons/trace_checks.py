@@ -18,7 +18,7 @@ from answer_faults import (
     number_from,
 )
 
-from mdp import TransitionModel
+from rl_yardstick.mdp import TransitionModel
 
 
 @answering

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from gymnasium import spaces
 
-from agents.registry import ALGORITHMS, fitting_algorithms
+from rl_yardstick.agents.registry import ALGORITHMS, fitting_algorithms
 
 PAGES = Path(__file__).resolve().parents[1] / "algorithms"
 BOX = spaces.Box(-1, 1, (3,), np.float32)

@@ -51,7 +51,7 @@ def draw_environments() -> None:
     import gymnasium as gym
     from PIL import Image
 
-    import envs  # noqa: F401  # registers them
+    import rl_yardstick.envs  # noqa: F401  # registers them
     from fill_pages import pictured_environments
 
     folder = IMAGES / "environments"

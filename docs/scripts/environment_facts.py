@@ -21,15 +21,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-import envs
-from agents.registry import ALGORITHMS
-from envs.known_models import (
+from rl_yardstick import envs
+from rl_yardstick.agents.registry import ALGORITHMS
+from rl_yardstick.envs.known_models import (
     observations_of_states,
     success_outcomes,
     time_limit,
     transition_model,
 )
-from mdp import (
+from rl_yardstick.mdp import (
     Hardness,
     TransitionModel,
     baseline_policies,
@@ -37,11 +37,11 @@ from mdp import (
     hardness_of,
     policy_return,
 )
-from mdp.beliefs import Bracket
-from mdp.evaluation import PolicyReturn
-from pipeline.evaluation.observability import HiddenScale, hidden_scale
-from pipeline.settings.hyperparams import entry_names
-from pipeline.settings.values import parse_assignments
+from rl_yardstick.mdp.beliefs import Bracket
+from rl_yardstick.mdp.evaluation import PolicyReturn
+from rl_yardstick.pipeline.evaluation.observability import HiddenScale, hidden_scale
+from rl_yardstick.pipeline.settings.hyperparams import entry_names
+from rl_yardstick.pipeline.settings.values import parse_assignments
 
 PAGES = Path(__file__).resolve().parents[1] / "environments"
 HARDNESS_HEADS = (

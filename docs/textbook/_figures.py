@@ -19,9 +19,9 @@ from rich.table import Table
 from stable_baselines3.common.callbacks import CallbackList, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 
-from agents import load_algorithm
-from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon
-from mdp.transition_model import Floats
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon
+from rl_yardstick.mdp.transition_model import Floats
 
 mpl.use("Agg")
 

@@ -15,8 +15,8 @@ from _figures import Statement, arguments, finish, learn_episodes
 from matplotlib.figure import Figure
 from stable_baselines3.common.env_util import make_vec_env
 
-from agents.linear.action_values import SemiGradientSARSA
-from mdp.transition_model import Floats
+from rl_yardstick.agents.linear.action_values import SemiGradientSARSA
+from rl_yardstick.mdp.transition_model import Floats
 
 MOMENTS = (12, 104, 1000, 9000)  # episodes
 LONGEST = 100_000  # steps; the book's episodes have no limit

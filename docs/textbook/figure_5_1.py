@@ -15,10 +15,10 @@ from _figures import Statement, agent_on, arguments, finish, learn_episodes
 from gymnasium import spaces
 from matplotlib.figure import Figure
 
-from envs.known_models import transition_model
-from envs.wrappers import FlattenToDiscrete
-from mdp.graph import PolicyChain
-from mdp.transition_model import Floats, Ints, TransitionModel
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.envs.wrappers import FlattenToDiscrete
+from rl_yardstick.mdp.graph import PolicyChain
+from rl_yardstick.mdp.transition_model import Floats, Ints, TransitionModel
 
 FEW, MANY = 10_000, 500_000
 STICK, HIT = 0, 1

@@ -17,9 +17,9 @@ from figure_5_1 import DEALER, HIT, PLAYER, STICK, game, model, observations
 from matplotlib.figure import Figure
 from stable_baselines3.common.utils import LinearSchedule
 
-from mdp.evaluation import policy_return
-from mdp.finite_horizon import finite_horizon_optimum
-from mdp.transition_model import Ints
+from rl_yardstick.mdp.evaluation import policy_return
+from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
+from rl_yardstick.mdp.transition_model import Ints
 
 N_EPISODES = 500_000
 LONGEST = 25  # cards; no hand lasts so long

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from _figures import Statement, agent_on, arguments, canvas, finish, learn_episodes
 
-from mdp.transition_model import Floats
+from rl_yardstick.mdp.transition_model import Floats
 
 N_EPISODES = 300
 LEFT = 2  # steps

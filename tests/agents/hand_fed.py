@@ -5,8 +5,8 @@ import numpy as np
 from gymnasium import spaces
 from hypothesis import strategies as st
 
-from agents import load_algorithm
-from agents.common.algorithm import Transitions
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.algorithm import Transitions
 
 N_STATES, N_ACTIONS = 4, 3
 

@@ -9,9 +9,14 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents import load_algorithm
-from agents.bandits.algorithm import Pull
-from agents.bandits.upper_bounds import bernoulli_kl, kl_ucb_index, kl_upper_bound, ucb_index
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.bandits.algorithm import Pull
+from rl_yardstick.agents.bandits.upper_bounds import (
+    bernoulli_kl,
+    kl_ucb_index,
+    kl_upper_bound,
+    ucb_index,
+)
 from tests.agents.hand_fed import Spaces
 
 ARMS = 3

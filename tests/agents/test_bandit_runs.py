@@ -11,10 +11,10 @@ from gymnasium import spaces
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 
-import envs  # noqa: F401  # registers the bandits
-from agents import load_algorithm
-from agents.bandits.runs import run_batch, run_one_by_one
-from agents.compiled.worlds import NotCompilable
+import rl_yardstick.envs  # noqa: F401  # registers the bandits
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.bandits.runs import run_batch, run_one_by_one
+from rl_yardstick.agents.compiled.worlds import NotCompilable
 
 COINS, NORMAL, SEGMENTS = "BernoulliBandit-v0", "GaussianBandit-v0", "SegmentBandit-v0"
 

@@ -19,10 +19,15 @@ from stable_baselines3.common.callbacks import (
 )
 from stable_baselines3.common.logger import configure
 
-from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple, members
-from pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
-from pipeline.evaluation.sampled import Evaluation
-from pipeline.runs import Run
+from rl_yardstick.agents.common.callbacks import (
+    BlockCallback,
+    Horizon,
+    calls_until_multiple,
+    members,
+)
+from rl_yardstick.pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
+from rl_yardstick.pipeline.evaluation.sampled import Evaluation
+from rl_yardstick.pipeline.runs import Run
 from tests.agents.trainings import LAKE, environment, make, state_of
 
 ENGINES = ("interpreted", "compiled")

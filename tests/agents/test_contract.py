@@ -13,8 +13,8 @@ import stable_baselines3
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents import ALGORITHMS, load_algorithm
-from agents.common.model_files import JsonAlgorithm
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.agents.common.model_files import JsonAlgorithm
 from tests.agents.trainings import AGENTS, LAKE, LATE, SEGMENTS, assert_same, environment, state_of
 from tests.agents.trainings import make as make_in
 

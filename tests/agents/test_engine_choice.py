@@ -17,11 +17,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from envs import checking as model_checks
-from envs.known_models import transition_model
-from envs.wrappers import DiscretizeObservation
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.envs import checking as model_checks
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.envs.wrappers import DiscretizeObservation
 from tests.envs.corridors import Backwards, Corridor, Deaf, outcomes
 
 

@@ -10,10 +10,15 @@ import torch as th
 from gymnasium.wrappers import ClipReward, TimeLimit
 from stable_baselines3.common.utils import FloatSchedule
 
-from agents import ALGORITHMS
-from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon, calls_until_multiple
-from envs.grid import Tile
-from envs.wrappers import (
+from rl_yardstick.agents import ALGORITHMS
+from rl_yardstick.agents.common.callbacks import (
+    BlockCallback,
+    EpisodeBudget,
+    Horizon,
+    calls_until_multiple,
+)
+from rl_yardstick.envs.grid import Tile
+from rl_yardstick.envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,
     FlattenToDiscrete,

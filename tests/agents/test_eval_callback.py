@@ -9,9 +9,9 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents import load_algorithm
-from agents.common.callbacks import Horizon, calls_until_multiple
-from envs.wrappers import DiscretizeObservation
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import Horizon, calls_until_multiple
+from rl_yardstick.envs.wrappers import DiscretizeObservation
 
 LAKE, WAREHOUSE, CART = "FrozenLake-v1", "envs:Warehouse-v0", "CartPole-v1"
 WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}

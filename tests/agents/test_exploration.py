@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from agents import load_algorithm
-from agents.common.exploration import (
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.exploration import (
     BOLTZMANN,
     EPSILON_GREEDY,
     action_probabilities,
@@ -22,7 +22,7 @@ from agents.common.exploration import (
     greedy_action,
     noisy_greedy_action,
 )
-from agents.common.schedules import ExponentialSchedule, schedule_row, schedule_value
+from rl_yardstick.agents.common.schedules import ExponentialSchedule, schedule_row, schedule_value
 from tests.agents.hand_fed import Spaces
 
 VALUES = np.array([1.0, 3.0, 3.0, 2.0])

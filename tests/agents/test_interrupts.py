@@ -6,8 +6,8 @@ from contextlib import closing, contextmanager
 import numpy as np
 import pytest
 
-from agents.common.callbacks import BlockCallback, Horizon
-from agents.compiled.engine import interrupts_held
+from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon
+from rl_yardstick.agents.compiled.engine import interrupts_held
 from tests.agents.trainings import LAKE, environment, make
 
 N_ENVS = 2

@@ -10,11 +10,11 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from agents.common.callbacks import EpisodeBudget
-from envs.known_models import time_limit, transition_model
-from mdp import (
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.envs.known_models import time_limit, transition_model
+from rl_yardstick.mdp import (
     TransitionModel,
     finite_horizon_optimum,
     policy_iteration,

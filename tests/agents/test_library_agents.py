@@ -15,10 +15,10 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from agents.common.callbacks import EpisodeBudget
-from agents.library import DeepQLearning, DoubleDQN, double_q_values
-from agents.random_search import ARS
-from agents.reference import AngleAgent, RandomAgent
+from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.agents.library import DeepQLearning, DoubleDQN, double_q_values
+from rl_yardstick.agents.random_search import ARS
+from rl_yardstick.agents.reference import AngleAgent, RandomAgent
 
 # --- deep Q-learning -----------------------------------------------------------------------------
 

@@ -9,9 +9,9 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from agents.linear.tiles import make_tiles, tiles_of_all
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.linear.tiles import make_tiles, tiles_of_all
 from tests.agents.hand_fed import Told
 
 # --- tiles ---------------------------------------------------------------------------------------

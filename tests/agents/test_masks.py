@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-import envs  # noqa: F401  # registers the environments
-from agents import ALGORITHMS, load_algorithm
-from agents.bandits.algorithm import Pull
-from agents.library import DQN, DoubleDQN
-from envs.known_models import action_masks_of_states
-from envs.wrappers import ActionMasks
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.agents.bandits.algorithm import Pull
+from rl_yardstick.agents.library import DQN, DoubleDQN
+from rl_yardstick.envs.known_models import action_masks_of_states
+from rl_yardstick.envs.wrappers import ActionMasks
 from tests.agents.hand_fed import feed
 
 # The others choose by the same functions.

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from agents import load_algorithm
-from agents.common.model_files import CODECS, UnknownTypeError, decode, encode
-from agents.common.schedules import ExponentialSchedule
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.model_files import CODECS, UnknownTypeError, decode, encode
+from rl_yardstick.agents.common.schedules import ExponentialSchedule
 
 ARRAY_DTYPES = [
     npst.boolean_dtypes(),

@@ -5,8 +5,8 @@ import math
 import pytest
 from gymnasium import spaces
 
-import envs  # noqa: F401  # registers the environments
-from agents import ALGORITHMS, load_algorithm
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
 from tests.agents.hand_fed import Spaces
 
 INF, NAN = math.inf, math.nan

@@ -10,11 +10,11 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-import agents
-import envs  # noqa: F401  # registers the bandits
-from agents import ALGORITHMS, fitting_algorithms, load_algorithm
-from agents.bandits.runs import run_batch
-from pipeline.settings.values import algorithm_parameters
+import rl_yardstick.envs  # noqa: F401  # registers the bandits
+from rl_yardstick import agents
+from rl_yardstick.agents import ALGORITHMS, fitting_algorithms, load_algorithm
+from rl_yardstick.agents.bandits.runs import run_batch
+from rl_yardstick.pipeline.settings.values import algorithm_parameters
 from tests.agents.hand_fed import Told
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
@@ -130,7 +130,7 @@ MINE = "some_module:Mine"
 @pytest.mark.parametrize(
     ("name", "entry_point", "fields", "complaint"),
     [
-        ("PPO", MINE, {}, "there is an agent ppo already (agents.library:PPO)"),
+        ("PPO", MINE, {}, "there is an agent ppo already (rl_yardstick.agents.library:PPO)"),
         ("taken", "some_module:Other", {}, "register some_module:Other under another name"),
         ("../up", MINE, {}, "the name of an agent holds letters, digits and _"),
         ("mine", "some_module.Mine", {}, "is named as 'module:Class', not 'some_module.Mine'"),

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from agents.common.exploration import EPSILON_GREEDY, action_probabilities
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.exploration import EPSILON_GREEDY, action_probabilities
 from tests.agents.hand_fed import ENDS, N_ACTIONS, N_STATES, SHARES, Fed, episodes, greedy, tables
 
 GAMMA, ALPHA = 0.75, 0.25

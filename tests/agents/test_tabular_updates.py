@@ -7,10 +7,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import FloatSchedule
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from envs.known_models import transition_model
-from mdp import TransitionModel, value_iteration
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import TransitionModel, value_iteration
 from tests.agents.hand_fed import Fed
 
 ONE_STEP = ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-import envs  # noqa: F401  # registers the environments
-from agents.compiled.generators import handles_of, next_uniform, skip_uniform
-from agents.compiled.greedy_play import COMPENSATED_SUM
-from agents.compiled.loop import add_to_return, begin_episode
-from agents.compiled.worlds import (
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents.compiled.generators import handles_of, next_uniform, skip_uniform
+from rl_yardstick.agents.compiled.greedy_play import COMPENSATED_SUM
+from rl_yardstick.agents.compiled.loop import add_to_return, begin_episode
+from rl_yardstick.agents.compiled.worlds import (
     CAR_STATE,
     CART_POLE_ENV,
     MOUNTAIN_CAR_ENV,
@@ -22,8 +22,8 @@ from agents.compiled.worlds import (
     drive,
     swing,
 )
-from envs.wrappers import DiscretizeObservation
-from machine_code.compiling import kernel
+from rl_yardstick.envs.wrappers import DiscretizeObservation
+from rl_yardstick.machine_code.compiling import kernel
 
 # --- physics -------------------------------------------------------------------------------------
 

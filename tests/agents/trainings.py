@@ -4,9 +4,9 @@ import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from agents.common.schedules import ExponentialSchedule
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.schedules import ExponentialSchedule
 
 LAKE, COINS, SEGMENTS = "FrozenLake-v1", "BernoulliBandit-v0", "SegmentBandit-v0"
 CONSTANT = {"exploration_decay": "constant", "exploration_initial_eps": 0.4}

@@ -8,13 +8,11 @@ import pytest
 
 import compare
 import enjoy
-import explain
-import shaping
 import train
 import tune
-from commands import main, share
-from commands.cli import run_command
-from pipeline.signs_of_life import Silence
+from rl_yardstick.commands import explain, main, shaping, share
+from rl_yardstick.commands.cli import run_command
+from rl_yardstick.pipeline.signs_of_life import Silence
 
 MAINS = {
     "train.py": train.main,
@@ -50,7 +48,7 @@ def pictures():
 def no_pictures_elsewhere(request, monkeypatch):
     """They take most of a short run."""
     if "pictures" not in request.fixturenames:
-        monkeypatch.setattr("pipeline.training.draw", lambda *_: None)
+        monkeypatch.setattr("rl_yardstick.pipeline.training.draw", lambda *_: None)
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +58,7 @@ def train_in():
     def do(folder, *words):
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)
-            patch.setattr("pipeline.training.draw", lambda *_: None)
+            patch.setattr("rl_yardstick.pipeline.training.draw", lambda *_: None)
             patch.setattr("sys.argv", ["train.py", "--verbose", "0", "--seed", "0", *words])
             assert train.main() == 0
         return folder

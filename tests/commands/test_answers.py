@@ -110,7 +110,7 @@ def test_mistakes_name_the_installed_command(type_command):
 QUICKLY = ("train --help", "train --list", "compare --help", "enjoy --algo ppo --env CartPole-v1")
 PROGRAM = """
 import sys
-from commands import main
+from rl_yardstick.commands import main
 
 class Heavy:
     def find_spec(self, name, path=None, target=None):

@@ -155,8 +155,10 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(
 
 
 def test_films_and_pages_of_training(type_command, folder, monkeypatch):
-    monkeypatch.setattr("report.figures.write_figures", lambda *_: [])  # which take longest
-    monkeypatch.setattr("report.films.film_of", lambda _: None)
+    monkeypatch.setattr(
+        "rl_yardstick.report.figures.write_figures", lambda *_: []
+    )  # which take longest
+    monkeypatch.setattr("rl_yardstick.report.films.film_of", lambda _: None)
     words = ["--env", "FrozenLake-v1", "--algos", "qlearning", "--n-episodes", 40, "--seeds", 1]
     words += ["-j", 1, "-f", "studies", "--watch-learning", "--render-every", 20]
     code, out, err = type_command(*words)

@@ -9,10 +9,10 @@ import gymnasium as gym
 import pytest
 
 import compare
-import envs  # noqa: F401
-from agents import load_algorithm
-from envs.bandits import log_uniformly
-from experiments.off_policy.estimators import difference_in_value
+import rl_yardstick.envs  # noqa: F401
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.envs.bandits import log_uniformly
+from rl_yardstick.experiments.off_policy.estimators import difference_in_value
 
 
 def train(folder, algo, run, **kwargs):

@@ -12,12 +12,12 @@ import pytest
 from PIL import Image
 from rich.text import Text
 
-from commands import enjoy
-from commands.enjoy import build_parser, play
-from commands.terminal import TextConsole
-from pipeline.models.choose import ModelRequest
-from pipeline.models.load import load_to_play
-from pipeline.playing import FRAMES_PER_SECOND
+from rl_yardstick.commands import enjoy
+from rl_yardstick.commands.enjoy import build_parser, play
+from rl_yardstick.commands.terminal import TextConsole
+from rl_yardstick.pipeline.models.choose import ModelRequest
+from rl_yardstick.pipeline.models.load import load_to_play
+from rl_yardstick.pipeline.playing import FRAMES_PER_SECOND
 from tests.pipeline.short_runs import choose_model
 
 LAKE = ["--algo", "random", "--env", "FrozenLake-v1"]

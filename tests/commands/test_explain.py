@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from report.documents import write_tables
+from rl_yardstick.report.documents import write_tables
 
 PAIR = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 

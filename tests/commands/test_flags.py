@@ -5,20 +5,20 @@ from dataclasses import fields
 
 import pytest
 
-from agents import ALGORITHMS
-from commands import compare, enjoy, train, tune
-from commands.cli import INSTEAD
-from commands.compare import study_spec
-from commands.train import train_spec
-from commands.tune import tuning_spec
-from experiments.plan import plan
-from experiments.study import StudySpec
-from pipeline.environments import training_changes
-from pipeline.errors import UserError
-from pipeline.train_spec import TrainSpec
-from pipeline.unfinished_runs import SaveInterval
-from tuning.retesting import Candidate, retest_study
-from tuning.suggesting import planned_run
+from rl_yardstick.agents import ALGORITHMS
+from rl_yardstick.commands import compare, enjoy, train, tune
+from rl_yardstick.commands.cli import INSTEAD
+from rl_yardstick.commands.compare import study_spec
+from rl_yardstick.commands.train import train_spec
+from rl_yardstick.commands.tune import tuning_spec
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.study import StudySpec
+from rl_yardstick.pipeline.environments import training_changes
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.unfinished_runs import SaveInterval
+from rl_yardstick.tuning.retesting import Candidate, retest_study
+from rl_yardstick.tuning.suggesting import planned_run
 
 TRAIN, ENJOY, COMPARE = train, enjoy, compare
 LAKE = ["--env", "FrozenLake-v1"]

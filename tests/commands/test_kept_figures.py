@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.figures_store import checksum_of, packed, unpacked
-from experiments.results import difference
-from pipeline.runs import Run
+from rl_yardstick.experiments.figures_store import checksum_of, packed, unpacked
+from rl_yardstick.experiments.results import difference
+from rl_yardstick.pipeline.runs import Run
 
 NAME = "FrozenLake-v1_qlearning-sarsa"
 TWO = ["--env", "FrozenLake-v1", "--algos", "qlearning", "sarsa", "--n-episodes", "30", "-j", "2"]
@@ -65,8 +65,10 @@ def both(made, typed, own_folder, monkeypatch):
     """A study with all folders, and a copy of it with a file in their place and a page."""
     place, said = made
     if not said:
-        monkeypatch.setattr("report.figures.write_figures", lambda *_: [])  # which take longest
-        monkeypatch.setattr("report.films.film_of", lambda _: None)
+        monkeypatch.setattr(
+            "rl_yardstick.report.figures.write_figures", lambda *_: []
+        )  # which take longest
+        monkeypatch.setattr("rl_yardstick.report.films.film_of", lambda _: None)
         typed(*ALL)
         shutil.copytree("all", "folded")
         said.append(typed(*REPORT))

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pipeline.digests import RECORD, sealed
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.digests import RECORD, sealed
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
 
 SECRET = b"GIF89a the key to everything"
 LAKE, CART = "FrozenLake-v1", "CartPole-v1"
@@ -31,7 +31,7 @@ STUDY_NAMES += (".drafts", "failures", "figures", "films", "learning", "replaced
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """A finished run of each kind of agent."""
-    from pipeline.training import train as do_training
+    from rl_yardstick.pipeline.training import train as do_training
 
     folder, found = tmp_path_factory.mktemp("runs"), {}
     for kind, (algo, env_id, settings) in AGENTS.items():

@@ -10,12 +10,12 @@ import gymnasium
 import pytest
 
 import compare
-from agents import ALGORITHMS
+from rl_yardstick.agents import ALGORITHMS
 
 AGENTS = """
 import gymnasium
 
-import agents
+from rl_yardstick import agents
 
 agents.register("lazy", f"{__name__}:Lazy", summary="counts [rewards]", actions=("Discrete",))
 gymnasium.register("my/Lake-v0", "gymnasium.envs.toy_text:FrozenLakeEnv", max_episode_steps=30)

@@ -94,7 +94,7 @@ def test_a_potential_costs_nothing_and_a_bonus_for_every_step_forward_costs_all(
 
 def test_wrappers_in_order_and_the_agents_own_discount(shape):
     wrappers = ("--wrapper", "gymnasium.wrappers.ClipReward", "min_reward:-1")
-    wrappers += ("--wrapper", "envs.wrappers.ScaleReward", "scale:3")
+    wrappers += ("--wrapper", "rl_yardstick.envs.wrappers.ScaleReward", "scale:3")
     lines, data = shape("--env", "CliffWalking-v1", "--algo", "qlearning", *wrappers)
     assert lines[0] == "CliffWalking-v1; changed in training: rewards clipped at -1, rewards x 3"
     # It does not discount. The cliff is as cheap as any step then, but leads back to the start.
@@ -104,7 +104,7 @@ def test_wrappers_in_order_and_the_agents_own_discount(shape):
 
 REFUSED = {
     "--env CartPole-v1": "the model of CartPole-v1 is not known",
-    "--env Warehouse-v0 --wrapper envs.wrappers.ScaleReward scal:2": "scal",
+    "--env Warehouse-v0 --wrapper rl_yardstick.envs.wrappers.ScaleReward scal:2": "scal",
     "--env FrozenLake-v1 -params normalize:true": "normalize: the rewards that it makes",
     "--env FrozenLake-v1 --train-env-kwargs map_name:8x8": (
         "64 states and 4 actions cannot be compared with 16 states and 4 actions"

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 import train
-from commands.cli import run_command
-from pipeline import files, preparation, stopping, training
-from pipeline.runs import Run
-from pipeline.state_saver import StateSaver
+from rl_yardstick.commands.cli import run_command
+from rl_yardstick.pipeline import files, preparation, stopping, training
+from rl_yardstick.pipeline.runs import Run
+from rl_yardstick.pipeline.state_saver import StateSaver
 
 # --- signals at named moments of a training: what is left, and how the process ends ---------------
 

@@ -13,9 +13,9 @@ import zipfile
 import gymnasium as gym
 import pytest
 
-import envs  # noqa: F401  # registers the bandits
-from agents import load_algorithm
-from envs.bandits import log_uniformly
+import rl_yardstick.envs  # noqa: F401  # registers the bandits
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.envs.bandits import log_uniformly
 
 ENV = "SegmentBandit-v0"
 PLAY = ("--render", "none", "--n-episodes", "1")

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from commands import compare, enjoy, train
-from commands.cli import go_on_unread, run_command
-from commands.terminal import TextConsole, print_rows
-from pipeline.errors import UserError, visible
+from rl_yardstick.commands import compare, enjoy, train
+from rl_yardstick.commands.cli import go_on_unread, run_command
+from rl_yardstick.commands.terminal import TextConsole, print_rows
+from rl_yardstick.pipeline.errors import UserError, visible
 
 # --- readers that leave, and devices that are full --------------------------------------------
 

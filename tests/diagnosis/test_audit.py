@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from commands.audit import KINDS, main
-from commands.cli import run_command
-from diagnosis import probes, subjects
-from diagnosis.audit import TITLES, Verdict, audit
-from diagnosis.faults import FAULTS
-from diagnosis.probe_worlds import Record, World
-from diagnosis.probes import Finding, watkins_table
-from diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
+from rl_yardstick.commands.audit import KINDS, main
+from rl_yardstick.commands.cli import run_command
+from rl_yardstick.diagnosis import probes, subjects
+from rl_yardstick.diagnosis.audit import TITLES, Verdict, audit
+from rl_yardstick.diagnosis.faults import FAULTS
+from rl_yardstick.diagnosis.probe_worlds import Record, World
+from rl_yardstick.diagnosis.probes import Finding, watkins_table
+from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
 from tests.diagnosis import planted_classes
 from tests.diagnosis.planted_tables import (
     from_memory,
@@ -239,7 +239,7 @@ def test_a_script_of_ones_own(type_audit, tmp_path):
 
 
 def test_a_class_of_ones_own(type_audit, tmp_path, monkeypatch):
-    text = "from agents.tabular.one_step import QLearning\n\nMine = QLearning\n"
+    text = "from rl_yardstick.agents.tabular.one_step import QLearning\n\nMine = QLearning\n"
     (tmp_path / "my_audited_agents.py").write_text(text)
     monkeypatch.setattr(audit, "__defaults__", ((probes.probe_ends, probes.probe_discount),))
     words = ("--algo", "my_audited_agents:Mine", "--gym-packages", "my_audited_agents.py")

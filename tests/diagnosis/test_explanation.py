@@ -5,12 +5,12 @@ import re
 import pytest
 import torch as th
 
-from diagnosis.explanation import explanation, parting
-from envs.known_models import transition_model
-from mdp import policy_iteration
-from pipeline.environments import make_training_env
-from pipeline.evaluation.exact import exact_evaluator
-from report.why import parting_lines, why_lines
+from rl_yardstick.diagnosis.explanation import explanation, parting
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import policy_iteration
+from rl_yardstick.pipeline.environments import make_training_env
+from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
+from rl_yardstick.report.why import parting_lines, why_lines
 from tests.pipeline.short_runs import agent_of, spec_of
 
 LAKE = {"env_kwargs": {"is_slippery": False, "max_episode_steps": 30}}

@@ -9,8 +9,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 
-import envs  # noqa: F401 (registers the environments)
-from envs.bandits import (
+import rl_yardstick.envs  # noqa: F401 (registers the environments)
+from rl_yardstick.envs.bandits import (
     BernoulliBandit,
     GaussianBandit,
     LinearBandit,
@@ -18,9 +18,14 @@ from envs.bandits import (
     log_uniformly,
     read_log,
 )
-from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
-from envs.wrappers import ScaleReward
-from mdp import baseline_return, finite_horizon_optimum, policy_return
+from rl_yardstick.envs.known_models import (
+    observations_of_states,
+    success_outcomes,
+    time_limit,
+    transition_model,
+)
+from rl_yardstick.envs.wrappers import ScaleReward
+from rl_yardstick.mdp import baseline_return, finite_horizon_optimum, policy_return
 
 LOG = Path(__file__).parent / "uniform_log.csv"
 

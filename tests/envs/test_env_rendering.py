@@ -16,12 +16,12 @@ import pygame
 import pytest
 from PIL import Image
 
-from envs import drawing
-from envs.bandits import BernoulliBandit, GaussianBandit, ReplayBandit
-from envs.bandits.bandit import Tally, render_chart
-from envs.drawing import ChartRenderer, GridRenderer, Scene
-from envs.mine_maze import MineMazeEnv
-from envs.warehouse import WarehouseEnv
+from rl_yardstick.envs import drawing
+from rl_yardstick.envs.bandits import BernoulliBandit, GaussianBandit, ReplayBandit
+from rl_yardstick.envs.bandits.bandit import Tally, render_chart
+from rl_yardstick.envs.drawing import ChartRenderer, GridRenderer, Scene
+from rl_yardstick.envs.mine_maze import MineMazeEnv
+from rl_yardstick.envs.warehouse import WarehouseEnv
 
 UP, DOWN, LEFT, RIGHT = range(4)
 SHOWN_BY_CHARTS = "BernoulliBandit", "RandomWalk"

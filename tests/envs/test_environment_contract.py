@@ -17,10 +17,14 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import env_checker
 from gymnasium.wrappers import TimeLimit
 
-import envs  # noqa: F401 (registers the environments)
-from envs.known_models import action_masks_of_states, observations_of_states, transition_model
-from envs.mine_maze import MineMazeEnv
-from envs.wrappers import (
+import rl_yardstick.envs  # noqa: F401 (registers the environments)
+from rl_yardstick.envs.known_models import (
+    action_masks_of_states,
+    observations_of_states,
+    transition_model,
+)
+from rl_yardstick.envs.mine_maze import MineMazeEnv
+from rl_yardstick.envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,
     FlattenToDiscrete,
@@ -30,11 +34,13 @@ from envs.wrappers import (
     TerminationReward,
     action_masks,
 )
-from mdp import TransitionModel
+from rl_yardstick.mdp import TransitionModel
 
 LOG = {"log": str(Path(__file__).parent / "uniform_log.csv")}
 # An environment that is registered later is held to its contract as it is.
-SPECS = [spec for spec in gym.registry.values() if str(spec.entry_point).startswith("envs.")]
+SPECS = [
+    spec for spec in gym.registry.values() if str(spec.entry_point).startswith("rl_yardstick.envs.")
+]
 IDS = [(spec.id, LOG if spec.id == "ReplayBandit-v0" else {}) for spec in SPECS]
 VARIANTS = [
     *IDS,

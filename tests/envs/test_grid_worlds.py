@@ -8,10 +8,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from envs.grid import GridMap
-from envs.mine_maze import MineMazeEnv
-from envs.textbook.dyna_maze import DynaMazeEnv
-from envs.warehouse import WarehouseEnv, random_warehouse
+from rl_yardstick.envs.grid import GridMap
+from rl_yardstick.envs.mine_maze import MineMazeEnv
+from rl_yardstick.envs.textbook.dyna_maze import DynaMazeEnv
+from rl_yardstick.envs.warehouse import WarehouseEnv, random_warehouse
 
 UP, DOWN, LEFT, RIGHT = range(4)
 ROWS = ["..G", ".#.", "S.."]

@@ -17,24 +17,24 @@ from gymnasium.wrappers import (
 )
 from stable_baselines3.common.monitor import Monitor
 
-import envs  # noqa: F401 (registers the environments)
+import rl_yardstick.envs  # noqa: F401 (registers the environments)
 import train
-from envs.brackets import (
+from rl_yardstick.envs.brackets import (
     OptimumBracket,
     known_entries,
     may_have_bracket,
     optimum_bracket,
     upper_is_proven,
 )
-from envs.known_models import (
+from rl_yardstick.envs.known_models import (
     model_check,
     observations_of_states,
     success_outcomes,
     time_limit,
     transition_model,
 )
-from envs.layout import action_names, grid_layout, state_name
-from envs.wrappers import (
+from rl_yardstick.envs.layout import action_names, grid_layout, state_name
+from rl_yardstick.envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
     OneHotObservation,

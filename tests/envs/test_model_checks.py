@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
-from envs import check_transition_model, checking
-from envs.known_models import (
+from rl_yardstick.envs import check_transition_model, checking
+from rl_yardstick.envs.known_models import (
     model_check,
     observations_of_states,
     success_outcomes,
     transition_model,
 )
-from envs.warehouse import WarehouseEnv
+from rl_yardstick.envs.warehouse import WarehouseEnv
 from tests.envs.corridors import Backwards, Corridor, Deaf, altered, outcomes, with_p
 
 # Where nothing is a question of frequencies, or these are far off.

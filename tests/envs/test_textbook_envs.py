@@ -7,20 +7,25 @@ import numpy as np
 import pytest
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 
-import envs  # noqa: F401 (registers the environments)
-from agents import load_algorithm
-from agents.compiled.worlds import NotCompilable, compile_envs
-from envs.blackjack_model import blackjack_observations, natural_state, state_of
-from envs.known_models import (
+import rl_yardstick.envs  # noqa: F401 (registers the environments)
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.compiled.worlds import NotCompilable, compile_envs
+from rl_yardstick.envs.blackjack_model import blackjack_observations, natural_state, state_of
+from rl_yardstick.envs.known_models import (
     action_masks_of_states,
     observations_of_states,
     success_outcomes,
     time_limit,
     transition_model,
 )
-from envs.textbook.racetrack import LEFT_TRACK
-from envs.wrappers import FlattenToDiscrete
-from mdp import finite_horizon_optimum, policy_iteration, policy_return, value_iteration
+from rl_yardstick.envs.textbook.racetrack import LEFT_TRACK
+from rl_yardstick.envs.wrappers import FlattenToDiscrete
+from rl_yardstick.mdp import (
+    finite_horizon_optimum,
+    policy_iteration,
+    policy_return,
+    value_iteration,
+)
 
 
 def model_of(env_id, **kwargs):
@@ -387,7 +392,7 @@ STAY, FORWARD, RIGHT, AROUND, LEFT = range(5)
 
 def places(cell, action, facing):
     """By cell and facing, the chances after an action; cells 0 to 10 are the row, then alcoves."""
-    from envs.pomdp.hallway import _world
+    from rl_yardstick.envs.pomdp.hallway import _world
 
     world = _world()
     state = int(np.flatnonzero(world.hidden == 4 * cell + facing)[0])
@@ -427,7 +432,7 @@ def test_turning_is_that_of_the_original():
 
 
 def test_readings_are_those_of_the_original():
-    from envs.pomdp.hallway import _world
+    from rl_yardstick.envs.pomdp.hallway import _world
 
     env, world = gym.make("Hallway-v0"), _world()
     model = transition_model(env)

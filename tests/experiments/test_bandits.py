@@ -11,10 +11,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 import compare
-from agents import load_algorithm
-from agents.bandits.runs import run_batch
-from experiments.analysis import analyse
-from experiments.bandits import (
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.bandits.runs import run_batch
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.bandits import (
     MAX_POINTS,
     QUANTILES,
     PullStatistics,
@@ -23,12 +23,12 @@ from experiments.bandits import (
     run_regret,
     stacked_statistics,
 )
-from experiments.plan import plan
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
-from pipeline.callbacks import PullRecorder
-from pipeline.runs import PULLS_FILE, Run
-from pipeline.training import train
-from report.series import auer_bound
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
+from rl_yardstick.pipeline.callbacks import PullRecorder
+from rl_yardstick.pipeline.runs import PULLS_FILE, Run
+from rl_yardstick.pipeline.training import train
+from rl_yardstick.report.series import auer_bound
 
 SEGMENT_MEANS = np.array([[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]])
 COINS = (0.2, 0.5, 0.75)

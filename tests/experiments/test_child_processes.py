@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 import compare
-from experiments import child_processes
-from experiments.child_processes import (
+from rl_yardstick.experiments import child_processes
+from rl_yardstick.experiments.child_processes import (
     StoppedError,
     TaskDiedError,
     TaskFailedError,
@@ -24,14 +24,14 @@ from experiments.child_processes import (
     stop_all,
     supervise,
 )
-from experiments.launching import execute, local_launcher
-from experiments.plan import plan
-from experiments.run_folders import draft_path
-from experiments.run_in_child import do_run
-from experiments.run_limits import RunLimits, memory, resident_memory, seconds
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.settings.hyperparams import ComponentSpec
-from pipeline.train_spec import is_plain
+from rl_yardstick.experiments.launching import execute, local_launcher
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.run_folders import draft_path
+from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.experiments.run_limits import RunLimits, memory, resident_memory, seconds
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.settings.hyperparams import ComponentSpec
+from rl_yardstick.pipeline.train_spec import is_plain
 
 ROOT = Path(compare.__file__).parent
 
@@ -192,7 +192,7 @@ DRIVER = """
 import multiprocessing, sys
 from functools import partial
 import study_chores
-from experiments import child_processes
+from rl_yardstick.experiments import child_processes
 
 if __name__ == "__main__":
     method, folder = sys.argv[1:]

@@ -21,9 +21,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import compare
-from experiments.child_processes import NO_LIMITS
-from experiments.cluster import answers, cluster_launcher, schedulers
-from experiments.cluster.answers import (
+from rl_yardstick.experiments.child_processes import NO_LIMITS
+from rl_yardstick.experiments.cluster import answers, cluster_launcher, schedulers
+from rl_yardstick.experiments.cluster.answers import (
     Answer,
     RefusedAnswerError,
     check_in_place,
@@ -33,8 +33,8 @@ from experiments.cluster.answers import (
     sealed,
     unpacked,
 )
-from experiments.cluster.cluster_launcher import SentRun
-from experiments.cluster.schedulers import (
+from rl_yardstick.experiments.cluster.cluster_launcher import SentRun
+from rl_yardstick.experiments.cluster.schedulers import (
     SECONDS_TO_RESTART,
     ClosedScheduler,
     ClosedWorker,
@@ -50,18 +50,18 @@ from experiments.cluster.schedulers import (
     read_cluster,
     retiring,
 )
-from experiments.cluster.sent_code import SentCode, SentModule, UnfitError
-from experiments.cluster.working import Probe, RunOrder
-from experiments.plan import plan
-from experiments.run_folders import draft_path
-from experiments.run_in_child import do_run
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline import digests
-from pipeline.errors import UserError
-from pipeline.loaded_code import DISTRIBUTIONS, files_in_settings
-from pipeline.locks import mark
-from pipeline.settings.hyperparams import split
-from pipeline.user_modules import import_typed
+from rl_yardstick.experiments.cluster.sent_code import SentCode, SentModule, UnfitError
+from rl_yardstick.experiments.cluster.working import Probe, RunOrder
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.run_folders import draft_path
+from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline import digests
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.loaded_code import DISTRIBUTIONS, files_in_settings
+from rl_yardstick.pipeline.locks import mark
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.user_modules import import_typed
 
 ROOT = Path(compare.__file__).parent
 

@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 
-from experiments.analysis import analyse
-from experiments.growing import (
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.growing import (
     LOOKS_FILE,
     first_counts,
     grown,
@@ -15,10 +15,10 @@ from experiments.growing import (
     plan_of_looks,
     write_looks,
 )
-from experiments.plan import plan
-from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.errors import UserError
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
 TWO, THREE = ("qlearning", "sarsa"), ("qlearning", "sarsa", "expected_sarsa")

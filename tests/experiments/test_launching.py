@@ -13,16 +13,16 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
-from experiments import child_processes
-from experiments.launching import (
+from rl_yardstick.experiments import child_processes
+from rl_yardstick.experiments.launching import (
     BUSY,
     TimeLeft,
     execute,
     failure_log,
     local_launcher,
 )
-from experiments.plan import plan
-from experiments.run_folders import (
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.run_folders import (
     check_settings_kept,
     draft_path,
     in_the_way,
@@ -33,12 +33,12 @@ from experiments.run_folders import (
     run_name,
     take_over,
 )
-from experiments.run_in_child import do_run
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline import state_saver
-from pipeline.errors import UserError
-from pipeline.state_files import SOURCES, read_state, state_key, write_state
-from pipeline.user_modules import import_typed
+from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline import state_saver
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.state_files import SOURCES, read_state, state_key, write_state
+from rl_yardstick.pipeline.user_modules import import_typed
 
 LAKE = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_timesteps": 20})
 ARMS = EnvironmentSpec("arms", "BernoulliBandit-v0", {"n_timesteps": 20})
@@ -75,7 +75,7 @@ def test_a_run_stands_in_its_place_once_with_its_own_log(tmp_path):
 # An environment that counts its steps in a file, and fails within the fourth as it is told.
 COUNTING = """
 import errno, gymnasium as gym
-from pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError
 
 FAULTS = {
     "disk": (UserError("the disk takes no more"), OSError(errno.ENOSPC, "No space left on device")),

@@ -7,9 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents import load_algorithm
-from envs.bandits import ReplayBandit, log_uniformly, read_log
-from experiments.off_policy.estimators import (
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.envs.bandits import ReplayBandit, log_uniformly, read_log
+from rl_yardstick.experiments.off_policy.estimators import (
     ArmMeans,
     ArmRegressions,
     cross_fit,
@@ -24,15 +24,15 @@ from experiments.off_policy.estimators import (
     snips,
     terms_as_logged,
 )
-from experiments.off_policy.logged_policies import (
+from rl_yardstick.experiments.off_policy.logged_policies import (
     LoggedPolicy,
     compare_policies,
     load_policy,
     read_logged,
 )
-from experiments.off_policy.policy_files import find_policy
-from pipeline.errors import UserError
-from verdicts import Estimate
+from rl_yardstick.experiments.off_policy.policy_files import find_policy
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.verdicts import Estimate
 
 ESTIMATORS = ("ips", "snips", "direct", "doubly_robust")
 

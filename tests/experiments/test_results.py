@@ -11,24 +11,24 @@ import pandas as pd
 import pytest
 
 import compare
-from commands.terminal import TextConsole
-from experiments.analysis import analyse
-from experiments.launching import EarlyResults
-from experiments.plan import plan
-from experiments.results import (
+from rl_yardstick.commands.terminal import TextConsole
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.launching import EarlyResults
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.results import (
     RUN_COLUMNS,
     mixed_versions,
     read_results,
     threshold_of,
     values_over_seeds,
 )
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.runs import FINISHED
-from report.conclusions import places_without_a_run
-from report.documents import write_tables
-from report.figures import write_figures
-from report.series import episodes_table, study_series
-from report.terminal import print_analysis, print_episodes_table
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.runs import FINISHED
+from rl_yardstick.report.conclusions import places_without_a_run
+from rl_yardstick.report.documents import write_tables
+from rl_yardstick.report.figures import write_figures
+from rl_yardstick.report.series import episodes_table, study_series
+from rl_yardstick.report.terminal import print_analysis, print_episodes_table
 
 HOUSE = EnvironmentSpec("Warehouse-v0", "Warehouse-v0", {"n_timesteps": 100})
 POLE = EnvironmentSpec("CartPole-v1", "CartPole-v1", {"n_timesteps": 100})

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import compare
-from experiments.plan import check_settings, plan, tuning_seeds
-from experiments.study import (
+from rl_yardstick.experiments.plan import check_settings, plan, tuning_seeds
+from rl_yardstick.experiments.study import (
     AgentSpec,
     EnvironmentSpec,
     StudySpec,
@@ -21,11 +21,11 @@ from experiments.study import (
     read_study,
     write_study,
 )
-from pipeline.digests import DamagedFileError
-from pipeline.errors import UserError
-from pipeline.runs import FAILED, FINISHED
-from pipeline.train_spec import TrainSpec
-from report.words import seed_sentence
+from rl_yardstick.pipeline.digests import DamagedFileError
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.runs import FAILED, FINISHED
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.report.words import seed_sentence
 
 SHIPPED = Path(compare.__file__).parent / "studies"
 

@@ -22,18 +22,18 @@ import pytest
 from distributed import LocalCluster
 
 import compare
-from experiments.cluster import cluster_launcher
-from experiments.cluster.schedulers import LocalWorkers, SchedulerAddress
-from experiments.cluster.sent_code import SentCode
-from experiments.cluster.working import Probe
-from experiments.launching import execute
-from experiments.plan import plan
-from experiments.run_folders import draft_path
-from experiments.run_in_child import do_run
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.errors import UserError
-from pipeline.loaded_code import recorded_code
-from pipeline.user_modules import import_typed
+from rl_yardstick.experiments.cluster import cluster_launcher
+from rl_yardstick.experiments.cluster.schedulers import LocalWorkers, SchedulerAddress
+from rl_yardstick.experiments.cluster.sent_code import SentCode
+from rl_yardstick.experiments.cluster.working import Probe
+from rl_yardstick.experiments.launching import execute
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.run_folders import draft_path
+from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.loaded_code import recorded_code
+from rl_yardstick.pipeline.user_modules import import_typed
 
 ROOT = Path(compare.__file__).parent
 

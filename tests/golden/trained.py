@@ -168,7 +168,7 @@ def trainings() -> Iterator[Thing]:
 
 def environments() -> list[str]:
     """Ids of the project's environments and of those that everybody knows."""
-    import envs  # noqa: F401  # registers them
+    import rl_yardstick.envs  # noqa: F401  # registers them
 
     own = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("envs.")]
     return sorted([*own, *OTHER_ENVIRONMENTS])
@@ -176,7 +176,7 @@ def environments() -> list[str]:
 
 def fitting(env_id: str, arguments: dict[str, Any]) -> list[str]:
     """Names of the agents that can work with an environment, in the order of the alphabet."""
-    import agents
+    from rl_yardstick import agents
 
     with gym.make(env_id, **arguments) as env:
         masks = hasattr(env.unwrapped, "action_masks")
@@ -186,7 +186,7 @@ def fitting(env_id: str, arguments: dict[str, Any]) -> list[str]:
 
 def engines(algo: str) -> tuple[str, ...]:
     """The engines that can be asked for; one empty word where there is no choice."""
-    import agents
+    from rl_yardstick import agents
 
     chosen = tuple(word for word in agents.ALGORITHMS[algo].engines if word != "auto")
     return tuple(sorted(chosen)) if len(chosen) > 1 else ("",)
@@ -226,7 +226,7 @@ def trained(case: Case, engine: str) -> str:
     from stable_baselines3.common.utils import LinearSchedule
     from stable_baselines3.common.vec_env import DummyVecEnv
 
-    import agents
+    from rl_yardstick import agents
 
     env_id, env_arguments, algo, given = case
     n_steps, arguments = NETWORKS.get(algo, (N_STEPS, {}))
@@ -273,7 +273,7 @@ def plans() -> Iterator[Thing]:
 
 def model_of(env: gym.Env[Any, Any]) -> Any:
     """The transition model of one of the project's environments, or of Gymnasium's toy_text."""
-    from mdp import TransitionModel
+    from rl_yardstick.mdp import TransitionModel
 
     base: Any = env.unwrapped
     if hasattr(base, "transition_model"):
@@ -283,7 +283,7 @@ def model_of(env: gym.Env[Any, Any]) -> Any:
 
 def planned(env_id: str, what: str) -> str:
     """What planning or evaluating on the model of an environment comes to."""
-    import mdp
+    from rl_yardstick import mdp
 
     with gym.make(env_id, **ENVIRONMENT_ARGUMENTS.get(env_id, {})) as env:
         model, limit = model_of(env), env.spec.max_episode_steps if env.spec else None

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-import agents
-from machine_code import cache as code_cache
-from machine_code import sources
+from rl_yardstick import agents
+from rl_yardstick.machine_code import cache as code_cache
+from rl_yardstick.machine_code import sources
 
 ROOT = Path(agents.__file__).resolve().parent.parent
 
@@ -30,22 +30,22 @@ log.addHandler(Note()); log.setLevel(logging.INFO); log.propagate = False
 
 # A function, and another of another file that it is compiled into.
 RULE = """
-from machine_code.compiling import inlined
+from rl_yardstick.machine_code.compiling import inlined
 
 @inlined
 def rule(x):
     return 3.0 * x
 """
 LOOP = """
-from agents.common.small_rule import rule
-from machine_code.compiling import kernel
+from rl_yardstick.agents.common.small_rule import rule
+from rl_yardstick.machine_code.compiling import kernel
 
 @kernel
 def run_small(x):
     return rule(x) + 1.0
 """
 SMALL = f"""{NOTE}
-from agents.small_loop import run_small
+from rl_yardstick.agents.small_loop import run_small
 print(int(run_small(4.0)), "compiled", int("compiling run_small" in names))
 """
 
@@ -117,8 +117,8 @@ def test_a_changed_rule_is_what_runs_and_files_that_do_not_serve_are_replaced(ch
 OWN_RULE = """
 import gc
 gc.disable()
-from machine_code.compiling import inlined
-from agents.tabular.one_step import QLearning
+from rl_yardstick.machine_code.compiling import inlined
+from rl_yardstick.agents.tabular.one_step import QLearning
 WORTH = {worth}
 
 @inlined
@@ -131,7 +131,7 @@ class Own(QLearning):
 USE = """
 import numpy as np
 from own_rules import Own
-from agents.common.algorithm import Transitions
+from rl_yardstick.agents.common.algorithm import Transitions
 def q(cls):
     # Not a whole training, whose other functions would be compiled too.
     model = cls(env="FrozenLake-v1", learning_rate=1.0, gamma=1.0)
@@ -227,12 +227,12 @@ def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
     """It has the old sources or the new: the digest cannot tell, so nothing is kept."""
     code = """
     from pathlib import Path
-    import agents
-    from machine_code import cache
+    from rl_yardstick import agents
+    from rl_yardstick.machine_code import cache
     folder = cache.folder("agents")
     source = Path("mdp/graph.py")
     source.write_text(source.read_text() + "\\n")
-    from agents.small_loop import run_small
+    from rl_yardstick.agents.small_loop import run_small
     print(run_small(4.0), len(list(folder.rglob("*.nb[ic]"))))
     """
     before = (checkout / "mdp" / "graph.py").read_text()

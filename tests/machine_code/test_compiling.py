@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numba.core import event
 
-from machine_code import WorkTime
-from machine_code.compiling import called, compile_timer, compiled, inlined, kernel
+from rl_yardstick.machine_code import WorkTime
+from rl_yardstick.machine_code.compiling import called, compile_timer, compiled, inlined, kernel
 
 
 @called
@@ -63,8 +63,8 @@ def test_parts_are_compiled_once_and_only_python_is_refused():
 def test_without_the_compiler_python_plans_and_evaluates():
     code = """
 import gymnasium
-from envs.known_models import transition_model
-from mdp import finite_horizon_optimum, policy_return
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import finite_horizon_optimum, policy_return
 for name in ("envs:Warehouse-v0", "FrozenLake-v1"):
     model = transition_model(gymnasium.make(name))
     plan = finite_horizon_optimum(model, 100)

@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs.known_models import transition_model
-from mdp import (
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import (
     TransitionModel,
     baseline_policies,
     finite_horizon_optimum,
@@ -76,7 +76,7 @@ def test_large_chains_are_solved_as_small_ones_are(monkeypatch):
     uniform = baseline_policies(model)[0]
     dense = policy_return(model, uniform, None, success=model.terminated)
     dense_visits = state_visitation(model, uniform, None)
-    monkeypatch.setattr("mdp.graph.LARGEST_DENSE", 0)
+    monkeypatch.setattr("rl_yardstick.mdp.graph.LARGEST_DENSE", 0)
     sparse = policy_return(model, uniform, None, success=model.terminated)
     for name, value in vars(dense).items():
         assert getattr(sparse, name) == pytest.approx(value, rel=1e-10), name

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mdp import finite_horizon_optimum, policy_return
-from mdp.advantages import discounted_values, expected_estimates
-from mdp.gaps import (
+from rl_yardstick.mdp import finite_horizon_optimum, policy_return
+from rl_yardstick.mdp.advantages import discounted_values, expected_estimates
+from rl_yardstick.mdp.gaps import (
     first_differences,
     gap_by_state,
     greedy_repairs,

@@ -8,9 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envs.known_models import success_outcomes, time_limit, transition_model
-from mdp import TransitionModel, finite_horizon_optimum, hardness_of
-from mdp.hardness import action_gaps, diameter, hitting_times, looking_ahead, random_wait
+from rl_yardstick.envs.known_models import success_outcomes, time_limit, transition_model
+from rl_yardstick.mdp import TransitionModel, finite_horizon_optimum, hardness_of
+from rl_yardstick.mdp.hardness import (
+    action_gaps,
+    diameter,
+    hitting_times,
+    looking_ahead,
+    random_wait,
+)
 from tests.mdp.test_random_models import deterministic, models
 
 

@@ -3,15 +3,15 @@
 from itertools import product
 
 import gymnasium as gym
+import mdp.beliefs
+import mdp.memoryless
 import numpy as np
 import pytest
 
-import mdp.beliefs
-import mdp.memoryless
-from envs.known_models import observations_of_states, transition_model
-from mdp import TransitionModel, finite_horizon_optimum, policy_return
-from mdp.beliefs import memory_optimum
-from mdp.memoryless import best_memoryless, observation_groups
+from rl_yardstick.envs.known_models import observations_of_states, transition_model
+from rl_yardstick.mdp import TransitionModel, finite_horizon_optimum, policy_return
+from rl_yardstick.mdp.beliefs import memory_optimum
+from rl_yardstick.mdp.memoryless import best_memoryless, observation_groups
 
 
 def random_world(seed, n_states=4, n_actions=2, n_groups=2):

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from envs.known_models import transition_model
-from mdp import (
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.mdp import (
     TransitionModel,
     finite_horizon_optimum,
     policy_iteration,
     policy_return,
     value_iteration,
 )
-from mdp.planning import Plan
+from rl_yardstick.mdp.planning import Plan
 from tests.mdp.test_random_models import deterministic, models
 
 PLANNERS = pytest.mark.parametrize("plan", [value_iteration, policy_iteration])

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mdp import (
+from rl_yardstick.mdp import (
     TransitionModel,
     baseline_policies,
     baseline_return,
@@ -241,7 +241,7 @@ def test_evaluation_against_a_recursion(model, horizon, discount, kind, data):
     for most_backwards in (2_000_000, 0):
         with pytest.MonkeyPatch.context() as patch:
             # From a limit on, which these models would take minutes to reach, it goes forwards.
-            patch.setattr("mdp.evaluation.MOST_BACKWARDS", most_backwards)
+            patch.setattr("rl_yardstick.mdp.evaluation.MOST_BACKWARDS", most_backwards)
             found = vars(policy_return(model, policy, horizon, discount, success))
         np.testing.assert_allclose(list(found.values()), expected, rtol=1e-9, atol=1e-9)
     _, values, _ = moments_by_recursion(model, chances, 1.0, success)
@@ -253,7 +253,7 @@ def test_evaluation_against_a_recursion(model, horizon, discount, kind, data):
         for one in baseline_policies(model)
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mdp.evaluation.MOST_BACKWARDS", 0)
+        patch.setattr("rl_yardstick.mdp.evaluation.MOST_BACKWARDS", 0)
         found = baseline_return(model, horizon, discount)
     assert found == pytest.approx(max(returns), abs=1e-9)
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mdp import policy_return
-from mdp.shaping import discounted_effect, effect_under_limit
+from rl_yardstick.mdp import policy_return
+from rl_yardstick.mdp.shaping import discounted_effect, effect_under_limit
 from tests.mdp.test_random_models import deterministic, models, stationary_policies
 
 DISCOUNTS = [0.3, 0.9]

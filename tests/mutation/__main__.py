@@ -155,8 +155,8 @@ class Copy:
 
     def _keep_machine_code(self, code: Path, fresh: bool) -> None:
         """Give what was compiled before the error the error's digest, if it is not about that."""
-        import agents  # noqa: F401  # tells which packages keep machine code
-        from machine_code import cache, sources
+        import rl_yardstick.agents  # noqa: F401  # tells which packages keep machine code
+        from rl_yardstick.machine_code import cache, sources
 
         for package in sources.kept_packages():
             digests = (self.place / "kept" / "yardstick" / package).iterdir()

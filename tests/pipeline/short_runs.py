@@ -2,11 +2,11 @@
 
 from rich.console import Console
 
-from agents import load_algorithm
-from pipeline.models.choose import find_model, with_statistics
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
-from pipeline.training import train
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.pipeline.models.choose import find_model, with_statistics
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.training import train
 
 LAKE, CART, SWING, WAREHOUSE = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1", "Warehouse-v0"
 

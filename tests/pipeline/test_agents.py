@@ -15,23 +15,27 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import set_random_seed
 
-import agents
-from agents import ALGORITHMS, load_algorithm
-from envs.wrappers import ActionMasks
-from pipeline import training
-from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
-from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.policies import policy_matrix
-from pipeline.evaluation.sampled import evaluate
-from pipeline.models.load import (
+from rl_yardstick import agents
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.envs.wrappers import ActionMasks
+from rl_yardstick.pipeline import training
+from rl_yardstick.pipeline.environments import (
+    make_evaluation_env,
+    make_single_env,
+    make_training_env,
+)
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
+from rl_yardstick.pipeline.evaluation.policies import policy_matrix
+from rl_yardstick.pipeline.evaluation.sampled import evaluate
+from rl_yardstick.pipeline.models.load import (
     load_model,
     load_replay_buffer,
     load_to_play,
 )
-from pipeline.playing import play_episodes
-from pipeline.settings.components import build_algorithm_kwargs
-from pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.playing import play_episodes
+from rl_yardstick.pipeline.settings.components import build_algorithm_kwargs
+from rl_yardstick.pipeline.settings.hyperparams import split
 from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of
 from tests.pipeline.short_runs import spec_of as spec_for
 

@@ -18,13 +18,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
-from pipeline.errors import UserError
-from pipeline.models.choose import ModelRequest
-from pipeline.models.find import model_at, replay_buffer_of, run_of
-from pipeline.models.load import load_model, load_to_play, with_normalised_rewards
-from pipeline.playing import play_episodes, playing_env
-from pipeline.settings.yaml import read_saved_settings
-from pipeline.training import prepare
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.models.choose import ModelRequest
+from rl_yardstick.pipeline.models.find import model_at, replay_buffer_of, run_of
+from rl_yardstick.pipeline.models.load import load_model, load_to_play, with_normalised_rewards
+from rl_yardstick.pipeline.playing import play_episodes, playing_env
+from rl_yardstick.pipeline.settings.yaml import read_saved_settings
+from rl_yardstick.pipeline.training import prepare
 from tests.pipeline.short_runs import CART, choose_model, spec_of, trained
 
 SMALL_A2C = {"policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}

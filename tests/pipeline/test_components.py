@@ -15,18 +15,18 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from torch import nn, optim
 
-from agents import load_algorithm
-from pipeline.environments import check_env_id, make_env, make_training_env
-from pipeline.errors import UserError
-from pipeline.settings.components import (
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.pipeline.environments import check_env_id, make_env, make_training_env
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.settings.components import (
     build_algorithm_kwargs,
     callbacks,
     confined,
     vec_wrapper_factory,
     wrapper_factory,
 )
-from pipeline.settings.hyperparams import split
-from pipeline.user_modules import (
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.user_modules import (
     UserModule,
     as_flag,
     check_recorded,

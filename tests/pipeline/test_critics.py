@@ -12,11 +12,11 @@ from rich.console import Console
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from mdp import TransitionModel, policy_return, state_visitation
-from mdp.advantages import expected_estimates
-from pipeline.environments import make_training_env
-from pipeline.evaluation import critics
-from pipeline.evaluation.critics import (
+from rl_yardstick.mdp import TransitionModel, policy_return, state_visitation
+from rl_yardstick.mdp.advantages import expected_estimates
+from rl_yardstick.pipeline.environments import make_training_env
+from rl_yardstick.pipeline.evaluation import critics
+from rl_yardstick.pipeline.evaluation.critics import (
     CriticRecorder,
     KnownWorld,
     RolloutRecorder,
@@ -24,9 +24,9 @@ from pipeline.evaluation.critics import (
     minibatches,
     recorder_of,
 )
-from pipeline.evaluation.policies import policy_matrix
-from pipeline.preparation import prepare
-from pipeline.training import close
+from rl_yardstick.pipeline.evaluation.policies import policy_matrix
+from rl_yardstick.pipeline.preparation import prepare
+from rl_yardstick.pipeline.training import close
 from tests.envs.corridors import Corridor
 from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
 from tests.pipeline.test_resuming import carried_out, content, cut_off, gone_on

@@ -6,8 +6,8 @@ import pytest
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from envs.wrappers import OneHotObservation, ScaleReward, TerminationReward
-from pipeline.environments import (
+from rl_yardstick.envs.wrappers import OneHotObservation, ScaleReward, TerminationReward
+from rl_yardstick.pipeline.environments import (
     EVALUATION_TIME_LIMIT,
     evaluation_kwargs,
     make_evaluation_env,
@@ -19,7 +19,7 @@ from pipeline.environments import (
     with_logs_located,
     with_maps_read,
 )
-from pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError
 from tests.pipeline.short_runs import spec_of as spec_for
 
 
@@ -80,7 +80,7 @@ def test_which_arguments_reach_training_and_which_evaluation(tmp_path):
 
 
 SHAPED = {"shelf_reward": -10}
-SCALED = {"envs.wrappers.ScaleReward": {"scale": 0.01}}
+SCALED = {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.01}}
 
 
 UNLIMITED = {"max_episode_steps": -1}
@@ -133,10 +133,10 @@ def test_evaluation_always_has_a_time_limit(env_id, entry, training, evaluation)
 
 WRAPPED = {
     "env_wrapper": [
-        {"envs.wrappers.TerminationReward": {"reward": 5}},
-        "envs.wrappers.OneHotObservation",
+        {"rl_yardstick.envs.wrappers.TerminationReward": {"reward": 5}},
+        "rl_yardstick.envs.wrappers.OneHotObservation",
     ],
-    "train_env_wrapper": [{"envs.wrappers.ScaleReward": {"scale": 0.5}}],
+    "train_env_wrapper": [{"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.5}}],
 }
 
 

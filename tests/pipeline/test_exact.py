@@ -3,22 +3,22 @@
 import math
 
 import numpy as np
+import pipeline.evaluation.histories
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
-import pipeline.evaluation.histories
-from agents import load_algorithm
-from mdp import policy_return, value_iteration
-from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation import policies
-from pipeline.evaluation.advice import advice
-from pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
-from pipeline.evaluation.histories import by_histories, world_of_memory
-from pipeline.evaluation.policies import action_figures, policy_matrix
-from pipeline.evaluation.sampled import evaluate
-from pipeline.evaluation.yardstick import HiddenState, Yardstick, with_memory
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.mdp import policy_return, value_iteration
+from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
+from rl_yardstick.pipeline.evaluation import policies
+from rl_yardstick.pipeline.evaluation.advice import advice
+from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
+from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
+from rl_yardstick.pipeline.evaluation.policies import action_figures, policy_matrix
+from rl_yardstick.pipeline.evaluation.sampled import evaluate
+from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick, with_memory
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, trained
 from tests.pipeline.short_runs import spec_of as spec_for
 
@@ -26,7 +26,7 @@ from tests.pipeline.short_runs import spec_of as spec_for
 WITHIN_999 = 3.2905
 POSITION = {"env_kwargs": {"observation": "position", "max_episode_steps": 60, "slip": 0.1}}
 HOT = {"env_kwargs": {"slip": 0.1, "max_episode_steps": 60}}
-HOT |= {"env_wrapper": "envs.wrappers.OneHotObservation"}
+HOT |= {"env_wrapper": "rl_yardstick.envs.wrappers.OneHotObservation"}
 SLIPPERY = {"env_kwargs": {"slip": 0.1, "max_episode_steps": 60, "shelf_reward": -3}}
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
 PROBS = {"probabilities": [0.2, 0.5, 0.9], "pulls": 100}

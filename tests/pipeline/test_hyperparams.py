@@ -8,21 +8,26 @@ import pytest
 import yaml
 from gymnasium.spaces import Box
 
-from agents import ALGORITHMS, load_algorithm
-from envs.known_models import transition_model
-from pipeline.agent_settings import check_fit, resolved_spec, training_follows, without_auto
-from pipeline.environments import make_single_env
-from pipeline.errors import UserError
-from pipeline.evaluation.exact import discount_note, exact_evaluator
-from pipeline.settings import hyperparams
-from pipeline.settings.components import (
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.pipeline.agent_settings import (
+    check_fit,
+    resolved_spec,
+    training_follows,
+    without_auto,
+)
+from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.evaluation.exact import discount_note, exact_evaluator
+from rl_yardstick.pipeline.settings import hyperparams
+from rl_yardstick.pipeline.settings.components import (
     action_noise,
     build_algorithm_kwargs,
     callbacks,
     default_policy,
     vec_wrapper_factory,
 )
-from pipeline.settings.hyperparams import (
+from rl_yardstick.pipeline.settings.hyperparams import (
     SPECIAL_KEYS,
     TUNED_ON,
     entry_names,
@@ -31,8 +36,8 @@ from pipeline.settings.hyperparams import (
     seeds_tuned_on,
     split,
 )
-from pipeline.settings.values import constructor_parameters
-from pipeline.settings.yaml import read_yaml
+from rl_yardstick.pipeline.settings.values import constructor_parameters
+from rl_yardstick.pipeline.settings.yaml import read_yaml
 from tests.peers.peer_environment import peer_folder
 
 ZOO = peer_folder("rl_zoo3") / "hyperparams"
@@ -198,7 +203,7 @@ def spec_of_entry(env_id, raw, algo="qlearning"):
     return resolved_spec(raw, algo=algo, env_id=env_id, seed=0)
 
 
-SCALED = {"train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": "auto"}}}
+SCALED = {"train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": "auto"}}}
 CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 SHORT = {"max_episode_steps": 200}
 POOR = {"shelf_reward": -1, "step_reward": -0.01, "goal_reward": 1}

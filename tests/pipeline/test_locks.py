@@ -13,15 +13,18 @@ from contextlib import suppress
 
 import pytest
 
-from pipeline import locks
-from pipeline.digests import LOCK
-from pipeline.errors import UserError
-from pipeline.models.find import model_of
-from pipeline.runs import INTERRUPTED, RUNNING, Run
+from rl_yardstick.pipeline import locks
+from rl_yardstick.pipeline.digests import LOCK
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.models.find import model_of
+from rl_yardstick.pipeline.runs import INTERRUPTED, RUNNING, Run
 
 FOREIGN = {**locks.mark(), "host": "elsewhere", "machine": "other", "boot": "other"}
 FOREIGN |= {"token": "t", "since": "2026-01-01 00:00:00"}
-SHOW_MARK = "import json; from pipeline.locks import mark; print(json.dumps(mark()), flush=True)"
+SHOW_MARK = (
+    "import json; from rl_yardstick.pipeline.locks import mark; "
+    "print(json.dumps(mark()), flush=True)"
+)
 
 
 def never(*words):

@@ -17,11 +17,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.digests import LOCK, sealed
-from pipeline.errors import UserError
-from pipeline.model_card import fenced
-from pipeline.models.choose import ModelRequest
-from pipeline.packs import check_pack, is_study, pack, pack_study, unpacked
+from rl_yardstick.pipeline.digests import LOCK, sealed
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.model_card import fenced
+from rl_yardstick.pipeline.models.choose import ModelRequest
+from rl_yardstick.pipeline.packs import check_pack, is_study, pack, pack_study, unpacked
 from tests.pipeline.short_runs import CART, LAKE, choose_model, trained
 
 HOME = str(Path.home())

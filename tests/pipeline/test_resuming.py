@@ -14,17 +14,17 @@ import torch as th
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents.compiled import engine as compiled_engine
-from pipeline import state_files, state_saver
-from pipeline.agent_settings import resolved_spec
-from pipeline.digests import LOCK
-from pipeline.errors import UserError
-from pipeline.evaluation import sampled
-from pipeline.runs import at_work_on
-from pipeline.settings.hyperparams import override, read_hyperparams
-from pipeline.stopping import stops_noticed
-from pipeline.training import carry_out, prepare
-from pipeline.unfinished_runs import (
+from rl_yardstick.agents.compiled import engine as compiled_engine
+from rl_yardstick.pipeline import state_files, state_saver
+from rl_yardstick.pipeline.agent_settings import resolved_spec
+from rl_yardstick.pipeline.digests import LOCK
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.evaluation import sampled
+from rl_yardstick.pipeline.runs import at_work_on
+from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
+from rl_yardstick.pipeline.stopping import stops_noticed
+from rl_yardstick.pipeline.training import carry_out, prepare
+from rl_yardstick.pipeline.unfinished_runs import (
     SaveInterval,
     StateKeeping,
     go_on,
@@ -32,7 +32,7 @@ from pipeline.unfinished_runs import (
     recorded_training,
     tell_changes,
 )
-from pipeline.user_modules import import_typed
+from rl_yardstick.pipeline.user_modules import import_typed
 
 COMPILED = {"engine": "compiled"}
 GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
@@ -44,8 +44,8 @@ STACKED = {"normalize": True, "frame_stack": 2}
 NOISE = {"noise_type": "ornstein-uhlenbeck", "noise_std": 0.1}
 # Ten rewards of 0.1 are not 1: what Monitor adds up depends on the order.
 FINE = {"env_kwargs": {"reward_schedule": (1.7, -0.3, 0.1)}}
-EACH_7 = {"pipeline.callbacks.EpisodeCheckpoint": {"every_n_episodes": 7}}
-FALLING = {"callback": [EACH_7, "pipeline.callbacks.ExponentialExploration"]}
+EACH_7 = {"rl_yardstick.pipeline.callbacks.EpisodeCheckpoint": {"every_n_episodes": 7}}
+FALLING = {"callback": [EACH_7, "rl_yardstick.pipeline.callbacks.ExponentialExploration"]}
 OFF = StateKeeping(SaveInterval(is_off=True))
 
 
@@ -116,7 +116,7 @@ def until_cut_off(training, monkeypatch, n_states=2):
         return save(*args)
 
     with monkeypatch.context() as context:
-        context.setattr("pipeline.training.give_up", lambda *_: None)
+        context.setattr("rl_yardstick.pipeline.training.give_up", lambda *_: None)
         context.setattr(state_saver, "save_state", save_or_die)
         with pytest.raises(CutOffError):
             carry_out(training)
@@ -296,7 +296,7 @@ def test_the_newest_unfinished_run_and_a_state_of_other_settings(parts, monkeypa
 
 def test_a_state_of_other_sources_is_told_of(tmp_path, monkeypatch):
     with monkeypatch.context() as context:  # of an older release
-        context.setattr("pipeline.state_files.source_digest", lambda: "older")
+        context.setattr("rl_yardstick.pipeline.state_files.source_digest", lambda: "older")
         run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
     told = []
     go_on(run, StateKeeping(), told.append)

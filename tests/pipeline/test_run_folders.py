@@ -13,11 +13,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline import files
-from pipeline.digests import DamagedFileError, read_arrays
-from pipeline.errors import UserError
-from pipeline.models.find import check_digest
-from pipeline.runs import NoRunError, Run, environment_name
+from rl_yardstick.pipeline import files
+from rl_yardstick.pipeline.digests import DamagedFileError, read_arrays
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.models.find import check_digest
+from rl_yardstick.pipeline.runs import NoRunError, Run, environment_name
 
 TAXI = "Taxi-v4"
 

@@ -15,14 +15,14 @@ from rich.console import Console
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents import load_algorithm
-from agents.compiled import greedy_play
-from commands.terminal import result_lines
-from envs.wrappers import DiscretizeObservation
-from pipeline.agent_settings import without_auto
-from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation import sampled
-from pipeline.evaluation.sampled import (
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.compiled import greedy_play
+from rl_yardstick.commands.terminal import result_lines
+from rl_yardstick.envs.wrappers import DiscretizeObservation
+from rl_yardstick.pipeline.agent_settings import without_auto
+from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
+from rl_yardstick.pipeline.evaluation import sampled
+from rl_yardstick.pipeline.evaluation.sampled import (
     Evaluation,
     SampledEvaluator,
     Shares,
@@ -35,11 +35,11 @@ from pipeline.evaluation.sampled import (
     evaluation_seed,
     is_sure,
 )
-from pipeline.settings import hyperparams
-from pipeline.settings.hyperparams import TUNED_ON, split
-from pipeline.settings.yaml import read_yaml
-from pipeline.train_spec import TrainSpec
-from pipeline.training import train
+from rl_yardstick.pipeline.settings import hyperparams
+from rl_yardstick.pipeline.settings.hyperparams import TUNED_ON, split
+from rl_yardstick.pipeline.settings.yaml import read_yaml
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.training import train
 from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of, trained
 
 CAR = "MountainCar-v0"

@@ -9,20 +9,20 @@ import stable_baselines3 as sb3
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents import ALGORITHMS, load_algorithm
-from pipeline.errors import UserError
-from pipeline.settings.components import (
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.settings.components import (
     build_algorithm_kwargs,
     build_value,
     callbacks,
     wrapper_factory,
 )
-from pipeline.settings.hyperparams import (
+from rl_yardstick.pipeline.settings.hyperparams import (
     check_algorithm_kwargs,
     read_hyperparams,
     split,
 )
-from pipeline.settings.values import (
+from rl_yardstick.pipeline.settings.values import (
     DottedName,
     algorithm_parameters,
     constructor_parameters,
@@ -31,7 +31,7 @@ from pipeline.settings.values import (
     parse_literal,
     parse_schedule,
 )
-from pipeline.settings.yaml import parse_yaml
+from rl_yardstick.pipeline.settings.yaml import parse_yaml
 
 PARAMETERS = {
     "PPO": constructor_parameters(sb3.PPO),

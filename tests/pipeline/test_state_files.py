@@ -31,15 +31,15 @@ import pytest
 import torch as th
 from stable_baselines3.common.logger import Logger
 
-from agents import load_algorithm
-from pipeline import state_files, state_saver
-from pipeline.errors import UserError
-from pipeline.runs import Run
-from pipeline.state_files import read_state, write_state
-from pipeline.state_saver import StateSaver, put_back, user_state
-from pipeline.states import NotKeepableError, pickled, unpickled
-from pipeline.unfinished_runs import SaveInterval, StateKeeping
-from pipeline.user_modules import import_typed
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.pipeline import state_files, state_saver
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.runs import Run
+from rl_yardstick.pipeline.state_files import read_state, write_state
+from rl_yardstick.pipeline.state_saver import StateSaver, put_back, user_state
+from rl_yardstick.pipeline.states import NotKeepableError, pickled, unpickled
+from rl_yardstick.pipeline.unfinished_runs import SaveInterval, StateKeeping
+from rl_yardstick.pipeline.user_modules import import_typed
 
 KEY = b"k" * 32
 
@@ -410,7 +410,7 @@ def test_without_room_on_the_disk_the_last_state_stays(tmp_path, home, small_dis
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     """A state takes half a second here: the next is saved fifty times as long after it."""
     clock = [0.0]
-    monkeypatch.setattr("pipeline.state_saver.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("rl_yardstick.pipeline.state_saver.time.monotonic", lambda: clock[0])
     model = load_algorithm("qlearning")("QTablePolicy", "FrozenLake-v1")
     model.set_logger(Logger(None, []))
 

@@ -22,10 +22,10 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from pipeline import files, stopping
-from pipeline.errors import UserError
-from pipeline.runs import ROOM, ROOM_BYTES
-from pipeline.stopping import (
+from rl_yardstick.pipeline import files, stopping
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.runs import ROOM, ROOM_BYTES
+from rl_yardstick.pipeline.stopping import (
     SIGNALS,
     Stopped,
     current,
@@ -122,7 +122,7 @@ def test_a_stop_comes_in_time_as_itself(work, monkeypatch):
 # --- the processes of environments ---------------------------------------------------------------
 SCRIPT = """
 import multiprocessing, os, signal, time
-from pipeline.stopping import close_environments, shield_workers, stops_noticed
+from rl_yardstick.pipeline.stopping import close_environments, shield_workers, stops_noticed
 
 def work(pipe):
     pipe.send("there")

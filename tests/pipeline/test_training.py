@@ -20,10 +20,10 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.common.callbacks import EpisodeBudget
-from commands.train import describe_pulls, print_outcome
-from envs.bandits import log_uniformly
-from pipeline.callbacks import (
+from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.commands.train import describe_pulls, print_outcome
+from rl_yardstick.envs.bandits import log_uniformly
+from rl_yardstick.pipeline.callbacks import (
     EpisodeCheckpoint,
     EvaluationCallback,
     ExponentialExploration,
@@ -31,11 +31,11 @@ from pipeline.callbacks import (
     StepCheckpoint,
     summarise_pulls,
 )
-from pipeline.evaluation.sampled import Evaluation, evaluate
-from pipeline.models.find import checkpoint_file
-from pipeline.runs import PULLS_FILE, Run
-from pipeline.training import carry_out, prepare, train
-from pipeline.unfinished_runs import run_of_spec
+from rl_yardstick.pipeline.evaluation.sampled import Evaluation, evaluate
+from rl_yardstick.pipeline.models.find import checkpoint_file
+from rl_yardstick.pipeline.runs import PULLS_FILE, Run
+from rl_yardstick.pipeline.training import carry_out, prepare, train
+from rl_yardstick.pipeline.unfinished_runs import run_of_spec
 from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
 
 TINY_DQN = {"buffer_size": 200, "batch_size": 4, "learning_starts": 20}

@@ -13,23 +13,23 @@ import torch as th
 from matplotlib.figure import Figure
 from rich.console import Console
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from pipeline import map_pictures as drawing
-from pipeline import progress, watching
-from pipeline.agent_settings import resolved_spec
-from pipeline.curve_pictures import read_monitors
-from pipeline.environments import make_training_env
-from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.value_maps import value_map
-from pipeline.models.load import load_model
-from pipeline.preparation import algorithm_kwargs, make_model
-from pipeline.progress import ProgressDisplay
-from pipeline.settings.hyperparams import read_hyperparams
-from pipeline.signs_of_life import Heartbeat
-from pipeline.training import carry_out, prepare
-from pipeline.watching import TERMINATED, TableRecorder
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.pipeline import map_pictures as drawing
+from rl_yardstick.pipeline import progress, watching
+from rl_yardstick.pipeline.agent_settings import resolved_spec
+from rl_yardstick.pipeline.curve_pictures import read_monitors
+from rl_yardstick.pipeline.environments import make_training_env
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
+from rl_yardstick.pipeline.evaluation.value_maps import value_map
+from rl_yardstick.pipeline.models.load import load_model
+from rl_yardstick.pipeline.preparation import algorithm_kwargs, make_model
+from rl_yardstick.pipeline.progress import ProgressDisplay
+from rl_yardstick.pipeline.settings.hyperparams import read_hyperparams
+from rl_yardstick.pipeline.signs_of_life import Heartbeat
+from rl_yardstick.pipeline.training import carry_out, prepare
+from rl_yardstick.pipeline.watching import TERMINATED, TableRecorder
 from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, spec_of, trained
 
 

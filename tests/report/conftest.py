@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from report import films
+from rl_yardstick.report import films
 
 
 @pytest.fixture(autouse=True)

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.bandits import PullStatistics
-from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from verdicts import AgentRuns, Best, Estimate, Pair, Study, Summary, ThresholdSummary
+from rl_yardstick.experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from rl_yardstick.experiments.bandits import PullStatistics
+from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.verdicts import AgentRuns, Best, Estimate, Pair, Study, Summary, ThresholdSummary
 
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 

@@ -13,14 +13,14 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, PercentFormatter
 
-from experiments.analysis import OverallAnalysis
-from report.figures import (
+from rl_yardstick.experiments.analysis import OverallAnalysis
+from rl_yardstick.report.figures import (
     draw_learning_curves,
     draw_runs,
     label_ends,
     write_figures,
 )
-from report.series import (
+from rl_yardstick.report.series import (
     COLOURS,
     AgentRuns,
     ArmSeries,

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.analysis import analyse
-from experiments.child_processes import TaskFailedError
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.errors import UserError
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
-from pipeline.training import carry_out, prepare
-from report.page import learning
-from report.page.frame import as_json
-from report.page.learning import exactly, write_first_pages, write_learning_page
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.child_processes import TaskFailedError
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.training import carry_out, prepare
+from rl_yardstick.report.page import learning
+from rl_yardstick.report.page.frame import as_json
+from rl_yardstick.report.page.learning import exactly, write_first_pages, write_learning_page
 
 HOSTILE = "</script><script>document.title='taken'</script>"
 

@@ -8,14 +8,14 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from report.documents import write_verdicts
-from report.page import render, result_sections
-from report.page.frame import Report
-from report.series import EnvironmentSeries, StudySeries, agent_marks, run_series
-from report.terminal import print_analysis
+from rl_yardstick.report.documents import write_verdicts
+from rl_yardstick.report.page import render, result_sections
+from rl_yardstick.report.page.frame import Report
+from rl_yardstick.report.series import EnvironmentSeries, StudySeries, agent_marks, run_series
+from rl_yardstick.report.terminal import print_analysis
+from rl_yardstick.verdicts import judge
 from tests.report.test_page import Page
 from tests.report.test_sentences import study_of
-from verdicts import judge
 
 RUNS = {
     "best": [1.0] * 12,

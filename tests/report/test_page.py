@@ -11,13 +11,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from experiments.analysis import analyse
-from experiments.results import read_compared
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from report.films import MAX_BYTES, MAX_SIDE, film_of
-from report.page import render, result_sections, write_report
-from report.page.frame import Report
-from report.series import (
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.results import read_compared
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.report.films import MAX_BYTES, MAX_SIDE, film_of
+from rl_yardstick.report.page import render, result_sections, write_report
+from rl_yardstick.report.page.frame import Report
+from rl_yardstick.report.series import (
     Curve,
     EnvironmentSeries,
     Grid,

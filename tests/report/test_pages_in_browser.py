@@ -15,11 +15,11 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
-from pipeline.training import carry_out, prepare
-from report.page.learning import write_learning_page
-from report.page.tuning import write_tuning_page
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.training import carry_out, prepare
+from rl_yardstick.report.page.learning import write_learning_page
+from rl_yardstick.report.page.tuning import write_tuning_page
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")

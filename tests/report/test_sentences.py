@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.analysis import analyse
-from experiments.plan import plan
-from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from report.conclusions import conclusion, pairs_both_ways, unseen_sentence
-from report.documents import headline, verdicts_as
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.report.conclusions import conclusion, pairs_both_ways, unseen_sentence
+from rl_yardstick.report.documents import headline, verdicts_as
+from rl_yardstick.verdicts import Best, ThresholdSummary
 from tests.report import made_up
-from verdicts import Best, ThresholdSummary
 
 NAN, INF = math.nan, math.inf
 

@@ -10,14 +10,14 @@ import pandas as pd
 import pytest
 from scipy import integrate
 
-import envs  # noqa: F401  # registers the bandits
-from experiments.analysis import analyse
-from experiments.bandits import pull_statistics
-from experiments.plan import PlannedRun
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
-from report.series import (
+import rl_yardstick.envs  # noqa: F401  # registers the bandits
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.bandits import pull_statistics
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.report.series import (
     auer_bound,
     best_expected_reward,
     best_of_normals,

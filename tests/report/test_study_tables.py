@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import pytest
 
-from report.conclusions import conclusion
-from report.documents import (
+from rl_yardstick.report.conclusions import conclusion
+from rl_yardstick.report.documents import (
     MARKUPS,
     headline,
     latex_text,
@@ -21,12 +21,12 @@ from report.documents import (
     table_as,
     verdicts_as,
 )
-from report.page import result_sections
-from report.page.frame import Report
-from report.ranking import COLUMNS, Row
-from report.series import StudySeries
+from rl_yardstick.report.page import result_sections
+from rl_yardstick.report.page.frame import Report
+from rl_yardstick.report.ranking import COLUMNS, Row
+from rl_yardstick.report.series import StudySeries
+from rl_yardstick.verdicts import Best, Estimate, ThresholdSummary
 from tests.report import made_up
-from verdicts import Best, Estimate, ThresholdSummary
 
 NAMES = ["low", "same", "open", "first"]
 CHANGES = ("random starts", "rewards x 0.01")

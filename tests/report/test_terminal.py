@@ -8,10 +8,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from commands.terminal import TextConsole
-from experiments.off_policy.estimators import PolicyTerms
-from experiments.off_policy.logged_policies import Comparison, Judged
-from report.terminal import folded, print_analysis, print_comparison, print_episodes_table
+from rl_yardstick.commands.terminal import TextConsole
+from rl_yardstick.experiments.off_policy.estimators import PolicyTerms
+from rl_yardstick.experiments.off_policy.logged_policies import Comparison, Judged
+from rl_yardstick.report.terminal import (
+    folded,
+    print_analysis,
+    print_comparison,
+    print_episodes_table,
+)
 from tests.report import made_up
 
 NAMES = ["double_expected_sarsa_with_a_long_name", "an agent of many short words here", "x"]

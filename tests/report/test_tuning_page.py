@@ -6,7 +6,7 @@ import re
 import optuna
 import pytest
 
-from report.page.tuning import (
+from rl_yardstick.report.page.tuning import (
     Trials,
     changes,
     cost,

@@ -20,11 +20,11 @@ from stable_baselines3 import DQN, PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.utils import ConstantSchedule
 
-from safe_files import UnsafeFileError, inspect_model, load_model, load_replay_buffer
-from safe_files.archives import first_look
-from safe_files.buffers_and_statistics import read_normalization
-from safe_files.known_objects import load_tensors, read_pickle
-from safe_files.pickles import PRICES
+from rl_yardstick.safe_files import UnsafeFileError, inspect_model, load_model, load_replay_buffer
+from rl_yardstick.safe_files.archives import first_look
+from rl_yardstick.safe_files.buffers_and_statistics import read_normalization
+from rl_yardstick.safe_files.known_objects import load_tensors, read_pickle
+from rl_yardstick.safe_files.pickles import PRICES
 
 UTILS = "stable_baselines3.common.utils"
 START = b"\x80\x04"

@@ -21,8 +21,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch import nn, optim
 
-from envs.wrappers import ActionMasks
-from safe_files import (
+from rl_yardstick.envs.wrappers import ActionMasks
+from rl_yardstick.safe_files import (
     UnsafeFileError,
     inspect_model,
     load_model,

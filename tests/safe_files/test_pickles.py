@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_files.files import UnsafeFileError
-from safe_files.known_objects import read_pickle
-from safe_files.pickles import Made, Name, read_tree
+from rl_yardstick.safe_files.files import UnsafeFileError
+from rl_yardstick.safe_files.known_objects import read_pickle
+from rl_yardstick.safe_files.pickles import Made, Name, read_tree
 
 KEYS = st.text(max_size=5) | st.integers(-(2**60), 2**60) | st.binary(max_size=5) | st.none()
 VALUES = st.recursive(

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 import compare
-from envs.warehouse import WarehouseEnv
-from experiments.plan import plan
-from experiments.results import read_episodes, read_results
-from experiments.run_in_child import do_run
-from experiments.study import read_study
-from mdp import value_iteration
-from pipeline.models.load import load_model
-from pipeline.preparation import algorithm_kwargs
+from rl_yardstick.envs.warehouse import WarehouseEnv
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.results import read_episodes, read_results
+from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.experiments.study import read_study
+from rl_yardstick.mdp import value_iteration
+from rl_yardstick.pipeline.models.load import load_model
+from rl_yardstick.pipeline.preparation import algorithm_kwargs
 
 ROOT = Path(compare.__file__).parent
 # Bandits have a guide of their own.

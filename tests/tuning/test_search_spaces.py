@@ -9,19 +9,19 @@ import optuna
 import pytest
 from optuna.trial import FixedTrial
 
-from agents import ALGORITHMS, load_algorithm
-from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.agent_settings import resolved_spec
-from pipeline.errors import UserError
-from pipeline.settings import hyperparams
-from pipeline.settings.components import build_algorithm_kwargs, default_policy
-from pipeline.settings.hyperparams import entry_names, read_hyperparams, split
-from pipeline.settings.yaml import read_yaml
-from tuning import search_spaces
-from tuning.dimensions import same
-from tuning.search_spaces import corners, read_search_space
-from tuning.suggesting import Suggestions
-from tuning.tuning_spec import TuningSpec
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.agent_settings import resolved_spec
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.settings import hyperparams
+from rl_yardstick.pipeline.settings.components import build_algorithm_kwargs, default_policy
+from rl_yardstick.pipeline.settings.hyperparams import entry_names, read_hyperparams, split
+from rl_yardstick.pipeline.settings.yaml import read_yaml
+from rl_yardstick.tuning import search_spaces
+from rl_yardstick.tuning.dimensions import same
+from rl_yardstick.tuning.search_spaces import corners, read_search_space
+from rl_yardstick.tuning.suggesting import Suggestions
+from rl_yardstick.tuning.tuning_spec import TuningSpec
 
 FOLDER = Path(search_spaces.__file__).parents[1] / "hyperparams" / "search_spaces"
 NOTHING_TO_SEARCH = {"optimal", "random", "angle", "mabwiser_thompson"}
@@ -39,7 +39,7 @@ default:
   exploration_fraction: {low: 0.1, high: 0.9, when: {max_grad_norm: 10}}
   policy_kwargs.net_arch: {choices: {small: [32], large: [64, 64]}}
   train_env_wrapper:
-    choices: {plain: null, tenth: {envs.wrappers.ScaleReward: {scale: 0.1}}}
+    choices: {plain: null, tenth: {rl_yardstick.envs.wrappers.ScaleReward: {scale: 0.1}}}
 Taxi-v4:
   n_steps: null
   max_grad_norm: [2, 20]
@@ -204,7 +204,7 @@ def test_what_optuna_chooses_becomes_settings(space):
         "max_grad_norm": 10,
         "exploration_fraction": 0.25,
         "policy_kwargs": {"net_arch": [64, 64]},
-        "train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 0.1}},
+        "train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.1}},
     }
     assert close(space.params_of(settings), params)
     assert params.keys() == space.distributions().keys()
@@ -260,7 +260,7 @@ def test_settings_outside_widen_the_space(space):
         "train_freq": 2,
         "gradient_steps": 2,
         "max_grad_norm": 5,
-        "train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 7}},
+        "train_env_wrapper": {"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 7}},
     }
     with pytest.raises(UserError, match=r"learning_rate: the search space does not hold 0\.5"):
         space.params_of(entry)

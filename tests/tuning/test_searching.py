@@ -11,15 +11,21 @@ import optuna
 import pandas as pd
 import pytest
 
-from experiments.analysis import analyse
-from experiments.growing import looked
-from experiments.plan import plan
-from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, Curve, RunResults, StudyResults
-from pipeline.errors import UserError
-from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
-from tuning import retesting, searching
-from tuning.pruning import PRUNERS, is_hopeless
-from tuning.retesting import (
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.growing import looked
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.results import (
+    CURVE_COLUMNS,
+    RUN_COLUMNS,
+    Curve,
+    RunResults,
+    StudyResults,
+)
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
+from rl_yardstick.tuning import retesting, searching
+from rl_yardstick.tuning.pruning import PRUNERS, is_hopeless
+from rl_yardstick.tuning.retesting import (
     Candidate,
     Outcome,
     Retested,
@@ -31,10 +37,10 @@ from tuning.retesting import (
     retest_study,
     write_winner,
 )
-from tuning.searching import RunOutcome, outcome_of
-from tuning.trial_storage import FAILURE, FIGURES, SETTINGS
-from tuning.tuning_spec import judged
-from verdicts import Estimate
+from rl_yardstick.tuning.searching import RunOutcome, outcome_of
+from rl_yardstick.tuning.trial_storage import FAILURE, FIGURES, SETTINGS
+from rl_yardstick.tuning.tuning_spec import judged
+from rl_yardstick.verdicts import Estimate
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -367,7 +373,7 @@ ENTRY = {
     "n_timesteps": 1000,
     "learning_rate": 3e-05,
     "policy_kwargs": {"net_arch": [64, 64], "activation_fn": "nn.ReLU"},
-    "env_wrapper": [{"envs.wrappers.ScaleReward": {"scale": 0.1}}],
+    "env_wrapper": [{"rl_yardstick.envs.wrappers.ScaleReward": {"scale": 0.1}}],
     "normalize": None,
 }
 

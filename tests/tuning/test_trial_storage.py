@@ -2,11 +2,11 @@
 
 import pytest
 
-from pipeline import locks
-from pipeline.errors import UserError
-from tuning import trial_storage
-from tuning.trial_storage import open_storage
-from tuning.tuning_spec import failing_in_a_line, kind_of, without_secret
+from rl_yardstick.pipeline import locks
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.tuning import trial_storage
+from rl_yardstick.tuning.trial_storage import open_storage
+from rl_yardstick.tuning.tuning_spec import failing_in_a_line, kind_of, without_secret
 
 
 def test_passwords_are_left_out_of_refusals_and_commands():

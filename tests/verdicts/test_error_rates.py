@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from verdicts import judge
+from rl_yardstick.verdicts import judge
 
 BANK = Path(__file__).parents[2] / "benchmarks" / "verdict_bank.npz"
 MARGIN = 0.02

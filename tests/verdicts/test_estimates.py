@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from verdicts import (
+from rl_yardstick.verdicts import (
     curve_band,
     mean_over_runs,
     on_grid,
@@ -16,7 +16,7 @@ from verdicts import (
     summarise,
     summarise_steps,
 )
-from verdicts.estimates import median_over_runs, share_interval
+from rl_yardstick.verdicts.estimates import median_over_runs, share_interval
 
 INF, NAN = math.inf, math.nan
 

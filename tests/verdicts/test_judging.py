@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from verdicts import judge
+from rl_yardstick.verdicts import judge
 
 NAN = math.nan
 

@@ -14,11 +14,11 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from agents.common.callbacks import BlockCallback, EpisodeBudget
-from agents.common.schedules import ExponentialSchedule, library_schedule
-from envs.wrappers import ActionMasks, OneHotObservation
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import BlockCallback, EpisodeBudget
+from rl_yardstick.agents.common.schedules import ExponentialSchedule, library_schedule
+from rl_yardstick.envs.wrappers import ActionMasks, OneHotObservation
 
 SMALL = {"buffer_size": 100, "learning_starts": 10}
 SHORT = {"n_steps": 32, "batch_size": 32}

@@ -18,10 +18,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from torch.distributions import Categorical
 
-import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
-from agents.common.callbacks import BlockCallback, Horizon
-from envs.wrappers import OneHotObservation
+import rl_yardstick.envs  # noqa: F401  # registers the environments
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon
+from rl_yardstick.envs.wrappers import OneHotObservation
 
 TOLERANCE = 1e-4  # what rounding comes to after a few hundred steps
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")

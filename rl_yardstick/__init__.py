@@ -1,0 +1,1 @@
+"""Tabular, bandit and deep reinforcement learning, measured against the exact optimum."""

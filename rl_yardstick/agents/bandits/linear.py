@@ -1,0 +1,299 @@
+"""Contextual agents with a linear model of each arm: LinUCB and similar ones."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Unpack
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from rl_yardstick.agents.bandits.algorithm import ArmPolicy, BanditArguments, Pull, RuleBandit
+from rl_yardstick.agents.bandits.choosing import (
+    PULL,
+    Feedback,
+    LinearAgent,
+    Regressions,
+    best_arm,
+    choose_by_allowed_models,
+    choose_by_model,
+    deviation,
+    learn_by_model,
+    learn_one,
+    row_of_vector,
+)
+from rl_yardstick.agents.common.exploration import choose_action
+from rl_yardstick.agents.common.schedules import epsilon_schedule
+from rl_yardstick.agents.common.settings import (
+    ExplorationDecay,
+    check_above_zero,
+    check_at_least,
+    check_epsilons,
+    check_vectors,
+    settings_of,
+)
+from rl_yardstick.agents.compiled.generators import generator_of, handles_of
+from rl_yardstick.machine_code.compiling import inlined
+from rl_yardstick.mdp.transition_model import Floats, Ints
+
+# The policy of agents with a linear model of each arm's reward: their knowledge, in buffers.
+
+
+class LinearBanditPolicy(ArmPolicy):
+    """Pulls the arm of the highest predicted reward."""
+
+    factors: th.Tensor  # of each arm's regression matrix, float64 of shape (A, d, d)
+    moments: th.Tensor  # sum of reward times context, float64 of shape (A, d)
+    coefficients: th.Tensor  # of each arm's regression, float64 of shape (A, d)
+    counts: th.Tensor  # number of rewards of each arm, int64 of shape (A,)
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        ridge: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
+        n_arms, n_features = int(action_space.n), number_of_features(observation_space)
+        identity = ridge * th.eye(n_features, dtype=th.float64)
+        self.register_buffer("factors", identity.repeat(n_arms, 1, 1))
+        self.register_buffer("moments", th.zeros((n_arms, n_features), dtype=th.float64))
+        self.register_buffer("coefficients", th.zeros((n_arms, n_features), dtype=th.float64))
+        self.register_buffer("counts", th.zeros(n_arms, dtype=th.int64))
+
+    @property
+    def models(self) -> Regressions:
+        """The buffers as arrays that share their memory."""
+        return Regressions(
+            self.factors.numpy(),
+            self.moments.numpy(),
+            self.coefficients.numpy(),
+            self.counts.numpy(),
+        )
+
+    def judged(self, observations: NDArray[Any]) -> Floats:
+        contexts = features(self.observation_space, observations)
+        return np.asarray(contexts @ self.coefficients.numpy().T)
+
+
+def number_of_features(space: spaces.Space[Any]) -> int:
+    """Length of the vectors that `features` returns."""
+    return int(space.n) if isinstance(space, spaces.Discrete) else int(space.shape[0])  # type: ignore[index]
+
+
+def features(space: spaces.Space[Any], observations: NDArray[Any]) -> Floats:
+    """Observations as vectors, one-hot where they are numbers; shape (n, d)."""
+    n_features = number_of_features(space)
+    if isinstance(space, spaces.Discrete):
+        return np.asarray(np.eye(n_features)[observations.astype(np.int64).reshape(-1)])
+    vectors: Floats = observations.astype(np.float64).reshape(-1, n_features)
+    return vectors
+
+
+# Contextual agents with a linear model of each arm's reward.
+
+
+class LinearArguments(BanditArguments, total=False):
+    """Arguments of these agents' constructors; see `LinearBanditAgent`."""
+
+    ridge: float
+
+
+@inlined
+def no_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """Arms are judged by their predicted rewards."""
+    return 0.0
+
+
+@inlined
+def confidence_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """``alpha`` standard deviations of the prediction."""
+    return float(agent.settings.alpha * deviation(agent, arm, context))
+
+
+@inlined
+def sampled_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """A draw from the posterior of the prediction, less its mean.
+
+    For a single context, one normal number per arm has the same distribution as a prediction from
+    a draw of all its coefficients.
+    """
+    noise = agent.settings.alpha * generator_of(agent.rng).standard_normal()
+    return float(noise * deviation(agent, arm, context))
+
+
+@inlined
+def pick_epsilon_greedily(agent: LinearAgent, progress: Any) -> int:
+    """A uniformly random arm with probability epsilon, else a best one."""
+    settings = agent.settings
+    agent.draws[1] = generator_of(agent.rng).random()
+    epsilon, ties = progress.exploration, settings.tie_scale
+    return choose_action(settings.strategy, agent.arms, epsilon, ties, agent.draws)
+
+
+class LinearBanditAgent(RuleBandit):
+    """An agent with a ridge regression for each arm; contexts that are numbers become one-hot.
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: environment with `Box` observations of shape (d,) or `Discrete` ones, or its id.
+        ridge: regularisation: the diagonal of each regression matrix at the start, above 0.
+        kwargs: as in `BanditAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "LinearBanditPolicy": LinearBanditPolicy
+    }
+    policy: LinearBanditPolicy
+
+    # Called by the training loops; each algorithm defines `bonus`.
+    choose_arm = choose_by_model
+    context_row = row_of_vector
+    learn_from_reward = learn_by_model
+    choose_allowed = choose_by_allowed_models
+    pick = best_arm
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "LinearBanditPolicy",
+        env: GymEnv | str | None = None,
+        ridge: float = 1.0,
+        **kwargs: Unpack[BanditArguments],
+    ) -> None:
+        self.ridge = ridge
+        super().__init__(policy, env, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_vectors(self, self.observation_space)
+        check_above_zero(settings_of(self, "ridge"))
+
+    def _make_policy(self) -> LinearBanditPolicy:
+        policy: Any = self.policy_class
+        made: LinearBanditPolicy = policy(
+            self.observation_space, self.action_space, self.lr_schedule, ridge=self.ridge
+        )
+        return made
+
+    def compiled_agent(
+        self,
+        rng: np.random.Generator,
+        models: Regressions | None = None,
+        capacity: int = 1,
+        context: Floats | None = None,
+    ) -> LinearAgent:
+        """The agent for compiled functions."""
+        n_features = number_of_features(self.observation_space)
+        return LinearAgent(
+            self.settings()[0],
+            models or self.policy.models,
+            Feedback(np.zeros(capacity, dtype=PULL), np.zeros(1, dtype=np.int64)),
+            np.empty((capacity, n_features)),
+            np.empty(n_features) if context is None else context,
+            np.arange(self.n_arms),
+            np.empty(self.n_arms),
+            np.empty(n_features),
+            np.empty(2),
+            handles_of([rng])[0],
+        )
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> LinearAgent:
+        return self.compiled_agent(rng, capacity=n)
+
+    def _contexts(self, obs: NDArray[Any]) -> Floats:
+        return features(self.observation_space, obs)
+
+    def _rows(self, agent: LinearAgent, contexts: Floats) -> tuple[Ints, int]:
+        agent.contexts[:] = contexts
+        return np.arange(len(contexts)), len(contexts)
+
+    def _learn(self, pull: Pull) -> None:
+        agent = self._workspace_for(self.rng, 1)
+        agent.contexts[0] = pull.context
+        learn_one(agent, np.array([(0, *pull[1:4])], dtype=PULL)[0], None)
+
+
+class LinUCB(LinearBanditAgent):
+    """Linear upper confidence bounds with disjoint models (Li et al., 2010).
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: as in `LinearBanditAgent`.
+        alpha: how many standard deviations the bound lies above the predicted reward.
+        kwargs: as in `LinearBanditAgent`.
+    """
+
+    parameters = {"alpha": np.float64}  # noqa: RUF012
+    bonus = confidence_bonus
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "LinearBanditPolicy",
+        env: GymEnv | str | None = None,
+        alpha: float = 1.0,
+        **kwargs: Unpack[LinearArguments],
+    ) -> None:
+        self.alpha = alpha
+        super().__init__(policy, env, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_at_least(0, settings_of(self, "alpha"))
+
+
+class LinThompson(LinUCB):
+    """Linear Thompson sampling (Agrawal and Goyal, 2013), with a model for each arm.
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: as in `LinearBanditAgent`.
+        alpha: factor of the posterior's standard deviation; correct is the noise's of the rewards.
+        kwargs: as in `LinearBanditAgent`.
+    """
+
+    bonus = sampled_bonus
+
+
+class LinEpsilonGreedy(LinearBanditAgent):
+    """Epsilon-greedy in the predicted rewards.
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: as in `LinearBanditAgent`.
+        exploration_initial_eps: epsilon at the start.
+        exploration_final_eps: epsilon at the end of ``exploration_fraction``.
+        exploration_fraction: share of training over which epsilon falls.
+        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
+        kwargs: as in `LinearBanditAgent`.
+    """
+
+    bonus = no_bonus
+    pick = pick_epsilon_greedily
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "LinearBanditPolicy",
+        env: GymEnv | str | None = None,
+        exploration_initial_eps: float = 0.1,
+        exploration_final_eps: float = 0.01,
+        exploration_fraction: float = 1.0,
+        exploration_decay: ExplorationDecay = "constant",
+        **kwargs: Unpack[LinearArguments],
+    ) -> None:
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_fraction = exploration_fraction
+        self.exploration_decay = exploration_decay
+        super().__init__(policy, env, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_epsilons(self)
+
+    def _make_exploration_schedule(self) -> Schedule:
+        return epsilon_schedule(self)

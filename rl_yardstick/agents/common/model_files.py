@@ -1,0 +1,463 @@
+"""Reads and writes model files without pickles: tables as ``policy.pth``, the rest as JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+import warnings
+import zipfile
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import stable_baselines3 as sb3
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import open_path
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import (
+    ConstantSchedule,
+    FloatSchedule,
+    LinearSchedule,
+    check_for_correct_spaces,
+    get_system_info,
+)
+
+from rl_yardstick.agents.common.schedules import ExponentialSchedule
+from rl_yardstick.safe_files.archives import MEMBERS, parse_settings, read_members
+from rl_yardstick.safe_files.files import (
+    MAX_ARCHIVE_BYTES,
+    Budget,
+    UnsafeFileError,
+    content_of,
+    read_file,
+    shown,
+)
+from rl_yardstick.safe_files.known_objects import check_values, load_tensors
+from rl_yardstick.safe_files.models import charged_tensors, hides
+
+# `encode` turns the attributes of an agent into JSON, `decode` reverses it. An object that JSON
+# lacks is written as ``{"type": name, ...}`` and rebuilt by the fixed table `CODECS`, so reading a
+# file can build nothing else.
+
+TYPE = "type"
+
+# Largest number of elements in a space: each table has a row or a column for each element.
+_MAX_VALUES = 10_000_000
+
+# Booleans and numbers of at most 64 bits, which JSON stores without loss.
+_ARRAY_DTYPE = re.compile(r"[<>|][biuf][1248]")
+
+# Exceptions that a constructor may raise for wrong values.
+_DAMAGE = (TypeError, LookupError, AttributeError, AssertionError, ArithmeticError, RecursionError)
+
+# Types of most attributes of an agent.
+_AS_THEY_ARE = frozenset({type(None), bool, int, float, str})
+
+
+class UnknownTypeError(TypeError):
+    """The file format cannot represent an object."""
+
+
+@dataclass(frozen=True)
+class Codec:
+    """Encodes and decodes the objects of one class."""
+
+    cls: type
+    # For each field in the file, the function that reads its value from an object.
+    fields: Mapping[str, Callable[[Any], Any]]
+    build: Callable[..., Any]
+
+
+def encode(value: Any) -> Any:
+    """Turn ``value`` into JSON."""
+    if type(value) in _AS_THEY_ARE:
+        return value
+    if type(value) is dict:  # fast path for Monitor's hundred episode records
+        return {TYPE: "dict", "pairs": [_encode_all(pair) for pair in value.items()]}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, list):
+        return _encode_all(value)
+    name = type(value).__name__
+    codec = CODECS.get(name)
+    if codec is None or type(value) is not codec.cls:
+        raise UnknownTypeError(f"cannot be written as JSON: {type(value).__module__}.{name}")
+    return {TYPE: name, **{key: encode(read(value)) for key, read in codec.fields.items()}}
+
+
+def _encode_all(values: Iterable[Any]) -> list[Any]:
+    return [value if type(value) in _AS_THEY_ARE else encode(value) for value in values]
+
+
+def decode(data: Any) -> Any:
+    """Rebuild the value that `encode` wrote."""
+    if isinstance(data, list):
+        return [decode(item) for item in data]
+    if not isinstance(data, dict):
+        return data
+    name = data.get(TYPE)
+    codec = CODECS.get(name) if isinstance(name, str) else None
+    if codec is None:
+        raise ValueError(f"unknown type {name!r} in an agent's file")
+    if data.keys() != {TYPE, *codec.fields}:
+        raise ValueError(f"damaged {name} in an agent's file: its fields are {', '.join(data)}")
+    try:
+        return codec.build(*(decode(data[key]) for key in codec.fields))
+    except _DAMAGE as error:
+        raise ValueError(f"damaged {name} in an agent's file: {error}") from error
+
+
+def _attributes(*names: str) -> dict[str, Callable[[Any], Any]]:
+    return {name: attrgetter(name) for name in names}
+
+
+def _space(cls: type, make: Callable[..., Any], **fields: Callable[[Any], Any]) -> Codec:
+    """Rebuild a space with its generator, so that sampling continues where it was."""
+
+    def build(*values: Any) -> Any:
+        *arguments, rng = values
+        if not (rng is None or isinstance(rng, np.random.Generator)):
+            raise TypeError(f"{rng!r} is no generator")
+        space = make(*arguments)
+        space._np_random = rng
+        return space
+
+    return Codec(cls, {**fields, "rng": attrgetter("_np_random")}, build)
+
+
+def _pairs(mapping: Mapping[Any, Any]) -> list[list[Any]]:
+    return [list(pair) for pair in mapping.items()]
+
+
+def _generator_state(generator: np.random.Generator) -> Mapping[str, Any]:
+    # `default_rng` makes this kind, and `_generator` rebuilds only this kind.
+    if not isinstance(generator.bit_generator, np.random.PCG64):
+        raise UnknownTypeError(f"cannot be written as JSON: {generator}")
+    return generator.bit_generator.state
+
+
+def _generator(state: dict[str, Any]) -> np.random.Generator:
+    generator = np.random.default_rng()
+    generator.bit_generator.state = state
+    return generator
+
+
+def _array_dtype(array: np.ndarray[Any, Any]) -> str:
+    dtype: str = array.dtype.str
+    if not _ARRAY_DTYPE.fullmatch(dtype):
+        raise UnknownTypeError(f"cannot be written as JSON: an array of {array.dtype}")
+    return dtype
+
+
+def _array(dtype: str, shape: tuple[int, ...], values: list[Any]) -> np.ndarray[Any, Any]:
+    if not _ARRAY_DTYPE.fullmatch(dtype):
+        raise ValueError(f"unknown array type {dtype!r} in an agent's file")
+    return np.array(values, dtype=np.dtype(dtype)).reshape(shape)
+
+
+def _discrete(n: int, start: int) -> spaces.Discrete:
+    if n > _MAX_VALUES:
+        raise ValueError(f"a space of more than {_MAX_VALUES:,} values in an agent's file")
+    return spaces.Discrete(n, start=start)
+
+
+def _multi_discrete(nvec: np.ndarray[Any, Any], start: np.ndarray[Any, Any]) -> Any:
+    return spaces.MultiDiscrete(nvec, dtype=nvec.dtype.type, start=start)
+
+
+def _box(low: np.ndarray[Any, Any], high: np.ndarray[Any, Any]) -> spaces.Box:
+    return spaces.Box(low, high, dtype=low.dtype.type)
+
+
+def _dict_space(pairs: list[list[Any]]) -> spaces.Dict:
+    # Pairs, because a Dict space sorts the keys of a plain mapping.
+    return spaces.Dict([(key, space) for key, space in pairs])
+
+
+_RANGE = _attributes("start", "end", "end_fraction")
+_ARRAY: dict[str, Callable[[Any], Any]] = {
+    "dtype": _array_dtype,
+    "shape": attrgetter("shape"),
+    "values": lambda array: array.ravel().tolist(),
+}
+_CODEC_LIST = [
+    Codec(dict, {"pairs": _pairs}, dict),
+    Codec(tuple, {"items": list}, tuple),
+    Codec(deque, {"iterable": list, "maxlen": attrgetter("maxlen")}, deque),
+    Codec(np.ndarray, _ARRAY, _array),
+    Codec(np.random.Generator, {"state": _generator_state}, _generator),
+    Codec(ConstantSchedule, _attributes("val"), ConstantSchedule),
+    Codec(LinearSchedule, _RANGE, LinearSchedule),
+    Codec(ExponentialSchedule, _RANGE, ExponentialSchedule),
+    Codec(FloatSchedule, _attributes("value_schedule"), FloatSchedule),
+    _space(spaces.Discrete, _discrete, **_attributes("n", "start")),
+    _space(spaces.MultiDiscrete, _multi_discrete, **_attributes("nvec", "start")),
+    _space(spaces.MultiBinary, spaces.MultiBinary, **_attributes("n")),
+    _space(spaces.Box, _box, **_attributes("low", "high")),
+    _space(spaces.Tuple, spaces.Tuple, spaces=lambda space: list(space.spaces)),
+    _space(spaces.Dict, _dict_space, pairs=lambda space: _pairs(space.spaces)),
+]
+CODECS = {codec.cls.__name__: codec for codec in _CODEC_LIST}
+
+
+FORMAT_VERSION = 1
+TABLES = "policy.pth"
+MOST_ENVS = 100_000
+
+
+class JsonAlgorithm(BaseAlgorithm):
+    """An algorithm whose zip contains JSON instead of the library's pickles."""
+
+    # `_setup_model` rebuilds these, or they belong to one process.
+    _rebuilt: ClassVar[tuple[str, ...]] = ("lr_schedule", "policy_class", "start_time")
+
+    def save(
+        self,
+        path: str | Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Write the agent as a zip: JSON for its attributes, ``policy.pth`` for its tables.
+
+        Args:
+            path: the target; ``.zip`` is appended to a path without a suffix.
+            exclude: attributes to leave out.
+            include: attributes to write that are left out by default.
+        """
+        left_out = {*self._excluded_save_params(), *self._rebuilt, *(exclude or ())}
+        left_out -= set(include or ())
+        data: dict[str, Any] = {"format": FORMAT_VERSION, "algorithm": type(self).__name__}
+        for name, value in self.__dict__.items():
+            if name not in left_out:
+                data[name] = self._encode_attribute(name, value)
+        content = _zipped(data, self.get_parameters())
+        file = open_path(path, "w", verbose=0, suffix="zip")
+        file.write(content)
+        if isinstance(path, str | Path):
+            file.close()
+
+    def _encode_attribute(self, name: str, value: Any) -> Any:
+        try:
+            return encode(value)
+        except UnknownTypeError:
+            if not callable(value):
+                raise
+            # Losing the learnt tables would be worse than losing the shape of a schedule.
+            present = float(value(self._current_progress_remaining))
+            warnings.warn(
+                f"{name} is a Python function, which a model file cannot hold: "
+                f"its present value {present} is saved instead",
+                stacklevel=3,
+            )
+            return present
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "cpu",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """Build an agent from a zip that `save` wrote.
+
+        Args:
+            path: the zip.
+            env: environment for further training, or None to predict only.
+            device: ignored, as tables live on the CPU.
+            custom_objects: values that replace those of the same name in the file; the replaced
+                ones are not read. Unknown names are ignored, as in the library.
+            print_system_info: print the library versions that the file was written with.
+            force_reset: begin a new episode at the next `learn`.
+            kwargs: attributes to change.
+
+        Raises:
+            ValueError: if the zip holds another agent, is damaged, or does not fit ``env``; or if
+                ``custom_objects`` is not a dictionary.
+        """
+        content = _content(path)
+        budget = Budget(len(content))
+        members = read_members(content, MEMBERS, budget)
+        if print_system_info:
+            text = members.get("system_info.txt", b"").decode("ascii", "replace")
+            # No control characters for the terminal.
+            sys.stdout.writelines(f"{shown(line)[1:-1]}\n" for line in text.splitlines())
+        data = {**cls._read_data(members, budget, path, custom_objects), **kwargs}
+        if env is not None:
+            env = cls._wrap_env(env, data["verbose"])
+            check_for_correct_spaces(env, data["observation_space"], data["action_space"])
+            data["n_envs"] = env.num_envs
+            if force_reset:
+                data["_last_obs"] = None
+        policy = next(iter(cls.policy_aliases))
+        model = cls(policy=policy, env=env, _init_setup_model=False)  # type: ignore[call-arg]
+        _check_names(model, data)
+        for name in ("observation_space", "action_space"):
+            if not isinstance(data.get(name), spaces.Space):
+                raise UnsafeFileError(f"does not say its {name}")
+        n_envs = data.get("n_envs")
+        # The constructor allocates memory for the episodes of all environments.
+        if not isinstance(n_envs, int) or not 1 <= n_envs <= MOST_ENVS:
+            raise UnsafeFileError(
+                f"is of an agent on {shown(n_envs)} environments, not on 1 to {MOST_ENVS}"
+            )
+        # With seed None, `_setup_model` does not reseed the loaded spaces.
+        model.__dict__.update({**data, "seed": None})
+        with charged_tensors(budget):
+            model._setup_model()
+        model.__dict__.update(data)
+        if "seed" in kwargs:
+            model.set_random_seed(kwargs["seed"])
+        tables: Any = load_tensors(members[TABLES], budget) if TABLES in members else None
+        _check_tables(tables, model.policy.state_dict())
+        model.set_parameters({"policy": tables}, exact_match=True, device="cpu")
+        return model
+
+    @classmethod
+    def _read_data(
+        cls,
+        members: Mapping[str, bytes],
+        budget: Budget,
+        path: Any,
+        replaced: dict[str, Any] | None,
+    ) -> dict[str, Any]:
+        """The decoded attributes of a zip of this class, without the replaced ones."""
+        if not (replaced is None or isinstance(replaced, dict)):
+            raise ValueError("custom_objects must be a dictionary or None")
+        known = replaced or {}
+        named = "it" if isinstance(path, io.BufferedIOBase) else str(path)
+        raw = parse_settings(members, budget)
+        if raw.pop("algorithm", None) != cls.__name__:
+            raise ValueError(f"{named} does not hold a {cls.__name__} agent")
+        if raw.pop("format", None) != FORMAT_VERSION:
+            raise ValueError(f"{named} is written in another version of the file format")
+        return {
+            name: known[name] if name in known else decode(value)
+            for name, value in raw.items()
+            # Older files may contain more.
+            if name not in cls._rebuilt
+        }
+
+
+def _content(path: str | Path | io.BufferedIOBase) -> bytes:
+    """The whole file, read once; ``.zip`` is appended if no file of that name exists."""
+    if not isinstance(path, io.BufferedIOBase):
+        path = Path(path)
+        if not path.exists():
+            path = path.with_name(f"{path.name}.zip")
+    return content_of(path, MAX_ARCHIVE_BYTES)
+
+
+def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:
+    """Check that a file sets only attributes of a new agent, and hides no method."""
+    declared = (vars(cls).get("__annotations__", {}) for cls in type(model).__mro__)
+    known = {*vars(model)}.union(*declared)
+    for name in data:
+        if name not in known or hides(type(model), name):
+            raise UnsafeFileError(f"sets {shown(name)}, which is no attribute of such an agent")
+
+
+def _check_tables(found: Any, expected: Mapping[str, th.Tensor]) -> None:
+    """Check that tables hold numbers, of the same dtype as in a new agent.
+
+    PyTorch would convert one dtype into another. The policies check the shapes themselves.
+    """
+    if not isinstance(found, dict):
+        raise UnsafeFileError(f"holds no {TABLES}")
+    for key, table in found.items():
+        like = expected.get(key)
+        if not isinstance(table, th.Tensor) or (like is not None and table.dtype != like.dtype):
+            raise UnsafeFileError(f"{TABLES}: {shown(key)} is not of the kind of such agents")
+        # The score of an arm is infinite until its first pull.
+        if like is not None and like.shape == table.shape and bool(th.isinf(like).any()):
+            check_values({"policy": {key: table[~th.isinf(table)]}})
+        else:
+            check_values({"policy": {key: table}})
+
+
+def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
+    """The zip with the members that the library writes, the JSON last.
+
+    The JSON has one line for each attribute. With the library's deeper indentation, writing would
+    take twice as long as all the rest.
+    """
+    members = {"pytorch_variables.pth": _saved({})}
+    members |= {f"{name}.pth": _saved(tables) for name, tables in params.items()}
+    members["_stable_baselines3_version"] = sb3.__version__.encode()
+    members["system_info.txt"] = _system_info().encode()
+    lines = [f"{json.dumps(name)}: {json.dumps(value)}" for name, value in data.items()]
+    members["data"] = ("{\n" + ",\n".join(lines) + "\n}").encode()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+def _saved(tables: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    th.save(tables, buffer)
+    return buffer.getvalue()
+
+
+@cache
+def _system_info() -> str:
+    return get_system_info(print_info=False)[1]
+
+
+class TablePolicy(BasePolicy):
+    """A policy that stores what it has learnt in buffers on the CPU."""
+
+    def _sizes(self) -> dict[str, Any]:
+        """The constructor's arguments that determine the shapes of the buffers."""
+        return {}
+
+    @classmethod
+    def _remade(cls, arguments: Mapping[str, Any]) -> Self:
+        """A new policy from its spaces and the result of `_sizes`."""
+        return cls(**arguments)
+
+    def save(self, path: str) -> None:
+        """Write the tensors, and the policy's arguments as JSON, so that loading runs no code."""
+        data = {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            **self._sizes(),
+        }
+        text = json.dumps({name: encode(value) for name, value in data.items()})
+        th.save({"state_dict": self.state_dict(), "data": text}, path)
+
+    @classmethod
+    def load(cls, path: str, device: th.device | str = "cpu") -> Self:
+        """Load a policy that `save` wrote; loading runs no code from the file."""
+        content = read_file(Path(path), MAX_ARCHIVE_BYTES)
+        budget = Budget(len(content))
+        saved = load_tensors(content, budget)
+        if not (isinstance(saved, dict) and isinstance(saved.get("data"), str)):
+            raise UnsafeFileError(f"{path} holds no policy of this kind")
+        check_values({"the policy": saved.get("state_dict")})
+        budget.charge_json(saved["data"].encode())
+        try:
+            data = {name: decode(value) for name, value in json.loads(saved["data"]).items()}
+            with charged_tensors(budget):
+                policy = cls._remade(data)
+            policy.load_state_dict(saved["state_dict"])
+        except (TypeError, LookupError, AttributeError, RuntimeError, AssertionError) as error:
+            raise UnsafeFileError(f"{path} holds no {cls.__name__}: {error}") from error
+        policy.set_training_mode(False)
+        return policy

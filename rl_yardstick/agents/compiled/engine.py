@@ -1,0 +1,428 @@
+"""Chooses between compiled and interpreted training, and drives the compiled loop."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+from typing import Any, Literal, cast
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from rl_yardstick.agents.common.algorithm import is_read
+from rl_yardstick.agents.common.callbacks import (
+    NEVER,
+    EpisodeBudget,
+    horizon,
+    members,
+    pass_over,
+    unknown_callbacks,
+    wants_position,
+)
+from rl_yardstick.agents.compiled.generators import handles_of
+from rl_yardstick.agents.compiled.greedy_play import (
+    COMPENSATED_SUM,
+    CompiledEvaluations,
+    EnvStates,
+    Playground,
+)
+from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
+from rl_yardstick.agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
+from rl_yardstick.agents.compiled.records import (
+    Episodes,
+    Statistics,
+    keeps_records,
+    record_in_monitors,
+    time_columns,
+    write_records,
+)
+from rl_yardstick.agents.compiled.worlds import (
+    EPISODE,
+    PROGRESS,
+    RECORD,
+    NotCompilable,
+    World,
+    compile_envs,
+    draws_alike,
+)
+
+Handler = Callable[[int, FrameType | None], object]
+
+# Windows has no SIGHUP.
+_SIGNALS = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")]
+
+
+@contextmanager
+def interrupts_held() -> Iterator[Callable[[], bool]]:
+    """Delay the exception of the first signal to the end of the ``with`` statement.
+
+    The handlers of SIGINT, SIGTERM and SIGHUP run at once; only the exception of the first one is
+    delayed. Outside the main thread, where Python delivers no signals, this does nothing. Yields
+    a function that tells whether an exception is waiting.
+    """
+    n_signals = 0
+    waiting: list[BaseException] = []
+
+    def held(handler: Handler) -> Handler:
+        def hold(number: int, frame: FrameType | None) -> None:
+            nonlocal n_signals
+            n_signals += 1
+            try:
+                handler(number, frame)
+            except BaseException as error:
+                if n_signals > 1:
+                    raise
+                waiting.append(error)
+
+        return hold
+
+    try:
+        with ExitStack() as restoring:
+            if threading.current_thread() is threading.main_thread():
+                for number in filter(None, _SIGNALS):
+                    handler = signal.getsignal(number)
+                    if callable(handler):
+                        restoring.callback(signal.signal, number, handler)
+                        signal.signal(number, held(handler))
+            yield lambda: bool(waiting)
+    finally:
+        if waiting:
+            raise waiting[0]
+
+
+# A block takes some hundredths of a second, for which a signal may have to wait.
+MAX_BLOCK_STEPS = 262_144
+
+
+class CompiledEngine:
+    """One call of ``learn`` on the compiled loop."""
+
+    # Whether statistics include the step on which a callback ends training.
+    counts_where_stopped = True
+
+    def __init__(
+        self, agent: Any, world: World, callback: BaseCallback, log_interval: int | None
+    ) -> None:
+        assert isinstance(agent.env, DummyVecEnv)
+        self.agent = agent
+        self.world = world
+        self.callback = callback
+        self.log_interval = log_interval
+        self.reports_success = ["is_success" in (info or {}) for info in agent.env.reset_infos]
+        self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
+        self.states = self._make_states()
+        self.envs = self.states.records
+        # Handles do not keep their generators alive.
+        self.generators = [env.unwrapped.np_random for env in agent.env.envs]
+        self.handles = handles_of(self.generators)
+        self.progress = np.zeros(1, dtype=PROGRESS)
+        self.log = EpisodeLog(
+            np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
+            np.empty((self.block_steps, agent.n_envs)),
+            np.zeros(self._most_records(), dtype=RECORD),
+        )
+        self.made_from: tuple[Any, ...] = ()
+        self.learner: Any = None
+        self.evaluations = CompiledEvaluations(agent, callback, self._playground)
+        self._read()
+
+    def _make_states(self) -> EnvStates:
+        return EnvStates(self.agent.env, self.world)
+
+    def _most_records(self) -> int:
+        """The largest number of log records that can be due in a block."""
+        takes_records = getattr(self.agent, "logs_by_records", False)
+        if not takes_records or self.log_interval is None or self.log_interval < 1:
+            return 0
+        n_episodes = self.block_steps * self.agent.n_envs
+        return int(min(self.block_steps, n_episodes // self.log_interval + 1))
+
+    def _playground(self, vec_env: VecEnv) -> Playground:
+        """The compiled counterpart of evaluation environments."""
+        world: Any = compile_envs(vec_env)
+        return world, EnvStates(cast(DummyVecEnv, vec_env), world), None
+
+    def _learner(self) -> Any:
+        """The agent for compiled functions, updated after changes by callbacks."""
+        agent, progress = self.agent, self.progress[0]
+        made_from = agent.made_from(agent.rng)
+        if made_from != self.made_from:
+            self.made_from, self.learner = made_from, self._compiled_agent()
+        for name, schedule in agent.schedules().items():
+            progress[f"{name}_schedule"] = compiled_schedule(schedule)
+            progress[name] = schedule(agent._current_progress_remaining)
+        self._take_generators()
+        return self.learner
+
+    def _compiled_agent(self) -> Any:
+        return self.agent.compiled_agent(self.agent.rng)
+
+    def _take_generators(self) -> None:
+        """Make new handles, because a callback may have reseeded the environments."""
+        generators = [env.unwrapped.np_random for env in self.agent.env.envs]
+        if any(a is not b for a, b in zip(generators, self.generators, strict=True)):
+            self.generators, self.handles = generators, handles_of(generators)
+
+    def run(self, total_timesteps: int) -> None:
+        """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
+        with interrupts_held() as interrupted:
+            try:
+                while not self._is_over(total_timesteps):
+                    if not self._run_block(total_timesteps) or interrupted():
+                        break
+            finally:
+                self._write()
+
+    def _is_over(self, total_timesteps: int) -> bool:
+        return bool(self.agent.num_timesteps >= total_timesteps)
+
+    def _run_block(self, total_timesteps: int) -> bool:
+        agent = self.agent
+        if wants_position(self.callback):
+            self._write()
+            self.callback.on_rollout_start()
+            self._read()
+        else:
+            self.callback.on_rollout_start()
+        self.progress[0]["episodes"] = agent._episode_num
+        self._keep_records()
+        ahead = horizon(self.callback)
+        began = time.time_ns()
+        steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
+        n_steps = run_block(
+            self.world,
+            self._learner(),
+            self.envs,
+            self.handles,
+            self.progress[0],
+            self.log,
+            min(ahead.calls, steps_left, self.block_steps),
+            min(ahead.episodes, self._episodes_to_log()),
+            COMPENSATED_SUM,
+        )
+        episodes = Episodes.of(self.log.episodes[: self.progress[0]["logged_episodes"]])
+        keep_going = self._tell(episodes, n_steps, began)
+        learn_from_last_step(self._learner(), self.envs, self.progress[0])
+        last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
+        self._take_over_counts(1, len(episodes.envs) - last_step)
+        self.callback.on_rollout_end()
+        return keep_going
+
+    def _keep_records(self) -> None:
+        """Let the loop store log records, if writing them can wait until the block ends."""
+        progress, interval = self.progress[0], self.log_interval
+        progress["record_interval"] = progress["n_records"] = 0
+        if interval is not None and keeps_records(self.agent, interval):
+            progress["record_interval"] = interval
+            progress["next_record"] = (self.agent._episode_num // interval + 1) * interval
+
+    def _episodes_to_log(self) -> int:
+        """Episodes until the next log record that cannot wait for the end of the block."""
+        waits = self.progress[0]["record_interval"] > 0
+        if self.log_interval is None or waits or not is_read(self.agent.logger):
+            return NEVER
+        return self.log_interval - int(self.agent._episode_num) % self.log_interval
+
+    def _tell(self, episodes: Episodes, n_steps: int, began: int = 0) -> bool:
+        """Update Monitor, statistics and callbacks; False once a callback asks to stop."""
+        agent = self.agent
+        records = self.log.records[: self.progress[0]["n_records"]]
+        before = Statistics(agent) if len(records) else None
+        self.states.keep_rewards(episodes, self.log.rewards[:n_steps])
+        times = record_in_monitors(self.states.monitors, episodes, n_steps)
+        # As in the interpreted loop, the statistics get the last step after the callbacks.
+        earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
+        self._update_statistics(episodes, 0, earlier, times)
+        agent.num_timesteps += n_steps * agent.n_envs
+        n_recorded = 0
+        if before is not None:
+            n_recorded = self._write_records(before, records, episodes, n_steps, began)
+        # Callbacks run before the agent learns from the last step, so the counters exclude it yet.
+        self._take_over_counts(n_steps - 1, earlier - n_recorded)
+        if n_steps > 1:
+            self._record_earlier()
+        pass_over(self.callback, n_steps - 1, earlier)
+        self.callback.update_locals(self._last_step(episodes, earlier, times))
+        with self.evaluations.taking_over():
+            keep_going = self.callback.on_step()
+        if keep_going or self.counts_where_stopped:
+            self._update_statistics(episodes, earlier, len(episodes.envs), times)
+        return keep_going
+
+    def _write_records(
+        self, before: Statistics, records: Any, episodes: Episodes, n_steps: int, began: int
+    ) -> int:
+        """Write the log records, and return the number of episodes that they count."""
+        agent = self.agent
+        n_done = (records["step"] + 1) * agent.n_envs
+        steps = agent.num_timesteps - n_steps * agent.n_envs + n_done
+        now = time.time_ns()
+        times = began + (now - began) * (records["step"] + 1) // n_steps
+        n_before = int(agent._episode_num)
+        agent._episode_num = int(records["episodes"][-1])
+        columns = {
+            "time/episodes": records["episodes"].tolist(),
+            "train/n_updates": (agent._n_updates + n_done).tolist(),
+            **time_columns(agent, steps, times),
+            **before.columns(episodes, records["logged_episodes"]),
+            **agent.log_columns(records),
+        }
+        write_records(agent, columns, times)
+        return int(records["episodes"][-1]) - n_before
+
+    def _record_earlier(self) -> None:
+        """Give the logger values that callbacks may read there, of all steps except the last."""
+
+    def _update_statistics(
+        self, episodes: Episodes, start: int, stop: int, times: list[float]
+    ) -> None:
+        agent = self.agent
+        remembered = slice(max(start, stop - agent._stats_window_size), stop)
+        if self.states.monitors[0] is not None:
+            agent.ep_info_buffer.extend(episodes.infos(remembered, times))
+        if self.reports_success[0]:
+            agent.ep_success_buffer.extend(episodes.successes[remembered].tolist())
+
+    def _last_step(self, episodes: Episodes, earlier: int, times: list[float]) -> dict[str, Any]:
+        """The last step's values for callbacks, under the names of the interpreted loop."""
+        envs = self.envs
+        infos: list[dict[str, Any]] = [
+            {"TimeLimit.truncated": bool(done and not terminated)}
+            for done, terminated in zip(envs["done"], envs["terminated"], strict=True)
+        ]
+        last, ends = slice(earlier, None), self.states.observations(envs, "next_")
+        for env, info in zip(
+            episodes.envs[last].tolist(), episodes.infos(last, times), strict=True
+        ):
+            infos[env].update(episode=info, terminal_observation=ends[env])
+        return {
+            "actions": envs["action"].copy(),
+            "new_obs": self.states.observations(envs, "new_"),
+            "rewards": envs["reward"].astype(np.float32),
+            "dones": envs["done"].copy(),
+            "infos": infos,
+        }
+
+    def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
+        """Update the algorithm's own counters, and write the log if it is due."""
+        agent = self.agent
+        agent._current_progress_remaining = float(self.progress[0]["remaining"])
+        agent._n_updates += n_steps * agent.n_envs
+        self._take_over_position()
+        if n_episodes:
+            agent._count_episodes(n_episodes, self.log_interval)
+
+    def _take_over_position(self) -> None:
+        self.agent._last_obs = self.states.observations(self.envs, "")
+        self.agent.take_over(self.envs, self.progress)
+
+    def _write(self) -> None:
+        """Copy the records into the state of agent and environments."""
+        self._take_over_position()
+        self.states.write()
+
+    def _read(self) -> None:
+        """Copy the state of agent and environments into the records."""
+        agent, progress = self.agent, self.progress[0]
+        budgets = (m for m in members(self.callback) if isinstance(m, EpisodeBudget))
+        for budget in budgets:
+            progress["episode_budget"] = budget.n_episodes
+            progress["budget_episodes"] = budget.episodes_seen
+        progress["num_timesteps"] = agent.num_timesteps
+        progress["total_timesteps"] = agent._total_timesteps
+        progress["remaining"] = agent._current_progress_remaining
+        progress["episodes"] = agent._episode_num
+        agent.hand_over(self.envs, self.progress)
+        self.states.read()
+        self.states.take_observations(agent._last_obs)
+
+
+EngineChoice = Literal["auto", "compiled", "interpreted"]
+
+# What a class may override in Python: all of it reaches compiled functions through the settings,
+# schedules, tables and memory.
+SETTINGS = (
+    "__dict__",
+    "__init__",
+    "__weakref__",
+    "_check_arguments",
+    "_make_exploration_schedule",
+    "_make_memory",
+    "_make_policy",
+    "_memory_in_use",
+    "strategy",
+    "tie_scale",
+    "averages_samples",
+)
+
+
+def choose_engine(
+    agent: Any,
+    callback: BaseCallback,
+    log_interval: int | None,
+    make_world: Callable[[VecEnv], Any] = compile_envs,
+    engine: type[CompiledEngine] = CompiledEngine,
+) -> CompiledEngine | None:
+    """The compiled engine, if the agent asks for it and can be compiled; else None.
+
+    If an environment draws random numbers in its own way, its compiled copy has only the same
+    distribution. ``auto`` does not use such a copy, so that results do not depend on whether
+    compilation was possible. ``agent.engine_in_use`` records the choice and its reason.
+    """
+    if agent.engine == "interpreted":
+        agent.engine_in_use = "interpreted: asked for"
+        return None
+    try:
+        world = _world_for(agent, callback, make_world)
+    except NotCompilable as reason:
+        if agent.engine == "compiled":
+            raise ValueError(f"engine: compiled is not possible: {reason}") from None
+        agent.engine_in_use = f"interpreted: {reason}"
+        return None
+    agent.engine_in_use = "compiled"
+    if not draws_alike(agent.env):
+        if agent.engine == "auto":
+            agent.engine_in_use = (
+                "interpreted: the environment draws in its own way, so that compiled training "
+                "is equal in distribution only (engine: compiled takes that)"
+            )
+            return None
+        agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"
+    return engine(agent, world, callback, log_interval)
+
+
+def _world_for(
+    agent: LearningAlgorithm, callback: BaseCallback, make_world: Callable[[VecEnv], Any]
+) -> Any:
+    check_class(type(agent))
+    for name in vars(agent):
+        if callable(vars(agent)[name]) and callable(getattr(type(agent), name, None)):
+            raise NotCompilable(f"this agent has a {name} of its own in Python")
+    unknown = unknown_callbacks(callback)
+    if unknown:
+        raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
+    agent.check_compilable()
+    for schedule in agent.schedules().values():
+        compiled_schedule(schedule)
+    assert agent.env is not None
+    return make_world(agent.env)
+
+
+def check_class(algorithm: type) -> None:
+    """Check that no Python method of the algorithm replaces a compiled part of a step."""
+    order = algorithm.__mro__
+    settings: Any = algorithm.settings_type.names  # type: ignore[attr-defined]
+    for place, cls in enumerate(order[: order.index(LearningAlgorithm)]):
+        if cls.__module__.startswith("rl_yardstick.agents."):
+            continue
+        above = [vars(base) for base in order[place + 1 :] if base is not object]
+        for name, value in vars(cls).items():
+            in_python = hasattr(value, "__get__") and not hasattr(value, "py_func")
+            replaces = any(name in names for names in above) or name in settings
+            if in_python and replaces and name not in SETTINGS:
+                raise NotCompilable(f"{algorithm.__name__} has a {name} of its own in Python")

@@ -1,0 +1,205 @@
+"""Semi-gradient control on active tiles: Q-learning and SARSA."""
+
+from __future__ import annotations
+
+from typing import Any, Unpack
+
+import numpy as np
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from rl_yardstick.agents.common.exploration import (
+    EPSILON_GREEDY,
+    action_probabilities,
+    greedy_action,
+    highest_value,
+)
+from rl_yardstick.agents.common.schedules import epsilon_schedule
+from rl_yardstick.agents.common.settings import (
+    ExplorationDecay,
+    TieBreaking,
+    check_epsilons,
+    check_finite,
+    settings_of,
+)
+from rl_yardstick.agents.compiled.generators import next_uniform
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.worlds import UNDECIDED
+from rl_yardstick.agents.linear.algorithm import TileAlgorithm, TileArguments
+from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, choose, look, move_sum, sum_of
+from rl_yardstick.agents.networks.network_worlds import AFTER, BEFORE, move_on
+from rl_yardstick.machine_code.compiling import called
+from rl_yardstick.mdp.transition_model import Floats
+
+# Semi-gradient control: action values are sums of weights, moved towards bootstrapped targets.
+#
+# It is the temporal-difference learning of `agents.tabular`, with sums instead of table entries. If
+# each observation is a tile of its own, both are the same bit for bit. After termination the
+# discount is 0; a truncated episode still bootstraps. An algorithm defines `next_value`, and
+# `commit` if it chooses its next action before the update.
+#
+# Source: Sutton and Barto (2nd edition), section 10.1 (SARSA) and chapter 11 (Q-learning).
+
+
+@by_type
+def next_value(agent: LinearAgent, env: Any, progress: Any) -> float:
+    """The value of the next state; ``agent.room.sums`` has the values of the next actions."""
+    raise CompiledOnlyError
+
+
+@by_type
+def commit(agent: LinearAgent, env: Any, progress: Any) -> None:
+    """Choose ``env.next_action`` before the update, if the update needs it."""
+
+
+@called
+def no_commitment(agent: LinearAgent, env: Any, progress: Any) -> None:
+    """Do nothing: the next action is chosen when it is due."""
+
+
+@called
+def choose_epsilon_greedily(agent: LinearAgent, progress: Any) -> int:
+    """A uniformly random action with probability epsilon, else a best one."""
+    sums, explore, place = agent.room.sums, next_uniform(agent.rng), next_uniform(agent.rng)
+    if explore < progress.exploration:
+        return int(place * len(sums))
+    return greedy_action(sums, place * agent.settings.tie_scale)
+
+
+@called
+def semi_gradient_step(agent: LinearAgent, env: Any, progress: Any) -> float:
+    """Learn from an environment's last step, and return the TD error."""
+    room, weights = agent.room, agent.weights
+    look(agent, env, AFTER, room.next_tiles)
+    add_up(agent, room.next_tiles)
+    discount = 0.0 if env.terminated else agent.settings.gamma
+    target = env.reward + discount * next_value(agent, env, progress)
+    look(agent, env, BEFORE, room.tiles)
+    td_error = target - sum_of(weights, room.tiles, env.action)
+    step = progress.learning_rate / len(room.tiles) * td_error
+    move_sum(weights, room.tiles, env.action, step)
+    return float(td_error)
+
+
+@called
+def semi_gradient_learning(agent: LinearAgent, envs: Any, progress: Any) -> None:
+    """All commitments, then the updates in order."""
+    for i in range(len(envs)):
+        commit(agent, envs[i], progress)
+    total_error = 0.0
+    for i in range(len(envs)):
+        env = envs[i]
+        total_error += abs(semi_gradient_step(agent, env, progress))
+        move_on(agent.seen, env)
+        if env.done:
+            env.next_action = UNDECIDED
+    progress.mean_td_error = total_error / len(envs)
+
+
+class SemiGradientAlgorithm(TileAlgorithm):
+    """Epsilon-greedy control on action values that are sums of weights over active tiles.
+
+    Args:
+        policy: ``"TilePolicy"``.
+        env: as in `TileAlgorithm`.
+        learning_rate: as in `TileAlgorithm`.
+        exploration_fraction: share of training over which epsilon falls.
+        exploration_initial_eps: epsilon at the start.
+        exploration_final_eps: epsilon at the end of that share.
+        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
+        tie_breaking: as in `LearningAlgorithm`.
+        initial_q: every action's value at the start; high values are optimistic.
+        kwargs: as in `TileAlgorithm`.
+    """
+
+    # Called by the training loops; each algorithm defines `next_value`.
+    choose_by_sums = choose_epsilon_greedily
+    learn_from_step = semi_gradient_learning
+    commit = no_commitment
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "TilePolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: float | Schedule = 0.1,
+        exploration_fraction: float = 0.5,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        exploration_decay: ExplorationDecay = "linear",
+        tie_breaking: TieBreaking = "random",
+        initial_q: float = 0.0,
+        **kwargs: Unpack[TileArguments],
+    ) -> None:
+        self.exploration_fraction = exploration_fraction
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_decay = exploration_decay
+        self.initial_q = initial_q
+        super().__init__(policy, env, learning_rate, tie_breaking, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_epsilons(self)
+        check_finite(settings_of(self, "initial_q"))
+
+    def _initial_sums(self) -> Floats:
+        return np.full(self.n_actions, float(self.initial_q))
+
+    def _make_exploration_schedule(self) -> Schedule:
+        return epsilon_schedule(self)
+
+    def _probabilities(self, sums: Floats) -> Floats:
+        ties = self.tie_breaking == "random"
+        return action_probabilities(EPSILON_GREEDY, sums, self.exploration_rate, random_ties=ties)
+
+    def _record_training(self) -> None:
+        super()._record_training()
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+
+
+# Semi-gradient Q-learning.
+
+
+@called
+def best_next_value(agent: LinearAgent, env: Any, progress: Any) -> float:
+    """The best next action's value."""
+    return highest_value(agent.room.sums)
+
+
+class SemiGradientQ(SemiGradientAlgorithm):
+    """Semi-gradient Q-learning (Sutton and Barto, chapter 11).
+
+    It may diverge, because it combines off-policy learning, bootstrapping and function
+    approximation (the deadly triad), as in Baird's counterexample (section 11.2).
+    """
+
+    next_value = best_next_value
+
+
+# Semi-gradient SARSA.
+
+
+@called
+def commit_to_next_action(agent: LinearAgent, env: Any, progress: Any) -> None:
+    """Choose the next action, unless the episode has terminated."""
+    env.next_action = 0
+    if not env.terminated:
+        look(agent, env, AFTER, agent.room.next_tiles)
+        env.next_action = choose(agent, agent.room.next_tiles, progress)
+
+
+@called
+def committed_value(agent: LinearAgent, env: Any, progress: Any) -> float:
+    """The value of the next action that the agent has committed to."""
+    return float(agent.room.sums[env.next_action])
+
+
+class SemiGradientSARSA(SemiGradientAlgorithm):
+    """Episodic semi-gradient SARSA (Sutton and Barto, section 10.1).
+
+    It commits to its next action before the update that uses it. If an episode is truncated, it
+    chooses an action in the last state for the target only.
+    """
+
+    commit = commit_to_next_action
+    next_value = committed_value

@@ -1,0 +1,400 @@
+"""The registry of agents: names, classes and supported spaces; users can add to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+from gymnasium import spaces
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+
+@dataclass(frozen=True)
+class AlgorithmEntry:
+    """One agent that can be trained.
+
+    Attributes:
+        entry_point: the class, as ``"module:Class"``; imported only when needed.
+        summary: the agent in a few words.
+        observations: names of the Gymnasium spaces that it can observe; empty for any space, which
+            the class itself must check.
+        actions: names of the Gymnasium spaces that it can act in, likewise.
+        observation_shape: the only observation shape that it supports, or None for any.
+        for_bandits: whether it considers only the next reward.
+        needs_masks: whether the environment must provide action masks.
+        has_memory: whether its actions depend on earlier observations, too.
+        package: the import name of an optional package that it needs, or None.
+        extra: the extra of this distribution that installs that package.
+        engines: values of its argument ``engine``, the default first; one or none if it has only
+            one engine and no such argument.
+    """
+
+    entry_point: str
+    summary: str
+    observations: tuple[str, ...] = ()
+    actions: tuple[str, ...] = ()
+    observation_shape: tuple[int, ...] | None = None
+    for_bandits: bool = False
+    needs_masks: bool = False
+    has_memory: bool = False
+    package: str | None = None
+    extra: str | None = None
+    engines: tuple[str, ...] = ()
+
+    @property
+    def family(self) -> str:
+        """The folder or file of `agents` with the class; empty if it is elsewhere."""
+        module, prefix = self.entry_point.partition(":")[0], "rl_yardstick.agents."
+        return module[len(prefix) :].split(".")[0] if module.startswith(prefix) else ""
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether the package that the agent needs is installed."""
+        return self.package is None or importlib.util.find_spec(self.package) is not None
+
+    @property
+    def install_command(self) -> str:
+        """The command that installs this package."""
+        what = f"'rl-yardstick[{self.extra}]'" if self.extra else self.package
+        return f"pip install {what}"
+
+    def misfit(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> str:
+        """The reason why the agent cannot work with these spaces; empty if it can."""
+        for space, known, role in (
+            (observation_space, self.observations, "observes"),
+            (action_space, self.actions, "acts in"),
+        ):
+            if not known:
+                continue
+            if type(space).__name__ not in known:
+                return f"it {role} {' or '.join(known)} spaces, not {space}"
+            # The one-hot encoding of Stable-Baselines3 and every table count from zero.
+            if isinstance(space, spaces.Discrete) and space.start != 0:
+                return f"it needs Discrete spaces that start at 0, not {space}"
+        shape = self.observation_shape
+        if shape is not None and observation_space.shape != shape:
+            return f"it needs observations of shape {shape}, not {observation_space.shape}"
+        return ""
+
+    def env_misfit(self, env: gym.Env[Any, Any]) -> str:
+        """The reason why the agent cannot work with the environment; empty if it can."""
+        from rl_yardstick.envs.wrappers import has_masks
+
+        if self.for_bandits and not is_bandit(env):
+            return "it is for bandits, where a pull changes nothing but its own reward"
+        if self.needs_masks and not has_masks(env):
+            return (
+                "it needs to be told which actions are valid, by a method action_masks() or by "
+                "info['action_mask']"
+            )
+        return self.misfit(env.observation_space, env.action_space)
+
+
+def is_bandit(env: gym.Env[Any, Any]) -> bool:
+    """Whether the environment is one of `envs.bandits`."""
+    from rl_yardstick.envs.bandits import Bandit
+
+    return isinstance(env.unwrapped, Bandit)
+
+
+# The agents: names, classes and supported spaces.
+
+DISCRETE = ("Discrete",)
+LINEAR_INPUTS = ("Box", "Discrete")
+NETWORK_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict")
+POLICY_GRADIENT_OUTPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
+CONTINUOUS = ("Box",)
+TABLE_ENGINES = ("auto", "compiled", "interpreted")
+LIBRARY_ENGINES = ("library", "compiled", "auto")
+NETWORK_ENGINES = ("auto", "compiled", "library")
+VECTOR_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
+
+
+def _tabular(place: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"rl_yardstick.agents.tabular.{place}", summary, DISCRETE, DISCRETE, engines=TABLE_ENGINES
+    )
+
+
+def _tiled(place: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"rl_yardstick.agents.linear.{place}",
+        summary,
+        LINEAR_INPUTS,
+        DISCRETE,
+        engines=TABLE_ENGINES,
+    )
+
+
+def _network(
+    name: str,
+    summary: str,
+    actions: tuple[str, ...] = DISCRETE,
+    engines: tuple[str, ...] = LIBRARY_ENGINES,
+) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"rl_yardstick.agents.library:{name}", summary, NETWORK_INPUTS, actions, engines=engines
+    )
+
+
+def _continuous(name: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"stable_baselines3:{name}",
+        f"{summary} (Stable-Baselines3)",
+        NETWORK_INPUTS,
+        CONTINUOUS,
+        engines=LIBRARY_ENGINES[:1],
+    )
+
+
+def _contrib(
+    entry_point: str,
+    summary: str,
+    actions: tuple[str, ...],
+    observations: tuple[str, ...] = NETWORK_INPUTS,
+    *,
+    needs_masks: bool = False,
+    has_memory: bool = False,
+) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        entry_point,
+        f"{summary} (sb3-contrib)",
+        observations,
+        actions,
+        needs_masks=needs_masks,
+        has_memory=has_memory,
+        package="sb3_contrib",
+        extra="contrib",
+        engines=LIBRARY_ENGINES[:1],
+    )
+
+
+def _planning(name: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"rl_yardstick.agents.planning:{name}", f"planning: {summary}", DISCRETE, DISCRETE
+    )
+
+
+def _bandit(place: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"rl_yardstick.agents.bandits.{place}", summary, observations, DISCRETE, for_bandits=True
+    )
+
+
+def _mabwiser(name: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"rl_yardstick.agents.mabwiser:{name}",
+        f"{summary} (MABWiser)",
+        observations,
+        DISCRETE,
+        for_bandits=True,
+        package="mabwiser",
+        extra="bandits",
+    )
+
+
+ALGORITHMS: dict[str, AlgorithmEntry] = {
+    "qlearning": _tabular("one_step:QLearning", "Q-learning on a table"),
+    "sarsa": _tabular("one_step:SARSA", "SARSA on a table"),
+    "expected_sarsa": _tabular("one_step:ExpectedSARSA", "Expected SARSA on a table"),
+    "double_qlearning": _tabular("one_step:DoubleQLearning", "double Q-learning on two tables"),
+    "n_step_sarsa": _tabular("n_step:NStepSARSA", "n-step SARSA on a table"),
+    "n_step_tree_backup": _tabular("n_step:NStepTreeBackup", "n-step tree backup on a table"),
+    "sarsa_lambda": _tabular("traces:SARSALambda", "SARSA(lambda): traces on a table"),
+    "q_lambda": _tabular("traces:QLambda", "Watkins's Q(lambda): traces on a table"),
+    "monte_carlo": _tabular("monte_carlo:MonteCarlo", "on-policy Monte Carlo on a table"),
+    "off_policy_monte_carlo": _tabular(
+        "monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
+    ),
+    "dyna_q": _tabular("dyna:DynaQ", "Q-learning that plans on a learnt model"),
+    "dyna_q_plus": _tabular("dyna:DynaQPlus", "Dyna-Q with a bonus for actions not tried for long"),
+    "prioritized_sweeping": _tabular(
+        "prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
+    ),
+    "r_max": _tabular("optimism:RMax", "planning that assumes the best of everything unknown"),
+    "qlearning_ucb": _tabular("optimism:QLearningUCB", "Q-learning with upper confidence bounds"),
+    "semi_gradient_sarsa": _tiled(
+        "action_values:SemiGradientSARSA", "SARSA on tile coding (or a table)"
+    ),
+    "semi_gradient_q": _tiled(
+        "action_values:SemiGradientQ", "Q-learning on tile coding (or a table)"
+    ),
+    "actor_critic": _tiled(
+        "policy_gradients:ActorCritic", "one-step actor-critic on tiles or a table"
+    ),
+    "reinforce": _tiled(
+        "policy_gradients:Reinforce", "REINFORCE on tiles or a table, with or without a baseline"
+    ),
+    "dqn": _network("DQN", "deep Q-network (Stable-Baselines3)"),
+    "double_dqn": _network("DoubleDQN", "DQN with van Hasselt's target", DISCRETE, NETWORK_ENGINES),
+    "deep_qlearning": _network(
+        "DeepQLearning", "DQN of 2013: squared loss, no target network", DISCRETE, NETWORK_ENGINES
+    ),
+    "ppo": _network(
+        "PPO", "proximal policy optimisation (Stable-Baselines3)", POLICY_GRADIENT_OUTPUTS
+    ),
+    "a2c": _network("A2C", "advantage actor-critic (Stable-Baselines3)", POLICY_GRADIENT_OUTPUTS),
+    "sac": _continuous("SAC", "soft actor-critic"),
+    "td3": _continuous("TD3", "twin delayed policy gradient"),
+    "ddpg": _continuous("DDPG", "deep deterministic policy gradient"),
+    "qrdqn": _contrib("sb3_contrib:QRDQN", "quantile-regression DQN", DISCRETE),
+    "tqc": _contrib("sb3_contrib:TQC", "truncated quantile critics", CONTINUOUS),
+    "crossq": _contrib(
+        "sb3_contrib:CrossQ", "SAC without target networks", CONTINUOUS, VECTOR_INPUTS
+    ),
+    "trpo": _contrib(
+        "sb3_contrib:TRPO", "trust-region policy optimisation", POLICY_GRADIENT_OUTPUTS
+    ),
+    "ars": _contrib(
+        "rl_yardstick.agents.random_search:ARS",
+        "augmented random search",
+        (*CONTINUOUS, *DISCRETE),
+        VECTOR_INPUTS,
+    ),
+    "ppo_lstm": _contrib(
+        "sb3_contrib:RecurrentPPO",
+        "PPO with a memory",
+        # sb3-contrib 2.9 fails on the other spaces.
+        ("Box", "Discrete", "MultiDiscrete"),
+        ("Box", "Discrete", "MultiBinary", "Dict"),
+        has_memory=True,
+    ),
+    "ppo_mask": _contrib(
+        "sb3_contrib:MaskablePPO",
+        "PPO that is told which actions are valid",
+        ("Discrete", "MultiDiscrete", "MultiBinary"),
+        needs_masks=True,
+    ),
+    "value_iteration": _planning("ValueIteration", "greedy in the optimal values"),
+    "policy_iteration": _planning("PolicyIteration", "policies evaluated and improved in turn"),
+    "optimal": _planning("Optimal", "the optimum under the time limit"),
+    "random": AlgorithmEntry(
+        "rl_yardstick.agents.reference:RandomAgent",
+        "uniformly random actions",
+        NETWORK_INPUTS,
+        POLICY_GRADIENT_OUTPUTS,
+    ),
+    "angle": AlgorithmEntry(
+        "rl_yardstick.agents.reference:AngleAgent",
+        "CartPole: push to where the pole leans",
+        CONTINUOUS,
+        DISCRETE,
+        observation_shape=(4,),
+    ),
+    "epsilon_greedy": _bandit("value_bandits:EpsilonGreedy", "bandit: epsilon-greedy"),
+    "boltzmann": _bandit("value_bandits:Boltzmann", "bandit: softmax of the estimates"),
+    "ucb": _bandit("upper_bounds:UCB", "bandit: upper confidence bounds"),
+    "kl_ucb": _bandit("upper_bounds:KLUCB", "bandit: upper bounds by Kullback-Leibler divergence"),
+    "gradient_bandit": _bandit("preferences:GradientBandit", "bandit: gradient on preferences"),
+    "exp3": _bandit("preferences:Exp3", "bandit: exponential weights against an adversary"),
+    "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),
+    "linucb": _bandit(
+        "linear:LinUCB", "contextual bandit: linear upper confidence bounds", LINEAR_INPUTS
+    ),
+    "lin_thompson": _bandit(
+        "linear:LinThompson", "contextual bandit: linear Thompson sampling", LINEAR_INPUTS
+    ),
+    "lin_epsilon_greedy": _bandit(
+        "linear:LinEpsilonGreedy", "contextual bandit: linear, epsilon-greedy", LINEAR_INPUTS
+    ),
+    "mabwiser_epsilon_greedy": _mabwiser("MABWiserEpsilonGreedy", "bandit: epsilon-greedy"),
+    "mabwiser_ucb1": _mabwiser("MABWiserUCB1", "bandit: UCB1"),
+    "mabwiser_thompson": _mabwiser("MABWiserThompson", "bandit: Thompson sampling"),
+    "mabwiser_linucb": _mabwiser("MABWiserLinUCB", "contextual bandit: LinUCB", LINEAR_INPUTS),
+}
+
+
+def register(name: str, entry_point: str, **fields: Any) -> None:
+    """Add an agent of your own to the registry, so that the commands find it.
+
+    Nothing is imported: call it when your module is imported, before any slow imports. A second
+    call with the same arguments has no effect.
+
+    Args:
+        name: the value of ``--algo``.
+        entry_point: the class, a subclass of `BaseAlgorithm`, as ``"module:Class"``.
+        fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
+            class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
+            ``for_bandits``, ``needs_masks``, ``has_memory``, ``package``, ``extra`` and
+            ``engines``, which is read from the class by default.
+
+    Raises:
+        ValueError: if the name is taken, or a field does not exist or has an invalid value.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9]\w*([.-]\w+)*", name, re.ASCII):
+        raise ValueError(f"the name of an agent holds letters, digits and _, not {name!r}")
+    if not re.fullmatch(r"[\w.]+:\w+", str(entry_point)):
+        raise ValueError(f"{name}: the class is named as 'module:Class', not {entry_point!r}")
+    unknown = set(fields) - {key.name for key in dataclasses.fields(AlgorithmEntry)}
+    if unknown:
+        raise ValueError(f"{name}: an entry has no {', '.join(sorted(unknown))}")
+    for role in ("observations", "actions"):
+        fields[role] = _space_names(name, role, fields.get(role, ()))
+    fields.setdefault("summary", entry_point.rpartition(":")[2])
+    entry = AlgorithmEntry(entry_point, **fields)
+    taken = next((known for known in ALGORITHMS if known.lower() == name.lower()), None)
+    if taken is not None and (taken, ALGORITHMS[taken]) != (name, entry):
+        raise ValueError(
+            f"there is an agent {taken} already ({ALGORITHMS[taken].entry_point}): "
+            f"register {entry_point} under another name"
+        )
+    ALGORITHMS[name] = entry
+
+
+def _space_names(name: str, role: str, given: Any) -> tuple[str, ...]:
+    """The names of spaces as an entry holds them."""
+    names = tuple(given) if isinstance(given, list | tuple) else (given,)
+    for space in names:
+        kind = getattr(spaces, space, None) if isinstance(space, str) else None
+        if not (isinstance(kind, type) and issubclass(kind, spaces.Space)):
+            raise ValueError(f"{name}: {role} are names of Gymnasium's spaces, not {space!r}")
+    return names
+
+
+def load_algorithm(name: str) -> type[BaseAlgorithm]:
+    """Import the class of the agent ``name``.
+
+    Raises:
+        KeyError: if there is no agent of that name.
+        ModuleNotFoundError: if the optional package that it needs is missing.
+        ValueError: if there is no such class, or it is no subclass of `BaseAlgorithm`.
+    """
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    entry_point = ALGORITHMS[name].entry_point
+    module_name, class_name = entry_point.split(":")
+    algorithm = getattr(importlib.import_module(module_name), class_name, None)
+    if not (isinstance(algorithm, type) and issubclass(algorithm, BaseAlgorithm)):
+        fault = "does not exist" if algorithm is None else "is no subclass of BaseAlgorithm"
+        raise ValueError(f"{name} is registered as {entry_point}, which {fault}")
+    return algorithm
+
+
+def fitting_algorithms(
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    bandit: bool = False,
+    masks: bool = False,
+) -> list[str]:
+    """Names of the agents that can work with these spaces, in the order of the registry.
+
+    Args:
+        observation_space: the environment's observation space.
+        action_space: the environment's action space.
+        bandit: whether the environment is a bandit.
+        masks: whether the environment provides action masks.
+    """
+    return [
+        name
+        for name, entry in ALGORITHMS.items()
+        if bandit >= entry.for_bandits
+        and masks >= entry.needs_masks
+        and not entry.misfit(observation_space, action_space)
+    ]

@@ -1,0 +1,470 @@
+"""The base of the tabular agents: arguments, masks, memory, acting and learning."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal, Unpack, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import FloatSchedule
+
+from rl_yardstick.agents.common.algorithm import Transitions
+from rl_yardstick.agents.common.exploration import (
+    STRATEGIES,
+    action_probabilities,
+    draws_per_choice,
+)
+from rl_yardstick.agents.common.masks import (
+    check_masks_exist,
+    checked_masks,
+    masks_of_observations,
+    numbers_in,
+    present_masks,
+)
+from rl_yardstick.agents.common.schedules import epsilon_schedule
+from rl_yardstick.agents.common.settings import (
+    CommonArguments,
+    ExplorationDecay,
+    TieBreaking,
+    check_above_zero,
+    check_epsilons,
+    check_option,
+    check_share,
+    check_space,
+    settings_of,
+)
+from rl_yardstick.agents.compiled.engine import EngineChoice, choose_engine
+from rl_yardstick.agents.compiled.generators import handles_of
+from rl_yardstick.agents.compiled.greedy_play import Explorer, Plan
+from rl_yardstick.agents.compiled.learning_algorithm import StepSize
+from rl_yardstick.agents.compiled.worlds import NotCompilable
+from rl_yardstick.agents.tabular.policy import QTablePolicy
+from rl_yardstick.agents.tabular.updates import (
+    MaskedTables,
+    Room,
+    Tables,
+    TabularAgent,
+    act_in_all,
+    act_on_values,
+    learn_from_all,
+    no_commitment,
+    td_learning,
+)
+from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
+from rl_yardstick.envs.wrappers import INFO_KEY
+from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+
+ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
+
+
+class TableWorkspace(Workspace):
+    """A workspace with an agent, whose tables are changed in place.
+
+    ``masks`` has the allowed actions at each observation; without rows all actions are allowed.
+    """
+
+    def __init__(self, agent: TabularAgent, masks: Bools, rng: np.random.Generator, n: int) -> None:
+        super().__init__(n)
+        self.rng = rng  # kept here, because its handle does not keep it alive
+        # The arguments of `act_in_all` and `learn_from_all`, in order.
+        self.arrays = (
+            np.array([agent.settings]),
+            self.envs,
+            self.progress,
+            *agent.tables[:2],
+            masks,
+            *agent.room,
+            handles_of([rng]),
+            agent.memory,
+        )
+        self._chosen: Ints | None = None
+
+    def _check(self, field: str, outside: int) -> None:
+        """Raise ValueError for an observation without a row, unless ``outside`` is -1."""
+        if outside >= 0:
+            n_states = self.arrays[3].shape[1]
+            obs = self.fields[field][outside]
+            raise ValueError(f"observation {obs} is not in Discrete({n_states}), the agent's space")
+
+    def act(self, obs: Any) -> Ints:
+        """An action for each observation: the one committed to, if there is one."""
+        fields = self.fields
+        fields["obs"][:] = obs
+        self._check("obs", act_in_all(*self.arrays))
+        actions: Ints = fields["action"].copy()
+        self._chosen = actions
+        return actions
+
+    def learn(self, transitions: Transitions) -> float:
+        """Learn from a step of each environment, and return the mean absolute TD error."""
+        fields = self.fields
+        if transitions.actions is not self._chosen:
+            # After `act`, its observations and actions are in the records already.
+            fields["obs"][:] = transitions.obs
+            fields["action"][:] = transitions.actions
+        fields["next_obs"][:] = transitions.next_obs
+        self.take_outcomes(transitions)
+        self._check("next_obs", learn_from_all(*self.arrays))
+        return float(self.mean_td_error[0])
+
+
+class MaskedArguments(CommonArguments, total=False):
+    """Arguments that constructors of tabular agents pass on; see `TabularAlgorithm`."""
+
+    mask_actions: bool
+
+
+class TabularAlgorithm(WorkspaceAlgorithm):
+    """Temporal-difference control on a table of action values.
+
+    An algorithm may have a memory besides its tables: a NamedTuple of arrays from `_make_memory`,
+    which compiled functions get as ``agent.memory`` and change in place. Arrays for current
+    episodes have a row for each environment. A model file does not contain the memory: permanent
+    knowledge must be in buffers of the policy, which `_memory_in_use` may add to the memory.
+
+    Args:
+        policy: ``"QTablePolicy"``.
+        env: environment with `Discrete` observations and actions, or its id.
+        learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N(s, a).
+        gamma: discount factor.
+        exploration: ``"epsilon_greedy"``; ``"boltzmann"`` (softmax of value / temperature); or
+            ``"gaussian_noise"`` (greedy in value + noise_std / (episode + 1) * normal noise, with
+            episodes counted over all environments).
+        exploration_fraction: share of training over which epsilon falls.
+        exploration_initial_eps: epsilon at the start.
+        exploration_final_eps: epsilon at the end of that share.
+        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
+        temperature: of ``"boltzmann"``, above 0, constant or scheduled.
+        noise_std: of ``"gaussian_noise"``, constant or scheduled.
+        tie_breaking: as in `LearningAlgorithm`.
+        initial_q: value of every entry of the table at the start; high values are optimistic.
+        initial_q_std: standard deviation of normal noise on the entries at the start.
+        skip_terminal_update: learn nothing from the step that terminates an episode, a common
+            mistake in hand-written programs, to reproduce their results.
+        engine: ``"compiled"`` trains on a compiled copy of the environments, with bit-identical
+            results and a hundred times faster; ValueError if there is none. ``"interpreted"``
+            calls them step by step; ``"auto"`` compiles if it can.
+        policy_kwargs: further arguments of the policy.
+        mask_actions: choose among the actions that the environment allows, and bootstrap from
+            those allowed next. The environment's method `action_masks()` must depend on the
+            observation only. At an observation never visited, all actions are allowed.
+        kwargs: as in `OnlineAlgorithm`.
+
+    Attributes:
+        masks_are_known: whether the policy has the masks of all states.
+        last_steps: a record for each environment, with target and TD error of its last update.
+
+    Raises:
+        ValueError: if an argument is outside its range, a space does not fit, or the environment
+            has no masks for ``mask_actions``; while learning, if a mask is malformed, allows no
+            action, or differs from an earlier one of the same observation.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
+    policy: QTablePolicy
+    n_tables: ClassVar[int] = 1
+    parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
+
+    # Called by the training loops; each algorithm defines `next_value`.
+    act = act_on_values
+    learn_from_step = td_learning
+    commit = no_commitment
+
+    _rebuilt = (
+        *WorkspaceAlgorithm._rebuilt,
+        *("masks_are_known", "_infos", "_memory", "last_steps"),
+    )
+    excluded_from_states = ("last_steps",)
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "QTablePolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: StepSize = 0.1,
+        gamma: float = 0.99,
+        exploration: ExplorationStrategy = "epsilon_greedy",
+        exploration_fraction: float = 0.5,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        exploration_decay: ExplorationDecay = "linear",
+        temperature: float | Schedule = 1.0,
+        noise_std: float | Schedule = 1.0,
+        tie_breaking: TieBreaking = "random",
+        initial_q: float = 0.0,
+        initial_q_std: float = 0.0,
+        skip_terminal_update: bool = False,
+        engine: EngineChoice = "auto",
+        policy_kwargs: dict[str, Any] | None = None,
+        mask_actions: bool = False,
+        **kwargs: Unpack[CommonArguments],
+    ) -> None:
+        self.gamma = gamma
+        self.exploration = exploration
+        self.exploration_fraction = exploration_fraction
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_decay = exploration_decay
+        self.temperature = temperature
+        self.noise_std = noise_std
+        self.initial_q = initial_q
+        self.initial_q_std = initial_q_std
+        self.skip_terminal_update = skip_terminal_update
+        self.engine = engine
+        self.mask_actions = mask_actions
+        self.masks_are_known = False
+        self.last_steps: NDArray[np.void] | None = None
+        self._infos: list[dict[str, Any]] = []
+        self._memory: tuple[Any, ...] = ()
+        super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
+
+    def _check_arguments(self) -> None:
+        if self.mask_actions and self.env is not None:
+            check_masks_exist(self.env)
+        check_space(self, "observations", self.observation_space)
+        check_space(self, "actions", self.action_space)
+        check_option("exploration", self.exploration, ExplorationStrategy)
+        check_option("engine", self.engine, EngineChoice)
+        check_epsilons(self)
+        check_share(settings_of(self, "gamma"))
+        check_above_zero(settings_of(self, "temperature"))
+
+    def _make_policy(self) -> QTablePolicy:
+        policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            n_tables=self.n_tables,
+            **self.policy_kwargs,
+        )
+        if self.mask_actions:
+            policy.keep_masks()
+        noise = self.rng.standard_normal(policy.q_tables.shape)
+        with np.errstate(over="ignore"):
+            tables = self.initial_q + self.initial_q_std * noise
+        if not np.isfinite(tables).all():
+            given = f"{self.initial_q:g} and {self.initial_q_std:g}"
+            raise ValueError(f"initial_q and initial_q_std must give finite values, not {given}")
+        policy.q_tables.copy_(th.from_numpy(tables))
+        return policy
+
+    def _make_exploration_schedule(self) -> Schedule:
+        if self.exploration == "boltzmann":
+            return FloatSchedule(self.temperature)
+        if self.exploration == "gaussian_noise":
+            return FloatSchedule(self.noise_std)
+        return epsilon_schedule(self)
+
+    # Arguments of compiled functions.
+
+    def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
+        """The agent for compiled functions, with its tables in the memory of its policy."""
+        self._check_tables()
+        self._check_memory()
+        policy = self.policy
+        values, counts = policy.q_tables.numpy(), policy.visit_counts.numpy()
+        n_actions = values.shape[2]
+        n_draws = draws_per_choice(self.strategy, n_actions)
+        return TabularAgent(
+            self.settings()[0],
+            MaskedTables(values, counts, policy.masks)
+            if self.mask_actions
+            else Tables(values, counts),
+            Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
+            handles_of([rng])[0],
+            self._memory_in_use(),
+        )
+
+    def _check_tables(self) -> None:
+        """Raise ValueError for tables of a wrong shape, which compiled code does not check."""
+        sizes = cast(Any, (self.observation_space, self.action_space))
+        shape = (self.n_tables, *(int(space.n) for space in sizes))
+        found = tuple(self.policy.q_tables.shape), tuple(self.policy.visit_counts.shape)
+        if found != (shape, shape) or self.n_tables not in (1, 2):
+            raise ValueError(f"tables must be 1 or 2, of shape {shape}, not {found[0]}")
+        if self.mask_actions and self.policy.masks.shape != shape[1:]:
+            raise ValueError(f"masks must be of shape {shape[1:]}, not {self.policy.masks.shape}")
+        if self.strategy not in STRATEGIES.values():
+            raise ValueError(f"unknown exploration strategy {self.strategy}")
+
+    def _make_memory(self) -> tuple[Any, ...]:
+        """An empty memory for ``n_envs`` environments."""
+        return ()
+
+    def _memory_in_use(self) -> tuple[Any, ...]:
+        """The memory for compiled functions; a subclass may add to it."""
+        return self._memory
+
+    def _check_memory(self) -> None:
+        """Raise ValueError for a memory of wrong shapes, which compiled code does not check."""
+        expected: Any = self._make_memory()
+        if type(self._memory) is not type(expected):
+            raise ValueError(f"the agent's memory must be a {type(expected).__name__}")
+        for name, found, like in zip(
+            getattr(expected, "_fields", ()), self._memory, expected, strict=True
+        ):
+            if (found.dtype, found.shape) != (like.dtype, like.shape):
+                raise ValueError(
+                    f"the agent's memory was made for other settings: {name} must be of shape "
+                    f"{like.shape} and {like.dtype}, not {found.shape} and {found.dtype}"
+                )
+
+    def greedy_player(self, seen: Any) -> Plan:
+        """A player with the greedy actions of `predict` on compiled environments."""
+        numbers = np.arange(self.policy.q_tables.shape[1])
+        return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
+
+    def exploring_player(self, seen: Any) -> Explorer:
+        """A player with the exploring actions of `predict`, drawn from the same generator."""
+        return Explorer(self.compiled_agent(self.predict_rng), self.progress())
+
+    # Training.
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self.mask_actions:
+            assert self.env is not None
+            check_masks_exist(self.env)
+            known = masks_of_observations(self.env, len(self.policy.masks))
+            self.masks_are_known = known is not None
+            if known is not None:
+                self.policy.masks[:] = known
+        return prepared
+
+    def check_compilable(self) -> None:
+        if self.asks_for_masks:
+            raise NotCompilable("the action masks are not known of all states")
+
+    def _begin_episodes(self) -> None:
+        super()._begin_episodes()
+        self._memory = self._make_memory()
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        engine = choose_engine(self, callback, log_interval)
+        if engine is not None:
+            engine.run(total_timesteps)
+            return
+        self._in_use = None
+        super()._run(total_timesteps, callback, log_interval)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "last_steps": None}
+
+    def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Take over the records of the compiled loop."""
+        super().take_over(envs, progress)
+        self.last_steps = envs
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> TableWorkspace:
+        return TableWorkspace(self.compiled_agent(rng), self.policy.masks, rng, n)
+
+    def _choose_actions(self) -> Ints:
+        if self.asks_for_masks:
+            assert self.env is not None
+            self.policy.note_masks(self._last_obs, present_masks(self.env, self._last_obs))
+        workspace: TableWorkspace | None = self._in_use
+        if workspace is None or workspace.rng is not self.rng:
+            return super()._choose_actions()
+        # The workspace is up to date since the last learning, except for ended episodes.
+        workspace.episodes[0] = self._episode_num
+        return workspace.act(self._last_obs)
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        if self.asks_for_masks:
+            self._note_next_masks(transitions)
+        super()._learn_from(transitions)
+        self.last_steps = self._in_use.envs
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Bools | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        self._infos = infos
+
+    @property
+    def asks_for_masks(self) -> bool:
+        """Whether to ask the environments for masks at each step."""
+        return self.mask_actions and not self.masks_are_known
+
+    def _note_next_masks(self, transitions: Transitions) -> None:
+        """Store the masks of the states after the step.
+
+        A finished environment has been reset by now. For the last state of a truncated episode,
+        the mask is in ``info``, or else the one stored before is used.
+        """
+        assert self.env is not None
+        going_on = np.flatnonzero(~transitions.dones)
+        if going_on.size:
+            masks = present_masks(self.env, transitions.next_obs)
+            self.policy.note_masks(transitions.next_obs[going_on], masks[going_on])
+        n_actions = int(cast(spaces.Discrete, self.action_space).n)
+        for i in np.flatnonzero(transitions.dones & ~transitions.terminated):
+            if INFO_KEY in self._infos[i]:
+                obs = transitions.next_obs[i : i + 1]
+                masks = checked_masks([self._infos[i][INFO_KEY]], obs, n_actions)
+                self.policy.note_masks(obs, masks)
+
+    # Prediction and exploration.
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+        action_masks: Any = None,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The greedy action, or an exploring one unless ``deterministic``, as in DQN.
+
+        Takes one state index or an array of shape (n,), and returns actions of the same shape and
+        ``state``; ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape
+        (n, A) replace the masks that the agent has stored.
+        """
+        if deterministic and action_masks is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        obs = numbers_in(self.observation_space, observation)
+        with self.policy.told(obs.reshape(-1), action_masks):
+            if deterministic:
+                return super().predict(obs, state, episode_start, deterministic)
+            return self._exploring_actions(obs), state
+
+    @property
+    def strategy(self) -> int:
+        """The exploration strategy, a number of `agents.common.exploration`."""
+        return STRATEGIES[self.exploration]
+
+    @property
+    def exploration_rate(self) -> float:
+        """The present exploration rate: epsilon, temperature or standard deviation."""
+        rate = super().exploration_rate
+        if self.exploration == "gaussian_noise":
+            return rate / (self._episode_num + 1)
+        return rate
+
+    def action_probabilities(self) -> Floats:
+        """The present probabilities of the exploring policy, shape (S, A).
+
+        Raises:
+            ValueError: for Gaussian noise, whose probabilities have no closed form.
+        """
+        return action_probabilities(
+            self.strategy,
+            self.policy.q_table,
+            self.exploration_rate,
+            random_ties=self.tie_breaking == "random",
+            masks=self.policy.masks,
+        )
+
+    def _record_training(self) -> None:
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+        super()._record_training()
+
+    def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
+        """As in the base class, but Gaussian noise decreases with the episodes."""
+        columns = super().log_columns(records)
+        if self.exploration == "gaussian_noise":
+            rates = records["exploration"] / (records["episodes"] + 1)
+            columns["rollout/exploration_rate"] = rates.tolist()
+        return columns

@@ -1,0 +1,395 @@
+"""Dyna-Q and Dyna-Q+: learning a model of the environment, and planning on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
+
+from rl_yardstick.agents.common.settings import (
+    check_at_least,
+    check_finite,
+    check_whole,
+    settings_of,
+    step_size,
+)
+from rl_yardstick.agents.compiled.generators import next_uniform
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
+from rl_yardstick.agents.tabular.one_step import QLearning
+from rl_yardstick.agents.tabular.policy import QTablePolicy
+from rl_yardstick.agents.tabular.updates import TabularAgent, action_at, best_value, room_at, update
+from rl_yardstick.machine_code.compiling import inlined
+from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+from rl_yardstick.safe_files.files import MAX_ARCHIVE_BYTES
+
+# The learnt model of the environment: the last outcomes of each pair of state and action.
+#
+# Compiled functions. A pair is the number ``obs * A + action``.
+
+
+class LearntModel(NamedTuple):
+    """The last K outcomes of each pair, with equal probabilities."""
+
+    next_obs: Ints  # shape (S, A, K)
+    rewards: Floats  # shape (S, A, K)
+    terminated: Bools  # whether they ended the episode, shape (S, A, K)
+    counts: Ints  # number of all outcomes, including dropped ones, shape (S, A)
+    # The pairs that planning draws from, in the order of their first visit, shape (S * A,).
+    pairs: Ints
+    n_pairs: Ints  # the number of these pairs, shape (1,)
+
+
+@inlined
+def n_kept(model: Any, obs: int, action: int) -> int:
+    """The number of outcomes of a pair in the model."""
+    return int(min(model.counts[obs, action], model.next_obs.shape[2]))
+
+
+@inlined
+def note_outcome(model: Any, env: Any) -> None:
+    """Store the environment's last step; a full pair loses its oldest outcome."""
+    place = model.counts[env.obs, env.action] % model.next_obs.shape[2]
+    model.next_obs[env.obs, env.action, place] = env.next_obs
+    model.rewards[env.obs, env.action, place] = env.reward
+    model.terminated[env.obs, env.action, place] = env.terminated
+    model.counts[env.obs, env.action] += 1
+
+
+@inlined
+def add_pair(model: Any, obs: int, action: int) -> None:
+    """Add a pair to those that planning draws from."""
+    if model.n_pairs[0] < len(model.pairs):  # also with numbers from a damaged file
+        model.pairs[model.n_pairs[0]] = obs * model.counts.shape[1] + action
+        model.n_pairs[0] += 1
+
+
+# The policy of tabular agents that learn a model, which their model file contains, too.
+
+# The largest size of the arrays, so that a model file can be read again.
+MOST_BYTES = MAX_ARCHIVE_BYTES * 15 // 16
+
+
+class ModelPolicy(QTablePolicy):
+    """Greedy in a table, with a learnt model of the environment beside it."""
+
+    model_type: ClassVar[Any] = LearntModel  # the model's NamedTuple of arrays
+
+    def __init__(
+        self,
+        observation_space: spaces.Discrete,
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        n_tables: int = 1,
+        outcomes_kept: int = 1,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, lr_schedule, n_tables, **kwargs)
+        self.outcomes_kept = 0
+        self.keep_outcomes(outcomes_kept)
+
+    def _sizes(self) -> dict[str, Any]:
+        return {**super()._sizes(), "outcomes_kept": self.outcomes_kept}
+
+    def keep_outcomes(self, n: int) -> None:
+        """Allocate the model for ``n`` outcomes of each pair; if n changes, it starts empty."""
+        most = self._most_outcomes()
+        if n > most:
+            raise ValueError(
+                f"{n} outcomes of {self.visit_counts[0].numel()} pairs of state and action are too "
+                f"many to keep: at most {most} of each"
+            )
+        if n != self.outcomes_kept:
+            self.outcomes_kept = n
+            n_states, n_actions = self.visit_counts.shape[1:]
+            for name, array in self._nothing_learnt(n_states, n_actions, n).items():
+                self.register_buffer(f"model_{name}", th.from_numpy(array))
+
+    def _most_outcomes(self) -> int:
+        """The largest number of outcomes of each pair that fits into a model file."""
+        n_states, n_actions = self.visit_counts.shape[1:]
+        with_one, with_two = (
+            n_states * sum(a.nbytes for a in self._nothing_learnt(1, n_actions, n).values())
+            for n in (1, 2)
+        )
+        tables = self.q_tables.nbytes + self.visit_counts.nbytes
+        return max(1 + int((MOST_BYTES - tables - with_one) // (with_two - with_one)), 0)
+
+    def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
+        """The arrays of an empty model, by name."""
+        shape = n_states, n_actions, n
+        return {
+            "next_obs": np.zeros(shape, dtype=np.int64),
+            "rewards": np.zeros(shape),
+            "terminated": np.zeros(shape, dtype=np.bool_),
+            "counts": np.zeros(shape[:2], dtype=np.int64),
+            "pairs": np.zeros(n_states * n_actions, dtype=np.int64),
+            "n_pairs": np.zeros(1, dtype=np.int64),
+        }
+
+    def _places(self, n_states: int, n_pairs: int) -> Mapping[str, tuple[int, int]]:
+        """The range (least, end) of arrays with indices of states, pairs or places."""
+        return {
+            "next_obs": (0, n_states),
+            "pairs": (0, n_pairs),
+            "n_pairs": (0, n_pairs + 1),
+            "counts": (0, 2**62),
+        }
+
+    @property
+    def model(self) -> Any:
+        """The model, as arrays that share the memory of the policy."""
+        buffers: Any = self._buffers
+        names: tuple[str, ...] = self.model_type._fields
+        return self.model_type(*(buffers[f"model_{name}"].numpy() for name in names))
+
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Load a table and a model."""
+        held = state_dict.get("model_next_obs")
+        if getattr(held, "ndim", 0) == 3 and held.shape[2] != self.outcomes_kept:
+            raise ValueError(
+                f"holds a model with room for {held.shape[2]} outcomes of each pair of state and "
+                f"action, and the settings ask for {self.outcomes_kept}: leave them as they were"
+            )
+        result = super().load_state_dict(state_dict, strict, assign)
+        self.check_places()
+        return result
+
+    def check_shapes(self) -> None:
+        """Raise ValueError for arrays of wrong shapes, which compiled code does not check."""
+        n_states, n_actions = self.visit_counts.shape[1:]
+        expected = self._nothing_learnt(n_states, n_actions, self.outcomes_kept)
+        for name, like in expected.items():
+            found = getattr(self.model, name)
+            if (found.dtype, found.shape) != (like.dtype, like.shape):
+                raise ValueError(
+                    f"model_{name} must be of shape {like.shape} and {like.dtype}, not "
+                    f"{found.shape} and {found.dtype}"
+                )
+
+    def check_places(self) -> None:
+        """Raise ValueError for a model with indices out of range."""
+        n_states, n_actions = self.visit_counts.shape[1:]
+        for name, (least, end) in self._places(n_states, n_states * n_actions).items():
+            numbers = getattr(self.model, name)
+            if not ((numbers >= least) & (numbers < end)).all():
+                raise ValueError(f"holds no model for these observations and actions: model_{name}")
+
+
+# The base of tabular agents that learn a model of their environment.
+
+MOST_PLANNING = 10**6  # updates after one step
+
+
+class ModelKeeper(TabularAlgorithm):
+    """Passes the model in its policy to compiled functions as ``agent.memory``."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": ModelPolicy}
+    policy: ModelPolicy
+    outcomes_kept: int = 1  # number of outcomes in the model for each pair of state and action
+
+    def _make_policy(self) -> QTablePolicy:
+        policy = super()._make_policy()
+        assert isinstance(policy, ModelPolicy)
+        policy.keep_outcomes(self.outcomes_kept)
+        return policy
+
+    def _memory_in_use(self) -> Any:
+        return self.policy.model
+
+    def _check_tables(self) -> None:
+        super()._check_tables()
+        self.policy.check_shapes()
+
+
+# Dyna-Q.
+
+
+@by_type
+def remember(agent: TabularAgent, env: Any) -> None:
+    """Update the model with the environment's last step."""
+    raise CompiledOnlyError
+
+
+@by_type
+def imagined_reward(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
+    """The reward in planning, given the model's ``reward``."""
+    raise CompiledOnlyError
+
+
+@inlined
+def remember_outcome(agent: TabularAgent, env: Any) -> None:
+    """Store the outcome; planning draws from tried pairs."""
+    if agent.memory.counts[env.obs, env.action] == 0:
+        add_pair(agent.memory, env.obs, env.action)
+    note_outcome(agent.memory, env)
+
+
+@inlined
+def remembered_reward(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
+    """The model's reward."""
+    return reward
+
+
+@inlined
+def imagine_step(agent: TabularAgent, progress: Any) -> None:
+    """Learn from the model's outcome of a random pair.
+
+    The remainder of the random number that draws the pair draws one of its outcomes.
+    """
+    settings, tables, model = agent.settings, agent.tables, agent.memory
+    drawn = next_uniform(agent.rng) * model.n_pairs[0]
+    pair = model.pairs[int(drawn)]
+    obs, action = pair // tables.values.shape[2], pair % tables.values.shape[2]
+    # The model of an untried pair: it stays in its state, with reward 0.
+    reward, next_obs, goes_on = 0.0, obs, True
+    if model.counts[obs, action] > 0:
+        k = int((drawn - int(drawn)) * n_kept(model, obs, action))
+        reward, next_obs = model.rewards[obs, action, k], model.next_obs[obs, action, k]
+        goes_on = not model.terminated[obs, action, k]
+    target = imagined_reward(agent, obs, action, reward)
+    if goes_on:
+        target += settings.gamma * best_value(tables, next_obs, agent.room)
+    count = max(tables.visit_counts[0, obs, action], 1)
+    size = step_size(progress.learning_rate, settings.averages_samples, count)
+    tables.values[0, obs, action] += size * (target - tables.values[0, obs, action])
+
+
+@inlined
+def learn_and_plan(agent: TabularAgent, envs: Any, progress: Any) -> None:
+    """For each environment, in order: learn from its step, remember it, and plan."""
+    total_error = 0.0
+    for i in range(len(envs)):
+        env = envs[i]
+        if not (env.terminated and agent.settings.skip_terminal_update):
+            total_error += abs(update(agent, env, progress))
+            remember(agent, env)
+            for _ in range(agent.settings.planning_steps):
+                imagine_step(agent, progress)
+        env.obs = env.new_obs
+    progress.mean_td_error = total_error if len(envs) == 1 else total_error / len(envs)
+
+
+class DynaQ(ModelKeeper, QLearning):
+    """Q-learning with planning on a learnt model (Sutton and Barto, section 8.2).
+
+    After each step it does ``planning_steps`` more updates, on pairs of state and action drawn
+    uniformly from those that were tried. (The book draws the state first.) The book's model has the
+    last outcome of a pair, which is enough in deterministic environments; for stochastic ones,
+    ``outcomes_kept`` stores more outcomes, of which an update draws one. Without planning this is
+    Q-learning, bit for bit.
+
+    Updates by planning are not counted: ``"sample_average"`` is 1/N after N real visits.
+
+    Args:
+        args: as in `TabularAlgorithm`.
+        planning_steps: updates from the model after each step of an environment.
+        outcomes_kept: as in `ModelKeeper`.
+        kwargs: as in `TabularAlgorithm`.
+    """
+
+    parameters = {"planning_steps": np.int64}  # noqa: RUF012
+    learn_from_step = learn_and_plan
+    remember = remember_outcome
+    imagined_reward = remembered_reward
+
+    def __init__(
+        self, *args: Any, planning_steps: int = 5, outcomes_kept: int = 1, **kwargs: Any
+    ) -> None:
+        self.planning_steps = planning_steps
+        self.outcomes_kept = outcomes_kept
+        super().__init__(*args, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
+        check_whole(1, settings_of(self, "outcomes_kept"))
+
+
+# Dyna-Q+.
+
+
+class DatedModel(NamedTuple):
+    """A model with the times of its outcomes."""
+
+    next_obs: Ints
+    rewards: Floats
+    terminated: Bools
+    counts: Ints
+    pairs: Ints
+    n_pairs: Ints
+    tried_at: Ints  # time of the last try of a pair, 0 for never, shape (S, A)
+    time: Ints  # steps of all environments so far, shape (1,)
+
+
+@inlined
+def remember_outcome_and_time(agent: TabularAgent, env: Any) -> None:
+    """Store the outcome and its time; planning draws from all actions of visited states."""
+    model = agent.memory
+    seen = 0
+    for action in range(model.counts.shape[1]):
+        seen += model.counts[env.obs, action]
+    if seen == 0:
+        room = room_at(agent.tables, env.obs, agent.room)
+        for k in range(len(room.values)):
+            add_pair(model, env.obs, action_at(agent.tables, room, k))
+    note_outcome(model, env)
+    model.time[0] += 1
+    model.tried_at[env.obs, env.action] = model.time[0]
+
+
+@inlined
+def reward_for_trying(agent: TabularAgent, obs: int, action: int, reward: float) -> float:
+    """The reward, plus a bonus that grows with the time since the last try."""
+    idle = agent.memory.time[0] - agent.memory.tried_at[obs, action]
+    return float(reward + agent.settings.kappa * math.sqrt(idle))
+
+
+class DatedModelPolicy(ModelPolicy):
+    """The policy of Dyna-Q+."""
+
+    model_type: ClassVar[Any] = DatedModel
+
+    def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
+        times = {
+            "tried_at": np.zeros((n_states, n_actions), dtype=np.int64),
+            "time": np.zeros(1, dtype=np.int64),
+        }
+        return {**super()._nothing_learnt(n_states, n_actions, n), **times}
+
+
+class DynaQPlus(DynaQ):
+    """Dyna-Q with an exploration bonus, for changing environments (Sutton and Barto, section 8.3).
+
+    In planning, a pair that was not tried for t steps gets a bonus of ``kappa`` * sqrt(t). Planning
+    uses all actions of visited states; the model of an untried pair is that it stays in its state
+    with reward 0 (the book's footnote). The values include the bonus, so they overestimate, and the
+    greedy policy may be worse: the less, the smaller ``kappa``.
+
+    Time is counted in steps of all environments together.
+
+    Args:
+        args: as in `DynaQ`.
+        kappa: weight of the bonus.
+        kwargs: as in `DynaQ`.
+    """
+
+    policy_aliases = {"QTablePolicy": DatedModelPolicy}  # noqa: RUF012
+    parameters = {"kappa": np.float64}  # noqa: RUF012
+    remember = remember_outcome_and_time
+    imagined_reward = reward_for_trying
+
+    def __init__(self, *args: Any, kappa: float = 0.001, **kwargs: Any) -> None:
+        self.kappa = kappa
+        super().__init__(*args, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_at_least(0.0, settings_of(self, "kappa"))
+        check_finite(settings_of(self, "kappa"))

@@ -1,0 +1,293 @@
+"""Monte Carlo control: learning from whole episodes, on-policy and off-policy."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from rl_yardstick.agents.common.exploration import greedy_action, highest_value
+from rl_yardstick.agents.common.settings import check_whole, settings_of
+from rl_yardstick.agents.compiled.learning_algorithm import StepSize
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.tabular.n_step import (
+    MOST_STEPS,
+    NOTHING_LEARNT,
+    EpisodicAlgorithm,
+    place_of,
+    probability_of,
+)
+from rl_yardstick.agents.tabular.policy import QTablePolicy
+from rl_yardstick.agents.tabular.updates import (
+    TabularAgent,
+    act_on_values,
+    choose,
+    move_towards,
+    values_at,
+)
+from rl_yardstick.machine_code.compiling import inlined
+from rl_yardstick.mdp.transition_model import Floats, Ints
+
+# Whole episodes, stored until the agent learns from them at their end.
+#
+# Source: Sutton and Barto (2nd edition), chapter 5.
+
+
+class EpisodeRecords(NamedTuple):
+    """The current episodes."""
+
+    states: Ints  # shape (n_envs, longest_episode)
+    actions: Ints  # shape (n_envs, longest_episode)
+    rewards: Floats  # shape (n_envs, longest_episode)
+    probabilities: Floats  # of the actions, by the policy, shape (n_envs, longest_episode)
+    lengths: Ints  # number of steps so far, shape (n_envs,)
+
+
+@by_type
+def learn_episode(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
+    """Learn from the record of environment ``i``; returns the mean absolute error."""
+    raise CompiledOnlyError
+
+
+@inlined
+def record_and_learn(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Store the step, and learn when the episode is over or fills the record."""
+    records = agent.memory
+    place = records.lengths[i]
+    records.states[i, place] = env.obs
+    records.actions[i, place] = env.action
+    records.rewards[i, place] = env.reward
+    records.probabilities[i, place] = env.probability
+    records.lengths[i] = place + 1
+    if not env.done and place + 1 < records.states.shape[1]:
+        return NOTHING_LEARNT
+    records.lengths[i] = 0
+    return float(learn_episode(agent, env, progress, i, place + 1))
+
+
+class RecordAlgorithm(EpisodicAlgorithm):
+    """Learns from whole episodes, when they are over.
+
+    The return of a truncated episode bootstraps from the value of its last state. An episode is
+    treated as truncated after ``longest_episode`` steps, and its rest as another episode.
+
+    Args:
+        policy: as in `TabularAlgorithm`.
+        env: as in `TabularAlgorithm`.
+        learning_rate: as in `TabularAlgorithm`; the textbook's is ``"sample_average"``.
+        longest_episode: maximal number of stored steps of an episode, at least 1.
+        kwargs: as in `TabularAlgorithm`.
+    """
+
+    learn_in = record_and_learn
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "QTablePolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: StepSize = "sample_average",
+        longest_episode: int = 10_000,
+        **kwargs: Any,
+    ) -> None:
+        self.longest_episode = longest_episode
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_whole(1, settings_of(self, "longest_episode"), MOST_STEPS // self.n_envs)
+
+    def _make_memory(self) -> EpisodeRecords:
+        shape = (self.n_envs, self.longest_episode)
+        states, actions = (np.zeros(shape, dtype=np.int64) for _ in range(2))
+        lengths = np.zeros(self.n_envs, dtype=np.int64)
+        return EpisodeRecords(states, actions, np.zeros(shape), np.zeros(shape), lengths)
+
+
+# The policy of off-policy Monte Carlo control: action values, and the sums of their weights.
+
+
+class ImportanceTablePolicy(QTablePolicy):
+    """Greedy in a table of action values, each the weighted mean of returns."""
+
+    # Sum of the weights of the returns of each entry, float64 of shape (T, S, A).
+    weights: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Discrete,
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+        self.register_buffer("weights", th.zeros_like(self.q_tables))
+
+
+# On-policy Monte Carlo control.
+
+
+class VisitRecords(NamedTuple):
+    """The fields of `EpisodeRecords`, and scratch for each entry's first visit, shape (S, A)."""
+
+    states: Ints
+    actions: Ints
+    rewards: Floats
+    probabilities: Floats
+    lengths: Ints
+    first_visits: Ints
+
+
+@inlined
+def value_where_cut_off(agent: TabularAgent, env: Any, progress: Any) -> float:
+    """The value of the policy's next action; 0 after a termination."""
+    if env.terminated:
+        return 0.0
+    env.next_action = choose(agent, env.next_obs, progress)
+    return float(agent.tables.values[0, env.next_obs, env.next_action])
+
+
+@inlined
+def note_first_visits(agent: TabularAgent, i: int, length: int) -> None:
+    """Fill in the step of each entry's first visit in the episode."""
+    records = agent.memory
+    for k in range(length - 1, -1, -1):
+        records.first_visits[records.states[i, k], records.actions[i, k]] = k
+
+
+@inlined
+def learn_from_visits(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
+    """Move each entry towards the return after its first visit, or after every visit."""
+    records = agent.memory
+    later = value_where_cut_off(agent, env, progress)
+    note_first_visits(agent, i, length)
+    total_error, n_learnt = 0.0, 0
+    for k in range(length - 1, -1, -1):
+        state, action = records.states[i, k], records.actions[i, k]
+        later = records.rewards[i, k] + agent.settings.gamma * later
+        if agent.settings.every_visit or records.first_visits[state, action] == k:
+            total_error += abs(move_towards(agent, progress, 0, state, action, later))
+            n_learnt += 1
+    return total_error / n_learnt
+
+
+class MonteCarlo(RecordAlgorithm):
+    """On-policy Monte Carlo control (Sutton and Barto, section 5.4).
+
+    It learns the values of the exploring policy, at the end of each episode. Exploring starts are
+    up to the environment: Blackjack has some.
+
+    Args:
+        args: as in `RecordAlgorithm`.
+        every_visit: learn from every visit of an entry in an episode, not only from the first.
+        kwargs: as in `RecordAlgorithm`.
+    """
+
+    parameters = {"every_visit": np.bool_}  # noqa: RUF012
+    learn_episode = learn_from_visits
+
+    def __init__(self, *args: Any, every_visit: bool = False, **kwargs: Any) -> None:
+        self.every_visit = every_visit
+        super().__init__(*args, **kwargs)
+
+    def _memory_in_use(self) -> VisitRecords:
+        room = np.empty(self.policy.q_tables.shape[1:], dtype=np.int64)
+        return VisitRecords._make((*self._memory, room))
+
+
+# Off-policy Monte Carlo control.
+
+# With larger weights their sum could become infinite.
+LARGEST_WEIGHT = 1e150
+
+
+class WeightedRecords(NamedTuple):
+    """The fields of `EpisodeRecords`, and the weights of the policy, shape (1, S, A)."""
+
+    states: Ints
+    actions: Ints
+    rewards: Floats
+    probabilities: Floats
+    lengths: Ints
+    weights: Floats
+
+
+@inlined
+def act_and_tell(agent: TabularAgent, env: Any, progress: Any) -> None:
+    """Act, and store the probability of the action."""
+    act_on_values(agent, env, progress)
+    room = values_at(agent, env.obs, 0)
+    env.probability = probability_of(agent, room, env.action, progress)
+
+
+@inlined
+def is_first_best(agent: TabularAgent, state: int, action: int) -> bool:
+    """Whether the action is the one of `predict`."""
+    room = values_at(agent, state, 0)
+    return bool(place_of(agent, room, action) == greedy_action(room.values, 0.0))
+
+
+@inlined
+def learn_by_importance(agent: TabularAgent, env: Any, progress: Any, i: int, length: int) -> float:
+    """Weigh returns by importance sampling ratios of the greedy to the exploring policy."""
+    records, values, weight = agent.memory, agent.tables.values, 1.0
+    later = 0.0 if env.terminated else highest_value(values_at(agent, env.next_obs, 0).values)
+    total_error, n_learnt = 0.0, 0
+    for k in range(length - 1, -1, -1):
+        state, action = records.states[i, k], records.actions[i, k]
+        later = records.rewards[i, k] + agent.settings.gamma * later
+        records.weights[0, state, action] += weight
+        agent.tables.visit_counts[0, state, action] += 1
+        error = later - values[0, state, action]
+        values[0, state, action] += weight / records.weights[0, state, action] * error
+        total_error += abs(error)
+        n_learnt += 1
+        if records.probabilities[i, k] <= 0.0 or not is_first_best(agent, state, action):
+            break
+        weight /= records.probabilities[i, k]
+        if weight > LARGEST_WEIGHT:
+            break
+    return total_error / n_learnt
+
+
+class OffPolicyMonteCarlo(RecordAlgorithm):
+    """Off-policy Monte Carlo control by weighted importance sampling (Sutton and Barto, 5.7).
+
+    It learns the values of the greedy policy while it explores, from the end of each episode back
+    to the last action that the greedy policy would not have taken. A truncated episode bootstraps
+    from the best value in its last state. A weight above 1e150 ends the learning from an episode.
+    The sums of the weights are saved with the table.
+
+    Args:
+        args: as in `RecordAlgorithm`; ``learning_rate`` can only be ``"sample_average"``.
+        kwargs: as in `RecordAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": ImportanceTablePolicy}
+    policy: ImportanceTablePolicy
+
+    act = act_and_tell
+    learn_episode = learn_by_importance
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        self._refuse_gaussian_noise("off_policy_monte_carlo")
+        if not self.averages_samples:
+            raise ValueError(
+                "off_policy_monte_carlo takes weighted means: learning_rate must be "
+                f"'sample_average', not {self.learning_rate!r}"
+            )
+
+    def _check_tables(self) -> None:
+        super()._check_tables()
+        if self.policy.weights.shape != self.policy.q_tables.shape:
+            shape = tuple(self.policy.q_tables.shape)
+            raise ValueError(
+                f"weights must be of shape {shape}, not {tuple(self.policy.weights.shape)}"
+            )
+
+    def _memory_in_use(self) -> WeightedRecords:
+        return WeightedRecords._make((*self._memory, self.policy.weights.numpy()))

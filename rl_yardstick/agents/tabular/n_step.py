@@ -1,0 +1,313 @@
+"""Methods that learn from the last n steps: n-step SARSA and tree backup."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from rl_yardstick.agents.common.exploration import action_probability, expected_value, highest_value
+from rl_yardstick.agents.common.settings import check_option, check_whole, settings_of
+from rl_yardstick.agents.compiled.learning_algorithm import StepSize
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
+from rl_yardstick.agents.compiled.worlds import UNDECIDED
+from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
+from rl_yardstick.agents.tabular.one_step import commit_to_next_action, committed_value
+from rl_yardstick.agents.tabular.updates import (
+    Room,
+    TabularAgent,
+    action_at,
+    commit,
+    exploration_rate,
+    move_towards,
+    value_ahead,
+    values_at,
+)
+from rl_yardstick.machine_code.compiling import inlined
+from rl_yardstick.mdp.transition_model import Floats, Ints
+
+# Learning from the environments one after the other, with a memory of each of their episodes.
+
+NOTHING_LEARNT = -1.0
+
+# Stored steps of all environments together: about 32 bytes each, also in a saved state.
+MOST_STEPS = 50_000_000
+
+
+@by_type
+def learn_in(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Learn from the step of environment ``i``."""
+    raise CompiledOnlyError
+
+
+@inlined
+def learning_in_turn(agent: TabularAgent, envs: Any, progress: Any) -> None:
+    """All commitments, then the environments in order."""
+    for i in range(len(envs)):
+        commit(agent, envs[i], progress)
+    total_error, n_learnt = 0.0, 0
+    for i in range(len(envs)):
+        env = envs[i]
+        error = learn_in(agent, env, progress, i)
+        if error >= 0.0:
+            total_error += error
+            n_learnt += 1
+        env.obs = env.new_obs
+        if env.done:
+            env.next_action = UNDECIDED
+    if n_learnt > 0:
+        progress.mean_td_error = total_error / n_learnt
+
+
+@inlined
+def place_of(agent: TabularAgent, room: Room, action: int) -> int:
+    """The index of an action's value in the room; -1 if it is not allowed."""
+    for k in range(len(room.values)):
+        if action_at(agent.tables, room, k) == action:
+            return k
+    return -1
+
+
+@inlined
+def probability_of(agent: TabularAgent, room: Room, action: int, progress: Any) -> float:
+    """The probability of the action under the exploring policy, by the values in the room."""
+    place = place_of(agent, room, action)
+    if place < 0:
+        return 0.0
+    settings, rate = agent.settings, exploration_rate(agent, progress)
+    return float(
+        action_probability(settings.strategy, room.values, rate, settings.tie_scale, place)
+    )
+
+
+class EpisodicAlgorithm(TabularAlgorithm):
+    """A tabular agent that stores more of an episode than its last step; see the base class.
+
+    Several environments share the table; each has its own memory. ``skip_terminal_update`` is not
+    supported, because the agent learns from a reward at many steps.
+
+    Raises:
+        ValueError: as in the base class, and with ``skip_terminal_update``.
+    """
+
+    learn_from_step = learning_in_turn
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.skip_terminal_update:
+            raise ValueError(
+                f"{type(self).__name__} learns from the last reward at many steps: "
+                "skip_terminal_update is for the agents that learn from single steps"
+            )
+
+    def _refuse_gaussian_noise(self, role: str) -> None:
+        """Raise ValueError for an exploration without known probabilities, which are needed."""
+        if self.exploration == "gaussian_noise":
+            raise ValueError(
+                f"{role} needs the probabilities of the actions, which gaussian_noise does not "
+                "give: take epsilon_greedy or boltzmann"
+            )
+
+
+# The last n steps of each environment, and learning from them together.
+#
+# Source: Sutton and Barto (2nd edition), chapter 7.
+
+
+class Windows(NamedTuple):
+    """Steps that the agent has not learnt from yet, a ring for each environment."""
+
+    states: Ints  # shape (n_envs, n_steps)
+    actions: Ints  # shape (n_envs, n_steps)
+    rewards: Floats  # shape (n_envs, n_steps)
+    oldest: Ints  # index of the first step in the ring, shape (n_envs,)
+    lengths: Ints  # number of steps in it, shape (n_envs,)
+
+
+@by_type
+def backed_up(agent: TabularAgent, progress: Any, obs: int, action: int, later: float) -> float:
+    """The backed-up value of a state in the window; ``later`` is the return after its action."""
+    raise CompiledOnlyError
+
+
+@inlined
+def windowed_return(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """The return of the oldest step in the window, from the newest backwards."""
+    windows, n_places = agent.memory, agent.memory.states.shape[1]
+    later = 0.0 if env.terminated else value_ahead(agent, env, progress, 0)
+    after = windows.lengths[i] - 1
+    for k in range(after, -1, -1):
+        place = (windows.oldest[i] + k) % n_places
+        if k < after:
+            next_place = (place + 1) % n_places
+            state, action = windows.states[i, next_place], windows.actions[i, next_place]
+            later = backed_up(agent, progress, state, action, later)
+        later = windows.rewards[i, place] + agent.settings.gamma * later
+    return float(later)
+
+
+@inlined
+def learn_oldest(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Learn from the oldest step in the window and drop it; returns its absolute error."""
+    windows, place = agent.memory, agent.memory.oldest[i]
+    target = windowed_return(agent, env, progress, i)
+    state, action = windows.states[i, place], windows.actions[i, place]
+    error = move_towards(agent, progress, 0, state, action, target)
+    env.target, env.td_error = target, error
+    windows.oldest[i] = (place + 1) % windows.states.shape[1]
+    windows.lengths[i] -= 1
+    return abs(error)
+
+
+@inlined
+def learn_from_window(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
+    """Learn from the step n steps ago, and at the end of an episode from all remaining steps."""
+    windows, n_places = agent.memory, agent.memory.states.shape[1]
+    place = (windows.oldest[i] + windows.lengths[i]) % n_places
+    windows.states[i, place] = env.obs
+    windows.actions[i, place] = env.action
+    windows.rewards[i, place] = env.reward
+    windows.lengths[i] += 1
+    if not env.done and windows.lengths[i] < n_places:
+        return NOTHING_LEARNT
+    error, n_learnt = learn_oldest(agent, env, progress, i), 1
+    while env.done and windows.lengths[i] > 0:
+        error += learn_oldest(agent, env, progress, i)
+        n_learnt += 1
+        env.target = env.td_error = math.nan  # there is more than one
+    return error / n_learnt
+
+
+class WindowAlgorithm(EpisodicAlgorithm):
+    """Learns from the rewards of ``n_steps`` steps, and bootstraps from the state after them.
+
+    A truncated episode bootstraps from its last state.
+
+    Args:
+        policy: as in `TabularAlgorithm`.
+        env: as in `TabularAlgorithm`.
+        learning_rate: as in `TabularAlgorithm`.
+        n_steps: number of rewards in a target, at least 1.
+        kwargs: as in `TabularAlgorithm`.
+    """
+
+    learn_in = learn_from_window
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "QTablePolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: StepSize = 0.1,
+        n_steps: int = 4,
+        **kwargs: Any,
+    ) -> None:
+        self.n_steps = n_steps
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_whole(1, settings_of(self, "n_steps"), MOST_STEPS // self.n_envs)
+
+    def _make_memory(self) -> Windows:
+        shape = (self.n_envs, self.n_steps)
+        states, actions = (np.zeros(shape, dtype=np.int64) for _ in range(2))
+        oldest, lengths = (np.zeros(self.n_envs, dtype=np.int64) for _ in range(2))
+        return Windows(states, actions, np.zeros(shape), oldest, lengths)
+
+
+# n-step SARSA.
+
+
+@inlined
+def sampled_return(
+    agent: TabularAgent, progress: Any, obs: int, action: int, later: float
+) -> float:
+    """The sampled return after the action."""
+    return later
+
+
+class NStepSARSA(WindowAlgorithm):
+    """n-step SARSA (Sutton and Barto, section 7.2); with one step it is SARSA."""
+
+    commit = commit_to_next_action
+    next_value = committed_value
+    backed_up = sampled_return
+
+
+# n-step tree backup.
+
+TargetPolicy = Literal["exploring", "greedy"]
+
+
+@inlined
+def target_mean(agent: TabularAgent, room: Room, progress: Any) -> float:
+    """The mean of the values in the room under the target policy."""
+    if agent.settings.targets_greedy:
+        return highest_value(room.values)
+    rate = exploration_rate(agent, progress)
+    return float(expected_value(agent.settings.strategy, room.values, rate))
+
+
+@inlined
+def target_probability(agent: TabularAgent, room: Room, action: int, progress: Any) -> float:
+    """The target policy's probability of the action; the greedy one gives 1 to any best action."""
+    if not agent.settings.targets_greedy:
+        return probability_of(agent, room, action, progress)
+    place = place_of(agent, room, action)
+    return 1.0 if place >= 0 and room.values[place] == highest_value(room.values) else 0.0
+
+
+@inlined
+def target_value_ahead(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
+    """The mean next value under the target policy."""
+    return target_mean(agent, agent.room, progress)
+
+
+@inlined
+def tree_backed_up(
+    agent: TabularAgent, progress: Any, obs: int, action: int, later: float
+) -> float:
+    """The mean value, with the return after the taken action in place of its value."""
+    room = values_at(agent, obs, 0)
+    probability = target_probability(agent, room, action, progress)
+    surprise = later - agent.tables.values[0, obs, action]
+    return float(target_mean(agent, room, progress) + probability * surprise)
+
+
+class NStepTreeBackup(WindowAlgorithm):
+    """n-step tree backup (Precup et al., 2000; Sutton and Barto, section 7.5).
+
+    For each state in the window it takes the mean value under the target policy, with the return
+    after the taken action in place of that action's value. So it is off-policy without importance
+    sampling. With one step it is Expected SARSA or, for the greedy target policy, Q-learning.
+
+    Args:
+        args: as in `WindowAlgorithm`.
+        target_policy: the policy whose values it learns: the ``"exploring"`` policy, with the
+            present epsilon or temperature, or the ``"greedy"`` one.
+        kwargs: as in `WindowAlgorithm`.
+    """
+
+    parameters = {"targets_greedy": np.bool_}  # noqa: RUF012
+    next_value = target_value_ahead
+    backed_up = tree_backed_up
+
+    def __init__(
+        self, *args: Any, target_policy: TargetPolicy = "exploring", **kwargs: Any
+    ) -> None:
+        self.target_policy = target_policy
+        super().__init__(*args, **kwargs)
+
+    @property
+    def targets_greedy(self) -> bool:
+        """Whether the target policy is greedy."""
+        return self.target_policy == "greedy"
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_option("target_policy", self.target_policy, TargetPolicy)
+        if not self.targets_greedy:
+            self._refuse_gaussian_noise("target_policy: exploring")

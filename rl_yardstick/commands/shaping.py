@@ -1,0 +1,286 @@
+"""``shaping.py``: whether rewards in training change the optimal policies, and at what cost."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rl_yardstick.commands.cli import OneLineParser, add_shared, assignments, filled
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.failures import exits_as_mistakes
+from rl_yardstick.pipeline.stopping import stops_noticed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import gymnasium as gym
+
+    from rl_yardstick.mdp.shaping import Effect
+    from rl_yardstick.mdp.transition_model import TransitionModel
+    from rl_yardstick.pipeline.train_spec import TrainSpec
+
+# The largest number of states printed in which other actions are best.
+MOST_STATES = 3
+# Returns that differ by less, relative to the optimum, are equal.
+ROUNDING = 1e-9
+
+EPILOG = """\
+examples:
+  python -m rl_yardstick shaping --env Warehouse-v0 --algo ppo
+  python -m rl_yardstick shaping --env Warehouse-v0 --train-env-kwargs shelf_reward:-1 --gamma 0.99
+  python -m rl_yardstick shaping --env FrozenLake-v1 \\
+    --wrapper rl_yardstick.envs.wrappers.TerminationReward reward:-1
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The flags."""
+    parser = OneLineParser(
+        description="Say whether training on other rewards changes the optimal policies, and what "
+        "that costs, exactly. Default: the changes that an agent's settings make in training.",
+        epilog=EPILOG,
+    )
+    add = parser.add_argument
+    add("--env", required=True, help="environment id (see train.py --list)")
+    add("--algo", default="ppo", help="agent whose settings and discount count (default: ppo)")
+    add_shared(parser, "--env-kwargs")
+    kwargs = "arguments of the environment in training, in place of those in the settings"
+    add("--train-env-kwargs", **assignments(), help=kwargs)
+    wrapper = "a wrapper of the environment in training, with arguments (KEY:VALUE ...), in place "
+    wrapper += "of those in the settings; repeat the flag to add a wrapper around it"
+    metavar = ("NAME", "KEY:VALUE")
+    add("--wrapper", nargs="+", action="append", default=[], metavar=metavar, help=wrapper)
+    add("--gamma", type=float, help="discount (default: the agent's)")
+    add_shared(parser, "--hyperparams", help="hyperparameters to change, e.g. gamma:0.9")
+    add_shared(parser, "--conf-file", "--gym-packages")
+    add("--json", type=filled, metavar="FILE", help="also write the result to this file")
+    return parser
+
+
+def main() -> int:
+    """Parse the arguments and print the effect of the training rewards; return the exit code."""
+    args = build_parser().parse_args()
+    with stops_noticed(), exits_as_mistakes():
+        from rl_yardstick.commands.terminal import TextConsole, say
+        from rl_yardstick.pipeline.environments import make_single_env, training_changes
+        from rl_yardstick.pipeline.signs_of_life import doing
+
+        console = TextConsole(highlight=False)
+        spec = _spec(args)
+        discount = _discount(args, spec)
+        changes = ", ".join(training_changes(spec)) or "nothing"
+        say(console, f"{spec.env_id}; changed in training: {changes}")
+        with closing(make_single_env(spec)) as env:
+            with doing(console, "planning"):
+                compared = _compared(spec, env, discount)
+            for line in compared.lines():
+                say(console, line)
+        if args.json is not None:
+            from rl_yardstick.pipeline.files import write_json
+
+            write_json(Path(args.json), {"changes": changes, **compared.as_data()})
+    return 0
+
+
+# --- input ----------------------------------------------------------------------------------------
+
+
+def _spec(args: argparse.Namespace) -> TrainSpec:
+    """The settings of the agent, with the changes in training."""
+    from rl_yardstick.pipeline.agent_settings import (
+        check_algorithm,
+        resolved_spec,
+        training_follows,
+    )
+    from rl_yardstick.pipeline.environments import check_env_id, with_maps_read
+    from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
+    from rl_yardstick.pipeline.settings.values import parse_assignments
+    from rl_yardstick.pipeline.user_modules import import_typed
+
+    modules = import_typed(args.gym_packages, [args.env])
+    check_algorithm(args.algo)
+    check_env_id(args.env)
+    changes = parse_assignments(args.hyperparams, "-params")
+    typed = parse_assignments(args.env_kwargs, "--env-kwargs")
+    entry = read_hyperparams(args.algo, args.env, args.conf_file, typed)
+    if typed:
+        changes["env_kwargs"] = {**(entry.get("env_kwargs") or {}), **typed}
+    if args.train_env_kwargs or args.wrapper:
+        changes["train_env_kwargs"] = parse_assignments(args.train_env_kwargs, "--train-env-kwargs")
+        changes["train_env_wrapper"] = [
+            {name: parse_assignments(given, "--wrapper")} for name, *given in args.wrapper
+        ]
+    raw, _ = training_follows(override(entry, changes), {**changes, "env_kwargs": typed})
+    raw, packages = with_maps_read(args.env, raw), tuple(module.name for module in modules)
+    spec = resolved_spec(raw, algo=args.algo, env_id=args.env, seed=0, gym_packages=packages)
+    for key in ("normalize", "vec_env_wrapper"):
+        if getattr(spec.hyperparams, key):
+            raise UserError(f"{key}: the rewards that it makes have no model to compare")
+    return spec
+
+
+def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
+    """The discount of the flag, else of the settings, else the default of the agent's class."""
+    found = spec.hyperparams.algorithm.get("gamma") if args.gamma is None else args.gamma
+    if found is None:
+        from rl_yardstick.agents import load_algorithm
+
+        classes = load_algorithm(spec.algo).__mro__
+        given = [inspect.signature(each).parameters.get("gamma") for each in classes[:-1]]
+        found = next((one.default for one in given if one is not None), None)
+    if not isinstance(found, int | float) or not 0 <= found <= 1:
+        raise UserError(f"--gamma: a discount from 0 to 1 is needed, not {found}")
+    return float(found)
+
+
+def _model(spec: TrainSpec, env: gym.Env[Any, Any]) -> TransitionModel:
+    """The model of an environment with its wrappers; `UserError` if it is not known."""
+    from rl_yardstick.envs.known_models import model_check, transition_model, unknown_wrapper
+
+    model = transition_model(env)
+    if model is not None:
+        return model
+    if (wrapper := unknown_wrapper(env)) is not None:
+        raise UserError(f"the effect of {wrapper} on the model is not known: nothing to compare")
+    check = model_check(env)
+    reason = None if check is None else check.refusal
+    raise UserError(reason or f"the model of {spec.env_id} is not known, so there is no optimum")
+
+
+# --- results --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Compared:
+    """The optimal policies of two rewards, compared."""
+
+    env: gym.Env[Any, Any]  # in which policies are judged
+    model: TransitionModel
+    horizon: int
+    effects: dict[float, Effect]  # by discount; the last one undiscounted, under the time limit
+
+    def lines(self) -> Iterator[str]:
+        """The comparison in words."""
+        optimum = self.effects[1.0].optimum
+        for discount, found in self.effects.items():
+            of = f"{int(found.differs.sum()):,} of {int(self.model.reachable.sum()):,} states"
+            differ = f"NOT the same policies are optimal: the best actions differ in {of}"
+            told = "the same policies are optimal" if found.is_same else differ
+            where = (
+                f"discount {discount:g}" if discount < 1 else f"no discount, {self.horizon:,} steps"
+            )
+            yield f"{where}: {told}"
+            met = [place for place in self.places(found) if place["met"] > 0]
+            for place in met[:MOST_STATES]:
+                told = f"{place['met']:.1%} of episodes part here, worth {place['gain']:.4g}"
+                if place["optimal"] != place["shaped"]:
+                    sets = (" or ".join(place[name]) for name in ("optimal", "shaped"))
+                    told = "best is {}, with the changes {}; {}".format(*sets, told)
+                yield f"  {place['state']}: {told}"
+            if not found.is_same and not met:
+                yield "  nothing is lost in states that optimal policies with the changes reach"
+            yield f"  {_cost(found, optimum)}"
+        for discount, found in self.effects.items():
+            if discount < 1:
+                yield _potential(found)
+
+    def places(self, found: Effect) -> list[dict[str, Any]]:
+        """The states with other best actions, the largest loss of return first."""
+        import numpy as np
+
+        from rl_yardstick.envs.layout import action_names, grid_layout, state_name
+        from rl_yardstick.mdp.gaps import first_differences
+
+        states = np.flatnonzero(found.differs)
+        if not len(states):
+            return []
+        policies = found.policy, found.worst_policy
+        split = first_differences(self.model, *policies, self.horizon)
+        layout, names = grid_layout(self.env), action_names(self.env)
+        if layout is not None and layout.n_states != self.model.n_states:
+            layout = None
+        named = [names[a] if a < len(names) else f"action {a}" for a in range(self.model.n_actions)]
+        return [
+            {
+                "state": state_name(self.env, layout, int(state)),
+                "optimal": [named[action] for action in np.flatnonzero(found.optimal[state])],
+                "shaped": [named[action] for action in np.flatnonzero(found.shaped[state])],
+                "met": float(split.met[state]),
+                "gain": float(split.gains[state]),
+            }
+            for state in states[np.lexsort((-split.met[states], -split.gains[states]))]
+        ]
+
+    def as_data(self) -> dict[str, Any]:
+        """The comparison as JSON data."""
+        objectives = [
+            {
+                "discount": discount,
+                "time_limit": None if discount < 1 else self.horizon,
+                "same": found.is_same,
+                "n_states": int(self.model.reachable.sum()),
+                "n_differing": int(found.differs.sum()),
+                "optimum": found.optimum,
+                "returns": found.returns,
+                "cost": [found.optimum - each for each in found.returns],
+                "judged": found.judged,
+                "judged_before": found.judged_before,
+                "factor": found.factor,
+                "potential": None if found.potential is None else found.potential.tolist(),
+                "states": self.places(found),
+            }
+            for discount, found in self.effects.items()
+        ]
+        return {"optimum": self.effects[1.0].optimum, "objectives": objectives}
+
+
+def _compared(spec: TrainSpec, env: gym.Env[Any, Any], discount: float) -> Compared:
+    """Compute optimal policies of both models; `UserError` if they cannot be compared."""
+    from rl_yardstick.envs.known_models import time_limit
+    from rl_yardstick.mdp.shaping import discounted_effect, effect_under_limit
+    from rl_yardstick.pipeline.environments import make_single_env
+
+    with closing(make_single_env(spec, training=True)) as training:
+        shaped = _model(spec, training)
+    original, horizon = _model(spec, env), time_limit(env)
+    assert horizon is not None  # evaluations always have one
+    effects = {}
+    try:
+        if discount < 1:
+            effects[discount] = discounted_effect(original, shaped, discount, horizon)
+        effects[1.0] = effect_under_limit(original, shaped, horizon)
+    except ValueError as error:
+        raise UserError(f"{spec.env_id}: {error}") from error
+    return Compared(env, original, horizon, effects)
+
+
+def _cost(found: Effect, optimum: float) -> str:
+    """The undiscounted returns of optimal policies, with and without the changes."""
+    near = ROUNDING * max(1.0, abs(optimum))
+
+    def span(best: float, worst: float, form: str = ".6g") -> str:
+        ends = sorted((best, worst))
+        return " to ".join(f"{end:{form}}" for end in ends[: 1 + (ends[1] - ends[0] > near)])
+
+    lost = [one - other for one, other in zip(found.judged_before, found.judged, strict=True)]
+    cost = "nothing" if max(map(abs, lost)) <= near else span(lost[0], lost[1], ".4g")
+    told = f"with the changes optimal policies return {span(*found.judged)}"
+    if optimum - found.judged_before[1] > near:
+        told += f", without {span(*found.judged_before)}"
+    return f"{told}; the optimum is {optimum:.6g}: the changes cost {cost}"
+
+
+def _potential(found: Effect) -> str:
+    """Whether the change of rewards is a potential difference (Ng, Harada and Russell, 1999)."""
+    if found.factor is None or found.potential is None:
+        return "the changed rewards are not the original ones plus the difference of a potential"
+    factor = "" if found.factor == 1 else f"{found.factor:.6g} x "
+    if not found.potential.any():
+        return f"the changed rewards are {factor or 'equal to '}the original ones"
+    low, high = found.potential.min(), found.potential.max()
+    told = f"the changed rewards are {factor}the original ones plus the difference of a potential"
+    return f"{told}, which goes from {low:.4g} to {high:.4g}"

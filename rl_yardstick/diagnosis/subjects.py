@@ -1,0 +1,545 @@
+"""What is audited: classes in Stable-Baselines3's style, and functions that train."""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from rl_yardstick.agents.registry import ALGORITHMS, AlgorithmEntry, load_algorithm
+from rl_yardstick.diagnosis.probe_worlds import (
+    Actions,
+    Observations,
+    ProbeEnv,
+    Record,
+    World,
+    action_number,
+    make_env,
+)
+from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.errors import UserError, one_line, unknown
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.callbacks import BaseCallback
+
+GAMMA = 0.8
+
+# The next value in a target: that of the best action; that of the learner's next action; or the
+# state's under the learner's policy, for learners without action values.
+Target = Literal["maximises", "follows", "states"]
+KINDS: Mapping[str, Target] = {
+    "q_learning": "maximises",
+    "off_policy_monte_carlo": "maximises",
+    "sarsa": "follows",
+    "expected_sarsa": "follows",
+    "actor_critic": "states",
+    "policy_gradient": "states",
+}
+
+# Settings of all audits, unless others are given: full exploration, and targets of one step.
+BASE: Mapping[str, Any] = {
+    "exploration_initial_eps": 1.0,
+    "exploration_final_eps": 1.0,
+    "trace_decay": 0.0,
+    "n_steps": 1,
+}
+
+# Other names of settings; the first is the one that probes use.
+OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
+    "trace_decay": ("trace_decay", "lambda_", "lam", "lmbda", "td_lambda"),
+    "n_steps": ("n_steps", "n_step"),
+}
+
+
+class Trained(ABC):
+    """A learner that was trained in a world."""
+
+    def __init__(self, world: World, record: Record, env: ProbeEnv) -> None:
+        self.world, self.record, self._env = world, record, env
+
+    def observation(self, state: int) -> Any:
+        """The observation of a state."""
+        return self._env.observation_of(state)
+
+    @abstractmethod
+    def act(self, state: int) -> int:
+        """The action in a state when evaluated."""
+
+    @abstractmethod
+    def values(self) -> Floats | None:
+        """Its values, shape (S, 2) of actions or (S, 1) of states; None where it has none."""
+
+    @abstractmethod
+    def train(self, steps: int) -> None:
+        """Train for that many more steps."""
+
+    def state_values(self) -> Floats | None:
+        """State values, shape (S,): action values are averaged over the actions taken."""
+        values = self.values()
+        if values is None or values.shape[1] == 1:
+            return None if values is None else values[:, 0]
+        counts = self.record.counts()
+        weights = np.where(counts.sum(axis=1, keepdims=True) > 0, counts, 1)
+        means: Floats = np.average(values, axis=1, weights=weights)
+        return means
+
+
+class Subject(ABC):
+    """An algorithm under audit.
+
+    Attributes:
+        typed: settings that the user gave.
+        base: settings that learn tiny worlds, unless the user gave others.
+        steps: environment steps after which values are read first.
+        target: the kind of its targets; None where that is not known.
+        uses_ratio: whether it uses importance sampling, for a greedy target policy.
+        is_on_policy: whether it learns from rollouts, as the library's on-policy agents do.
+        has_values: whether its values can be read.
+        spaces: kinds of observations and actions.
+    """
+
+    typed: Mapping[str, Any]
+    steps = 2000
+    target: Target | None = None
+    uses_ratio = False
+    is_on_policy = False
+    has_values = True
+    spaces: tuple[Observations, Actions]
+
+    def __init__(self, name: str, kind: str | None) -> None:
+        self.name = name
+        self.base: dict[str, Any] = dict(BASE)
+        if kind is not None:
+            self.target = KINDS[kind]
+            self.uses_ratio = kind == "off_policy_monte_carlo"
+
+    @abstractmethod
+    def named(self, setting: str) -> str | None:
+        """The learner's name for this setting; None where it has no such setting."""
+
+    @abstractmethod
+    def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
+        """Train for that many steps with some settings changed."""
+
+    def accepts(self, setting: str) -> bool:
+        """Whether the learner has this setting."""
+        return self.named(setting) is not None
+
+    def find_spaces(self, wanted: tuple[Observations | None, Actions | None]) -> None:
+        """Take the first kinds of observations and actions that the learner can train on."""
+        errors = []
+        for observations in ("discrete", "box") if wanted[0] is None else (wanted[0],):
+            for actions in ("discrete", "box") if wanted[1] is None else (wanted[1],):
+                self.spaces = observations, actions
+                if self.misfit():
+                    continue
+                try:
+                    trained = self.begin(World(((0, 0), (1, 1))), 0, 40, {})
+                    trained.act(0)
+                    self.has_values = trained.values() is not None
+                    return
+                except UserError:
+                    raise
+                except Exception as error:  # noqa: BLE001 (user code may raise anything)
+                    errors.append(error)
+        if not errors:
+            raise UserError(f"{self.name} {self.misfit()}")
+        raise UserError(
+            f"{self.name} cannot train on a tiny world: {type(errors[0]).__name__}: "
+            f"{one_line(errors[0])} (--observations and --actions say what it needs)"
+        )
+
+    def misfit(self) -> str:
+        """Why it cannot train with its spaces; empty where it can."""
+        return ""
+
+    def world_env(self, world: World, record: Record) -> ProbeEnv:
+        """An environment to read observations and spaces from."""
+        return ProbeEnv(world, record, *self.spaces)
+
+
+# --- classes --------------------------------------------------------------------------------------
+
+
+class ClassSubject(Subject):
+    """A subclass of Stable-Baselines3's `BaseAlgorithm`."""
+
+    def __init__(
+        self,
+        name: str,
+        cls: type[BaseAlgorithm],
+        typed: Mapping[str, Any],
+        kind: str | None = None,
+        wanted: tuple[Observations | None, Actions | None] = (None, None),
+    ) -> None:
+        from rl_yardstick.pipeline.settings.components import build_algorithm_kwargs, default_policy
+        from rl_yardstick.pipeline.settings.values import algorithm_parameters
+
+        super().__init__(name, kind)
+        self.cls = cls
+        self.parameters = algorithm_parameters(cls)
+        entries = (entry for entry in ALGORITHMS.values() if _is_entry_of(entry, cls))
+        self.entry = next(entries, None)
+        self._find_family()
+        policy = self.parameters.get("policy")
+        settings: dict[str, Any] = dict(typed)
+        if policy is not None and policy.default is policy.empty and "policy" not in typed:
+            settings["policy"] = default_policy(cls, is_dict=False)
+        self.typed = build_algorithm_kwargs(cls, settings, "-params", (cls.__module__,))
+        self.find_spaces(wanted)
+
+    def _find_family(self) -> None:
+        """Set the settings that learn tiny worlds fast, and what the family claims to be."""
+        from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+        from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+        names = {ancestor.__name__ for ancestor in self.cls.__mro__}
+        family = next((name for name in _FAMILIES if name in names), None)
+        if family is not None:
+            target, self.steps, settings = _FAMILIES[family]
+            self.base |= settings
+            self.target = self.target or target
+        self.uses_ratio |= family == "OffPolicyMonteCarlo"
+        self.is_on_policy = issubclass(self.cls, OnPolicyAlgorithm)
+        self.engines = () if self.entry is None else self.entry.engines
+        self.has_network = self.is_on_policy or issubclass(self.cls, OffPolicyAlgorithm)
+        if self.is_on_policy or self.target == "states":
+            self.target = "states"
+
+    def misfit(self) -> str:
+        env = self.world_env(World(((0, 0),)), Record(1))
+        if self.entry is None:
+            return ""
+        return self.entry.misfit(env.observation_space, env.action_space)
+
+    def named(self, setting: str) -> str | None:
+        names = OTHER_NAMES.get(setting, (setting,))
+        return next((name for name in names if name in self.parameters), None)
+
+    def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
+        trained = TrainedModel(self, world, seed, changes)
+        trained.train(steps)
+        return trained
+
+
+# Families of the library and of ours, subclasses before base classes: kind of target, steps, and
+# settings that learn tiny worlds fast. Rates are constant, and exploration is full.
+_OFF_POLICY: Mapping[str, Any] = {
+    "learning_rate": 3e-3,
+    "buffer_size": 2000,
+    "learning_starts": 50,
+    "batch_size": 64,
+    "train_freq": 2,
+    "gradient_steps": 1,
+    "target_update_interval": 50,
+    "policy_kwargs": {"net_arch": [32]},
+}
+_ACTOR = {key: value for key, value in _OFF_POLICY.items() if key != "target_update_interval"}
+_ACTOR |= {"tau": 0.2, "ent_coef": 1e-3}
+_ON_POLICY: Mapping[str, Any] = {
+    "learning_rate": 5e-3,
+    "n_steps": 64,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gae_lambda": 0.0,
+    "policy_kwargs": {"net_arch": {"pi": [32], "vf": [32]}},
+}
+_FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
+    "OptimisticAlgorithm": ("maximises", 1000, {"bonus_scale": 1e-3, "known_after": 1}),
+    "RMax": ("maximises", 1000, {"known_after": 1}),
+    "OffPolicyMonteCarlo": ("maximises", 2000, {}),
+    "MonteCarlo": ("follows", 1000, {"learning_rate": 0.1}),
+    "NStepTreeBackup": ("follows", 1000, {}),
+    "NStepSARSA": ("follows", 1000, {}),
+    "SARSALambda": ("follows", 1000, {}),
+    "QLambda": ("maximises", 1000, {}),
+    "SARSA": ("follows", 1000, {}),
+    "ExpectedSARSA": ("follows", 1000, {}),
+    "QLearning": ("maximises", 1000, {}),
+    "DoubleQLearning": ("maximises", 2000, {}),
+    "PrioritizedSweeping": ("maximises", 1000, {}),
+    "SemiGradientSARSA": ("follows", 1000, {}),
+    "SemiGradientQ": ("maximises", 1000, {}),
+    "ActorCritic": ("states", 1000, {}),
+    "Reinforce": ("states", 1000, {"baseline": "value"}),
+    "QRDQN": (
+        "maximises",
+        250,
+        {**_OFF_POLICY, "policy_kwargs": {"net_arch": [32], "n_quantiles": 10}},
+    ),
+    "DQN": ("maximises", 250, _OFF_POLICY),
+    "DeepQLearning": ("maximises", 250, {**_OFF_POLICY, "learning_rate": 1e-3}),
+    "TQC": (
+        None,
+        250,
+        {**_ACTOR, "top_quantiles_to_drop_per_net": 0, "policy_kwargs": {"net_arch": [32]}},
+    ),
+    "CrossQ": (None, 1000, _ACTOR),
+    "SAC": (None, 250, _ACTOR),
+    "TD3": (None, 250, _ACTOR),
+    "A2C": ("states", 400, {**_ON_POLICY, "n_steps": 1, "learning_rate": 1e-2}),
+    "RecurrentPPO": (
+        "states",
+        256,
+        {
+            **_ON_POLICY,
+            "policy_kwargs": {"net_arch": {"pi": [32], "vf": [32]}, "lstm_hidden_size": 16},
+        },
+    ),
+    "TRPO": ("states", 256, {**_ON_POLICY, "n_critic_updates": 10}),
+    "OnPolicyAlgorithm": ("states", 256, _ON_POLICY),
+    "ARS": (None, 2000, {"n_delta": 4, "learning_rate": 0.05, "delta_std": 0.1}),
+}
+
+
+def _is_entry_of(entry: AlgorithmEntry, cls: type) -> bool:
+    module, _, name = entry.entry_point.partition(":")
+    return name == cls.__name__ and cls.__module__.split(".")[0] == module.split(".")[0]
+
+
+class TrainedModel(Trained):
+    """A `BaseAlgorithm` that was trained in a world."""
+
+    def __init__(
+        self, subject: ClassSubject, world: World, seed: int, changes: Mapping[str, Any]
+    ) -> None:
+        from stable_baselines3.common.logger import Logger
+
+        record = Record(world.n_states)
+        super().__init__(world, record, subject.world_env(world, record))
+        self.subject = subject
+        wanted = {**subject.base, "gamma": GAMMA, "seed": seed, "device": "cpu"}
+        wanted = {**wanted, **subject.typed, **changes}
+        named = {subject.named(key): value for key, value in wanted.items()}
+        settings = {name: value for name, value in named.items() if name is not None}
+        self.env = make_env(world, record, *subject.spaces)
+        # Copies: the library writes into policy_kwargs.
+        self.model = subject.cls(env=self.env, **deepcopy(settings))
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
+        self._has_begun = False
+
+    def train(self, steps: int, callback: BaseCallback | None = None) -> None:
+        self.model.learn(steps, callback=callback, reset_num_timesteps=not self._has_begun)
+        self._has_begun = True
+
+    def act(self, state: int) -> int:
+        return self.choose(state, deterministic=True)
+
+    def choose(self, state: int, *, deterministic: bool) -> int:
+        """The action in evaluation (``deterministic``), or one that may explore."""
+        observation = np.asarray(self.observation(state))
+        action, _ = self.model.predict(observation, deterministic=deterministic)
+        return action_number(action, self._env.action_space)
+
+    def drawn_actions(self, state: int, n: int) -> Floats:
+        """Actions as they are drawn in training, numbers of shape (n,)."""
+        observations = np.stack([np.asarray(self.observation(state))] * n)
+        actions, _ = self.model.predict(observations, deterministic=False)
+        return np.asarray(actions, dtype=np.float64).reshape(n)
+
+    def values(self) -> Floats | None:
+        states = list(range(self.world.n_states))
+        return values_of(self.model, [np.asarray(self.observation(s)) for s in states])
+
+
+def _takes_one_argument(function: Any) -> bool:
+    """Whether a user's method can be called with an observation alone."""
+    if not callable(function):
+        return False
+    try:
+        inspect.signature(function).bind(None)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def values_of(model: Any, observations: list[Any]) -> Floats | None:
+    """A model's values at observations, shape (n, 2) or (n, 1); None where it has none."""
+    policy = model.policy
+    batch = np.stack(observations)
+    for holder in (policy, model):
+        if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
+            found: Floats = np.asarray(table, dtype=np.float64)[batch]
+            return found
+    if hasattr(policy, "state_weights"):  # tiles
+        if len(policy.state_weights):
+            from rl_yardstick.agents.linear.tiles import tiles_of_all, vectors_of
+
+            vectors = vectors_of(policy.observation_space, batch)
+            active = tiles_of_all(policy.tiles, vectors)
+            return np.asarray(policy.state_weights.numpy()[active].sum(axis=1, keepdims=True))
+        return None if hasattr(model, "initial_preferences") else np.asarray(policy.sums(batch))
+    import torch as th
+
+    if _takes_one_argument(getattr(model, "values", None)):
+        return np.stack([np.atleast_1d(model.values(obs)) for obs in observations]).astype(float)
+    if not hasattr(policy, "obs_to_tensor"):
+        return None
+    policy.set_training_mode(False)
+    with th.no_grad():
+        tensor, _ = policy.obs_to_tensor(batch)
+        told = _network_values(model, policy, tensor)
+    values: Floats | None = None if told is None else told.double().numpy()
+    return values
+
+
+def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
+    """Values of networks, a tensor of shape (n, 2) or (n, 1); None where there are none."""
+    import torch as th
+
+    for holder in (model, policy):
+        if hasattr(holder, "q_net"):
+            return holder.q_net(tensor)
+        if hasattr(holder, "quantile_net"):
+            return holder.quantile_net(tensor).mean(dim=1)
+    if hasattr(policy, "lstm_critic"):  # each state after those that lead to it
+        values, shape = [], (policy.lstm_critic or policy.lstm_actor)
+        for last in range(len(tensor)):
+            start = th.zeros(shape.num_layers, 1, shape.hidden_size)
+            begins = th.zeros(last + 1)
+            begins[0] = 1
+            sequence = policy.predict_values(tensor[: last + 1], (start, start.clone()), begins)
+            values.append(sequence[-1])
+        return th.stack(values)
+    if hasattr(policy, "critic"):  # at the actor's action: values of other actions are not learnt
+        critics = policy.critic(tensor, policy._predict(tensor, deterministic=True))
+        critics = th.stack(critics) if isinstance(critics, tuple) else critics.transpose(0, 1)
+        return critics.reshape(len(critics), len(tensor), -1).mean(dim=(0, 2))[:, None]
+    return policy.predict_values(tensor) if hasattr(policy, "value_net") else None
+
+
+# --- single files ---------------------------------------------------------------------------------
+
+
+class ScriptSubject(Subject):
+    """A function ``train(make_env, seed, gamma, steps, ...)`` that returns a trained agent.
+
+    The agent has ``act(obs)``, an action, and ``values(obs)``, a number or one for each action.
+    Probes that need a setting give it as the argument of that name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        typed: Mapping[str, Any],
+        kind: str | None = None,
+        wanted: tuple[Observations | None, Actions | None] = (None, None),
+    ) -> None:
+        super().__init__(name, kind)
+        self.function, self.typed = function, typed
+        if self.target == "states":  # ``n_steps`` may be the length of a rollout
+            self.base = {key: value for key, value in BASE.items() if key != "n_steps"}
+        try:
+            self.parameters = inspect.signature(function).parameters
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{name}: {one_line(error)}") from error
+        needed = ("make_env", "seed", "gamma", "steps")
+        missing = [each for each in needed if self.named(each) is None]
+        if missing:
+            raise UserError(
+                f"{name} must take {', '.join(needed)}: {', '.join(missing)} is missing"
+            )
+        for key in typed:
+            if self.named(key) is None:
+                raise unknown(f"-params: unknown argument of {name}", key, self.parameters)
+        self.find_spaces(wanted)
+
+    def named(self, setting: str) -> str | None:
+        kinds = {parameter.kind for parameter in self.parameters.values()}
+        names = OTHER_NAMES.get(setting, (setting,))
+        if setting in ("make_env", "seed", "gamma", "steps") and (
+            inspect.Parameter.VAR_KEYWORD in kinds
+        ):
+            return setting
+        return next((name for name in names if name in self.parameters), None)
+
+    def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
+        trained = TrainedScript(self, world, seed, changes)
+        trained.train(steps)
+        return trained
+
+
+class TrainedScript(Trained):
+    """The agent that a script's function returned; more training starts from the beginning."""
+
+    def __init__(
+        self, subject: ScriptSubject, world: World, seed: int, changes: Mapping[str, Any]
+    ) -> None:
+        record = Record(world.n_states)
+        super().__init__(world, record, subject.world_env(world, record))
+        self.subject, self.seed = subject, seed
+        wanted = {**subject.base, **subject.typed, **changes}
+        self.settings = {
+            name: value for key, value in wanted.items() if (name := subject.named(key)) is not None
+        }
+        self.agent: Any = None
+        self.steps = 0
+
+    def train(self, steps: int) -> None:
+        self.steps += steps
+        self.record = Record(self.world.n_states)
+        self.agent = self.subject.function(
+            make_env=partial(make_env, self.world, self.record, *self.subject.spaces),
+            seed=self.seed,
+            **{"gamma": GAMMA, "steps": self.steps, **self.settings},
+        )
+        if not callable(getattr(self.agent, "act", None)):
+            raise UserError(f"{self.subject.name} must return something with act(obs)")
+
+    def act(self, state: int) -> int:
+        return action_number(self.agent.act(self.observation(state)), self._env.action_space)
+
+    def values(self) -> Floats | None:
+        if not callable(getattr(self.agent, "values", None)):
+            return None
+        found = [self.agent.values(self.observation(s)) for s in range(self.world.n_states)]
+        return np.stack([np.asarray(each, dtype=np.float64).reshape(-1) for each in found])
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+
+def class_named(name: str) -> type[BaseAlgorithm]:
+    """The class that ``--algo`` names: an agent of the table, or ``module:Class`` as imported."""
+    import sys
+
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from rl_yardstick.pipeline.agent_settings import check_algorithm
+
+    module, colon, attribute = name.rpartition(":")
+    if not colon:
+        check_algorithm(name)
+        entry = ALGORITHMS[name]
+        if entry.for_bandits:
+            raise UserError(f"--algo {name}: it is for bandits, and these worlds have states")
+        if entry.family in ("planning", "reference"):
+            raise UserError(f"--algo {name}: it does not learn")
+        return load_algorithm(name)
+    found = getattr(sys.modules[module], attribute, None)
+    if found is None:
+        raise UserError(f"--algo {name}: {module} has no {attribute}")
+    if not (isinstance(found, type) and issubclass(found, BaseAlgorithm)):
+        raise UserError(
+            f"--algo {name}: {attribute} is no subclass of Stable-Baselines3's BaseAlgorithm; a "
+            f"function that trains is audited by --script {name}"
+        )
+    return found
+
+
+def function_named(name: str) -> Callable[..., Any]:
+    """The function that ``--script module:function`` names, of a module that is imported."""
+    import sys
+
+    module, colon, attribute = name.rpartition(":")
+    found = getattr(sys.modules[module], attribute, None) if colon else None
+    if not callable(found):
+        raise UserError(f"--script takes module:function, and there is no function {name}")
+    return found  # type: ignore[no-any-return]

@@ -1,0 +1,421 @@
+"""Logged pulls in a CSV file, and replay of policies on them.
+
+Each row is one pull, under a header with the columns ``arm``, ``reward`` and, if known,
+``propensity``, the probability that the arm was chosen. All other columns are the context.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from io import TextIOWrapper
+from itertools import islice
+from pathlib import Path
+from typing import Any, TextIO
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rl_yardstick.envs.bandits.bandit import MAX_ARMS, Bandit
+from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+from rl_yardstick.safe_files.files import UnsafeFileError, opened
+
+ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
+
+MAX_BYTES = 1 << 30
+# An arm's linear model of the context needs the square of this in numbers.
+MAX_COLUMNS = 1000
+# Bounds within which squares of numbers, and the weights of rare pulls, stay usable.
+MAX_NUMBER, MIN_PROPENSITY = 1e15, 1e-9
+# Characters of a row; a thousand numbers take a tenth of that.
+MAX_ROW = 1 << 20
+MAX_CATEGORIES = 1_000_000
+ROWS_AT_ONCE = 10_000
+LONGEST_SHOWN, MOST_SHOWN = 60, 12  # characters of a name, and names, in a message
+NUMBER = "a finite number of no more than 1e15"
+
+
+class _LogReader:
+    """Reads a file in pieces as numbers: as text, a large file would take gigabytes."""
+
+    def __init__(self, path: Path, file: TextIO) -> None:
+        self.path = path
+        self.columns: dict[str, Floats] = {}
+        # The distinct values of text, numbered, if the context is one column of text.
+        self.words: dict[str, int] = {}
+        self.codes: list[Ints] = []  # the number of each row's text, in pieces
+        self._file = file
+        self._room = MAX_ROW  # characters that the present row may still have
+        self._reader = csv.reader(self._lines(), strict=True)
+
+    def read(self) -> None:
+        """Read all rows; ValueError where this is no such log, see `read_log`."""
+        rows = self._rows()
+        header = [name for _, cells in islice(rows, 1) for name in cells]
+        context = [name for name in header if name not in _WANTED]
+        either = context[0] if len(context) == 1 else None  # text in all rows, or numbers in all
+        any_number, mistake = False, None
+        pieces: dict[str, list[Floats]] = {name: [] for name in header}
+        while piece := list(islice(rows, ROWS_AT_ONCE)):
+            lines = [line for line, _ in piece]
+            columns_of_text = zip(*(cells for _, cells in piece), strict=True)
+            for name, texts in zip(header, columns_of_text, strict=True):
+                values = np.fromiter(map(_as_float, texts), np.float64)
+                pieces[name].append(values)
+                found = self._mistake(name, lines, texts, values)
+                if name != either:
+                    if found is not None:
+                        raise found
+                    continue
+                mistake = mistake or found
+                any_number |= not np.isnan(values).all()
+                if not any_number:
+                    self._number_words(name, texts)
+        if not (header and pieces[ARM]):
+            raise ValueError(f"{self.path} holds no pulls: a header and a row for each are needed")
+        if any_number:
+            self.words.clear()
+            if mistake is not None:
+                raise mistake
+        self.columns = {name: np.concatenate(values) for name, values in pieces.items()}
+
+    def _lines(self) -> Iterator[str]:
+        while line := self._file.readline(MAX_ROW + 1):  # one may go on for gigabytes
+            self._room -= len(line)
+            if self._room < 0:
+                raise csv.Error(f"a row has more than {MAX_ROW:,} characters")
+            yield line
+
+    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+        """The header and each row below it, of as many cells, each with its line number."""
+        n_cells = None
+        for row in self._reader:
+            self._room = MAX_ROW
+            if not row:
+                continue
+            cells, line = [cell.strip() for cell in row], self._reader.line_num
+            if n_cells is None:
+                self._check_header(cells)
+                n_cells = len(cells)
+            if len(cells) != n_cells:
+                raise ValueError(f"{self.path}, line {line} has {len(cells)} values, not {n_cells}")
+            yield line, cells
+
+    def _check_header(self, header: list[str]) -> None:
+        if len(header) > MAX_COLUMNS:
+            raise ValueError(f"{self.path} has {len(header):,} columns, more than {MAX_COLUMNS:,}")
+        for name in (ARM, REWARD):
+            if name not in header:
+                raise ValueError(f"{self.path} has no column {name!r}, only {some(header)}")
+        twice = next((name for name in header if header.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{self.path} has two columns {twice[:LONGEST_SHOWN]!r}")
+
+    def _mistake(
+        self, name: str, lines: list[int], texts: tuple[str, ...], values: Floats
+    ) -> ValueError | None:
+        """The error for the first number that is invalid or too large; None without one."""
+        wanted, valid = _WANTED.get(name, _CONTEXT)
+        wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
+        if not len(wrong):
+            return None
+        line, text = lines[wrong[0]], texts[wrong[0]]
+        shown = text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+        return ValueError(f"{self.path}, line {line}: {name} is {shown!r}, it must be {wanted}")
+
+    def _number_words(self, name: str, texts: tuple[str, ...]) -> None:
+        known = self.words
+        self.codes.append(np.array([known.setdefault(text, len(known)) for text in texts]))
+        if len(known) > MAX_CATEGORIES:
+            raise ValueError(f"{self.path}: {name} has more than {MAX_CATEGORIES:,} values of text")
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of some names, as a message lists them."""
+    text = ", ".join(name[:LONGEST_SHOWN] for name in names[:MOST_SHOWN])
+    return text if len(names) <= MOST_SHOWN else f"{text} and {len(names) - MOST_SHOWN:,} more"
+
+
+def _as_float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _is_arm(values: Floats) -> Bools:
+    is_arm: Bools = (values >= 0) & (values < MAX_ARMS) & (values == np.floor(values))
+    return is_arm
+
+
+def _is_propensity(values: Floats) -> Bools:
+    return (values >= MIN_PROPENSITY) & (values <= 1)
+
+
+# The valid values of a column: in words, and as a check of numbers.
+_CONTEXT = f"{NUMBER}: text can only be all of the context", np.isfinite
+_WANTED: Mapping[str, tuple[str, Callable[[Floats], Bools]]] = {
+    ARM: (f"a whole number from 0 to {MAX_ARMS - 1}", _is_arm),
+    REWARD: (NUMBER, np.isfinite),
+    PROPENSITY: (f"a probability from {MIN_PROPENSITY} to 1", _is_propensity),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedData:
+    """Logged pulls, in the order of the file."""
+
+    source: str  # the file, for messages
+    context_names: tuple[str, ...]  # the columns that make up the context, d of them
+    contexts: Floats  # before each pull, shape (n, d); text is given as its index in `categories`
+    arms: Ints  # shape (n,)
+    rewards: Floats  # shape (n,)
+    propensities: Floats | None  # the probability that each arm was chosen, shape (n,)
+    categories: tuple[str, ...] | None = None  # the values of a context of text, in order
+
+    def __len__(self) -> int:
+        return len(self.arms)
+
+    @property
+    def n_arms(self) -> int:
+        """One more than the highest arm that was pulled."""
+        return int(self.arms.max()) + 1
+
+    @property
+    def observation_space(self) -> spaces.Space[Any]:
+        """The space of the contexts: Discrete as `ReplayBandit` says, or a Box within bounds."""
+        if not self.context_names:
+            return spaces.Discrete(1)
+        if self.categories is not None:
+            return spaces.Discrete(len(self.categories))
+        if len(self.context_names) == 1:
+            values = np.unique(self.contexts)
+            if np.array_equal(values, np.arange(len(values))):
+                return spaces.Discrete(len(values))
+        rounded = self.contexts.astype(np.float32)
+        return spaces.Box(rounded.min(axis=0), rounded.max(axis=0), dtype=np.float32)
+
+    def observations(self, space: spaces.Space[Any]) -> NDArray[Any]:
+        """The contexts as observations in a given observation space.
+
+        Shape (n,) for Discrete, (n, d) for a Box; a ValueError if they do not fit.
+        """
+        if isinstance(space, spaces.Discrete):
+            return self._as_discrete(int(space.n))
+        n_columns = len(self.context_names)
+        if not isinstance(space, spaces.Box) or space.shape != (n_columns,) or self.categories:
+            raise ValueError(f"{self.source} has {self._described()}, the agent observes {space}")
+        return self.contexts.astype(np.float32)
+
+    def _as_discrete(self, n_contexts: int) -> Ints:
+        if n_contexts == 1 and not self.context_names:
+            return np.zeros(len(self), np.int64)
+        codes = self.contexts.astype(np.int64)
+        fits = len(self.context_names) == 1 and np.array_equal(codes, self.contexts)
+        if self.categories is not None:
+            fits = len(self.categories) == n_contexts
+        if not fits or codes.min() < 0 or codes.max() >= n_contexts:
+            wanted = f"one column of whole numbers from 0 to {n_contexts - 1}"
+            raise ValueError(f"{self.source} has {self._described()}, the agent observes {wanted}")
+        return codes[:, 0]
+
+    def _described(self) -> str:
+        """The contexts in words."""
+        if not self.context_names:
+            return "no context"
+        names = some(self.context_names)
+        if self.categories is None:
+            return f"the context {names}"
+        return f"the context {names} with {len(self.categories)} values of text"
+
+
+def read_log(path: str | Path) -> LoggedData:
+    """Read logged pulls.
+
+    Args:
+        path: a CSV file, separated by commas, with a header; see the module.
+
+    Raises:
+        ValueError: if it cannot be read, a column is missing or duplicated, a row is too short or
+            too long, an arm is not a whole number from 0, a number not finite or beyond 1e15, or a
+            propensity not from 1e-9 to 1. The message names file and line.
+    """
+    file = Path(path)
+    try:
+        with opened(file, MAX_BYTES) as binary:
+            log = _LogReader(file, TextIOWrapper(binary, encoding="utf-8-sig", newline=""))
+            log.read()
+    except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ValueError(f"cannot read {file}: {reason}") from error
+    columns, categories = log.columns, tuple(sorted(log.words))
+    names = tuple(name for name in columns if name not in _WANTED)
+    contexts = np.empty((len(columns[ARM]), len(names)))
+    for i, name in enumerate(names):
+        contexts[:, i] = columns[name]
+    if categories:
+        place = {word: i for i, word in enumerate(categories)}
+        contexts[:, 0] = np.array([place[word] for word in log.words])[np.concatenate(log.codes)]
+    return LoggedData(
+        source=str(path),
+        context_names=names,
+        contexts=contexts,
+        arms=columns[ARM].astype(np.int64),
+        rewards=columns[REWARD],
+        propensities=columns.get(PROPENSITY),
+        categories=categories or None,
+    )
+
+
+def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -> None:
+    """Pull arms uniformly at random, and write the log for `read_log`.
+
+    Args:
+        env: a bandit as `gymnasium.make` returns it; its observations are Discrete, or a Box of
+            one axis.
+        n: the number of pulls; episodes follow each other where one is too short.
+        seed: the seed of the environment and of the arms.
+        path: the file to write.
+    """
+    assert isinstance(env.action_space, spaces.Discrete)
+    n_arms = int(env.action_space.n)
+    # A separate stream: the environment uses that of the seed itself.
+    arms = np.random.default_rng([seed, 1]).integers(n_arms, size=n).tolist()
+    space = env.observation_space
+    if isinstance(space, spaces.Discrete):
+        names = ["context"] if space.n > 1 else []
+    else:
+        assert isinstance(space, spaces.Box)
+        names = [f"feature_{i}" for i in range(space.shape[0])]
+    context, _ = env.reset(seed=seed)
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*names, ARM, REWARD, PROPENSITY])
+        for arm in arms:
+            shown = np.ravel(context).tolist()[: len(names)]
+            context, reward, terminated, truncated, _ = env.step(arm)
+            writer.writerow([*shown, arm, reward, 1 / n_arms])
+            if terminated or truncated:
+                context, _ = env.reset()
+
+
+# The relative tolerance between a propensity and 1 / n_arms: files hold rounded numbers.
+TOLERANCE = 0.02
+
+
+class ReplayBandit(Bandit):
+    """Replay of logged pulls, of which only those of the same arm count.
+
+    ## Description
+    What would another policy have earned on the users of a log? If the log chose its arms uniformly
+    at random, replay answers without bias: go through the log, let the policy choose for each
+    context, and count the rows where it chooses the logged arm, because only there the reward is
+    known (Li, Chu, Langford and Wang, "Unbiased offline evaluation of contextual-bandit-based news
+    article recommendation algorithms", 2011). About one row in `n_arms` counts. The policy's mean
+    reward is estimated by the return divided by `matched_pulls`.
+
+    ## Action Space
+    `Discrete(n_arms)`: the arm to pull; the propensities determine their number.
+
+    ## Observation Space
+    `Discrete(1)` if the log has no context; `Discrete(n)` if its context is one column of text, or
+    one that holds every whole number from 0 to n - 1; else `Box` with a float32 for each column.
+    Text is numbered in alphabetical order.
+
+    ## Rewards
+    The logged reward where the arm is the logged one; otherwise 0.
+
+    ## Starting State
+    The context of the first row.
+
+    ## Episode End
+    The episode is truncated after the last row, or after `max_episode_steps` where that is given
+    to `gymnasium.make`.
+
+    ## Information
+    `step` gives `matched`, whether the arm was the logged one; `matched_pulls`, how often that has
+    been so in this episode; and `feedback_due`, always True. `reset` gives nothing. The best arm is
+    not known, so there is no regret.
+
+    If `matched` is False, the reward is unknown, and an agent must not learn from it. The bandit
+    agents skip it. Other agents, such as DQN, learn from the reward of 0. With uniform logging this
+    divides their estimate for each arm by `n_arms`, and does not change the order of the arms. No
+    random numbers are drawn.
+
+    ## Arguments
+    - `log`: the path to a CSV file with the columns `arm`, `reward` and `propensity`, and one for
+      each part of the context; see `envs.bandits.logged`. Every propensity must be one in
+      `n_arms`, within 2 %.
+    - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
+
+    ## Version History
+    - v0: the first version
+    """
+
+    kind = "replay"
+
+    def __init__(self, log: str | Path | None = None, render_mode: str | None = None) -> None:
+        if not isinstance(log, str | Path):
+            raise ValueError(f"log must be the path to a CSV file of logged pulls, not {log!r}")
+        data = read_log(log)
+        n_arms = _number_of_arms(data)
+        super().__init__(n_arms, data.observation_space, pulls=len(data), render_mode=render_mode)
+        self.data = data
+        observations = data.observations(data.observation_space)
+        self._contexts = observations.tolist() if observations.ndim == 1 else list(observations)
+        self.matched_pulls = 0
+        self.context = self._contexts[0]
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Choose an arm for the context of the present row.
+
+        Raises:
+            ValueError: if there is no such arm, or no row left.
+        """
+        arm, row = self._checked(action), self.pulls_done
+        if row == self.pulls:
+            raise ValueError(f"{self.data.source} has {self.pulls} rows: call reset after the last")
+        self.pulls_done += 1
+        matched = arm == int(self.data.arms[row])
+        self.matched_pulls += matched
+        reward = float(self.data.rewards[row]) if matched else 0.0
+        before = self.context
+        # After the last row there is no next context: the context stays.
+        self.context = self._contexts[min(self.pulls_done, self.pulls - 1)]
+        info = {
+            "matched": matched,
+            "matched_pulls": self.matched_pulls,
+            "feedback_due": True,
+        }
+        if matched:
+            self._show_pull(before, arm, reward)
+        return self.context, reward, False, self.pulls_done == self.pulls, info
+
+    def _true_means(self) -> None:
+        return None
+
+    def _begin(self) -> None:
+        self.matched_pulls = 0
+        self.context = self._contexts[0]
+
+
+def _number_of_arms(data: LoggedData) -> int:
+    """The number of arms of a uniform log; ValueError if it is not uniform, or does not say."""
+    if data.propensities is None:
+        raise ValueError(
+            f"{data.source} has no column 'propensity': replay needs one, each value the "
+            "probability with which the arm was chosen"
+        )
+    n_arms = max(data.n_arms, round(1 / float(np.median(data.propensities))), 2)
+    wrong = np.flatnonzero(np.abs(data.propensities * n_arms - 1) > TOLERANCE)
+    if len(wrong):
+        raise ValueError(
+            f"{data.source} did not choose among its {n_arms} arms uniformly: the propensity of "
+            f"pull {wrong[0] + 1} is {data.propensities[wrong[0]]:g}, not {1 / n_arms:.4g}; use "
+            f"inverse propensities instead: compare --logged {data.source} --policy RUN"
+        )
+    return n_arms

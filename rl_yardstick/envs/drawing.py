@@ -1,0 +1,489 @@
+"""Environments as pictures and in a window; the only module that draws with pygame."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from rl_yardstick.envs.argument_checks import check_choice
+
+if TYPE_CHECKING:
+    import pygame
+
+# The colours are those of Okabe and Ito ("Color universal design", 2008) where things must be told
+# apart, and every thing has a shape of its own, so that no meaning rests on colour alone.
+Colour = tuple[int, int, int]
+Point = tuple[float, float]
+
+FLOOR: Colour = (246, 244, 239)
+GRID: Colour = (226, 222, 212)
+SHELF: Colour = (84, 92, 107)
+SHELF_LIGHT: Colour = (112, 121, 138)
+SHELF_DARK: Colour = (62, 69, 82)
+BLUE: Colour = (0, 114, 178)
+DARK_BLUE: Colour = (0, 72, 120)
+SKY: Colour = (176, 214, 238)
+GREEN: Colour = (0, 142, 104)
+PALE_GREEN: Colour = (205, 235, 224)
+VERMILION: Colour = (213, 94, 0)
+ORANGE: Colour = (240, 170, 20)
+PALE_RED: Colour = (250, 226, 212)
+PALE_YELLOW: Colour = (252, 243, 206)
+INK: Colour = (38, 42, 50)
+WHITE: Colour = (255, 255, 255)
+
+
+class Disc(NamedTuple):
+    """A filled circle."""
+
+    centre: Point
+    radius: float
+    colour: Colour
+
+
+class Ring(NamedTuple):
+    """A circle's outline, its width inside the radius."""
+
+    centre: Point
+    radius: float
+    width: float
+    colour: Colour
+
+
+class Box(NamedTuple):
+    """A filled rectangle, its corners rounded."""
+
+    corner: Point
+    size: Point
+    rounding: float
+    colour: Colour
+
+
+class Polygon(NamedTuple):
+    """A filled polygon."""
+
+    points: tuple[Point, ...]
+    colour: Colour
+
+
+class Label(NamedTuple):
+    """A line of text."""
+
+    text: str
+    at: Point
+    height: float
+    colour: Colour
+    # The part of the text at this point: 0 its left end, 0.5 its middle, 1 its right end.
+    align: float = 0.5
+
+
+Shape = Disc | Ring | Box | Polygon | Label
+
+
+def _star(n_rays: int, outer: float, inner: float) -> tuple[Point, ...]:
+    radii = (outer, inner) * n_rays
+    angles = (math.pi * i / n_rays for i in range(2 * n_rays))
+    return tuple(
+        (0.5 + radius * math.sin(angle), 0.5 - radius * math.cos(angle))
+        for radius, angle in zip(radii, angles, strict=True)
+    )
+
+
+# Shapes in a unit square, y pointing down.
+_WHOLE_CELL: tuple[Point, Point, float] = ((0, 0), (1, 1), 0)
+_BOLT = ((0.58, 0.14), (0.24, 0.57), (0.46, 0.57), (0.40, 0.87), (0.76, 0.42), (0.53, 0.42))
+
+LETTER_SHAPES: dict[str, tuple[Shape, ...]] = {
+    "#": (
+        Box((0.03, 0.03), (0.94, 0.94), 0.10, SHELF_DARK),
+        Box((0.03, 0.03), (0.94, 0.86), 0.10, SHELF),
+        Box((0.14, 0.15), (0.72, 0.20), 0.04, SHELF_LIGHT),
+        Box((0.14, 0.47), (0.72, 0.20), 0.04, SHELF_LIGHT),
+    ),
+    "S": (Box(*_WHOLE_CELL, SKY), Ring((0.5, 0.5), 0.34, 0.07, BLUE)),
+    "G": (
+        Box(*_WHOLE_CELL, PALE_GREEN),
+        Box((0.27, 0.14), (0.07, 0.74), 0.03, INK),
+        Polygon(((0.34, 0.16), (0.82, 0.34), (0.34, 0.52)), GREEN),
+        Box((0.17, 0.84), (0.27, 0.06), 0.03, INK),
+    ),
+    "M": (
+        Box(*_WHOLE_CELL, PALE_RED),
+        Polygon(_star(8, 0.42, 0.26), INK),
+        Disc((0.5, 0.5), 0.30, INK),
+        Disc((0.5, 0.5), 0.13, VERMILION),
+    ),
+    "P": (
+        Box(*_WHOLE_CELL, PALE_YELLOW),
+        Disc((0.5, 0.5), 0.42, ORANGE),
+        Polygon(_BOLT, WHITE),
+    ),
+}
+EMPTIED_SHAPES: tuple[Shape, ...] = (
+    Box(*_WHOLE_CELL, FLOOR),
+    Ring((0.5, 0.5), 0.42, 0.04, GRID),
+)
+BURST_SHAPES: tuple[Shape, ...] = (
+    Polygon(_star(9, 0.50, 0.34), VERMILION),
+    Polygon(_star(9, 0.42, 0.28), ORANGE),
+)
+# Seen from above, driving up.
+ROBOT_SHAPES: tuple[Shape, ...] = (
+    Box((0.08, 0.17), (0.20, 0.27), 0.06, INK),
+    Box((0.72, 0.17), (0.20, 0.27), 0.06, INK),
+    Box((0.08, 0.57), (0.20, 0.27), 0.06, INK),
+    Box((0.72, 0.57), (0.20, 0.27), 0.06, INK),
+    Box((0.17, 0.09), (0.66, 0.82), 0.17, DARK_BLUE),
+    Box((0.20, 0.12), (0.60, 0.76), 0.15, BLUE),
+    Box((0.25, 0.19), (0.50, 0.26), 0.12, WHITE),
+    Disc((0.38, 0.32), 0.065, INK),
+    Disc((0.62, 0.32), 0.065, INK),
+    Ring((0.5, 0.66), 0.12, 0.05, SKY),
+)
+
+# One colour each, for maps whose cells are too small to show a shape.
+LETTER_COLOURS: dict[str, Colour] = {
+    "#": SHELF_LIGHT,
+    ".": FLOOR,
+    "S": SKY,
+    "G": GREEN,
+    "M": VERMILION,
+    "P": ORANGE,
+}
+TRAIL_WIDTH = 0.16
+
+
+def trail_shapes(sides: frozenset[int]) -> tuple[Shape, ...]:
+    """A line from the middle of a cell to some of its sides: 0 up, 1 down, 2 left, 3 right."""
+    half = TRAIL_WIDTH / 2
+    arms = {
+        0: Box((0.5 - half, 0), (TRAIL_WIDTH, 0.5), 0, BLUE),
+        1: Box((0.5 - half, 0.5), (TRAIL_WIDTH, 0.5), 0, BLUE),
+        2: Box((0, 0.5 - half), (0.5, TRAIL_WIDTH), 0, BLUE),
+        3: Box((0.5, 0.5 - half), (0.5, TRAIL_WIDTH), 0, BLUE),
+    }
+    return (Disc((0.5, 0.5), half, BLUE), *(arms[side] for side in sorted(sides)))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A moment of an episode in a grid world; cells are numbered row by row."""
+
+    rows: tuple[str, ...]
+    robot: int
+    steps: Collection[tuple[int, int]]  # neighbouring cells that it has gone from and to
+    collected: Collection[int]  # cells that it has emptied
+    last_action: int | None  # 0 up, 1 down, 2 left, 3 right; None before the first
+    title: str | None = None  # above the map as text; None for the latest move
+
+    def place(self, cell: int) -> tuple[int, int]:
+        """Row and column of a cell."""
+        return divmod(cell, len(self.rows[0]))
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A picture made of shapes, the hindmost first, all in pixels."""
+
+    size: tuple[int, int]
+    shapes: Sequence[Shape]
+
+
+class Renderer(ABC):
+    """Shows scenes, as pixels or in a window; pygame is imported when the first one is drawn.
+
+    Copies, pickled ones included, share no window: they open their own when they need it.
+    """
+
+    def __init__(self, fps: int, title: str) -> None:
+        self.fps = fps  # pictures a second in a window
+        self.title = title
+        self._window: pygame.Surface | None = None
+        self._clock: pygame.time.Clock | None = None
+
+    @abstractmethod
+    def paint(self, scene: Any) -> pygame.Surface:
+        """Draw a scene."""
+
+    def pixels(self, scene: Any) -> NDArray[np.uint8]:
+        """The picture of a scene, shape (height, width, 3)."""
+        import pygame
+
+        picture = self.paint(scene)
+        return np.ascontiguousarray(pygame.surfarray.array3d(picture).swapaxes(0, 1))
+
+    def show(self, scene: Any) -> None:
+        """Draw a scene into the window, at most ``fps`` times a second."""
+        import pygame
+
+        picture = self.paint(scene)
+        if self._window is None:
+            pygame.display.init()
+            pygame.display.set_caption(self.title)
+            self._window = pygame.display.set_mode(picture.get_size())
+            self._clock = pygame.time.Clock()
+        assert self._clock is not None
+        self._window.blit(picture, (0, 0))
+        pygame.event.pump()
+        pygame.display.update()
+        self._clock.tick(self.fps)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            import pygame
+
+            pygame.display.quit()
+            self._window = None
+
+
+class ChartRenderer(Renderer):
+    """Shows charts."""
+
+    def __reduce__(self) -> tuple[type[ChartRenderer], tuple[int, str]]:
+        return ChartRenderer, (self.fps, self.title)
+
+    def paint(self, scene: Chart) -> pygame.Surface:
+        import pygame
+
+        picture = pygame.Surface(scene.size)
+        picture.fill(FLOOR)
+        for shape in scene.shapes:
+            _draw(picture, shape, 1)
+        return picture
+
+
+MAX_SIDE = 1024
+MAX_CELL = 64
+# In smaller cells shapes cannot be told apart: each is filled with one colour.
+MIN_DETAILED_CELL = 12
+# Start, goal and robot of such maps are drawn across cells, large enough to be seen.
+MARKER = 28
+# The additional width of the trail on such maps, in pixels.
+TRAIL_MARKER = 4
+OVERSAMPLING = 4
+
+
+class GridRenderer(Renderer):
+    """Shows scenes on one map, whose common background is drawn once."""
+
+    def __init__(self, rows: tuple[str, ...], fps: int, title: str) -> None:
+        super().__init__(fps, title)
+        self.rows = rows
+        self.n_columns = len(rows[0])
+        longest = max(len(rows), self.n_columns)
+        self.cell = min(max(MAX_SIDE // longest, 1), MAX_CELL)
+        self.detailed = self.cell >= MIN_DETAILED_CELL
+        self._sprites: dict[tuple[tuple[Shape, ...], int], pygame.Surface] = {}
+
+    def __reduce__(self) -> tuple[type[GridRenderer], tuple[tuple[str, ...], int, str]]:
+        return GridRenderer, (self.rows, self.fps, self.title)
+
+    def paint(self, scene: Scene) -> pygame.Surface:
+        import pygame
+
+        picture = self._detailed(scene) if self.detailed else self._coarse(scene)
+        longest = max(picture.get_size())
+        if longest <= MAX_SIDE:
+            return picture
+        width, height = (max(1, side * MAX_SIDE // longest) for side in picture.get_size())
+        return pygame.transform.smoothscale(picture, (width, height))
+
+    def _detailed(self, scene: Scene) -> pygame.Surface:
+        picture = self._background.copy()
+        for cell in scene.collected:
+            self._put(picture, EMPTIED_SHAPES, cell)
+        for cell, sides in self._sides(scene).items():
+            self._put(picture, trail_shapes(frozenset(sides)), cell)
+        self._put_robot(picture, scene, self.cell)
+        return picture
+
+    def _coarse(self, scene: Scene) -> pygame.Surface:
+        import pygame
+
+        colours = self._colours.copy()
+        colours.reshape(-1, 3)[list(scene.collected)] = FLOOR
+        pixels = colours.repeat(self.cell, axis=0).repeat(self.cell, axis=1)
+        picture = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
+        for step in scene.steps:
+            first, last = (self._centre(cell) for cell in sorted(step))
+            area = pygame.Rect(first, (last[0] - first[0] + 1, last[1] - first[1] + 1))
+            picture.fill(BLUE, area.inflate(TRAIL_MARKER, TRAIL_MARKER))
+        for cell, letter in self._landmarks:
+            self._put(picture, LETTER_SHAPES[letter], cell, MARKER)
+        self._put_robot(picture, scene, MARKER)
+        return picture
+
+    @cached_property
+    def _background(self) -> pygame.Surface:
+        """Floor, lines between its cells, and all that stands on it."""
+        import pygame
+
+        size = (self.n_columns * self.cell, len(self.rows) * self.cell)
+        picture = pygame.Surface(size)
+        picture.fill(FLOOR)
+        for row, letters in enumerate(self.rows):
+            for column, letter in enumerate(letters):
+                if letter in LETTER_SHAPES:
+                    cell = row * self.n_columns + column
+                    self._put(picture, LETTER_SHAPES[letter], cell)
+        for x in range(self.cell, size[0], self.cell):
+            pygame.draw.line(picture, GRID, (x, 0), (x, size[1]))
+        for y in range(self.cell, size[1], self.cell):
+            pygame.draw.line(picture, GRID, (0, y), (size[0], y))
+        return picture
+
+    @cached_property
+    def _colours(self) -> NDArray[np.uint8]:
+        """One colour for each cell, shape (rows, columns, 3)."""
+        table = np.zeros((128, 3), np.uint8)
+        for letter, colour in LETTER_COLOURS.items():
+            table[ord(letter)] = colour
+        codes = np.frombuffer("".join(self.rows).encode("ascii"), np.uint8)
+        return table[codes].reshape(len(self.rows), self.n_columns, 3)
+
+    @cached_property
+    def _landmarks(self) -> list[tuple[int, str]]:
+        """Cells of the start and the goals."""
+        return [
+            (row * self.n_columns + column, letter)
+            for row, letters in enumerate(self.rows)
+            if "S" in letters or "G" in letters
+            for column, letter in enumerate(letters)
+            if letter in "SG"
+        ]
+
+    def _sides(self, scene: Scene) -> dict[int, set[int]]:
+        """Through which sides the trail leaves each of its cells: 0 up, 1 down, 2 left, 3 right."""
+        # The keys would coincide on a map of one column, where left and right do not occur.
+        side_of = {-1: 2, 1: 3} | {-self.n_columns: 0, self.n_columns: 1}
+        sides: dict[int, set[int]] = defaultdict(set)
+        for origin, target in scene.steps:
+            sides[origin].add(side_of[target - origin])
+            sides[target].add(side_of[origin - target])
+        return sides
+
+    def _put_robot(self, picture: pygame.Surface, scene: Scene, size: int) -> None:
+        import pygame
+
+        row, column = scene.place(scene.robot)
+        if self.rows[row][column] == "M":
+            self._put(picture, BURST_SHAPES, scene.robot, size * 3 // 2)
+        robot = self._sprite(ROBOT_SHAPES, size)
+        degrees = {None: 0, 0: 0, 1: 180, 2: 90, 3: 270}[scene.last_action]
+        self._blit(picture, pygame.transform.rotate(robot, degrees), scene.robot)
+
+    def _put(
+        self,
+        picture: pygame.Surface,
+        shapes: tuple[Shape, ...],
+        cell: int,
+        size: int | None = None,
+    ) -> None:
+        self._blit(picture, self._sprite(shapes, size or self.cell), cell)
+
+    def _blit(self, picture: pygame.Surface, sprite: pygame.Surface, cell: int) -> None:
+        """Draw a sprite centred on a cell; markers stay inside the picture."""
+        area = sprite.get_rect(center=self._centre(cell))
+        picture.blit(sprite, area if self.detailed else area.clamp(picture.get_rect()))
+
+    def _centre(self, cell: int) -> tuple[int, int]:
+        """The pixel in the middle of a cell."""
+        row, column = divmod(cell, self.n_columns)
+        return column * self.cell + self.cell // 2, row * self.cell + self.cell // 2
+
+    def _sprite(self, shapes: tuple[Shape, ...], size: int) -> pygame.Surface:
+        """Shapes as a square picture with smooth edges, drawn once for each size."""
+        import pygame
+
+        if (shapes, size) not in self._sprites:
+            large = pygame.Surface((size * OVERSAMPLING, size * OVERSAMPLING), pygame.SRCALPHA)
+            for shape in shapes:
+                _draw(large, shape, size * OVERSAMPLING)
+            self._sprites[shapes, size] = pygame.transform.smoothscale(large, (size, size))
+        return self._sprites[shapes, size]
+
+
+def _draw(surface: pygame.Surface, shape: Shape, scale: int) -> None:
+    import pygame
+
+    def point(at: tuple[float, float]) -> tuple[int, int]:
+        return round(at[0] * scale), round(at[1] * scale)
+
+    match shape:
+        case Polygon():
+            pygame.draw.polygon(surface, shape.colour, [point(at) for at in shape.points])
+        case Disc():
+            pygame.draw.circle(surface, shape.colour, point(shape.centre), shape.radius * scale)
+        case Ring():
+            width = max(1, round(shape.width * scale))
+            radius = shape.radius * scale
+            pygame.draw.circle(surface, shape.colour, point(shape.centre), radius, width)
+        case Label():
+            pygame.font.init()
+            font = pygame.font.Font(None, round(shape.height * scale))
+            text = font.render(shape.text, True, shape.colour)
+            x, y = point(shape.at)
+            surface.blit(text, (x - shape.align * text.get_width(), y - text.get_height() // 2))
+        case _:
+            area = pygame.Rect(point(shape.corner), point(shape.size))
+            rounding = round(shape.rounding * scale)
+            pygame.draw.rect(surface, shape.colour, area, border_radius=rounding)
+
+
+RENDER_MODES = ("ansi", "rgb_array", "human")
+
+
+class ShownEnv(gym.Env[Any, Any], ABC):
+    """An environment with three render modes: ``ansi``, ``rgb_array`` and ``human``."""
+
+    # Not annotated as ClassVar, since Gymnasium declares it as an attribute of the instance.
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
+
+    def __init__(self, render_mode: str | None) -> None:
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, RENDER_MODES)
+        self.render_mode = render_mode
+        self._renderer: Renderer | None = None
+
+    def render(self) -> str | NDArray[np.uint8] | None:
+        """As text (``ansi``), as a picture of shape (height, width, 3), or in a window."""
+        if self.render_mode is None:
+            gym.logger.warn("render() does nothing: the environment was made without render_mode")
+            return None
+        if self.render_mode == "ansi":
+            return self._text()
+        if self._renderer is None:
+            title = type(self).__name__ if self.spec is None else self.spec.id
+            self._renderer = self._make_renderer(self.metadata["render_fps"], title)
+        if self.render_mode == "rgb_array":
+            return self._renderer.pixels(self._picture())
+        self._renderer.show(self._picture())
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    @abstractmethod
+    def _text(self) -> str:
+        """The state as text."""
+
+    @abstractmethod
+    def _picture(self) -> Any:
+        """The state as the scene that the renderer paints."""
+
+    @abstractmethod
+    def _make_renderer(self, fps: int, title: str) -> Renderer:
+        """The renderer of the pictures."""

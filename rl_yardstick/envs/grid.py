@@ -1,0 +1,637 @@
+"""Worlds on a map: maps, moves, text, stepping and the exact model."""
+
+from __future__ import annotations
+
+import os
+import sys
+from abc import abstractmethod
+from array import array
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, TypeGuard
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rl_yardstick.envs.argument_checks import check_flag, check_number
+from rl_yardstick.envs.drawing import GridRenderer, Scene, ShownEnv
+from rl_yardstick.envs.finite_env import (
+    FiniteEnv,
+    Outcome,
+    as_dictionaries,
+    first_above,
+    summing_to_one,
+)
+from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
+from rl_yardstick.safe_files.files import UnsafeFileError, read_file
+
+START = "S"
+GOAL = "G"
+# 4096 x 4096 cells: a Q-table of four actions then fills half a gigabyte.
+MAX_STATES = 2**24
+# A letter and maybe a line break for each cell.
+MAX_MAP_BYTES = 3 * MAX_STATES
+UNREACHED = -1
+
+Description = Sequence[str] | str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap:
+    """A rectangular map of letters; row 0 is at the top, cells are numbered row by row."""
+
+    rows: tuple[str, ...]
+    codes: bytes  # the letters' ASCII codes, one per cell
+    start: int  # the cell of the only ``S``
+    distances: NDArray[np.int32]  # see `distances_to`, to the nearest goal; shape (cells,)
+
+    @classmethod
+    def read(cls, desc: Description, known: Collection[str], passable: Collection[str]) -> GridMap:
+        """Read and check a map.
+
+        Args:
+            desc: the rows; or the path to a text file that holds them; or that text itself,
+                which has at least one line break.
+            known: the letters that may occur.
+            passable: those of them that the way to the goal may lead over, ``S`` among them.
+
+        Raises:
+            ValueError: if the file cannot be read, rows differ in length, a letter is unknown,
+                there is not exactly one start or no goal, or no way between them. Where there
+                is a place to name, the message names row and column, counted from one.
+        """
+        rows, source = read_rows(desc), f"the map {desc}" if _is_path(desc) else "the map"
+        _check_shape(rows, source)
+        letters, n_columns = "".join(rows), len(rows[0])
+        if not set(letters) <= set(known):
+            cell = next(cell for cell, letter in enumerate(letters) if letter not in known)
+            raise ValueError(
+                f"{source}: unknown letter {letters[cell]!r} at {_place(cell, n_columns)}; "
+                f"known are {' '.join(known)}"
+            )
+        codes = letters.encode("ascii")
+        start = _only_start(codes, n_columns, source)
+        goals = [cell for cell, code in enumerate(codes) if code == ord(GOAL)]
+        if not goals:
+            raise ValueError(f"{source} has no goal: mark it with the letter {GOAL}")
+        free = np.isin(np.frombuffer(codes, np.uint8), [ord(letter) for letter in passable])
+        distances = distances_to(goals, free.reshape(len(rows), n_columns)).ravel()
+        if distances[start] == UNREACHED:
+            raise ValueError(
+                f"{source}: the goal at {_place(goals[0], n_columns)} cannot be reached from the "
+                f"start at {_place(start, n_columns)}"
+            )
+        return cls(rows, codes, start, distances)
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns."""
+        return len(self.rows[0])
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return len(self.codes)
+
+
+def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
+    """Moves from each cell to the nearest target over free cells, by breadth-first search.
+
+    Targets need not be free. -1 where no way leads to one; the shape is that of ``free``.
+    """
+    n_rows, n_columns = free.shape
+    # A border all around saves the search from asking whether it left the map. Plain Python on
+    # bytes takes a third of a second for a million cells, without a library to import.
+    width = n_columns + 2
+    unvisited = bytearray(np.pad(free, 1).tobytes())
+    distances = array("i", [UNREACHED]) * len(unvisited)
+    frontier = [(cell // n_columns + 1) * width + cell % n_columns + 1 for cell in targets]
+    n_moves = 0
+    while frontier:
+        reached = []
+        for cell in frontier:
+            unvisited[cell] = False
+            distances[cell] = n_moves
+        for cell in frontier:
+            for beside in (cell - width, cell + width, cell - 1, cell + 1):
+                if unvisited[beside]:
+                    unvisited[beside] = False
+                    reached.append(beside)
+        frontier = reached
+        n_moves += 1
+    padded = np.frombuffer(distances, np.int32).reshape(n_rows + 2, width)
+    return padded[1:-1, 1:-1].copy()
+
+
+def read_rows(desc: Description) -> tuple[str, ...]:
+    """The rows of a map, not checked yet; see `GridMap.read`."""
+    if _is_path(desc):
+        text = _read_file(Path(desc))
+    elif isinstance(desc, str):
+        text = desc
+    elif isinstance(desc, Sequence) and all(isinstance(row, str) for row in desc):
+        return tuple(desc)
+    else:
+        raise ValueError(
+            f"desc must be a list of rows, such as ['S.', '#G'], or the path to a text file, not "
+            f"{desc!r}"
+        )
+    return tuple(text.strip("\r\n").splitlines())
+
+
+def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:
+    return isinstance(desc, os.PathLike) or (isinstance(desc, str) and "\n" not in desc)
+
+
+def _read_file(path: Path) -> str:
+    try:
+        return read_file(path, MAX_MAP_BYTES).decode("utf-8-sig")
+    except OSError as error:
+        reason = str(error.strerror)
+    except UnsafeFileError as error:
+        raise ValueError(f"desc: {error}") from error
+    except UnicodeDecodeError:
+        reason = "it is not a text file in UTF-8"
+    raise ValueError(f"desc: cannot read the map file {path}: {reason}")
+
+
+def _check_shape(rows: tuple[str, ...], source: str) -> None:
+    if not rows or not rows[0]:
+        raise ValueError(f"{source} is empty")
+    n_columns = len(rows[0])
+    if len(rows) * n_columns > MAX_STATES:
+        raise ValueError(
+            f"{source} has {len(rows)} rows of {n_columns} cells, more than {MAX_STATES:,} cells"
+        )
+    for row, cells in enumerate(rows, 1):
+        if len(cells) != n_columns:
+            where = min(len(cells), n_columns)
+            raise ValueError(
+                f"{source}: row {row} has {len(cells)} cells and row 1 has {n_columns}: they "
+                f"differ from column {where + 1} on"
+            )
+
+
+def _only_start(codes: bytes, n_columns: int, source: str) -> int:
+    first = codes.find(ord(START))
+    if first < 0:
+        raise ValueError(f"{source} has no start: mark it with the letter {START}")
+    second = codes.find(ord(START), first + 1)
+    if second >= 0:
+        raise ValueError(
+            f"{source} has two starts, at {_place(first, n_columns)} and at "
+            f"{_place(second, n_columns)}; there must be one"
+        )
+    return first
+
+
+def _place(cell: int, n_columns: int) -> str:
+    row, column = divmod(cell, n_columns)
+    return f"row {row + 1}, column {column + 1}"
+
+
+MOVE_NAMES = ("up", "down", "left", "right")
+MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
+# For each action the way it is meant to go, then the two ways it may slip.
+POSSIBLE_MOVES = ((0, 2, 3), (1, 2, 3), (2, 0, 1), (3, 0, 1))
+
+
+@dataclass(frozen=True)
+class Tile:
+    """The effect of trying to move onto a cell.
+
+    Attributes:
+        reward: what the move earns.
+        blocked: the robot stays where it was.
+        terminated: the episode ends.
+        bonus: what is added the first time in an episode, None where there is nothing to collect.
+    """
+
+    reward: float
+    blocked: bool = False
+    terminated: bool = False
+    bonus: float | None = None
+
+
+class Move(NamedTuple):
+    """The outcome of one move."""
+
+    next_state: int
+    reward: float
+    terminated: bool
+    bumped: bool
+
+
+class GridDynamics:
+    """The dynamics of a robot on a map, for a single step and for all states at once.
+
+    A state is a cell plus the number of cells times a bit mask: bit i is set when the i-th
+    collectable cell, row by row, has been visited in this episode. Without collectable cells
+    the states are the cells. A state in which no move can be made, because the episode has ended
+    there or no robot can be there, leads to itself and terminates, as in Gymnasium's toy_text.
+
+    Args:
+        grid_map: the map.
+        tiles: what each letter of the map means.
+        edge: the effect of trying to leave the map.
+        slip: probability that a move goes sideways, half of it to each side.
+
+    Raises:
+        ValueError: if there are more than 2**24 states.
+    """
+
+    def __init__(
+        self, grid_map: GridMap, tiles: Mapping[str, Tile], edge: Tile, slip: float
+    ) -> None:
+        self.n_rows, self.n_columns = grid_map.n_rows, grid_map.n_columns
+        self.n_cells = grid_map.n_cells
+        self.codes = grid_map.codes
+        self.tiles = {ord(letter): tile for letter, tile in tiles.items()}
+        self.edge = edge
+        collectable = {code for code, tile in self.tiles.items() if tile.bonus is not None}
+        cells = [cell for cell, code in enumerate(self.codes) if code in collectable]
+        # Shifted no further than needed: a map can hold a million such cells.
+        if self.n_cells << min(len(cells), 64) > MAX_STATES:
+            raise ValueError(
+                f"the map has {self.n_cells} cells, {len(cells)} of them to collect: these make "
+                f"{self.n_cells} * 2**{len(cells)} states, more than {MAX_STATES:,}"
+            )
+        self.collectable_bits = {cell: 1 << i for i, cell in enumerate(cells)}
+        self.n_states = self.n_cells << len(cells)
+        self.outcome_prob = (1.0,) if slip == 0 else (1 - slip, slip / 2, slip / 2)
+
+    def move(self, state: int, direction: int) -> Move:
+        """Try to move one cell in a direction."""
+        collected, cell = divmod(state, self.n_cells)
+        here = self.tiles[self.codes[cell]]
+        if here.blocked or here.terminated:
+            return Move(state, 0.0, terminated=True, bumped=False)
+        row, column = divmod(cell, self.n_columns)
+        row += MOVES[direction][0]
+        column += MOVES[direction][1]
+        if not (0 <= row < self.n_rows and 0 <= column < self.n_columns):
+            return Move(state, self.edge.reward, self.edge.terminated, bumped=True)
+        target = row * self.n_columns + column
+        tile = self.tiles[self.codes[target]]
+        if tile.blocked:
+            return Move(state, tile.reward, tile.terminated, bumped=True)
+        reward = tile.reward
+        if tile.bonus is not None and not collected & self.collectable_bits[target]:
+            reward += tile.bonus
+            collected |= self.collectable_bits[target]
+        return Move(target + self.n_cells * collected, reward, tile.terminated, bumped=False)
+
+    def transition_model(self, initial: Floats) -> TransitionModel:
+        """The model as arrays, with the probabilities ``initial`` of starts, shape (S,).
+
+        There is one outcome, or three where moves may slip: as meant, then to the two sides.
+        """
+        chosen = np.array(POSSIBLE_MOVES)[:, : len(self.outcome_prob)]
+        next_state, reward, terminated = self._all_moves()
+        return TransitionModel(
+            prob=np.broadcast_to(self.outcome_prob, (self.n_states, *chosen.shape)),
+            next_state=next_state[:, chosen],
+            reward=reward[:, chosen],
+            terminated=terminated[:, chosen],
+            initial=initial,
+        )
+
+    def action_mask(self, state: int) -> Bools:
+        """The moves that neither a wall nor the edge stops, bool of shape (4,); all if none."""
+        free = [not self.move(state, direction).bumped for direction in range(len(MOVES))]
+        return np.array(free) | (not any(free))
+
+    def action_masks(self) -> Bools:
+        """`action_mask` of all states, bool of shape (S, 4)."""
+        entered, _ = self._entered()
+        free = ~self._per_code("blocked", np.bool_)[entered]
+        free |= self._over()[:, None]
+        free |= ~free.any(axis=1, keepdims=True)
+        return np.tile(free, (self.n_states // self.n_cells, 1))
+
+    def _all_moves(self) -> tuple[Ints, Floats, Bools]:
+        """`move` for all states and directions: next states, rewards, ends; each (S, 4)."""
+        entered, target = self._entered()
+        stays = self._per_code("blocked", np.bool_)[entered]
+        cells = np.arange(self.n_cells)[:, None]
+        destination = np.where(stays, cells, target)
+
+        bits = np.zeros(self.n_cells, np.int64)
+        bits[list(self.collectable_bits)] = list(self.collectable_bits.values())
+        found = np.where(stays, 0, bits[destination])
+        collected = np.arange(self.n_states // self.n_cells)[:, None, None]
+        bonus = np.where(found & ~collected, self._per_code("bonus", np.float64)[entered], 0.0)
+
+        next_state = destination + self.n_cells * (collected | found)
+        reward = self._per_code("reward", np.float64)[entered] + bonus
+        ends = self._per_code("terminated", np.bool_)[entered]
+        terminated = np.broadcast_to(ends, next_state.shape).copy()
+
+        over = self._over()
+        states = np.arange(self.n_states).reshape(-1, self.n_cells)
+        next_state[:, over] = states[:, over, None]
+        reward[:, over] = 0.0
+        terminated[:, over] = True
+        shape = (self.n_states, len(MOVES))
+        return next_state.reshape(shape), reward.reshape(shape), terminated.reshape(shape)
+
+    def _entered(self) -> tuple[NDArray[np.uint8], Ints]:
+        """The code of what each move meets, and the cell it aims at; each (cells, 4)."""
+        rows, columns = np.divmod(np.arange(self.n_cells)[:, None], self.n_columns)
+        steps = np.array(MOVES)
+        rows, columns = rows + steps[:, 0], columns + steps[:, 1]
+        inside = (rows >= 0) & (rows < self.n_rows) & (columns >= 0) & (columns < self.n_columns)
+        target = np.where(inside, rows * self.n_columns + columns, 0)
+        codes = np.frombuffer(self.codes, np.uint8)
+        # The edge takes the place of a letter: code 0, which no map holds.
+        return np.where(inside, codes[target], 0).astype(np.uint8), target
+
+    def _over(self) -> Bools:
+        """The cells from which no move can be made, shape (cells,)."""
+        over = self._per_code("blocked", np.bool_) | self._per_code("terminated", np.bool_)
+        found: Bools = over[np.frombuffer(self.codes, np.uint8)]
+        return found
+
+    def _per_code(self, name: str, dtype: type[Any]) -> NDArray[Any]:
+        """An attribute of the tiles as a table of ASCII codes, the edge's at 0, None as zero."""
+        table = np.zeros(128, dtype)
+        for code, tile in {0: self.edge, **self.tiles}.items():
+            table[code] = getattr(tile, name) or 0
+        return table
+
+
+ROBOT = "R"
+TRAIL = "*"
+# What a terminal of common size shows; of larger maps the part around the robot is drawn.
+MAX_ROWS = 40
+MAX_COLUMNS = 100
+RESET = "\x1b[0m"
+# Select Graphic Rendition of ECMA-48: 1 bold, 2 faint, 3x colours, 44 on blue.
+STYLES = {
+    ROBOT: "\x1b[1;37;44m",
+    TRAIL: "\x1b[34m",
+    "#": "\x1b[2m",
+    "S": "\x1b[36m",
+    "G": "\x1b[1;32m",
+    "M": "\x1b[1;31m",
+    "P": "\x1b[1;33m",
+}
+
+
+def render_text(scene: Scene) -> str:
+    """The latest action on a line, then the map: ``R`` the robot, ``*`` where it has been."""
+    robot_row, robot_column = scene.place(scene.robot)
+    rows = _window(robot_row, len(scene.rows), MAX_ROWS)
+    columns = _window(robot_column, len(scene.rows[0]), MAX_COLUMNS)
+    trail = {scene.place(cell) for step in scene.steps for cell in step}
+    marks = {(row, column): TRAIL for row, column in trail if scene.rows[row][column] != START}
+    marks[robot_row, robot_column] = ROBOT
+    opted_out = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
+    style = _coloured if sys.stdout.isatty() and not opted_out else str
+    lines = [_title(scene, rows, columns)]
+    for row in rows:
+        letters = (marks.get((row, column), scene.rows[row][column]) for column in columns)
+        lines.append("".join(map(style, letters)))
+    return "\n".join(lines) + "\n"
+
+
+def _title(scene: Scene, rows: range, columns: range) -> str:
+    move = "start" if scene.last_action is None else MOVE_NAMES[scene.last_action]
+    title = f"({move if scene.title is None else scene.title})"
+    if len(rows) < len(scene.rows) or len(columns) < len(scene.rows[0]):
+        title += f" rows {rows[0]}-{rows[-1]}, columns {columns[0]}-{columns[-1]}"
+    return title
+
+
+def _window(centre: int, length: int, most: int) -> range:
+    """At most ``most`` indices around ``centre``."""
+    first = max(0, min(centre - most // 2, length - most))
+    return range(first, min(first + most, length))
+
+
+def _coloured(letter: str) -> str:
+    return f"{STYLES[letter]}{letter}{RESET}" if letter in STYLES else letter
+
+
+Observation = int | NDArray[np.float32]
+
+
+class GridWorld(ShownEnv):
+    """A robot on a map of letters, moving up, down, left or right; the base of all grid worlds.
+
+    A subclass defines its letters in `tiles`; cells that neither block nor terminate can be walked
+    on. So that the arrays of `transition_model` replay an episode exactly, a subclass must keep
+    this rule: `reset` and `step` draw one uniform number each, even where nothing is random, and
+    choose by cumulative sum in the order of `initial_state_distrib` and `P`.
+
+    Args:
+        desc: the map: its rows, or the path to a text file. Exactly one ``S``, at least one ``G``.
+        tiles: what each letter means.
+        edge: the effect of trying to leave the map.
+        slip: probability that a move goes sideways, half of it to each side.
+        random_start: start each episode on any cell that can be walked on, holds nothing to
+            collect, and has a way to the goal, with equal probability, instead of on ``S``.
+        render_mode: ``"ansi"``, ``"rgb_array"``, ``"human"`` or None.
+
+    Attributes:
+        s: the state, an index; may be set to continue from another one.
+
+    Raises:
+        ValueError: if an argument is out of range or the map malformed; see `GridMap.read`.
+    """
+
+    def __init__(
+        self,
+        desc: Description,
+        tiles: Mapping[str, Tile],
+        edge: Tile,
+        *,
+        slip: float,
+        random_start: bool,
+        render_mode: str | None,
+    ) -> None:
+        slip = check_number("slip", slip, 0, 1)
+        self.random_start = check_flag("random_start", random_start)
+        super().__init__(render_mode)
+        passable = [
+            letter for letter, tile in tiles.items() if not (tile.blocked or tile.terminated)
+        ]
+        self.map = GridMap.read(desc, tiles, passable)
+        self.dynamics = GridDynamics(self.map, tiles, edge, slip)
+        self.observation_space = spaces.Discrete(self.dynamics.n_states)
+        self.action_space = spaces.Discrete(len(MOVES))
+        self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
+        self.s = self.map.start
+        self._steps: set[tuple[int, int]] = set()
+        self._last_action: int | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; ``options`` are not used."""
+        super().reset(seed=seed)
+        starts, thresholds = self._starts
+        drawn = np.searchsorted(thresholds, self.np_random.random(), side="right")
+        self.s = int(starts[drawn])
+        self._steps = set()
+        self._last_action = None
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), self._info(bumped=False)
+
+    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Try to move one cell; the class describes the results."""
+        action = int(action)
+        if not 0 <= action < len(MOVES):
+            raise ValueError(f"action {action} does not exist: 0 up, 1 down, 2 left, 3 right")
+        outcome = first_above(self._slip_thresholds, self.np_random.random())
+        move = self.dynamics.move(self.s, POSSIBLE_MOVES[action][outcome])
+        if self.render_mode is not None:
+            origin, target = self.s % self.map.n_cells, move.next_state % self.map.n_cells
+            if origin != target:
+                self._steps.add((origin, target))
+            self._last_action = action
+        self.s = move.next_state
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), move.reward, move.terminated, False, self._info(move.bumped)
+
+    def action_masks(self) -> Bools:
+        """Which moves neither a wall nor the edge stops, bool of shape (4,).
+
+        Where moves may slip, only the intended move counts. All moves are allowed in a cell that is
+        walled in, and where an episode has ended. The convention is that of sb3-contrib's agents.
+        """
+        return self.dynamics.action_mask(self.s)
+
+    def observation_of(self, states: AnyInts) -> NDArray[Any]:
+        """The observations of many states, shape (n,): here the states themselves."""
+        return states
+
+    def transition_model(self) -> TransitionModel:
+        """The exact dynamics as arrays; its states are numbered as `s`, whatever is observed."""
+        return self.dynamics.transition_model(self.initial_state_distrib)
+
+    @cached_property
+    def initial_state_distrib(self) -> Floats:
+        """Probabilities of the starting states, shape (S,)."""
+        starts, thresholds = self._starts
+        distribution = np.zeros(self.dynamics.n_states)
+        distribution[starts] = _equal(len(thresholds))
+        return distribution
+
+    @cached_property
+    def P(self) -> dict[int, dict[int, list[Outcome]]]:  # noqa: N802 (the name toy_text gave it)
+        """The dynamics as Gymnasium's toy_text environments hold them.
+
+        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built
+        on first access, from `transition_model`, whose arrays take a tenth of the memory.
+        """
+        return as_dictionaries(self.transition_model())
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the dynamics do not change over time, so that their model always holds."""
+        return True
+
+    @property
+    def desc(self) -> NDArray[np.bytes_]:
+        """The map as FrozenLake holds it, single letters of shape (rows, columns)."""
+        return np.frombuffer(self.map.codes, "S1").reshape(self.map.n_rows, self.map.n_columns)
+
+    @property
+    def shortest_path_length(self) -> int:
+        """Moves from ``S`` to the nearest goal if none slips."""
+        return int(self.map.distances[self.map.start])
+
+    @cached_property
+    def _starts(self) -> tuple[Ints, Floats]:
+        """The cells where an episode may begin, in order, and their cumulative probabilities."""
+        if self.random_start:
+            starts = np.flatnonzero(self.map.distances > 0)
+            starts = starts[~np.isin(starts, list(self.dynamics.collectable_bits))]
+        else:
+            starts = np.array([self.map.start])
+        return starts, np.cumsum(_equal(len(starts)))
+
+    def _observe(self) -> Observation:
+        return self.s
+
+    def _info(self, bumped: bool) -> dict[str, Any]:
+        cell = self.s % self.map.n_cells
+        return {
+            "position": divmod(cell, self.map.n_columns),
+            "bumped": bumped,
+            # On every step, so that an episode cut off by a time limit counts as a failure.
+            "is_success": self.map.codes[cell] == ord(GOAL),
+        }
+
+    def _text(self) -> str:
+        return render_text(self._picture())
+
+    def _make_renderer(self, fps: int, title: str) -> GridRenderer:
+        return GridRenderer(self.map.rows, fps, title)
+
+    def _picture(self) -> Scene:
+        collected, cell = divmod(self.s, self.map.n_cells)
+        return Scene(
+            rows=self.map.rows,
+            robot=cell,
+            steps=self._steps,
+            collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
+            last_action=self._last_action,
+        )
+
+
+def _equal(n: int) -> Floats:
+    """Equal probabilities."""
+    return summing_to_one(np.full(n, 1 / n))
+
+
+# Longer chains are drawn in several rows, read as lines of text are.
+LONGEST_ROW = 50
+
+
+class MapEnv(FiniteEnv):
+    """An environment whose states are shown on a map, ``rows``, with letters of `envs.drawing`."""
+
+    rows: tuple[str, ...]
+    action_names: ClassVar[tuple[str, ...]]
+
+    def cell_of(self, state: int) -> int:
+        """The cell of a state, counted row by row: by default states are cells."""
+        return state
+
+    def _text(self) -> str:
+        return render_text(self._picture())
+
+    def _picture(self) -> Scene:
+        name = "start" if self.last_action is None else self.action_names[self.last_action]
+        return Scene(self.rows, self.cell_of(self.s), (), (), None, title=name)
+
+    def _make_renderer(self, fps: int, title: str) -> GridRenderer:
+        return GridRenderer(self.rows, fps, title)
+
+
+class ChainEnv(MapEnv):
+    """An environment whose states lie side by side."""
+
+    @abstractmethod
+    def letters(self) -> str:
+        """The letter of each state, in order."""
+
+    @property
+    def rows(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The chain, in rows of equal length."""
+        letters = self.letters()
+        length = min(len(letters), LONGEST_ROW)
+        starts = range(0, len(letters), length)
+        return tuple(letters[start : start + length].ljust(length, "#") for start in starts)

@@ -1,0 +1,235 @@
+"""The exact dynamics of a Gymnasium environment, with the effects of its wrappers.
+
+The result is None where the effect of a wrapper is unknown, since a wrong model would make every
+figure computed from it wrong. For the same reason a model that is neither of Gymnasium's own
+classes nor of this project's is compared with `step` before it is accepted, once a process: see
+`envs.checking`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.toy_text.blackjack import BlackjackEnv
+from gymnasium.envs.toy_text.taxi import TaxiEnv
+from gymnasium.wrappers import ClipReward
+from numpy.typing import NDArray
+
+from rl_yardstick.envs.checking import ModelCheck, checked
+from rl_yardstick.envs.finite_env import MaskedFiniteEnv
+from rl_yardstick.envs.grid import GOAL, GridWorld
+from rl_yardstick.envs.model_claims import Claim, claim_of, is_trusted
+from rl_yardstick.envs.wrappers import (
+    ActionMasks,
+    DiscretizeObservation,
+    FlattenToDiscrete,
+    IdleActionMasks,
+    OneHotObservation,
+    ScaleReward,
+    TerminationReward,
+)
+from rl_yardstick.mdp.transition_model import Bools, TransitionModel
+
+Env = gym.Env[Any, Any]
+Wrapper = gym.Wrapper[Any, Any, Any, Any]
+
+# By name, and not as classes: this package does not import Stable-Baselines3, and a subclass may
+# do anything.
+TRANSPARENT_WRAPPERS = frozenset(
+    {
+        "gymnasium.wrappers.common.OrderEnforcing",
+        "gymnasium.wrappers.common.PassiveEnvChecker",
+        "gymnasium.wrappers.common.RecordEpisodeStatistics",
+        "gymnasium.wrappers.common.TimeLimit",
+        "gymnasium.wrappers.rendering.HumanRendering",
+        "gymnasium.wrappers.rendering.RecordVideo",
+        "gymnasium.wrappers.rendering.RenderCollection",
+        "stable_baselines3.common.monitor.Monitor",
+    }
+)
+OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
+
+Judgement = tuple[Claim | None, ModelCheck | None]
+
+# A cache of judgements of environments, by `id`: set only while these live.
+_looked_at: ContextVar[dict[int, Judgement] | None] = ContextVar("looked_at", default=None)
+
+
+def transition_model(env: Env) -> TransitionModel | None:
+    """The exact dynamics of an environment, with the rewards that its outermost wrapper gives.
+
+    The model is known for this project's grid worlds and textbook environments, its bandits with
+    click rates, Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, and environments that
+    hold ``P`` and ``initial_state_distrib`` as toy_text's do and pass
+    `envs.check_transition_model`. Known wrappers are those that leave the dynamics alone,
+    `ScaleReward`, Gymnasium's `ClipReward` (unless rewards are random), and `TerminationReward`
+    where it gives its reward at terminations only. A time limit is no part of the model: see
+    `time_limit`. None where the model is not known.
+    """
+    base, wrappers = _layers(env)
+    claim = _believed(base) if all(map(_folds, wrappers)) else None
+    if claim is None:
+        return None
+    model = claim.model
+    reward, variance = model.reward, model.reward_variance
+    for wrapper in wrappers:
+        if isinstance(wrapper, ScaleReward):
+            reward = reward * wrapper.scale
+            variance = None if variance is None else variance * wrapper.scale**2
+        elif isinstance(wrapper, TerminationReward):
+            reward = np.where(model.terminated, wrapper.last_reward, reward)
+            variance = None if variance is None else np.where(model.terminated, 0.0, variance)
+        elif isinstance(wrapper, ClipReward):
+            if variance is not None:
+                return None
+            reward = np.asarray(wrapper.func(reward), dtype=np.float64)
+    if reward is model.reward:
+        return model
+    return replace(model, reward=reward, reward_variance=variance)
+
+
+def model_check(env: Env) -> ModelCheck | None:
+    """The result of checking the environment's own model against its `step`.
+
+    Trusted environments pass without a check. None where there is no model, or wrappers hide it.
+    """
+    base, wrappers = _layers(env)
+    return _judged(base)[1] if all(map(_folds, wrappers)) else None
+
+
+def unknown_wrapper(env: Env) -> str | None:
+    """The innermost wrapper that hides the model, by its class; None where none does."""
+    wrappers = (type(wrapper) for wrapper in _layers(env)[1] if not _folds(wrapper))
+    return next((f"{kind.__module__}.{kind.__qualname__}" for kind in wrappers), None)
+
+
+def time_limit(env: Env) -> int | None:
+    """The number of steps after which an episode is cut off, None where there is no limit."""
+    _, wrappers = _layers(env)
+    limits = [w._max_episode_steps for w in wrappers if isinstance(w, gym.wrappers.TimeLimit)]
+    return min(limits, default=None)
+
+
+def success_outcomes(env: Env) -> Bools | None:
+    """The transitions that end an episode well, bool of shape (S, A, K) as in `transition_model`.
+
+    In a grid world those are the ones that reach a goal. Elsewhere they are the ones that
+    terminate with the highest reward that any termination has before wrappers change it: the goal
+    of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
+    None where the model is not known or no episode terminates.
+    """
+    base, wrappers = _layers(env)
+    claim = _believed(base) if all(map(_folds, wrappers)) else None
+    if claim is None:
+        return None
+    model = claim.model
+    ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
+    if not ends.any():
+        return None
+    if isinstance(base, GridWorld):
+        codes = np.frombuffer(base.map.codes, np.uint8)
+        good = codes[model.next_state % base.map.n_cells] == ord(GOAL)
+    elif isinstance(base, BlackjackEnv):
+        good = model.reward > 0
+    else:
+        good = model.reward == model.reward[ends].max()
+    success: Bools = ends & good
+    return success
+
+
+def observations_of_states(env: Env) -> NDArray[Any] | None:
+    """The observation of each state of `transition_model`; None where it is not known."""
+    base, wrappers = _layers(env)
+    claim = _believed(base)
+    if claim is None or claim.observations is None:
+        return None
+    observations = claim.observations
+    for wrapper in wrappers:
+        if isinstance(wrapper, OBSERVATION_WRAPPERS):
+            observations = wrapper.map_observations(observations)
+        elif not _folds(wrapper):
+            return None
+    return observations
+
+
+def action_masks_of_states(env: Env) -> Bools | None:
+    """The action mask of each state of `transition_model`, bool of shape (S, A).
+
+    Known for this project's environments, Gymnasium's Taxi, and `IdleActionMasks`, under the
+    wrappers that `transition_model` knows; None elsewhere.
+    """
+    base, wrappers = _layers(env)
+    if not all(map(_folds, wrappers)):
+        return None
+    idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
+    if idle:
+        return np.array(idle[-1])
+    # A subclass may have masks of its own.
+    kind: Any = type(base)
+    if isinstance(base, GridWorld) and kind.action_masks is GridWorld.action_masks:
+        return base.dynamics.action_masks() if base.is_stationary else None
+    if isinstance(base, MaskedFiniteEnv) and kind.action_masks is MaskedFiniteEnv.action_masks:
+        return base.masks_of_states()
+    if isinstance(base, TaxiEnv) and kind.action_mask is TaxiEnv.action_mask:
+        return np.array([base.action_mask(state) for state in sorted(base.P)], dtype=np.bool_)
+    return None
+
+
+def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
+    """The environment without its wrappers, and the wrappers, the innermost first."""
+    wrappers = []
+    while isinstance(env, gym.Wrapper):
+        wrappers.append(env)
+        env = env.env
+    return env, wrappers[::-1]
+
+
+def _folds(wrapper: Wrapper) -> bool:
+    """Whether a wrapper keeps the states, and changes rewards at most in a known way."""
+    if type(wrapper) is TerminationReward:
+        return not wrapper.on_truncation
+    if type(wrapper) is ClipReward:  # as it was made, with the same bounds for all rewards
+        is_own = getattr(wrapper.func, "__qualname__", "").startswith("ClipReward.__init__.")
+        return is_own and all(np.ndim(bound) == 0 for bound in wrapper._saved_kwargs.values())
+    if type(wrapper) in {ScaleReward, ActionMasks, IdleActionMasks, *OBSERVATION_WRAPPERS}:
+        return True
+    return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
+
+
+def _believed(base: Env) -> Claim | None:
+    """The environment's claim about its dynamics, if it is accepted."""
+    claim, check = _judged(base)
+    return claim if check is not None and check.refusal is None else None
+
+
+@contextmanager
+def one_look(env: Env) -> Iterator[None]:
+    """Cache the model of ``env``, which must not change within the ``with`` statement."""
+    token = _looked_at.set({id(env.unwrapped): _judged(env.unwrapped)})
+    try:
+        yield
+    finally:
+        _looked_at.reset(token)
+
+
+def _judged(base: Env) -> Judgement:
+    """The environment's claim about its dynamics, and the result of its check."""
+    known = _looked_at.get()
+    if known is not None and id(base) in known:
+        return known[id(base)]
+    try:
+        claim = claim_of(base)
+    except ValueError as error:
+        return None, ModelCheck(str(error))
+    if claim is None:
+        return None, None
+    if is_trusted(base):
+        plays = claim.plays_from_model
+        return claim, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)
+    return claim, checked(base, claim)

@@ -1,0 +1,156 @@
+"""The hallway: a robot with noisy sensors that does not know where it is."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rl_yardstick.envs.grid import MapEnv
+from rl_yardstick.envs.pomdp.readings import World, with_readings
+from rl_yardstick.mdp.transition_model import TransitionModel
+
+ROWS = ("...........", "##.#.#.#G##")
+# North, east, south, west; numbers of facings.
+STEPS = ((-1, 0), (0, 1), (1, 0), (0, -1))
+SOUTH = 2
+STAY, FORWARD = 0, 1
+# Probabilities of turning right by 0, 90, 180 and 270 degrees, for turns right, around and left.
+TURNS = ((0.1, 0.7, 0.1, 0.1), (0.1, 0.15, 0.6, 0.15), (0.1, 0.1, 0.1, 0.7))
+# Outcomes of a move forward: the direction, the new facing, both by turns, and the probability.
+# Otherwise the robot stays as it is, and also where a wall is in the way.
+MOVES = ((0, 0, 0.8), (1, 1, 0.05), (3, 3, 0.05), (2, 0, 0.025), (2, 2, 0.025))
+SEES_WALL, SEES_NO_WALL = 0.9, 0.95  # where there is one, and where there is none
+N_WALL_READINGS, N_READINGS = 16, 21
+
+
+class HallwayEnv(MapEnv):
+    """A robot in a hallway feels walls beside it, often wrongly, and is to find an alcove.
+
+    ## Description
+    The hallway of Littman, Cassandra and Kaelbling (Learning Policies for Partially Observable
+    Environments: Scaling Up, 1995): eleven cells in a row, four alcoves to the south of them, and
+    the goal ``G`` in one of these::
+
+        ...........
+        ##.#.#.#G##
+
+    The robot faces north, east, south or west. It does not know where it is, and feels only whether
+    there are walls in front of it, to its right, behind it and to its left.
+
+    The probabilities are those of the authors' file `hallway.POMDP`, which rounds them to six
+    digits. Two things differ: the episode ends at the goal, where the original begins anew, and the
+    first reading comes before the first action.
+
+    ## Action Space
+    `Discrete(5)`: 0 stay, 1 forward, 2 turn right, 3 turn around, 4 turn left. Forward leads
+    forward with probability .8, to each side with .05 (the robot then faces that way), and back
+    with .05 (half of it facing the other way); else, and where there is a wall, the robot stays as
+    it is. Turning right or left succeeds with probability .7, around with .6.
+
+    ## Observation Space
+    `Discrete(21)`: 0 to 15 the sum of 8 for a wall in front, 4 to the right, 2 behind and 1 to the
+    left. A wall is felt with probability .9, and where there is none, one is felt with .05. Facing
+    south above an alcove, the robot sees its sign instead, without error: 16 to 19, where 19 is the
+    goal's alcove. At the goal it sees 20.
+
+    ## Rewards
+    1 at the goal.
+
+    ## Starting State
+    Any cell but the goal and any facing, with equal probability.
+
+    ## Episode End
+    The episode terminates at the goal. It is truncated after 30 steps when made by
+    `gymnasium.make`.
+
+    ## Information
+    `reset` and `step` give nothing more. The exact dynamics are available as arrays from
+    `transition_model()`, and as `P` and `initial_state_distrib` as in Gymnasium's FrozenLake; their
+    states are triples of cell, facing and last reading.
+
+    ## Arguments
+    - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
+
+    ## Version History
+    - v0: the first version
+    """
+
+    rows = ROWS
+    action_names: ClassVar[tuple[str, ...]] = (
+        "stay", "forward", "turn right", "turn around", "turn left",
+    )  # fmt: skip
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(_world().model.n_states, len(self.action_names), render_mode)
+        self.observation_space = spaces.Discrete(N_READINGS)
+
+    def transition_model(self) -> TransitionModel:
+        return _world().model
+
+    def observation_of(self, states: Any) -> NDArray[Any]:
+        """The last reading."""
+        readings: NDArray[Any] = _world().reading[states]
+        return readings
+
+    def cell_of(self, state: int) -> int:
+        row, column = _cells()[int(_world().hidden[state]) // len(STEPS)]
+        return row * len(ROWS[0]) + column
+
+
+def _cells() -> list[tuple[int, int]]:
+    """Row and column of each cell, row by row; the goal is the last one."""
+    return [(y, x) for y, row in enumerate(ROWS) for x, letter in enumerate(row) if letter != "#"]
+
+
+@lru_cache(maxsize=1)
+def _world() -> World:
+    cells = _cells()
+    n_states = len(cells) * len(STEPS)
+    prob = np.zeros((n_states, 2 + len(TURNS), len(MOVES) + 1))
+    next_state = np.zeros(prob.shape, np.int64)
+    readings = np.zeros((n_states, N_READINGS))
+    signs = [cell for cell in cells if (cell[0] + 1, cell[1]) in cells]
+    for state in range(n_states):
+        (row, column), facing = cells[state // len(STEPS)], state % len(STEPS)
+        beside = [
+            (row + STEPS[(facing + turn) % 4][0], column + STEPS[(facing + turn) % 4][1])
+            for turn in range(4)
+        ]
+        next_state[state] = state
+        prob[state, STAY, 0] = 1
+        for turns, action in zip(TURNS, range(2, 5), strict=True):
+            prob[state, action, :4] = turns
+            next_state[state, action, :4] = state - facing + (facing + np.arange(4)) % 4
+        for k, (way, turn, chance) in enumerate(MOVES):
+            prob[state, FORWARD, k] = chance
+            if beside[way] in cells:
+                place = cells.index(beside[way])
+                next_state[state, FORWARD, k] = 4 * place + (facing + turn) % 4
+        prob[state, FORWARD, -1] = 1 - sum(chance for _, _, chance in MOVES)
+        if cells[-1] == (row, column):
+            readings[state, -1] = 1
+        elif facing == SOUTH and (row, column) in signs:
+            readings[state, N_WALL_READINGS + signs.index((row, column))] = 1
+        else:
+            readings[state, :N_WALL_READINGS] = _wall_readings([b not in cells for b in beside])
+    at_goal = next_state // len(STEPS) == len(cells) - 1
+    is_over = np.arange(n_states) // len(STEPS) == len(cells) - 1
+    reward = np.where(is_over[:, None, None], 0.0, at_goal.astype(np.float64))
+    initial = np.where(is_over, 0.0, 1 / (~is_over).sum())
+    hidden = TransitionModel(prob, next_state, reward, at_goal, initial)
+    return with_readings(hidden, readings, np.stack([readings] * prob.shape[1]))
+
+
+def _wall_readings(walls: list[bool]) -> NDArray[np.float64]:
+    """The chances of readings 0 to 15, for walls in front, to the right, behind, to the left."""
+    chances = np.ones(1)
+    for is_wall in walls:
+        felt = SEES_WALL if is_wall else 1 - SEES_NO_WALL
+        chances = np.concatenate(
+            [chances[:, None] * (1 - felt), chances[:, None] * felt], 1
+        ).ravel()
+    return chances

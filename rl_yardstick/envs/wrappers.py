@@ -1,0 +1,398 @@
+"""Wrappers that fit an environment to an agent: masks, rewards, encodings, time limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.toy_text.taxi import TaxiEnv
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import ArrayLike, NDArray
+
+from rl_yardstick.envs.argument_checks import check_flag, check_number, check_whole_number
+from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints
+
+Env = gym.Env[Any, Any]
+
+# The names of masks in Gymnasium's Taxi (in ``info``) and in sb3-contrib (a method).
+INFO_KEY = "action_mask"
+METHOD = "action_masks"
+
+
+def mask_source(env: Env) -> Callable[[], Any] | None:
+    """A function that returns the mask of the present state, or None where there are no masks.
+
+    That is the method `action_masks` of the environment or of a wrapper around it; for Gymnasium's
+    Taxi, which has no such method, its mask of the present state.
+    """
+    if env.has_wrapper_attr(METHOD):
+        method: Callable[[], Any] = env.get_wrapper_attr(METHOD)
+        return method
+    base = env.unwrapped
+    if isinstance(base, TaxiEnv):
+        return lambda: base.action_mask(int(base.s))
+    return None
+
+
+def has_masks(env: Env) -> bool:
+    """Whether the environment has action masks, in either form; may call its `reset`."""
+    return mask_source(env) is not None or INFO_KEY in env.reset()[1]
+
+
+def action_masks(env: Env) -> Bools | None:
+    """The allowed actions now, bool of shape (n_actions,), or None where there are no masks.
+
+    An environment that gives masks by ``info["action_mask"]`` alone needs the wrapper
+    `envs.wrappers.ActionMasks`.
+    """
+    source = mask_source(env)
+    return None if source is None else np.asarray(source(), dtype=np.bool_)
+
+
+class ActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Gives action masks in both forms: by `action_masks()` and by ``info["action_mask"]``.
+
+    The first is sb3-contrib's convention and can be called at any time. The second comes with each
+    step, so that it also masks the state in which an episode is truncated.
+
+    Args:
+        env: an environment with masks in one of the two forms, or Gymnasium's Taxi.
+
+    Raises:
+        ValueError: if it has masks in neither.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+        self._told: Any = None
+        if not has_masks(env):
+            name = env.unwrapped if env.spec is None else env.spec.id
+            raise ValueError(
+                f"{name} has no action masks: neither a method action_masks() nor "
+                f"info[{INFO_KEY!r}]"
+            )
+
+    def action_masks(self) -> Bools:
+        """The allowed actions now, bool of shape (n_actions,)."""
+        source = mask_source(self.env)
+        return np.asarray(self._told if source is None else source(), dtype=np.bool_)
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """As the environment, with the mask in ``info``."""
+        obs, info = self.env.reset(**kwargs)
+        return obs, self._with_mask(info)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """As the environment, with the mask in ``info`` unless the episode has terminated."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if not terminated:
+            info = self._with_mask(info)
+        return obs, reward, terminated, truncated, info
+
+    def _with_mask(self, info: dict[str, Any]) -> dict[str, Any]:
+        self._told = info.get(INFO_KEY)
+        return {**info, INFO_KEY: self.action_masks().astype(np.int8)}
+
+
+class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Masks actions that change nothing, by the model that the environment holds.
+
+    An action that surely leaves the state as it is, without ending the episode, is masked; in a
+    state that no action changes, none is. For FrozenLake and CliffWalking, which have no masks.
+
+    Args:
+        env: an environment that holds ``P`` and its state ``s`` as Gymnasium's toy_text does.
+
+    Attributes:
+        masks: the masks of all states, bool of shape (S, A).
+
+    Raises:
+        ValueError: if it holds no ``P``.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+        P = getattr(env.unwrapped, "P", None)  # noqa: N806 (Gymnasium's own name)
+        if P is None:
+            raise ValueError(f"IdleActionMasks needs an environment that holds P, not {env}")
+        self.masks = np.array(
+            [[_changes(s, P[s][action]) for action in range(len(P[s]))] for s in range(len(P))]
+        )
+        self.masks |= ~self.masks.any(axis=1, keepdims=True)
+
+    def action_masks(self) -> Bools:
+        """The allowed actions now, bool of shape (A,)."""
+        base: Any = self.env.unwrapped
+        return np.array(self.masks[base.s])
+
+
+def _changes(state: int, outcomes: list[tuple[float, int, float, bool]]) -> bool:
+    """Whether an action can lead to another state or end the episode."""
+    return any(prob > 0 and (ends or after != state) for prob, after, _, ends in outcomes)
+
+
+class ScaleReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
+    """Multiplies every reward.
+
+    Args:
+        env: any environment.
+        scale: the factor.
+
+    Raises:
+        ValueError: if the factor is zero or not a finite number.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], scale: float) -> None:
+        RecordConstructorArgs.__init__(self, scale=scale)
+        gym.RewardWrapper.__init__(self, env)
+        self.scale = check_number("scale", scale)
+        if self.scale == 0:
+            raise ValueError("scale must not be 0: every reward would be the same")
+
+    def reward(self, reward: SupportsFloat) -> float:
+        """The scaled reward."""
+        return float(reward) * self.scale
+
+
+class TerminationReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Replaces the last reward of an episode.
+
+    Args:
+        env: any environment. Truncation by wrappers outside this one, such as a further time limit,
+            does not count.
+        reward: the reward of the step that terminates the episode.
+        on_truncation: replace the reward of a truncated episode as well.
+
+    Raises:
+        ValueError: if the reward is not a finite number.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], reward: float, on_truncation: bool = False) -> None:
+        RecordConstructorArgs.__init__(self, reward=reward, on_truncation=on_truncation)
+        gym.Wrapper.__init__(self, env)
+        self.last_reward = check_number("reward", reward)
+        self.on_truncation = check_flag("on_truncation", on_truncation)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or (truncated and self.on_truncation):
+            reward = self.last_reward
+        return obs, reward, terminated, truncated, info
+
+
+class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+    """Turns an observation of several whole numbers into one, the last number counting fastest.
+
+    Args:
+        env: an environment whose observations are MultiDiscrete, a Tuple of Discrete, or a
+            Discrete, which is counted from zero afterwards.
+
+    Raises:
+        ValueError: if the observations are none of these, or too many for a 64-bit number.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.ObservationWrapper.__init__(self, env)
+        self._sizes, self._first = _sizes_and_starts(env.observation_space)
+        n = math.prod(self._sizes)
+        if n > np.iinfo(np.int64).max:
+            raise ValueError(f"{env.observation_space} has {n} values, too many to be numbered")
+        self.observation_space = spaces.Discrete(n)
+
+    def observation(self, observation: Any) -> int:
+        """The number of one observation."""
+        if isinstance(observation, np.ndarray):
+            observation = observation.ravel().tolist()
+        index = 0
+        values = observation if isinstance(observation, Sequence) else [observation]
+        for value, size, first in zip(values, self._sizes, self._first, strict=True):
+            index = index * size + int(value) - first
+        return index
+
+    def map_observations(self, batch: ArrayLike) -> Ints:
+        """The numbers of many observations, shape (n,).
+
+        Args:
+            batch: whole numbers, the first axis counting the observations; for a Tuple, its parts
+                side by side in shape (n, parts).
+        """
+        parts = np.asarray(batch, np.int64)
+        places = parts.reshape(len(parts), -1) - self._first
+        numbers: Ints = np.ravel_multi_index(tuple(places.T), self._sizes)
+        return numbers
+
+
+class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+    """Turns a number into a vector that is 1 at its place and 0 elsewhere.
+
+    Args:
+        env: an environment whose observations are Discrete.
+
+    Raises:
+        ValueError: if they are not.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.ObservationWrapper.__init__(self, env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Discrete):
+            raise ValueError(f"OneHotObservation needs Discrete observations, not {space}")
+        self._first = int(space.start)
+        self._n = int(space.n)
+        self.observation_space = spaces.Box(0, 1, (self._n,), np.float32)
+
+    def observation(self, observation: int) -> NDArray[np.float32]:
+        """The vector of one number."""
+        hot = np.zeros(self._n, np.float32)
+        hot[int(observation) - self._first] = 1
+        return hot
+
+    def map_observations(self, batch: AnyInts) -> NDArray[np.float32]:
+        """The vectors of many numbers of shape (n,), shape (n, number of values)."""
+        hot = np.zeros((len(batch), self._n), np.float32)
+        hot[np.arange(len(batch)), np.asarray(batch) - self._first] = 1
+        return hot
+
+
+def _sizes_and_starts(space: spaces.Space[Any]) -> tuple[list[int], list[int]]:
+    if isinstance(space, spaces.MultiDiscrete):
+        return space.nvec.ravel().tolist(), space.start.ravel().tolist()
+    parts = space.spaces if isinstance(space, spaces.Tuple) else [space]
+    discrete = [part for part in parts if isinstance(part, spaces.Discrete)]
+    if not discrete or len(discrete) < len(parts):
+        raise ValueError(
+            f"FlattenToDiscrete needs MultiDiscrete, a Tuple of Discrete, or Discrete, not {space}"
+        )
+    return [int(part.n) for part in discrete], [int(part.start) for part in discrete]
+
+
+class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+    """Turns a vector into one number by cutting each of its dimensions into bins of equal width.
+
+    The bin of a value is ``floor((value - low) / (high - low) * bins)``, computed in float64 and
+    clipped to the first and the last bin. The observation is the index of the box that the vector
+    lies in, the last dimension counting fastest.
+
+    Args:
+        env: an environment whose observations are a Box of one axis.
+        bins: number of bins, one for all dimensions or one for each that counts.
+        low: where the first bin begins, likewise; by default the bounds of the space.
+        high: where the last bin ends, likewise.
+        dims: indices of the dimensions that count; by default all.
+
+    Raises:
+        ValueError: if the observations are not such a Box, a dimension does not exist, the numbers
+            of arguments disagree, there are no bins, or bounds are infinite or out of order.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        bins: int | Sequence[int],
+        low: float | Sequence[float] | None = None,
+        high: float | Sequence[float] | None = None,
+        dims: Sequence[int] | None = None,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, bins=bins, low=low, high=high, dims=dims)
+        gym.ObservationWrapper.__init__(self, env)
+        space = env.observation_space
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"DiscretizeObservation needs a Box of one axis, not {space}")
+        self.dims = _chosen_dims(dims, space.shape[0])
+        counts = _per_dim("bins", bins, self.dims)
+        self.bins = counts.astype(np.int64)
+        if np.any(self.bins != counts) or np.any(self.bins < 1):
+            raise ValueError(f"bins must be whole numbers from 1 on, not {bins}")
+        self.low = _per_dim("low", space.low[self.dims] if low is None else low, self.dims)
+        self.high = _per_dim("high", space.high[self.dims] if high is None else high, self.dims)
+        self._check_bounds()
+        self.observation_space = spaces.Discrete(math.prod(self.bins.tolist()))
+        self._cuts = list(
+            zip(self.dims, *(a.tolist() for a in (self.low, self.high, self.bins)), strict=True)
+        )
+
+    def observation(self, observation: NDArray[Any]) -> int:
+        """The index of the box that one vector lies in."""
+        index = 0
+        for dim, low, high, bins in self._cuts:
+            place = (float(observation[dim]) - low) / (high - low) * bins
+            index = index * bins + int(min(max(place, 0), bins - 1))
+        return index
+
+    def map_observations(self, batch: NDArray[Any]) -> Ints:
+        """The indices of many vectors of shape (n, dimensions), shape (n,)."""
+        places = (batch[:, self.dims].astype(np.float64) - self.low) / (self.high - self.low)
+        places = np.clip(np.floor(places * self.bins), 0, self.bins - 1).astype(np.int64)
+        indices: Ints = np.ravel_multi_index(tuple(places.T), tuple(self.bins))
+        return indices
+
+    def _check_bounds(self) -> None:
+        for dim, low, high in zip(self.dims, self.low, self.high, strict=True):
+            if not (math.isfinite(low) and math.isfinite(high)):
+                raise ValueError(
+                    f"dimension {dim} of the observation has the bounds {low} and {high}: give "
+                    f"finite low and high, or choose other dims"
+                )
+            if not low < high:
+                raise ValueError(f"dimension {dim}: low {low} is not below high {high}")
+
+
+def _chosen_dims(dims: Sequence[int] | None, n_dims: int) -> list[int]:
+    if dims is None:
+        return list(range(n_dims))
+    try:
+        chosen = [check_whole_number("dims", dim, 0, n_dims - 1) for dim in dims]
+    except TypeError:
+        chosen = []
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise ValueError(f"dims must list dimensions, each once, not {dims!r}")
+    return chosen
+
+
+def _per_dim(name: str, values: ArrayLike, dims: list[int]) -> Floats:
+    """One value for each of the dimensions that count."""
+    try:
+        return np.broadcast_to(np.asarray(values, np.float64), (len(dims),)).copy()
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} must be one number, or one for each of the dimensions {dims}, not {values!r}"
+        ) from None
+
+
+def limit_by_shortest_path(
+    env: gym.Env[Any, Any], multiple: int, instead_of: int
+) -> gym.Env[Any, Any]:
+    """Limit the episodes of a grid world to a multiple of its shortest path.
+
+    Args:
+        env: a grid world as `gymnasium.make` returns it.
+        multiple: the limit in shortest paths.
+        instead_of: the default limit to replace. Another limit, or none, was chosen by the caller
+            of `gymnasium.make`, and stays.
+
+    Returns:
+        The environment under the limit.
+    """
+    base: Any = env.unwrapped
+    return _limited(env, multiple * base.shortest_path_length, instead_of)
+
+
+def limit_by_pulls(env: gym.Env[Any, Any], instead_of: int) -> gym.Env[Any, Any]:
+    """Limit the episodes of a bandit to its `pulls`; see `limit_by_shortest_path`."""
+    base: Any = env.unwrapped
+    return _limited(env, base.pulls, instead_of)
+
+
+def _limited(env: gym.Env[Any, Any], n_steps: int, instead_of: int) -> gym.Env[Any, Any]:
+    if not isinstance(env, gym.wrappers.TimeLimit) or env.spec is None:
+        return env
+    is_default = env.spec.max_episode_steps == instead_of
+    return gym.wrappers.TimeLimit(env.env, n_steps) if is_default else env

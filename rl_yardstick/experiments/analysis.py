@@ -1,0 +1,620 @@
+"""Analyses the runs of a study: figures with intervals, verdicts on pairs, failed runs.
+
+It also says how soon agents reach the threshold, and what the agents of failed runs do instead of
+their task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from rl_yardstick.agents import ALGORITHMS
+from rl_yardstick.envs.return_bounds import return_bounds
+from rl_yardstick.experiments.child_processes import do_aside
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.results import StudyResults, values_over_seeds
+from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
+from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.environments import make_single_env, training_changes
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.evaluation.yardstick import FAILED, Yardstick
+from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.verdicts import (
+    AgentRuns,
+    Best,
+    Bounds,
+    Estimate,
+    Pair,
+    Study,
+    Summary,
+    ThresholdSummary,
+    failure_threshold,
+    judge,
+    mean_over_runs,
+    performance_profile,
+    summarise,
+    summarise_steps,
+)
+
+# The metrics on the scale of the best random or constant policy.
+ON_THE_SCALE = ("final", "best")
+
+# Prefixes of the entry points of agents that do not learn.
+FIXED_POLICIES = ("rl_yardstick.agents.planning:", "rl_yardstick.agents.reference:")
+
+UNIT: Bounds = (0.0, 1.0)  # of scores
+MARGIN = 0.02  # of the gap between the best random or constant policy and the optimum
+OVERALL = "all environments"  # the name of the comparison of scores over all environments
+
+
+# --- The evidence for verdicts.
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence for verdicts on an environment."""
+
+    environment: str  #: its label
+    #: By agent, the metric of its seeds, shape (n_seeds,): NaN for a missing run.
+    values: Mapping[str, Floats]
+    seeds: Mapping[str, int]  #: by agent, the planned number of seeds
+    #: The highest expected return of any policy, or an upper bound of it; None if unknown.
+    optimum: float | None
+    optimum_at_least: float | None  #: a lower bound of the optimum; None if it is exact or unknown
+    baseline: float | None  #: expected return of the best random or constant policy, or None
+    threshold: float | None  #: the return that counts as solved, or None
+    bounds: Bounds  #: the least and the greatest possible return
+    certain: frozenset[str]  #: the agents that do not depend on chance
+    is_score: bool  #: whether verdicts are on scores, from the baseline (0) to the optimum (1)
+    is_cost: bool  #: whether a lower metric is better
+    margin: float  #: the largest difference that does not matter, in scores or else in the metric
+
+    @cached_property
+    def scores(self) -> dict[str, Floats]:
+        """By agent, what verdicts compare, one for each of its seeds; higher is better.
+
+        Scores are cut at 0 and 1: less than the best random or constant policy counts as 0.
+        """
+        given = {name: values[: self.seeds[name]] for name, values in self.values.items()}
+        if not self.is_score:
+            return {name: -values if self.is_cost else values for name, values in given.items()}
+        zero, one = self.baseline or 0.0, self.optimum or 0.0
+        return {name: np.clip((x - zero) / (one - zero), 0, 1) for name, x in given.items()}
+
+    @property
+    def score_bounds(self) -> Bounds:
+        """The least and the greatest possible of these scores."""
+        if self.is_score:
+            return UNIT
+        return (-self.bounds[1], -self.bounds[0]) if self.is_cost else self.bounds
+
+
+def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
+    """Collect the evidence on an environment; None if no run has finished."""
+    study, table = results.study, results.summary
+    table = table[table["environment"] == environment]
+    if table.empty:
+        return None
+    optimum, baseline = _first(table, "optimum"), _first(table, "baseline")
+    at_least = _first(table, "optimum_at_least")
+    is_score, span = False, 0.0
+    if study.metric in ON_THE_SCALE and optimum is not None and baseline is not None:
+        is_score = Yardstick(optimum, baseline).has_scale
+        span = optimum - baseline
+    margin = 0.0 if study.margin is None else study.margin
+    if is_score:
+        margin = MARGIN if study.margin is None else study.margin / span
+    return Evidence(
+        environment=environment,
+        values=values_over_seeds(results, environment, study.metric),
+        seeds=_seeds(results, environment),
+        optimum=optimum,
+        optimum_at_least=at_least,
+        baseline=baseline,
+        threshold=_first(table, "threshold"),
+        bounds=_bounds(results, environment, optimum),
+        certain=agents_without_chance(results, table),
+        is_score=is_score,
+        is_cost=study.metric in COSTS,
+        margin=margin,
+    )
+
+
+def agents_without_chance(results: StudyResults, table: pd.DataFrame) -> frozenset[str]:
+    """The agents that do not learn, if policies are evaluated exactly: all their runs are equal."""
+    if not (table["exact"] == True).all():  # noqa: E712  # None is neither True nor False
+        return frozenset()
+    return frozenset(
+        agent.label
+        for agent in results.study.agents
+        if agent.algo in ALGORITHMS
+        and ALGORITHMS[agent.algo].entry_point.startswith(FIXED_POLICIES)
+    )
+
+
+def _bounds(results: StudyResults, environment: str, optimum: float | None) -> Bounds:
+    """The least and the greatest possible metric: of a return, a regret, or a time."""
+    study = results.study
+    if study.metric in COSTS:
+        return 0.0, np.inf
+    first = {run.agent: run for run in results.planned if run.environment == environment}
+    if study.metric in OF_TRAINING and any(training_changes(r.spec) for r in first.values()):
+        return -np.inf, np.inf  # returns of training on a changed environment
+    env = make_single_env(next(iter(first.values())).spec)
+    try:
+        low, high = return_bounds(env)
+    finally:
+        env.close()
+    return low, high if optimum is None or study.metric in OF_TRAINING else min(high, optimum)
+
+
+def _seeds(results: StudyResults, environment: str) -> dict[str, int]:
+    counts = dict.fromkeys((agent.label for agent in results.study.agents), 0)
+    for run in results.planned:
+        if run.environment == environment:
+            counts[run.agent] += run.n_runs
+    return counts
+
+
+def _first(table: pd.DataFrame, column: str) -> float | None:
+    known = table[column].dropna()
+    return None if known.empty else float(known.iloc[0])
+
+
+def verdicts_on(
+    study: StudySpec,
+    evidence: Sequence[Evidence],
+    looks: Sequence[int] = (),
+    overall: Mapping[str, Floats] | None = None,
+) -> Study:
+    """The verdicts on all pairs of a study.
+
+    Args:
+        study: the study.
+        evidence: of each environment with runs.
+        looks: the seeds at each look of a study that grows until it is decided.
+        overall: by agent, its mean score over all environments for each seed, shape (n_seeds,).
+    """
+    scores: dict[str, Mapping[str, Floats]] = {one.environment: one.scores for one in evidence}
+    bounds = {one.environment: one.score_bounds for one in evidence}
+    margin = {one.environment: one.margin for one in evidence}
+    baseline = {one.environment: 0.0 if one.is_score else None for one in evidence}
+    if overall is not None:
+        scores[OVERALL], bounds[OVERALL] = overall, UNIT
+        margin[OVERALL], baseline[OVERALL] = MARGIN, None
+    return judge(
+        scores,
+        bounds=bounds,
+        margin=margin,
+        baseline=baseline,
+        certain={(one.environment, name) for one in evidence for name in one.certain},
+        paired=study.shared_randomness,
+        against=study.against,
+        looks=looks,
+    )
+
+
+# --- All environments together.
+
+
+@dataclass(frozen=True)
+class OverallAnalysis:
+    """The comparison of agents over all environments, by their scores."""
+
+    scores: Mapping[str, Summary]  #: figures by agent, the best first
+    #: All pairs, better ranked agent first, by the means of their scores over environments; none
+    #: in a study that grows until it is decided.
+    pairs: tuple[Pair, ...]
+    best: Best | None  #: likewise None
+    thresholds: Floats  #: the scores of the profiles, shape (n,)
+    profiles: Mapping[str, Floats]  #: by agent, the share of runs above each of these scores
+
+
+def scores_over_all(results: StudyResults) -> dict[str, Floats] | None:
+    """By agent, its scores, shape (n_seeds, n_environments); None where they are not known."""
+    labels = [environment.label for environment in results.study.environments]
+    columns = [values_over_seeds(results, label, "score") for label in labels]
+    scores = {
+        agent.label: np.column_stack([np.clip(column[agent.label], 0, 1) for column in columns])
+        for agent in results.study.agents
+    }
+    known = all(np.isfinite(matrix).any(axis=0).all() for matrix in scores.values())
+    return scores if known and len(labels) > 1 else None
+
+
+def _overall(scores: Mapping[str, Floats], said: Study) -> OverallAnalysis:
+    means = {agent: matrix.mean(axis=1) for agent, matrix in scores.items()}
+    summaries = {agent: summarise(values, UNIT) for agent, values in means.items()}
+    order = sorted(means, key=lambda agent: summaries[agent].mean.point, reverse=True)
+    thresholds = np.linspace(0, 1, 101)
+    return OverallAnalysis(
+        scores={agent: summaries[agent] for agent in order},
+        pairs=_in_order([pair for pair in said.pairs if pair.environment == OVERALL], order),
+        best=said.best.get(OVERALL),
+        thresholds=thresholds,
+        profiles={agent: performance_profile(scores[agent], thresholds) for agent in order},
+    )
+
+
+def _in_order(pairs: Sequence[Pair], names: Sequence[str]) -> tuple[Pair, ...]:
+    """The pairs with the better ranked agent first, in the order of both."""
+    place = {name: k for k, name in enumerate(names)}
+    there = [pair for pair in pairs if pair.first in place and pair.second in place]
+    turned = [p if place[p.first] < place[p.second] else p.swapped() for p in there]
+    return tuple(sorted(turned, key=lambda pair: (place[pair.first], place[pair.second])))
+
+
+# --- Each environment.
+
+# The mark of agents that were trained on a changed environment.
+MARK = "†"
+
+
+@dataclass(frozen=True)
+class AgentAnalysis:
+    """The results of one agent on one environment."""
+
+    agent: str  #: its label
+    algo: str  #: its name in the table of agents
+    runs: AgentRuns  #: its runs as the verdicts compare them
+    judged: Estimate  #: the mean of what the verdicts compare: scores, or else the metric
+    spread: float  #: the standard deviation of these over runs
+    n_runs: int  #: finished runs
+    n_missing: int  #: unfinished runs
+    metric: Summary  #: the metric of the verdicts, over seeds
+    #: The final policy's score: 0 is the best random or constant policy, 1 the optimum; less
+    #: counts as 0. None if these are not known.
+    score: Estimate | None
+    final: Estimate  #: mean return of the final policy
+    area: Estimate  #: mean return over the learning curve
+    last_episodes: Estimate  #: mean return of the last training episodes
+    regret: Estimate  #: on bandits, the sum over all pulls; else NaN
+    #: Steps until the learning curve first reached the threshold; None without a threshold.
+    steps_to_threshold: ThresholdSummary | None
+    episodes_to_stay: ThresholdSummary | None  #: episodes until it reached the threshold for good
+    success_rate: Estimate | None  #: of the final policy; None if not reported
+    #: Processor time of training; nan for runs of older versions, which did not measure it.
+    seconds: Estimate
+    #: Whether it was trained on a variant of the environment, whose returns cannot be compared
+    #: with those of evaluations or the optimum.
+    on_variant: bool = False
+    #: Training's changes of the environment in words, as the runs recorded them.
+    changes: tuple[str, ...] = ()
+    #: Steps until the learning curve reached the threshold for good; None without a threshold.
+    steps_to_stay: ThresholdSummary | None = None
+    #: Exact return of the policy that acts in training, None if unknown, and its description.
+    stochastic: Estimate | None = None
+    acts_by: str = ""
+    #: Exact discounted return of the final policy, the agent's discount, and the optimum under it.
+    discounted: Estimate | None = None
+    discount: float | None = None
+    discounted_optimum: float | None = None
+
+    @property
+    def marked(self) -> str:
+        """The label, with a mark if the agent was trained on a changed environment."""
+        return f"{self.agent} {MARK}" if self.changes else self.agent
+
+
+@dataclass(frozen=True)
+class EnvironmentAnalysis:
+    """The comparison of agents on one environment."""
+
+    environment: str  #: its label
+    env_id: str  #: its Gymnasium id
+    #: The highest expected return of any policy, or an upper bound of it; None if unknown.
+    optimum: float | None
+    baseline: float | None  #: expected return of the best random or constant policy, or None
+    threshold: float | None  #: the return that counts as solved, or None
+    is_score: bool  #: whether verdicts are on scores, from the baseline (0) to the optimum (1)
+    margin: float  #: the largest difference that does not matter, in scores or else in the metric
+    bounds: Bounds  #: the least and the greatest possible return
+    exact: bool  #: whether all final returns are exact expectations, not means of episodes
+    agents: tuple[AgentAnalysis, ...]  #: the agents, the best first
+    pairs: tuple[Pair, ...]  #: all pairs, better ranked agent first
+    best: Best  #: the agents than which no other is shown to be better
+    failure_threshold: float | None  #: the score below which a run failed; None if not defined
+    #: Missing runs by agent, including agents without a finished run.
+    missing: Mapping[str, int] = field(default_factory=dict)
+    seeds: Mapping[str, int] = field(default_factory=dict)  #: by agent, its planned seeds
+    looks: tuple[int, ...] = ()  #: the seeds at each look, if the study grows until it is decided
+    #: A lower bound of the optimum; None if ``optimum`` is exact or unknown.
+    optimum_at_least: float | None = None
+    optimum_is_proven: bool = True  #: whether the upper bound is proven
+    #: In a partially observable environment, the optimum of agents that see the state; else None.
+    full_optimum: float | None = None
+    #: There, the input of the policies whose optimum is the scale: ``observation`` or ``memory``.
+    measured_by: str | None = None
+    #: The optima by agent, if agents play environments with different optima; else empty.
+    optima: Mapping[str, float] = field(default_factory=dict)
+    advice: tuple[str, ...] = ()  #: sentences on failed runs, see `with_advice`
+    #: The agents whose mean final return exceeds the upper bound by more than six standard errors.
+    impossible: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StudyAnalysis:
+    """The analysis of a study."""
+
+    results: StudyResults  #: the runs
+    verdicts: Study  #: the verdicts on all pairs
+    environments: tuple[EnvironmentAnalysis, ...]  #: by environment
+    #: Over all environments; None for a single one, or if a score is not known.
+    overall: OverallAnalysis | None
+
+    @property
+    def study(self) -> StudySpec:
+        """The study's specification."""
+        return self.results.study
+
+
+def analyse(
+    results: StudyResults, tell: Tell = tell_nobody, looks: Sequence[int] = ()
+) -> StudyAnalysis:
+    """Analyse the runs of a study.
+
+    Args:
+        results: the runs.
+        tell: receives the progress.
+        looks: the seeds at each look, if the study grows until its pairs are decided.
+    """
+    found = [evidence_on(results, environment.label) for environment in results.study.environments]
+    evidence = [one for one in found if one is not None]
+    scores = scores_over_all(results)
+    means = {name: matrix.mean(axis=1) for name, matrix in scores.items()} if scores else None
+    said = verdicts_on(results.study, evidence, looks, None if looks else means)
+    environments = []
+    for one in evidence:
+        tell(one.environment)
+        environments.append(_analyse_environment(results, one, said, looks))
+    overall = _overall(scores, said) if scores else None
+    return StudyAnalysis(results, said, tuple(environments), overall)
+
+
+def _analyse_environment(
+    results: StudyResults, evidence: Evidence, said: Study, looks: Sequence[int]
+) -> EnvironmentAnalysis:
+    table, environment = results.summary, evidence.environment
+    table = table[table["environment"] == environment]
+    of_runs = {runs.name: runs for runs in said.agents if runs.environment == environment}
+    agents = [_analyse_agent(results, evidence, runs) for runs in of_runs.values()]
+    missing = {agent.agent: agent.n_missing for agent in agents}
+    agents = [agent for agent in agents if agent.n_runs]
+    last = -np.inf  # agents without a figure
+    agents.sort(key=lambda a: last if np.isnan(a.runs.mean) else a.runs.mean, reverse=True)
+    names, threshold = [agent.agent for agent in agents], said.failure_threshold[environment]
+    return EnvironmentAnalysis(
+        environment=environment,
+        env_id=str(table["env_id"].iloc[0]),
+        optimum=evidence.optimum,
+        baseline=evidence.baseline,
+        threshold=evidence.threshold,
+        is_score=evidence.is_score,
+        margin=evidence.margin,
+        bounds=evidence.bounds,
+        exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is neither True nor False
+        agents=tuple(agents),
+        pairs=_in_order([p for p in said.pairs if p.environment == environment], names),
+        best=said.best[environment],
+        failure_threshold=None if np.isnan(threshold) else threshold,
+        missing=missing,
+        seeds=evidence.seeds,
+        looks=tuple(looks),
+        optimum_at_least=evidence.optimum_at_least,
+        optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # likewise
+        full_optimum=_first(table, "full_optimum") if "full_optimum" in table else None,
+        measured_by=_measured_by(table),
+        optima=_differing_optima(table),
+        impossible=_impossible(evidence, table),
+    )
+
+
+def _measured_by(table: pd.DataFrame) -> str | None:
+    if "measured_by" not in table:
+        return None
+    found = table["measured_by"].dropna()
+    return str(found.iloc[0]) if len(found) else None
+
+
+def _impossible(evidence: Evidence, table: pd.DataFrame) -> tuple[str, ...]:
+    most = evidence.optimum
+    if most is None or evidence.optimum_at_least is None:
+        return ()
+    found = []
+    for agent, rows in table.groupby("agent", sort=False):
+        finals = rows["final"].dropna().to_numpy(np.float64)
+        error = float(finals.std(ddof=1)) / len(finals) ** 0.5 if len(finals) > 1 else np.inf
+        if float(finals.mean()) - 6 * error > most + abs(most) * 1e-6:
+            found.append(str(agent))
+    return tuple(found)
+
+
+def _differing_optima(table: pd.DataFrame) -> dict[str, float]:
+    """By agent, the optimum on the first seed, as maps and arms may depend on the seed."""
+    known = table[table["seed"] == table["seed"].min()].dropna(subset=["optimum"])
+    optima = {str(row["agent"]): float(row["optimum"]) for _, row in known.iterrows()}
+    alike = len(optima) < 2 or np.allclose([*optima.values()], next(iter(optima.values())))
+    return {} if alike else optima
+
+
+def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -> AgentAnalysis:
+    study, table, environment = results.study, results.summary, evidence.environment
+    agent = runs.name
+    table = table[(table["environment"] == environment) & (table["agent"] == agent)]
+    n_seeds = evidence.seeds[agent]
+
+    def values(column: str) -> Floats:
+        column_of = table.set_index("seed")[column].reindex(study.seeds[:n_seeds])
+        return column_of.to_numpy(dtype=np.float64, na_value=np.nan)
+
+    def mean(column: str, bounds: Bounds = (-np.inf, np.inf)) -> Estimate:
+        return mean_over_runs(values(column), bounds)
+
+    has_threshold = bool(table["threshold"].notna().any())
+    compared = evidence.scores[agent]
+    known = compared[np.isfinite(compared)]
+    sign = -1.0 if evidence.is_cost else 1.0
+    low, high = evidence.score_bounds if evidence.is_score else evidence.bounds
+    judged = mean_over_runs(compared if evidence.is_score else sign * compared, (low, high))
+    optimum, baseline = evidence.optimum, evidence.baseline
+    score = None
+    if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
+        score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
+    of_returns = evidence.bounds if study.metric in ON_THE_SCALE else (-np.inf, np.inf)
+    changes = _recorded_changes(results, agent, environment)
+    return AgentAnalysis(
+        agent=agent,
+        algo=next(spec.algo for spec in study.agents if spec.label == agent),
+        runs=runs,
+        judged=judged,
+        spread=float(known.std(ddof=1)) if len(known) > 1 else 0.0,
+        n_runs=len(table),
+        n_missing=n_seeds - len(table),
+        metric=summarise(values(study.metric), evidence.bounds),
+        score=score,
+        final=mean("final", of_returns),
+        area=mean("area", of_returns),
+        last_episodes=mean("last_episodes"),
+        regret=mean("regret", (0.0, np.inf)),
+        steps_to_threshold=summarise_steps(values("steps_to_threshold")) if has_threshold else None,
+        steps_to_stay=summarise_steps(values("steps_to_stay")) if has_threshold else None,
+        episodes_to_stay=summarise_steps(values("episodes_to_stay")) if has_threshold else None,
+        success_rate=mean("success_rate", UNIT) if table["success_rate"].notna().any() else None,
+        seconds=mean("cpu_seconds", (0.0, np.inf)),
+        on_variant=any(
+            training_changes(run.spec)
+            for run in results.planned
+            if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
+        ),
+        changes=changes,
+        stochastic=mean("stochastic_return") if table["stochastic_return"].notna().any() else None,
+        acts_by=_only(table["acts_by"]),
+        discounted=mean("discounted_return") if table["discounted_return"].notna().any() else None,
+        discount=_first(table, "discount"),
+        discounted_optimum=_first(table, "discounted_optimum"),
+    )
+
+
+def _only(texts: pd.Series) -> str:
+    """The text that is the same in all runs; empty if it differs."""
+    found = texts.dropna().unique()
+    return str(found[0]) if len(found) == 1 else ""
+
+
+def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:
+    """The recorded changes of the agent's first run, because all seeds share the settings."""
+    run = next((r for r in results.finished if r.labels == (agent, environment)), None)
+    if run is None:
+        return ()
+    info = results.stored[run.labels].infos()[0] if results.is_stored(run) else run.run.read_info()
+    return training_changes(TrainSpec.of_data(info["spec"]))
+
+
+def runs_to_keep(results: StudyResults) -> list[PlannedRun]:
+    """The stored runs whose agents are kept: the best, median and worst, and those for the page.
+
+    The page plays the first run, splits the gap of the median final return, and asks the first
+    failed run for advice.
+    """
+    study, table = results.study, results.summary
+    runs = {(*run.labels, run.seed): run for run in results.finished if results.is_stored(run)}
+    kept = {(*labels, study.first_seed) for labels in results.stored}
+    for environment in study.environments:
+        evidence = evidence_on(results, environment.label)
+        scores = {} if evidence is None or not evidence.is_score else evidence.scores
+        threshold = failure_threshold(0.0, scores.values())
+        kept |= {
+            (*run.labels, run.seed)
+            for several, _ in _failed_runs(results, environment.label, threshold)
+            for run in several[:1]
+        }
+    for labels, rows in table.groupby(["agent", "environment"], sort=False):
+        for column in (study.metric, "final"):
+            order = rows[["seed", column]].dropna().sort_values(column, kind="stable")["seed"]
+            places = {0, (len(order) - 1) // 2, len(order) - 1} if len(order) else ()
+            kept |= {(*map(str, labels), int(order.iloc[place])) for place in places}  # type: ignore[misc]
+    return [run for key, run in runs.items() if key in kept]
+
+
+# --- Advice on failed runs, once for each agent.
+
+# The largest number of agents per environment with advice, because each agent is loaded.
+MOST_TOLD = 4
+
+
+def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
+    """The analysis with sentences on failed runs, if there is advice."""
+    thresholds = analysis.verdicts.failure_threshold
+    failed = [
+        _failed_runs(analysis.results, one.environment, thresholds[one.environment])
+        for one in analysis.environments
+    ]
+    asked = [runs[0] for several in failed for runs, _ in several[:MOST_TOLD]]
+    answers = iter(do_aside(advice_on, asked) if asked else ())
+    environments = []
+    for one, several in zip(analysis.environments, failed, strict=True):
+        advice = []
+        for runs, n_runs in several[:MOST_TOLD]:
+            first, answer = runs[0], next(answers)
+            if answer is not None:
+                of = f"{len(runs)} of {n_runs} runs" if n_runs > 1 else "its run"
+                seed = f"; seed {first.seed}" if len(runs) > 1 else ""
+                instead, try_first = answer
+                then = f"; try first: {try_first}" if try_first else ""
+                told = f"{first.agent} failed in {of}{seed}"
+                advice.append(f"{told}: {instead}{then}.")
+        if more := several[MOST_TOLD:]:
+            names = ", ".join(f"{runs[0].agent} ({len(runs)} of {n})" for runs, n in more)
+            advice.append(f"Runs of {len(more)} more agents failed: {names}.")
+        environments.append(replace(one, advice=tuple(advice)))
+    return replace(analysis, environments=tuple(environments))
+
+
+def _failed_runs(
+    results: StudyResults, label: str, threshold: float
+) -> list[tuple[list[PlannedRun], int]]:
+    """For each agent with failed runs: these runs by seed, and its number of runs.
+
+    Where no agent has learnt, so that the threshold is NaN, all runs at the baseline count.
+    """
+    table = results.summary[results.summary["environment"] == label]
+    runs = {(run.agent, run.seed): run for run in results.finished if run.environment == label}
+    least = FAILED if np.isnan(threshold) else threshold
+    found = []
+    for agent, rows in table.groupby("agent", sort=False):
+        has_failed = rows["score"].astype(float) < least
+        seeds = rows[has_failed & rows["exact"].astype(bool)]["seed"]
+        if len(seeds):
+            found.append(([runs[str(agent), int(seed)] for seed in sorted(seeds)], len(rows)))
+    return found
+
+
+def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
+    """The advice on the agent of each run; None for a run without advice."""
+    return [_advice_on(run) for run in runs]
+
+
+def _advice_on(planned: PlannedRun) -> tuple[str, str | None] | None:
+    from rl_yardstick.pipeline.evaluation.advice import advice
+    from rl_yardstick.pipeline.evaluation.exact import evaluator_of
+    from rl_yardstick.pipeline.models.load import load_model
+
+    run, spec = planned.run, planned.spec
+    with suppress(UserError, OSError):
+        evaluator = evaluator_of(spec)
+        if evaluator is None:
+            return None
+        agent = load_model(spec.algo, run.model_path, modules=spec.user_modules, device="cpu")
+        if evaluator.obstacle(agent):
+            return None
+        n_steps = int(run.read_info()["n_timesteps"])
+        found = advice(spec, agent, evaluator, evaluator(agent), n_steps)
+        return None if found is None else (found.instead, found.try_first)
+    return None

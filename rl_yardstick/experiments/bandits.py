@@ -1,0 +1,360 @@
+"""Does runs on bandits as one batch for each agent, and computes figures pull by pull.
+
+Functions that read raise `DamagedFileError` for a file that is missing, changed, or has another
+schema.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.mdp.transition_model import AnyInts, Floats, Ints
+from rl_yardstick.pipeline.digests import DamagedFileError, read_shaped
+from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.files import replacing
+from rl_yardstick.pipeline.loaded_code import recorded_code
+from rl_yardstick.pipeline.runs import (
+    FINISHED,
+    PULLS_FILE,
+    Run,
+    recorded_machine,
+    recorded_versions,
+    write_settings,
+)
+from rl_yardstick.pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from rl_yardstick.agents.bandits.runs import BatchResult
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+FIRST_PULLS = 100  # each is a point; later points are ever farther apart, `MAX_POINTS` in all
+MAX_POINTS = 300
+
+
+@dataclass(frozen=True)
+class PullStatistics:
+    """Statistics over the runs of one agent on one bandit, and the totals of each run.
+
+    Regret is the best expected reward minus that of the pulled arm. Simple regret is the regret of
+    recommending the most pulled arm so far (Bubeck, Munos and Stoltz, 2009), in each context.
+    """
+
+    # The points: pulls for which there are statistics, counted from 1.
+    pulls: Annotated[Ints, "points"]
+    reward: Annotated[Floats, "points"]  # mean reward of a pull since the previous point
+    optimal: Annotated[Floats, "points"]  # share of best arms among these pulls
+    regret: Annotated[Floats, "points"]  # mean regret of those pulls
+    cumulative_regret: Annotated[Floats, "points"]  # mean sum of regrets up to the point
+    cumulative_regret_sem: Annotated[Floats, "points"]  # its standard error over runs
+    cumulative_regret_quantiles: Annotated[Floats, "5 points"]  # over runs, see `QUANTILES`
+    simple_regret: Annotated[Floats, "points"]  # mean over runs
+    total_reward: Annotated[Floats, "runs"]
+    total_regret: Annotated[Floats, "runs"]
+    shares: Annotated[Floats, "contexts arms"]  # share of each arm among the pulls, by context
+    # Mean regret of a pull; nan if the arm was never pulled.
+    context_regret: Annotated[Floats, "contexts arms"]
+    # Mean of the final estimates over runs; empty if the agent has no estimates. An agent without
+    # contexts has one row for all.
+    estimates: Annotated[Floats, "seen arms_seen"]
+    estimates_std: Annotated[Floats, "seen arms_seen"]  # their standard deviation over runs
+    # Means of the arms, if all runs have the same; else empty.
+    true_means: Annotated[Floats, "known arms_known"]
+    moments: Annotated[Ints, "moments"]  # pulls after which posteriors were stored
+    # Of the first run's arms: parameters of Beta distributions, or means and standard deviations;
+    # else empty.
+    posteriors: Annotated[Floats, "kept contexts_kept arms_kept 2"]
+
+    def save(self, path: Path) -> None:
+        """Write all arrays to a NumPy archive."""
+        arrays: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        with replacing(path) as file:
+            np.savez(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> PullStatistics:
+        """Read the file that `save` wrote.
+
+        Raises:
+            DamagedFileError: if the file is missing, changed, or has another schema.
+        """
+        kinds = get_type_hints(cls, include_extras=True)
+        shapes = {name: kind.__metadata__[0] for name, kind in kinds.items()}
+        arrays = read_shaped(path, Run(path.parent, "").files.read(path), shapes)
+        found = cls(**{name: arrays[name] for name in shapes})
+        n_kept = found.moments.size if found.posteriors.size else len(found.posteriors)
+        if not found.pulls.size or len(found.posteriors) != n_kept:
+            raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+        return found
+
+
+def points_of(n_pulls: int) -> Ints:
+    """The points: all of the first pulls, then pulls at growing distances, shape (points,)."""
+    if n_pulls <= MAX_POINTS:
+        return np.arange(1, n_pulls + 1)
+    first = np.arange(1, FIRST_PULLS + 1)
+    rest = np.geomspace(FIRST_PULLS + 1, n_pulls, MAX_POINTS - FIRST_PULLS)
+    return np.unique(np.concatenate([first, rest.round().astype(np.int64)]))
+
+
+def pull_statistics(
+    arms: AnyInts,
+    rewards: NDArray[np.floating[Any]],
+    regrets: Floats,
+    contexts: AnyInts | None,
+    n_arms: int,
+    n_contexts: int = 1,
+    estimates: Floats | None = None,
+    true_means: Floats | None = None,
+    moments: tuple[int, ...] = (),
+    posteriors: Floats | None = None,
+) -> PullStatistics:
+    """Compute the statistics of runs; arrays have a row for each run and a column for each pull.
+
+    Estimates have the shape (n_runs, n_contexts, n_arms), true means (n_contexts, n_arms), and
+    posteriors (n_runs, n_moments, n_contexts, n_arms, 2).
+    """
+    points = points_of(arms.shape[1])
+    at = points - 1
+    cumulative = np.cumsum(regrets, axis=1)
+    cells = arms.astype(np.int64) + n_arms * (0 if contexts is None else contexts.astype(np.int64))
+    size = n_arms * n_contexts
+    counts = np.bincount(cells.ravel(), minlength=size).reshape(n_contexts, n_arms)
+    sums = np.bincount(cells.ravel(), weights=regrets.ravel(), minlength=size)
+    empty = np.empty((0, 0))
+    with np.errstate(invalid="ignore"):
+        context_regret = sums.reshape(n_contexts, n_arms) / counts
+        shares = counts / counts.sum(axis=1, keepdims=True)
+    n_runs = len(arms)
+    mean, std = _mean_and_std(empty[None] if estimates is None else estimates)
+    return PullStatistics(
+        pulls=points,
+        reward=_mean_since_last(rewards.mean(axis=0, dtype=np.float64), points),
+        optimal=_mean_since_last((regrets == 0.0).mean(axis=0), points),
+        regret=_mean_since_last(regrets.mean(axis=0), points),
+        cumulative_regret=cumulative[:, at].mean(axis=0),
+        cumulative_regret_sem=cumulative[:, at].std(axis=0, ddof=min(1, n_runs - 1)) / n_runs**0.5,
+        cumulative_regret_quantiles=np.quantile(cumulative[:, at], QUANTILES, axis=0),
+        simple_regret=_simple_regret(cells, regrets, at, (n_contexts, n_arms)),
+        total_reward=rewards.sum(axis=1, dtype=np.float64),
+        total_regret=cumulative[:, -1],
+        shares=shares,
+        context_regret=context_regret,
+        estimates=mean,
+        estimates_std=std,
+        true_means=empty if true_means is None else true_means,
+        moments=np.array(moments, dtype=np.int64),
+        posteriors=np.empty((0, 0, 0, 2)) if posteriors is None else posteriors[0],
+    )
+
+
+def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
+    """Mean and deviation over runs, without nan; nan if no run has a figure."""
+    is_known = ~np.isnan(estimates)
+    with np.errstate(invalid="ignore"):
+        n_known = is_known.sum(axis=0)
+        mean = np.where(is_known, estimates, 0.0).sum(axis=0) / n_known
+        squares = np.where(is_known, estimates - mean, 0.0) ** 2
+        return mean, np.sqrt(squares.sum(axis=0) / n_known)
+
+
+def _mean_since_last(by_pull: Floats, points: Ints) -> Floats:
+    """Means over the pulls from one point (exclusive) to the next (inclusive)."""
+    sums = np.cumsum(by_pull)[points - 1]
+    return np.asarray(np.diff(sums, prepend=0.0) / np.diff(points, prepend=0))
+
+
+def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int]) -> Floats:
+    """The mean simple regret over runs, for recommending the most pulled arm so far.
+
+    ``cells`` are combined numbers of context and arm, shape (n_runs, n_pulls); ``at`` are pulls
+    counted from 0; ``shape`` has the numbers of contexts and arms.
+    """
+    n_runs, rows = len(cells), np.arange(len(cells))
+    counts = np.zeros((n_runs, shape[0] * shape[1]))
+    sums = np.zeros_like(counts)
+    result, begin = np.empty(len(at)), 0
+    for index, last in enumerate(at.tolist()):
+        for pull in range(begin, last + 1):
+            counts[rows, cells[:, pull]] += 1
+            sums[rows, cells[:, pull]] += regrets[:, pull]
+        begin = last + 1
+        by_context = counts.reshape(n_runs, *shape)
+        most = by_context.argmax(axis=2)[..., None]
+        n_most = np.take_along_axis(by_context, most, axis=2)[..., 0]
+        regret_of_most = np.take_along_axis(sums.reshape(n_runs, *shape), most, axis=2)[..., 0]
+        # Contexts are weighted by how often they were seen.
+        weights = by_context.sum(axis=2) / (last + 1)
+        result[index] = (weights * regret_of_most / np.maximum(n_most, 1)).sum(axis=1).mean()
+    return result
+
+
+# --- Results of batches, and of single runs.
+
+STATISTICS_FILE = "pull_statistics.npz"
+_PULLS = ("arms", "rewards", "regrets")  # the arrays of a run, besides contexts
+
+
+def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStatistics]:
+    """Read the figures by pull of all runs on bandits."""
+    batches = [run for run in finished if run.is_batch]
+    pulls = {run.labels: PullStatistics.load(run.path / STATISTICS_FILE) for run in batches}
+    one_by_one: dict[tuple[str, str], list[PlannedRun]] = {}
+    for run in finished:
+        if run.run.files.matching(PULLS_FILE):
+            one_by_one.setdefault(run.labels, []).append(run)
+    for labels, runs in one_by_one.items():
+        pulls[labels] = stacked_statistics(runs[0].spec, [run.path for run in runs])
+    return pulls
+
+
+def run_regret(planned: PlannedRun) -> float | None:
+    """The regret of a single run, or None if it was not on a bandit."""
+    files = planned.run.files
+    if not files.matching(PULLS_FILE):
+        return None
+    if files.digests is None:
+        check_pulls(planned.spec, planned.path)
+    pulls = read_run(planned.path, planned.spec.hyperparams.n_timesteps)
+    return float(pulls["regrets"].sum())
+
+
+def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
+    """Read the pulls of a single run in the order of time, each of shape (n_pulls,).
+
+    Agents that collect whole rollouts exceed ``n_timesteps``; the surplus is dropped.
+    """
+    path = folder / PULLS_FILE
+    shapes = dict.fromkeys((*_PULLS, "contexts"), "environments pulls")
+    arrays = read_shaped(path, Run(folder, "").files.read(path), shapes, ("contexts",))
+    if not arrays["arms"].size:
+        raise DamagedFileError(path, "is damaged: it holds no pull")
+    for name in ("arms", "contexts"):
+        numbers = arrays.get(name)
+        if numbers is not None and (numbers.dtype.kind not in "iu" or (numbers < 0).any()):
+            raise DamagedFileError(path, f"is damaged: {name} are no numbers from 0 on")
+    return {name: arrays[name].T.ravel()[:n_timesteps] for name in shapes if name in arrays}
+
+
+def check_pulls(spec: TrainSpec, folder: Path) -> None:
+    """Check that a run's arms and contexts exist in the environment of its spec."""
+    pulls = read_run(folder, spec.hyperparams.n_timesteps)
+    with closing(make_single_env(spec)) as env:
+        bandit: Any = env.unwrapped
+        sizes = {"arms": bandit.n_arms, "contexts": bandit.n_contexts}
+    for name, size in sizes.items():
+        if size > 0 and name in pulls and pulls[name].max() >= size:
+            raise DamagedFileError(folder / PULLS_FILE, f"is damaged: {name} are of another bandit")
+
+
+def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
+    """The statistics of single runs, from the pulls in their folders."""
+    runs = [read_run(folder, spec.hyperparams.n_timesteps) for folder in folders]
+    n_pulls = min(len(run["arms"]) for run in runs)
+    stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
+    return _statistics_on(spec, *(stacked.get(name) for name in (*_PULLS, "contexts")))
+
+
+def _statistics_on(
+    spec: TrainSpec, arms: Any, rewards: Any, regrets: Any, contexts: Any, **more: Any
+) -> PullStatistics:
+    """The statistics of pulls on the bandit of a spec, see `pull_statistics`."""
+    with closing(make_single_env(spec)) as env:
+        bandit: Any = env.unwrapped
+        n_arms, n_contexts = bandit.n_arms, max(bandit.n_contexts, 1)
+        is_known = bandit.n_contexts > 0 and not _is_drifting(bandit)
+        more["true_means"] = true_means(env)
+    contexts = contexts if n_contexts > 1 else None
+    found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
+    # Simple regret is not defined if the means drift, or depend on a vector.
+    nowhere = np.full_like(found.simple_regret, np.nan)
+    return found if is_known else replace(found, simple_regret=nowhere)
+
+
+def true_means(env: gym.Env[Any, Any]) -> Floats | None:
+    """Means of the arms by context, shape (n_contexts, n_arms), if all runs have the same."""
+    bandit: Any = env.unwrapped
+    moves = getattr(bandit, "redraws", False) or _is_drifting(bandit)
+    means = getattr(bandit, "means", None)
+    return None if moves or means is None else np.array(means, dtype=np.float64)
+
+
+def _is_drifting(bandit: Any) -> bool:
+    return bool(getattr(bandit, "drift_std", 0.0) > 0)
+
+
+# --- All runs of an agent as one batch: each a fresh agent and one episode.
+
+
+def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
+    """Do ``n_runs`` runs, from the spec's seed on, and save their statistics in the run folder."""
+    from rl_yardstick.machine_code import WorkTime
+    from rl_yardstick.machine_code.compiling import compile_timer
+
+    started = WorkTime.now()
+    with compile_timer() as time_compiling:
+        result, engine = _run(spec, n_runs)
+    _check_rewards(result, spec.seed)
+    statistics = _statistics_on(
+        spec,
+        result.arms,
+        result.rewards,
+        result.regrets,
+        result.contexts,
+        estimates=result.estimates,
+        moments=result.moments,
+        posteriors=result.posteriors,
+    )
+    statistics.save(run.path / STATISTICS_FILE)
+    write_settings(run, spec, command)
+    run.end(
+        state=FINISHED,
+        env_name=run.env_name,
+        spec=spec.as_data(),
+        n_runs=n_runs,
+        n_timesteps=len(result.arms[0]),
+        versions=recorded_versions(),
+        machine=recorded_machine(),
+        **recorded_code(spec.user_modules),
+        engine=engine,
+        **(WorkTime.now() - started - time_compiling()).as_data(),
+    )
+
+
+def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
+    # A slow import that only processes with runs need.
+    from rl_yardstick.agents.bandits.runs import run_batch, run_one_by_one
+    from rl_yardstick.agents.compiled.worlds import NotCompilable
+    from rl_yardstick.pipeline.preparation import algorithm_kwargs
+
+    arguments: tuple[Any, ...] = (
+        spec.algo,
+        algorithm_kwargs(spec),
+        spec.env_id,
+        spec.hyperparams.env_kwargs,
+        range(spec.seed, spec.seed + n_runs),
+        spec.hyperparams.n_timesteps,
+    )
+    try:
+        return run_batch(*arguments), "compiled batch"
+    except NotCompilable as reason:
+        return run_one_by_one(*arguments), f"one by one: {reason}"
+
+
+def _check_rewards(result: BatchResult, first_seed: int) -> None:
+    """Refuse rewards that are not finite."""
+    from rl_yardstick.pipeline.finite_numbers import NotFiniteError, is_finite
+
+    for seed, rewards in enumerate(result.rewards, start=first_seed):
+        if not is_finite(rewards):
+            pull = int(np.argmin(np.isfinite(rewards)))
+            what = f"reward of seed {seed} at step {pull + 1:,}"
+            raise NotFiniteError(what, float(rewards[pull]))

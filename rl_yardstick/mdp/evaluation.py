@@ -1,0 +1,590 @@
+"""Exact evaluation of policies, without sampling.
+
+A policy is given in one of three forms. Only the rows of states that it visits are used.
+
+- Float of shape (S, A): the probabilities of the actions in each state.
+- Integer of shape (S,): the action in each state.
+- Integer of shape (horizon, S): the action at each step in each state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl_yardstick.machine_code.compiling import called, compiled
+from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
+from rl_yardstick.mdp.graph import PolicyChain, reachable_states
+from rl_yardstick.mdp.large_maps import moments_along_ways, moments_by_spreading
+from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
+
+
+@dataclass(frozen=True)
+class PolicyReturn:
+    """Moments of one episode, averaged over the distribution of starting states.
+
+    Attributes:
+        expected_return: the mean of the (discounted) sum of rewards.
+        return_variance: its variance.
+        expected_length: the mean number of steps; infinite where episodes may never end.
+        length_variance: its variance; NaN where the mean is infinite.
+        success_rate: the probability that the episode succeeds; None where success was not defined.
+    """
+
+    expected_return: float
+    return_variance: float
+    expected_length: float
+    length_variance: float
+    success_rate: float | None
+
+
+def over_starts(initial: Floats, moments: Floats, *, with_success: bool) -> PolicyReturn:
+    """Average over the starting states; their differences add to the variances."""
+    start = initial > 0
+    chance, moments = initial[start], moments[start]
+    mean = chance @ moments
+    return PolicyReturn(
+        expected_return=float(mean[0]),
+        return_variance=float(mean[1] + chance @ (moments[:, 0] - mean[0]) ** 2),
+        expected_length=float(mean[2]),
+        length_variance=float(mean[3] + chance @ (moments[:, 2] - mean[2]) ** 2)
+        if np.isfinite(mean[2])
+        else float("nan"),
+        success_rate=float(mean[4]) if with_success else None,
+    )
+
+
+def policy_return(
+    model: TransitionModel,
+    policy: Policy,
+    horizon: int | None,
+    discount: float = 1.0,
+    success: Bools | None = None,
+) -> PolicyReturn:
+    """Evaluate a policy exactly.
+
+    Args:
+        model: the decision process.
+        policy: in any of its forms.
+        horizon: the time limit in steps, after which the episode is cut off; None for none.
+        discount: from 0 to 1.
+        success: the outcomes that make an episode a success, bool of shape (S, A, K). Outcomes
+            that do not end the episode are ignored.
+
+    Raises:
+        ValueError: for arguments out of range or of the wrong shape, and, without time limit and
+            discount, for a policy under which episodes may never end.
+    """
+    _check(model, horizon, discount, success)
+    if model.reward_variance is not None:
+        return _with_drawn_rewards(model, policy, horizon, discount, success)
+    policy = canonical_policy(model, policy, horizon)
+    ends_well = model.terminated if success is None else model.terminated & success
+    if horizon is not None:
+        episodes = LimitedEpisodes(model, policy, horizon)
+        return episodes.result(float(discount), ends_well, with_success=success is not None)
+    chain = PolicyChain.build(model, policy_matrix(model, policy))
+    moments = _moments_without_limit(chain, discount, ends_well)
+    return over_starts(model.initial[chain.states], moments, with_success=success is not None)
+
+
+def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None) -> Floats:
+    """The expected number of times that an episode acts in each state, shape (S,).
+
+    Args:
+        model: the decision process.
+        policy: in any of its forms.
+        horizon: the time limit in steps; None for none.
+
+    Raises:
+        ValueError: as ``policy_return``.
+    """
+    _check(model, horizon, 1.0, None)
+    policy = canonical_policy(model, policy, horizon)
+    if horizon is not None:
+        return LimitedEpisodes(model, policy, horizon).visits()
+    visits = np.zeros(model.n_states)
+    chain = PolicyChain.build(model, policy_matrix(model, policy))
+    _refuse_endless(chain)
+    visits[chain.states] = chain.solve(model.initial[chain.states], 1.0, transposed=True)
+    return visits
+
+
+def baseline_policies(model: TransitionModel) -> list[Floats]:
+    """The policies of agents that have learnt nothing: random first, then each constant action.
+
+    Returns:
+        Policy matrices of shape (S, A), 1 + A of them.
+    """
+    shape = (model.n_states, model.n_actions)
+    uniform = np.full(model.n_actions, 1 / model.n_actions)
+    return [np.broadcast_to(row, shape) for row in (uniform, *np.eye(model.n_actions))]
+
+
+def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0) -> float:
+    """The largest expected return of uniformly random actions and of each constant action.
+
+    Random actions alone would be too easy to beat: where mistakes cost more than time, standing
+    still beats them by far. (A fixed sequence of actions ignores observations too, but may be
+    optimal where nothing is random.)
+    """
+    _check(model, horizon, discount, None)
+    best = -np.inf
+    uniform, *constant = baseline_policies(model)
+    # Random actions visit most states: with a known floor, their evaluation often stops early.
+    for policy in (*constant, uniform):
+        episodes = LimitedEpisodes(model, canonical_policy(model, policy, horizon), horizon)
+        floor = best if discount == 1 else -np.inf
+        found = episodes.result(discount, model.terminated, with_success=False, floor=floor)
+        best = max(best, found.expected_return)
+    return best
+
+
+def _with_drawn_rewards(
+    model: TransitionModel,
+    policy: Policy,
+    horizon: int | None,
+    discount: float,
+    success: Bools | None,
+) -> PolicyReturn:
+    """As `policy_return`, with independent random rewards around the model's means.
+
+    Adds the expected sum of their variances, discounted by ``discount**2``, to the variance.
+    """
+    assert model.reward_variance is not None
+    settled = replace(model, reward_variance=None)
+    result = policy_return(settled, policy, horizon, discount, success)
+    drawn = replace(settled, reward=model.reward_variance)
+    added = policy_return(drawn, policy, horizon, discount**2).expected_return
+    return replace(result, return_variance=result.return_variance + added)
+
+
+def _check(
+    model: TransitionModel, horizon: int | None, discount: float, success: Bools | None
+) -> None:
+    if horizon is not None and horizon < 1:
+        raise ValueError(f"horizon is {horizon}, it must be at least 1, or None for no limit")
+    if not 0 <= discount <= 1:
+        raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
+    if success is not None and success.shape != model.prob.shape:
+        raise ValueError(f"success has shape {success.shape}, the model has {model.prob.shape}")
+
+
+def _moments_without_limit(chain: PolicyChain, discount: float, ends_well: Bools) -> Floats:
+    """As ``moments_under_limit``, from linear systems."""
+    if discount == 1:
+        _refuse_endless(chain)
+    moments = np.empty((len(chain.states), 5))
+    moments[:, 0] = chain.solve(chain.mean(chain.reward), discount)
+    result = chain.reward + discount * chain.after(moments[:, 0])
+    moments[:, 1] = chain.solve(chain.spread(result, moments[:, 0]), discount**2)
+    if chain.endless.any():
+        moments[:, 2], moments[:, 3] = np.inf, np.nan
+    else:
+        moments[:, 2] = chain.solve(np.ones(len(chain.states)), 1.0)
+        length = 1 + chain.after(moments[:, 2])
+        moments[:, 3] = chain.solve(chain.spread(length, moments[:, 2]), 1.0)
+    succeeds = chain.mean(ends_well.ravel()[chain.outcome])
+    moments[:, 4] = chain.solve(succeeds, 1.0, zero=chain.endless)
+    return moments
+
+
+def _refuse_endless(chain: PolicyChain) -> None:
+    if chain.endless.any():
+        state = chain.states[chain.endless][0]
+        raise ValueError(
+            f"from state {state} the policy never ends the episode: give a time limit (horizon) "
+            "or a discount below 1"
+        )
+
+
+# Far above the rounding errors of a thousand steps, far below what a learner can distinguish.
+OPTIMAL_TOLERANCE = 1e-9
+
+
+def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats:
+    """The expected undiscounted return of episodes that begin in each state.
+
+    Args:
+        model: the decision process.
+        policy: in any of its forms.
+        horizon: the time limit in steps, all of which are left in each state.
+
+    Returns:
+        Shape (S,); zero for states that no policy reaches.
+
+    Raises:
+        ValueError: for a horizon below 1, or a malformed policy.
+    """
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, it must be at least 1")
+    policy = canonical_policy(model, policy, horizon)
+    states = np.flatnonzero(model.reachable)
+    values = np.zeros(model.n_states)
+    moments = LimitedEpisodes(model, policy, horizon).along_ways(states, 1.0, model.terminated)
+    if moments is not None:
+        values[states] = moments[:, 0]
+        return values
+    place = np.cumsum(model.reachable) - 1
+    values[states] = _returns_under_limit(
+        model.prob[states],
+        place[model.next_state[states]],
+        model.terminated[states],
+        model.expected_reward[states],
+        chances_in(model, policy, states),
+        horizon,
+    )
+    return values
+
+
+def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools]:
+    """The optimal value of each state, and its optimal actions.
+
+    Sutton and Barto, Reinforcement Learning, 2nd edition, section 3.6.
+
+    Args:
+        model: the decision process.
+        horizon: the time limit in steps, all of which are left in each state.
+
+    Returns:
+        The optimal expected undiscounted returns, shape (S,), zero for states that no policy
+        reaches. And the actions whose value comes within 1e-9 of the best, relative to it where
+        it is above 1: bool of shape (S, A), all actions in unreachable states.
+
+    Raises:
+        ValueError: for a horizon below 1.
+    """
+    values = finite_horizon_optimum(model, horizon).values
+    later = finite_horizon_optimum(model, horizon - 1).values if horizon > 1 else 0 * values
+    following = np.where(model.terminated, 0.0, later[model.next_state])
+    action_values = model.expected_reward + np.einsum("sak,sak->sa", model.prob, following)
+    margin = OPTIMAL_TOLERANCE * np.maximum(1.0, np.abs(values))
+    optimal = action_values >= (values - margin)[:, None]
+    return values, optimal | ~model.reachable[:, None]
+
+
+@compiled
+def _returns_under_limit(
+    prob: Floats,
+    next_state: Ints,
+    terminated: Bools,
+    mean_reward: Floats,
+    policy: Floats,
+    horizon: int,
+) -> Floats:
+    """The expected returns alone, as in ``moments_under_limit``, shape (n,)."""
+    later = np.zeros(prob.shape[0])
+    now = np.zeros(prob.shape[0])
+    for step in range(horizon - 1, -1, -1):
+        chances = policy[min(step, policy.shape[0] - 1)]
+        changed = False
+        for state in range(prob.shape[0]):
+            value = 0.0
+            for action in range(prob.shape[1]):
+                if chances[state, action] > 0:
+                    after = mean_reward[state, action]
+                    for k in range(prob.shape[2]):
+                        if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                            after += prob[state, action, k] * later[next_state[state, action, k]]
+                    value += chances[state, action] * after
+            changed = changed or value != later[state]
+            now[state] = value
+        now, later = later, now
+        # Converged: further steps change nothing.
+        if not changed and policy.shape[0] == 1:
+            break
+    return later
+
+
+# The forms of a policy.
+
+Policy = NDArray[np.floating] | AnyInts
+
+# Networks work in float32, whose probabilities sum to one within some 1e-7.
+POLICY_TOLERANCE = 1e-5
+
+
+def canonical_policy(model: TransitionModel, policy: Policy, horizon: int | None) -> Policy:
+    """The policy as a float64 matrix (S, A), or as actions of shape (1 or horizon, S)."""
+    n_states, n_actions = model.n_states, model.n_actions
+    if np.issubdtype(policy.dtype, np.integer):
+        actions: AnyInts = np.atleast_2d(policy)
+        if actions.shape not in {(1, n_states), (horizon, n_states)}:
+            raise ValueError(
+                f"actions have shape {policy.shape}, they must have ({n_states},), or "
+                f"({horizon}, {n_states}) under a time limit"
+            )
+        taken = actions[:, model.reachable]
+        if taken.min() < 0 or taken.max() >= n_actions:
+            raise ValueError(f"the policy takes an action outside 0..{n_actions - 1}")
+        return actions
+    if policy.shape != (n_states, n_actions):
+        raise ValueError(
+            f"the policy matrix has shape {policy.shape}, it must have ({n_states}, {n_actions})"
+        )
+    matrix = policy.astype(np.float64)
+    total = matrix.sum(axis=1)
+    # Written so that a NaN fails.
+    valid = (matrix >= 0).all(axis=1) & (np.abs(total - 1) <= POLICY_TOLERANCE)
+    if not valid[model.reachable].all():
+        state = np.flatnonzero(model.reachable & ~valid)[0]
+        raise ValueError(f"in state {state} the policy's probabilities are {policy[state]}")
+    matrix[valid] /= total[valid, None]
+    return matrix
+
+
+def chances_in(model: TransitionModel, policy: Policy, states: Ints) -> Floats:
+    """The probabilities of actions in the listed states, shape (1 or horizon, n, A)."""
+    if np.issubdtype(policy.dtype, np.integer):
+        return np.eye(model.n_actions)[policy[:, states]]
+    return np.ascontiguousarray(policy[None, states], np.float64)
+
+
+def policy_matrix(model: TransitionModel, policy: Policy) -> Floats:
+    """The probabilities of actions in all states, shape (S, A), of a stationary policy."""
+    matrix: Floats = chances_in(model, policy, np.arange(model.n_states))[0]
+    return matrix
+
+
+def actions_used(model: TransitionModel, policy: Policy) -> Bools:
+    """The actions that the policy may take at some step, bool of shape (S, A)."""
+    if not np.issubdtype(policy.dtype, np.integer):
+        return policy > 0
+    used = np.zeros((model.n_states, model.n_actions), np.bool_)
+    used[np.arange(model.n_states), np.clip(policy, 0, model.n_actions - 1)] = True
+    return used
+
+
+# Under a time limit.
+
+# Visited states times steps; above this, backward induction takes more than tenths of a second.
+MOST_BACKWARDS = 2_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LimitedEpisodes:
+    """The episodes of a policy under a time limit."""
+
+    model: TransitionModel  # the decision process
+    policy: Policy  # in the form of `canonical_policy`
+    horizon: int  # the time limit in steps
+
+    def result(
+        self, discount: float, ends_well: Bools, *, with_success: bool, floor: float = -np.inf
+    ) -> PolicyReturn:
+        """Mean and variance of one episode.
+
+        A mean return that is certainly below ``floor`` may be given as minus infinity; only
+        without discount.
+        """
+        states = self._visited()
+        moments = self.along_ways(states, discount, ends_well)
+        if moments is None and self._is_large(states):
+            mean, variance, length, spread, rate = self._forwards(
+                discount, ends_well, floor
+            ).tolist()
+            return PolicyReturn(mean, variance, length, spread, rate if with_success else None)
+        if moments is None:
+            rows = (*self._rows(states), self.model.reward[states], ends_well[states])
+            chances = chances_in(self.model, self.policy, states)
+            if len(chances) == 1 and ((chances == 0) | (chances == 1)).all():
+                # Keep the rows of these actions only: the sweeps would skip all others each time.
+                taken = np.arange(len(states)), chances[0].argmax(axis=1)
+                rows = tuple(array[taken][:, None] for array in rows)
+                chances = np.ones((1, len(states), 1))
+            moments = moments_under_limit(*rows, chances, self.horizon, discount)
+        return over_starts(self.model.initial[states], moments, with_success=with_success)
+
+    def visits(self) -> Floats:
+        """The expected number of times that an episode acts in each state, shape (S,)."""
+        states, visits = self._visited(), np.zeros(self.model.n_states)
+        chances = chances_in(self.model, self.policy, states)
+        start = self.model.initial[states]
+        visits[states] = visits_under_limit(*self._rows(states), chances, start, self.horizon)
+        return visits
+
+    def _visited(self) -> Ints:
+        return np.flatnonzero(reachable_states(self.model, actions_used(self.model, self.policy)))
+
+    def _rows(self, states: Ints) -> tuple[Floats, Ints, Bools]:
+        """Rows of n states: prob, next_state (as indices into these n states), terminated."""
+        model = self.model
+        following = self._places(states)[model.next_state[states]]
+        return model.prob[states], following, model.terminated[states]
+
+    def _places(self, states: Ints) -> Ints:
+        place = np.full(self.model.n_states, -1)
+        place[states] = np.arange(len(states))
+        return place
+
+    def _is_stationary(self) -> bool:
+        is_actions = np.issubdtype(self.policy.dtype, np.integer)
+        return not is_actions or len(self.policy) == 1
+
+    def _is_large(self, states: Ints) -> bool:
+        return self._is_stationary() and len(states) * self.horizon > MOST_BACKWARDS
+
+    def along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
+        """The moments, if each of the n states has one outcome; None if a state has more.
+
+        The states must be closed under the policy; shape (n, 5) as `moments_under_limit`.
+        """
+        if not self._is_stationary():
+            return None
+        if np.issubdtype(self.policy.dtype, np.integer):
+            action = self.policy[0, states].astype(np.int64)
+        else:
+            action = self.policy[states].argmax(axis=1)
+            if (self.policy[states, action] != 1).any():
+                return None
+        outcome = self.model.prob[states, action].argmax(axis=1)
+        at = states, action, outcome
+        if (self.model.prob[at] != 1).any():
+            return None
+        following = self._places(states)[self.model.next_state[at]]
+        ends, reward = self.model.terminated[at], self.model.reward[at]
+        return moments_along_ways(following, ends, reward, ends_well[at], self.horizon, discount)
+
+    def _forwards(self, discount: float, ends_well: Bools, floor: float) -> Floats:
+        """The moments (5,) of an episode from the distribution of the starting states."""
+        model = self.model
+        is_actions = np.issubdtype(self.policy.dtype, np.integer)
+        chances = actions_used(model, self.policy) if is_actions else self.policy
+        rows = model.prob, model.next_state, model.terminated, model.reward, ends_well
+        return moments_by_spreading(
+            rows, chances.astype(np.float64), model.initial, self.horizon, discount, floor
+        )
+
+
+# Compiled.
+
+
+@compiled
+def moments_under_limit(
+    prob: Floats,
+    next_state: Ints,
+    terminated: Bools,
+    reward: Floats,
+    success: Bools,
+    policy: Floats,
+    horizon: int,
+    discount: float,
+) -> Floats:
+    """Moments of the episodes that start in each state.
+
+    The variances are sums of squared deviations, which stay accurate where the mean is large
+    (Sobel, The Variance of Discounted Markov Decision Processes, 1982).
+
+    Returns:
+        Shape (n, 5): mean and variance of the return, mean and variance of the length, and the
+        probability of success.
+    """
+    later = np.zeros((prob.shape[0], 5))
+    now = np.zeros((prob.shape[0], 5))
+    for step in range(horizon - 1, -1, -1):
+        chances = policy[min(step, policy.shape[0] - 1)]
+        changed = False
+        for state in range(prob.shape[0]):
+            outcomes = (prob[state], next_state[state], terminated[state], reward[state])
+            _means(*outcomes, success[state], chances[state], discount, later, now[state])
+            _variances(*outcomes, chances[state], discount, later, now[state])
+            for moment in range(5):
+                changed = changed or now[state, moment] != later[state, moment]
+        now, later = later, now
+        # Converged: further steps change nothing.
+        if not changed and policy.shape[0] == 1:
+            break
+    return later
+
+
+@called
+def _means(
+    prob: Floats,
+    next_state: Ints,
+    terminated: Bools,
+    reward: Floats,
+    success: Bools,
+    chances: Floats,
+    discount: float,
+    later: Floats,
+    now: Floats,
+) -> None:
+    """The means of one state, from its rows of the model and the moments one step later."""
+    now[0] = 0.0
+    now[2] = 1.0
+    now[4] = 0.0
+    for action in range(prob.shape[0]):
+        for k in range(prob.shape[1]):
+            weight = chances[action] * prob[action, k]
+            if weight > 0:
+                now[0] += weight * reward[action, k]
+                now[4] += weight * success[action, k]
+                if not terminated[action, k]:
+                    after = later[next_state[action, k]]
+                    now[0] += weight * discount * after[0]
+                    now[2] += weight * after[2]
+                    now[4] += weight * after[4]
+
+
+@called
+def _variances(
+    prob: Floats,
+    next_state: Ints,
+    terminated: Bools,
+    reward: Floats,
+    chances: Floats,
+    discount: float,
+    later: Floats,
+    now: Floats,
+) -> None:
+    """The variances of one state, by the law of total variance."""
+    now[1] = 0.0
+    now[3] = 0.0
+    for action in range(prob.shape[0]):
+        for k in range(prob.shape[1]):
+            weight = chances[action] * prob[action, k]
+            if weight > 0:
+                result = reward[action, k]
+                length = 1.0
+                if not terminated[action, k]:
+                    after = later[next_state[action, k]]
+                    result += discount * after[0]
+                    length += after[2]
+                    now[1] += weight * discount * discount * after[1]
+                    now[3] += weight * after[3]
+                now[1] += weight * (result - now[0]) ** 2
+                now[3] += weight * (length - now[2]) ** 2
+
+
+@compiled
+def visits_under_limit(
+    prob: Floats,
+    next_state: Ints,
+    terminated: Bools,
+    policy: Floats,
+    initial: Floats,
+    horizon: int,
+) -> Floats:
+    """The expected number of steps taken in each state, shape (n,)."""
+    visits = np.zeros(len(initial))
+    here = initial.copy()
+    for step in range(horizon):
+        chances = policy[min(step, policy.shape[0] - 1)]
+        there = np.zeros(len(initial))
+        left = 0.0
+        for state in range(len(initial)):
+            visits[state] += here[state]
+            if here[state] == 0:
+                continue
+            for action in range(prob.shape[1]):
+                for k in range(prob.shape[2]):
+                    weight = here[state] * chances[state, action] * prob[state, action, k]
+                    if weight > 0 and not terminated[state, action, k]:
+                        there[next_state[state, action, k]] += weight
+                        left += weight
+        here = there
+        if left == 0:
+            break
+    return visits

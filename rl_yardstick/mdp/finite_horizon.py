@@ -1,0 +1,131 @@
+"""The optimal policy under a time limit, which depends on the number of steps left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl_yardstick.machine_code.compiling import compiled
+from rl_yardstick.mdp.planning import TIE_TOLERANCE
+from rl_yardstick.mdp.transition_model import (
+    AnyInts,
+    Bools,
+    Floats,
+    Ints,
+    TransitionModel,
+    allowed_actions,
+)
+
+# The smallest unsigned integers that hold the actions.
+Actions = NDArray[np.unsignedinteger]
+
+
+@dataclass(frozen=True, eq=False)
+class FiniteHorizonPlan:
+    """An optimal policy under a time limit.
+
+    Attributes:
+        values: the optimal expected (discounted) sum of rewards from each state at step 0, shape
+            (S,); zero for states that cannot be reached.
+        actions_left: the greedy action, the first among ties within 1e-12 of the best value, with
+            1, 2, ... steps left: shape (m, S) of a small unsigned integer type. With more than m
+            steps left, the last row applies.
+        horizon: the number of steps after which the episode is cut off.
+        start_value: the mean of ``values`` over the starting states.
+    """
+
+    values: Floats
+    actions_left: Actions
+    horizon: int
+    start_value: float
+
+    def actions(self, step: int) -> Actions:
+        """The actions (S,) to take after ``step`` steps of the episode, 0 to horizon - 1."""
+        if not 0 <= step < self.horizon:
+            raise ValueError(f"step is {step}, it must lie between 0 and {self.horizon - 1}")
+        row: Actions = self.actions_left[min(self.horizon - step, len(self.actions_left)) - 1]
+        return row
+
+    @property
+    def policy(self) -> Actions:
+        """The actions at each step, shape (horizon, S), in order of time."""
+        left = np.minimum(np.arange(self.horizon, 0, -1), len(self.actions_left))
+        rows: Actions = self.actions_left[left - 1]
+        return rows
+
+
+def finite_horizon_optimum(
+    model: TransitionModel, horizon: int, discount: float = 1.0, mask: Bools | None = None
+) -> FiniteHorizonPlan:
+    """Plan backwards from the time limit.
+
+    Stops once a step changes no value in its last bit: further steps would change none either.
+    Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
+    Decision Processes, 1994, section 4.5.
+
+    Args:
+        model: the decision process; rows of unreachable states are ignored.
+        horizon: the time limit in steps, at least 1.
+        discount: from 0 to 1.
+        mask: the actions that may be taken, bool of shape (S, A), or None for all.
+
+    Raises:
+        ValueError: for a horizon or discount out of range, or a malformed mask.
+    """
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, it must be at least 1")
+    if not 0 <= discount <= 1:
+        raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
+    states = np.flatnonzero(model.reachable)
+    allowed = allowed_actions(model, mask)
+    arrays = (model.prob, model.next_state, model.terminated, model.expected_reward, allowed)
+    values = np.zeros(model.n_states)
+    rows: list[Actions] = []
+    for _ in range(horizon):
+        earlier = np.zeros(model.n_states)
+        actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
+        back_up(*arrays, float(discount), states, values, earlier, actions)
+        rows.append(actions)
+        if np.array_equal(earlier, values):
+            break
+        values = earlier
+    return FiniteHorizonPlan(values, np.array(rows), horizon, float(model.initial @ values))
+
+
+@compiled
+def back_up(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    allowed: Bools,
+    discount: float,
+    states: Ints,
+    values: Floats,
+    earlier: Floats,
+    actions: Actions,
+) -> None:
+    """Values one step earlier, and the actions to take there, into ``earlier`` and ``actions``."""
+    action_values = np.empty(prob.shape[1])
+    for state in states:
+        # A loop: NumPy's maximum takes longer to compile than all of this.
+        best = -np.inf
+        for action in range(prob.shape[1]):
+            if not allowed[state, action]:
+                action_values[action] = -np.inf
+                continue
+            value = mean_reward[state, action]
+            for k in range(prob.shape[2]):
+                if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                    following = values[next_state[state, action, k]]
+                    value += discount * prob[state, action, k] * following
+            action_values[action] = value
+            best = max(best, value)
+        tied = best - TIE_TOLERANCE * max(1.0, abs(best))
+        action = 0
+        while action_values[action] < tied:
+            action += 1
+        earlier[state] = best
+        actions[state] = action

@@ -1,0 +1,397 @@
+"""The gap between a policy and the optimum by state, exactly and under a time limit.
+
+The gap is a sum over states and steps: the probability of being in the state at that step, times
+what the policy's action loses there against the best one (the performance difference lemma:
+Kakade and Langford, Approximately Optimal Approximate Reinforcement Learning, 2002, lemma 6.1, here
+with time). Policies have the forms of `mdp.evaluation`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rl_yardstick.machine_code.compiling import called, compiled
+from rl_yardstick.mdp.evaluation import Policy, canonical_policy, chances_in, policy_return
+from rl_yardstick.mdp.finite_horizon import back_up
+from rl_yardstick.mdp.transition_model import (
+    AnyInts,
+    Bools,
+    Floats,
+    TransitionModel,
+    allowed_actions,
+)
+
+# The largest number of values to store over all steps, 8 bytes each.
+MOST_VALUES = 30_000_000
+# The number of states to try a repair in, those with the largest losses first; and the outcomes
+# of all states at all steps above which trying takes too long.
+MOST_CANDIDATES = 24
+MOST_OUTCOMES_REPAIRED = 20_000_000
+# Probabilities of two policies within this of each other count as equal.
+SAME = 1e-9
+
+
+class TooLargeError(ValueError):
+    """The values of all states at all steps do not fit into the memory set aside for them."""
+
+
+@dataclass(frozen=True, eq=False)
+class GapByState:
+    """The gap between the optimum and a policy, split over the states in which it acts.
+
+    Attributes:
+        optimum: the highest expected return under the time limit.
+        value: the policy's expected return.
+        losses: the return lost in each state per episode, shape (S,). Losses are at least 0, and
+            sum to ``optimum - value`` up to rounding.
+        visits: how often an episode acts in each state, shape (S,).
+        action_values: the optimal action values, averaged over the steps at which the policy is in
+            the state, shape (S, A); 0 in states that the policy never visits.
+    """
+
+    optimum: float
+    value: float
+    losses: Floats
+    visits: Floats
+    action_values: Floats
+
+    @property
+    def gap(self) -> float:
+        """How far the policy stays behind the optimum."""
+        return self.optimum - self.value
+
+
+def gap_by_state(model: TransitionModel, policy: Policy, horizon: int) -> GapByState:
+    """Split the gap of a policy over the states in which it acts.
+
+    Args:
+        model: the decision process.
+        policy: in any of its forms.
+        horizon: the time limit in steps.
+
+    Raises:
+        ValueError: for a horizon below 1 or a malformed policy; `TooLargeError` where horizon times
+            states are too many.
+    """
+    policy = canonical_policy(model, policy, horizon)
+    best = _optimal_rows(model, horizon)
+    chances = chances_in(model, policy, np.arange(model.n_states))
+    none = np.zeros(model.n_states, np.bool_)
+    losses, visits, values = _losses(
+        *_arrays(model), chances, none, best[:1], model.initial, best, horizon
+    )
+    seen = visits > 0
+    values[seen] /= visits[seen, None]
+    value = policy_return(model, policy, horizon).expected_return
+    return GapByState(float(model.initial @ best[-1]), value, losses, visits, values)
+
+
+class Repair(NamedTuple):
+    """A state in which to act optimally, and the policy's return after that change."""
+
+    state: int
+    value: float  # expected return with this and all earlier repairs
+
+
+def greedy_repairs(
+    model: TransitionModel, policy: Policy, horizon: int, split: GapByState, most: int = 3
+) -> list[Repair]:
+    """The states in which better actions would raise the return most, one after the other.
+
+    In a repaired state the policy takes the best action at each step, given its actions in all
+    other states. Each repair is the best among those in the states with the largest losses. The
+    list is empty where the model is so large that trying repairs takes many seconds.
+
+    Args:
+        model: the decision process.
+        policy: in any of its forms.
+        horizon: the time limit in steps.
+        split: the result of `gap_by_state` for this policy.
+        most: the largest number of repairs.
+    """
+    if model.prob.size * horizon > MOST_OUTCOMES_REPAIRED:
+        return []
+    policy = canonical_policy(model, policy, horizon)
+    chances = chances_in(model, policy, np.arange(model.n_states))
+    best, arrays = _optimal_rows(model, horizon), _arrays(model)
+    repaired = np.zeros(model.n_states, np.bool_)
+    repairs: list[Repair] = []
+    losses, value = split.losses, split.value
+    least = 1e-9 * max(1.0, abs(split.gap))  # smaller gains are rounding errors
+    while len(repairs) < most and split.optimum - value > least:
+        worst = np.argsort(-losses, kind="stable")[:MOST_CANDIDATES]
+        tried: list[Repair] = []
+        for state in worst[(losses[worst] > 0) & ~repaired[worst]]:
+            one = repaired | (np.arange(model.n_states) == state)
+            rows = _policy_rows(*arrays, chances, one, horizon)
+            tried.append(Repair(int(state), float(model.initial @ rows[-1])))
+        found = max(tried, key=lambda repair: repair.value, default=Repair(-1, value))
+        if found.value <= value + least:
+            break
+        repairs.append(found)
+        value, repaired[found.state] = found.value, True
+        rows = _policy_rows(*arrays, chances, repaired, horizon)
+        losses = _losses(*arrays, chances, repaired, rows, model.initial, best, horizon)[0]
+    return repairs
+
+
+@dataclass(frozen=True, eq=False)
+class FirstDifferences:
+    """Where two policies first differ in an episode, and how that changes the return.
+
+    Attributes:
+        met: the probability that an episode's first difference is in each state, shape (S,).
+        gains: what the first policy gains over the second by these differences, in return per
+            episode, shape (S,). They sum to the difference of the two returns.
+    """
+
+    met: Floats
+    gains: Floats
+
+
+def first_differences(
+    model: TransitionModel, policy: Policy, other: Policy, horizon: int
+) -> FirstDifferences:
+    """Split the difference of two policies' returns over the states where they first part.
+
+    Raises:
+        ValueError: as `gap_by_state`.
+    """
+    _check_size(horizon + 1, model)
+    states, none, arrays = (
+        np.arange(model.n_states),
+        np.zeros(model.n_states, np.bool_),
+        _arrays(model),
+    )
+    chances = chances_in(model, canonical_policy(model, policy, horizon), states)
+    others = chances_in(model, canonical_policy(model, other, horizon), states)
+    rows, other_rows = (_policy_rows(*arrays, one, none, horizon) for one in (chances, others))
+    found = _partings(*arrays, chances, others, model.initial, rows, other_rows, horizon)
+    return FirstDifferences(*found)
+
+
+def policy_gradient(model: TransitionModel, policy: Floats, horizon: int) -> tuple[float, Floats]:
+    """The return of a stationary policy (S, A), and its gradient in the action probabilities.
+
+    Sutton, McAllester, Singh and Mansour, Policy Gradient Methods for Reinforcement Learning with
+    Function Approximation, 2000, theorem 1.
+
+    Returns:
+        The expected return, and its partial derivative with respect to each probability, shape
+        (S, A).
+    """
+    arrays, none = _arrays(model), np.zeros(model.n_states, np.bool_)
+    rows = _policy_rows(*arrays, policy[None], none, horizon)
+    slope = _losses(*arrays, policy[None], none, rows, model.initial, rows, horizon)[2]
+    return float(model.initial @ rows[-1]), slope
+
+
+def _arrays(model: TransitionModel) -> tuple[Floats, AnyInts, Bools, Floats]:
+    return model.prob, model.next_state, model.terminated, model.expected_reward
+
+
+def _check_size(n_rows: int, model: TransitionModel) -> None:
+    if n_rows * model.n_states > MOST_VALUES:
+        raise TooLargeError(
+            f"the values of {model.n_states:,} states at {n_rows:,} steps and more are too many to "
+            "keep"
+        )
+
+
+def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
+    """Optimal values with 0, 1, 2, ... steps left, shape (m, S).
+
+    With m steps or more left they are those of the last row.
+    """
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, it must be at least 1")
+    states = np.flatnonzero(model.reachable)
+    allowed = allowed_actions(model, None)
+    rows = [np.zeros(model.n_states)]
+    for _ in range(horizon):
+        earlier, actions = np.zeros(model.n_states), np.zeros(model.n_states, np.uint64)
+        back_up(*_arrays(model), allowed, 1.0, states, rows[-1], earlier, actions)
+        if np.array_equal(earlier, rows[-1]):
+            break
+        rows.append(earlier)
+        _check_size(len(rows), model)
+    return np.array(rows)
+
+
+# Compiled. With more steps left than there are rows of values, the last row applies.
+
+
+@called
+def action_value(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    state: int,
+    action: int,
+    later: Floats,
+) -> float:
+    """The undiscounted value of an action, from the state values one step later."""
+    value = float(mean_reward[state, action])
+    for k in range(prob.shape[2]):
+        if prob[state, action, k] > 0 and not terminated[state, action, k]:
+            value += prob[state, action, k] * later[next_state[state, action, k]]
+    return value
+
+
+@called
+def _spread(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    state: int,
+    action: int,
+    weight: float,
+    there: Floats,
+) -> float:
+    """Move a state's probability to its successors in ``there``; returns the part that goes on."""
+    left = 0.0
+    for k in range(prob.shape[2]):
+        if prob[state, action, k] > 0 and not terminated[state, action, k]:
+            there[next_state[state, action, k]] += weight * prob[state, action, k]
+            left += weight * prob[state, action, k]
+    return left
+
+
+@compiled
+def _losses(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    chances: Floats,
+    repaired: Bools,
+    rows: Floats,
+    initial: Floats,
+    best: Floats,
+    horizon: int,
+) -> tuple[Floats, Floats, Floats]:
+    """Losses (S,), visits (S,) and summed action values (S, A) of a policy (1 or horizon, S, A).
+
+    In repaired states the policy is greedy for its own values, ``rows``.
+    """
+    n_states, n_actions = mean_reward.shape
+    losses, visits = np.zeros(n_states), np.zeros(n_states)
+    values, weights = np.zeros((n_states, n_actions)), np.zeros(n_actions)
+    here = initial.copy()
+    for step in range(horizon):
+        left = horizon - step
+        now, later = best[min(left, len(best) - 1)], best[min(left - 1, len(best) - 1)]
+        own = rows[min(left - 1, len(rows) - 1)]
+        there = np.zeros(n_states)
+        goes_on = 0.0
+        for state in range(n_states):
+            if here[state] == 0:
+                continue
+            weights[:] = chances[min(step, len(chances) - 1), state]
+            if repaired[state]:
+                chosen, highest = 0, -np.inf
+                for action in range(n_actions):
+                    value = action_value(
+                        prob, next_state, terminated, mean_reward, state, action, own
+                    )
+                    if value > highest:
+                        chosen, highest = action, value
+                weights[:] = 0.0
+                weights[chosen] = 1.0
+            visits[state] += here[state]
+            for action in range(n_actions):
+                value = action_value(
+                    prob, next_state, terminated, mean_reward, state, action, later
+                )
+                values[state, action] += here[state] * value
+                weight = here[state] * weights[action]
+                if weight > 0:
+                    losses[state] += weight * max(now[state] - value, 0.0)
+                    goes_on += _spread(prob, next_state, terminated, state, action, weight, there)
+        here = there
+        if goes_on == 0:
+            break
+    return losses, visits, values
+
+
+@compiled
+def _policy_rows(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    chances: Floats,
+    repaired: Bools,
+    horizon: int,
+) -> Floats:
+    """Values with 0, 1, ... steps left, shape (m, S); repaired states take the best action."""
+    n_states, n_actions = mean_reward.shape
+    rows = np.zeros((horizon + 1, n_states))
+    for left in range(1, horizon + 1):
+        later, now = rows[left - 1], rows[left]
+        taken = chances[min(horizon - left, len(chances) - 1)]
+        changed = False
+        for state in range(n_states):
+            highest, mean = -np.inf, 0.0
+            for action in range(n_actions):
+                if taken[state, action] == 0 and not repaired[state]:
+                    continue
+                value = action_value(
+                    prob, next_state, terminated, mean_reward, state, action, later
+                )
+                highest = max(highest, value)
+                mean += taken[state, action] * value
+            now[state] = highest if repaired[state] else mean
+            changed = changed or now[state] != later[state]
+        # Converged: further steps change nothing.
+        if not changed and len(chances) == 1:
+            return rows[: left + 1].copy()
+    return rows
+
+
+@compiled
+def _partings(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    mean_reward: Floats,
+    chances: Floats,
+    others: Floats,
+    initial: Floats,
+    rows: Floats,
+    other_rows: Floats,
+    horizon: int,
+) -> tuple[Floats, Floats]:
+    """Probabilities (S,) of the first difference in each state, and its gains (S,)."""
+    n_states, n_actions = mean_reward.shape
+    met, gains = np.zeros(n_states), np.zeros(n_states)
+    here = initial.copy()
+    for step in range(horizon):
+        taken = chances[min(step, len(chances) - 1)]
+        other = others[min(step, len(others) - 1)]
+        now = rows[min(horizon - step, len(rows) - 1)]
+        other_now = other_rows[min(horizon - step, len(other_rows) - 1)]
+        there = np.zeros(n_states)
+        goes_on = 0.0
+        for state in range(n_states):
+            if here[state] == 0:
+                continue
+            differs = False
+            for action in range(n_actions):
+                differs = differs or abs(taken[state, action] - other[state, action]) > SAME
+            if differs:
+                met[state] += here[state]
+                gains[state] += here[state] * (now[state] - other_now[state])
+                continue
+            for action in range(n_actions):
+                weight = here[state] * taken[state, action]
+                if weight > 0:
+                    goes_on += _spread(prob, next_state, terminated, state, action, weight, there)
+        here = there
+        if goes_on == 0:
+            break
+    return met, gains

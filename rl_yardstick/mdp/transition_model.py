@@ -1,0 +1,231 @@
+"""A finite Markov decision process as arrays.
+
+The arrays have shape (S, A, K): S states, A actions, and K, the largest number of outcomes that
+any state and action has. Outcome k of taking action a in state s happens with probability
+``prob[s, a, k]``, leads to ``next_state[s, a, k]``, earns ``reward[s, a, k]`` and ends the episode
+if ``terminated[s, a, k]``. Rows with fewer outcomes are padded with outcomes of probability zero.
+
+Termination belongs to the transition, not to the state: the rows of a state that only terminating
+transitions enter are never used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Types of arrays; docstrings give the shapes.
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+# Integers of any width, such as the int32 that halves the size of a large map.
+AnyInts = NDArray[np.integer]
+
+PROBABILITY_TOLERANCE = 1e-9
+
+Outcomes = Sequence[tuple[float, int, float, bool]]
+
+
+@dataclass(frozen=True, eq=False)
+class TransitionModel:
+    """The dynamics, rewards and starting states of a finite Markov decision process.
+
+    The arrays are converted to the types below, copied only if necessary, and made read-only.
+    Outcomes keep their order, and equal ones are not merged: a simulator that samples an outcome
+    by cumulative sum then picks the same one as the source.
+
+    Args:
+        prob: probabilities, float64 of shape (S, A, K), summing to one over K.
+        next_state: indices of the states reached, int64 (or int32) of shape (S, A, K).
+        reward: rewards, float64 of shape (S, A, K).
+        terminated: whether the episode ends with the outcome, bool of shape (S, A, K).
+        initial: probabilities of the starting states, float64 of shape (S,), summing to one.
+        reward_variance: variances of random rewards, float64 of shape (S, A, K); ``reward`` holds
+            their means, and rewards are independent of each other. None where the outcome
+            determines the reward.
+
+    Raises:
+        ValueError: where the shapes disagree, a probability lies outside [0, 1], a row of
+            probabilities does not sum to one within 1e-9, an index is out of range, a reward or
+            variance is not finite, or a variance negative. The message names state and action.
+    """
+
+    prob: Floats
+    next_state: AnyInts
+    reward: Floats
+    terminated: Bools
+    initial: Floats
+    reward_variance: Floats | None = None
+
+    def __post_init__(self) -> None:
+        index_type = np.int32 if np.asarray(self.next_state).dtype == np.int32 else np.int64
+        self._freeze("prob", np.float64)
+        self._freeze("next_state", index_type)
+        self._freeze("reward", np.float64)
+        self._freeze("terminated", np.bool_)
+        self._freeze("initial", np.float64)
+        if self.reward_variance is not None:
+            self._freeze("reward_variance", np.float64)
+        self._check_shapes()
+        self._check_outcomes()
+        self._check_initial()
+
+    @classmethod
+    def from_gymnasium(
+        cls,
+        P: Mapping[int, Mapping[int, Outcomes]],  # noqa: N803 (Gymnasium's own name)
+        initial_state_distrib: ArrayLike,
+    ) -> TransitionModel:
+        """The model in the attributes ``P`` and ``initial_state_distrib`` of Gymnasium's toy_text.
+
+        Args:
+            P: ``P[state][action]`` is a list of (probability, next state, reward, terminated);
+                states and actions are numbered from zero.
+            initial_state_distrib: probabilities of the starting states, shape (S,).
+
+        Raises:
+            ValueError: as the constructor, and where states have different numbers of actions
+                or a state and action has no outcome.
+        """
+        n_states = len(P)
+        n_actions = len(P[0])
+        rows = [_row(P, state, action) for state in range(n_states) for action in range(n_actions)]
+        lengths = np.array([len(row) for row in rows])
+        n_outcomes = int(lengths.max())
+        filled = np.arange(n_outcomes) < lengths[:, None]
+        flat = [outcome for row in rows for outcome in row]
+
+        def column(position: int, dtype: type[Any]) -> NDArray[Any]:
+            padded = np.zeros(filled.shape, dtype)
+            padded[filled] = [outcome[position] for outcome in flat]
+            return padded.reshape(n_states, n_actions, n_outcomes)
+
+        return cls(
+            prob=column(0, np.float64),
+            next_state=column(1, np.int64),
+            reward=column(2, np.float64),
+            terminated=column(3, np.bool_),
+            initial=np.asarray(initial_state_distrib, np.float64),
+        )
+
+    @property
+    def n_states(self) -> int:
+        """S, the number of states, unreachable ones included."""
+        return int(self.prob.shape[0])
+
+    @property
+    def n_actions(self) -> int:
+        """A, the number of actions."""
+        return int(self.prob.shape[1])
+
+    @property
+    def n_outcomes(self) -> int:
+        """K, the largest number of outcomes of any state and action, padding included."""
+        return int(self.prob.shape[2])
+
+    @cached_property
+    def expected_reward(self) -> Floats:
+        """The mean reward of one step, shape (S, A)."""
+        return _read_only(np.einsum("sak,sak->sa", self.prob, self.reward))
+
+    @cached_property
+    def reachable(self) -> Bools:
+        """The states in which the agent may have to act, bool of shape (S,).
+
+        These are the possible starting states and all states that transitions reach from them
+        without ending the episode. The rows of all other states are meaningless.
+        """
+        from rl_yardstick.mdp.reachability import reached_from
+
+        allowed = np.ones((self.n_states, self.n_actions), np.bool_)
+        start = self.initial > 0
+        found = reached_from(start, self.prob, self.next_state, self.terminated, allowed)
+        return _read_only(found)
+
+    def _freeze(self, name: str, dtype: type[Any]) -> None:
+        """Replace an array by a read-only view, so that the caller's own stays writable."""
+        view = np.ascontiguousarray(getattr(self, name), dtype).view()
+        object.__setattr__(self, name, _read_only(view))
+
+    def _check_shapes(self) -> None:
+        shape = self.prob.shape
+        if len(shape) != 3 or 0 in shape:
+            raise ValueError(f"prob has shape {shape}, it must be (states, actions, outcomes)")
+        for name in ("next_state", "reward", "terminated"):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, prob has {shape}")
+        if self.reward_variance is not None and self.reward_variance.shape != shape:
+            raise ValueError(
+                f"reward_variance has shape {self.reward_variance.shape}, prob has {shape}"
+            )
+        if self.initial.shape != shape[:1]:
+            raise ValueError(f"initial has shape {self.initial.shape}, it must be {shape[:1]}")
+
+    def _check_outcomes(self) -> None:
+        # Written so that a NaN fails each check.
+        self._require((self.prob >= 0) & (self.prob <= 1), "a probability outside [0, 1]")
+        total = self.prob.sum(axis=2)
+        self._require(
+            np.abs(total - 1) <= PROBABILITY_TOLERANCE, "probabilities that do not sum to one"
+        )
+        in_range = (self.next_state >= 0) & (self.next_state < self.n_states)
+        self._require(in_range, f"a next state outside 0..{self.n_states - 1}")
+        self._require(np.isfinite(self.reward), "a reward that is not finite")
+        if self.reward_variance is not None:
+            valid = np.isfinite(self.reward_variance) & (self.reward_variance >= 0)
+            self._require(valid, "a variance of the reward that is negative or not finite")
+
+    def _check_initial(self) -> None:
+        bad = np.flatnonzero(~((self.initial >= 0) & (self.initial <= 1)))
+        if bad.size:
+            raise ValueError(f"initial has a probability outside [0, 1] at state {bad[0]}")
+        if not abs(self.initial.sum() - 1) <= PROBABILITY_TOLERANCE:
+            raise ValueError(f"initial sums to {self.initial.sum()}, it must sum to one")
+
+    @staticmethod
+    def _require(valid: Bools, problem: str) -> None:
+        if not valid.all():
+            state, action = np.argwhere(~valid)[0][:2]
+            raise ValueError(f"state {state}, action {action} has {problem}")
+
+
+def allowed_actions(model: TransitionModel, mask: Bools | None) -> Bools:
+    """The actions that planning may take, bool of shape (S, A); none in unreachable states.
+
+    Args:
+        model: the decision process.
+        mask: bool of shape (S, A), or None for all actions.
+
+    Raises:
+        ValueError: if the mask has another shape, or allows nothing in a reachable state.
+    """
+    shape = (model.n_states, model.n_actions)
+    reachable = model.reachable[:, None]
+    if mask is None:
+        return np.repeat(reachable, model.n_actions, axis=1)
+    if mask.shape != shape:
+        raise ValueError(f"the mask has shape {mask.shape}, it must be {shape}")
+    stuck = np.flatnonzero(model.reachable & ~mask.any(axis=1))
+    if stuck.size:
+        raise ValueError(f"the mask allows nothing in state {stuck[0]}")
+    return reachable & mask.astype(np.bool_)
+
+
+def _row(P: Mapping[int, Mapping[int, Outcomes]], state: int, action: int) -> Outcomes:  # noqa: N803
+    if state not in P:
+        raise ValueError(f"P has no state {state}: states must be numbered from 0 to {len(P) - 1}")
+    if len(P[state]) != len(P[0]) or action not in P[state]:
+        raise ValueError(f"state {state} must have the actions 0 to {len(P[0]) - 1} in P")
+    if not P[state][action]:
+        raise ValueError(f"state {state}, action {action} has no outcome in P")
+    return P[state][action]
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    array.setflags(write=False)
+    return array

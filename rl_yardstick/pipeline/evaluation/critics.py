@@ -1,0 +1,474 @@
+"""Compares an agent's values, advantages and gradients with the exact ones of its current policy.
+
+The exact values are those of the training environment, under the agent's discount and without the
+time limit, because agents bootstrap there.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3 import A2C
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from rl_yardstick.agents.common.callbacks import BlockCallback
+from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+from rl_yardstick.agents.linear.tiles import tiles_of_all, vectors_of
+from rl_yardstick.agents.planning import PlanningAgent
+from rl_yardstick.envs.known_models import (
+    action_masks_of_states,
+    observations_of_states,
+    time_limit,
+    transition_model,
+)
+from rl_yardstick.mdp import TransitionModel, state_visitation
+from rl_yardstick.mdp.advantages import PolicyValues, discounted_values, expected_estimates
+from rl_yardstick.mdp.graph import LARGEST_DENSE
+from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+from rl_yardstick.pipeline.curve_pictures import MEANINGS
+from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.evaluation.exact import is_wrapped_as_vector
+from rl_yardstick.pipeline.evaluation.policies import (
+    OfLastPolicy,
+    believed_values,
+    best_actions,
+    is_network,
+    obstacle,
+    policy_matrix,
+    takes_masks,
+)
+from rl_yardstick.pipeline.files import write_text
+from rl_yardstick.pipeline.train_spec import TrainSpec
+
+SECONDS_BETWEEN_WRITES = 1.0
+
+# Agents that always learn the values of their exploring policy.
+EXPLORING = frozenset(
+    {
+        "sarsa", "expected_sarsa", "n_step_sarsa", "sarsa_lambda", "monte_carlo",
+        "semi_gradient_sarsa",
+    }
+)  # fmt: skip
+
+# Gradients are computed for at most this many minibatches of a rollout.
+MOST_MINIBATCHES = 32
+# In larger models, even one comparison takes too long.
+MOST_OUTCOMES = 1_000_000
+
+
+@dataclass(frozen=True)
+class KnownWorld:
+    """The environment that an agent trains on, with its exact model."""
+
+    model: TransitionModel
+    observations: NDArray[Any]  # of each state, states along the first axis
+    horizon: int  # the time limit, for visit counts
+    masks: Bools | None  # action masks, shape (S, A), for agents that use them
+    is_limited: bool = True  # whether ``horizon`` limits training; else only evaluations
+
+    @cached_property
+    def visits(self) -> OfLastPolicy[Floats]:
+        """The function from a policy (S, A) to the share of its steps in each state, shape (S,)."""
+
+        def shares(policy: Floats) -> Floats:
+            is_fixed = (policy.max(axis=1) == 1).all()
+            given = policy.argmax(axis=1) if is_fixed else policy  # faster
+            visits = state_visitation(self.model, given, self.horizon)
+            return np.asarray(visits / visits.sum())
+
+        return OfLastPolicy(shares)
+
+    @cached_property
+    def _last_values(self) -> dict[float, OfLastPolicy[PolicyValues]]:
+        return {}
+
+    def values(self, policy: Floats, discount: float) -> PolicyValues:
+        """The exact values of a policy (S, A)."""
+        known = self._last_values.setdefault(
+            discount, OfLastPolicy(lambda asked: discounted_values(self.model, asked, discount))
+        )
+        return known(policy)
+
+    @cached_property
+    def numbers(self) -> dict[bytes, int]:
+        """The index of each state, by the bytes of its observation."""
+        rows = np.ascontiguousarray(self.observations.reshape(len(self.observations), -1))
+        return {row.tobytes(): number for number, row in enumerate(rows)}
+
+    @property
+    def tells_states_apart(self) -> bool:
+        """Whether every state has a different observation."""
+        return len(self.numbers) == self.model.n_states
+
+    def states_of(self, observations: NDArray[Any], n_rows: int) -> Ints:
+        """The indices of the states with these ``n_rows`` observations, shape (n_rows,)."""
+        rows = np.ascontiguousarray(observations.reshape(n_rows, -1), self.observations.dtype)
+        return np.array([self.numbers[row.tobytes()] for row in rows], np.int64)
+
+
+def known_world(spec: TrainSpec, agent: BaseAlgorithm) -> KnownWorld | str:
+    """The world for comparing the agent's values with exact ones; or why that is impossible."""
+    if isinstance(agent, PlanningAgent):
+        return "a planner's values are exact already"
+    if not isinstance(getattr(agent, "gamma", None), int | float):
+        return f"{spec.algo} has no discount, so there are no values to compare"
+    if is_wrapped_as_vector(spec):
+        return "a VecEnv wrapper changes what the agent sees"
+    with closing(make_single_env(spec, training=True)) as env:
+        model, horizon, observations = transition_model(env), time_limit(env), None
+        if model is not None:
+            observations, masks = observations_of_states(env), action_masks_of_states(env)
+    if model is None or observations is None:
+        return f"the exact model of {spec.env_id} is not known"
+    is_limited = horizon is not None
+    if horizon is None:
+        with closing(make_single_env(spec)) as env:
+            horizon = time_limit(env)
+        assert horizon is not None
+    if model.prob.size > MOST_OUTCOMES:
+        return f"{spec.env_id} has {model.prob.size:,} outcomes, which are too many"
+    if reason := obstacle(agent, observations, masks, horizon, deterministic=False):
+        return reason
+    if own_values(agent, observations) is None:
+        return f"{spec.algo} has no values"
+    masks = masks if takes_masks(agent) else None
+    world = KnownWorld(model, observations, horizon, masks, is_limited)
+    # Compiled functions are loaded before the training begins.
+    first = np.eye(model.n_actions)[np.zeros(model.n_states, np.int64)]
+    world.values(first, 0.5)
+    world.visits(first)
+    return world
+
+
+def own_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
+    """An agent's values of actions (S, A) or states (S,); None if it has none."""
+    if not isinstance(agent, SoftmaxAlgorithm):
+        return believed_values(agent, observations)
+    policy = agent.policy
+    if not len(policy.state_weights):
+        return None
+    active = tiles_of_all(policy.tiles, vectors_of(policy.observation_space, observations))
+    return np.asarray(policy.state_weights.numpy()[active].sum(axis=1))
+
+
+def recorder_of(
+    path: Path, spec: TrainSpec, agent: BaseAlgorithm, *, is_evaluated: bool
+) -> CriticRecorder | str:
+    """The recorder of a training; or a line on why there is none."""
+    if not is_evaluated:
+        return "there are no evaluations during this training"
+    world = known_world(spec, agent)
+    if isinstance(world, str):
+        return world
+    explores = learns_exploring_values(spec, agent) or isinstance(agent, SoftmaxAlgorithm)
+    if not isinstance(agent, OnPolicyAlgorithm):
+        return CriticRecorder(path, world, spec, explores=explores)
+    has_rollouts = type(agent.rollout_buffer) is RolloutBuffer or takes_masks(agent)
+    is_seen = has_rollouts and world.tells_states_apart
+    return (RolloutRecorder if is_seen else CriticRecorder)(path, world, spec, explores=True)
+
+
+def learns_exploring_values(spec: TrainSpec, agent: BaseAlgorithm) -> bool:
+    """Whether a table or tiles learn the values of the exploring policy, not of the greedy one."""
+    return spec.algo in EXPLORING or getattr(agent, "target_policy", "") == "exploring"
+
+
+class CriticRecorder(BlockCallback):
+    """Writes ``diagnosis.csv``: a row for each comparison of the agent.
+
+    Args:
+        path: the file.
+        world: the environment that the agent trains on.
+        spec: the spec of the training.
+        explores: whether the agent learns the values of its exploring policy, else those of its
+            greedy policy.
+    """
+
+    def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
+        super().__init__()
+        self.path, self.world, self.explores = path, world, explores
+        # With an explicit evaluation interval, the agent is compared at each evaluation.
+        self.is_limited = spec.eval_freq is None
+        self.training_steps = spec.hyperparams.n_timesteps
+        self.training_episodes = spec.hyperparams.n_episodes
+        self.rows: list[dict[str, float]] = []
+        self._written_at = -np.inf
+
+    def _on_step(self) -> bool:
+        return True
+
+    def judge(self, timesteps: int, n_episodes: int) -> None:
+        """Compare the agent now, unless comparisons would take too large a share of training."""
+        if self.can_afford(n_episodes):
+            self._append(timesteps, self.figures())
+
+    def can_afford(self, n_episodes: int) -> bool:
+        """Whether the training has done enough steps for another comparison."""
+        if not self.is_limited:
+            return True
+        n_trained = self.model.num_timesteps - self.model._num_timesteps_at_start
+        if self.training_episodes is not None:
+            progress = n_episodes / self.training_episodes
+        else:
+            progress = n_trained / (self.training_steps or 1)
+        planned = n_trained / progress if progress > 0 else 0.0
+        least = SECONDS_OF_NETWORKS if is_network(self.model) else SECONDS_IN_ANY_CASE
+        allowed = max(SHARE * planned * seconds_per_step(self.model), least)
+        cost = seconds_of_comparison(self.world, self.model, explores=self.explores)
+        return (len(self.rows) + 1) * cost <= allowed * min(progress, 1.0)
+
+    def finish(self, timesteps: int) -> None:
+        """Compare the agent at the end of training, and write the file."""
+        if not self.rows or self.rows[-1]["timesteps"] < timesteps:
+            self._append(timesteps, self.figures())
+        self.write()
+
+    def write(self) -> None:
+        """Write the rows up to now."""
+        if not self.rows:
+            return
+        known = {name for row in self.rows for name in row}
+        names = ["timesteps", *(name for name in MEANINGS if name in known)]
+        text = io.StringIO()
+        table = csv.DictWriter(text, names, restval="", lineterminator="\n")
+        table.writeheader()
+        table.writerows(self.rows)
+        write_text(self.path, text.getvalue())
+        self._written_at = time.monotonic()
+
+    def _append(self, timesteps: int, figures: dict[str, float]) -> None:
+        finite = {name: value for name, value in figures.items() if np.isfinite(value)}
+        self.rows.append({"timesteps": timesteps, **finite})
+        for name, value in finite.items():
+            self.model.logger.record(f"diagnosis/{name}", value)
+        if time.monotonic() - self._written_at > SECONDS_BETWEEN_WRITES:
+            self.write()
+
+    # --- what is compared -------------------------------------------------------------------------
+
+    def policy(self) -> Floats:
+        """The target policy of the agent's values, as probabilities of shape (S, A)."""
+        world, agent = self.world, self.model
+        if self.explores:
+            found = policy_matrix(agent, world.observations, deterministic=False, masks=world.masks)
+            # Probabilities in float32 do not sum to exactly 1.
+            return np.asarray(found / found.sum(axis=1, keepdims=True))
+        actions = best_actions(agent, world.observations, world.masks)
+        return np.eye(world.model.n_actions)[actions]
+
+    def figures(self) -> dict[str, float]:
+        """The columns for the current agent."""
+        world, policy = self.world, self.policy()
+        exact = world.values(policy, float(self.model.gamma))  # type: ignore[attr-defined]
+        believed, visits = own_values(self.model, world.observations), world.visits(policy)
+        assert believed is not None
+        reachable = world.model.reachable
+        allowed = np.broadcast_to(reachable[:, None], policy.shape)
+        if world.masks is not None:
+            allowed = allowed & world.masks
+        values, found = believed, {}
+        if believed.ndim == 2:
+            values = (policy * believed).sum(axis=1)
+            n_allowed = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
+            alike, by_visits = allowed.astype(np.float64), visits[:, None] * allowed / n_allowed
+            weights: dict[str, Floats] = {"": alike, "_visited": np.asarray(by_visits)}
+            errors = believed - exact.action_values
+            own_advantages = believed - values[:, None]
+            for end, weight in weights.items():
+                found[f"q_error{end}"] = root_mean_square(errors, weight)
+                of_advantages = root_mean_square(own_advantages - exact.advantages, weight)
+                found[f"advantage_error{end}"] = of_advantages
+            if not self.explores:
+                found["overestimation"] = weighted_mean(values - exact.values, visits)
+        found["v_error"] = root_mean_square(values - exact.values, reachable.astype(np.float64))
+        found["v_error_visited"] = root_mean_square(values - exact.values, visits)
+        if self.explores:
+            logs = np.log(np.where(policy > 0, policy, 1.0))
+            found["entropy"] = float(visits @ -(policy * logs).sum(axis=1))
+        return found
+
+
+def weighted_mean(numbers: Floats, weights: Floats) -> float:
+    """The weighted mean of the finite numbers; NaN if none has a positive weight."""
+    known = np.isfinite(numbers) & (weights > 0)
+    total = weights[known].sum()
+    return float(weights[known] @ numbers[known] / total) if total > 0 else float("nan")
+
+
+def root_mean_square(numbers: Floats, weights: Floats) -> float:
+    """The weighted root mean square of the finite numbers; NaN as in `weighted_mean`."""
+    return float(np.sqrt(weighted_mean(numbers**2, weights)))
+
+
+# --- rollouts -------------------------------------------------------------------------------------
+
+
+class RolloutRecorder(CriticRecorder):
+    """Compares agents such as PPO and A2C at the end of a rollout, before they update.
+
+    Until then, the policy is the same as during the whole rollout and the evaluation within it.
+    """
+
+    def __init__(self, path: Path, world: KnownWorld, spec: TrainSpec, *, explores: bool) -> None:
+        super().__init__(path, world, spec, explores=explores)
+        self.asked_at: int | None = None  # the time step of the evaluation
+
+    def wants_rollout_end(self) -> bool:
+        return self.asked_at is not None
+
+    def judge(self, timesteps: int, n_episodes: int) -> None:
+        if self.can_afford(n_episodes):
+            self.asked_at = timesteps
+
+    def _on_rollout_end(self) -> None:
+        if self.asked_at is None:
+            return
+        timesteps, self.asked_at = self.asked_at, None
+        self._append(timesteps, {**self.figures(), **self.rollout_figures(timesteps)})
+        self.model.logger.record("time/total_timesteps", timesteps, exclude="tensorboard")
+        self.model.logger.dump(timesteps)
+
+    def rollout_figures(self, seed: int) -> dict[str, float]:
+        """The columns on the errors of the rollout's advantages and of its policy gradient."""
+        world, agent = self.world, cast(Any, self.model)
+        buffer = agent.rollout_buffer
+        n_steps, n_envs = buffer.rewards.shape
+        states = world.states_of(buffer.observations, n_steps * n_envs)
+        actions = buffer.actions.reshape(-1).astype(np.int64)
+        estimates = buffer.advantages.reshape(-1).astype(np.float64)
+        policy, critic = self.policy(), own_values(agent, world.observations)
+        exact = world.values(policy, float(agent.gamma))
+        times = np.arange(n_steps)[:, None]
+        begun = np.maximum.accumulate(np.where(buffer.episode_starts > 0, times, 0))
+        n_left = np.broadcast_to(n_steps - times, begun.shape)
+        if world.is_limited:
+            n_left = np.minimum(n_left, world.horizon - (times - begun))
+        assert critic is not None
+        steps = states, actions, n_left.reshape(-1)
+        expected, shared = expected_estimates(
+            world.model, policy, critic, agent.gamma, agent.gae_lambda, steps
+        )
+        ones = np.ones(len(states))
+        found = {
+            "gae_bias": root_mean_square(
+                expected - shared - exact.advantages[states, actions], ones
+            ),
+            "gae_offset": root_mean_square(shared, ones),
+            "gae_std": root_mean_square(estimates - expected, ones),
+        }
+        visits = world.visits(policy)[:, None]
+        true = np.where((visits > 0) & (policy > 0), visits * policy * exact.advantages, 0.0)
+        if np.isfinite(true).all():
+            batches = minibatches(agent, estimates, seed)
+            found |= self.gradient_figures(true, states, actions, batches)
+        return found
+
+    def gradient_figures(
+        self, true: Floats, states: Ints, actions: Ints, batches: list[tuple[Ints, Floats]]
+    ) -> dict[str, float]:
+        """Cosine similarity and signal-to-noise ratio of minibatch gradients.
+
+        A policy gradient is a weighted sum over states and actions of the gradients of the log
+        probabilities; ``true`` contains the weights of the exact one, shape (S, A).
+        """
+        shown = np.flatnonzero((np.bincount(states, minlength=len(true)) > 0) | true.any(axis=1))
+        place = np.full(len(true), -1)
+        place[shown] = np.arange(len(shown))
+        weights = np.zeros((len(batches) + 1, len(shown), true.shape[1]))
+        for weight, (steps, advantages) in zip(weights, batches, strict=False):
+            at = place[states[steps]], actions[steps]
+            np.add.at(weight, at, advantages / len(steps))
+        weights[-1] = true[shown]
+        *found, exact = _gradients(self.model.policy, self.world, shown, weights)
+        norm, sizes = np.linalg.norm(exact), np.linalg.norm(found, axis=1)
+        cosines = (np.array(found) @ exact)[sizes > 0] / (norm * sizes[sizes > 0])
+        noise = ((np.array(found) - exact) ** 2).sum(axis=1).mean()
+        return {
+            "gradient_cosine": float(cosines.mean()) if len(cosines) and norm > 0 else np.nan,
+            "gradient_snr": float(norm**2 / noise) if noise > 0 else np.nan,
+        }
+
+
+def minibatches(agent: Any, estimates: Floats, seed: int) -> list[tuple[Ints, Floats]]:
+    """The steps and advantages of each minibatch in an epoch over a rollout.
+
+    If the agent normalises advantages, they are only centred here, because their scale only acts
+    as a step size.
+    """
+    n = len(estimates)
+    size = min(agent.batch_size, n) if hasattr(agent, "n_epochs") else n
+    # A separate generator, so that the agent's own order does not change.
+    order = np.random.default_rng(seed).permutation(n)
+    found = []
+    for begin in range(0, min(n - size + 1, MOST_MINIBATCHES * size), size):
+        steps = order[begin : begin + size]
+        is_centred = getattr(agent, "normalize_advantage", False) and size > 1
+        centre = estimates[steps].mean() if is_centred else 0.0
+        found.append((steps, estimates[steps] - centre))
+    return found
+
+
+def _gradients(policy: Any, world: KnownWorld, shown: Ints, weights: Floats) -> Floats:
+    """Gradients in the parameters for n sets of weights (n, states, A), shape (n, parameters)."""
+    told = {} if world.masks is None else {"action_masks": world.masks[shown]}
+    tensor, _ = policy.obs_to_tensor(world.observations[shown])
+    logs = policy.get_distribution(tensor, **told).distribution.logits
+    parameters = [p for p in policy.parameters() if p.requires_grad]
+    found = []
+    for weight in th.as_tensor(weights, dtype=logs.dtype, device=logs.device):
+        slopes: Any = th.autograd.grad(
+            logs, parameters, weight, retain_graph=True, allow_unused=True
+        )
+        found.append(th.cat([slope.reshape(-1) for slope in slopes if slope is not None]))
+    return np.asarray(th.stack(found).double().cpu().numpy())
+
+
+# --- how often to compare -------------------------------------------------------------------------
+
+# The share of training time for comparisons, by the estimates below: high ones for comparisons, low
+# ones for training steps. No clock is used, so the same seed gives the same file.
+SHARE = 0.1
+SECONDS_IN_ANY_CASE = 5e-3
+SECONDS_OF_NETWORKS = 2e-2  # the same for networks
+
+
+def seconds_per_step(model: BaseAlgorithm) -> float:
+    """A lower estimate of the time of a training step."""
+    engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
+    if engine.startswith("compiled but"):
+        return 2e-5
+    if engine.startswith("compiled"):
+        return 2.5e-6 if isinstance(model, A2C) else 1e-5 if learns_weights else 7e-8
+    return 7e-5 if learns_weights else 4e-5
+
+
+def seconds_of_comparison(world: KnownWorld, model: BaseAlgorithm, *, explores: bool) -> float:
+    """An upper estimate of the time of a comparison."""
+    per_state = world.model.n_actions * world.model.n_outcomes
+    n_states = int(world.model.reachable.sum())
+    visits = 7e-9 * world.horizon * n_states * per_state
+    seconds = (7e-4 + visits) if explores else (4e-4 + visits / 3)
+    seconds += 2e-7 * world.model.prob.size
+    if n_states <= LARGEST_DENSE:
+        seconds += 1e-10 * n_states**3
+    else:
+        seconds += (3e-5 if explores else 3e-6) * n_states
+    if model.gamma == 1:  # type: ignore[attr-defined]
+        seconds *= 2  # first it finds the states from which every episode ends
+    if is_network(model):
+        seconds += 1e-3 + 5e-6 * world.model.n_states
+    if isinstance(model, OnPolicyAlgorithm):
+        seconds += 7e-3 + 6e-6 * model.n_steps * model.n_envs
+    return seconds

@@ -1,0 +1,270 @@
+"""Computes the value of an agent's policy exactly, instead of sampling it.
+
+If the transition model of the environment is known, the evaluator queries the policy in all states
+at once, and computes its expected return under the time limit, without evaluation noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from rl_yardstick.agents.planning import PlanningAgent
+from rl_yardstick.agents.reference import RandomAgent
+from rl_yardstick.envs.known_models import (
+    action_masks_of_states,
+    model_check,
+    observations_of_states,
+    success_outcomes,
+    time_limit,
+    transition_model,
+)
+from rl_yardstick.envs.layout import GridLayout, grid_layout
+from rl_yardstick.mdp import (
+    TransitionModel,
+    baseline_return,
+    finite_horizon_optimum,
+    optimal_choices,
+    optimum_far_from_limit,
+    policy_iteration,
+    policy_return,
+    state_values,
+)
+from rl_yardstick.mdp.transition_model import Bools, Floats
+from rl_yardstick.pipeline.environments import evaluation_kwargs, make_single_env
+from rl_yardstick.pipeline.evaluation.observability import HiddenScale, hidden_scale
+from rl_yardstick.pipeline.evaluation.policies import (
+    OfLastPolicy,
+    acts_by,
+    best_actions,
+    obstacle,
+    policy_matrix,
+)
+from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
+from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.train_spec import TrainSpec, is_plain
+
+# Limit for the array with the observations of all states.
+MOST_BYTES_OBSERVED = 1 << 30
+# Backups of backward induction (steps x outcomes of all states and actions); a second does some
+# hundred million. Above FEW_BACKUPS, a faster method is tried first.
+FEW_BACKUPS = 200_000_000
+MOST_BACKUPS = 20_000_000_000
+# The most steps x outcomes of all states and actions for which `OtherReturns` are computed: in a
+# millisecond on a small model, and in about two seconds at most.
+MOST_OUTCOMES_OF_OTHERS = 600_000_000
+# For `discount_note`: the most outcomes of all states and actions (planning takes a tenth of a
+# second), and the score below which there is a note.
+MOST_OUTCOMES_PLANNED = 250_000
+LOW_SCORE = 0.95
+# The most cached evaluators of plain runs, and the most states of their models. By caching, runs in
+# one process compute the optimum once; larger models would need too much memory.
+MOST_KEPT = 8
+MOST_STATES_KEPT = 20_000
+
+
+@dataclass(frozen=True)
+class ExactEvaluator:
+    """Evaluates agents on an environment whose model is known."""
+
+    model: TransitionModel  #: dynamics of the evaluation environment
+    observations: NDArray[Any]  #: of each state, states along the first axis
+    horizon: int  #: the time limit
+    success: Bools | None  #: the outcomes that count as success, shape (S, A, K), or None
+    yardstick: Yardstick  #: the returns of optimum and baseline
+    layout: GridLayout | None = None  #: where the states lie on a map, for grid worlds
+    masks: Bools | None = None  #: action masks, shape (S, A), for agents that use them
+    scale: HiddenScale | None = None  #: the optima if observations hide the state
+
+    def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
+        """Evaluate the agent's current policy exactly."""
+        return self._worth(self.policy(agent, deterministic))
+
+    def at_the_end(self, agent: BaseAlgorithm) -> Evaluation:
+        """Evaluate the final policy, and compute its `other_returns`."""
+        return replace(self(agent), others=self.other_returns(agent))
+
+    def other_returns(self, agent: BaseAlgorithm) -> OtherReturns:
+        """The returns of the agent's stochastic policy, and of its greedy one under its discount.
+
+        Empty if the model is large.
+        """
+        if self.model.prob.size * self.horizon > MOST_OUTCOMES_OF_OTHERS:
+            return OtherReturns()
+        found, discount = OtherReturns(), getattr(agent, "gamma", None)
+        with suppress(TypeError, ValueError):  # an agent's probabilities may not be known
+            policy = self.policy(agent, deterministic=False)
+            # The mean alone takes a fifth of the time that `policy_return` takes.
+            values = state_values(self.model, policy, self.horizon)
+            found = OtherReturns(acts_by(agent), float(self.model.initial @ values))
+        if isinstance(discount, int | float) and 0 <= discount <= 1:
+            greedy = self.policy(agent, deterministic=True)
+            worth = policy_return(self.model, greedy, self.horizon, discount).expected_return
+            optimum = self._optimum_under(discount) if self.scale is None else None
+            found = replace(
+                found, discount=discount, discounted_return=worth, discounted_optimum=optimum
+            )
+        return found
+
+    @cached_property
+    def _optimum_under(self) -> Callable[[float], float]:
+        """The function from a discount to the optimum of agents that see the state."""
+        return cache(lambda d: finite_horizon_optimum(self.model, self.horizon, d).start_value)
+
+    @cached_property
+    def _worth(self) -> OfLastPolicy[Evaluation]:
+        return OfLastPolicy(self._evaluate)
+
+    def _evaluate(self, policy: NDArray[Any]) -> Evaluation:
+        result = policy_return(self.model, policy, self.horizon, success=self.success)
+        rate = result.success_rate
+        return Evaluation(
+            returns=np.array([result.expected_return]),
+            lengths=np.array([result.expected_length]),
+            successes=None if rate is None else np.array([rate]),
+            exact_std=float(np.sqrt(result.return_variance)),
+            yardstick=self.yardstick,
+        )
+
+    @cached_property
+    def values(self) -> OfLastPolicy[Floats]:
+        """The function from a policy to its state values, shape (S,); see `state_values`."""
+        return OfLastPolicy(lambda policy: state_values(self.model, policy, self.horizon))
+
+    @cached_property
+    def optimum(self) -> tuple[Floats, Bools]:
+        """The optimal state values, shape (S,), and the optimal actions, shape (S, A)."""
+        return optimal_choices(self.model, self.horizon)
+
+    def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
+        """The policy: probabilities (S, A), or actions (S,), or actions by step (horizon, S)."""
+        if isinstance(agent, PlanningAgent):
+            n_steps = 1 if agent.policy.is_stationary else self.horizon
+            return agent.policy.actions_after(self.observations[None], np.arange(n_steps)[:, None])
+        if deterministic and not isinstance(agent, RandomAgent):
+            return best_actions(agent, self.observations, self.masks)
+        return policy_matrix(agent, self.observations, deterministic, self.masks)
+
+    def obstacle(self, agent: BaseAlgorithm, deterministic: bool = True) -> str:
+        """Why the policy cannot be computed, or only too slowly; empty if it can."""
+        return obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
+
+
+def _observation_bytes(space: spaces.Space[Any]) -> int:
+    """Bytes of one observation; 0 if unknown."""
+    if isinstance(space, spaces.Dict):
+        return sum(map(_observation_bytes, space.spaces.values()))
+    if isinstance(space, spaces.Tuple):
+        return sum(map(_observation_bytes, space.spaces))
+    if space.shape is None or space.dtype is None:
+        return 0
+    return math.prod(space.shape) * space.dtype.itemsize
+
+
+def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
+    """Make the exact evaluator of a run, or None if episodes have to be sampled."""
+    return None if is_wrapped_as_vector(spec) else evaluator_of_single(spec)
+
+
+def evaluator_of_single(spec: TrainSpec) -> ExactEvaluator | None:
+    """Like `exact_evaluator`, but ignores VecEnv wrappers."""
+    with closing(make_single_env(spec)) as env:
+        model, horizon = transition_model(env), time_limit(env)
+        if model is None or horizon is None:
+            return None
+        if model.n_states * _observation_bytes(env.observation_space) > MOST_BYTES_OBSERVED:
+            return None
+        observations = observations_of_states(env)
+        if observations is None:
+            return None
+        optimum = _optimum(model, horizon)
+        if optimum is None:
+            return None
+        masks = action_masks_of_states(env)
+        success, layout = success_outcomes(env), grid_layout(env)
+    if layout is not None and layout.n_states != model.n_states:
+        layout = None  # the states of a user's grid world are not cells
+    baseline = float(baseline_return(model, horizon))
+    scale = hidden_scale(model, observations, horizon, optimum, baseline)
+    yardstick = Yardstick(optimum, baseline) if scale is None else scale.yardstick(False)
+    return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks, scale)
+
+
+def _optimum(model: TransitionModel, horizon: int) -> float | None:
+    """The highest expected return under the time limit; None if planning takes too long."""
+    n_backups = int(model.reachable.sum()) * model.n_actions * model.n_outcomes * horizon
+    if n_backups > FEW_BACKUPS:
+        found = optimum_far_from_limit(model, horizon)
+        if found is not None or n_backups > MOST_BACKUPS:
+            return found
+    return finite_horizon_optimum(model, horizon).start_value
+
+
+def model_refusal(spec: TrainSpec) -> str | None:
+    """Why the environment's own model is rejected, in one line; None if it is accepted."""
+    if is_wrapped_as_vector(spec):
+        return None
+    with closing(make_single_env(spec)) as env:
+        check = model_check(env)
+    return None if check is None else check.refusal
+
+
+def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> str | None:
+    """A one-line note on what the agent's discount costs; None if the cost is small.
+
+    The best policy under the discount, planned exactly on the training environment, is evaluated
+    like an agent. A learner cannot be expected to do better.
+    """
+    with closing(make_single_env(spec, training=True)) as env:
+        model = transition_model(env)
+    if model is None or model.prob.shape != exact.model.prob.shape or exact.scale is not None:
+        return None
+    if model.prob.size > MOST_OUTCOMES_PLANNED or not 0 <= discount < 1:
+        return None
+
+    def score(gamma: float) -> float:
+        plan = policy_iteration(model, gamma)
+        worth = policy_return(exact.model, plan.policy, exact.horizon)
+        return exact.yardstick.score(worth.expected_return)
+
+    reached, other = score(discount), 1 - 1 / (2 * exact.horizon)
+    if reached >= LOW_SCORE:
+        return None
+    said = f"at gamma {discount:g} even exact planning scores {reached:.2f} here"
+    better = score(other)
+    return f"{said}; {other:g}: {better:.2f} (gamma: auto)" if better > reached + 0.01 else said
+
+
+def is_wrapped_as_vector(spec: TrainSpec) -> bool:
+    """Whether a VecEnv wrapper changes the agent's observations."""
+    special = spec.hyperparams
+    return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)
+
+
+_kept: OrderedDict[str, ExactEvaluator] = OrderedDict()
+
+
+def evaluator_of(spec: TrainSpec) -> ExactEvaluator | None:
+    """Like `exact_evaluator`, cached for plain runs on the same environment."""
+    if not is_plain(spec):
+        return exact_evaluator(spec)
+    # The key: everything that determines the evaluation environment of a plain run.
+    masks = spec.hyperparams.algorithm.get("mask_actions", False)
+    key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
+    evaluator = _kept.pop(key, None) or exact_evaluator(spec)
+    if evaluator is not None and evaluator.model.n_states <= MOST_STATES_KEPT:
+        _kept[key] = evaluator
+        if len(_kept) > MOST_KEPT:
+            _kept.popitem(last=False)
+    return evaluator

@@ -1,0 +1,329 @@
+"""Queries agents' policies in all states at once, and says for which agents this fails."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.distributions import CategoricalDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnv
+
+from rl_yardstick.agents.bandits.preferences import PreferenceBandit
+from rl_yardstick.agents.bandits.value_bandits import ValueBandit
+from rl_yardstick.agents.common.exploration import BOLTZMANN
+from rl_yardstick.agents.common.masks import check_masks_exist, present_masks
+from rl_yardstick.agents.linear.algorithm import TileAlgorithm
+from rl_yardstick.agents.linear.policy_gradients import SoftmaxAlgorithm
+from rl_yardstick.agents.planning import PlanningAgent
+from rl_yardstick.agents.reference import RandomAgent
+from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
+from rl_yardstick.agents.tabular.policy import QTablePolicy
+from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
+from rl_yardstick.pipeline.errors import UserError
+
+# Agents of these packages accept any number of observations at once.
+KNOWN_LIBRARIES = ("rl_yardstick", "stable_baselines3")
+
+
+def is_network(model: BaseAlgorithm) -> bool:
+    """Whether the agent's policy is a network."""
+    policy = getattr(model, "policy", None)
+    return isinstance(policy, th.nn.Module) and next(policy.parameters(), None) is not None
+
+
+def has_memory(agent: BaseAlgorithm) -> bool:
+    """Whether the agent's policy is recurrent, and depends on earlier observations too."""
+    # If sb3-contrib is not imported, no policy can be of its classes.
+    module = sys.modules.get("sb3_contrib.common.recurrent.policies")
+    return module is not None and isinstance(
+        getattr(agent, "policy", None), module.RecurrentActorCriticPolicy
+    )
+
+
+def takes_masks(model: Any) -> bool:
+    """Whether `predict` takes ``action_masks``, and the agent uses them."""
+    predict = getattr(model.predict, "__func__", model.predict)
+    return "action_masks" in _parameters(predict) and bool(getattr(model, "mask_actions", True))
+
+
+@lru_cache(maxsize=64)
+def _parameters(predict: Callable[..., Any]) -> frozenset[str]:
+    return frozenset(inspect.signature(predict).parameters)
+
+
+def player(model: BaseAlgorithm, env: VecEnv) -> Any:
+    """The agent, wrapped to receive masks from ``env`` if it takes action masks."""
+    if not takes_masks(model):
+        return model
+    try:
+        check_masks_exist(env)
+    except ValueError as error:
+        raise UserError(
+            f"{type(model).__name__} needs action masks, and the environment has none"
+        ) from error
+    return MaskTold(model, env)
+
+
+class MaskTold:
+    """Passes the action masks of environments to an agent."""
+
+    def __init__(self, model: Any, env: VecEnv) -> None:
+        self.model = model
+        self.env = env
+
+    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """Predict with the current action masks of the environments."""
+        masks = present_masks(self.env, observation)
+        actions, state = self.model.predict(observation, action_masks=masks, **kwargs)
+        return actions, state
+
+
+Result = TypeVar("Result")
+
+
+class OfLastPolicy(Generic[Result]):
+    """Caches the last result of a function of a policy, because policies often stay the same."""
+
+    def __init__(self, work: Callable[[NDArray[Any]], Result]) -> None:
+        self._work = work
+        self._last: tuple[NDArray[Any], Result] | None = None
+
+    def __call__(self, policy: NDArray[Any]) -> Result:
+        """Return the result for a policy in one of the forms of `mdp.evaluation`."""
+        last = self._last
+        if last is not None and last[0].dtype == policy.dtype and np.array_equal(last[0], policy):
+            return last[1]
+        result = self._work(policy)
+        self._last = policy.copy(), result
+        return result
+
+
+# The most input numbers of a network per call, and in total; above, playing episodes is faster than
+# querying all states.
+MOST_AT_ONCE = 1 << 26
+MOST_NUMBERS = 400_000_000
+# The most steps x states of a plan that depends on the time step.
+MOST_PLANNED = 1 << 27
+# The most states x steps if actions are random, because these reach many states.
+MOST_AT_RANDOM = 30_000_000
+
+
+def obstacle(
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    masks: Bools | None,
+    horizon: int,
+    deterministic: bool = True,
+) -> str:
+    """Why exact evaluation is impossible, or slower than playing; empty if it is fine."""
+    n_states = len(observations)
+    if reason := _cannot_be_asked(agent, masks):
+        return reason
+    if is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
+        return f"querying a network in {n_states:,} states takes longer than playing"
+    if isinstance(agent, PlanningAgent):
+        if agent.policy.is_stationary or n_states * horizon <= MOST_PLANNED:
+            return ""
+        return f"a plan for {horizon:,} steps in {n_states:,} states is too large"
+    is_random = isinstance(agent, RandomAgent) or not deterministic
+    if is_random and n_states * horizon > MOST_AT_RANDOM:
+        return f"random actions reach too many of {n_states:,} states in {horizon:,} steps"
+    return ""
+
+
+def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
+    """Why `predict` fails for all states at once, or empty; tries it for the user's agents."""
+    if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
+        return ""
+    try:
+        asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
+        first, second = (np.asarray(actions) for actions, _ in asked)
+    except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
+        return f"predict takes no batch of observations ({type(error).__name__})"
+    if first.shape != observations.shape[:1]:
+        return f"predict returns actions of shape {first.shape} for {len(observations)} states"
+    if any(state is not None for _, state in asked):
+        return "predict depends on earlier observations"
+    return "" if np.array_equal(first, second) else "predict draws its actions at random"
+
+
+def policy_matrix(
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    deterministic: bool = True,
+    masks: Bools | None = None,
+) -> Floats:
+    """The agent's policy as probabilities of shape (S, A); TypeError if they are not known.
+
+    ``observations`` has the states along its first axis, ``masks`` the shape (S, A).
+    """
+    if reason := _cannot_be_asked(agent, masks):
+        raise TypeError(f"{type(agent).__name__}: {reason}")
+    n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
+    if isinstance(agent, RandomAgent):
+        return np.full((n_states, n_actions), 1 / n_actions)
+    if deterministic:
+        return np.eye(n_actions)[best_actions(agent, observations, masks)]
+    if isinstance(agent, TabularAlgorithm):
+        return np.asarray(agent.action_probabilities()[observations])
+    if isinstance(agent, TileAlgorithm | ValueBandit | PreferenceBandit):
+        return agent.action_probabilities(observations)
+    policy: Any = getattr(agent, "policy", None)
+    if hasattr(policy, "get_distribution"):  # an actor with a softmax over actions
+
+        def probabilities(part: NDArray[Any], **told: Any) -> NDArray[Any]:
+            with th.no_grad():
+                tensor, _ = policy.obs_to_tensor(part)
+                probs = policy.get_distribution(tensor, **told).distribution.probs
+            return np.asarray(probs.cpu().numpy(), dtype=np.float64)
+
+        return _in_parts(agent, observations, masks, probabilities)
+    # DQN, and QR-DQN, which may not be installed and is not a subclass of DQN.
+    homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
+    if any(base.__module__.startswith(homes) for base in type(agent).__mro__):
+        epsilon = float(vars(agent)["exploration_rate"])
+        greedy = policy_matrix(agent, observations, masks=masks)
+        is_told = masks is not None and takes_masks(agent)
+        allowed: Any = masks if is_told else np.ones(greedy.shape, dtype=np.bool_)
+        random = epsilon * allowed / allowed.sum(axis=1, keepdims=True)
+        return np.asarray(random + (1 - epsilon) * greedy)
+    raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
+
+
+def acts_by(agent: BaseAlgorithm) -> str:
+    """The stochastic policy of `policy_matrix`, in words."""
+    if isinstance(agent, PlanningAgent | RandomAgent):
+        return "the same policy"
+    draws = isinstance(agent, SoftmaxAlgorithm | PreferenceBandit)
+    if draws or hasattr(agent.policy, "get_distribution"):
+        return "its own distribution"
+    is_softmax = getattr(agent, "strategy", None) == BOLTZMANN
+    return (
+        f"{'temperature' if is_softmax else 'epsilon'} {getattr(agent, 'exploration_rate', 0.0):g}"
+    )
+
+
+def best_actions(
+    agent: BaseAlgorithm, observations: NDArray[Any], masks: Bools | None = None
+) -> Ints:
+    """The agent's greedy action in each state, shape (S,)."""
+    if reason := _cannot_be_asked(agent, masks):
+        raise TypeError(f"{type(agent).__name__}: {reason}")
+
+    # Reading a plain table is faster than `predict`, which would take most of an evaluation.
+    is_ours = type(agent).predict is TabularAlgorithm.predict and not takes_masks(agent)
+    table: object = agent.policy if is_ours else None
+    if isinstance(table, QTablePolicy) and type(table) is QTablePolicy:
+        return np.asarray(table.allowed_values(observations).argmax(axis=1))
+
+    def predicted(observations: NDArray[Any], **told: Any) -> NDArray[Any]:
+        return np.asarray(agent.predict(observations, deterministic=True, **told)[0])
+
+    return _in_parts(agent, observations, masks, predicted).astype(np.int64)
+
+
+def _in_parts(
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    masks: Bools | None,
+    asked: Callable[..., NDArray[Any]],
+) -> NDArray[Any]:
+    """Call ``asked`` on batches of observations that a network can take."""
+    n_states = len(observations)
+    n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
+    told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
+    found = [
+        asked(observations[i : i + n_rows], **{k: v[i : i + n_rows] for k, v in told.items()})
+        for i in range(0, n_states, n_rows)
+    ]
+    return found[0] if len(found) == 1 else np.concatenate(found)
+
+
+def _n_inputs(agent: BaseAlgorithm) -> int:
+    """The size of a flattened observation."""
+    return max(int(spaces.flatdim(agent.observation_space)), 1)
+
+
+def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
+    if has_memory(agent):
+        return "its actions depend on earlier observations, not on the state alone"
+    if masks is None and takes_masks(agent):
+        return "which actions are valid in each state is not known"
+    return ""
+
+
+# --- values or probabilities of actions at one observation ----------------------------------------
+
+
+class ActionFigures(NamedTuple):
+    """A number for each action."""
+
+    word: str  # the kind of numbers: "value", "score" or "probability"
+    numbers: Floats  # shape (A,)
+
+
+def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | None:
+    """The agent's figures for each action at the observation of one environment, or None."""
+    policy: Any = agent.policy
+    if not isinstance(agent.action_space, spaces.Discrete):
+        return None
+    for word, name in (("value", "q_table"), ("score", "scores")):
+        table = getattr(policy, name, None)
+        if table is not None and isinstance(agent.observation_space, spaces.Discrete):
+            row = int(np.asarray(observations).reshape(-1)[0])
+            return ActionFigures(word, np.asarray(table)[row if len(table) > 1 else 0])
+    if isinstance(agent, SoftmaxAlgorithm):
+        return ActionFigures("probability", agent.action_probabilities(observations)[0])
+    if isinstance(agent, TileAlgorithm):
+        return ActionFigures("value", agent.policy.sums(observations)[0])
+    with th.no_grad():
+        if (net := getattr(policy, "q_net", None)) is not None:
+            values = net(policy.obs_to_tensor(observations)[0])[0]
+            return ActionFigures("value", values.cpu().numpy())
+        if (net := getattr(policy, "quantile_net", None)) is not None:
+            values = net(policy.obs_to_tensor(observations)[0])[0].mean(dim=0)
+            return ActionFigures("value", values.cpu().numpy())
+        # A recurrent policy would need its hidden state.
+        if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
+            distribution = policy.get_distribution(policy.obs_to_tensor(observations)[0])
+            if isinstance(distribution, CategoricalDistribution):
+                values = distribution.distribution.probs[0]
+                return ActionFigures("probability", values.cpu().numpy())
+    return None
+
+
+def believed_values(agent: BaseAlgorithm, observations: NDArray[Any]) -> Floats | None:
+    """The agent's own values of actions (S, A) or states (S,); None if it has none.
+
+    ``observations`` has the states along its first axis.
+    """
+    policy: Any = agent.policy
+    if isinstance(agent, TabularAlgorithm):
+        return np.asarray(policy.q_table[observations])
+    if isinstance(agent, TileAlgorithm) and not isinstance(agent, SoftmaxAlgorithm):
+        return np.asarray(policy.sums(observations))
+    if not is_network(agent) or has_memory(agent):
+        return None
+
+    def asked(part: NDArray[Any]) -> NDArray[Any]:
+        with th.no_grad():
+            tensor, _ = policy.obs_to_tensor(part)
+            if (net := getattr(policy, "q_net", None)) is not None:
+                values = net(tensor)
+            elif (net := getattr(policy, "quantile_net", None)) is not None:
+                values = net(tensor).mean(dim=1)
+            else:
+                values = policy.predict_values(tensor)[:, 0]
+        return np.asarray(values.cpu().numpy(), dtype=np.float64)
+
+    has_values = any(hasattr(policy, name) for name in ("q_net", "quantile_net", "predict_values"))
+    return _in_parts(agent, observations, None, asked) if has_values else None

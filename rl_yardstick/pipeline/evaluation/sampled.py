@@ -1,0 +1,406 @@
+"""Evaluates agents by episodes on the original environment, not on a training variant.
+
+The number of evaluation steps depends on the number of training steps and never on the clock, so
+that the same seed gives the same files on every machine. Agents that train in compiled code are
+evaluated in compiled code too.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing, nullcontext
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3 import A2C
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from rl_yardstick.envs.brackets import may_have_bracket, optimum_bracket
+from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.evaluation.policies import KNOWN_LIBRARIES, is_network, player
+from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
+from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
+from rl_yardstick.pipeline.train_spec import TrainSpec
+
+# A mean this many standard errors above an upper bound shows that the bound is wrong.
+BEYOND_CHANCE = 6.0
+# Fewer episodes may all have begun in states of high return.
+FEWEST_TO_TELL = 10
+
+
+@dataclass(frozen=True)
+class OtherReturns:
+    """Further exact returns of the final agent; None where unknown."""
+
+    acts_by: str | None = None  # its policy in training, in words: "epsilon 0.01"
+    stochastic_return: float | None = None  # of its policy in training
+    discount: float | None = None  # the agent's discount
+    discounted_return: float | None = None  # of the greedy policy, under that discount
+    discounted_optimum: float | None = None  # under that discount; None if the state is hidden
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The result of an evaluation: sampled episodes, or their exact expectation."""
+
+    # undiscounted return of each episode, shape (n_episodes,);
+    # if exact, the expected return, of shape (1,)
+    returns: Floats
+    lengths: NDArray[np.floating[Any] | np.integer[Any]]  # number of steps, likewise
+    # whether each episode succeeded, or the probability of success, likewise; None if the
+    # environment does not report it
+    successes: NDArray[np.bool_ | np.floating[Any]] | None
+    # exact standard deviation of an episode's return; None for sampled episodes
+    exact_std: float | None = None
+    yardstick: Yardstick | None = None  # the scale for the return, if known
+    others: OtherReturns | None = None  # further returns; None for sampled episodes
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the figures are exact expectations."""
+        return self.exact_std is not None
+
+    @cached_property
+    def mean_return(self) -> float:
+        """Mean return of an episode."""
+        return float(self.returns.mean())
+
+    @cached_property
+    def mean_length(self) -> float:
+        """Mean number of steps of an episode."""
+        return float(self.lengths.mean())
+
+    @cached_property
+    def std_return(self) -> float:
+        """Standard deviation of an episode's return."""
+        return float(self.returns.std()) if self.exact_std is None else self.exact_std
+
+    @cached_property
+    def success_rate(self) -> float | None:
+        """Share of successful episodes, if the environment reports success."""
+        return None if self.successes is None else float(self.successes.mean())
+
+    @property
+    def beats_optimum(self) -> bool:
+        """Whether the mean is significantly above the upper bound of the optimum.
+
+        If so, the bracket is wrong, or belongs to another environment.
+        """
+        if self.yardstick is None or self.yardstick.at_least is None:
+            return False
+        if len(self.returns) < FEWEST_TO_TELL:
+            return False
+        error = self.std_return / math.sqrt(len(self.returns) - 1)
+        # Monitor rounds returns to six digits.
+        return self.mean_return - BEYOND_CHANCE * error > self.yardstick.optimum + 1e-6
+
+    def measured_by(self, yardstick: Yardstick | None) -> Evaluation:
+        """The same figures with another yardstick."""
+        return replace(self, yardstick=yardstick)
+
+    def joined(self, more: Evaluation) -> Evaluation:
+        """These sampled episodes together with further ones of the same agent."""
+        both = None
+        if self.successes is not None and more.successes is not None:
+            both = np.concatenate([self.successes, more.successes])
+        returns = np.concatenate([self.returns, more.returns])
+        return Evaluation(returns, np.concatenate([self.lengths, more.lengths]), both)
+
+    def summary(self) -> dict[str, Any]:
+        """The figures as JSON."""
+        figures: dict[str, Any] = {
+            "mean_return": self.mean_return,
+            "std_return": self.std_return,
+            "mean_length": self.mean_length,
+            "success_rate": self.success_rate,
+            "exact": self.is_exact,
+            "n_episodes": None if self.is_exact else len(self.returns),
+        }
+        if self.yardstick is not None:
+            figures |= self.yardstick.figures(self.mean_return)
+        if self.others is not None:
+            figures |= asdict(self.others)
+        if self.beats_optimum:
+            figures["beats_optimum"] = True
+        return figures
+
+
+def evaluate(
+    model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int | None, deterministic: bool = True
+) -> Evaluation:
+    """Play ``n_episodes``, determined by the seed; with None, environments are not reseeded."""
+    successes: list[bool] = []
+
+    def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:
+        if local["done"] and "is_success" in local["info"]:
+            successes.append(bool(local["info"]["is_success"]))
+
+    # Planners, for example, do not count steps.
+    when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
+    if seed is not None:
+        env.seed(seed)
+    watched: Any = FinitePlayer(player(model, env), when)
+    returns, lengths = evaluate_policy(
+        watched,
+        env,
+        n_eval_episodes=n_episodes,
+        deterministic=deterministic,
+        return_episode_rewards=True,
+        callback=note_success,
+        warn=False,
+    )
+    check_numbers(returns, "return", when)
+    return Evaluation(
+        np.asarray(returns, dtype=np.float64),
+        np.asarray(lengths, dtype=np.int64),
+        np.array(successes) if len(successes) == n_episodes else None,
+    )
+
+
+def takes_batches(model: BaseAlgorithm) -> bool:
+    """Whether an agent can act in several environments at once."""
+    if type(model).__module__.partition(".")[0] in KNOWN_LIBRARIES:
+        return True
+    sample: Any = model.observation_space.sample()
+    try:
+        if isinstance(sample, dict):
+            twice: Any = {name: np.stack([part, part]) for name, part in sample.items()}
+        else:
+            twice = np.stack([sample, sample])
+        actions, _ = model.predict(twice, deterministic=True)
+    except Exception:  # noqa: BLE001  # a stranger's code can fail in any way
+        return False
+    return len(np.atleast_1d(actions)) == 2
+
+
+def evaluation_seed(seed: int, purpose: int) -> int:
+    """A seed distinct from training's; purpose 1: during training, 2: at its end, 3: playing."""
+    stream = np.random.SeedSequence(seed, spawn_key=(purpose,))
+    return int(stream.generate_state(1)[0] % 2**31)
+
+
+def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
+    """The known bracket of the evaluation environment's optimum, or None."""
+    if spec.hyperparams.vec_env_wrapper or not may_have_bracket(spec.env_id):
+        return None
+    with closing(make_single_env(spec)) as env:
+        found = optimum_bracket(env)
+    if found is None:
+        return None
+    return Yardstick(found.upper, found.baseline, found.lower, found.upper_is_proven)
+
+
+class Shares(NamedTuple):
+    """Evaluation steps per training step."""
+
+    usual: float  # for every training
+    at_first: float  # for short trainings, up to `STEPS_AT_FIRST` evaluation steps
+
+
+# Chosen by the time of an evaluation step relative to a training step, so that evaluations take at
+# most a fifth of the training time. Figures: docs/benchmarks.md.
+NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
+TABLE = Shares(usual=1 / 100, at_first=1 / 5)
+# A2C learns once from each step, which takes no longer than playing it.
+LIGHT_NETWORK = Shares(usual=1 / 10, at_first=1 / 10)
+# Training and evaluation are both compiled.
+COMPILED_NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
+COMPILED_TABLE = Shares(usual=1 / 10, at_first=1 / 2)
+# Learning is compiled, the environments are in Python.
+PYTHON_ENV = Shares(usual=1 / 32, at_first=1 / 6)
+# Training is compiled, evaluation cannot be.
+NETWORK_ALONE = Shares(usual=1 / 32, at_first=1 / 32)
+TABLE_ALONE = Shares(usual=1 / 2500, at_first=1 / 2500)
+STEPS_AT_FIRST = 10_000
+# A tenth of a second in most environments.
+STEPS_IN_ANY_CASE = 2_000
+
+
+def shares_of(model: BaseAlgorithm, *, plays_compiled: bool) -> Shares:
+    """The evaluation steps per training step of an agent."""
+    engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
+    if engine.startswith("compiled but"):
+        return PYTHON_ENV
+    if not engine.startswith("compiled"):
+        light = LIGHT_NETWORK if isinstance(model, A2C) else NETWORK
+        return light if learns_weights else TABLE
+    if plays_compiled:
+        return COMPILED_NETWORK if learns_weights else COMPILED_TABLE
+    return NETWORK_ALONE if learns_weights else TABLE_ALONE
+
+
+def allowed_steps(n_trained: float, shares: Shares) -> float:
+    """The number of steps that all evaluations of a training together may take."""
+    at_first = min(shares.at_first * n_trained, STEPS_AT_FIRST)
+    return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
+
+
+# Of the allowed steps; the final evaluation gets the rest, but at least the other half.
+PART_DURING_TRAINING = 1 / 2
+
+# Episodes of an evaluation: first this many, then more until the standard error is small.
+STAGES = (5, 10, 20)
+STAGES_AT_THE_END = (10, 25, 50, 100)
+LEAST_SURE = 10
+# Relative to the mean return.
+PRECISION = 0.05
+PRECISION_AT_THE_END = 0.01
+
+
+class SampledEvaluator:
+    """Evaluates by episodes: a given number, or as few as are precise enough."""
+
+    def __init__(self, spec: TrainSpec, env: VecEnv, yardstick: Yardstick | None = None) -> None:
+        self.env = env
+        self.yardstick = yardstick or bracketed_yardstick(spec)
+        self.seed = spec.seed
+        self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
+        # Explicit intervals or numbers of episodes take precedence over the limit.
+        self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
+        self.training_steps = spec.hyperparams.n_timesteps
+        self.training_episodes = spec.hyperparams.n_episodes
+        self.n_steps = 0  # in all evaluations
+        self._left = math.inf
+        self._last_length: float | None = None
+
+    def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
+        """Whether the training has done enough steps for another evaluation."""
+        if self.is_limited:
+            n_trained = model.num_timesteps - model._num_timesteps_at_start
+            progress = n_trained / (self.training_steps or math.inf)
+            if self.training_episodes is not None:
+                progress = n_episodes / self.training_episodes
+            planned = n_trained / progress if progress > 0 else 0.0
+            allowed = self._allowed(model, planned) * min(progress, 1.0)
+            self._left = allowed * PART_DURING_TRAINING - self.n_steps
+        return STAGES[0] * self._usual_length(model) <= self._left
+
+    def __call__(self, model: BaseAlgorithm) -> Evaluation:
+        """Evaluate during training."""
+        stages = STAGES if self.n_episodes is None else (self.n_episodes,)
+        return self._evaluate(model, stages, PRECISION, self._left, evaluation_seed(self.seed, 1))
+
+    def at_the_end(self, model: BaseAlgorithm) -> Evaluation:
+        """Evaluate at the end of training, on separate episodes."""
+        n_trained = model.num_timesteps - model._num_timesteps_at_start
+        allowed = self._allowed(model, n_trained)
+        left = max(allowed - self.n_steps, allowed * (1 - PART_DURING_TRAINING))
+        stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
+        length = self._last_length or math.inf
+        if self.n_final is None and stages[0] * length > left:
+            stages = (STAGES[0], *stages)
+        seed = evaluation_seed(self.seed, 2)
+        return self._evaluate(model, stages, PRECISION_AT_THE_END, left, seed)
+
+    def _evaluate(
+        self,
+        model: BaseAlgorithm,
+        stages: tuple[int, ...],
+        within: float,
+        most: float,
+        seed: int,
+    ) -> Evaluation:
+        """Play episodes until the mean is precise enough, or the allowed steps are used up."""
+        copy = self._compiled_copy(model)
+
+        def play(n_episodes: int, seed: int | None) -> Evaluation:
+            if copy is None:
+                return evaluate(model, self.env, n_episodes, seed)
+            return evaluate_compiled(model, copy, n_episodes, seed)
+
+        found = play(stages[0], seed)
+        for n_episodes in stages[1:]:
+            n_more = n_episodes - len(found.returns)
+            if is_sure(found, within) or found.lengths.sum() + n_more * found.mean_length > most:
+                break
+            # Without a new seed, the environments continue with other episodes.
+            found = found.joined(play(n_more, None))
+        self.n_steps += int(found.lengths.sum())
+        self._last_length = found.mean_length
+        return found.measured_by(self.yardstick)
+
+    def _allowed(self, model: BaseAlgorithm, n_trained: float) -> float:
+        is_compiled = self._compiled_copy(model) is not None
+        return allowed_steps(n_trained, shares_of(model, plays_compiled=is_compiled))
+
+    def _usual_length(self, model: BaseAlgorithm) -> float:
+        """Mean steps of an episode in the last evaluation, or else in training's last episodes."""
+        if self._last_length is not None:
+            return self._last_length
+        lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
+        return float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
+
+    def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
+        """The compiled evaluation environments, if the agent trains in compiled code."""
+        if getattr(model, "engine_in_use", "") != "compiled":
+            return None
+        return compiled_copy(self.env)
+
+
+def is_sure(evaluation: Evaluation, precision: float) -> bool:
+    """Whether at least ten episodes have a small standard error relative to their mean."""
+    n_episodes = len(evaluation.returns)
+    error = float(np.std(evaluation.returns)) / math.sqrt(max(n_episodes - 1, 1))
+    return n_episodes >= LEAST_SURE and error <= precision * abs(evaluation.mean_return)
+
+
+def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
+    """The number of parallel evaluation environments: at most one for each episode."""
+    return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
+
+
+@dataclass(frozen=True)
+class CompiledCopy:
+    """Evaluation environments and their compiled counterpart."""
+
+    env: DummyVecEnv
+    world: Any  # the compiled environments, for `agents.compiled.loop`
+    seen: Any  # converts their observations
+
+
+def compiled_copy(env: VecEnv) -> CompiledCopy | None:
+    """The compiled copy of CartPole or MountainCar, plain or in Monitor; None for others."""
+    from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
+
+    from rl_yardstick.agents.compiled.worlds import NotCompilable, monitor_of
+    from rl_yardstick.agents.networks.network_worlds import network_world
+
+    if not isinstance(env, DummyVecEnv) or any(monitor_of(each) is None for each in env.envs):
+        return None
+    if not isinstance(env.envs[0].unwrapped, CartPoleEnv | MountainCarEnv):
+        return None
+    try:
+        return CompiledCopy(env, *network_world(env))
+    except NotCompilable:
+        return None
+
+
+def evaluate_compiled(
+    model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
+) -> Evaluation:
+    """Like `evaluate`, in compiled code; the library's network decides near ties."""
+    from rl_yardstick.agents.compiled.greedy_play import play_episodes
+    from rl_yardstick.agents.compiled.records import DECIMALS
+    from rl_yardstick.agents.networks.network_worlds import NetworkEnvStates
+    from rl_yardstick.agents.networks.perceptron import one_thread
+
+    env, n_envs = copy.env, copy.env.num_envs
+    if seed is not None:
+        env.seed(seed)
+    # As many episodes per environment as in `evaluate_policy`.
+    wanted = (n_episodes + np.arange(n_envs)) // n_envs
+    states = NetworkEnvStates(env, copy.world, copy.seen)
+    acting = cast(Any, model).greedy_player(copy.seen)
+    with one_thread() if is_network(model) else nullcontext():
+        found = play_episodes(copy.world, acting, states, env.reset(), wanted)
+    # Rounded as in Monitor.
+    returns = np.array([round(total, DECIMALS) for total in found.returns.tolist()])
+    when = f"in the evaluation at step {model.num_timesteps:,}"
+    check_numbers(returns, "return", when)
+    return Evaluation(returns, found.lengths, None)

@@ -1,0 +1,203 @@
+"""Plays trained agents, episode by episode, and films them."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import io
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from rl_yardstick.pipeline.environments import make_evaluation_env
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.files import replacing
+from rl_yardstick.pipeline.models.choose import ChosenModel
+from rl_yardstick.pipeline.models.load import take_over
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
+
+RenderMode = Literal["human", "ansi", "rgb_array"]
+
+# In these modes, an environment returns frames instead of showing them.
+KEPT_MODES: tuple[RenderMode, ...] = ("ansi", "rgb_array")
+
+# After this many known frames in a row, an episode counts as repeating itself.
+FRAMES_OF_A_REPETITION = 20
+
+
+def playing_env(
+    chosen: ChosenModel,
+    mode: RenderMode | None,
+    n_envs: int = 1,
+    monitor_folder: Path | None = None,
+) -> VecEnv:
+    """Make the VecEnv for playing, with this render mode; `FrameTaker` returns its frames."""
+    if mode == "rgb_array":
+        # Rendering into memory needs no display, but SDL complains if there is none.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    extra = {} if mode is None else {"render_mode": mode}
+    # A VecEnv resets a finished environment at once, so frames are stored before that.
+    wrap_innermost = None
+    if mode in KEPT_MODES:
+        from gymnasium.wrappers import RenderCollection
+
+        wrap_innermost = partial(RenderCollection, pop_frames=True, reset_clean=False)
+    spec = chosen.spec
+    env: VecEnv = make_evaluation_env(
+        spec, n_envs, wrap_innermost=wrap_innermost, monitor_folder=monitor_folder, **extra
+    )
+    if mode is not None and mode not in env.get_attr("metadata")[0].get("render_modes", []):
+        raise UserError(f"{spec.env_id} cannot be rendered as {mode}")
+    if chosen.statistics is not None:
+        take_over(env, chosen.statistics)
+    return env
+
+
+def play_episodes(
+    model: BaseAlgorithm,
+    env: VecEnv,
+    n_episodes: int | None,
+    n_steps: int | None = None,
+    *,
+    deterministic: bool = True,
+    before_step: Callable[[Any, Any], object] = lambda obs, actions: None,
+    after_step: Callable[[bool], object] = lambda done: None,
+) -> Iterator[tuple[float, int]]:
+    """Play a number of episodes, or a number of steps over all environments.
+
+    ``before_step`` gets the observations and the actions; ``after_step`` gets whether the step
+    ended an episode of the first environment.
+
+    Yields:
+        Return and length of each episode as it ends.
+    """
+    from rl_yardstick.pipeline.evaluation.policies import player
+    from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
+
+    choose = FinitePlayer(player(model, env), "while it is played").predict
+    obs: Any = env.reset()
+    state = None
+    starts = np.ones(env.num_envs, dtype=bool)
+    # An equal share for each environment, as in `evaluate_policy`: the first episodes to end over
+    # all environments would mostly be short ones.
+    due: Any = np.full(env.num_envs, np.inf)
+    if n_episodes is not None:
+        due = (n_episodes + np.arange(env.num_envs)) // env.num_envs
+    steps = 0
+    while any(due > 0) and (n_steps is None or steps < n_steps):
+        actions, state = choose(obs, state=state, episode_start=starts, deterministic=deterministic)
+        before_step(obs, actions)
+        obs, _, starts, infos = env.step(actions)
+        steps += env.num_envs
+        after_step(bool(starts[0]))
+        for index in np.flatnonzero(starts & (due > 0)):
+            # Missing if a wrapper restarts although the episode itself has not ended.
+            episode = infos[index].get("episode")
+            if episode is not None:
+                due[index] -= 1
+                check_numbers(episode["r"], "return", f"of an episode of environment {index}")
+                yield episode["r"], episode["l"]
+
+
+class Repetition:
+    """Detects that an episode only repeats frames."""
+
+    def __init__(self) -> None:
+        self._seen: set[Any] = set()
+        self._n_known = 0  # consecutive
+
+    def goes_on(self, frame: Any) -> bool:
+        """Whether this frame and the last `FRAMES_OF_A_REPETITION` were all shown before."""
+        self._n_known = self._n_known + 1 if frame in self._seen else 0
+        self._seen.add(frame)
+        return self._n_known > FRAMES_OF_A_REPETITION
+
+    def forget(self) -> None:
+        """Start again with another episode."""
+        self._seen.clear()
+        self._n_known = 0
+
+
+class FrameTaker:
+    """Returns the frames of an environment of `playing_env`, separated by episode."""
+
+    def __init__(self, env: VecEnv) -> None:
+        self.env = env
+        self._first_of_next: list[Any] = []
+
+    def take(self, done: bool) -> list[Any]:
+        """The frames since the last call, except the first frame of the next episode."""
+        drawn: list[Any] = self._first_of_next + self.env.env_method("render")[0]
+        self._first_of_next = [drawn.pop()] if done else []
+        return drawn
+
+
+# --- films ----------------------------------------------------------------------------------------
+
+FILM_SUFFIXES = (".gif", ".mp4")
+FRAMES_PER_SECOND = 10
+
+
+def check_film_path(path: Path) -> None:
+    """Check that a film can be written, before anything is played."""
+    if path.suffix not in FILM_SUFFIXES:
+        raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
+    if not path.absolute().parent.is_dir():
+        raise UserError(f"--record: there is no folder {path.parent}")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise UserError(f"--record: nothing can be written in {path.parent}")
+    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise UserError("--record to .mp4 needs: pip install 'rl-yardstick[video]'")
+
+
+def film_episode(
+    model: BaseAlgorithm, env: VecEnv, max_steps: int, *, deterministic: bool
+) -> tuple[list[Any], tuple[float, int] | None]:
+    """Play an episode; returns its frames, and return and length, None if it did not end."""
+    taker = FrameTaker(env)
+    frames: list[Any] = []
+
+    def keep(done: bool) -> None:
+        frames.extend(taker.take(done))
+
+    played = play_episodes(model, env, 1, max_steps, deterministic=deterministic, after_step=keep)
+    ended = list(played)
+    return frames, ended[0] if ended else None
+
+
+def write_film(path: Path, frames: list[Any]) -> None:
+    """Write frames, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
+    film = _as_mp4(frames) if path.suffix == ".mp4" else as_gif(frames)
+    with replacing(path) as file:
+        file.write(film)
+
+
+def as_gif(frames: list[Any]) -> bytes:
+    """The content of a GIF file of frames, uint8 of shape (height, width, 3)."""
+    from PIL import Image
+
+    first, *others = [Image.fromarray(frame) for frame in frames]
+    duration, film = 1000 // FRAMES_PER_SECOND, io.BytesIO()
+    first.save(film, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    return film.getvalue()
+
+
+def _as_mp4(frames: list[Any]) -> bytes:
+    import imageio.v2 as imageio
+
+    # Encoders need even side lengths.
+    even = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]
+    film: bytes = imageio.mimwrite(
+        "<bytes>", even, format="mp4", fps=FRAMES_PER_SECOND, macro_block_size=1
+    )
+    # The library uses a temporary file, and does not report a full disk.
+    if b"moov" not in film:
+        raise OSError(errno.EIO, "the encoder wrote no whole film: is the disk full?")
+    return film

@@ -1,0 +1,325 @@
+"""The conclusions of a study as sentences: who is best, pair by pair, who failed, and how soon."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from rl_yardstick.experiments.analysis import (
+    MARK,
+    ON_THE_SCALE,
+    AgentAnalysis,
+    EnvironmentAnalysis,
+    StudyAnalysis,
+)
+from rl_yardstick.experiments.study import METRIC_WORDS, OF_TRAINING, StudySpec
+from rl_yardstick.report.words import (
+    enumeration,
+    number,
+    optimum_words,
+    scale_words,
+    score_number,
+    seeds,
+)
+from rl_yardstick.verdicts import Pair, unseen_share
+
+# Sentences on pairs of agents.
+
+
+def pairs_both_ways(pairs: Iterable[Pair]) -> dict[tuple[str, str], Pair]:
+    """Every pair in both orders, by first and second agent."""
+    seen = [one for pair in pairs for one in (pair, pair.swapped())]
+    return {(one.first, one.second): one for one in seen}
+
+
+def pair_sentences(environment: EnvironmentAnalysis) -> list[str]:
+    """The words on all pairs, one sentence for each first agent and word."""
+    return [sentence for group in _groups(environment) for sentence in group]
+
+
+def _groups(environment: EnvironmentAnalysis) -> Iterable[list[str]]:
+    oriented = [pair.swapped() if pair.word == "worse" else pair for pair in environment.pairs]
+    ways = {"better": "{} is {} than {}.", "tied": "{} is {} with {}."}
+    for name in (agent.agent for agent in environment.agents):
+        told: dict[str, list[Pair]] = {}
+        for pair in oriented:
+            if pair.first == name:
+                told.setdefault(pair.text, []).append(pair)
+        yield [
+            ways.get(pairs[0].word, "{} is {} against {}.").format(
+                name, text, enumeration([_other(environment, pair) for pair in pairs])
+            )
+            for text, pairs in sorted(told.items(), key=lambda item: item[0])
+        ]
+
+
+def _other(environment: EnvironmentAnalysis, pair: Pair) -> str:
+    """The other agent, and the difference; of an undecided pair also how many seeds it would take.
+
+    A study that grows says how many seeds decided the pair.
+    """
+    low, high = map(number, pair.interval)
+    unit = " of the score" if environment.is_score else ""
+    told = [f"by {low} to {high}{unit}"]
+    if pair.word == "tied":
+        told = [f"within {number(environment.margin)}{unit}"]
+    elif pair.word == "undecided":
+        told = [f"difference {low} to {high}{unit}"]
+        if math.isinf(pair.interval[0]) or math.isinf(pair.interval[1]):
+            told = ["too few runs"]
+        if pair.seeds_needed is not None:
+            told.append(f"about {seeds(pair.seeds_needed)} would decide")
+    if environment.looks:
+        told.append(f"with {seeds(pair.n)}")
+    return f"{pair.second} ({'; '.join(told)})"
+
+
+def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    """The planned numbers of seeds of the agents, in words."""
+    return seeds(*(environment.seeds.values() or [study.n_seeds]))
+
+
+def failed_runs(environment: EnvironmentAnalysis) -> str:
+    """How many runs of each agent failed; empty if none did."""
+    return enumeration(
+        [
+            f"{agent.runs.failed} of {agent.runs.n} runs of {agent.agent} failed"
+            for agent in environment.agents
+            if agent.runs.failed
+        ]
+    )
+
+
+def failed_words(environment: EnvironmentAnalysis) -> str:
+    """What a failed run is; empty where failures have no meaning."""
+    if environment.failure_threshold is None:
+        return ""
+    return f"failed: a score below {number(environment.failure_threshold)}, half the best median"
+
+
+def unseen_sentence(analysis: StudyAnalysis) -> str:
+    """What this many runs cannot show; once on every page."""
+    counts = [agent.runs.n for one in analysis.environments for agent in one.agents]
+    n = min(counts, default=0)
+    if not n:
+        return ""
+    runs = "1 run" if n == 1 else f"{n:,} runs"
+    share = f"{100 * unseen_share(n):.2g} % of further runs"
+    return f"A failure that no run showed is not counted: with {runs} up to {share} could fail."
+
+
+# Sentences on how soon agents stay above the threshold.
+
+
+def speed_sentences(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """How many runs reach the threshold and stay there, and from which step."""
+    told = [
+        (agent.agent, agent.steps_to_stay.share_reached, agent.steps_to_stay.median.point)
+        for agent in environment.agents
+        if agent.steps_to_stay is not None and agent.steps_to_stay.share_reached.n
+    ]
+    arrived = sorted((one for one in told if one[1].point > 0), key=lambda one: one[2])
+    if len(told) < 2 or not arrived:
+        return
+    parts: list[str] = []
+    for name, share, steps in arrived:
+        goal = "" if parts else f"stays above {_goal(environment)} "
+        parts.append(f"{name} {goal}in {round(share.point * share.n)} of {share.n} runs")
+        if not math.isinf(steps):
+            parts[-1] += f", in the median run from step {steps:,.0f}"
+    never = [name for name, share, _ in told if share.point == 0]
+    if never:
+        parts.append(f"{enumeration(never)} in none")
+    yield f"{'; '.join(parts)}."
+
+
+def _goal(environment: EnvironmentAnalysis) -> str:
+    threshold, optimum, baseline = environment.threshold, environment.optimum, environment.baseline
+    if threshold is not None and optimum is not None and baseline is not None:
+        share = (threshold - baseline) / (optimum - baseline) if optimum > baseline else 0.0
+        if math.isclose(share, 0.95):
+            return "a score of 0.95"
+    return f"a return of {number(threshold)}"
+
+
+# The conclusion on an environment: the lead (a line on who is best), the pairs, and notes.
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """The sentences on an environment."""
+
+    lead: str  # who is best, and the optimum
+    pairs: tuple[str, ...]  # every word, with figures; several in a sentence
+    # Failures, how soon agents arrive, training on variants, missing runs, what failed agents
+    # do instead, and the number of looks.
+    notes: tuple[str, ...]
+
+    @property
+    def everything(self) -> tuple[str, ...]:
+        """All sentences."""
+        return (self.lead, *self.pairs, *self.notes)
+
+
+def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion:
+    """What a study has shown on one environment."""
+    failed = failed_runs(environment)
+    return Conclusion(
+        lead=_lead(study, environment),
+        pairs=tuple(pair_sentences(environment)),
+        notes=(
+            *([f"{failed}."] if failed else []),
+            *_on_other_tasks(environment),
+            *_on_the_hidden(environment),
+            *speed_sentences(environment),
+            *_on_the_impossible(environment),
+            *_on_variants(study, environment),
+            *on_changes([environment]),
+            *_on_missing(study, environment),
+            *environment.advice,
+            *_on_looks(environment),
+        ),
+    )
+
+
+def overall_sentences(analysis: StudyAnalysis) -> list[str]:
+    """Who is best over all environments; nothing for a single one."""
+    overall = analysis.overall
+    if overall is None or overall.best is None or len(overall.scores) < 2:
+        return []
+    n = len(analysis.environments)
+    where = "Over both environments" if n == 2 else f"Over all {n} environments"
+    means = {name: overall.scores[name].mean.point for name in overall.scores}
+    told = [f"{name} {score_number(means[name])}" for name in overall.best.agents]
+    scores = f"mean score: {', '.join(told)}"
+    return [f"{where}, best: {overall.best}; {scores}.", *unproven_sentences(analysis.environments)]
+
+
+def unproven_sentences(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
+    """On which environments a score may be too high, because no proof bounds the optimum."""
+    names = [one.environment for one in environments if not one.optimum_is_proven]
+    if not names:
+        return []
+    told = f"On {enumeration(names)} the upper end of the optimum's bracket is not proven"
+    return [f"{told}: a score there may be too high."]
+
+
+def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
+    """A sentence for each environment on which nothing has finished."""
+    there = {environment.environment for environment in analysis.environments}
+    absent = [e.label for e in analysis.study.environments if e.label not in there]
+    return [f"On {label}, no run has finished." for label in absent]
+
+
+def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    agents, words = environment.agents, METRIC_WORDS[study.metric]
+    if math.isnan(agents[0].runs.mean):
+        return f"No run has a figure for the {words}."
+    optimum = _optimum(study, environment)
+    if none_has_learnt(study, environment):
+        figure = f"the best mean {words} is {number(agents[0].metric.mean.point)}"
+        return (
+            "None of the agents has learnt: no median is above the best random or constant "
+            f"policy's {number(environment.baseline)}; {figure}{optimum}."
+        )
+    if len(agents) == 1:
+        return f"{agents[0].agent}: {words} {_figure(environment, agents[0])}{optimum}."
+    return f"Best: {environment.best}{optimum}."
+
+
+def _figure(environment: EnvironmentAnalysis, agent: AgentAnalysis) -> str:
+    text = number(agent.metric.mean.point)
+    return f"{text}, score {score_number(agent.judged.point)}" if environment.is_score else text
+
+
+def _optimum(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    known = study.metric in ON_THE_SCALE and environment.optimum is not None
+    ends = environment.optimum, environment.optimum_at_least
+    words = optimum_words(*ends, environment.optimum_is_proven)
+    return f"; the optimum is {words}" if known else ""
+
+
+def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
+    """Whether no median exceeds the best random or constant policy by more than the margin."""
+    baseline, optimum = environment.baseline, environment.optimum
+    if study.metric not in ON_THE_SCALE or baseline is None or optimum is None:
+        return False
+    margin = environment.margin * (optimum - baseline if environment.is_score else 1.0)
+    reach = baseline + margin
+    medians = [agent.metric.median.point for agent in environment.agents]
+    return optimum > baseline and all(median <= reach for median in medians)
+
+
+def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """A warning if the settings of an agent change the environment, and so the optimum."""
+    if environment.optima:
+        each = [f"{number(optimum)} for {name}" for name, optimum in environment.optima.items()]
+        yield (
+            f"The agents do NOT PLAY THE SAME ENVIRONMENT: the optimum is {enumeration(each)}. "
+            "Their returns cannot be compared."
+        )
+
+
+def _on_the_hidden(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """Under partial observability: what the optimum is based on, and that of the full state."""
+    words = scale_words(environment.full_optimum, environment.measured_by)
+    if words:
+        yield f"{words[0].upper()}{words[1:]}."
+
+
+def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """Agents whose returns exceed the upper bound on the optimum."""
+    names, most = environment.impossible, environment.optimum
+    if names:
+        verb = "has" if len(names) == 1 else "have"
+        yield (
+            f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, {number(most)}: the "
+            "bracket belongs to another environment, or is wrong"
+            f"{'.' if environment.optimum_is_proven else '; its upper end is not proven.'}"
+        )
+
+
+def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
+    """Agents trained on a changed environment, if the verdicts are on training returns."""
+    names = [agent.agent for agent in environment.agents if agent.on_variant]
+    if names and study.metric in OF_TRAINING:
+        verb = "was" if len(names) == 1 else "were"
+        yield (
+            f"{enumeration(names)} {verb} trained on a changed environment: training returns are "
+            "those of that one."
+        )
+
+
+def on_changes(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
+    """Which agents were trained on a changed environment, and what was changed: one sentence.
+
+    It names the environments if there are several, and groups agents with the same changes.
+    """
+    found: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for environment in environments:
+        place = f" on {environment.environment}" if len(environments) > 1 else ""
+        for agent in environment.agents:
+            if agent.changes:
+                found.setdefault((place, agent.changes), []).append(agent.agent)
+    told = [f"{enumeration(a)}{place} ({', '.join(what)})" for (place, what), a in found.items()]
+    return [f"{MARK}: trained on a changed environment: {'; '.join(told)}."] if told else []
+
+
+def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """How often a growing study is looked at."""
+    n = len(environment.looks)
+    if n:
+        looks = "1 look" if n == 1 else f"up to {n} looks"
+        sizes = enumeration([f"{size:,}" for size in environment.looks])
+        yield f"Agents got more seeds until they were decided: {looks}, at {sizes} seeds."
+
+
+def _on_missing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
+    for agent, n_missing in environment.missing.items():
+        n_seeds = environment.seeds.get(agent, study.n_seeds)
+        if n_missing == n_seeds:
+            yield f"No run of {agent} has finished."
+        elif n_missing:
+            verb = "is" if n_missing == 1 else "are"
+            yield f"{n_missing} of {n_seeds} runs of {agent} {verb} missing."

@@ -1,0 +1,350 @@
+"""A study as files: CSV, Markdown and LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import math
+import re
+import unicodedata
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from rl_yardstick.experiments.plan import tuning_seeds
+from rl_yardstick.experiments.results import CURVE_COLUMNS, Curve, StudyResults
+from rl_yardstick.experiments.study import METRIC_WORDS
+from rl_yardstick.pipeline.errors import visible
+from rl_yardstick.pipeline.files import replacing, write_json, write_text
+from rl_yardstick.report.conclusions import (
+    conclusion,
+    none_has_learnt,
+    on_changes,
+    unproven_sentences,
+    unseen_sentence,
+)
+from rl_yardstick.report.words import (
+    enumeration,
+    interval,
+    number,
+    score_number,
+    seed_sentence,
+)
+
+# A markup is named by the suffix of its files and of its templates.
+Markup = Literal["md", "tex"]
+MARKUPS: tuple[Markup, ...] = get_args(Markup)
+
+PLAIN_NAME = re.compile(r"[\w.=+-]+")
+
+
+# Escaping of plain text.
+
+# What Markdown takes for markup: no underscores inside words, no brackets without a link.
+_MARKUP = re.compile(r"[\\`*<>|~&]|(?<!\w)_|_(?!\w)|\](?=[(\[:])|^[#+-]")
+
+
+def name_of(label: str) -> str:
+    """A label in Markdown: code if it is a plain name, else escaped text."""
+    return f"`{label}`" if PLAIN_NAME.fullmatch(label) else markdown_text(label)
+
+
+def markdown_text(text: str) -> str:
+    """Escape a text for Markdown, on one line."""
+    return _MARKUP.sub(lambda found: "\\" + found[0], " ".join(visible(text).split()))
+
+
+_PREAMBLE = r"% Taken in by \input; above it: \usepackage{booktabs,graphicx}"
+_FOREIGN = "% With XeLaTeX or LuaLaTeX, and a font that has these signs: "
+_MINUS = "\N{MINUS SIGN}"
+_SIGNS = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"{\char34}",  # active in some languages
+    "`": r"{\char96}",
+    **{sign: f"\\{sign}" for sign in "{}$&#%_"},
+    "±": r"$\pm$",
+    "\N{MULTIPLICATION SIGN}": r"$\times$",
+    "·": r"$\cdot$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "∞": r"$\infty$",
+    _MINUS: "$-$",
+    "…": r"\ldots{}",
+    "†": r"$\dagger$",
+}
+_GREEK = (
+    "ALPHA BETA GAMMA DELTA EPSILON ZETA ETA THETA KAPPA LAMDA MU NU XI PI RHO SIGMA TAU PHI CHI "
+    "PSI OMEGA"
+)
+_NOT_IN_OT1 = "ÐÞðþ«»"  # Latin-1 characters that pdfLaTeX prints in other font encodings only
+_BEFORE_A_NUMBER = re.compile(r"(?<![\w.)\]}-])-(?=[\d.∞])")
+# LaTeX joins two hyphens, commas or apostrophes into one character. At the start of a row or an
+# item it reads a bracket or an asterisk as an argument of the command before.
+_LIGATURES = re.compile(r"(?<=-)(?=-)|(?<=,)(?=,)|(?<=')(?=')")
+_COMMAND_ARGUMENT = re.compile(r"^[\[*]")
+
+
+def latex_text(text: str) -> str:
+    """Escape a text for LaTeX, on one line; the engine must know its letters."""
+    line = _BEFORE_A_NUMBER.sub(_MINUS, " ".join(visible(text).split()))
+    line = _LIGATURES.sub("\0", _COMMAND_ARGUMENT.sub(lambda found: f"\0{found[0]}", line))
+    return "".join("{}" if sign == "\0" else _SIGNS.get(sign) or _letter(sign) for sign in line)
+
+
+def _letter(sign: str) -> str:
+    """The LaTeX command of a small Greek letter; any other character unchanged."""
+    greek, _, name = unicodedata.name(sign, "").partition(" SMALL LETTER ")
+    if greek != "GREEK" or name not in _GREEK.split():
+        return sign
+    return f"$\\{ {'LAMDA': 'lambda', 'EPSILON': 'varepsilon'}.get(name, name.lower()) }$"
+
+
+def _latex_name(label: str) -> str:
+    text = latex_text(label)
+    return f"\\texttt{{{text}}}" if PLAIN_NAME.fullmatch(label) else text
+
+
+_FILTERS: Mapping[Markup, Mapping[str, Callable[[str], str]]] = {
+    "md": {"text": markdown_text, "name": name_of},
+    "tex": {"text": latex_text, "name": _latex_name},
+}
+
+
+@cache
+def _templates(markup: Markup) -> Environment:
+    environment = Environment(  # noqa: S701  # no HTML; what is markup here the filters escape
+        loader=PackageLoader("report"),
+        variable_start_string="<<",
+        variable_end_string=">>",
+        block_start_string="<%",
+        block_end_string="%>",
+        trim_blocks=True,
+        undefined=StrictUndefined,
+    )
+    environment.filters.update(_FILTERS[markup], table=partial(table_as, markup))
+    return environment
+
+
+# A study as Markdown or LaTeX: verdicts, failures and cost.
+
+NOTHING = "-"
+
+
+class Cell(NamedTuple):
+    """A table cell: a figure and the notes after it, where LaTeX needs markup for ± only."""
+
+    figure: str
+    is_bold: bool = False
+    notes: str = ""
+
+
+class Row(NamedTuple):
+    """An agent's figures, and whether it was trained on a changed environment."""
+
+    label: str
+    is_changed: bool
+    cells: list[Cell]
+
+
+class Table(NamedTuple):
+    """The content of a table, in plain text."""
+
+    headings: list[str]
+    rows: list[Row]
+    caption: str
+
+
+def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
+    """The whole study: its seeds, the headline table, and each environment's verdicts."""
+    study = analysis.study
+    template = _templates(markup).get_template(f"verdicts.{markup}")
+    content = template.render(
+        title=study.title,
+        command=visible(command),
+        seeds=seed_sentence(study.seeds, tuning_seeds(study)),
+        unseen=unseen_sentence(analysis),
+        headline=headline(analysis),
+        environments=[
+            {
+                "name": environment.environment,
+                "ranking": ranking(analysis.results, environment),
+                "sentences": conclusion(study, environment).everything,
+            }
+            for environment in analysis.environments
+        ],
+    )
+    if markup == "md":
+        return content
+    foreign = sorted({sign for sign in content if ord(sign) > 0xFF or sign in _NOT_IN_OT1})
+    preamble = [_PREAMBLE, *([_FOREIGN + " ".join(foreign)] if foreign else [])]
+    return "\n".join([*preamble, "", content])
+
+
+def table_as(markup: Markup, table: Table) -> str:
+    """A table with its caption."""
+    return _templates(markup).get_template(f"table.{markup}").render(table=table)
+
+
+def headline(analysis: StudyAnalysis) -> Table:
+    """The table of agents by environments; its caption explains the marks."""
+    environments = analysis.environments
+    changed = {a.agent for one in environments for a in one.agents if a.changes}
+    found = [_cells(analysis, environment) for environment in environments]
+    rows = [
+        Row(name, name in changed, [cells.get(name, Cell(NOTHING)) for cells in found])
+        for name in (agent.label for agent in analysis.study.agents)
+    ]
+    return Table(["", *(one.environment for one in environments)], rows, _legend(analysis))
+
+
+def _legend(analysis: StudyAnalysis) -> str:
+    study, environments = analysis.study, analysis.environments
+    if all(one.is_score for one in environments):
+        what = (
+            "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts "
+            "as 0."
+        )
+        names = [one.environment for one in environments if one.optimum_at_least is not None]
+        if names:
+            what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
+            what = " ".join([what, *unproven_sentences(environments)])
+    else:
+        what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
+    text = (
+        f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is shown "
+        "to be worse on average."
+    )
+    if processor_seconds(analysis.results):
+        text += " In brackets: processor time of the median run."
+    return " ".join([text, *on_changes(environments)])
+
+
+def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Cell]:
+    """The cell of each agent that has a run."""
+    best = environment.best.agents
+    if none_has_learnt(analysis.study, environment) or len(best) == len(environment.agents):
+        best = ()  # nobody is shown to be worse
+    costs = processor_seconds(analysis.results)
+    cells = {}
+    for agent in environment.agents:
+        figure = number(agent.metric.mean.point)
+        if environment.is_score:
+            figure = score_number(agent.judged.point)
+        cost = costs.get((agent.agent, environment.environment))
+        runs = agent.runs
+        spread = number(float(f"{agent.spread:.2g}"))
+        notes = "" if spread == "0" else f" ± {spread}"
+        notes += "" if cost is None else f" ({duration(cost)})"
+        notes += f", {runs.failed} of {runs.n} failed" if runs.failed else ""
+        notes += f", {agent.n_missing} missing" if agent.n_missing else ""
+        cells[agent.agent] = Cell(figure, agent.agent in best, notes)
+    return cells
+
+
+def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
+    """The agents of an environment with their figures, the best first."""
+    costs = processor_seconds(results)
+    rows = []
+    for agent in environment.agents:
+        runs, stays = agent.runs, agent.steps_to_stay
+        cost = costs.get((agent.agent, environment.environment))
+        figures = [
+            interval(agent.metric.mean),
+            number(agent.metric.median.point),
+            NOTHING if agent.score is None else interval(agent.score, score_number),
+            NOTHING if runs.failed is None else f"{runs.failed} of {runs.n}",
+            NOTHING if stays is None else number(stays.median.point),
+            NOTHING if cost is None else duration(cost),
+        ]
+        rows.append(Row(agent.agent, bool(agent.changes), list(map(Cell, figures))))
+    headings = ["mean", "median", "score", "failed", "stays from", "processor time"]
+    # A column in which no agent has a figure is left out.
+    kept = [k for k in range(len(headings)) if any(row.cells[k].figure != NOTHING for row in rows)]
+    metric = METRIC_WORDS[results.study.metric]
+    return Table(
+        ["", *(headings[k] for k in kept)],
+        [row._replace(cells=[row.cells[k] for k in kept]) for row in rows],
+        f"{environment.environment}: {metric}, with 95 % intervals over seeds.",
+    )
+
+
+def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
+    """Median CPU seconds of a run by agent and environment, if all their runs were measured."""
+    table = results.summary
+    found = {}
+    for (agent, environment), rows in table.groupby(["agent", "environment"], sort=False):
+        times = rows["cpu_seconds"].astype(float)
+        if len(times) and times.notna().all():
+            found[str(agent), str(environment)] = float(times.median())
+    return found
+
+
+def duration(time: float) -> str:
+    """Seconds with two significant digits."""
+    if time <= 0:
+        return "0 s"
+    digits = 1 - math.floor(math.log10(time))
+    return f"{round(time, digits):,.{max(digits, 0)}f} s"
+
+
+# A study as files: comma-separated values, and verdicts as Markdown and LaTeX.
+
+PAIR_COLUMNS = (
+    *("environment", "first", "second", "verdict", "word", "so_far", "difference", "low", "high"),
+    *("p_different", "p_tied", "n", "seeds_needed"),
+)
+
+
+def write_tables(results: StudyResults) -> list[Path]:
+    """Write ``summary.csv``, a row for each run, and ``curves.csv.gz``, all learning curves."""
+    # The default compression level takes twice the time to save one more per cent of the size.
+    rows: Any = {"mode": "wb", "index": False, "lineterminator": "\n"}
+    summary, curves = results.root / "summary.csv", results.root / "curves.csv.gz"
+    with replacing(summary) as file:
+        results.summary.to_csv(file, **rows)
+    with replacing(curves) as file, gzip.GzipFile("", "wb", 6, file, mtime=0) as packed:
+        results.curves.to_csv(packed, float_format="%.8g", **rows)
+        for curve in results.stored_curves():
+            packed.write(_rows_of(curve).encode())
+    return [summary, curves]
+
+
+def _rows_of(curve: Curve) -> str:
+    """The CSV rows of a curve: the text that pandas writes, in a fifth of the time."""
+    labels = io.StringIO()
+    order = [name for name in CURVE_COLUMNS if name in curve.labels]
+    csv.writer(labels, lineterminator="").writerow(curve.labels[name] for name in order)
+    figures = (curve.figures[name].tolist() for name in CURVE_COLUMNS if name in curve.figures)
+    row = labels.getvalue().replace("%", "%%") + ",%.8g,%.8g,%.8g,%.8g\n"
+    return "".join(row % each for each in zip(*figures, strict=True))
+
+
+def write_verdicts(analysis: StudyAnalysis, command: str) -> list[Path]:
+    """Write the verdicts: as Markdown and LaTeX for texts, as CSV and JSON for programs."""
+    said, root = analysis.verdicts, analysis.results.root
+    rows = [
+        {**asdict(pair), "verdict": pair.text, "low": pair.interval[0], "high": pair.interval[1]}
+        for pair in said.pairs
+    ]
+    written = [root / "verdicts.csv", root / "verdicts.json"]
+    with replacing(written[0]) as file:
+        table = pd.DataFrame(rows, columns=PAIR_COLUMNS)
+        table.to_csv(file, mode="wb", index=False, lineterminator="\n")
+    best = {environment: {**asdict(b), "text": str(b)} for environment, b in said.best.items()}
+    write_json(written[1], {**asdict(said), "pairs": rows, "best": best})
+    for markup in MARKUPS:
+        written.append(analysis.results.root / f"verdicts.{markup}")
+        write_text(written[-1], verdicts_as(markup, analysis, command))
+    return written

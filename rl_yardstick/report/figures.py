@@ -1,0 +1,739 @@
+"""Figures of a study for a paper: PNG, SVG and PDF."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.textpath import TextToPath
+from matplotlib.ticker import (
+    EngFormatter,
+    FixedLocator,
+    FuncFormatter,
+    NullLocator,
+    PercentFormatter,
+)
+from matplotlib.transforms import offset_copy
+
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis, OverallAnalysis
+from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, file_name
+from rl_yardstick.mdp.transition_model import Floats, Ints
+from rl_yardstick.pipeline.curve_pictures import DWARFED, symlog_ticks
+from rl_yardstick.pipeline.files import replacing
+from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
+from rl_yardstick.report.series import (
+    COLOURS,
+    DASHES,
+    SPREAD,
+    AgentRuns,
+    ArmSeries,
+    Belief,
+    Curve,
+    Dash,
+    EnvironmentSeries,
+    Grid,
+    LearningCurves,
+    Mark,
+    PullSeries,
+    StudySeries,
+    Sweep,
+    linear_up_to,
+    mean_regret,
+    regret_of_runs,
+    with_best_mean,
+)
+from rl_yardstick.report.words import enumeration, number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+# The style of a study's figures, and how they are saved.
+#
+# A figure is as wide as the text of a page, so that it is printed unscaled. Long labels wrap.
+
+# Matplotlib's names for Plotly's line styles.
+_LINE_STYLES: Mapping[Dash, str] = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":"}
+
+REFERENCE = "0.35"  # the grey of reference lines
+MOST_BANDS = 4  # the largest number of shaded intervals in a figure: more would hide each other
+
+# Inches.
+WIDTH, HEIGHT = 6.5, 2.7  # of a row of panels
+_BESIDE, _BELOW = 0.85, 0.8  # space for tick labels and axis labels of a panel
+_END = 1.5  # width of the names beside the ends of lines
+_LINE = 0.14  # from one line of small print to the next
+
+_SMALL, _PLAIN, _TITLE = 8, 9, 9.5
+_FONTS: Any = {
+    "font.size": _PLAIN,
+    "axes.titlesize": _TITLE,
+    "axes.labelsize": _PLAIN,
+    "xtick.labelsize": _SMALL,
+    "ytick.labelsize": _SMALL,
+    "legend.fontsize": _SMALL,
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,  # TrueType, which publishers ask for
+}
+FORMATS = ("png", "svg", "pdf")
+
+LOG = "(log scale)"
+
+
+def line_style(mark: Mark) -> dict[str, Any]:
+    """Colour and line style of an agent, as Matplotlib's functions take them."""
+    return {"color": COLOURS[mark.colour], "linestyle": _LINE_STYLES[mark.dash]}
+
+
+def fill_band(axes: Axes, band: Curve, mark: Mark, alpha: float = 0.2) -> None:
+    """Shade the interval of a curve."""
+    style = {"color": COLOURS[mark.colour], "alpha": alpha, "linewidth": 0}
+    axes.fill_between(band.x, band.low, band.high, **style)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class FigureFiles:
+    """Saves figures as files."""
+
+    folder: Path  # of the files
+    formats: Sequence[str] = FORMATS[:2]  # among "png", "svg", "pdf"
+    written: list[Path] = field(default_factory=list)  # the files so far
+
+    @contextmanager
+    def figure(
+        self, name: str, n_columns: int = 1, n_rows: int = 1, height: float = HEIGHT
+    ) -> Iterator[Sequence[Axes]]:
+        """Yield axes row by row, ``height`` inches each; on exit save the figure as ``name``."""
+        with mpl.rc_context(_FONTS):
+            # The resolution is that of the PNG; the other formats have none.
+            canvas = Figure(figsize=(WIDTH, height * n_rows), dpi=300, layout="constrained")
+            axes = list(canvas.subplots(n_rows, n_columns, squeeze=False).flat)
+            for place in axes:
+                place.grid(alpha=0.3)
+                place.spines[["top", "right"]].set_visible(False)
+            yield axes
+            for form in sorted(set(self.formats), key=FORMATS.index):
+                self.written.append(self.folder / f"{name}.{form}")
+                with replacing(self.written[-1]) as file:
+                    write(canvas, form, file)
+                # The other formats keep the layout of the first: computing it takes longest.
+                canvas.set_layout_engine("none")
+
+
+def write(canvas: Figure, form: str, file: BinaryIO) -> None:
+    """Write a figure by its backend; `savefig` would draw twice, first for the layout."""
+    backend = import_module(f"matplotlib.backends.backend_{'agg' if form == 'png' else form}")
+    undated = {"svg": {"metadata": {"Date": None}}, "pdf": {"metadata": {"CreationDate": None}}}
+    getattr(backend.FigureCanvas(canvas), f"print_{form}")(file, **undated.get(form, {}))
+
+
+def width_of(text: str, size: float = _SMALL) -> float:
+    """The width of a line in inches."""
+    font = FontProperties(size=size)
+    return TextToPath().get_text_width_height_descent(text, font, ismath=False)[0] / 72
+
+
+def wrapped(text: str, width: float, size: float = _SMALL) -> str:
+    """Wrap a text into lines of at most ``width`` inches, and escape dollar signs."""
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".lstrip()
+        if width_of(longer, size) <= width:
+            lines[-1] = longer
+            continue
+        lines += [""] if lines[-1] else []
+        for letter in word:
+            if lines[-1] and width_of(lines[-1] + letter, size) > width:
+                lines.append("")
+            lines[-1] += letter
+    return "\n".join(lines).replace("$", r"\$")
+
+
+def lettering(
+    axes: Axes, *, title: str = "", x: str = "", y: str = "", beside: float = _BESIDE
+) -> None:
+    """Set the title and the axis labels; ``beside`` is the space left of the axes, in inches."""
+    figure, spec = _figure_of(axes), axes.get_subplotspec()
+    n_rows, n_columns = (1, 1) if spec is None else spec.get_gridspec().get_geometry()
+    y = wrapped(y, max(figure.get_figheight() / n_rows - _BELOW, 1.0), _PLAIN)
+    beside += 0.17 * y.count("\n")
+    width = max(figure.get_figwidth() / n_columns - beside, 1.0)
+    axes.set_title(wrapped(title, width, _TITLE), loc="left")
+    axes.set_xlabel(wrapped(x, width, _PLAIN))
+    axes.set_ylabel(y)
+
+
+def _figure_of(axes: Axes) -> Figure:
+    found = axes.get_figure(root=True)
+    assert found is not None
+    return found
+
+
+def band_words(n_curves: int) -> str:
+    """The legend's entry for the shaded intervals of ``n_curves`` curves."""
+    return (
+        "95 % interval" if n_curves <= MOST_BANDS else f"95 % interval, of the first {MOST_BANDS}"
+    )
+
+
+def shared_legend(*places: Axes, band: str = "") -> None:
+    """Add one legend for all axes below the figure, and make the figure higher for it."""
+    named = [axes.get_legend_handles_labels() for axes in places]
+    found = {name: handle for some in named for handle, name in zip(*some, strict=True)}
+    if not found:
+        return
+    # Agents before references.
+    grey = {name for name in found if getattr(found[name], "get_color", str)() == REFERENCE}
+    found = {name: found[name] for name in sorted(found, key=grey.__contains__)}
+    figure = _figure_of(places[0])
+    found |= {band: Patch(color=REFERENCE, alpha=0.2, linewidth=0)} if band else {}
+    names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in found]
+    lines = [name.split("\n") for name in names]
+    widest = max(width_of(line, _SMALL) for name in lines for line in name) + 0.65
+    n_columns = min(len(names), max(int((figure.get_figwidth() - 0.3) / widest), 1))
+    n_rows = -(-len(names) // n_columns) * max(map(len, lines))
+    figure.set_figheight(figure.get_figheight() + _LINE * (n_rows + 1))
+    handles = list(found.values())
+    style = {"ncols": n_columns, "frameon": False, "handlelength": 2.5}  # as long as a dash and dot
+    figure.legend(handles, names, loc="outside lower center", **style)
+
+
+def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
+    """Write names beside the ends of lines, after all are drawn; ``ends``: name, x, y, colour.
+
+    An arrow after a name says that its line ends above the axes.
+    """
+    low, high = axes.get_ylim()
+    names = [wrapped(f"{name} ↑" if y > high else name, _END) for name, _, y, _ in ends]
+    figure, spec = _figure_of(axes), axes.get_subplotspec()
+    n_rows = 1 if spec is None else spec.get_gridspec().nrows
+    needed = [_LINE * (name.count("\n") + 1) for name in names]
+    inches = max(figure.get_figheight() / n_rows - _BELOW, sum(needed))
+    figure.set_figheight(max(figure.get_figheight(), (inches + _BELOW) * n_rows))
+    seen = [float(np.clip(y, low, high)) for _, _, y, _ in ends]
+    heights = [(y - low) / ((high - low) or 1.0) for y in seen]
+    places = _apart(heights, [inch / inches for inch in needed])
+    for name, (_, x, _, colour), y, place in zip(names, ends, seen, places, strict=True):
+        axes.annotate(
+            name,
+            (x, y),
+            xytext=(1.04, place),
+            textcoords="axes fraction",
+            fontsize=_SMALL,
+            color=colour,
+            verticalalignment="center",
+            linespacing=1.1,
+            annotation_clip=False,
+            arrowprops={
+                "arrowstyle": "-",
+                "color": colour,
+                "linewidth": 0.5 if y < high else 0,
+                "shrinkA": 0,
+                "shrinkB": 0,
+                "relpos": (0, 0.5),
+            },
+        )
+
+
+def _apart(wanted: Sequence[float], sizes: Sequence[float]) -> list[float]:
+    """Centres in [0, 1] near the wanted ones, so that no labels of these sizes overlap."""
+
+    def span(group: list[int]) -> tuple[float, float]:
+        # Bottom and top of a stack of labels, near the mean of their wanted centres.
+        total = sum(sizes[k] for k in group)
+        middle = float(np.mean([wanted[k] for k in group]))
+        bottom = min(max(middle - total / 2, 0.0), 1 - total)
+        return bottom, bottom + total
+
+    groups: list[list[int]] = []
+    for k in sorted(range(len(wanted)), key=lambda k: wanted[k]):
+        group = [k]
+        while groups and span(groups[-1])[1] > span(group)[0]:
+            group = groups.pop() + group
+        groups.append(group)
+    places = list(wanted)
+    for group in groups:
+        bottom = span(group)[0]
+        for k in group:
+            places[k] = bottom + sizes[k] / 2
+            bottom += sizes[k]
+    return places
+
+
+# Figures of bandits, in the forms of the textbooks.
+
+Marks = Mapping[str, Mark]
+Line = tuple[str, Ints, Floats, Mapping[str, str]]  # name, x, y, style
+
+_PULLS = f"pulls {LOG}"
+UPRIGHT = 6  # the largest number of names that fit side by side
+
+
+def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks: Marks) -> None:
+    """Average reward and share of optimal arms by pull: figure 2.2 of Sutton and Barto."""
+    found = series.pulls.items()
+    rewards: list[Line] = [(a, p.pulls, p.reward, line_style(marks[a])) for a, p in found]
+    if series.best is not None:
+        pulls = rewards[0][1][[0, -1]]
+        style = {"color": REFERENCE, "linestyle": "-"}
+        rewards.append(("best possible", pulls, np.full(2, series.best), style))
+    _draw_lines(upper, rewards)
+    lettering(upper, title=f"{place}, {series.n_runs:,} runs", x="pulls", y="average reward")
+    lower.set_ylim(0, 1)
+    _draw_lines(lower, [(a, p.pulls, p.optimal, line_style(marks[a])) for a, p in found])
+    lower.yaxis.set_major_formatter(PercentFormatter(1))
+    lettering(lower, x="pulls", y="runs that pull a best arm")
+
+
+def _draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
+    """Lines with their names at their ends."""
+    for name, x, y, style in lines:
+        axes.plot(x, y, label=name, linewidth=1, **style)  # type: ignore[arg-type]
+    label_ends(axes, [(name, x[-1], y[-1], style["color"]) for name, x, y, style in lines])
+
+
+def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> None:
+    """Cumulative regret on a logarithmic axis of pulls, with the bounds from theory."""
+    axes.set_xscale("log")
+    lines: list[Line] = []
+    # The interval of the mean and the spread of runs, or fewer bands where agents are many.
+    kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
+    for agent, pulls in series.pulls.items():
+        lines.append((agent, pulls.pulls, mean_regret(pulls).y, line_style(marks[agent])))
+        for curve_of, alpha in kinds:
+            fill_band(axes, curve_of(pulls), marks[agent], alpha)
+    words = ("", " with its 95 % interval", f", its 95 % interval, and {SPREAD} of the runs")
+    title = f"{place}: mean of {series.n_runs:,} runs{words[len(kinds)]}"
+    highest = max(axes.dataLim.y1, *(np.nanmax(y) for _, _, y, _ in lines))
+    if series.bounds is not None:
+        # A bound far above is cut, and an agent that never learns does not flatten the rest.
+        bounds, shown = series.bounds, series.bounds.auer <= 1.5 * highest
+        for name, x, y, dash in (
+            ("Auer's bound for UCB1", bounds.pulls[shown], bounds.auer[shown], "--"),
+            ("Lai-Robbins slope", bounds.pulls, bounds.lai_robbins, ":"),
+        ):
+            lines.append((name, x, y, {"color": REFERENCE, "linestyle": dash}))
+        highest = min(highest, float(bounds.auer[-1]))
+    axes.set_ylim(0, 1.05 * highest)
+    _draw_lines(axes, lines)
+    lettering(axes, title=title, x=_PULLS, y="cumulative regret")
+
+
+def draw_simple_regret(axes: Axes, series: PullSeries, marks: Marks) -> None:
+    """Simple regret: the best mean reward less that of the arm pulled most so far."""
+    axes.set_xscale("log")
+    found = series.pulls.items()
+    known = [(a, p) for a, p in found if np.isfinite(p.simple_regret).any()]
+    _draw_lines(axes, [(a, p.pulls, p.simple_regret, line_style(marks[a])) for a, p in known])
+    title = "of recommending the arm pulled most"
+    lettering(axes, title=title, x=_PULLS, y="simple regret")
+
+
+def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
+    """By context, each arm's share of the pulls, and the final estimates of its mean."""
+    places = np.arange(len(arms.names))
+    width = 0.8 / len(arms.shares)
+    for index, (agent, shares) in enumerate(arms.shares.items()):
+        colour = COLOURS[marks[agent].colour]
+        offset = places + (index - (len(arms.shares) - 1) / 2) * width
+        upper.bar(offset, shares, width, color=colour, label=agent)
+        if agent in arms.estimates:
+            mean, std = arms.estimates[agent]
+            lower.errorbar(offset, mean, std, fmt="o", markersize=3, linewidth=1, color=colour)
+    lower.hlines(arms.means, places - 0.42, places + 0.42, color="black", linewidth=1, zorder=3)
+    upright = len(arms.names) <= UPRIGHT
+    for axes in (upper, lower):
+        names = [name.replace(", ", "\n" if upright else ", ") for name in arms.names]
+        axes.set_xticks(places, names, rotation=0 if upright else 90)
+    upper.set_ylim(0, 1)
+    upper.yaxis.set_major_formatter(PercentFormatter(1))
+    lettering(upper, title="pulls, by context", y="share of the pulls")
+    title = "final estimates, mean and spread over runs; lines across are the truth"
+    lettering(lower, title=title, y="mean reward")
+    shared_legend(upper)
+
+
+def draw_belief(panels: Sequence[Axes], belief: Belief) -> None:
+    """An agent's posterior of each arm in its first run, a panel per context and moment."""
+    n_moments, n_contexts, n_arms, _ = belief.densities.shape
+    for panel, axes in enumerate(panels):
+        context, moment = divmod(panel, n_moments)
+        for arm in range(n_arms):
+            colour = COLOURS[arm % len(COLOURS)]
+            y = belief.densities[moment, context, arm]
+            axes.plot(belief.points, y, linewidth=1.2, label=f"arm {arm}", color=colour)
+            mean = belief.true_means[context][arm]
+            if mean is not None:
+                axes.axvline(mean, color=colour, linestyle=":", linewidth=1)
+        where = f", context {context}" if n_contexts > 1 else ""
+        title = f"{belief.agent}{where}, after {belief.moments[moment]:,} pulls"
+        lettering(axes, title=title, x="mean reward", y="density")
+    panels[0].legend(frameon=False)
+
+
+# Figures of any study: learning curves, runs, swept parameters, blocks of episodes, profiles.
+
+_AXES = {"step": "environment steps", "episode": "episodes"}
+
+ON_VARIANT = "trained on a variant of the environment"
+CIRCLES_APART = 0.12  # of the diagonal of the axes
+NAMES = 2.1  # inches, the width of the names of agents beside their runs
+LONGEST = 20  # letters of a value on an axis
+MOST_TICKS = 8  # the largest number of values of a parameter with a tick each
+FEW = 3  # the largest number of names in a legend's entry
+BLOCKS = {"average": "-", "minimum": ":", "maximum": "--"}
+
+
+def panels(curves: Mapping[str, LearningCurves]) -> list[tuple[str, str]]:
+    """The kind of curve and the x axis of each panel: that of the budget, and episodes."""
+    both = (("evaluation", curves["evaluation"].budget), ("training", "episode"))
+    return [(kind, by) for kind, by in both if curves[kind].by_axis[by]]
+
+
+def draw_learning_curves(
+    places: Sequence[Axes],
+    curves: Mapping[str, LearningCurves],
+    environment: EnvironmentAnalysis,
+    marks: Marks,
+) -> None:
+    """Draw each of the `panels` on its axes, with intervals for the first (best) agents."""
+    title = f"{environment.environment}: "
+    kinds = panels(curves)
+    scales = {kind: curves[kind].linear_up_to for kind, _ in kinds}
+    # Returns on a variant are another metric, with an axis of its own.
+    if not curves["training"].on_variant:
+        known = [scale for scale in scales.values() if scale is not None]
+        scales = dict.fromkeys(scales, known[0] if known else None)
+        for place in places[1:]:
+            place.sharey(places[0])
+    for place, (kind, by) in zip(places, kinds, strict=True):
+        found = curves[kind]
+        # Before the lines, because the limits depend on the scale.
+        words = _set_scale(place, scales[kind])
+        _draw_curves(place, found.by_axis[by], marks)
+        for agent, curve in found.by_axis[by].items():
+            if agent in found.on_variant:
+                # Circles mark the curve of a variant without colour.
+                colour = COLOURS[marks[agent].colour]
+                (circles,) = place.plot(curve.x, curve.y, "o", ms=5, mfc="white", color=colour)
+                circles.set_markevery(CIRCLES_APART)
+        if not found.on_variant:
+            _draw_references(place, environment)
+        title += "evaluations" if kind == "evaluation" else "training episodes"
+        if found.on_variant:
+            n = len(found.on_variant)
+            names = found.on_variant[0] if n == 1 else f"{n} agents"
+            title += f" ({names}: on a variant of the environment)"
+        lettering(place, title=title, x=_AXES[by], y=f"return{words}")
+        place.xaxis.set_major_formatter(EngFormatter(sep=""))
+        title = ""
+    if curves["training"].on_variant:
+        # The legend's entry for the circles.
+        places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
+    shared_legend(*places, band=band_words(len(environment.agents)))
+
+
+def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
+    """Curves, the first ones with their intervals."""
+    for place, (agent, curve) in enumerate(curves.items()):
+        marker = "o" if len(curve.x) == 1 else ""  # a single point draws no line
+        style = line_style(marks[agent])
+        axes.plot(curve.x, curve.y, label=agent, linewidth=1.5, marker=marker, **style)
+        if place < MOST_BANDS:
+            fill_band(axes, curve, marks[agent])
+
+
+def _set_scale(axes: Axes, linear_up_to: float | None) -> str:
+    """Make the y axis logarithmic beyond ``linear_up_to``, if given; return words for its label."""
+    if linear_up_to is None:
+        return ""
+    axes.set_yscale("symlog", linthresh=linear_up_to)
+    axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
+    axes.yaxis.set_minor_locator(NullLocator())
+    # With the minus sign of Matplotlib's own axes.
+    signed = FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
+    axes.yaxis.set_major_formatter(signed)
+    return f" (log scale beyond ±{number(linear_up_to)})"
+
+
+def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
+    is_known = environment.optimum_at_least is None
+    most = "optimum, at most" if environment.optimum_is_proven else "optimum, at most (not proven)"
+    for label, height, style in (
+        ("optimum" if is_known else most, environment.optimum, "-"),
+        ("optimum, at least", environment.optimum_at_least, "--"),
+        ("best random or constant policy", environment.baseline, ":"),
+    ):
+        if height is not None:
+            axes.axhline(height, color=REFERENCE, ls=style, lw=1, label=label, zorder=1)
+
+
+def draw_runs(
+    axes: Axes,
+    runs: Sequence[AgentRuns],
+    environment: EnvironmentAnalysis,
+    metric: str,
+    marks: Marks,
+) -> None:
+    """Each run as a dot, the mean with its interval; the best agent on top."""
+    upwards = runs[::-1]
+    for row, agent in enumerate(upwards):
+        colour = COLOURS[marks[agent.agent].colour]
+        n = len(agent.values)
+        spread = np.linspace(-0.18, 0.18, n) if n > 1 else np.zeros(n)
+        axes.plot(agent.values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
+        mean = agent.mean
+        bar = "D" if mean.low == mean.high else "-"  # a bar of no length is invisible
+        axes.plot([mean.low, mean.high], [row, row], bar, color=colour, lw=5, ms=7, alpha=0.35)
+        axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
+    names = [wrapped(agent.agent, NAMES) for agent in upwards]
+    axes.set_yticks(range(len(upwards)), names)
+    lines = max(name.count("\n") + 1 for name in names)
+    _figure_of(axes).set_figheight(1.1 + len(names) * max(0.32, _LINE * lines + 0.04))
+    axes.set_ylim(-0.6, len(upwards) - 0.4)
+    title = environment.environment
+    if metric in ("final", "best") and environment.optimum is not None:
+        axes.axvline(environment.optimum, color=REFERENCE, linewidth=1)
+        if environment.optimum_at_least is None:
+            title += "; the line is the optimum"
+        else:
+            axes.axvline(environment.optimum_at_least, color=REFERENCE, linewidth=1)
+            title += "; the optimum lies between the lines"
+            title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
+    ends = "range" if all(a.mean.is_range for a in runs) else "95 % interval"
+    x = f"{METRIC_WORDS[metric]}; mean, {ends}, each seed"
+    x += "; diamond: all runs are equal" if any(a.mean.low == a.mean.high for a in runs) else ""
+    title += f"; best: {environment.best}" if len(runs) > 1 else ""
+    widest = max(width_of(line) for name in names for line in name.split("\n"))
+    lettering(axes, title=title, x=x, beside=widest + 0.3)
+
+
+def draw_sweeps(
+    axes: Axes, sweeps: Mapping[str, Sweep], environment: EnvironmentAnalysis, metric: str
+) -> None:
+    """The metric by the swept parameter, for agents swept over one parameter."""
+    names = list(dict.fromkeys(sweep.parameter for sweep in sweeps.values()))
+    values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
+    words = _set_scale_of_values(axes, values)
+    for place, (group, sweep) in enumerate(sweeps.items()):
+        mark = Mark(group, place % len(COLOURS), DASHES[place % len(DASHES)])
+        x, y = sweep.means.x, sweep.means.y
+        label = group if len(names) == 1 else f"{group}, {sweep.parameter}"
+        axes.plot(x, y, marker="o", label=label, markersize=4, **line_style(mark))
+        if place < MOST_BANDS:  # a bar each: a band needs two neighbours with an interval
+            aside = 5 * (place - (min(len(sweeps), MOST_BANDS) - 1) / 2)
+            at = offset_copy(axes.transData, _figure_of(axes), x=aside, units="points")
+            ends, colour = (sweep.means.low, sweep.means.high), COLOURS[mark.colour]
+            axes.vlines(x, *ends, color=colour, alpha=0.35, linewidth=4, transform=at)
+            axes.update_datalim(np.column_stack([np.tile(x, 2), np.concatenate(ends)]))
+    axes.autoscale_view()
+    best = with_best_mean(
+        environment, [label for sweep in sweeps.values() for label in sweep.labels]
+    )
+    rings = [
+        (x, y)
+        for sweep in sweeps.values()
+        for label, x, y in zip(sweep.labels, sweep.means.x, sweep.means.y, strict=True)
+        if label in best
+    ]
+    if rings:
+        x, y = np.transpose(rings)
+        prefix = f"{next(iter(sweeps))} with " if len(sweeps) == 1 else ""
+        told = enumeration([label.removeprefix(prefix) for label in best])
+        label = f"best mean: {told}" if len(best) <= FEW else "best mean"
+        axes.scatter(x, y, 90, "none", edgecolor="black", label=label, zorder=3)
+    if len(values) <= MOST_TICKS:
+        axes.xaxis.set_major_locator(FixedLocator(_ticks_apart(axes, values)))
+        axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
+    across = names[0] if len(names) == 1 else "value of the parameter"
+    lettering(axes, title=environment.environment, x=across + words, y=METRIC_WORDS[metric])
+    is_there = any(np.isfinite(sweep.means.low).any() for sweep in sweeps.values())
+    shared_legend(axes, band=band_words(len(sweeps)) if is_there else "")
+
+
+def _ticks_apart(axes: Axes, values: Floats) -> list[float]:
+    """The values, in order, whose numbers do not touch on the x axis."""
+    places = axes.xaxis.get_transform().transform(values)
+    inches = (WIDTH - 1.3) * (places - places[0]) / ((places[-1] - places[0]) or 1.0)
+    kept, end = [], -np.inf
+    for value, place in zip(values.tolist(), inches, strict=True):
+        half = width_of(f"{value:.4g}") / 2
+        if place - half > end:
+            kept.append(value)
+            end = place + half + 0.08
+    return kept
+
+
+def _set_scale_of_values(axes: Axes, values: Floats) -> str:
+    """Make the x axis logarithmic if values span two decades; return words for its label."""
+    least = float(values[values > 0].min(initial=np.inf))
+    if values.min() < 0 or values.max() < DWARFED * least:
+        return ""
+    if values.min() > 0:
+        axes.set_xscale("log")
+        return f" {LOG}"
+    axes.set_xscale("symlog", linthresh=least)
+    return f" (log scale beyond {number(least)})"
+
+
+def draw_grid(
+    axes: Axes, grid: Grid, title: str, environment: EnvironmentAnalysis, metric: str
+) -> None:
+    """The means over two swept parameters as a heat map, the best in frames."""
+    shares = grid.shares(is_cost=metric in COSTS)  # the darker the better
+    colours = mpl.colormaps["Blues"](0.05 + 0.75 * shares)
+    across, down = (np.arange(-0.5, n) for n in grid.means.shape[::-1])  # edges of the cells
+    axes.pcolormesh(across, down, colours, edgecolor="white", linewidth=1)
+    best = with_best_mean(environment, [label for row in grid.labels for label in row])
+    for (row, column), mean in np.ndenumerate(grid.means):
+        if not np.isnan(mean):
+            ink = "white" if shares[row, column] > 0.6 else "black"
+            axes.text(column, row, number(mean), color=ink, ha="center", va="center", size=8)
+        if grid.labels[row][column] in best:
+            frame = Rectangle((column - 0.46, row - 0.44), 0.92, 0.88, fill=False, linewidth=2)
+            frame.set_edgecolor(COLOURS[1])
+            axes.add_patch(frame)
+    axes.invert_yaxis()
+    axes.grid(visible=False)
+    turned = 90 if len(grid.across) > UPRIGHT else 0
+    axes.set_xticks(range(len(grid.across)), list(map(_brief, grid.across)), rotation=turned)
+    axes.set_yticks(range(len(grid.down)), list(map(_brief, grid.down)))
+    axes.tick_params(length=0)
+    y, x = grid.parameters
+    frames = "a frame" if len(best) == 1 else "frames"
+    title += f": {METRIC_WORDS[metric]}, means over seeds; the best mean in {frames}"
+    lettering(axes, title=title, x=x, y=y, beside=1.8)
+
+
+def _brief(text: str) -> str:
+    """A value on an axis, in at most two lines."""
+    return wrapped(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…", 1.0)
+
+
+def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark, scale: float | None) -> None:
+    """Average, minimum and maximum of each block of an agent's episodes."""
+    words = _set_scale(axes, scale)
+    colour = COLOURS[mark.colour]
+    for column, style in BLOCKS.items():
+        axes.plot(rows["episode"], rows[column], style, marker="o", markersize=3, color=colour)
+    lettering(axes, title=mark.label, x="episode", y=f"return{words}")
+
+
+def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
+    """The share of runs whose score is higher than each threshold."""
+    for agent, shares in overall.profiles.items():
+        style = line_style(marks[agent])
+        axes.plot(overall.thresholds, shares, label=agent, linewidth=1.5, **style)
+    axes.set_ylim(0, 1.02)
+    axes.yaxis.set_major_formatter(PercentFormatter(1))
+    title = "Performance profiles over environments"
+    lettering(axes, title=title, x="score", y="share of runs with a higher score")
+    shared_legend(axes)
+
+
+# Which figures a study has, and their files.
+
+# The lines of more agents are unreadable; a sweep shows its agents by parameter instead.
+MOST_LINES = 14
+MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
+
+
+def write_figures(
+    series: StudySeries, episodes_table: pd.DataFrame | None, tell: Tell = tell_nobody
+) -> list[Path]:
+    """Draw all figures that the study's runs allow into its folder ``figures``; return the files.
+
+    ``episodes_table`` is the result of `report.series.episodes_table`, or None for no such figure.
+    """
+    files = FigureFiles(series.analysis.results.root / "figures", series.analysis.study.figures)
+    files.folder.mkdir(exist_ok=True)
+    for one in series.environments:
+        if one.pulls is not None:
+            name = one.environment.environment
+            tell(name)
+            _bandit_figures(files, one.pulls, name, series.marks)
+    for one in series.environments:
+        tell(one.environment.environment)
+        _study_figures(files, series, one, episodes_table)
+    if series.analysis.overall is not None:
+        tell("all environments")
+        with files.figure("performance_profiles") as (axes,):
+            draw_profiles(axes, series.analysis.overall, series.marks)
+    return files.written
+
+
+def _study_figures(
+    files: FigureFiles, series: StudySeries, one: EnvironmentSeries, blocks: pd.DataFrame | None
+) -> None:
+    environment, metric, marks = one.environment, series.analysis.study.metric, series.marks
+    name = file_name(environment.environment)
+    if one.sweeps:
+        with files.figure(f"{name}_sweep") as (axes,):
+            draw_sweeps(axes, one.sweeps, environment, metric)
+    for group, grid in one.grids.items():
+        title = environment.environment + (f", {group}" if len(one.grids) > 1 else "")
+        height = 1.6 + 0.4 * len(grid.down)
+        with files.figure(f"{name}_{file_name(group)}_grid", height=height) as (axes,):
+            draw_grid(axes, grid, title, environment, metric)
+    if len(environment.agents) > MOST_LINES or one.curves is None:
+        return
+    if n_columns := len(panels(one.curves)):
+        with files.figure(f"{name}_learning_curves", n_columns) as places:
+            draw_learning_curves(places, one.curves, environment, marks)
+    with files.figure(f"{name}_intervals") as (axes,):
+        draw_runs(axes, one.runs, environment, metric, marks)
+    if blocks is not None:
+        rows = blocks[blocks["environment"] == environment.environment]
+        _block_figure(files, f"{name}_episodes", rows, marks)
+
+
+def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Marks) -> None:
+    agents = list(dict.fromkeys(rows["agent"]))
+    if agents:
+        n_columns = min(len(agents), 2 if len(agents) <= MOST_IN_PAIRS else 3)
+        n_rows = -(-len(agents) // n_columns)
+        with files.figure(name, n_columns, n_rows, height=2.2) as places:
+            found = {agent: rows[rows["agent"] == agent] for agent in agents}
+            curves = [each[column].to_numpy(float) for each in found.values() for column in BLOCKS]
+            for axes in places[1 : len(agents)]:
+                axes.sharey(places[0])
+            for axes, (agent, blocks) in zip(places, found.items(), strict=False):
+                draw_blocks(axes, blocks, marks[agent], linear_up_to(curves, None))
+            for axes in places[len(agents) :]:
+                axes.set_visible(False)
+            for label, style in BLOCKS.items():
+                places[0].plot([], [], style, marker="o", ms=3, color=REFERENCE, label=label)
+            shared_legend(places[0])
+
+
+def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:
+    name = file_name(place)
+    if len(pulls.pulls) <= MOST_LINES:
+        with files.figure(f"{name}_pulls", n_rows=2) as (upper, lower):
+            draw_rewards(upper, lower, pulls, place, marks)
+        has_simple = any(np.isfinite(p.simple_regret).any() for p in pulls.pulls.values())
+        with files.figure(f"{name}_regret", n_rows=1 + has_simple) as (upper, *others):
+            draw_regret(upper, pulls, place, marks)
+            for axes in others:
+                draw_simple_regret(axes, pulls, marks)
+    if pulls.arms is not None and len(pulls.arms.shares) <= MOST_LINES:
+        with files.figure(f"{name}_arms", n_rows=2) as (upper, lower):
+            draw_arms(upper, lower, pulls.arms, marks)
+    for belief in pulls.beliefs:
+        n_moments, n_contexts = belief.densities.shape[:2]
+        n_columns = 2 if n_moments % 2 == 0 else 1
+        n_rows = n_moments * n_contexts // n_columns
+        path = f"{name}_{file_name(belief.agent)}_posteriors"
+        with files.figure(path, n_columns, n_rows, height=2.2) as places:
+            draw_belief(places, belief)

@@ -1,0 +1,215 @@
+"""What pages have in common: templates, data for scripts, sections."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from rl_yardstick.envs.layout import GridLayout
+from rl_yardstick.experiments.analysis import StudyAnalysis
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.pipeline.errors import visible
+from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
+from rl_yardstick.report.ranking import bar
+from rl_yardstick.report.series import StudySeries
+from rl_yardstick.report.words import (
+    interval_alone,
+    number,
+    optimum_words,
+    scale_words,
+    score_number,
+)
+
+# Data as text for a browser: templates, JSON, inline scripts.
+
+_WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
+
+STYLES = ("parts.css", "page.css", "paper.css")
+# Scripts that the sections use, loaded before their own.
+SHARED = ("core.js", "exports.js", "figures.js", "tables.js")
+
+SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
+
+
+def templates(folder: str = "") -> Environment:
+    """The templates, those in ``folder`` first; they escape all values."""
+    paths = [f"templates/{folder}", "templates"]
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader("rl_yardstick.report.page", path) for path in paths]),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+        finalize=lambda value: visible(value) if type(value) is str else value,
+    )
+    environment.filters.update(
+        number=number,
+        optimum=optimum_words,
+        hidden=lambda one: scale_words(one.full_optimum, one.measured_by),
+        interval=interval_alone,
+        score=score_number,
+        bar=bar,
+        breakable=breakable,
+    )
+    return environment
+
+
+def template_file(name: str) -> str:
+    """The text of a file beside the templates."""
+    return (files("rl_yardstick.report.page") / "templates" / name).read_text(encoding="utf-8")
+
+
+def rounded(number: float) -> float | None:
+    """A number for figures; None if it is not finite."""
+    return float(f"{number:.{SIGNIFICANT}g}") if math.isfinite(number) else None
+
+
+def plain(value: Any, of_float: Callable[[float], Any] = rounded) -> Any:
+    """Convert a value to JSON's types, and its floats by ``of_float``."""
+    if isinstance(value, float):
+        return of_float(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist(), of_float)
+    if isinstance(value, dict):
+        return {str(key): plain(item, of_float) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item, of_float) for item in value]
+    if is_dataclass(value):
+        return plain(vars(value), of_float)
+    return value
+
+
+def as_json(value: Any, of_float: Callable[[float], Any] = rounded) -> str:
+    """Compact JSON of a value converted by `plain`."""
+    return json.dumps(plain(value, of_float), separators=(",", ":"), allow_nan=False)
+
+
+def data_uri(kind: str, content: bytes) -> str:
+    """A file as a data URI; ``kind`` is its MIME type."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def packed(text: str) -> str:
+    """A text compressed by gzip and encoded in base64: a third of its size."""
+    return base64.b64encode(gzip.compress(text.encode("utf-8"), mtime=0)).decode("ascii")
+
+
+def inline_script(text: str) -> Markup:
+    """A script as the content of its element; ValueError if it would end the element."""
+    if "</script" in text.lower() or "<!--" in text:
+        raise ValueError("a script that is put into a page may not hold </script or <!--")
+    return Markup(text)  # noqa: S704  # ours or the library's, and checked above
+
+
+def script_hash(text: str) -> str:
+    """How a content security policy names an inline script."""
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def page_frame(scripts: Sequence[str]) -> dict[str, str]:
+    """Styles, scripts, and their content security policy, for a page with figures."""
+    from plotly.offline import get_plotlyjs
+
+    early, start = template_file("theme.js"), template_file("start.js")
+    own, plotly = "\n".join(map(template_file, scripts)), get_plotlyjs()
+    return {
+        "style": Markup("\n".join(map(template_file, STYLES))),  # noqa: S704  # our own
+        "early": inline_script(early),
+        "plotly": packed(plotly),
+        "own": inline_script(own),
+        "start": inline_script(start),
+        "policy": " ".join(map(script_hash, [early, plotly, own, start])),
+    }
+
+
+def breakable(label: str) -> Markup:
+    """A label that may wrap where its words end: "Frozen|Lake8x8-|v1"."""
+    return Markup("<wbr>").join(_WORD_ENDS.split(label))
+
+
+def setting(value: Any) -> str:
+    """A hyperparameter as its YAML file has it."""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+# What the page and its sections have in common.
+
+
+@dataclass(frozen=True)
+class LearningPage:
+    """The page that plays the first training of an agent."""
+
+    agent: str  # its label
+    environment: str  # that of the environment
+    seed: int  # of the training
+    place: str  # path of the file, relative to the study's folder; empty if there is none
+    words: str  # what it shows, or why there is none
+    size: int = 0  # of the file, in bytes
+
+
+@dataclass(frozen=True)
+class Report:
+    """The input of a study's page."""
+
+    series: StudySeries  # the numbers in its figures
+    command: str  # the command that reproduces the study
+    tell: Tell = tell_nobody  # receives the progress of the slow parts
+    # The pages that play trainings, where they were asked for.
+    learning: Sequence[LearningPage] = ()
+
+    @property
+    def analysis(self) -> StudyAnalysis:
+        """The study."""
+        return self.series.analysis
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the page."""
+
+    name: str  # of its template, its script and its anchor
+    title: str  # its heading
+    context: Mapping[str, Any] = field(default_factory=dict)  # the variables of its template
+    # The data of its script, to write as JSON; None if there are none.
+    data: Any = None
+    # The script's data for each environment, in their order, parsed when that is chosen; None
+    # where there are none.
+    places: Sequence[Any] = ()
+    # Whether it shows the environment that is chosen at the top of the page. Its template marks
+    # what belongs to environment i by ``data-environment="i"``.
+    by_environment: bool = False
+
+
+def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
+    """By environment, the first finished run of each agent; no batches, which save no agent."""
+    first: dict[tuple[str, str], PlannedRun] = {}
+    for run in analysis.results.in_folders:
+        if not run.is_batch:
+            first.setdefault((run.agent, run.environment), run)
+    ranked = (
+        [(agent.agent, one.environment) for agent in one.agents] for one in analysis.environments
+    )
+    return [[first[name] for name in names if name in first] for names in ranked]
+
+
+def layout_data(layout: GridLayout) -> dict[str, Any]:
+    """The layout of states on a map, for scripts."""
+    return {
+        "rows": layout.rows,
+        "moves": layout.moves,
+        "names": dict(layout.names),
+        "layers": [layout.collected_in(layer) for layer in range(layout.n_layers)],
+    }

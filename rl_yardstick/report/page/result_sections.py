@@ -1,0 +1,375 @@
+"""Sections on results: overview, verdicts, rankings, curves, differences, scores, settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis
+from rl_yardstick.experiments.plan import tuning_seeds
+from rl_yardstick.experiments.results import StudyResults, mixed_versions
+from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, StudySpec
+from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.report.conclusions import (
+    conclusion,
+    on_changes,
+    overall_sentences,
+    pairs_both_ways,
+    places_without_a_run,
+    unproven_sentences,
+    unseen_sentence,
+)
+from rl_yardstick.report.documents import MARKUPS, verdicts_as
+from rl_yardstick.report.page.frame import Report, Section, setting
+from rl_yardstick.report.ranking import COLUMNS, OTHER_RETURNS, Column, Row, filled
+from rl_yardstick.report.series import (
+    AgentRuns,
+    Curve,
+    EnvironmentSeries,
+    Grid,
+    linear_up_to,
+    mean_regret,
+    with_best_mean,
+)
+from rl_yardstick.report.words import number, seed_sentence
+
+WIDTH, HEIGHT = 200, 100  # of a small figure, in the drawing's own unit
+
+
+class SmallFigure(NamedTuple):
+    """The curves of an environment."""
+
+    name: str  # the environment's
+    what: str  # the label of the y axis
+    lines: Mapping[str, str]  # by agent, the points of its SVG polyline
+    optimum: float | None  # its distance from the top; None if it is unknown or not shown
+
+
+def overview(report: Report) -> Section | None:
+    """All environments side by side, each as a small figure; None for a single one."""
+    environments = report.series.environments
+    if len(environments) < 2:
+        return None
+    figures = [_small_figure(one) for one in environments]
+    agents = [label for label in report.series.marks if any(label in f.lines for f in figures)]
+    context = {"figures": figures, "agents": agents, "width": WIDTH, "height": HEIGHT}
+    return Section("overview", "Environments", context, data={})
+
+
+def _small_figure(one: EnvironmentSeries) -> SmallFigure:
+    curves: Mapping[str, Curve] = {}
+    linear, optimum = None, None
+    if one.pulls is not None:
+        what = "cumulative regret by pull"
+        curves = {agent: mean_regret(found) for agent, found in one.pulls.pulls.items()}
+    else:
+        what, optimum = "return of evaluations", one.environment.optimum
+        if one.curves is not None:
+            found = one.curves["evaluation"]
+            what += f" by {found.budget}"
+            curves, linear = found.by_axis[found.budget], found.linear_up_to
+    heights = {agent: _compressed(curve.y, linear) for agent, curve in curves.items()}
+    best = _compressed(np.array([] if optimum is None else [optimum]), linear)
+    known = np.concatenate([best, *heights.values()])
+    known = known[np.isfinite(known)]
+    low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
+    last = max((float(curve.x[-1]) for curve in curves.values()), default=1.0) or 1.0
+
+    def down(height: float) -> float:
+        # The distance from the top, with a margin for the width of a line.
+        return 4 + (HEIGHT - 8) * (high - height) / ((high - low) or 1.0)
+
+    lines = {
+        agent: " ".join(
+            f"{WIDTH * x / last:.1f},{down(y):.1f}"
+            for x, y in zip(curves[agent].x, values, strict=True)
+            if math.isfinite(y)
+        )
+        for agent, values in heights.items()
+    }
+    name = one.environment.environment
+    return SmallFigure(name, what, lines, down(float(best[0])) if best.size else None)
+
+
+def _compressed(values: Floats, linear: float | None) -> Floats:
+    """Heights on an axis that is logarithmic beyond ``linear``, as in the large figure."""
+    if linear is None:
+        return values
+    size = np.maximum(np.abs(values) / linear, 1e-300)
+    return np.asarray(np.sign(values) * np.where(size <= 1, size, 1 + np.log10(size)))
+
+
+def verdict(report: Report) -> Section | None:
+    """For each environment the lead, the pairs as a matrix or sentences, and the notes."""
+    study, environments = report.analysis.study, report.series.environments
+    metric = METRIC_WORDS[study.metric]
+    cards = [
+        {
+            "environment": one.environment,
+            "conclusion": conclusion(study, one.environment),
+            "pairs": pairs_both_ways(one.environment.pairs),
+            "has_sweeps": bool(one.sweeps),
+            "grids": {name: _grid(one, grid, study.metric) for name, grid in one.grids.items()},
+        }
+        for one in environments
+    ]
+    context = {
+        "general": [*overall_sentences(report.analysis), *places_without_a_run(report.analysis)],
+        "cards": cards,
+        "unseen": unseen_sentence(report.analysis),
+        "metric": metric,
+    }
+    files = {name: verdicts_as(name, report.analysis, report.command) for name in MARKUPS}
+    data = {"files": files, "metric": metric, "sweeps": [_sweeps(one) for one in environments]}
+    return Section("verdict", "Verdict", context, data)
+
+
+def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
+    """By sweep, the means by parameter, and which of them are the best of all sweeps."""
+    best = with_best_mean(
+        one.environment, [at for sweep in one.sweeps.values() for at in sweep.labels]
+    )
+    return {
+        group: {
+            **vars(sweep.means),
+            "parameter": sweep.parameter,
+            "best": [label in best for label in sweep.labels],
+        }
+        for group, sweep in one.sweeps.items()
+    }
+
+
+def _grid(one: EnvironmentSeries, grid: Grid, metric: str) -> dict[str, Any]:
+    """The heat map of an agent: its rows of cells."""
+    best = with_best_mean(one.environment, [label for row in grid.labels for label in row])
+    shares = grid.shares(is_cost=metric in COSTS)
+    rows = [
+        [
+            {"mean": mean, "strength": f"{90 * share:.0f}%", "is_best": label in best}
+            for label, mean, share in zip(*of_row, strict=True)
+        ]
+        for of_row in zip(grid.labels, grid.means, shares, strict=True)
+    ]
+    return {"grid": grid, "n_best": len(best), "rows": list(zip(grid.down, rows, strict=True))}
+
+
+def ranking(report: Report) -> Section | None:
+    """A table for each environment."""
+    study = report.analysis.study
+    tables = [_ranking(study, environment) for environment in report.analysis.environments]
+    context = {"tables": tables, "metric": METRIC_WORDS[study.metric]}
+    return Section("ranking", "Ranking", context, by_environment=True)
+
+
+def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Any]:
+    """The ranking, the table of other returns below it, and a sentence on changed training."""
+    rows = [Row(agent, environment) for agent in environment.agents]
+    has_others = any(agent.stochastic or agent.discounted for agent in environment.agents)
+    return {
+        **_table(study, [column for column in COLUMNS if column.page], rows),
+        "others": _table(study, OTHER_RETURNS, rows) if has_others else None,
+        "changes": on_changes([environment]),
+    }
+
+
+def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
+    """The headings, and each agent's cells."""
+    shown = filled(columns, rows)
+    of = rows[0].environment if rows else None
+    words = {"threshold": "", "failed": ""}
+    if of is not None:
+        words = {"threshold": number(of.threshold), "failed": number(of.failure_threshold)}
+    return {
+        "headings": [
+            {
+                "title": column.page,
+                "help": column.help.format(**words),
+                "order": column.order(study),
+            }
+            for column, _ in shown
+        ],
+        "rows": [
+            (row.agent, [cells[place] for _, cells in shown]) for place, row in enumerate(rows)
+        ],
+    }
+
+
+STAGES = (0.1, 0.25, 0.5, 1.0)  # shares of an agent's training with a column in the table
+
+
+def curves(report: Report) -> Section | None:
+    """The curves of every environment, kind and axis; the script chooses among them.
+
+    Bandits have a section of their own, with curves by pull.
+    """
+    curves = [one.curves for one in report.series.environments]
+    if not (report.analysis.results.has_curves and any(curves)):
+        return None
+    units = ["step" if item is None else item["evaluation"].budget for item in curves]
+    shown = [
+        {} if item is None else item["evaluation"].by_axis[unit]
+        for item, unit in zip(curves, units, strict=True)
+    ]
+    context = {
+        "has_curves": [item is not None for item in curves],
+        "stages": STAGES,
+        "units": units,
+        # For readers who cannot see the figure.
+        "tables": [
+            [(agent, [_at(curve, share) for share in STAGES]) for agent, curve in of_agents.items()]
+            for of_agents in shown
+        ],
+    }
+    return Section("curves", "Learning curves", context, places=curves, by_environment=True)
+
+
+def _at(curve: Curve, share: float) -> dict[str, float]:
+    """The point of a curve nearest to this share of its range of x."""
+    nearest = np.abs(curve.x - share * curve.x[-1]).argmin()
+    return {name: values[nearest] for name, values in vars(curve).items()}
+
+
+# With more runs of an agent than this, the page shows only their mean.
+MOST_DOTS = 300
+
+
+def comparison(report: Report) -> Section | None:
+    """Intervals and each run as figures, the pairs as a table and as a matrix."""
+    analysis = report.analysis
+    metric = METRIC_WORDS[analysis.study.metric]
+    context = {
+        "metric": metric,
+        "most_dots": MOST_DOTS,
+        "lower_is_better": analysis.study.metric in COSTS,
+    }
+    places = [
+        {
+            "intervals": [_runs(agent) for agent in one.runs],
+            "words": {f"{p.first} | {p.second}": p.text for p in one.environment.pairs},
+            "linear": linear_up_to((runs.values for runs in one.runs), one.environment.optimum),
+        }
+        for one in report.series.environments
+    ]
+    data = {"metric": metric}
+    return Section("comparison", "Differences", context, data, places, by_environment=True)
+
+
+def _runs(agent: AgentRuns) -> dict[str, Any]:
+    """The mean, and each run unless there are too many to see."""
+    shown = slice(0 if len(agent.values) > MOST_DOTS else None)
+    runs = {"seeds": agent.seeds[shown], "runs": agent.values[shown]}
+    return {"agent": agent.agent, **vars(agent.mean), **runs}
+
+
+def overall(report: Report) -> Section | None:
+    """Aggregates, profiles and the score on each environment; None for a single environment."""
+    overall = report.analysis.overall
+    if overall is None:
+        return None
+    agents = list(overall.scores)
+    scores = [
+        {agent.agent: agent.score for agent in one.agents if agent.score is not None}
+        for one in report.analysis.environments
+    ]
+    context = {
+        "agents": agents,
+        "scores": scores,
+        "pairs": pairs_both_ways(overall.pairs),
+        "unproven": unproven_sentences(report.analysis.environments),
+    }
+    data = {
+        "agents": agents,
+        "means": [{"agent": agent, **vars(overall.scores[agent].mean)} for agent in agents],
+        "thresholds": overall.thresholds,
+        "profiles": overall.profiles,
+    }
+    return Section("overall", "Overall", context, data)
+
+
+def watching(report: Report) -> Section | None:
+    """The links to pages that play trainings; None where none were asked for."""
+    if not report.learning:
+        return None
+    return Section("watching", "See it learn", {"pages": report.learning}, by_environment=True)
+
+
+# What a reader needs to repeat the study: settings as run, seeds, looks, versions, failures.
+
+ABSENT = "-"
+
+
+def settings(report: Report) -> Section | None:
+    """Settings by environment; command, seeds, versions and missing runs of the whole study."""
+    results, environments = report.analysis.results, report.analysis.environments
+    done = list(results.infos())
+    infos = [info for *_, info in done]
+    context = {
+        "command": report.command,
+        "seeds": seed_sentence(results.study.seeds, tuning_seeds(results.study)),
+        "absent": ABSENT,
+        "tables": [
+            _settings_table([(agent, info) for agent, on, info in done if on == e.environment])
+            for e in environments
+        ],
+        "versions": recorded("versions", infos),
+        "machine": recorded("machine", infos),
+        "mixed": mixed_versions(infos),
+        "missing": _missing_runs(results),
+    }
+    return Section("settings", "Settings", context, by_environment=True)
+
+
+def _settings_table(runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+    """The agents, and for each setting its values by agent and whether these differ."""
+    columns: dict[str, dict[str, str]] = {}
+    for agent in dict.fromkeys(agent for agent, _ in runs):
+        columns[agent] = _column([info for one, info in runs if one == agent])
+    rows = {}
+    for name in dict.fromkeys(name for column in columns.values() for name in column):
+        values = [column.get(name, ABSENT) for column in columns.values()]
+        rows[name] = (values, len({*values} - {ABSENT}) > 1)
+    return {"agents": list(columns), "rows": rows}
+
+
+def _column(infos: list[Mapping[str, Any]]) -> dict[str, str]:
+    """The settings of an agent, which its seeds share, and how long its runs were."""
+    spec = infos[0]["spec"]
+    steps = sorted(info["n_timesteps"] for info in infos)
+    lengths = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
+    column = {"agent": spec["algo"], "steps run": lengths}
+    engines = sorted({str(info["engine"]) for info in infos if info.get("engine")})
+    if engines:
+        column["engine"] = "; ".join(engines)
+    return column | {name: setting(value) for name, value in spec["hyperparams"].items()}
+
+
+def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """Versions or parts of the machine by name, all distinct values joined; old runs have none."""
+    found: dict[str, set[str]] = {}
+    for info in infos:
+        for name, value in info.get(what, {}).items():
+            found.setdefault(name, set()).add(value)
+    return {name: ", ".join(sorted(values)) for name, values in found.items()}
+
+
+def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
+    """Missing runs, grouped by agent, environment and reason.
+
+    The reason is the last line of a run's record of failure; the details are all of the last one.
+    """
+    groups: dict[tuple[str, str, str], dict[str, Any]] = {}
+    damaged = {one.planned.path: one.reason for one in results.left_out}
+    there = {(*run.labels, run.seed) for run in results.finished}
+    for run in results.planned:
+        if (*run.labels, run.seed) in there:
+            continue
+        details = results.failures.get(run.path, "").strip()
+        reason = damaged.get(run.path) or (details.splitlines()[-1] if details else "not done yet")
+        new = {"agent": run.agent, "environment": run.environment, "reason": reason, "seeds": []}
+        group = groups.setdefault((run.agent, run.environment, reason), new)
+        group["seeds"].append(run.seed)
+        group["details"] = details
+    return list(groups.values())

@@ -1,0 +1,348 @@
+"""The page of a tuning: what was found, how, and what it cost."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rl_yardstick.pipeline.environments import titled
+from rl_yardstick.pipeline.files import write_text
+from rl_yardstick.report.page.frame import (
+    SHARED,
+    Section,
+    as_json,
+    packed,
+    page_frame,
+    setting,
+    templates,
+)
+from rl_yardstick.report.words import number
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+
+COMPLETE, PRUNED, FAILED = "judged on all seeds", "ended early", "failed"
+
+
+@dataclass(frozen=True)
+class Trials:
+    """The trials of a tuning."""
+
+    record: Mapping[str, Any]  # the record of the tuning, see `tuning.retesting`
+
+    @cached_property
+    def ended(self) -> list[Mapping[str, Any]]:
+        """The trials that have ended, in the order of the record."""
+        return [t for t in self.record["trials"] if t["state"] in {"complete", "pruned", "fail"}]
+
+    @property
+    def is_cost(self) -> bool:
+        """Whether the lower figure is the better."""
+        return bool(self.record["lower_is_better"])
+
+    @property
+    def judged(self) -> list[Mapping[str, Any]]:
+        """The trials with a figure on at least one seed."""
+        return [trial for trial in self.ended if trial["value"] is not None and trial["figures"]]
+
+    @property
+    def best_first(self) -> list[Mapping[str, Any]]:
+        """The trials judged on all seeds, the best first, and then the others."""
+        whole = [trial for trial in self.judged if kind(trial) == COMPLETE]
+        whole.sort(key=lambda trial: trial["value"], reverse=not self.is_cost)
+        whole.sort(key=self._steps_at_optimum)
+        return whole + [trial for trial in self.ended if trial not in whole]
+
+    def _steps_at_optimum(self, trial: Mapping[str, Any]) -> float:
+        steps = [*trial.get("at_optimum", {}).values()]
+        is_optimal = bool(steps) and len(steps) == len(trial["figures"])
+        return sum(steps) / len(steps) if is_optimal else math.inf
+
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """The distribution of each parameter."""
+        from optuna.distributions import json_to_distribution
+
+        space = (self.record.get("asked") or {}).get("search_space", {})
+        return {name: json_to_distribution(text) for name, text in space.items()}
+
+
+def kind(trial: Mapping[str, Any]) -> str:
+    """How a trial ended."""
+    if trial["failure"] or trial["state"] == "fail":
+        return FAILED
+    return COMPLETE if trial["state"] == "complete" else PRUNED
+
+
+def importances(trials: Trials) -> dict[str, float]:
+    """The importance of each parameter for whether a trial is in the best tenth.
+
+    Trials that ended early count too, by their seeds so far: the others are few, and all good.
+
+    The shares sum to 1, the largest first; empty if trials are too few or all alike.
+
+    Source: PED-ANOVA, Watanabe et al. (2023), "PED-ANOVA: Efficiently quantifying hyperparameter
+    importance in arbitrary subspaces", IJCAI, as Optuna computes it.
+    """
+    import optuna
+
+    ranges = trials.distributions()
+    judged = trials.judged
+    if len({trial["value"] for trial in judged}) < 2 or not ranges:
+        return {}
+    directions = optuna.study.StudyDirection
+    direction = directions.MINIMIZE if trials.is_cost else directions.MAXIMIZE
+    study = optuna.create_study(direction=direction, sampler=optuna.samplers.RandomSampler(0))
+    for trial in judged:
+        params = {name: value for name, value in trial["params"].items() if name in ranges}
+        drawn_from = {name: ranges[name] for name in params}
+        study.add_trial(
+            optuna.create_trial(value=trial["value"], params=params, distributions=drawn_from)
+        )
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+    with warnings.catch_warnings():
+        # The warning is of parameters that few trials have; the page says that itself.
+        warnings.filterwarnings("ignore", "Some regimes for parameter")
+        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {name: share for name, share in found.items() if share > 0}
+
+
+# The numbers behind the figures.
+
+# The share of the worst trials that the axis of values may cut off, to show the best apart.
+_BELOW = 0.25
+# The number of groups of ranks, each drawn with its own opacity.
+_GROUPS = 5
+_ABSENT = object()
+
+
+def history(trials: Trials) -> dict[str, Any]:
+    """The value of each trial, the best so far, and the value of the shipped settings."""
+    best, steps = None, []
+    better = min if trials.is_cost else max
+    for trial in trials.ended:
+        if kind(trial) == COMPLETE and trial["value"] is not None:
+            best = trial["value"] if best is None else better(best, trial["value"])
+        steps.append(best)
+    shipped = next((t["value"] for t in trials.ended if t["number"] == 0), None)
+    return {
+        "isCost": trials.is_cost,
+        "figure": trials.record["figure"],
+        "edge": _edge(trials),
+        "shipped": shipped,
+        "numbers": [trial["number"] for trial in trials.ended],
+        "best": steps,
+        "values": {
+            name: [_value(trial) if kind(trial) == name else None for trial in trials.ended]
+            for name in (COMPLETE, PRUNED)
+        },
+        "texts": [_text(trial) for trial in trials.ended],
+        "failed": [t["number"] for t in trials.ended if _value(t) is None],
+    }
+
+
+def _value(trial: Mapping[str, Any]) -> float | None:
+    value = trial["value"] if trial["figures"] else None
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _text(trial: Mapping[str, Any]) -> str:
+    n_seeds = len(trial["figures"])
+    seeds = f"{n_seeds} seed{'' if n_seeds == 1 else 's'}"
+    return f"trial {trial['number']}: {number(_value(trial))} on {seeds}"
+
+
+def _edge(trials: Trials) -> float | None:
+    """The worst value on the axis of values; None if the axis shows all values.
+
+    It shows the best three quarters of the trials judged on all seeds, or else of all trials. It
+    includes the shipped settings unless these would more than double it.
+    """
+    sign = -1.0 if trials.is_cost else 1.0
+    values = [
+        (kind(t), t["number"], sign * v) for t in trials.ended if (v := _value(t)) is not None
+    ]
+    goods = np.array([value for *_, value in values])
+    whole = np.array([value for name, _, value in values if name == COMPLETE])
+    shipped = next((value for _, number, value in values if number == 0), -math.inf)
+    for some in (whole, goods):
+        if some.size and (room := some.max() - np.quantile(some, _BELOW)) > 0:
+            best = float(some.max())
+            room = max(room, best - shipped) if best - shipped <= 2 * room else room
+            edge = best - 1.15 * float(room)
+            return sign * edge if edge > goods.min() else None
+    return None
+
+
+def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
+    """Each trial as a line through its parameters, the most important ones first."""
+    ranges = trials.distributions()
+    names = [*shares, *(name for name in ranges if name not in shares)]
+    ranked = sorted(trials.judged, key=lambda t: t["value"], reverse=trials.is_cost)
+    return {
+        "axes": [{"name": name, "ticks": _ticks(ranges[name])} for name in names],
+        "lines": [
+            {
+                "number": trial["number"],
+                "group": min(_GROUPS - 1, rank * _GROUPS // len(ranked)),
+                "text": _text(trial),
+                "at": [_place(ranges[name], trial["params"].get(name, _ABSENT)) for name in names],
+                "said": [_said(trial["params"].get(name, _ABSENT)) for name in names],
+            }
+            for rank, trial in enumerate(ranked)
+        ],
+        "groups": _GROUPS,
+    }
+
+
+def _place(ends: BaseDistribution, value: Any) -> float | None:
+    """A value's position between the ends, from 0 to 1; None if the trial lacks the parameter."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if value is _ABSENT:
+        return None
+    if isinstance(ends, CategoricalDistribution):
+        return (ends.choices.index(value) + 0.5) / len(ends.choices)
+    assert isinstance(ends, FloatDistribution | IntDistribution)
+    low, high, at = float(ends.low), float(ends.high), float(value)
+    if ends.log:
+        low, high, at = math.log(low), math.log(high), math.log(at)
+    return 0.5 if low == high else (at - low) / (high - low)
+
+
+def _ticks(ends: BaseDistribution) -> list[tuple[float | None, str]]:
+    words = getattr(ends, "choices", None) or (ends.low, ends.high)  # type: ignore[attr-defined]
+    return [(_place(ends, word), _said(word)) for word in words]
+
+
+def _said(value: Any) -> str:
+    if value is _ABSENT:
+        return "not there"
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number(value) if is_number else setting(value)
+
+
+# The tables: changed settings, and the cost.
+
+LEFT_OUT = "-"
+
+
+class Change(NamedTuple):
+    """A setting that differs between the winner and the shipped settings, as in a YAML file."""
+
+    name: str
+    shipped: str
+    found: str
+
+
+def changes(trials: Trials, winner: int) -> list[Change]:
+    """The settings of a trial that differ from those that the search began with."""
+    settings = {trial["number"]: trial["settings"] or {} for trial in trials.ended}
+    before, after = (
+        {name: setting(value) for name, value in settings.get(number, {}).items()}
+        for number in (0, winner)
+    )
+    return [
+        Change(name, before.get(name, LEFT_OUT), after.get(name, LEFT_OUT))
+        for name in dict.fromkeys([*before, *after])
+        if before.get(name) != after.get(name)
+    ]
+
+
+def cost(trials: Trials) -> list[tuple[str, str]]:
+    """The cost of the search."""
+    record = trials.record
+    kinds = Counter(kind(trial) for trial in trials.ended)
+    n_runs = sum(len(trial["figures"]) for trial in trials.ended)
+    whole = len(trials.ended) * len(record["seeds"])
+    saved = f"{1 - n_runs / whole:.0%}" if whole else LEFT_OUT
+    seconds = sum(trial["seconds"] for trial in trials.ended)
+    began = [datetime.fromisoformat(t["began"]) for t in trials.ended if t["began"]]
+    ended = [datetime.fromisoformat(t["ended"]) for t in trials.ended if t["ended"]]
+    wall = (max(ended) - min(began)).total_seconds() if began and ended else None
+    retest = (record["retest"] or {}).get("settings", [])
+    return [
+        ("Trials", f"{len(trials.ended):,} of {record['n_trials']:,}"),
+        *((name[0].upper() + name[1:], f"{count:,}") for name, count in sorted(kinds.items())),
+        ("Runs", f"{n_runs:,} of at most {whole:,}"),
+        ("Runs saved by ending trials early", saved),
+        ("Processor time of all runs", _duration(seconds)),
+        ("From the first trial to the end of the last", _duration(wall)),
+        ("Runs of the re-test", f"{sum(each['n_runs'] for each in retest):,}"),
+    ]
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return LEFT_OUT
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes, hours = seconds / 60, seconds / 3600
+    return f"{minutes:.0f} min" if minutes < 90 else f"{hours:.1f} h"
+
+
+# The page as one file, in the frame of a study's page.
+
+
+def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = "") -> None:
+    """Write the page of a tuning: one self-contained file, which needs no network.
+
+    Args:
+        record: the record of the tuning, see `tuning.retesting`.
+        path: the file, which is replaced.
+        retest_page: link from there to the page of the re-test; empty if there is none.
+    """
+    trials = Trials(record)
+    shares = importances(trials)
+    asked, retest = record["asked"] or {}, record["retest"]
+    retested = {each["label"]: each for each in retest["settings"]} if retest else {}
+    winner = retested.get(retest["winner"]) if retest else None
+    sections = _sections(trials, shares, winner)
+    data: dict[str, Any] = {"page": {"agents": [], "environments": []}}
+    data |= {section.name: section.data for section in sections if section.data}
+    environment = titled(asked.get("env", "an environment"), record.get("map_name", ""))
+    template = templates("tuning").get_template("tuning.html")
+    text = template.render(
+        title=f"{asked.get('algo', 'an agent')} on {environment}",
+        record=record,
+        asked=asked,
+        sections=sections,
+        retest=retest,
+        retest_page=retest_page,
+        winner=winner,
+        changes=[] if winner is None else changes(trials, winner["number"]),
+        n_params=len(trials.distributions()),
+        cost=cost(trials),
+        trials=trials.best_first,
+        kind=kind,
+        said=_said,
+        shares=shares,
+        data={name: packed(as_json(item)) for name, item in data.items()},
+        **page_frame([*SHARED, "tuning/tuning.js", "paper.js"]),
+    )
+    write_text(path, text)
+
+
+def _sections(
+    trials: Trials, shares: Mapping[str, float], winner: Mapping[str, Any] | None
+) -> list[Section]:
+    """The sections of the page, with the data of their figures."""
+    sections = [
+        Section("verdict", "What was found"),
+        Section("history", "History", data=history(trials)),
+    ]
+    if trials.judged and trials.record["asked"]:
+        lines = {**parallel(trials, shares), "winner": winner and winner["number"]}
+        sections.append(Section("parallel", "Settings tried", data=lines))
+    if shares:
+        bars = {"names": [*shares], "shares": [*shares.values()]}
+        sections.append(Section("importances", "What matters", data=bars))
+    return [*sections, Section("cost", "Cost"), Section("trials", "All trials")]

@@ -1,0 +1,328 @@
+"""Sections on what agents do: on bandits, on maps, in films."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from PIL import Image
+
+from rl_yardstick.envs.known_models import transition_model
+from rl_yardstick.envs.layout import GridLayout, grid_layout
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from rl_yardstick.experiments.child_processes import do_aside
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.results import mean_curve, read_compared, read_value_maps
+from rl_yardstick.pipeline.curve_pictures import MEANINGS
+from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.report.films import MAX_BYTES, films_of, has_film
+from rl_yardstick.report.page.frame import Report, Section, data_uri, first_runs, layout_data
+from rl_yardstick.report.series import SPREAD, Curve, Pulls, PullSeries, mean_regret, regret_of_runs
+from rl_yardstick.report.why import whys_of
+from rl_yardstick.report.words import number
+from rl_yardstick.safe_files.files import NO_LIMIT, read_file
+
+# Bandits: rewards and regret by pull, shares of the pulls, posteriors.
+
+MOST_ARMS = 40  # over all contexts, in a table or in a figure
+
+
+def bandits(report: Report) -> Section | None:
+    """Figures by pull of every bandit; None where there is none."""
+    bandits = [one.pulls for one in report.series.environments]
+    if not any(bandits):
+        return None
+    data = [None if series is None else _bandit_data(series) for series in bandits]
+    pulls = [{} if series is None else series.pulls for series in bandits]
+    context = {
+        "is_bandit": [series is not None for series in bandits],
+        "tables": [context_tables(of_agents) for of_agents in pulls],
+        "agents": [list(of_agents) for of_agents in pulls],
+        "spread": SPREAD,
+        "has_bounds": any(series is not None and series.bounds for series in bandits),
+    }
+    return Section("bandits", "Pulls and regret", context, places=data, by_environment=True)
+
+
+def context_tables(pulls: Pulls) -> list[dict[str, Any]]:
+    """Shares of the pulls by context; empty if true means differ between runs."""
+    known = {agent: p for agent, p in pulls.items() if p.true_means.size}
+    if not known:
+        return []
+    means = next(iter(known.values())).true_means
+    if means.size > MOST_ARMS:
+        return []
+    gaps = means.max(axis=1, keepdims=True) - means
+    n_contexts, n_arms = means.shape
+    return [
+        {
+            "name": f"context {context}" if n_contexts > 1 else "",
+            "rows": [
+                {
+                    "name": f"arm {arm}",
+                    "mean": means[context, arm],
+                    "regret": gaps[context, arm],
+                    # NaN where an agent never saw the context.
+                    "shares": {agent: p.shares[context, arm] for agent, p in known.items()},
+                }
+                for arm in range(n_arms)
+            ],
+            "regrets": {agent: p.shares[context] @ gaps[context] for agent, p in known.items()},
+        }
+        for context in range(n_contexts)
+    ]
+
+
+def _bandit_data(series: PullSeries) -> dict[str, Any]:
+    return {
+        "best": series.best,
+        "bounds": series.bounds,
+        "curves": {
+            agent: {
+                "x": pulls.pulls,
+                "reward": pulls.reward,
+                "optimal": pulls.optimal,
+                "regret": {"mean": mean_regret(pulls), "runs": regret_of_runs(pulls)},
+                "simple": pulls.simple_regret,
+            }
+            for agent, pulls in series.pulls.items()
+        },
+        "arms": series.arms if series.arms and len(series.arms.names) <= MOST_ARMS else None,
+        "beliefs": series.beliefs,
+    }
+
+
+# Where the median run of each agent loses return.
+
+MOST_EXPLAINED = 8  # the largest number of agents per environment, because each is loaded
+
+
+def why(report: Report) -> Section | None:
+    """The explanation of each agent's median run; None if no gap can be split."""
+    analysis = report.analysis
+    chosen = [_median_runs(analysis, one)[:MOST_EXPLAINED] for one in analysis.environments]
+    asked = [(run.spec, run.run.model_path) for runs in chosen for run in runs]
+    answers = iter(do_aside(whys_of, asked) if asked else ())
+    told = [[(run, next(answers)) for run in runs] for runs in chosen]
+    told = [[(run, why) for run, why in of_runs if why is not None] for of_runs in told]
+    if not any(told):
+        return None
+    return Section("why", "Why not optimal", {"told": told}, by_environment=True)
+
+
+def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> list[PlannedRun]:
+    """Each agent's run with the (lower) median final return among its exactly evaluated runs."""
+    table = analysis.results.summary
+    here = (table["environment"] == environment.environment) & table["exact"].astype(bool)
+    runs: dict[tuple[str, str], dict[int, PlannedRun]] = {}
+    for run in analysis.results.in_folders:
+        if not run.is_batch:
+            runs.setdefault(run.labels, {})[run.seed] = run
+    found = []
+    for agent in environment.agents:
+        rows = table[here & (table["agent"] == agent.agent)].sort_values("final", kind="stable")
+        of_agent = runs.get((agent.agent, environment.environment), {})
+        if len(rows) and of_agent:
+            median = int(rows["seed"].iloc[(len(rows) - 1) // 2])
+            found += [of_agent[median]] if median in of_agent else []
+    return found
+
+
+# Errors of values, advantages and gradients, in runs with `diagnose`.
+
+
+def diagnosis(report: Report) -> Section | None:
+    """A curve for each figure of `diagnosis.csv`; None where no run has one."""
+    analysis = report.analysis
+    data = [_compared(analysis, environment) for environment in analysis.environments]
+    if not any(data):
+        return None
+    context = {"is_there": [bool(item) for item in data]}
+    places = [item or None for item in data]
+    return Section(
+        "diagnosis", "Critics and gradients", context, MEANINGS, places, by_environment=True
+    )
+
+
+def _compared(
+    analysis: StudyAnalysis, environment: EnvironmentAnalysis
+) -> dict[str, dict[str, Curve]]:
+    """By column of the files and by agent, the mean over seeds with its interval."""
+    found: dict[str, dict[str, list[pd.DataFrame]]] = {name: {} for name in MEANINGS}
+    for planned in analysis.results.finished:
+        if planned.environment != environment.environment or planned.is_batch:
+            continue
+        if not planned.run.diagnosis_path.exists():
+            continue
+        columns = read_compared(planned.run)
+        for name in columns.keys() & found.keys():
+            rows = pd.DataFrame({"step": columns["timesteps"], "value": columns[name]}).dropna()
+            if len(rows):
+                found[name].setdefault(planned.agent, []).append(rows)
+    curves: dict[str, dict[str, Curve]] = {}
+    for name, of_agents in found.items():
+        for agent in (one.agent for one in environment.agents):
+            mean = mean_curve(of_agents.get(agent, []), "step")
+            if mean is not None:
+                points, band = mean
+                curve = Curve(points, band.point, band.low, band.high)
+                curves.setdefault(name, {})[agent] = curve
+    return curves
+
+
+# What agents do on each cell of a grid world, over their training, beside the optimum.
+
+MAX_MAPS = 40  # of a run: more than a slider needs
+MIN_MAPS = 2  # the first and the last
+# The most values and actions on a page, shared by its environments; each takes 4 bytes.
+MAX_FIGURES = 200_000
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def policies(report: Report) -> Section | None:
+    """The maps of every grid world; None where there is none."""
+    analysis = report.analysis
+    room = MAX_FIGURES // len(analysis.environments)
+    data = [_policy_data(analysis, environment, room) for environment in analysis.environments]
+    if not any(data):
+        return None
+    context = {"is_drawn": [item is not None for item in data]}
+    return Section("policies", "Policies", context, places=data, by_environment=True)
+
+
+def _policy_data(
+    analysis: StudyAnalysis, environment: EnvironmentAnalysis, room: int
+) -> dict[str, Any] | None:
+    order = [agent.agent for agent in environment.agents]
+    runs = [
+        run
+        for run in analysis.results.in_folders
+        if run.environment == environment.environment and run.run.value_maps_path.exists()
+    ]
+    if not runs:
+        return None
+    # By seed, the best agent first.
+    runs.sort(key=lambda run: (run.seed, order.index(run.agent)))
+    env = make_single_env(runs[0].spec)
+    try:
+        layout, model = grid_layout(env), transition_model(env)
+    finally:
+        env.close()
+    if layout is None or model is None:
+        return None
+    maps = _read_maps(runs, layout, room)
+    if not maps:
+        return None
+    optimum = next(iter(maps.values()))
+    return {
+        **layout_data(layout),
+        "matters": _digits(model.reachable),
+        "optimum": {
+            "values": optimum["optimal_values"],
+            # Bit a of a state's number is set if action a is optimal there.
+            "actions": (optimum["optimal_actions"] << np.arange(len(layout.moves))).sum(axis=1),
+        },
+        "runs": [
+            {
+                "agent": agent,
+                "seed": seed,
+                "steps": arrays["timesteps"],
+                "values": arrays["values"],
+                "actions": [_digits(actions) for actions in arrays["actions"]],
+            }
+            for (agent, seed), arrays in maps.items()
+        ],
+    }
+
+
+def _read_maps(
+    runs: Sequence[PlannedRun], layout: GridLayout, room: int
+) -> dict[tuple[str, int], Arrays]:
+    """The maps by agent and seed: of the first seed, and of as many others as fit."""
+    n_agents = sum(run.seed == runs[0].seed for run in runs)
+    # All agents of the first seed fit, if necessary with few moments.
+    n_maps = min(max(room // (2 * layout.n_states * n_agents), MIN_MAPS), MAX_MAPS)
+    maps: dict[tuple[str, int], Arrays] = {}
+    figures = 0
+    for run in runs:
+        arrays = read_value_maps(run.run)
+        n = len(arrays["timesteps"])
+        if n > n_maps:  # the first and the last among them
+            kept = np.linspace(0, n - 1, n_maps).round().astype(np.int64)
+            arrays |= {name: arrays[name][kept] for name in ("timesteps", "values", "actions")}
+        if arrays["optimal_actions"].shape != (layout.n_states, len(layout.moves)):
+            continue  # an agent that was given another map
+        figures += 2 * arrays["values"].size
+        if figures > room and run.seed != runs[0].seed:
+            # All agents of a seed, or none of them.
+            return {key: found for key, found in maps.items() if key[1] != run.seed}
+        maps[run.agent, run.seed] = arrays
+    return maps
+
+
+def _digits(numbers: NDArray[Any]) -> str:
+    """Numbers below ten as one text, which is shortest."""
+    return "".join(map(str, numbers.astype(np.int64).tolist()))
+
+
+# An episode of each agent as an animated picture inside the page.
+
+MOST_FILMED = 8  # agents of an environment, the best of them
+ALL_BYTES = 1_000_000  # of the films of a page, before base64
+
+
+def played_episodes(report: Report) -> Section | None:
+    """The films of each environment; None where nothing can be drawn."""
+    groups: list[list[dict[str, Any]]] = []
+    contents: dict[bytes, int] = {}  # of each film its place on the page; equal films share one
+    without_room: list[list[str]] = []
+    ranked = first_runs(report.analysis)
+    to_film = [run for runs in ranked for run in runs[:MOST_FILMED]]
+    report.tell("filming episodes")
+    made = films_of(to_film) if all(map(has_film, to_film)) else do_aside(films_of, to_film)
+    paths = dict(zip((run.path for run in to_film), made, strict=True))
+    for n_done, runs in enumerate(ranked, start=1):
+        groups.append([])
+        without_room.append([])
+        for run in runs[:MOST_FILMED]:
+            path = paths[run.path]
+            if path is None:
+                continue
+            content = read_file(path, NO_LIMIT)
+            # Space that an environment does not use is left to the next ones.
+            room = ALL_BYTES * n_done // len(ranked) - sum(map(len, contents))
+            if content in contents or len(content) <= room:
+                place = contents.setdefault(content, len(contents))
+                groups[-1].append({"agent": run.agent, "place": place, **_film(path, content)})
+            else:
+                without_room[-1].append(run.agent)
+    if not any(groups):
+        return None
+    data = [data_uri("image/gif", content) for content in contents]
+    not_filmed = [[run.agent for run in runs[MOST_FILMED:]] for runs in ranked]
+    context = {"films": groups, "without_room": without_room, "not_filmed": not_filmed}
+    return Section("films", "Episodes", context, data, by_environment=True)
+
+
+def _film(path: Path, content: bytes) -> dict[str, Any]:
+    """The first frame as a data URI, its size in pixels, and a caption with the return."""
+    still = io.BytesIO()
+    with Image.open(io.BytesIO(content)) as picture:
+        width, height = picture.size
+        picture.convert("RGB").quantize(64).save(still, "PNG", optimize=True)
+    episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
+    shown, steps = episode["frames"] - 1, episode["steps"]
+    if steps is None:
+        caption = f"the first {shown} steps"
+    else:
+        caption = f"return {number(episode['return'])} in {steps} step{'s' if steps > 1 else ''}"
+        caption += f", of which these are the first {shown}" if shown < steps else ""
+    address = data_uri("image/png", still.getvalue())
+    return {"still": address, "width": width, "height": height, "caption": caption}

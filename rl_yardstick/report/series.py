@@ -1,0 +1,532 @@
+"""The numbers in the figures, computed once for paper and for the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy import integrate, special, stats
+
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from rl_yardstick.experiments.bandits import QUANTILES, PullStatistics
+from rl_yardstick.experiments.results import (
+    StudyResults,
+    curves_by_agent,
+    mean_curve,
+    read_episodes,
+    stored_curves,
+    values_over_seeds,
+)
+from rl_yardstick.experiments.study import AgentSpec, StudySpec, symbol
+from rl_yardstick.mdp.transition_model import Floats, Ints
+from rl_yardstick.pipeline.curve_pictures import DWARFED
+from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
+from rl_yardstick.verdicts import UNBOUNDED, Bounds, Estimate
+
+# One colour and one line style for each agent, the same in every figure of a study.
+
+# Okabe and Ito's palette, which is safe for colour-blind readers. The page's style sheet repeats
+# it, and has another one for the dark theme.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+Dash = Literal["solid", "dash", "dashdot", "dot"]
+# Seven colours and four line styles repeat together: neighbours differ in both, so lines differ in
+# greyscale, too, and 28 agents have distinct marks.
+DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How an agent is drawn."""
+
+    label: str  # the agent's
+    colour: int  # the index of its colour in `COLOURS`
+    dash: Dash  # Plotly's name for its line style
+    # The index of the shape of the dot beside its name on the page: the number of times that the
+    # colours have repeated before, modulo 4.
+    shape: int = 0
+
+
+def agent_marks(study: StudySpec) -> dict[str, Mark]:
+    """The marks of the agents by label, in the order of the study."""
+    marks = {}
+    for place, label in enumerate(agent.label for agent in study.agents):
+        dash = DASHES[place % len(DASHES)]
+        again, colour = divmod(place, len(COLOURS))
+        marks[label] = Mark(label, colour, dash, again % len(DASHES))
+    return marks
+
+
+# Learning curves of all agents, by step, episode and wall time.
+
+KINDS = ("evaluation", "training")
+AXES = ("step", "episode", "seconds")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A line and its interval, each of shape (n_points,); NaN where there is no interval."""
+
+    x: Floats
+    y: Floats
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True)
+class LearningCurves:
+    """The mean curves on an environment."""
+
+    # By axis, and then by agent, the best first; an agent without a curve is left out.
+    by_axis: Mapping[str, Mapping[str, Curve]]
+    # Where a symmetric logarithmic axis of returns ceases to be linear; None for a linear axis.
+    linear_up_to: float | None
+    # Agents with returns on a variant of the environment, which cannot be compared with the
+    # optimum.
+    on_variant: tuple[str, ...] = ()
+    # The axis in the unit of the runs' budget: "step" or "episode".
+    budget: str = "step"
+
+
+def learning_curves(
+    results: StudyResults, environment: EnvironmentAnalysis
+) -> dict[str, LearningCurves]:
+    """The curves on an environment, by kind; none where each would be a single point."""
+    found = {}
+    here = [run.spec for run in results.planned if run.environment == environment.environment]
+    by_episode = here and all(spec.hyperparams.n_timesteps is None for spec in here)
+    variants = tuple(agent.agent for agent in environment.agents if agent.on_variant)
+    runs = curves_by_agent(results, environment.environment)
+    for kind in KINDS:
+        by_axis: dict[str, dict[str, Curve]] = {by: {} for by in AXES}
+        # Training returns of a changed environment have other bounds.
+        bounds = UNBOUNDED if kind == "training" and variants else environment.bounds
+        for agent in (each.agent for each in environment.agents):
+            of_agent: list[Any] = runs.get((agent, kind), [])
+            if stored := stored_curves(results, environment.environment, agent, kind):
+                of_agent = [*of_agent, *stored]
+            for by in AXES:
+                if (curve := _curve(of_agent, by, bounds)) is not None:
+                    by_axis[by][agent] = curve
+        for by, curves in by_axis.items():
+            if all(len(curve.x) == 1 for curve in curves.values()):
+                by_axis[by] = {}
+        scale = linear_up_to([curve.y for curve in by_axis["step"].values()], environment.optimum)
+        budget = "episode" if by_episode and by_axis["episode"] else "step"
+        on_variant = variants if kind == "training" else ()
+        found[kind] = LearningCurves(by_axis, scale, on_variant, budget)
+    return found
+
+
+def _curve(runs: Sequence[Any], by: str, bounds: Bounds) -> Curve | None:
+    try:
+        found = mean_curve(runs, by, bounds)
+    except ValueError:
+        return None  # the clock was set back, so wall times decrease
+    if found is None:
+        return None
+    points, band = found
+    return Curve(points, band.point, band.low, band.high)
+
+
+def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | None:
+    """Where a symmetric logarithmic axis ceases to be linear; None where a linear axis shows all.
+
+    It is the optimum's magnitude or, if that is unknown, the largest magnitude in the last quarter
+    of the curves, but at least 1. Each curve is in order of time, of shape (n_points,).
+    """
+    known = [finite for curve in curves if len(finite := curve[np.isfinite(curve)])]
+    if not known:
+        return None
+    if optimum is None:
+        optimum = max(float(np.abs(curve[-max(len(curve) // 4, 1) :]).max()) for curve in known)
+    scale = max(abs(optimum), 1.0)
+    return scale if max(float(np.abs(curve).max()) for curve in known) >= DWARFED * scale else None
+
+
+# Training returns, summed up by blocks of episodes.
+
+
+def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
+    """Training returns of all seeds by agent, environment and block of ``width`` episodes.
+
+    Columns agent, environment, episode (the last of the block), average, minimum, maximum.
+    """
+    rows = []
+    for planned in results.in_folders:
+        returns = read_episodes(planned.run).returns
+        columns = {
+            "agent": planned.agent,
+            "environment": planned.environment,
+            "episode": (np.arange(len(returns)) // width + 1) * width,
+            "return": returns,
+        }
+        rows.append(pd.DataFrame(columns))
+    if not rows:
+        return pd.DataFrame(columns=["agent", "environment", "episode"])
+    grouped = pd.concat(rows).groupby(["environment", "agent", "episode"], sort=False)["return"]
+    return grouped.agg(average="mean", minimum="min", maximum="max").reset_index()
+
+
+# The posteriors of Thompson sampling, as densities to draw.
+
+N_POINTS = 241
+
+
+@dataclass(frozen=True)
+class Belief:
+    """The posteriors of an agent for the arms' mean rewards, in its first run."""
+
+    agent: str  # its label
+    moments: Ints  # numbers of pulls, shape (n_moments,)
+    points: Floats  # mean rewards at which the densities are evaluated, shape (n_points,)
+    densities: Floats  # shape (n_moments, n_contexts, n_arms, n_points)
+    # By context and arm; None for an agent that ignores contexts.
+    true_means: list[list[float | None]]
+
+
+def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Belief:
+    """The densities of an agent's posteriors, at all recorded moments."""
+    spec = next(planned.spec for planned in results.planned if planned.agent == agent)
+    means = statistics.true_means
+    # Parameters: mean and standard deviation of a normal, alpha and beta of a Beta distribution.
+    if spec.hyperparams.algorithm.get("likelihood") == "gaussian":
+        family, low, high = stats.norm, means.min() - 2, means.max() + 2
+    else:
+        family, low, high = stats.beta, 0.0, min(2 * float(means.max()), 1.0)
+    points = np.linspace(low, high, N_POINTS)
+    parameters = statistics.posteriors
+    _, n_contexts, n_arms, _ = parameters.shape
+    return Belief(
+        agent,
+        statistics.moments,
+        points,
+        family.pdf(points, parameters[..., :1], parameters[..., 1:]),
+        means.tolist() if n_contexts == len(means) else [[None] * n_arms] * n_contexts,
+    )
+
+
+# Bounds from theory on the regret of bandit agents.
+
+
+def auer_bound(means: ArrayLike, pulls: ArrayLike) -> Floats:
+    """An upper bound on the expected regret of UCB1, by pulls, for rewards between 0 and 1.
+
+    Source: Auer, Cesa-Bianchi and Fischer (2002), theorem 1.
+    """
+    arms = np.asarray(means, dtype=np.float64)
+    gaps = arms.max() - arms
+    gaps = gaps[gaps > 0]
+    rate = (8 / gaps).sum()
+    return np.asarray(rate * np.log(pulls) + (1 + np.pi**2 / 3) * gaps.sum())
+
+
+def lai_robbins_slope(means: ArrayLike) -> float:
+    """Lower bound on the growth of the regret per logarithm of the pulls, for Bernoulli arms.
+
+    The bound is asymptotic: after a finite number of pulls the regret may be below it.
+
+    Args:
+        means: of the arms, shape (n_arms,), strictly between 0 and 1.
+
+    Source: Lai and Robbins (1985), theorem 1.
+    """
+    arms = np.asarray(means, dtype=np.float64)
+    best = arms.max()
+    worse = arms[arms < best]
+    divergence = special.rel_entr(worse, best) + special.rel_entr(1 - worse, 1 - best)
+    return float(((best - worse) / divergence).sum())
+
+
+def best_of_normals(n: int) -> float:
+    """The expected maximum of ``n`` independent standard normal variables."""
+    value, _ = integrate.quad(
+        lambda x: x * n * stats.norm.pdf(x) * stats.norm.cdf(x) ** (n - 1), -np.inf, np.inf
+    )
+    return float(value)
+
+
+def best_expected_reward(env: gym.Env[object, object]) -> float | None:
+    """The highest expected reward of a pull, averaged over contexts and over draws at reset.
+
+    None if it drifts with time, or has no closed form.
+    """
+    bandit = env.unwrapped
+    if getattr(bandit, "drift_std", 0.0) > 0:
+        return None
+    if getattr(bandit, "redraws", False):
+        if bandit.kind != "gaussian":  # type: ignore[attr-defined]
+            return None
+        return float(bandit.mean_loc + best_of_normals(bandit.n_arms))  # type: ignore[attr-defined]
+    means = getattr(bandit, "means", None)
+    if means is None:
+        return None
+    weights = getattr(bandit, "context_probabilities", np.ones(1))
+    return float(np.asarray(weights) @ np.asarray(means).max(axis=1))
+
+
+# The results of agents on a bandit: regret by pull, shares of the pulls, posteriors.
+
+SPREAD = f"{QUANTILES[-1] - QUANTILES[0]:.0%}"  # of the runs lie between the outer quantiles
+
+Pulls = Mapping[str, PullStatistics]
+
+
+@dataclass(frozen=True)
+class RegretBounds:
+    """Bounds on the regret from theory, each of shape (n_points,)."""
+
+    pulls: Ints
+    auer: Floats
+    lai_robbins: Floats
+
+
+@dataclass(frozen=True)
+class ArmSeries:
+    """Arms in the order of contexts, each array of shape (n_contexts * n_arms,)."""
+
+    names: list[str]  # of the arms
+    means: Floats  # their true mean rewards
+    # By agent, each arm's share of the pulls in its context.
+    shares: Mapping[str, Floats]
+    # By agent with estimates of the means: mean and standard deviation over runs, at the end.
+    estimates: Mapping[str, tuple[Floats, Floats]]
+
+
+@dataclass(frozen=True)
+class PullSeries:
+    """The numbers to draw for a bandit."""
+
+    pulls: Pulls  # figures by pull of each agent, the best first
+    best: float | None  # the highest expected reward of a pull, if known
+    # For Bernoulli arms without contexts that are the same in all runs; else None.
+    bounds: RegretBounds | None
+    arms: ArmSeries | None  # None where arms differ between runs
+    beliefs: tuple[Belief, ...]  # of the agents with posteriors
+
+    @property
+    def n_runs(self) -> int:
+        """How many runs the figures are over."""
+        return len(next(iter(self.pulls.values())).total_reward)
+
+
+def pull_series(results: StudyResults, environment: EnvironmentAnalysis) -> PullSeries | None:
+    """The numbers to draw for a bandit; None for another environment."""
+    label = environment.environment
+    pulls = {
+        agent.agent: results.pulls[agent.agent, label]
+        for agent in environment.agents
+        if (agent.agent, label) in results.pulls
+    }
+    if not pulls:
+        return None
+    env = make_single_env(next(p for p in results.planned if p.environment == label).spec)
+    try:
+        best, bounds = best_expected_reward(env), regret_bounds(env, next(iter(pulls.values())))
+    finally:
+        env.close()
+    known = {agent: found for agent, found in pulls.items() if found.true_means.size}
+    beliefs = [belief(results, agent, p) for agent, p in known.items() if len(p.moments)]
+    return PullSeries(pulls, best, bounds, arm_series(known), tuple(beliefs))
+
+
+def mean_regret(statistics: PullStatistics) -> Curve:
+    """Cumulative regret: the mean over runs with its 95 % interval."""
+    mean, reach = statistics.cumulative_regret, 1.96 * statistics.cumulative_regret_sem
+    return Curve(statistics.pulls.astype(np.float64), mean, mean - reach, mean + reach)
+
+
+def regret_of_runs(statistics: PullStatistics) -> Curve:
+    """Cumulative regret: the median over runs, and the outer quantiles as its interval."""
+    low, *_, high = statistics.cumulative_regret_quantiles
+    median = statistics.cumulative_regret_quantiles[QUANTILES.index(0.5)]
+    return Curve(statistics.pulls.astype(np.float64), median, low, high)
+
+
+def regret_bounds(env: gym.Env[Any, Any], statistics: PullStatistics) -> RegretBounds | None:
+    """The bounds on the regret from theory; None if their conditions do not hold."""
+    bandit: Any = env.unwrapped
+    means, pulls = statistics.true_means, statistics.pulls
+    if bandit.kind != "clicks" or len(means) != 1 or means.max() == means.min():
+        return None
+    slope = lai_robbins_slope(means[0])
+    return RegretBounds(pulls, auer_bound(means[0], pulls), slope * np.log(pulls))
+
+
+def arm_series(known: Pulls) -> ArmSeries | None:
+    """Shares and estimates of arms that are the same in all runs; None if there are none."""
+    if not known:
+        return None
+    means = next(iter(known.values())).true_means
+    contexts, arms = means.shape
+    return ArmSeries(
+        names=[
+            f"arm {arm}" if contexts == 1 else f"context {context}, arm {arm}"
+            for context in range(contexts)
+            for arm in range(arms)
+        ],
+        means=means.ravel(),
+        shares={agent: statistics.shares.ravel() for agent, statistics in known.items()},
+        estimates={
+            agent: (
+                np.broadcast_to(statistics.estimates, means.shape).ravel(),
+                np.broadcast_to(statistics.estimates_std, means.shape).ravel(),
+            )
+            for agent, statistics in known.items()
+            if np.isfinite(statistics.estimates).any()
+        },
+    )
+
+
+# The metric of each run, and the means with their intervals.
+
+LEAST_VALUES = 3  # the smallest number of values of a parameter for a figure
+
+
+@dataclass(frozen=True)
+class AgentRuns:
+    """The metric of an agent's runs."""
+
+    agent: str  # its label
+    mean: Estimate  # the mean over runs with its interval
+    seeds: Ints  # of the runs, shape (n_runs,)
+    values: Floats  # of the metric, finite, shape (n_runs,)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Means by the one parameter that an agent was swept over."""
+
+    parameter: str  # its symbol, for an axis
+    means: Curve  # by its value, with their intervals
+    labels: tuple[str, ...]  # of the agents in that order
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Means by the two parameters that an agent was swept over."""
+
+    # Their symbols, for the axes: the parameter of the rows and that of the columns.
+    parameters: tuple[str, str]
+    down: list[str]  # values of the rows' parameter
+    across: list[str]  # values of the columns' parameter
+    means: Floats  # shape (down, across), NaN where there is no run
+    labels: list[list[str]]  # of the agents in the cells; empty where there is none
+
+    def shares(self, *, is_cost: bool) -> Floats:
+        """Each mean scaled to [0, 1], from the worst mean to the best."""
+        known = self.means[np.isfinite(self.means)]
+        low, high = known.min(initial=np.inf), known.max(initial=-np.inf)
+        shares = (self.means - low) / (high - low if high > low else 1.0)
+        return np.asarray(1 - shares if is_cost else shares)
+
+
+def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> list[AgentRuns]:
+    """The metric of each run on an environment; the best agent first."""
+    values = values_over_seeds(results, environment.environment, results.study.metric)
+    found = []
+    for agent in environment.agents:
+        there = np.flatnonzero(np.isfinite(values[agent.agent]))
+        runs, seeds = values[agent.agent][there], there + results.study.first_seed
+        found.append(AgentRuns(agent.agent, agent.metric.mean, seeds, runs))
+    return found
+
+
+def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Sweep]:
+    """The means of each agent swept over one parameter, in the order of its values."""
+    found: dict[str, Sweep] = {}
+    means = {agent.agent: agent.metric.mean for agent in environment.agents}
+    for (group, name), members in _groups(agents, environment, 1).items():
+        numbers = [(one.swept[name], one.label) for one in members]
+        by_value = {float(x): label for x, label in numbers if isinstance(x, int | float)}
+        if len(by_value) >= LEAST_VALUES:
+            x, labels = zip(*sorted(by_value.items()), strict=True)
+            rows = [(e.point, e.low, e.high) for e in map(means.__getitem__, labels)]
+            found[group] = Sweep(symbol(name), Curve(np.array(x), *np.array(rows).T), labels)
+    return found
+
+
+def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Grid]:
+    """The means of each agent swept over two parameters, by the values of both."""
+    found: dict[str, Grid] = {}
+    means = {agent.agent: agent.metric.mean for agent in environment.agents}
+    for (group, *names), members in _groups(agents, environment, 2).items():
+        down, across = ([str(one.swept[name]) for one in members] for name in names)
+        rows, columns = list(dict.fromkeys(down)), list(dict.fromkeys(across))
+        at = dict(zip(zip(down, across, strict=True), (one.label for one in members), strict=True))
+        labels = [[at.get((row, column), "") for column in columns] for row in rows]
+        if len(rows) > 1 and len(columns) > 1:
+            points = [[means[at].point if at else np.nan for at in row] for row in labels]
+            parameters = symbol(names[0]), symbol(names[1])
+            found[group] = Grid(parameters, rows, columns, np.array(points), labels)
+    return found
+
+
+def with_best_mean(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
+    """Which of these agents have the best mean."""
+    means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in labels}
+    best = next(iter(means.values()), math.nan)
+    return [label for label, mean in means.items() if math.isclose(mean, best)]
+
+
+def _groups(
+    agents: Sequence[AgentSpec], environment: EnvironmentAnalysis, n_parameters: int
+) -> dict[tuple[str, ...], list[AgentSpec]]:
+    """The agents with a mean here in each sweep over ``n_parameters``, by label and parameters."""
+    groups: dict[tuple[str, ...], list[AgentSpec]] = {}
+    there = {agent.agent for agent in environment.agents}
+    for spec in agents:
+        if len(spec.swept) == n_parameters and spec.label in there:
+            groups.setdefault((spec.group, *spec.swept), []).append(spec)
+    return groups
+
+
+# All numbers in the figures of a study, the same for paper and for the page.
+
+
+@dataclass(frozen=True)
+class EnvironmentSeries:
+    """The numbers to draw for an environment."""
+
+    environment: EnvironmentAnalysis  # how the agents did on it
+    # By kind; None for bandits, whose curves are by pull.
+    curves: Mapping[str, LearningCurves] | None
+    runs: Sequence[AgentRuns]  # the best agent first
+    pulls: PullSeries | None  # on bandits; else None
+    sweeps: Mapping[str, Sweep]  # by agent, where it was swept over one parameter
+    grids: Mapping[str, Grid] = field(default_factory=dict)  # by agent, where it was swept over two
+
+
+@dataclass(frozen=True)
+class StudySeries:
+    """The numbers to draw for a study."""
+
+    analysis: StudyAnalysis  # the study
+    marks: Mapping[str, Mark]  # how each agent is drawn
+    environments: tuple[EnvironmentSeries, ...]  # by environment
+
+
+def study_series(analysis: StudyAnalysis, tell: Tell = tell_nobody) -> StudySeries:
+    """Compute all that is drawn; most of the time goes into the intervals of the curves."""
+    results, agents = analysis.results, analysis.study.agents
+    environments = []
+    for one in analysis.environments:
+        tell(one.environment)
+        pulls = pull_series(results, one)
+        found = EnvironmentSeries(
+            environment=one,
+            curves=learning_curves(results, one) if pulls is None else None,
+            runs=run_series(results, one),
+            pulls=pulls,
+            sweeps=sweeps(agents, one),
+            grids=grids(agents, one),
+        )
+        environments.append(found)
+    return StudySeries(analysis, agent_marks(analysis.study), tuple(environments))

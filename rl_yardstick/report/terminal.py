@@ -1,0 +1,336 @@
+"""A study in the terminal."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import pandas as pd
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+
+from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from rl_yardstick.experiments.off_policy.estimators import difference_in_value, mean_reward
+from rl_yardstick.experiments.plan import tuning_seeds
+from rl_yardstick.experiments.study import METRIC_WORDS, StudySpec
+from rl_yardstick.report.conclusions import (
+    conclusion,
+    overall_sentences,
+    pairs_both_ways,
+    seeds_of,
+    unseen_sentence,
+)
+from rl_yardstick.report.ranking import BANDIT_COLUMNS, COLUMNS, Column, Row, filled
+from rl_yardstick.report.words import enumeration, number, optimum_words, seed_sentence
+from rl_yardstick.verdicts import FEW, Estimate
+
+if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
+    from rl_yardstick.experiments.off_policy.logged_policies import Comparison, Judged
+
+# A study in the terminal.
+
+MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
+UNBOUNDED = 10_000  # columns
+# Columns to drop, in this order, while a table is wider than the terminal, and then all but the
+# first, from the right; the page has all.
+FIRST_LEFT_OUT = (
+    *("training", "median", "stays from", "simple regret", "reward"),
+    *("CPU time", "score", "best arm"),
+)
+
+
+def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
+    """Print a table and a conclusion for each environment, then a sentence on the seeds."""
+    for sentence in overall_sentences(analysis):
+        console.print()
+        console.print(sentence, highlight=False)
+    for environment in analysis.environments:
+        console.print()
+        _print_ranking(console, analysis, environment)
+        _print_conclusion(console, analysis.study, environment)
+    console.print()
+    if unseen := unseen_sentence(analysis):
+        console.print(unseen, highlight=False)
+    origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
+    console.print(origin, highlight=False)
+
+
+def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
+    """Print the lead, the pairs (as a table of words for three agents or more), and the notes."""
+    said = conclusion(study, environment)
+    told: list[str | Table] = [said.lead]
+    table = _words_of_pairs(environment)
+    fits = len(environment.agents) > 2 and _width(console, table) <= console.width
+    told += [table] if fits else said.pairs
+    for each in (*told, *said.notes):
+        console.print(each, highlight=False)
+
+
+def _words_of_pairs(environment: EnvironmentAnalysis) -> Table:
+    """The word on the agent of each row, against the agents below it in the ranking."""
+    names = [agent.agent for agent in environment.agents]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("", overflow="fold", max_width=MOST_AGENT_WIDTH)
+    for name in names[1:]:
+        table.add_column(f"vs {name}", overflow="fold", max_width=MOST_AGENT_WIDTH)
+    pairs = pairs_both_ways(environment.pairs)
+    for place, name in enumerate(names[:-1], start=1):
+        words = [
+            pairs[name, other].text if (name, other) in pairs else "" for other in names[place:]
+        ]
+        table.add_row(name, *[""] * (place - 1), *words)
+    return table
+
+
+def _print_ranking(
+    console: Console, analysis: StudyAnalysis, environment: EnvironmentAnalysis
+) -> None:
+    pulls, label = analysis.results.pulls, environment.environment
+    rows = [
+        Row(agent, environment, pulls.get((agent.agent, label))) for agent in environment.agents
+    ]
+    on_bandit = [row for row in rows if row.pulls is not None]
+    if on_bandit:
+        left_out = _print_fitting(console, label, BANDIT_COLUMNS, on_bandit)
+        explained = _bandit_caption(analysis.study, left_out)
+    else:
+        columns = [column for column in COLUMNS if column.terminal]
+        title = label
+        if environment.optimum is not None:
+            ends = environment.optimum, environment.optimum_at_least
+            title += f": optimum {optimum_words(*ends, environment.optimum_is_proven)}"
+            title += f", best random or constant policy {number(environment.baseline)}"
+        left_out = _print_fitting(console, title, columns, rows)
+        explained = _caption(analysis.study, environment, left_out)
+    if left_out:
+        explained.append(f"a wider terminal shows {enumeration(left_out)} too")
+    # As wide as the terminal, and not as the table, which may be narrow.
+    console.print("; ".join(explained), style="italic dim", highlight=False)
+
+
+def _print_fitting(
+    console: Console, title: str, columns: Sequence[Column], rows: Sequence[Row]
+) -> list[str]:
+    """Print a table with the columns that fit; return the headings of the others."""
+    cells = {"agent": [row.agent.marked for row in rows]}
+    for column, found in filled(columns, rows):
+        cells[column.terminal] = [cell.in_line or cell.text for cell in found]
+    order = (*FIRST_LEFT_OUT, *(column.terminal for column in columns[:0:-1]))
+    table, left_out = _fitting(console, cells, order, MOST_AGENT_WIDTH)
+    table.title = title
+    console.print(table, crop=False)
+    return left_out
+
+
+def _fitting(
+    console: Console, cells: dict[str, list[str]], order: Sequence[str], most: int = UNBOUNDED
+) -> tuple[Table, list[str]]:
+    """A table with the columns that fit, and the headings of the others, left out in this order.
+
+    Numbers never wrap. Names, in the first column, wrap at ``most``, and earlier where all columns
+    that may be left out are. A table that still does not fit runs beyond the edge of the terminal.
+    """
+    heading, *_ = cells
+    longest = max(map(len, [heading, *cells[heading]]))
+    left_out: list[str] = []
+    to_leave_out = list(dict.fromkeys(each for each in order if each in cells))
+
+    def table(width: int) -> Table:
+        kept = {each: column for each, column in cells.items() if each not in left_out}
+        made = Table(title_justify="left")
+        made.add_column(heading, no_wrap=True, width=width)
+        for each in list(kept)[1:]:
+            made.add_column(each, justify="right", no_wrap=True)
+        for name, *row in zip(*kept.values(), strict=True):
+            made.add_row(folded(name, width), *row)
+        return made
+
+    def room() -> int:
+        return console.width - _width(console, table(LEAST_AGENT_WIDTH)) + LEAST_AGENT_WIDTH
+
+    while to_leave_out and min(longest, MOST_AGENT_WIDTH) > room():
+        left_out.append(to_leave_out.pop(0))
+    result = table(min(longest, most, max(room(), LEAST_AGENT_WIDTH)))
+    needed = _width(console, result)
+    result.width = needed if needed > console.width else None
+    return result, left_out
+
+
+def folded(name: str, width: int, ends: Sequence[str] = (r"[\s/,]", "[_=-]")) -> str:
+    """A name in lines of at most ``width`` letters, which end at the first ``ends`` if possible."""
+    if len(name) <= width or not ends:
+        return "\n".join(name[k : k + width] for k in range(0, len(name), width))
+    lines = [""]
+    for word in re.split(f"(?<={ends[0]})", name):
+        if lines[-1] and len(lines[-1] + word.rstrip()) > width:
+            lines.append("")
+        lines[-1] += word
+    return "\n".join(folded(line.rstrip(), width, ends[1:]) for line in lines)
+
+
+def _caption(
+    study: StudySpec, environment: EnvironmentAnalysis, left_out: Sequence[str]
+) -> list[str]:
+    rows = [Row(agent, environment) for agent in environment.agents]
+    on_variant = any(agent.on_variant for agent in environment.agents)
+    words = {
+        "threshold": number(environment.threshold),
+        "failed": number(environment.failure_threshold),
+        "variants": " (*: on a variant of the environment)" if on_variant else "",
+    }
+    n_runs = [agent.n_runs for agent in environment.agents]
+    what = "the range of the runs" if max(n_runs, default=0) < FEW else "95 % intervals"
+    told = [f"mean: {METRIC_WORDS[study.metric]} over {seeds_of(study, environment)}, with {what}"]
+    if any(agent.metric.mean.low == agent.metric.mean.high for agent in environment.agents):
+        told[0] += " (none where all runs are equal)"
+    for column, _ in filled(COLUMNS, rows):
+        if column.terminal and column.caption and column.terminal not in left_out:
+            told.append(f"{column.terminal}: {column.caption.format(**words)}")
+    return told
+
+
+def _bandit_caption(study: StudySpec, left_out: Sequence[str]) -> list[str]:
+    explained = [
+        f"regret: sum over the pulls of a run, with 95 % intervals over {study.n_seeds} runs"
+    ]
+    if "simple regret" not in left_out:
+        explained.append("simple regret: of recommending the arm pulled most")
+    last = [name for name in ("reward", "best arm") if name not in left_out]
+    return [*explained, f"{', '.join(last)}: at the last pulls"] if last else explained
+
+
+def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
+    """Print the table of `episodes_table`, with as many agents side by side as fit."""
+    for environment, rows in table.groupby("environment", sort=False):
+        title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
+        left = list(dict.fromkeys(rows["agent"]))
+        while left:
+            for n in range(len(left), 0, -1):
+                printed = _episodes(title, rows, left[:n])
+                if (needed := _width(console, printed)) <= console.width:
+                    break
+            printed.width = needed if needed > console.width else None
+            console.print()
+            console.print(printed, crop=False)
+            left = left[n:]
+
+
+def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
+    printed = Table(title=title, title_justify="left")
+    printed.add_column("episode", justify="right")
+    for agent in agents:
+        printed.add_column(folded(str(agent), MOST_AGENT_WIDTH), justify="right", no_wrap=True)
+    cells = {
+        (row["episode"], row["agent"]): "  ".join(
+            number(row[name]) for name in ("average", "minimum", "maximum")
+        )
+        for _, row in rows.iterrows()
+    }
+    for episode in sorted(set(rows["episode"])):
+        printed.add_row(f"{episode:,}", *(cells.get((episode, agent), "-") for agent in agents))
+    return printed
+
+
+def _width(console: Console, table: Table) -> int:
+    return Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum
+
+
+# ``compare.py --logged``: policies on a log as a table and in sentences.
+
+# With a smaller effective sample size, the interval of an estimate is unreliable.
+FEW_PULLS = 100
+SHORT, MOST_DECIMALS = 3, 6
+# Columns to drop, in this order, while the table is wider than the terminal.
+OFF_POLICY_LEFT_OUT = ("IPS", "self-normalised", "direct", "effective")
+
+
+def print_comparison(console: Console, comparison: Comparison) -> None:
+    """Print the table, sentences on it, and the notes."""
+    data = comparison.data
+    title = f"{data.source}: {len(data):,} pulls, {data.n_arms} arms"
+    console.print(title, style="italic", highlight=False)
+    table, left_out = _fitting(console, _off_policy_cells(comparison), OFF_POLICY_LEFT_OUT)
+    console.print(table, crop=False)
+    explained = (
+        "mean reward a pull, ± half the 95 % interval; effective: effective sample size in pulls; "
+        "differences below: simultaneous 95 % intervals"
+    )
+    explained += f"; a wider terminal shows {enumeration(left_out)} too" if left_out else ""
+    console.print(explained, style="italic dim", highlight=False)
+    for sentence in [*sentences(comparison), *comparison.notes]:
+        console.print(f"  {sentence}")
+
+
+def _off_policy_cells(comparison: Comparison) -> dict[str, list[str]]:
+    """The cells of the table by heading."""
+    terms = [row.terms for row in comparison.rows]
+    return {
+        "policy": [row.name for row in comparison.rows],
+        "IPS": [shown(mean_reward(one.ips)) for one in terms],
+        "self-normalised": [shown(mean_reward(one.snips)) for one in terms],
+        "direct": [shown(mean_reward(one.direct)) for one in terms],
+        "doubly robust": [shown(mean_reward(one.doubly_robust)) for one in terms],
+        "effective": [f"{one.effective:,.0f}" for one in terms],
+    }
+
+
+def sentences(comparison: Comparison) -> list[str]:
+    """Doubly robust: each given policy against the best alternative and the best given policy.
+
+    The best are chosen on the same log. So the intervals are simultaneous over all pairs that could
+    have been chosen.
+    """
+    given = [row for row in comparison.rows if row.is_given]
+    alternatives = [row for row in comparison.rows if not row.is_given]
+    alternative, leader = (
+        max(rows, key=lambda row: row.terms.doubly_robust.mean()) for rows in (alternatives, given)
+    )
+    n_pairs = len(given) * len(alternatives) + math.comb(len(given), 2)
+    pairs = [(row, alternative) for row in given]
+    pairs += [(leader, row) for row in given if row is not leader]
+    result = [_difference(*pair, n_pairs) for pair in pairs]
+    result += [
+        f"{row.name} rests on {row.terms.effective:.0f} effective pulls: too few to rely on its "
+        "intervals"
+        for row in given
+        if row.terms.effective < FEW_PULLS
+    ]
+    return result
+
+
+def _difference(first: Judged, second: Judged, n_pairs: int) -> str:
+    difference = difference_in_value(first.terms, second.terms, n_pairs)
+    if difference.low == difference.high == 0:
+        return f"{first.name} and {second.name} do the same on this log"
+    decimals = _decimals(difference)
+    point, low, high = (
+        f"{value:+.{decimals}f}" for value in (difference.point, difference.low, difference.high)
+    )
+    return (
+        f"{first.name} against {second.name}: {point} [{low}, {high}] a pull, {verdict(difference)}"
+    )
+
+
+def verdict(difference: Estimate) -> str:
+    """What the interval of a difference says."""
+    if difference.low > 0:
+        return "better"
+    return "worse" if difference.high < 0 else "undecided"
+
+
+def shown(estimate: Estimate) -> str:
+    """A figure and half its interval, which is symmetric."""
+    decimals = _decimals(estimate)
+    half = (estimate.high - estimate.low) / 2
+    return f"{estimate.point:.{decimals}f} ± {half:.{decimals}f}"
+
+
+def _decimals(estimate: Estimate) -> int:
+    """The number of decimals that gives half the interval two significant digits."""
+    half = (estimate.high - estimate.low) / 2
+    if not half > 0:
+        return SHORT
+    return min(max(1 - math.floor(math.log10(half)), 0), MOST_DECIMALS)

@@ -1,0 +1,172 @@
+"""An explanation in words: where an agent loses return, in at most twelve lines."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from rl_yardstick.diagnosis.explanation import Explanation, Part, Parting, StateLoss
+    from rl_yardstick.experiments.interventions import Tried
+
+# A part below this share of the gap has no line.
+LEAST_SHARE = 0.02
+# The least share of the gap that a change closes to count as a remedy.
+REMEDY = 0.05
+MOST_STATES = 3
+
+
+def why_lines(explained: Explanation) -> list[str]:
+    """How episodes end, the gap and its parts, the gap in the agent's own objective, its states."""
+    if explained.is_optimal:
+        return [f"optimal: it returns {explained.value:.6g}, and no policy returns more"]
+    gap, optimum = explained.gap, explained.optimum
+    told = [
+        explained.ending,
+        f"gap {gap:.4g}: it returns {explained.value:.6g}, the optimum is {optimum:.6g}",
+    ]
+    shown = [part for part in explained.parts if _is_shown(part, gap)]
+    told += [f"  {part.loss:>9.4g} {part.name}: {part.meaning}" for part in shown]
+    if explained.own_gap is not None:
+        own = f"in its own objective, at discount {explained.discount:g}"
+        told.append(f"the gap at the start {own}: {explained.own_gap:.4g}")
+    if explained.is_concentrated:
+        worst = explained.states[:MOST_STATES]
+        told += [_state(state, gap) for state in worst if state.loss >= LEAST_SHARE * gap]
+    elif explained.road:
+        told.append(explained.road)
+    if explained.repairs:
+        told.append(_repairs(explained))
+    return told
+
+
+@dataclass(frozen=True)
+class Why:
+    """The explanation of one run."""
+
+    lines: list[str]
+    proposal: str | None  # a change that may help, as ``explain.py --test`` takes it
+
+
+def whys_of(runs: Sequence[tuple[TrainSpec, Path]]) -> list[Why | None]:
+    """Explain each run, given its spec and model zip; None where its gap cannot be split.
+
+    Call this in a child process: it loads PyTorch.
+    """
+    return [_why_of(spec, path) for spec, path in runs]
+
+
+def _why_of(spec: TrainSpec, path: Path) -> Why | None:
+    from rl_yardstick.diagnosis.explanation import explanation
+    from rl_yardstick.pipeline.evaluation.exact import evaluator_of
+    from rl_yardstick.pipeline.models.load import load_model
+
+    with suppress(UserError, OSError):
+        evaluator = evaluator_of(spec)
+        if evaluator is not None:
+            agent = load_model(spec.algo, path, modules=spec.user_modules, device="cpu")
+            found = explanation(spec, agent, evaluator)
+            return Why(why_lines(found), next(map(as_words, found.proposals), None))
+    return None
+
+
+def _is_shown(part: Part, gap: float) -> bool:
+    return part.name == "not observable" or abs(part.loss) >= LEAST_SHARE * gap
+
+
+def _state(state: StateLoss, gap: float) -> str:
+    """The loss in one state, and the agent's estimates of its actions' values."""
+    share = f"{state.loss / gap:.0%} of the gap"
+    text = f"  {state.name}: {share}, {state.visits:.3g} visits an episode; "
+    text += f"it does {state.action}, where {state.best} is best"
+    if state.action == state.best:
+        text = f"  {state.name}: {share}, {state.visits:.3g} visits an episode; {state.action} is "
+        text += "best on average, but not with few steps left"
+    elif state.believed is not None and state.true is not None:
+        told = [f"believes {value:.4g}" for value in state.believed]
+        told = [f"{one}, truly {true:.4g}" for one, true in zip(told, state.true, strict=True)]
+        if state.updates is not None:
+            told = [f"{one}, {n:,} updates" for one, n in zip(told, state.updates, strict=True)]
+        text += f" ({state.action}: {told[0]}; {state.best}: {told[1]})"
+    return text
+
+
+def _repairs(explained: Explanation) -> str:
+    told = []
+    for place, reached in explained.repairs:
+        share = (reached - explained.value) / explained.gap
+        told.append(f"{place}: {reached:.5g}, {share:.1%} of the gap regained")
+    return f"with the best action in {'; and in '.join(told)}"
+
+
+def parting_lines(parting: Parting) -> list[str]:
+    """Where two agents first act differently and what that costs, the largest loss first."""
+    better, worse = parting.names
+    difference = f"{better} returns {parting.difference:.4g} more than {worse}"
+    if not parting.places:
+        return [f"{difference}: their policies are the same in every state that they visit"]
+    told = [f"{difference}; they part in {parting.met:.1%} of the episodes, first at"]
+    return told + [
+        f"  {place.name}: in {place.met:.1%} of the episodes, worth {place.gain:.4g}; "
+        f"{better} does {place.actions[0]}, {worse} {place.actions[1]}"
+        for place in parting.places[:MOST_STATES]
+    ]
+
+
+def course_lines(course: Mapping[int, Explanation]) -> list[str]:
+    """A table of the gap and its parts by the steps of training."""
+    names = list(dict.fromkeys(part.name for one in course.values() for part in one.parts))
+    rows = [["steps", "gap", *names]]
+    for steps, one in course.items():
+        losses = {part.name: part.loss for part in one.parts}
+        parts = [f"{losses[name]:.4g}" if name in losses else "" for name in names]
+        rows.append([f"{steps:,}", f"{one.gap:.4g}", *parts])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.rjust, row, widths)) for row in rows]
+
+
+def as_words(change: str) -> str:
+    """A change as it is typed in a shell."""
+    return " ".join(map(shlex.quote, change.split()))
+
+
+def tried_lines(tried: Sequence[Tried], optimum: float) -> list[str]:
+    """The returns of each change by seed, and which change helps most; a hint and no verdict."""
+    from rl_yardstick.experiments.interventions import AS_IT_IS, SHIPPED
+
+    width = max(len(one.change) for one in tried)
+    told = []
+    for one in tried:
+        returns = " ".join(f"{value:.5g}" for value in one.finished)
+        mean = f"mean {one.mean:.5g}, {returns}" if returns else "no run finished"
+        told.append(f"  {one.change:<{width}}  {mean}")
+    before = next(one for one in tried if one.change.endswith(AS_IT_IS))
+    gap, n_seeds = optimum - before.mean, len(before.returns)
+    if not 1e-9 * max(1.0, abs(optimum)) < gap < np.inf:
+        return [
+            *told,
+            "as it is, every run is optimal" if gap < np.inf else "nothing to compare with",
+        ]
+    helpful: dict[str, tuple[float, int]] = {}
+    for one in tried:
+        least = np.minimum(before.returns + REMEDY * gap, optimum - REMEDY * gap)
+        closed, n_better = (one.mean - before.mean) / gap, int((one.returns >= least).sum())
+        if closed >= REMEDY and 2 * n_better >= n_seeds:
+            helpful[one.change] = closed, n_better
+    changes = {change: found for change, found in helpful.items() if change != SHIPPED}
+    if not changes:
+        told.append(f"no change closes {REMEDY:.0%} of the gap and helps half of the seeds")
+    for change in [max(changes or helpful, key=helpful.__getitem__)] if helpful else []:
+        closed, n_better = helpful[change]
+        share = f"closes {closed:.0%} of the gap on average"
+        told.append(f"{change} helps most: it {share}, in {n_better} of {n_seeds} seeds")
+    return [*told, "four seeds are a hint, compare.py gives a verdict"]

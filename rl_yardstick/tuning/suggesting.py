@@ -1,0 +1,261 @@
+"""Suggests the settings of trials, and plans their runs.
+
+The first trial has the shipped settings; the others are points of a grid, or come from one of
+Optuna's samplers. Samplers with the same seed in several drivers would draw the same settings, and
+a sampler that restarts after a kill would draw its first settings again. So each trial has its own
+generator, seeded by the search's seed and the trial's number: its settings do not depend on the
+driver, nor on the driver's start.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import random
+import warnings
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from optuna import Study, Trial
+from optuna.distributions import BaseDistribution
+from optuna.exceptions import ExperimentalWarning
+from optuna.samplers import BaseSampler, GPSampler, RandomSampler, TPESampler
+from optuna.trial import FixedTrial, FrozenTrial
+
+from rl_yardstick.experiments.plan import PlannedRun, check_settings, plan
+from rl_yardstick.experiments.study import AgentSpec, layered
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.files import json_text
+from rl_yardstick.pipeline.models.load import agent_class
+from rl_yardstick.pipeline.settings.values import algorithm_parameters
+from rl_yardstick.tuning.search_spaces import SearchSpace
+from rl_yardstick.tuning.tuning_spec import TuningSpec
+
+# Values of each number in the finest grid.
+MOST_VALUES = 100
+# The largest grid, so that a grid of many parameters is refused before it fills the memory.
+MOST_POINTS = 1_000_000
+
+
+class SeededSampler(BaseSampler):
+    """Makes a new sampler for each trial, and for each independently drawn parameter."""
+
+    def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
+        self._make, self._seed = make, seed
+
+    def _made(self, *numbers: int) -> BaseSampler:
+        seeds = np.random.SeedSequence([self._seed, *numbers])
+        return self._make(int(seeds.generate_state(1)[0]))
+
+    def infer_relative_search_space(
+        self, study: Study, trial: FrozenTrial
+    ) -> dict[str, BaseDistribution]:
+        # Optuna calls this first; the sampler is kept for the second call.
+        self._sampler = self._made(trial.number)
+        return self._sampler.infer_relative_search_space(study, trial)
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        return self._sampler.sample_relative(study, trial, search_space)
+
+    def sample_independent(
+        self,
+        study: Study,
+        trial: FrozenTrial,
+        param_name: str,
+        param_distribution: BaseDistribution,
+    ) -> Any:
+        # Seeded by name, because after a kill some parameters of a trial are stored and not drawn.
+        sampler = self._made(trial.number, zlib.crc32(param_name.encode()))
+        return sampler.sample_independent(study, trial, param_name, param_distribution)
+
+
+def make_sampler(tuning: TuningSpec) -> BaseSampler:
+    """Make the sampler of a tuning; a grid has fixed trials, and ignores its sampler.
+
+    Options are explicit although they are Optuna 5's defaults, because Optuna 5 changed them. TPE
+    draws parameters jointly (``multivariate``), conditional ones together with others of the same
+    condition (``group``), and treats running trials as bad ones (``constant_liar``), so that
+    parallel trials do not try the same settings.
+    """
+
+    def make(seed: int) -> BaseSampler:
+        match tuning.sampler:
+            case "tpe":
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", ExperimentalWarning)  # of ``group``, since 2.8
+                    return TPESampler(
+                        n_startup_trials=tuning.n_startup_trials,
+                        n_ei_candidates=24,
+                        seed=seed,
+                        multivariate=True,
+                        group=True,
+                        constant_liar=True,
+                    )
+            case "gp":
+                return GPSampler(
+                    seed=seed,
+                    independent_sampler=RandomSampler(seed=seed),
+                    n_startup_trials=tuning.n_startup_trials,
+                    deterministic_objective=False,
+                    warn_independent_sampling=False,
+                )
+            case "random" | "grid":
+                return RandomSampler(seed=seed)
+
+    return SeededSampler(make, tuning.seed)
+
+
+class Suggestions:
+    """Suggests hyperparameters for each trial; ``shipped`` includes the user's fixed settings."""
+
+    def __init__(self, tuning: TuningSpec, space: SearchSpace, shipped: Mapping[str, Any]) -> None:
+        self.tuning, self.shipped = tuning, dict(shipped)
+        self.space = space.including(self.shipped)
+        self.first = self.space.params_of(self.shipped)  # the parameters of the first trial
+        self._fixed = self._settled()
+        self.fits_batches = self._fits_batches()
+
+    def _settled(self) -> dict[str, Any]:
+        """The parameters of settings that the user has fixed."""
+        given = set(self.tuning.agent.settings)
+        dimensions = [each for each in self.space.entries.values() if given.issuperset(each.keys)]
+        names = [name for each in dimensions for name in each.distributions]
+        return {name: self.first[name] for name in names if name in self.first}
+
+    def _fits_batches(self) -> bool:
+        """Whether trials sample sizes of batches or buffers, and the agent splits its buffer."""
+        from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+        algorithm = agent_class(self.tuning.agent.algo)
+        keys = {"batch_size", "n_steps", "n_envs"} & set(self.space.keys)
+        return (
+            issubclass(algorithm, OnPolicyAlgorithm)
+            and "batch_size" in algorithm_parameters(algorithm)
+            and bool(keys - set(self.tuning.agent.settings))
+        )
+
+    @property
+    def n_free(self) -> int:
+        """The number of parameters to choose."""
+        return len(self.space.distributions().keys() - self._fixed.keys())
+
+    @cached_property
+    def grid(self) -> list[dict[str, Any]]:
+        """The points of the finest grid with fewer points than trials, in random order."""
+        n_trials, found = self.tuning.n_trials - 1, self._points(2)
+        if len(found) > n_trials:
+            raise UserError(
+                f"--sampler grid: {len(found):,} settings with two values of each number, beside "
+                f"the shipped ones, and --trials says {self.tuning.n_trials:,}: give more trials "
+                "or a smaller --search-space"
+            )
+        for n in range(3, MOST_VALUES + 1):
+            finer = self._points(n)
+            if not len(found) < len(finer) <= n_trials:
+                break
+            found = finer
+        random.Random(self.tuning.seed).shuffle(found)  # noqa: S311  # an order, and no secret
+        return found
+
+    def _points(self, n: int) -> list[dict[str, Any]]:
+        """The distinct points of a grid; conditional parameters can make points equal."""
+        values = {**self.space.grid(n), **{name: [v] for name, v in self._fixed.items()}}
+        points: dict[str, dict[str, Any]] = {}
+        for number, point in enumerate(itertools.product(*values.values())):
+            if number >= MOST_POINTS:
+                break
+            trial = FixedTrial(dict(zip(values, point, strict=True)))
+            self.space.suggest(trial)
+            points[json.dumps(trial.params, sort_keys=True)] = trial.params
+        return list(points.values())
+
+    @property
+    def n_trials(self) -> int:
+        """The number of trials; with a grid, at most one more than the number of points."""
+        if self.tuning.sampler == "grid":
+            return min(self.tuning.n_trials, 1 + len(self.grid))
+        return self.tuning.n_trials
+
+    def params(self, number: int) -> dict[str, Any]:
+        """Parameters of a trial that are fixed before sampling."""
+        if number == 0:
+            return self.first
+        if self.tuning.sampler == "grid":
+            return self.grid[number - 1]
+        return self._fixed
+
+    def entry(self, trial: Trial) -> dict[str, Any]:
+        """The hyperparameters of a trial."""
+        suggested = self.space.suggest(trial)
+        if trial.number == 0:
+            return self.shipped
+        return self.merged(suggested)
+
+    def merged(self, suggested: Mapping[str, Any]) -> dict[str, Any]:
+        """The shipped hyperparameters with suggested settings and the user's fixed settings."""
+        entry = self.space.merged(self.shipped, suggested)
+        entry = layered(entry, self.tuning.agent.settings)
+        return self._with_fitting_batch(entry) if self.fits_batches else entry
+
+    def _with_fitting_batch(self, entry: dict[str, Any]) -> dict[str, Any]:
+        """The entry with batches that divide the buffer of steps, as the library recommends.
+
+        If the user has fixed the batch size, the number of steps is changed instead. The sampler
+        keeps the parameters that it drew.
+        """
+        parameters = algorithm_parameters(agent_class(self.tuning.agent.algo))
+        found = {key: entry.get(key, parameters[key].default) for key in ("n_steps", "batch_size")}
+        n_steps, batch_size, n_envs = *found.values(), entry.get("n_envs", 1)
+        if batch_size is None:
+            return entry
+        if "batch_size" not in self.tuning.agent.settings:
+            divisors = [k for k in range(2, n_steps * n_envs + 1) if n_steps * n_envs % k == 0]
+            nearest = min(divisors, key=lambda k: abs(k - batch_size), default=batch_size)
+            return entry if nearest == batch_size else {**entry, "batch_size": nearest}
+        unit = batch_size // math.gcd(batch_size, n_envs)
+        nearest = max(round(n_steps / unit), 1) * unit
+        is_fixed = nearest == n_steps or "n_steps" in self.tuning.agent.settings
+        return entry if is_fixed else {**entry, "n_steps": nearest}
+
+
+# The runs of a trial: one for each seed; trials with equal settings share folders.
+
+
+def name_of(entry: Mapping[str, Any]) -> str:
+    """The name of settings; independent of their order."""
+    text = json_text({key: entry[key] for key in sorted(entry)})
+    return f"settings-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
+    """A planned run of the agent with the initial settings."""
+    return plan(replace(tuning.study, n_seeds=1), root)[0]
+
+
+def check_entry(tuning: TuningSpec, root: Path, entry: Mapping[str, Any]) -> None:
+    """Check that the agent can be made with settings of the space."""
+    where = "its space" if tuning.search_space is None else str(tuning.search_space)
+    agent = replace(_agent(tuning, tuning.agent.algo, entry), where=where)
+    study = replace(tuning.study, agents=(agent,), n_seeds=1)
+    check_settings(study, plan(study, root))
+
+
+def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
+    """Plan one run of a trial."""
+    agent = _agent(tuning, name_of(entry), entry)
+    study = replace(tuning.study, agents=(agent,), first_seed=seed, n_seeds=1)
+    (planned,) = plan(study, root)
+    return planned
+
+
+def _agent(tuning: TuningSpec, label: str, entry: Mapping[str, Any]) -> AgentSpec:
+    return AgentSpec(label, tuning.agent.algo, tuning.searched(entry), tuned=False)

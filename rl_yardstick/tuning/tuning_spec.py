@@ -1,0 +1,219 @@
+"""The specification of a tuning as one immutable value, and the value of a setting."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rl_yardstick.agents import ALGORITHMS
+from rl_yardstick.experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError, one_line, shown
+from rl_yardstick.pipeline.files import plain
+
+Floats = NDArray[np.float64]
+Sampler = Literal["tpe", "gp", "random", "grid"]
+Objective = Literal["mean", "iqm", "lower"]
+SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
+OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
+
+# The figure of a run: a metric of compare.py, the score, or the cost to reach the threshold.
+COST_OF_THRESHOLD = ("steps", "seconds")
+FIGURES = ("score", *METRICS, *COST_OF_THRESHOLD)
+CHEAPER_IS_BETTER = (*COSTS, *COST_OF_THRESHOLD)
+
+AUTO = "auto"
+SHIPPED = "shipped"
+LOWER = 0.25
+
+# Fields that may change when a tuning is continued; any other change makes another tuning.
+_OF_RETEST = ("retest", "retest_seeds", "first_retest_seed", "until_decided", "max_retest_seeds")
+_MAY_CHANGE = ("study", "n_trials", *_OF_RETEST)
+
+
+@dataclass(frozen=True)
+class TuningSpec:
+    """A search over settings of one agent on one environment, and the re-test of the best."""
+
+    #: The agent with its initial settings, called `SHIPPED`, the environment, and the common
+    #: settings of all runs. Its seeds are the seeds of trials. The agent's ``settings`` are fixed
+    #: in every trial.
+    study: StudySpec
+    n_trials: int = 100  #: number of settings to try
+    figure: str = AUTO  #: one of `FIGURES`; or `AUTO`, until the kind of runs is known
+    objective: Objective = "mean"  #: the value of a setting over its seeds, see `judged`
+    sampler: Sampler = "tpe"  #: the sampler of settings
+    pruner: str = "auto"  #: the rule that ends trials early
+    n_startup_trials: int = 10  #: random trials before the sampler learns
+    seed: int = 0  #: seed of the sampler, and of the order of seeds
+    search_space: Path | None = None  #: a file with the space; None for the agent's own
+    retest: int = 3  #: number of best settings in the re-test on held-out seeds
+    retest_seeds: int = 20  #: number of held-out seeds
+    first_retest_seed: int = 1000  #: the first held-out seed
+    until_decided: bool = False  #: whether the re-test grows until its winner is decided
+    max_retest_seeds: int | None = None  #: the most held-out seeds then; None for 50
+
+    @property
+    def agent(self) -> AgentSpec:
+        """The agent with its initial settings."""
+        return self.study.agents[0]
+
+    @property
+    def environment(self) -> EnvironmentSpec:
+        """The environment of the tuning."""
+        return self.study.environments[0]
+
+    @property
+    def is_cost(self) -> bool:
+        """Whether a lower figure is better."""
+        return self.figure in CHEAPER_IS_BETTER
+
+    @property
+    def is_judged_by_study(self) -> bool:
+        """Whether the verdicts of a study are about the figure and statistic of the search."""
+        return self.objective == "mean" and self.figure not in COST_OF_THRESHOLD
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds of every trial, in their common order."""
+        order = np.random.default_rng(self.seed).permutation(self.study.n_seeds)
+        return tuple(self.study.first_seed + int(place) for place in order)
+
+    @property
+    def held_out(self) -> range:
+        """The held-out seeds of the re-test."""
+        return range(self.first_retest_seed, self.first_retest_seed + self.retest_seeds)
+
+    def searched(self, entry: Mapping[str, Any]) -> dict[str, Any]:
+        """Settings for runs of the search, which may use another engine than the agent's own.
+
+        In the search, the library's agents use ``engine: auto`` unless the settings name an engine.
+        The re-test uses the engine of normal training.
+        """
+        engines = ALGORITHMS[self.agent.algo].engines
+        return {**({"engine": "auto"} if "auto" in engines[1:] else {}), **entry}
+
+    def check(self) -> None:
+        """Check that search and re-test share no seeds, and that a re-test can grow."""
+        held_out = self.held_out
+        if self.until_decided:
+            held_out = range(held_out.start, held_out.start + self._check_growing())
+        elif self.max_retest_seeds is not None:
+            raise UserError("--max-retest-seeds belongs to --until-decided: give both")
+        shared = sorted(set(self.seeds) & set(held_out))
+        if self.retest and shared:
+            raise UserError(
+                f"seed {shared[0]} is one of the search and of the re-test: what is chosen by its "
+                "seeds is judged on others; see --first-seed and --first-retest-seed"
+            )
+
+    def _check_growing(self) -> int:
+        """Check that the re-test can grow until decided; returns the most seeds."""
+        from rl_yardstick.experiments.growing import MOST_SEEDS
+
+        if not self.retest:
+            raise UserError("--until-decided is about the re-test: leave out --retest 0")
+        if not self.is_judged_by_study:
+            raise UserError(
+                "--until-decided decides means of scores, returns or regrets: leave it out, or "
+                f"--objective {self.objective} --metric {self.figure}"
+            )
+        most = self.max_retest_seeds or max(MOST_SEEDS, self.retest_seeds)
+        if most < (least := self.retest_seeds):
+            raise UserError(f"--max-retest-seeds is {most}, the re-test begins with {least} seeds")
+        return most
+
+    def identity(self, shipped: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
+        """The identity of this tuning as JSON."""
+        entry = self.searched(shipped)
+        data = plain(
+            {
+                **{key: value for key, value in vars(self).items() if key not in _MAY_CHANGE},
+                **({"search_engine": entry["engine"]} if entry.keys() - shipped.keys() else {}),
+                "algo": self.agent.algo,
+                "env": self.environment.env_id,
+                "hyperparams": dict(shipped),
+                "first_seed": self.study.first_seed,
+                "seeds_per_trial": self.study.n_seeds,
+                "eval_freq": self.study.eval_freq,
+                "eval_episodes": self.study.eval_episodes,
+                "threshold": self.study.threshold,
+                "search_space": dict(space),
+            }
+        )
+        assert isinstance(data, dict)
+        return data
+
+
+def judged(figures: Sequence[float] | Floats, objective: Objective, *, is_cost: bool) -> float:
+    """The value of a setting by its runs.
+
+    Args:
+        figures: the figures of its runs, at least one.
+        objective: ``mean``; ``iqm``, the mean of the middle half; ``lower``, the quartile on the
+            side of the worst runs.
+        is_cost: whether a lower figure is better; ``lower`` is then the upper quartile.
+    """
+    values = np.sort(np.asarray(figures, np.float64))
+    if objective == "lower":
+        return float(np.quantile(values, 1 - LOWER if is_cost else LOWER))
+    cut = len(values) // 4 if objective == "iqm" else 0
+    return float(values[cut : len(values) - cut].mean())
+
+
+# The type of ``--storage``, and one-line messages for its failures: Optuna itself is loaded later.
+
+OWN_FILE = "trials.db"
+KNOWN = "a file for a journal, sqlite:///FILE, postgresql://..., mysql://..., grpc://HOST:PORT"
+# Packages whose errors are failures of the storage.
+_LIBRARIES = frozenset({"optuna", "sqlalchemy", "sqlite3", "grpc", "json"})
+_DATABASES = ("sqlite", "postgresql", "mysql", "mariadb")
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://)", re.IGNORECASE)
+_SECRET = re.compile(r"(?<=://)([^\s/@:]*):[^\s/@]*@")
+
+
+def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
+    """The type of a storage by its name."""
+    scheme = _SCHEME.match(given)
+    if scheme is None:
+        return "journal"
+    name = scheme[0].partition("+")[0].lower()
+    if name not in (*_DATABASES, "grpc"):
+        raise UserError(f"--storage: {shown(without_secret(given))} is no storage: {KNOWN}")
+    return "proxy" if name == "grpc" else "database"
+
+
+def without_secret(text: str) -> str:
+    """The text without the passwords in its URLs."""
+    return _SECRET.sub(r"\1:***@", text)
+
+
+@contextlib.contextmanager
+def failing_in_a_line(given: str | None) -> Iterator[None]:
+    """Report a failure of the storage in one line: full, unreachable, or damaged."""
+    try:
+        yield
+    except Exception as error:
+        if not _LIBRARIES & {kind.__module__.partition(".")[0] for kind in type(error).__mro__}:
+            raise
+        name = OWN_FILE if given is None else f"--storage {without_secret(given)}"
+        goes_on = "; finished work is kept, and the same command continues"
+        if isinstance(error, json.JSONDecodeError):
+            name, goes_on = f"{name} is damaged", ""
+        raise UserError(f"{name}: {reason_of(error)}{goes_on}") from error
+
+
+def reason_of(error: Exception) -> str:
+    """A library's message in one line, without questions, links to its manual, and passwords."""
+    cause = error.__cause__ if type(error).__name__ == "StorageInternalError" else None
+    said = one_line(cause or error)
+    for rest in ("(Background on", "[SQL: "):
+        said = said.partition(rest)[0]
+    return without_secret(said.strip())

@@ -1,0 +1,395 @@
+"""Which agent is better: one word for each pair of agents, from their scores over seeds.
+
+Welch's test for every pair in every environment, with Holm's correction over all pairs of the
+study in two families: 80 % of the level for differences, 20 % for ties, which are two one-sided
+tests against a margin. Words, intervals and the best agents are read from the same tests. Nothing
+is random. A failure that no run showed is not counted; ``AgentRuns.unseen`` bounds its frequency.
+docs/statistics.md has the reasons, and how often a word is wrong.
+
+    study = judge({"CartPole-v1": {"dqn": [500, 498, 500], "ppo": [500, 500, 500]}}, margin=10)
+    print(study.best["CartPole-v1"], study.pairs[0].text)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Literal, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rl_yardstick.verdicts.estimates import (
+    FEW,
+    LEVEL,
+    UNBOUNDED,
+    Bounds,
+    finite,
+    mean_over_runs,
+    share_interval,
+    unseen_share,
+)
+from rl_yardstick.verdicts.welch import (
+    Difference,
+    difference_interval,
+    holm,
+    p_different,
+    p_tied,
+    sample,
+    seeds_needed,
+    student,
+    welch,
+)
+
+Word = Literal["better", "worse", "tied", "undecided"]
+OPPOSITE: dict[Word, Word] = {"better": "worse", "worse": "better"}
+
+FEW_FOR_TIES = 10  # with fewer runs "tied" holds only so far: rare failures may be missing
+FOR_TIES = 0.2  # the share of the level for ties
+
+Key = tuple[str, str, str]  # environment, first agent, second agent
+Scores = Mapping[str, Mapping[str, ArrayLike]]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class AgentRuns:
+    """The runs of an agent in an environment. Its intervals hold alone, in 95 % of cases."""
+
+    environment: str
+    name: str
+    n: int  #: runs with a score
+    n_missing: int
+    mean: float
+    mean_interval: Bounds  #: Student's t, cut at the bounds; the range below five runs
+    median: float
+    failed: int | None  #: runs below ``Study.failure_threshold``; None where that is not known
+    failed_interval: Bounds  #: of the share of runs that fail
+    unseen: float  #: the largest share of further runs of a kind that no run showed
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two agents in an environment. The word is about the first."""
+
+    environment: str
+    first: str
+    second: str
+    word: Word
+    so_far: bool  #: whether runs are few: below five, below ten for ``tied``
+    difference: float  #: mean of the first minus mean of the second
+    interval: Bounds  #: at ``Study.interval_level``; it agrees with the word
+    p_different: float  #: corrected for all pairs of the study: different at 0.8 of the level
+    p_tied: float  #: likewise: tied at 0.2 of the level
+    n: int  #: the fewer runs of the two
+    #: where undecided: so many seeds of each would decide, if further runs are like these
+    seeds_needed: int | None = None
+
+    @property
+    def text(self) -> str:
+        """The word, with "so far" where runs are few."""
+        return f"{self.word} so far" if self.so_far else self.word
+
+    def swapped(self) -> Pair:
+        """The same pair from the second agent's point of view."""
+        return replace(
+            self,
+            first=self.second,
+            second=self.first,
+            word=OPPOSITE.get(self.word, self.word),
+            difference=-self.difference,
+            interval=(-self.interval[1], -self.interval[0]),
+        )
+
+
+@dataclass(frozen=True)
+class Best:
+    """The agents than which no other is shown to be better."""
+
+    agents: tuple[str, ...]  #: by mean, the highest first
+    tied: bool  #: whether all of them are tied
+    so_far: bool  #: whether runs are few for the words behind it
+
+    def __str__(self) -> str:
+        words = [] if len(self.agents) < 2 else ["tied" if self.tied else "undecided"]
+        words += ["so far"] if self.so_far and words != ["undecided"] else []
+        names = ", ".join(self.agents) or "none"
+        return f"{names} ({' '.join(words)})" if words else names
+
+
+@dataclass(frozen=True)
+class Study:
+    """The verdicts of a study."""
+
+    agents: list[AgentRuns]
+    pairs: list[Pair]
+    best: dict[str, Best]  #: by environment
+    failure_threshold: dict[str, float]  #: by environment; NaN where failures have no meaning
+    interval_level: float  #: one minus the confidence of each interval of a difference
+    #: With ``looks``, by environment and agent, its seeds at the next look: as many as at the last
+    #: where all its pairs are decided.
+    seeds: dict[str, dict[str, int]]
+    n_looks: int = 1  #: the number of looks so far
+    is_done: bool = True  #: whether no agent lacks seeds for another look
+
+
+class _Evidence(NamedTuple):
+    """A pair's smallest p-values over all looks so far, each with the runs behind it."""
+
+    different: tuple[float, Difference]
+    tied: tuple[float, Difference]
+    last: Difference
+
+
+class _Rules(NamedTuple):
+    """What is the same at every look."""
+
+    bounds: Bounds | Mapping[str, Bounds] | None
+    margin: float | Mapping[str, float]
+    level: float  # of one look
+    n_looks: int
+    baseline: float | Mapping[str, float | None] | None
+    certain: Collection[tuple[str, str]]
+    paired: bool
+    against: str
+
+    def ends(self, environment: str) -> Bounds:
+        return _of(self.bounds, environment) or UNBOUNDED
+
+
+def judge(
+    scores: Scores,
+    *,
+    bounds: Bounds | Mapping[str, Bounds] | None = None,
+    margin: float | Mapping[str, float] = 0.02,
+    level: float = LEVEL,
+    n_looks: int = 1,
+    baseline: float | Mapping[str, float | None] | None = 0.0,
+    certain: Collection[tuple[str, str]] = (),
+    paired: bool = False,
+    against: str = "",
+    looks: Sequence[int] = (),
+) -> Study:
+    """Compare every two agents in every environment.
+
+    Args:
+        scores: by environment and agent, one for each run, higher is better, shape (n_runs,); NaN
+            for a missing run.
+        bounds: the least and the greatest possible score (of each environment); None if unknown.
+        margin: the largest difference that does not matter (in each environment); 0: no ties.
+        level: the share of studies that may have a false word.
+        n_looks: how often the study will be looked at, fixed beforehand; each look has an equal
+            share of the level.
+        baseline: the score of an agent that has learnt nothing (in each environment): runs below
+            half the way from there to the best median failed. None: failures are not counted.
+        certain: environment and agent where chance has no part, so that all runs are equal.
+        paired: whether runs at one place share their randomness: Student's paired t test.
+        against: the only agent that the others are compared with; empty for all pairs.
+        looks: the number of seeds at each look of a study that grows until its pairs are decided,
+            fixed beforehand. All looks that the runs allow are made, from the first. A pair counts
+            with its smallest p-value so far times the number of all looks. Decided pairs keep
+            their word, and agents without undecided pairs get no more seeds.
+
+    Raises:
+        ValueError: for a level, a margin or a number of looks out of range.
+
+    Source: Welch (1947); Schuirmann (1987); Holm (1979). docs/statistics.md has the titles.
+    """
+    n_looks = len(looks) or n_looks
+    if not (0 < level < 0.5 and n_looks >= 1):
+        raise ValueError(f"level {level} must lie between 0 and 0.5, and n_looks {n_looks} above 0")
+    if min(margin.values() if isinstance(margin, Mapping) else [margin], default=0) < 0:
+        raise ValueError(f"margin {margin} must be 0 or a positive difference of scores")
+    share = level / n_looks
+    rules = _Rules(bounds, margin, share, n_looks, baseline, certain, paired, against)
+    if looks:
+        return _grown(rules, scores, looks)
+    return _study(rules, scores, _evidence(rules, scores, {}))
+
+
+def _of(value: T | Mapping[str, T], environment: str) -> T:
+    return value[environment] if isinstance(value, Mapping) else value
+
+
+def _evidence(
+    rules: _Rules, scores: Scores, before: Mapping[Key, _Evidence], words: Mapping[Key, Word] = {}
+) -> dict[Key, _Evidence]:
+    """The evidence on each pair, with that of earlier looks; decided pairs keep theirs."""
+    found = dict(before)
+    for environment, runs in scores.items():
+        margin = _of(rules.margin, environment)
+        samples = {
+            name: sample(values, is_certain=(environment, name) in rules.certain)
+            for name, values in runs.items()
+        }
+        for a, b in combinations(runs, 2):
+            key = environment, a, b
+            if rules.against not in ("", a, b) or words.get(key, "undecided") != "undecided":
+                continue
+            now = student(runs[a], runs[b]) if rules.paired else welch(samples[a], samples[b])
+            new = _Evidence((p_different(now), now), (p_tied(now, margin), now), now)
+            old = before.get(key, new)
+            found[key] = _Evidence(min(old[0], new[0]), min(old[1], new[1]), now)
+    return found
+
+
+# From tests to words.
+
+
+class _Words(NamedTuple):
+    words: dict[Key, Word]
+    p_different: dict[Key, float]  # corrected
+    p_tied: dict[Key, float]
+    levels: tuple[float, float]  # of one pair, for a difference and for a tie
+
+
+def _words(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> _Words:
+    """The words of all pairs, and what the tests say."""
+    apart = holm({key: each.different[0] for key, each in evidence.items()})
+    close = holm({key: each.tied[0] for key, each in evidence.items()})
+    levels = (1 - FOR_TIES) * rules.level, FOR_TIES * rules.level
+    words: dict[Key, Word] = {}
+    for environment, runs in scores.items():
+        place = {name: k for k, name in enumerate(runs)}
+        ahead, same = (np.zeros((len(place),) * 2, bool) for _ in range(2))
+        here = [(key, place[key[1]], place[key[2]]) for key in evidence if key[0] == environment]
+        for key, a, b in here:
+            if apart[key] <= levels[0]:
+                ahead[(a, b) if evidence[key].different[1].apart > 0 else (b, a)] = True
+            same[a, b] = same[b, a] = close[key] <= levels[1]
+        _close(ahead, same)
+        for key, a, b in here:
+            shown: Word = "better" if ahead[a, b] else "worse" if ahead[b, a] else "undecided"
+            words[key] = "tied" if same[a, b] else shown
+    open_ = sum(p > levels[0] for p in apart.values()), sum(p > levels[1] for p in close.values())
+    each = levels[0] / max(1, open_[0]), levels[1] / max(1, open_[1])
+    return _Words(words, apart, close, each)
+
+
+def _close(ahead: NDArray[np.bool_], same: NDArray[np.bool_]) -> None:
+    """Add what follows: a better than b better than c makes a better than c.
+
+    If a and c are tied, b is tied with both. Changes both arrays, of shape (agents, agents).
+    """
+    before = (-1, -1)
+    while before != (now := (int(ahead.sum()), int(same.sum()))):
+        before = now
+        ahead |= ahead @ ahead
+        between = ahead & (same @ ahead.T | ahead.T @ same)
+        same |= between | between.T
+
+
+def _study(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> Study:
+    found = _words(rules, scores, evidence)
+    pairs = [_pair(rules, key, evidence[key], found) for key in evidence]
+    agents: list[AgentRuns] = []
+    best, thresholds = {}, {}
+    for environment, runs in scores.items():
+        threshold = failure_threshold(_of(rules.baseline, environment), runs.values())
+        thresholds[environment] = threshold
+        here = [
+            _agent_runs(environment, name, values, rules.ends(environment), threshold)
+            for name, values in runs.items()
+        ]
+        agents += here
+        best[environment] = _best(here, [pair for pair in pairs if pair.environment == environment])
+    seeds = {e: {name: np.size(values) for name, values in r.items()} for e, r in scores.items()}
+    return Study(agents, pairs, best, thresholds, found.levels[0], seeds)
+
+
+def _pair(rules: _Rules, key: Key, evidence: _Evidence, found: _Words) -> Pair:
+    word, margin = found.words[key], _of(rules.margin, key[0])
+    shown = {"tied": evidence.tied[1], "undecided": evidence.last}.get(word, evidence.different[1])
+    low, high = difference_interval(shown, found.levels[0], rules.ends(key[0]))
+    least = {"better": 0.0, "tied": -margin}.get(word, -np.inf)
+    most = {"worse": 0.0, "tied": margin}.get(word, np.inf)
+    is_open, few = word == "undecided", FEW_FOR_TIES if word == "tied" else FEW
+    return Pair(
+        *key,
+        word,
+        so_far=not is_open and shown.n < few,
+        difference=shown.apart,
+        interval=(float(max(low, least)), float(min(high, most))),
+        p_different=min(1.0, found.p_different[key] * rules.n_looks),
+        p_tied=min(1.0, found.p_tied[key] * rules.n_looks),
+        n=1 if np.isinf(shown.n) else int(shown.n),
+        seeds_needed=seeds_needed(shown, found.levels, margin) if is_open else None,
+    )
+
+
+# The agents of an environment.
+
+
+def failure_threshold(baseline: float | None, scores: Iterable[ArrayLike]) -> float:
+    """The score below which a run failed: half the way from the baseline to the best median.
+
+    NaN where no median is above the baseline, or that is not known: failures have no meaning there.
+    """
+    medians = [float(np.median(runs)) for runs in map(finite, scores) if len(runs)]
+    best = max(medians, default=np.nan)
+    return (baseline + best) / 2 if baseline is not None and best > baseline else np.nan
+
+
+def _agent_runs(
+    environment: str, name: str, values: ArrayLike, ends: Bounds, threshold: float
+) -> AgentRuns:
+    runs, mean = finite(values), mean_over_runs(values, ends)
+    failed = None if np.isnan(threshold) else int((runs < threshold).sum())
+    return AgentRuns(
+        environment,
+        name,
+        n=len(runs),
+        n_missing=mean.n_missing,
+        mean=mean.point,
+        mean_interval=(mean.low, mean.high),
+        median=float(np.median(runs)) if len(runs) else np.nan,
+        failed=failed,
+        failed_interval=(0.0, 1.0) if failed is None else share_interval(failed, len(runs)),
+        unseen=unseen_share(len(runs)),
+    )
+
+
+def _best(agents: Sequence[AgentRuns], pairs: Sequence[Pair]) -> Best:
+    said = [one for pair in pairs for one in (pair, pair.swapped())]
+    behind = {pair.first for pair in said if pair.word == "worse"}
+    there = [agent for agent in agents if agent.n and agent.name not in behind]
+    names = [agent.name for agent in sorted(there, key=lambda agent: -agent.mean)]
+    among = [pair for pair in pairs if {pair.first, pair.second} <= set(names)]
+    n_pairs = len(names) * (len(names) - 1) // 2
+    is_tied = len(among) == n_pairs > 0 and all(pair.word == "tied" for pair in among)
+    leads = [pair for pair in said if pair.first in names and pair.word in ("better", "tied")]
+    return Best(tuple(names), is_tied, so_far=any(pair.so_far for pair in leads))
+
+
+# Studies that add seeds until their pairs are decided.
+
+
+def _grown(rules: _Rules, scores: Scores, looks: Sequence[int]) -> Study:
+    """The verdicts after all looks that the runs allow; see ``judge``."""
+    seeds = {env: dict.fromkeys(runs, looks[0]) for env, runs in scores.items()}
+    evidence: dict[Key, _Evidence] = {}
+    words: dict[Key, Word] = {}
+    shown, n_looks, is_done = scores, 0, False
+    for size in looks:
+        open_ = [key for key, word in words.items() if word == "undecided"]
+        for environment, *names in open_:
+            # An agent whose runs all crash would never be decided.
+            if evidence[environment, names[0], names[1]].last.n > 1:
+                seeds[environment] |= dict.fromkeys(names, size)
+        shown = {
+            e: {name: np.ravel(scores[e][name])[:n] for name, n in by.items()}
+            for e, by in seeds.items()
+        }
+        is_done = all(
+            np.size(shown[e][name]) == n for e, by in seeds.items() for name, n in by.items()
+        )
+        if not is_done or (
+            n_looks and size not in {n for by in seeds.values() for n in by.values()}
+        ):
+            break
+        evidence = _evidence(rules, shown, evidence, words)
+        words = _words(rules, shown, evidence).words
+        n_looks += 1
+    study = _study(rules, shown, evidence)
+    return replace(study, seeds=seeds, n_looks=n_looks, is_done=is_done)
