@@ -30,7 +30,7 @@ def _carry_out(command: str) -> int:
         from rl_yardstick.commands import share
 
         return share.pack() if command == "pack" else share.inspect()
-    main: Callable[[], int] = import_module(f"commands.{command}").main
+    main: Callable[[], int] = import_module(f"rl_yardstick.commands.{command}").main
     return main()
 
 
