@@ -39,4 +39,4 @@ _MODULES = {
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"safe_files.{_MODULES[name]}"), name)
+    return getattr(importlib.import_module(f"rl_yardstick.safe_files.{_MODULES[name]}"), name)
