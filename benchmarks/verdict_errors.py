@@ -46,6 +46,7 @@ MARGIN, DIFFERENT, TIED = 0.02, 0.04, 0.01  # the level of 5 % in two parts
 SAME, ROUNDING = 1e-12, 1e-9
 SIZES, LOOKS = (3, 5, 10, 20, 30), (10, 20, 40, 80)
 STUDIES = {1: 2000, 7: 500}  # for each figure, by number of environments
+N_PERMUTATIONS = 1000  # of AdaStop; with its default of 10,000 a study takes a minute
 GROWING = ("normal", "one fails in 5%, the other never", "one fails in 10%, the other never")
 WORDS = {"undecided": 0, "better": 1, "worse": -1, "tied": 2}
 
@@ -291,6 +292,16 @@ def power(words: Ints, runs: Runs) -> str:
     return f"{100 * right.mean():.0f}" if len(right) else ""
 
 
+def outcome(runs: Runs, words: Ints, seeds: Ints | None = None) -> str:
+    """Per cent of studies with a false word of each kind, power, and mean seeds if they vary."""
+    if seeds is not None:
+        is_seen = np.arange(runs.scores.shape[-1]) < seeds[..., None]
+        runs = runs._replace(scores=np.where(is_seen, runs.scores, runs.scores[..., :1]))
+    found = [*(per_cent(each, runs) for each in falsity(words, runs)), power(words, runs)]
+    told = ", ".join(filter(None, found))
+    return told if seeds is None else f"{told}; {seeds.mean():.0f} seeds"
+
+
 def judged(runs: Runs) -> Counter[str]:
     """How `judge` does on studies: faults by kind, and coverage of the intervals of means."""
     found: Counter[str] = Counter(studies=len(runs.scores))
@@ -422,30 +433,56 @@ def growth(scale: float) -> Iterator[str]:
         "per cent of pairs beyond the margin with the right word; mean seeds."
     )
 
-    def cell(runs: Runs, words: Ints | None = None, seeds: float = 0.0) -> str:
-        words = our_words(runs.scores) if words is None else words
-        found = [*(per_cent(each, runs) for each in falsity(words, runs)), power(words, runs)]
-        return ", ".join(filter(None, found)) + (f"; {seeds:.0f} seeds" if seeds else "")
-
     def both(runs: Runs) -> str:
+        fixed = outcome(runs, our_words(runs.scores))
         if runs.scores.shape[-1] < LOOKS[-1]:
-            return cell(runs)
-        words, seeds = grown(runs.scores)
-        is_seen = np.arange(LOOKS[-1]) < seeds[..., None]
-        seen = runs._replace(scores=np.where(is_seen, runs.scores, runs.scores[..., :1]))
-        return f"{cell(runs)} + {cell(seen, words, float(seeds.mean()))}"
+            return fixed
+        return f"{fixed} + {outcome(runs, *grown(runs.scores))}"
 
     some = {name: source for name, source in families().items() if name in GROWING}
     yield by_size(bank() | some, ((1, 2), (1, 4), (7, 4)), scale, both, (10, 20, 80))
+
+
+def adastop(scale: float) -> Iterator[str]:
+    """Studies that grow, and AdaStop (Mathieu et al., 2023)."""
+    try:
+        from adastop import MultipleAgentsComparator
+    except ImportError:
+        print("The table adastop needs `python -m pip install adastop`.", file=sys.stderr)
+        return
+
+    def words_and_seeds(x: Floats) -> tuple[list[int], Ints]:
+        test = MultipleAgentsComparator(n=10, K=8, B=N_PERMUTATIONS, alpha=0.05, seed=0)
+        going_on, seeds = np.arange(len(x)), np.zeros(len(x), int)
+        while not test.is_finished:
+            seeds[going_on] += 10
+            seen = {k: runs[:n] for k, (runs, n) in enumerate(zip(x, seeds, strict=True))}
+            test.partial_compare(seen, verbose=False)
+            going_on = np.unique(test.current_comparisons)
+        return [{"larger": 1, "smaller": -1, "equal": 0}[w] for w in test.decisions.values()], seeds
+
+    def cell(runs: Runs) -> str:
+        found = zip(*map(words_and_seeds, runs.scores[:, 0]), strict=True)
+        words, seeds = (np.array(each)[:, None] for each in found)
+        return f"{outcome(runs, words, seeds)} / {outcome(runs, *grown(runs.scores))}"
+
+    yield (
+        f"AdaStop (in groups of 10 up to 80 seeds, with {N_PERMUTATIONS} permutations) / studies "
+        f"that grow, on the same {max(int(20 * scale), 3)} studies; figures as in the last table. "
+        "`equal` of AdaStop means that it found no difference, and counts as `undecided`."
+    )
+    sources = {"different agents": bank()["different agents"], "normal": families()["normal"]}
+    yield by_size(sources, ((1, 4),), scale / 100, cell, LOOKS[-1:])
 
 
 # The rows of docs/statistics.md.
 SHOWN = (
     *("different agents: 2 agents, 1 env.", "different agents: 4 agents, 1 env."),
     *("different agents: 4 agents, 7 env.", "different agents: 8 agents, 7 env."),
-    *("the same agent: 4 agents, 1 env.", "the same agent: 2 agents, 7 env."),
-    *("the same agent: 4 agents, 7 env.", "the same agent: 8 agents, 7 env."),
+    *(f"the same agent: {shape}" for shape in ("2 agents, 1 env.", "4 agents, 1 env.")),
+    *(f"the same agent: {n} agents, 7 env." for n in (2, 4, 8)),
     *("means within 0.03: 4 agents, 1 env.", "means within 0.03: 4 agents, 7 env."),
+    "means within 0.03: 8 agents, 7 env.",
     *("normal: 2 agents, 1 env.", "normal: 4 agents, 1 env.", "normal: 4 agents, 7 env."),
     *("normal, deviations 1 to 10: 2 agents, 1 env.", "0 or 1, even: 4 agents, 7 env."),
     "exponential, opposite skews: 2 agents, 1 env.",
@@ -464,7 +501,7 @@ def shown(part: str) -> str:
 
 def main() -> None:
     """Print the tables."""
-    tables = {each.__name__: each for each in (errors, others, textbook, coverage, growth)}
+    tables = {each.__name__: each for each in (errors, others, textbook, coverage, growth, adastop)}
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("tables", nargs="*", metavar="TABLE", help=", ".join(tables))
     parser.add_argument("--quick", action="store_true", help="a twentieth of the studies")

@@ -1,7 +1,6 @@
 """What scores over seeds say: one word for each pair of agents, intervals, learning curves.
 
-Pure functions over arrays; nothing is random. Runs without a figure are given as NaN: they are left
-out and counted. docs/statistics.md names the method behind each figure, and the reasons for it.
+Pure functions over arrays; nothing is random. Runs without a figure are NaN: left out and counted.
 """
 
 from rl_yardstick.verdicts.curves import (
@@ -17,22 +16,16 @@ from rl_yardstick.verdicts.curves import (
 from rl_yardstick.verdicts.estimates import (
     FEW,
     UNBOUNDED,
+    AgentRuns,
     Bounds,
     Estimate,
     Summary,
+    failure_threshold,
     mean_over_runs,
     summarise,
     unseen_share,
 )
-from rl_yardstick.verdicts.judging import (
-    AgentRuns,
-    Best,
-    Pair,
-    Study,
-    Word,
-    failure_threshold,
-    judge,
-)
+from rl_yardstick.verdicts.judging import Best, Pair, Study, Word, judge
 
 __all__ = ["FEW", "UNBOUNDED", "AgentRuns", "Band", "Best", "Bounds", "Estimate", "Pair", "Study"]
 __all__ += ["Summary", "ThresholdSummary", "Word", "curve_band", "failure_threshold", "judge"]

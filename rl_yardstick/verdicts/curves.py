@@ -78,9 +78,7 @@ def on_grid(steps: ArrayLike, values: ArrayLike, grid: ArrayLike) -> Floats:
 def curve_band(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Band:
     """The mean over runs at each point, with the intervals of ``mean_over_runs``.
 
-    Args:
-        values: shape (n_runs, n_points); non-finite values are left out at their point.
-        bounds: the least and the greatest possible value.
+    ``values`` are of shape (n_runs, n_points); non-finite ones are left out at their point.
     """
     table = np.asarray(values, np.float64)
     known = np.isfinite(table)
@@ -128,10 +126,7 @@ def summarise_steps(steps: ArrayLike) -> ThresholdSummary:
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
     """The share of runs that score higher than each threshold, averaged over environments.
 
-    Args:
-        scores: shape (n_runs, n_envs), on a scale that the environments share; NaN is missing.
-        thresholds: shape (n_thresholds,), as is the result.
-
+    ``scores`` are of shape (n_runs, n_envs), on a scale that environments share; NaN is missing.
     Source: Agarwal et al. (2021), section 4.2, "run-score distributions".
     """
     table, marks = np.asarray(scores, np.float64), np.asarray(thresholds, np.float64)

@@ -1,10 +1,8 @@
-"""Figures over the runs of one agent, with their intervals. Nothing here is random.
-
-Runs without a figure are given as NaN: they are left out and counted.
-"""
+"""Figures over the runs of one agent, with their intervals."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +43,22 @@ class Summary:
     iqm: float  #: mean of the middle half of the runs (Agarwal et al., 2021)
 
 
+@dataclass(frozen=True)
+class AgentRuns:
+    """The runs of an agent in an environment. Its intervals hold alone, in 95 % of cases."""
+
+    environment: str
+    name: str
+    n: int  #: runs with a score
+    n_missing: int
+    mean: float
+    mean_interval: Bounds  #: Student's t, cut at the bounds; the range below five runs
+    median: float
+    failed: int | None  #: runs below ``Study.failure_threshold``; None where that is not known
+    failed_interval: Bounds  #: of the share of runs that fail
+    unseen: float  #: the largest share of further runs of a kind that no run showed
+
+
 def finite(values: ArrayLike) -> Floats:
     """The finite values, shape (n,)."""
     array = np.asarray(values, np.float64).ravel()
@@ -68,12 +82,7 @@ def t_reach(n: ArrayLike, variance: ArrayLike, level: float = LEVEL) -> Floats:
 
 
 def mean_over_runs(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Estimate:
-    """The mean of an agent's runs with Student's t interval, cut at what is possible.
-
-    Args:
-        values: one for each run, shape (n_runs,); NaN for a run without a figure.
-        bounds: the least and the greatest possible value.
-    """
+    """The mean of an agent's runs, shape (n_runs,), with Student's t interval cut at the bounds."""
     runs = finite(values)
     n, n_missing = len(runs), np.size(values) - len(runs)
     mean, variance = mean_and_variance(runs)
@@ -100,25 +109,20 @@ def median_over_runs(values: ArrayLike) -> Estimate:
         return Estimate(np.nan, np.nan, np.nan, 0, n_missing)
     # How many runs to leave out at each end: fewer than the lower quantile of Binomial(n, 1/2).
     cut = max(int((special.bdtr(np.arange(n), n, 0.5) <= LEVEL / 2).sum()) - 1, 0)
-    return Estimate(
-        float(np.median(ordered)), float(ordered[cut]), float(ordered[n - 1 - cut]), n, n_missing
-    )
+    low, high = float(ordered[cut]), float(ordered[n - 1 - cut])
+    return Estimate(float(np.median(ordered)), low, high, n, n_missing)
 
 
 def summarise(values: ArrayLike, bounds: Bounds = UNBOUNDED) -> Summary:
     """Mean, median and interquartile mean of an agent's runs, shape (n_runs,)."""
     runs = np.sort(finite(values))
     middle = runs[len(runs) // 4 : len(runs) - len(runs) // 4]
-    iqm = mean_and_variance(middle)[0]
-    return Summary(mean_over_runs(values, bounds), median_over_runs(finite(values)), iqm)
+    mean, median = mean_over_runs(values, bounds), median_over_runs(runs)
+    return Summary(mean, median, iqm=mean_and_variance(middle)[0])
 
 
 def share_interval(count: int, n: int) -> tuple[float, float]:
-    """The interval of a share of which ``count`` of ``n`` were seen.
-
-    Source: Clopper and Pearson (1934), "The use of confidence or fiducial limits illustrated in the
-    case of the binomial", Biometrika 26.
-    """
+    """The interval of a share of which ``count`` of ``n`` were seen: Clopper and Pearson (1934)."""
     low = 0.0 if count == 0 else float(special.betaincinv(count, n - count + 1, LEVEL / 2))
     high = 1.0 if count == n else float(special.betaincinv(count + 1, n - count, 1 - LEVEL / 2))
     return low, high
@@ -127,3 +131,33 @@ def share_interval(count: int, n: int) -> tuple[float, float]:
 def unseen_share(n: int) -> float:
     """The largest share of further runs that may be of a kind that none of ``n`` runs showed."""
     return 1 - LEVEL ** (1 / n) if n else 1.0
+
+
+def failure_threshold(baseline: float | None, scores: Iterable[ArrayLike]) -> float:
+    """The score below which a run failed: half the way from the baseline to the best median.
+
+    NaN where no median is above the baseline, or that is not known: failures have no meaning there.
+    """
+    medians = [float(np.median(runs)) for runs in map(finite, scores) if len(runs)]
+    best = max(medians, default=np.nan)
+    return (baseline + best) / 2 if baseline is not None and best > baseline else np.nan
+
+
+def describe(
+    environment: str, name: str, values: ArrayLike, ends: Bounds, threshold: float
+) -> AgentRuns:
+    """The runs of an agent; those below the threshold failed."""
+    runs, mean = finite(values), mean_over_runs(values, ends)
+    failed = None if np.isnan(threshold) else int((runs < threshold).sum())
+    return AgentRuns(
+        environment,
+        name,
+        n=len(runs),
+        n_missing=mean.n_missing,
+        mean=mean.point,
+        mean_interval=(mean.low, mean.high),
+        median=float(np.median(runs)) if len(runs) else np.nan,
+        failed=failed,
+        failed_interval=(0.0, 1.0) if failed is None else share_interval(failed, len(runs)),
+        unseen=unseen_share(len(runs)),
+    )

@@ -1,10 +1,7 @@
 """Which agent is better: one word for each pair of agents, from their scores over seeds.
 
-Welch's test for every pair in every environment, with Holm's correction over all pairs of the
-study in two families: 80 % of the level for differences, 20 % for ties, which are two one-sided
-tests against a margin. Words, intervals and the best agents are read from the same tests. Nothing
-is random. A failure that no run showed is not counted; ``AgentRuns.unseen`` bounds its frequency.
-docs/statistics.md has the reasons, and how often a word is wrong.
+Welch's tests with Holm's correction in two families, for differences and for ties (reasons:
+docs/statistics.md). A failure that no run showed is not counted: see ``AgentRuns.unseen``.
 
     study = judge({"CartPole-v1": {"dqn": [500, 498, 500], "ppo": [500, 500, 500]}}, margin=10)
     print(study.best["CartPole-v1"], study.pairs[0].text)
@@ -12,7 +9,7 @@ docs/statistics.md has the reasons, and how often a word is wrong.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal, NamedTuple, TypeVar
@@ -20,53 +17,26 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rl_yardstick.verdicts import welch as tests
 from rl_yardstick.verdicts.estimates import (
     FEW,
     LEVEL,
     UNBOUNDED,
+    AgentRuns,
     Bounds,
-    finite,
-    mean_over_runs,
-    share_interval,
-    unseen_share,
-)
-from rl_yardstick.verdicts.welch import (
-    Difference,
-    difference_interval,
-    holm,
-    p_different,
-    p_tied,
-    sample,
-    seeds_needed,
-    student,
-    welch,
+    describe,
+    failure_threshold,
 )
 
 Word = Literal["better", "worse", "tied", "undecided"]
 OPPOSITE: dict[Word, Word] = {"better": "worse", "worse": "better"}
 
 FEW_FOR_TIES = 10  # with fewer runs "tied" holds only so far: rare failures may be missing
-FOR_TIES = 0.2  # the share of the level for ties
+FOR_TIES = 0.2  # the share of the level for ties; differences have the rest
 
 Key = tuple[str, str, str]  # environment, first agent, second agent
 Scores = Mapping[str, Mapping[str, ArrayLike]]
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class AgentRuns:
-    """The runs of an agent in an environment. Its intervals hold alone, in 95 % of cases."""
-
-    environment: str
-    name: str
-    n: int  #: runs with a score
-    n_missing: int
-    mean: float
-    mean_interval: Bounds  #: Student's t, cut at the bounds; the range below five runs
-    median: float
-    failed: int | None  #: runs below ``Study.failure_threshold``; None where that is not known
-    failed_interval: Bounds  #: of the share of runs that fail
-    unseen: float  #: the largest share of further runs of a kind that no run showed
 
 
 @dataclass(frozen=True)
@@ -137,9 +107,9 @@ class Study:
 class _Evidence(NamedTuple):
     """A pair's smallest p-values over all looks so far, each with the runs behind it."""
 
-    different: tuple[float, Difference]
-    tied: tuple[float, Difference]
-    last: Difference
+    different: tuple[float, tests.Difference]
+    tied: tuple[float, tests.Difference]
+    last: tests.Difference
 
 
 class _Rules(NamedTuple):
@@ -187,9 +157,8 @@ def judge(
         paired: whether runs at one place share their randomness: Student's paired t test.
         against: the only agent that the others are compared with; empty for all pairs.
         looks: the number of seeds at each look of a study that grows until its pairs are decided,
-            fixed beforehand. All looks that the runs allow are made, from the first. A pair counts
-            with its smallest p-value so far times the number of all looks. Decided pairs keep
-            their word, and agents without undecided pairs get no more seeds.
+            fixed beforehand. Decided pairs keep their word, and agents without undecided pairs get
+            no more seeds. All looks that the runs allow are made, from the first.
 
     Raises:
         ValueError: for a level, a margin or a number of looks out of range.
@@ -201,8 +170,7 @@ def judge(
         raise ValueError(f"level {level} must lie between 0 and 0.5, and n_looks {n_looks} above 0")
     if min(margin.values() if isinstance(margin, Mapping) else [margin], default=0) < 0:
         raise ValueError(f"margin {margin} must be 0 or a positive difference of scores")
-    share = level / n_looks
-    rules = _Rules(bounds, margin, share, n_looks, baseline, certain, paired, against)
+    rules = _Rules(bounds, margin, level / n_looks, n_looks, baseline, certain, paired, against)
     if looks:
         return _grown(rules, scores, looks)
     return _study(rules, scores, _evidence(rules, scores, {}))
@@ -219,22 +187,18 @@ def _evidence(
     found = dict(before)
     for environment, runs in scores.items():
         margin = _of(rules.margin, environment)
-        samples = {
-            name: sample(values, is_certain=(environment, name) in rules.certain)
-            for name, values in runs.items()
-        }
+        certain = {name for e, name in rules.certain if e == environment}
+        samples = {name: tests.sample(runs[name], is_certain=name in certain) for name in runs}
         for a, b in combinations(runs, 2):
             key = environment, a, b
             if rules.against not in ("", a, b) or words.get(key, "undecided") != "undecided":
                 continue
-            now = student(runs[a], runs[b]) if rules.paired else welch(samples[a], samples[b])
-            new = _Evidence((p_different(now), now), (p_tied(now, margin), now), now)
+            paired = tests.student(runs[a], runs[b]) if rules.paired else None
+            now = paired or tests.welch(samples[a], samples[b])
+            new = _Evidence((tests.p_different(now), now), (tests.p_tied(now, margin), now), now)
             old = before.get(key, new)
             found[key] = _Evidence(min(old[0], new[0]), min(old[1], new[1]), now)
     return found
-
-
-# From tests to words.
 
 
 class _Words(NamedTuple):
@@ -246,8 +210,8 @@ class _Words(NamedTuple):
 
 def _words(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> _Words:
     """The words of all pairs, and what the tests say."""
-    apart = holm({key: each.different[0] for key, each in evidence.items()})
-    close = holm({key: each.tied[0] for key, each in evidence.items()})
+    apart = tests.holm({key: each.different[0] for key, each in evidence.items()})
+    close = tests.holm({key: each.tied[0] for key, each in evidence.items()})
     levels = (1 - FOR_TIES) * rules.level, FOR_TIES * rules.level
     words: dict[Key, Word] = {}
     for environment, runs in scores.items():
@@ -268,10 +232,7 @@ def _words(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
 
 
 def _close(ahead: NDArray[np.bool_], same: NDArray[np.bool_]) -> None:
-    """Add what follows: a better than b better than c makes a better than c.
-
-    If a and c are tied, b is tied with both. Changes both arrays, of shape (agents, agents).
-    """
+    """Add what follows: a > b > c makes a > c; if a and c are tied, b is tied with both."""
     before = (-1, -1)
     while before != (now := (int(ahead.sum()), int(same.sum()))):
         before = now
@@ -286,12 +247,9 @@ def _study(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
     agents: list[AgentRuns] = []
     best, thresholds = {}, {}
     for environment, runs in scores.items():
-        threshold = failure_threshold(_of(rules.baseline, environment), runs.values())
-        thresholds[environment] = threshold
-        here = [
-            _agent_runs(environment, name, values, rules.ends(environment), threshold)
-            for name, values in runs.items()
-        ]
+        baseline, ends = _of(rules.baseline, environment), rules.ends(environment)
+        threshold = thresholds[environment] = failure_threshold(baseline, runs.values())
+        here = [describe(environment, name, runs[name], ends, threshold) for name in runs]
         agents += here
         best[environment] = _best(here, [pair for pair in pairs if pair.environment == environment])
     seeds = {e: {name: np.size(values) for name, values in r.items()} for e, r in scores.items()}
@@ -301,7 +259,7 @@ def _study(rules: _Rules, scores: Scores, evidence: Mapping[Key, _Evidence]) -> 
 def _pair(rules: _Rules, key: Key, evidence: _Evidence, found: _Words) -> Pair:
     word, margin = found.words[key], _of(rules.margin, key[0])
     shown = {"tied": evidence.tied[1], "undecided": evidence.last}.get(word, evidence.different[1])
-    low, high = difference_interval(shown, found.levels[0], rules.ends(key[0]))
+    low, high = tests.difference_interval(shown, found.levels[0], rules.ends(key[0]))
     least = {"better": 0.0, "tied": -margin}.get(word, -np.inf)
     most = {"worse": 0.0, "tied": margin}.get(word, np.inf)
     is_open, few = word == "undecided", FEW_FOR_TIES if word == "tied" else FEW
@@ -314,39 +272,7 @@ def _pair(rules: _Rules, key: Key, evidence: _Evidence, found: _Words) -> Pair:
         p_different=min(1.0, found.p_different[key] * rules.n_looks),
         p_tied=min(1.0, found.p_tied[key] * rules.n_looks),
         n=1 if np.isinf(shown.n) else int(shown.n),
-        seeds_needed=seeds_needed(shown, found.levels, margin) if is_open else None,
-    )
-
-
-# The agents of an environment.
-
-
-def failure_threshold(baseline: float | None, scores: Iterable[ArrayLike]) -> float:
-    """The score below which a run failed: half the way from the baseline to the best median.
-
-    NaN where no median is above the baseline, or that is not known: failures have no meaning there.
-    """
-    medians = [float(np.median(runs)) for runs in map(finite, scores) if len(runs)]
-    best = max(medians, default=np.nan)
-    return (baseline + best) / 2 if baseline is not None and best > baseline else np.nan
-
-
-def _agent_runs(
-    environment: str, name: str, values: ArrayLike, ends: Bounds, threshold: float
-) -> AgentRuns:
-    runs, mean = finite(values), mean_over_runs(values, ends)
-    failed = None if np.isnan(threshold) else int((runs < threshold).sum())
-    return AgentRuns(
-        environment,
-        name,
-        n=len(runs),
-        n_missing=mean.n_missing,
-        mean=mean.point,
-        mean_interval=(mean.low, mean.high),
-        median=float(np.median(runs)) if len(runs) else np.nan,
-        failed=failed,
-        failed_interval=(0.0, 1.0) if failed is None else share_interval(failed, len(runs)),
-        unseen=unseen_share(len(runs)),
+        seeds_needed=tests.seeds_needed(shown, found.levels, margin) if is_open else None,
     )
 
 
@@ -362,31 +288,24 @@ def _best(agents: Sequence[AgentRuns], pairs: Sequence[Pair]) -> Best:
     return Best(tuple(names), is_tied, so_far=any(pair.so_far for pair in leads))
 
 
-# Studies that add seeds until their pairs are decided.
-
-
 def _grown(rules: _Rules, scores: Scores, looks: Sequence[int]) -> Study:
-    """The verdicts after all looks that the runs allow; see ``judge``."""
+    """The verdicts of a growing study, after all looks that the runs allow."""
     seeds = {env: dict.fromkeys(runs, looks[0]) for env, runs in scores.items()}
     evidence: dict[Key, _Evidence] = {}
     words: dict[Key, Word] = {}
     shown, n_looks, is_done = scores, 0, False
     for size in looks:
-        open_ = [key for key, word in words.items() if word == "undecided"]
-        for environment, *names in open_:
+        for key, word in words.items():
             # An agent whose runs all crash would never be decided.
-            if evidence[environment, names[0], names[1]].last.n > 1:
-                seeds[environment] |= dict.fromkeys(names, size)
+            if word == "undecided" and evidence[key].last.n > 1:
+                seeds[key[0]] |= dict.fromkeys(key[1:], size)
         shown = {
             e: {name: np.ravel(scores[e][name])[:n] for name, n in by.items()}
             for e, by in seeds.items()
         }
-        is_done = all(
-            np.size(shown[e][name]) == n for e, by in seeds.items() for name, n in by.items()
-        )
-        if not is_done or (
-            n_looks and size not in {n for by in seeds.values() for n in by.values()}
-        ):
+        asked = [(np.size(shown[e][name]), n) for e, by in seeds.items() for name, n in by.items()]
+        is_done = all(n_there == n for n_there, n in asked)
+        if not is_done or (n_looks and size not in [n for _, n in asked]):
             break
         evidence = _evidence(rules, shown, evidence, words)
         words = _words(rules, shown, evidence).words

@@ -82,8 +82,7 @@ def student(first: ArrayLike, second: ArrayLike) -> Difference:
 def lowest_p(n: ArrayLike) -> Floats:
     """The lowest one-sided p-value from n runs of both agents, elementwise; n is at least 2.
 
-    Equal runs must not prove everything: it is as if one run in 5 (n + 1) scored like the other
-    agent. So 3 runs decide 7 pairs at most, 4 runs 99, 5 runs 1,600.
+    Equal runs must not prove everything: as if one run in 5 (n + 1) scored like the other agent.
     """
     runs = np.asarray(n, np.float64)
     return np.asarray(special.stdtr(2 * runs - 2, -np.sqrt(2.5 * runs * (runs + 1))))
