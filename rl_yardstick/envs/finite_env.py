@@ -65,16 +65,16 @@ class FiniteEnv(ShownEnv):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[int, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; ``options`` are not used."""
         super().reset(seed=seed)
-        self.s = first_above(self.transition_model().initial.cumsum(), self.np_random.random())
+        self.s = self._draw_start()
         self.last_action = None
         if self.render_mode == "human":
             self.render()
-        return self._observe(), {}
+        return self._observe(), self._info()
 
-    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take an action; the class describes the results."""
         action = int(action)
         if not 0 <= action < self.n_actions:
@@ -85,14 +85,21 @@ class FiniteEnv(ShownEnv):
         self.s, self.last_action = state, action
         if self.render_mode == "human":
             self.render()
-        return self._observe(), reward, terminated, False, {}
+        return self._observe(), reward, terminated, False, self._info()
 
     def observation_of(self, states: Any) -> Any:
         """The observations of many states, shape (n,): by default their numbers."""
         return states
 
-    def _observe(self) -> int:
+    def _observe(self) -> Any:
         return int(self.observation_of(self.s))
+
+    def _info(self) -> dict[str, Any]:
+        """What `reset` and `step` give besides, at the end of each."""
+        return {}
+
+    def _draw_start(self) -> int:
+        return first_above(self.transition_model().initial.cumsum(), self.np_random.random())
 
     def _draw(self, action: int) -> tuple[int, float, bool]:
         """Sample the outcome: next state, reward, and whether the episode terminates."""

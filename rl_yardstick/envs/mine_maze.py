@@ -72,9 +72,6 @@ class MineMazeEnv(GridWorld):
     - `slip=0`: probability that the robot moves sideways instead, half of it to each side
     - `random_start=False`: see Starting State
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(

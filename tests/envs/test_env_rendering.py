@@ -6,8 +6,6 @@ in the place of the old one.
 """
 
 import copy
-import io
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -54,28 +52,6 @@ def test_text_of_a_map():
     assert shown(env) == "(start)\n..G\n.#.\nR..\n"
     maze = MineMazeEnv(desc=["SPPM", "...G"], render_mode="ansi")
     assert shown(maze, RIGHT, DOWN) == "(down)\nS*PM\n.R.G\n"
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-@pytest.mark.parametrize(
-    ("out", "no_color", "is_coloured"),
-    [(Terminal, "", True), (Terminal, "1", False), (io.StringIO, "", False)],
-    ids=["terminal", "opted out", "file"],
-)
-def test_text_has_colour_on_a_terminal_unless_opted_out(monkeypatch, out, no_color, is_coloured):
-    # Tests run without a terminal.
-    monkeypatch.setenv("NO_COLOR", no_color)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(sys, "stdout", out())
-    codes = zip("SRGPM", ("36", "1;37;44", "1;32", "1;33", "1;31"), strict=True)
-    styled = {letter: f"\x1b[{code}m{letter}\x1b[0m" for letter, code in codes}
-    found = shown(MineMazeEnv(desc=["S.G", "PM."], render_mode="ansi"), RIGHT)
-    letters = (styled.get(c, c) if is_coloured else c for c in "SRG\nPM.\n")
-    assert found == "(right)\n" + "".join(letters)
 
 
 # --- maps as pictures -----------------------------------------------------------------------------

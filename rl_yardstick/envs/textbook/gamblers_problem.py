@@ -52,9 +52,6 @@ class GamblersProblemEnv(GaugeEnv):
     - `goal=100`: the capital to reach, 2 or more
     - `start_capital=None`: see Starting State
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(

@@ -75,9 +75,6 @@ class JacksCarRentalEnv(GaugeEnv):
     - `variant="example"`: or `"exercise"`
     - `first_cars=10`, `second_cars=10`: in the first evening
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = tuple(

@@ -106,9 +106,6 @@ class RacetrackEnv(MapEnv):
     - `noise=0.1`: probability that the velocity does not change
     - `step_reward=-1`: the reward of each step
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = tuple(

@@ -59,9 +59,6 @@ class RandomWalkEnv(ChainEnv):
       equal probability
     - `left_reward=0`, `right_reward=1`: for leaving on that side
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("step",)

@@ -54,9 +54,6 @@ class RiverSwimEnv(ChainEnv):
     - `n_states=6`: the length of the river
     - `left_reward=0.005`, `right_reward=1`: see Rewards
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("left", "right")

@@ -77,9 +77,6 @@ class WindyGridworldEnv(MapEnv):
     - `stochastic=False`: whether the wind varies
     - `step_reward=-1`: the reward of each step
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     rows = MAP
