@@ -7,13 +7,14 @@ from functools import lru_cache
 import numpy as np
 
 from rl_yardstick.envs.argument_checks import check_number, check_whole_number
-from rl_yardstick.envs.finite_env import Gauge, GaugeEnv, summing_to_one
+from rl_yardstick.envs.bars import Bar, Bars, BarsEnv
+from rl_yardstick.envs.finite_env import MaskedFiniteEnv, summing_to_one
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 LARGEST_GOAL = 2000
 
 
-class GamblersProblemEnv(GaugeEnv):
+class GamblersProblemEnv(BarsEnv, MaskedFiniteEnv):
     """Stakes on a coin that comes up heads with a known probability: all at once, or a little?
 
     ## Description
@@ -74,9 +75,9 @@ class GamblersProblemEnv(GaugeEnv):
     def masks_of_states(self) -> Bools:
         return allowed_stakes(self.goal)
 
-    def _gauges(self) -> tuple[str, list[Gauge]]:
+    def _bars(self) -> Bars:
         title = "start" if self.last_action is None else f"stake {self.last_action}"
-        return title, [Gauge("capital", self.s, self.goal)]
+        return Bars(title, [Bar("capital", self.s, f"{self.s} of {self.goal}")], 0, self.goal)
 
 
 def allowed_stakes(goal: int) -> Bools:
