@@ -189,7 +189,9 @@ def test_a_column_of_all_whole_numbers_from_0_on_is_a_number_of_a_context(write)
     assert data.observation_space == spaces.Discrete(3)
     assert data.observations(spaces.Discrete(4)).tolist() == [0, 1, 2, 1]
     assert data.observations(spaces.Box(0, 9, (1,))).tolist() == [[0], [1], [2], [1]]
-    with pytest.raises(ValueError, match="has the context segment, the agent observes one column"):
+    with pytest.raises(
+        ValueError, match=r"has the context segment, the agent observes Discrete\(2\)"
+    ):
         data.observations(spaces.Discrete(2))
 
 

@@ -293,7 +293,10 @@ def test_rewards_are_scaled_and_the_last_one_is_replaced(limit, on_truncation, r
 BOX, DISCRETE = spaces.Box(0, 1, (2,)), spaces.Discrete(2)
 MISTAKEN = [
     (lambda: cart_pole(low=None), "dimension 3 of the observation has the bounds -inf and 50.0: g"),
-    (lambda: cart_pole(low=[1, -50]), "dimension 2: low 1.0 is not below high 0.418"),
+    (
+        lambda: cart_pole(low=[1, -50]),
+        "dimension 2 of the observation has the bounds 1.0 and 0.418",
+    ),
     (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
     (
         lambda: DiscretizeObservation(Showing(DISCRETE), bins=2),

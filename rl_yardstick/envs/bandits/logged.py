@@ -97,33 +97,20 @@ class LoggedData:
 
         Shape (n,) for Discrete, (n, d) for a Box; a ValueError if they do not fit.
         """
-        if isinstance(space, spaces.Discrete):
-            return self._as_discrete(int(space.n))
         n_columns = len(self.context_names)
-        if not isinstance(space, spaces.Box) or space.shape != (n_columns,) or self.categories:
-            raise ValueError(f"{self.source} has {self._described()}, the agent observes {space}")
-        return self.contexts.astype(np.float32)
-
-    def _as_discrete(self, n_contexts: int) -> Ints:
-        if n_contexts == 1 and not self.context_names:
-            return np.zeros(len(self), np.int64)
-        codes = self.contexts.astype(np.int64)
-        fits = len(self.context_names) == 1 and np.array_equal(codes, self.contexts)
-        if self.categories is not None:
-            fits = len(self.categories) == n_contexts
-        if not fits or codes.min() < 0 or codes.max() >= n_contexts:
-            wanted = f"one column of whole numbers from 0 to {n_contexts - 1}"
-            raise ValueError(f"{self.source} has {self._described()}, the agent observes {wanted}")
-        return codes[:, 0]
-
-    def _described(self) -> str:
-        """The contexts in words."""
-        if not self.context_names:
-            return "no context"
-        names = some(self.context_names)
-        if self.categories is None:
-            return f"the context {names}"
-        return f"the context {names} with {len(self.categories)} values of text"
+        if isinstance(space, spaces.Box) and space.shape == (n_columns,) and not self.categories:
+            return self.contexts.astype(np.float32)
+        if isinstance(space, spaces.Discrete):
+            codes = self.contexts.astype(np.int64)
+            if space.n == 1 and not n_columns:
+                return np.zeros(len(self), np.int64)
+            n_words = len(self.categories or ())
+            fits = n_columns == 1 and np.array_equal(codes, self.contexts)
+            if fits and n_words in {0, space.n} and codes.min() >= 0 and codes.max() < space.n:
+                return codes[:, 0]
+        context = f"the context {some(self.context_names)}" if n_columns else "no context"
+        words = "" if self.categories is None else f" with {len(self.categories)} values of text"
+        raise ValueError(f"{self.source} has {context}{words}, the agent observes {space}")
 
 
 def read_log(path: str | Path) -> LoggedData:
