@@ -63,8 +63,6 @@ class MineMazeEnv(GridWorld):
     wall) and `is_success` (whether it stands on the goal).
     `action_masks()` tells which moves do not run into the outer wall; with `slip` it
     considers the intended move, and in a cell that is walled in it allows all.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
 
     ## Arguments
     - `desc`: the map, as a list of rows or the path to a text file with one row per line

@@ -18,7 +18,15 @@ from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
 from rl_yardstick.mdp.graph import PolicyChain, reachable_states
 from rl_yardstick.mdp.large_maps import moments_along_ways, moments_by_spreading
-from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
+from rl_yardstick.mdp.planning import action_value
+from rl_yardstick.mdp.transition_model import (
+    AnyInts,
+    Bools,
+    Dynamics,
+    Floats,
+    Ints,
+    TransitionModel,
+)
 
 
 @dataclass(frozen=True)
@@ -229,10 +237,12 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
         return values
     place = np.cumsum(model.reachable) - 1
     values[states] = _returns_under_limit(
-        model.prob[states],
-        place[model.next_state[states]],
-        model.terminated[states],
-        model.expected_reward[states],
+        (
+            model.prob[states],
+            place[model.next_state[states]],
+            model.terminated[states],
+            model.expected_reward[states],
+        ),
         chances_in(model, policy, states),
         horizon,
     )
@@ -266,15 +276,9 @@ def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools
 
 
 @compiled
-def _returns_under_limit(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    mean_reward: Floats,
-    policy: Floats,
-    horizon: int,
-) -> Floats:
+def _returns_under_limit(model: Dynamics, policy: Floats, horizon: int) -> Floats:
     """The expected returns alone, as in ``moments_under_limit``, shape (n,)."""
+    prob = model[0]
     later = np.zeros(prob.shape[0])
     now = np.zeros(prob.shape[0])
     for step in range(horizon - 1, -1, -1):
@@ -284,10 +288,7 @@ def _returns_under_limit(
             value = 0.0
             for action in range(prob.shape[1]):
                 if chances[state, action] > 0:
-                    after = mean_reward[state, action]
-                    for k in range(prob.shape[2]):
-                        if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                            after += prob[state, action, k] * later[next_state[state, action, k]]
+                    after = action_value(model, state, action, later, 1.0)
                     value += chances[state, action] * after
             changed = changed or value != later[state]
             now[state] = value
@@ -387,14 +388,15 @@ class LimitedEpisodes:
             ).tolist()
             return PolicyReturn(mean, variance, length, spread, rate if with_success else None)
         if moments is None:
-            rows = (*self._rows(states), self.model.reward[states], ends_well[states])
+            arrays = (*self._rows(states), self.model.reward[states], ends_well[states])
             chances = chances_in(self.model, self.policy, states)
             if len(chances) == 1 and ((chances == 0) | (chances == 1)).all():
                 # Keep the rows of these actions only: the sweeps would skip all others each time.
                 taken = np.arange(len(states)), chances[0].argmax(axis=1)
-                rows = tuple(array[taken][:, None] for array in rows)
+                arrays = tuple(array[taken][:, None] for array in arrays)
                 chances = np.ones((1, len(states), 1))
-            moments = moments_under_limit(*rows, chances, self.horizon, discount)
+            rows, good = arrays[:4], arrays[4]
+            moments = moments_under_limit(rows, good, chances, self.horizon, discount)
         return over_starts(self.model.initial[states], moments, with_success=with_success)
 
     def visits(self) -> Floats:
@@ -463,14 +465,7 @@ class LimitedEpisodes:
 
 @compiled
 def moments_under_limit(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    success: Bools,
-    policy: Floats,
-    horizon: int,
-    discount: float,
+    model: Dynamics, success: Bools, policy: Floats, horizon: int, discount: float
 ) -> Floats:
     """Moments of the episodes that start in each state.
 
@@ -481,6 +476,7 @@ def moments_under_limit(
         Shape (n, 5): mean and variance of the return, mean and variance of the length, and the
         probability of success.
     """
+    prob, next_state, terminated, reward = model
     later = np.zeros((prob.shape[0], 5))
     now = np.zeros((prob.shape[0], 5))
     for step in range(horizon - 1, -1, -1):
@@ -488,8 +484,8 @@ def moments_under_limit(
         changed = False
         for state in range(prob.shape[0]):
             outcomes = (prob[state], next_state[state], terminated[state], reward[state])
-            _means(*outcomes, success[state], chances[state], discount, later, now[state])
-            _variances(*outcomes, chances[state], discount, later, now[state])
+            _means(outcomes, success[state], chances[state], discount, later, now[state])
+            _variances(outcomes, chances[state], discount, later, now[state])
             for moment in range(5):
                 changed = changed or now[state, moment] != later[state, moment]
         now, later = later, now
@@ -501,17 +497,10 @@ def moments_under_limit(
 
 @called
 def _means(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    success: Bools,
-    chances: Floats,
-    discount: float,
-    later: Floats,
-    now: Floats,
+    model: Dynamics, success: Bools, chances: Floats, discount: float, later: Floats, now: Floats
 ) -> None:
     """The means of one state, from its rows of the model and the moments one step later."""
+    prob, next_state, terminated, reward = model
     now[0] = 0.0
     now[2] = 1.0
     now[4] = 0.0
@@ -530,16 +519,10 @@ def _means(
 
 @called
 def _variances(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    chances: Floats,
-    discount: float,
-    later: Floats,
-    now: Floats,
+    model: Dynamics, chances: Floats, discount: float, later: Floats, now: Floats
 ) -> None:
     """The variances of one state, by the law of total variance."""
+    prob, next_state, terminated, reward = model
     now[1] = 0.0
     now[3] = 0.0
     for action in range(prob.shape[0]):

@@ -26,6 +26,9 @@ Bools = NDArray[np.bool_]
 # Integers of any width, such as the int32 that halves the size of a large map.
 AnyInts = NDArray[np.integer]
 
+# The arrays prob, next_state, terminated, and a reward, as compiled functions take them.
+Dynamics = tuple[Floats, AnyInts, Bools, Floats]
+
 PROBABILITY_TOLERANCE = 1e-9
 
 Outcomes = Sequence[tuple[float, int, float, bool]]
@@ -127,6 +130,11 @@ class TransitionModel:
     def n_outcomes(self) -> int:
         """K, the largest number of outcomes of any state and action, padding included."""
         return int(self.prob.shape[2])
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """``prob``, ``next_state``, ``terminated`` and ``expected_reward``."""
+        return self.prob, self.next_state, self.terminated, self.expected_reward
 
     @cached_property
     def expected_reward(self) -> Floats:

@@ -45,8 +45,6 @@ class GamblersProblemEnv(BarsEnv, MaskedFiniteEnv):
     ## Information
     `reset` and `step` give nothing more. One uniform number is drawn by each: it is heads if it
     lies below `heads_probability`.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
 
     ## Arguments
     - `heads_probability=0.4`: of the coin
