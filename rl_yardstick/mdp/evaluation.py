@@ -85,10 +85,10 @@ def policy_return(
         ValueError: for arguments out of range or of the wrong shape, and, without time limit and
             discount, for a policy under which episodes may never end.
     """
-    _check(model, horizon, discount, success)
+    _check(horizon, discount)
     if model.reward_variance is not None:
         return _with_drawn_rewards(model, policy, horizon, discount, success)
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     ends_well = model.terminated if success is None else model.terminated & success
     if horizon is not None:
         episodes = LimitedEpisodes(model, policy, horizon)
@@ -109,8 +109,8 @@ def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None
     Raises:
         ValueError: as ``policy_return``.
     """
-    _check(model, horizon, 1.0, None)
-    policy = canonical_policy(model, policy, horizon)
+    _check(horizon, 1.0)
+    policy = canonical_policy(model, policy)
     if horizon is not None:
         return LimitedEpisodes(model, policy, horizon).visits()
     visits = np.zeros(model.n_states)
@@ -138,12 +138,12 @@ def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0)
     still beats them by far. (A fixed sequence of actions ignores observations too, but may be
     optimal where nothing is random.)
     """
-    _check(model, horizon, discount, None)
+    _check(horizon, discount)
     best = -np.inf
     uniform, *constant = baseline_policies(model)
     # Random actions visit most states: with a known floor, their evaluation often stops early.
     for policy in (*constant, uniform):
-        episodes = LimitedEpisodes(model, canonical_policy(model, policy, horizon), horizon)
+        episodes = LimitedEpisodes(model, canonical_policy(model, policy), horizon)
         floor = best if discount == 1 else -np.inf
         found = episodes.result(discount, model.terminated, with_success=False, floor=floor)
         best = max(best, found.expected_return)
@@ -169,15 +169,11 @@ def _with_drawn_rewards(
     return replace(result, return_variance=result.return_variance + added)
 
 
-def _check(
-    model: TransitionModel, horizon: int | None, discount: float, success: Bools | None
-) -> None:
+def _check(horizon: int | None, discount: float) -> None:
     if horizon is not None and horizon < 1:
         raise ValueError(f"horizon is {horizon}, it must be at least 1, or None for no limit")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
-    if success is not None and success.shape != model.prob.shape:
-        raise ValueError(f"success has shape {success.shape}, the model has {model.prob.shape}")
 
 
 def _moments_without_limit(chain: PolicyChain, discount: float, ends_well: Bools) -> Floats:
@@ -222,13 +218,8 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
 
     Returns:
         Shape (S,); zero for states that no policy reaches.
-
-    Raises:
-        ValueError: for a horizon below 1, or a malformed policy.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}, it must be at least 1")
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     states = np.flatnonzero(model.reachable)
     values = np.zeros(model.n_states)
     moments = LimitedEpisodes(model, policy, horizon).along_ways(states, 1.0, model.terminated)
@@ -262,14 +253,10 @@ def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools
         The optimal expected undiscounted returns, shape (S,), zero for states that no policy
         reaches. And the actions whose value comes within 1e-9 of the best, relative to it where
         it is above 1: bool of shape (S, A), all actions in unreachable states.
-
-    Raises:
-        ValueError: for a horizon below 1.
     """
     values = finite_horizon_optimum(model, horizon).values
     later = finite_horizon_optimum(model, horizon - 1).values if horizon > 1 else 0 * values
-    following = np.where(model.terminated, 0.0, later[model.next_state])
-    action_values = model.expected_reward + np.einsum("sak,sak->sa", model.prob, following)
+    action_values = model.action_values(later)
     margin = OPTIMAL_TOLERANCE * np.maximum(1.0, np.abs(values))
     optimal = action_values >= (values - margin)[:, None]
     return values, optimal | ~model.reachable[:, None]
@@ -307,24 +294,14 @@ Policy = NDArray[np.floating] | AnyInts
 POLICY_TOLERANCE = 1e-5
 
 
-def canonical_policy(model: TransitionModel, policy: Policy, horizon: int | None) -> Policy:
+def canonical_policy(model: TransitionModel, policy: Policy) -> Policy:
     """The policy as a float64 matrix (S, A), or as actions of shape (1 or horizon, S)."""
-    n_states, n_actions = model.n_states, model.n_actions
     if np.issubdtype(policy.dtype, np.integer):
         actions: AnyInts = np.atleast_2d(policy)
-        if actions.shape not in {(1, n_states), (horizon, n_states)}:
-            raise ValueError(
-                f"actions have shape {policy.shape}, they must have ({n_states},), or "
-                f"({horizon}, {n_states}) under a time limit"
-            )
         taken = actions[:, model.reachable]
-        if taken.min() < 0 or taken.max() >= n_actions:
-            raise ValueError(f"the policy takes an action outside 0..{n_actions - 1}")
+        if taken.min() < 0 or taken.max() >= model.n_actions:
+            raise ValueError(f"the policy takes an action outside 0..{model.n_actions - 1}")
         return actions
-    if policy.shape != (n_states, n_actions):
-        raise ValueError(
-            f"the policy matrix has shape {policy.shape}, it must have ({n_states}, {n_actions})"
-        )
     matrix = policy.astype(np.float64)
     total = matrix.sum(axis=1)
     # Written so that a NaN fails.

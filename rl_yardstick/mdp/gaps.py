@@ -73,7 +73,7 @@ def gap_by_state(model: TransitionModel, policy: Policy, horizon: int) -> GapByS
     Raises:
         ValueError: for a malformed policy, and where horizon times states are too many.
     """
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     best = _optimal_rows(model, horizon)
     chances = chances_in(model, policy, np.arange(model.n_states))
     none = np.zeros(model.n_states, np.bool_)
@@ -111,7 +111,7 @@ def greedy_repairs(
     """
     if model.prob.size * horizon > MOST_OUTCOMES_REPAIRED:
         return []
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     chances = chances_in(model, policy, np.arange(model.n_states))
     best = _optimal_rows(model, horizon)
     repaired = np.zeros(model.n_states, np.bool_)
@@ -159,8 +159,8 @@ def first_differences(
     """
     _check_size(horizon + 1, model)
     states, none = np.arange(model.n_states), np.zeros(model.n_states, np.bool_)
-    chances = chances_in(model, canonical_policy(model, policy, horizon), states)
-    others = chances_in(model, canonical_policy(model, other, horizon), states)
+    chances = chances_in(model, canonical_policy(model, policy), states)
+    others = chances_in(model, canonical_policy(model, other), states)
     rows = _policy_rows(model.dynamics, chances, none, horizon)
     other_rows = _policy_rows(model.dynamics, others, none, horizon)
     found = _partings(model.dynamics, chances, others, model.initial, rows, other_rows, horizon)

@@ -59,9 +59,6 @@ def hardness_of(model: TransitionModel, horizon: int, success: Bools | None = No
         model: the decision process.
         horizon: the time limit in steps.
         success: the outcomes that end an episode well, bool of shape (S, A, K), or None.
-
-    Raises:
-        ValueError: for a horizon below 1, or ``success`` of another shape.
     """
     plan = finite_horizon_optimum(model, horizon)
     spanned = diameter(model)
@@ -168,8 +165,7 @@ def action_gaps(
     horizon = plan.horizon
     values, optimal = optimal_choices(model, horizon)
     later = finite_horizon_optimum(model, horizon - 1).values if horizon > 1 else 0 * values
-    following = np.where(model.terminated, 0.0, later[model.next_state])
-    worth = model.expected_reward + np.einsum("sak,sak->sa", model.prob, following)
+    worth = model.action_values(later)
     gaps = values - np.where(optimal, -np.inf, worth).max(axis=1)
     visits = np.where(np.isfinite(gaps), state_visitation(model, plan.policy, horizon), 0.0)
     seen = visits > 0
