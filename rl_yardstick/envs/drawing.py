@@ -42,20 +42,12 @@ WHITE: Colour = (255, 255, 255)
 
 
 class Disc(NamedTuple):
-    """A filled circle."""
+    """A circle, filled or as a ring of some width inside its radius."""
 
     centre: Point
     radius: float
     colour: Colour
-
-
-class Ring(NamedTuple):
-    """A circle's outline, its width inside the radius."""
-
-    centre: Point
-    radius: float
-    width: float
-    colour: Colour
+    width: float = 0
 
 
 class Box(NamedTuple):
@@ -85,7 +77,7 @@ class Label(NamedTuple):
     align: float = 0.5
 
 
-Shape = Disc | Ring | Box | Polygon | Label
+Shape = Disc | Box | Polygon | Label
 
 
 def _star(n_rays: int, outer: float, inner: float) -> tuple[Point, ...]:
@@ -108,7 +100,7 @@ LETTER_SHAPES: dict[str, tuple[Shape, ...]] = {
         Box((0.14, 0.15), (0.72, 0.20), 0.04, SHELF_LIGHT),
         Box((0.14, 0.47), (0.72, 0.20), 0.04, SHELF_LIGHT),
     ),
-    "S": (Box(*_WHOLE_CELL, SKY), Ring((0.5, 0.5), 0.34, 0.07, BLUE)),
+    "S": (Box(*_WHOLE_CELL, SKY), Disc((0.5, 0.5), 0.34, BLUE, 0.07)),
     "G": (
         Box(*_WHOLE_CELL, PALE_GREEN),
         Box((0.27, 0.14), (0.07, 0.74), 0.03, INK),
@@ -129,7 +121,7 @@ LETTER_SHAPES: dict[str, tuple[Shape, ...]] = {
 }
 EMPTIED_SHAPES: tuple[Shape, ...] = (
     Box(*_WHOLE_CELL, FLOOR),
-    Ring((0.5, 0.5), 0.42, 0.04, GRID),
+    Disc((0.5, 0.5), 0.42, GRID, 0.04),
 )
 BURST_SHAPES: tuple[Shape, ...] = (
     Polygon(_star(9, 0.50, 0.34), VERMILION),
@@ -146,7 +138,7 @@ ROBOT_SHAPES: tuple[Shape, ...] = (
     Box((0.25, 0.19), (0.50, 0.26), 0.12, WHITE),
     Disc((0.38, 0.32), 0.065, INK),
     Disc((0.62, 0.32), 0.065, INK),
-    Ring((0.5, 0.66), 0.12, 0.05, SKY),
+    Disc((0.5, 0.66), 0.12, SKY, 0.05),
 )
 
 # One colour each, for maps whose cells are too small to show a shape.
@@ -185,10 +177,7 @@ class Chart:
 
 
 class Renderer(ABC):
-    """Shows scenes, as pixels or in a window; pygame is imported when the first one is drawn.
-
-    Copies, pickled ones included, share no window: they open their own when they need it.
-    """
+    """Shows scenes, as pixels or in a window; pygame is imported when the first one is drawn."""
 
     def __init__(self, fps: int, title: str) -> None:
         self.fps = fps  # pictures a second in a window
@@ -235,9 +224,6 @@ class Renderer(ABC):
 class ChartRenderer(Renderer):
     """Shows charts."""
 
-    def __reduce__(self) -> tuple[type[ChartRenderer], tuple[int, str]]:
-        return ChartRenderer, (self.fps, self.title)
-
     def paint(self, scene: Chart) -> pygame.Surface:
         import pygame
 
@@ -271,9 +257,6 @@ class GridRenderer(Renderer):
         self.detailed = self.cell >= MIN_DETAILED_CELL
         self.marker = self.cell if self.detailed else MARKER
         self._sprites: dict[tuple[tuple[Shape, ...], int], pygame.Surface] = {}
-
-    def __reduce__(self) -> tuple[type[GridRenderer], tuple[tuple[str, ...], int, str]]:
-        return GridRenderer, (self.rows, self.fps, self.title)
 
     def paint(self, scene: Scene) -> pygame.Surface:
         import pygame
@@ -382,10 +365,7 @@ def _draw(surface: pygame.Surface, shape: Shape, scale: int) -> None:
         case Polygon():
             pygame.draw.polygon(surface, shape.colour, [point(at) for at in shape.points])
         case Disc():
-            pygame.draw.circle(surface, shape.colour, point(shape.centre), shape.radius * scale)
-        case Ring():
-            width = max(1, round(shape.width * scale))
-            radius = shape.radius * scale
+            width, radius = math.ceil(shape.width * scale), shape.radius * scale
             pygame.draw.circle(surface, shape.colour, point(shape.centre), radius, width)
         case Label():
             pygame.font.init()
@@ -413,6 +393,10 @@ class ShownEnv(gym.Env[Any, Any], ABC):
             check_choice("render_mode", render_mode, RENDER_MODES)
         self.render_mode = render_mode
         self._renderer: Renderer | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies, pickled ones included, open their own window when they need it.
+        return {**self.__dict__, "_renderer": None}
 
     def render(self) -> str | NDArray[np.uint8] | None:
         """As text (``ansi``), as a picture of shape (height, width, 3), or in a window."""

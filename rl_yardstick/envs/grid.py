@@ -57,23 +57,27 @@ class GridMap:
 
         Raises:
             ValueError: if the file cannot be read, rows differ in length, a letter is unknown,
-                there is not exactly one start or no goal, or no way between them. Where there
-                is a place to name, the message names row and column, counted from one.
+                there is not exactly one start or no goal, or no way between them. Rows and columns
+                are counted from one.
         """
         rows, source = read_rows(desc), f"the map {desc}" if _is_path(desc) else "the map"
-        _check_shape(rows, source)
+        if not rows or not rows[0]:
+            raise ValueError(f"{source} is empty")
         letters, n_columns = "".join(rows), len(rows[0])
+        if len(letters) > MAX_STATES:
+            raise ValueError(f"{source} has {len(letters):,} cells, more than {MAX_STATES:,}")
+        for i, row in enumerate(rows, 1):
+            if len(row) != n_columns:
+                raise ValueError(f"{source}: row {i} has {len(row)} cells, row 1 has {n_columns}")
         if not set(letters) <= set(known):
             cell = next(cell for cell, letter in enumerate(letters) if letter not in known)
-            raise ValueError(
-                f"{source}: unknown letter {letters[cell]!r} at {_place(cell, n_columns)}; "
-                f"known are {' '.join(known)}"
-            )
-        codes = letters.encode("ascii")
-        start = _only_start(codes, n_columns, source)
-        goals = [cell for cell, code in enumerate(codes) if code == ord(GOAL)]
-        if not goals:
-            raise ValueError(f"{source} has no goal: mark it with the letter {GOAL}")
+            place = f"{letters[cell]!r} at {_place(cell, n_columns)}"
+            raise ValueError(f"{source}: unknown letter {place}; known are {' '.join(known)}")
+        goals = [cell for cell, letter in enumerate(letters) if letter == GOAL]
+        if letters.count(START) != 1 or not goals:
+            found = f"{letters.count(START)} starts {START} and {len(goals)} goals {GOAL}"
+            raise ValueError(f"{source} has {found}, it must have one start, and a goal")
+        codes, start = letters.encode("ascii"), letters.index(START)
         free = np.isin(np.frombuffer(codes, np.uint8), [ord(letter) for letter in passable])
         distances = distances_to(goals, free.reshape(len(rows), n_columns)).ravel()
         if distances[start] == UNREACHED:
@@ -151,43 +155,9 @@ def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:
 def _read_file(path: Path) -> str:
     try:
         return read_file(path, MAX_MAP_BYTES).decode("utf-8-sig")
-    except OSError as error:
-        reason = str(error.strerror)
-    except UnsafeFileError as error:
-        raise ValueError(f"desc: {error}") from error
-    except UnicodeDecodeError:
-        reason = "it is not a text file in UTF-8"
-    raise ValueError(f"desc: cannot read the map file {path}: {reason}")
-
-
-def _check_shape(rows: tuple[str, ...], source: str) -> None:
-    if not rows or not rows[0]:
-        raise ValueError(f"{source} is empty")
-    n_columns = len(rows[0])
-    if len(rows) * n_columns > MAX_STATES:
-        raise ValueError(
-            f"{source} has {len(rows)} rows of {n_columns} cells, more than {MAX_STATES:,} cells"
-        )
-    for row, cells in enumerate(rows, 1):
-        if len(cells) != n_columns:
-            where = min(len(cells), n_columns)
-            raise ValueError(
-                f"{source}: row {row} has {len(cells)} cells and row 1 has {n_columns}: they "
-                f"differ from column {where + 1} on"
-            )
-
-
-def _only_start(codes: bytes, n_columns: int, source: str) -> int:
-    first = codes.find(ord(START))
-    if first < 0:
-        raise ValueError(f"{source} has no start: mark it with the letter {START}")
-    second = codes.find(ord(START), first + 1)
-    if second >= 0:
-        raise ValueError(
-            f"{source} has two starts, at {_place(first, n_columns)} and at "
-            f"{_place(second, n_columns)}; there must be one"
-        )
-    return first
+    except (OSError, UnsafeFileError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ValueError(f"desc: cannot read the map file {path}: {reason}") from error
 
 
 def _place(cell: int, n_columns: int) -> str:
