@@ -167,41 +167,31 @@ def test_a_log_with_a_context_of_text():
     assert data.observations(spaces.Discrete(2)).tolist() == [1, 0, 0, 1, 0, 1, 0]
 
 
-def test_columns_may_stand_in_any_order_and_propensities_be_missing(write):
+LOGS = {  # the text, names, contexts and arms; an observation space, and the observations
     # As a spreadsheet writes it: a mark in front, commas in names, and lines without anything.
-    data = read_log(write('\ufeffreward,age,arm,"income, net"\n1.5,30,2,1e3\n\n-1,40.5,0,2000\n'))
-    assert data.context_names == ("age", "income, net")
-    assert data.contexts.tolist() == [[30, 1000], [40.5, 2000]]
-    assert (data.arms.tolist(), data.rewards.tolist()) == ([2, 0], [1.5, -1])
-    assert data.propensities is data.categories is None
-    box = data.observation_space
-    assert (box.low.tolist(), box.high.tolist()) == ([30, 1000], [40.5, 2000])
-    observations = data.observations(spaces.Box(-1, 1, (2,)))
-    assert (observations.dtype, observations.tolist()) == (np.float32, [[30, 1000], [40.5, 2000]])
+    "any order": (
+        '\ufeffreward,age,arm,"income, net"\n1.5,30,2,1e3\n\n-1,40.5,0,2000\n',
+        ("age", "income, net"), [[30, 1000], [40.5, 2000]], [2, 0],
+        spaces.Box(np.float32([30, 1000]), np.float32([40.5, 2000])), [[30, 1000], [40.5, 2000]]),
+    "numbers of contexts": (
+        "segment,arm,reward\n0,0,1\n1,0,1\n2,0,1\n1,0,1\n",
+        ("segment",), [[0], [1], [2], [1]], [0] * 4, spaces.Discrete(3), [0, 1, 2, 1]),
+    "no context": ("arm,reward\n3,1\n", (), [[]], [3], spaces.Discrete(1), [0]),
+    "words": ("arm,reward,word\n0,1,NA\n1,1,True \n", ("word",), [[0], [1]], [0, 1],
+        spaces.Discrete(2), [0, 1]),
+}  # fmt: skip
 
 
-def log_of(values):
-    return "segment,arm,reward\n" + "".join(f"{value},0,1\n" for value in values)
-
-
-def test_a_column_of_all_whole_numbers_from_0_on_is_a_number_of_a_context(write):
-    data = read_log(write(log_of([0, 1, 2, 1])))
-    assert data.observation_space == spaces.Discrete(3)
-    assert data.observations(spaces.Discrete(4)).tolist() == [0, 1, 2, 1]
-    assert data.observations(spaces.Box(0, 9, (1,))).tolist() == [[0], [1], [2], [1]]
-    with pytest.raises(
-        ValueError, match=r"has the context segment, the agent observes Discrete\(2\)"
-    ):
-        data.observations(spaces.Discrete(2))
-
-
-def test_a_log_without_context_and_of_one_pull(write):
-    data = read_log(write("arm,reward\n3,1\n"))
-    assert (len(data), data.n_arms, data.contexts.shape) == (1, 4, (1, 0))
-    assert data.observation_space == spaces.Discrete(1)
-    assert data.observations(spaces.Discrete(1)).tolist() == [0]
-    with pytest.raises(ValueError, match="has no context, the agent observes"):
-        data.observations(spaces.Discrete(2))
+@pytest.mark.parametrize("name", LOGS)
+def test_logs_of_any_form(name, write):
+    text, names, contexts, arms, space, observations = LOGS[name]
+    data = read_log(write(text))
+    assert (data.context_names, data.contexts.tolist()) == (names, contexts)
+    assert (data.arms.tolist(), data.n_arms, data.propensities) == (arms, max(arms) + 1, None)
+    assert data.observation_space == space
+    assert data.observations(space).tolist() == observations
+    with pytest.raises(ValueError, match=r"log\.csv has .*context.*, the agent observes Multi"):
+        data.observations(spaces.MultiDiscrete([2]))
 
 
 MISTAKES = [
