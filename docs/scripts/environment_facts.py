@@ -51,7 +51,6 @@ HARDNESS_HEADS = (
 HARDNESS = Path(envs.__file__).with_name("hardness.json")
 LIMIT = 1000  # the commands' time limit for an environment without one
 MOST_REWARDS = 8
-LEFT_OUT = ("Version History",)
 
 
 def environment_block(env_id: str, *arguments: str) -> str:
@@ -60,7 +59,7 @@ def environment_block(env_id: str, *arguments: str) -> str:
 
 
 def docstring_block(env_id: str) -> str:
-    """The docstring of an environment without its history."""
+    """The docstring of an environment."""
     entry_point = gym.spec(env_id).entry_point
     assert isinstance(entry_point, str)
     return "\n\n".join(docstring_sections(load_env_creator(entry_point))) + "\n"
@@ -279,8 +278,7 @@ def docstring_sections(cls: Any) -> list[str]:
     """The sections of a class's docstring, with ``::`` before maps replaced for Markdown."""
     text = re.sub(r"::\n", ":\n", inspect.getdoc(cls) or "")
     lead, *sections = re.split(r"(?m)^(?=## )", text.partition("\n")[2].strip())
-    kept = [part.strip() for part in sections if part[3:].split("\n")[0] not in LEFT_OUT]
-    return [part for part in (lead.strip(), *kept) if part]
+    return [part for part in map(str.strip, (lead, *sections)) if part]
 
 
 if __name__ == "__main__":

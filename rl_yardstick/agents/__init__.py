@@ -11,8 +11,5 @@ from rl_yardstick.agents.registry import (
     load_algorithm,
     register,
 )
-from rl_yardstick.machine_code.sources import keep_machine_code
-
-keep_machine_code("agents", "mdp")
 
 __all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm", "register"]

@@ -575,7 +575,7 @@ def parting(one: Side, other: Side) -> Parting:
 
 def _first_actions(model: TransitionModel, policy: NDArray[Any], horizon: int) -> Ints:
     """The likeliest action of a policy at the first step, shape (S,)."""
-    canonical = canonical_policy(model, policy, horizon)
+    canonical = canonical_policy(model, policy)
     likeliest: Ints = policy_matrix(model, canonical).argmax(axis=1)
     return likeliest
 

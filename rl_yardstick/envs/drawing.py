@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,20 +42,12 @@ WHITE: Colour = (255, 255, 255)
 
 
 class Disc(NamedTuple):
-    """A filled circle."""
+    """A circle, filled or as a ring of some width inside its radius."""
 
     centre: Point
     radius: float
     colour: Colour
-
-
-class Ring(NamedTuple):
-    """A circle's outline, its width inside the radius."""
-
-    centre: Point
-    radius: float
-    width: float
-    colour: Colour
+    width: float = 0
 
 
 class Box(NamedTuple):
@@ -86,7 +77,7 @@ class Label(NamedTuple):
     align: float = 0.5
 
 
-Shape = Disc | Ring | Box | Polygon | Label
+Shape = Disc | Box | Polygon | Label
 
 
 def _star(n_rays: int, outer: float, inner: float) -> tuple[Point, ...]:
@@ -109,7 +100,7 @@ LETTER_SHAPES: dict[str, tuple[Shape, ...]] = {
         Box((0.14, 0.15), (0.72, 0.20), 0.04, SHELF_LIGHT),
         Box((0.14, 0.47), (0.72, 0.20), 0.04, SHELF_LIGHT),
     ),
-    "S": (Box(*_WHOLE_CELL, SKY), Ring((0.5, 0.5), 0.34, 0.07, BLUE)),
+    "S": (Box(*_WHOLE_CELL, SKY), Disc((0.5, 0.5), 0.34, BLUE, 0.07)),
     "G": (
         Box(*_WHOLE_CELL, PALE_GREEN),
         Box((0.27, 0.14), (0.07, 0.74), 0.03, INK),
@@ -130,7 +121,7 @@ LETTER_SHAPES: dict[str, tuple[Shape, ...]] = {
 }
 EMPTIED_SHAPES: tuple[Shape, ...] = (
     Box(*_WHOLE_CELL, FLOOR),
-    Ring((0.5, 0.5), 0.42, 0.04, GRID),
+    Disc((0.5, 0.5), 0.42, GRID, 0.04),
 )
 BURST_SHAPES: tuple[Shape, ...] = (
     Polygon(_star(9, 0.50, 0.34), VERMILION),
@@ -147,7 +138,7 @@ ROBOT_SHAPES: tuple[Shape, ...] = (
     Box((0.25, 0.19), (0.50, 0.26), 0.12, WHITE),
     Disc((0.38, 0.32), 0.065, INK),
     Disc((0.62, 0.32), 0.065, INK),
-    Ring((0.5, 0.66), 0.12, 0.05, SKY),
+    Disc((0.5, 0.66), 0.12, SKY, 0.05),
 )
 
 # One colour each, for maps whose cells are too small to show a shape.
@@ -159,19 +150,6 @@ LETTER_COLOURS: dict[str, Colour] = {
     "M": VERMILION,
     "P": ORANGE,
 }
-TRAIL_WIDTH = 0.16
-
-
-def trail_shapes(sides: frozenset[int]) -> tuple[Shape, ...]:
-    """A line from the middle of a cell to some of its sides: 0 up, 1 down, 2 left, 3 right."""
-    half = TRAIL_WIDTH / 2
-    arms = {
-        0: Box((0.5 - half, 0), (TRAIL_WIDTH, 0.5), 0, BLUE),
-        1: Box((0.5 - half, 0.5), (TRAIL_WIDTH, 0.5), 0, BLUE),
-        2: Box((0, 0.5 - half), (0.5, TRAIL_WIDTH), 0, BLUE),
-        3: Box((0.5, 0.5 - half), (0.5, TRAIL_WIDTH), 0, BLUE),
-    }
-    return (Disc((0.5, 0.5), half, BLUE), *(arms[side] for side in sorted(sides)))
 
 
 @dataclass(frozen=True)
@@ -199,10 +177,7 @@ class Chart:
 
 
 class Renderer(ABC):
-    """Shows scenes, as pixels or in a window; pygame is imported when the first one is drawn.
-
-    Copies, pickled ones included, share no window: they open their own when they need it.
-    """
+    """Shows scenes, as pixels or in a window; pygame is imported when the first one is drawn."""
 
     def __init__(self, fps: int, title: str) -> None:
         self.fps = fps  # pictures a second in a window
@@ -249,9 +224,6 @@ class Renderer(ABC):
 class ChartRenderer(Renderer):
     """Shows charts."""
 
-    def __reduce__(self) -> tuple[type[ChartRenderer], tuple[int, str]]:
-        return ChartRenderer, (self.fps, self.title)
-
     def paint(self, scene: Chart) -> pygame.Surface:
         import pygame
 
@@ -268,8 +240,8 @@ MAX_CELL = 64
 MIN_DETAILED_CELL = 12
 # Start, goal and robot of such maps are drawn across cells, large enough to be seen.
 MARKER = 28
-# The additional width of the trail on such maps, in pixels.
-TRAIL_MARKER = 4
+# The width of the trail: a share of a cell, and at least so many pixels.
+TRAIL_WIDTH, NARROWEST_TRAIL = 0.16, 5
 OVERSAMPLING = 4
 
 
@@ -283,63 +255,53 @@ class GridRenderer(Renderer):
         longest = max(len(rows), self.n_columns)
         self.cell = min(max(MAX_SIDE // longest, 1), MAX_CELL)
         self.detailed = self.cell >= MIN_DETAILED_CELL
+        self.marker = self.cell if self.detailed else MARKER
         self._sprites: dict[tuple[tuple[Shape, ...], int], pygame.Surface] = {}
-
-    def __reduce__(self) -> tuple[type[GridRenderer], tuple[tuple[str, ...], int, str]]:
-        return GridRenderer, (self.rows, self.fps, self.title)
 
     def paint(self, scene: Scene) -> pygame.Surface:
         import pygame
 
-        picture = self._detailed(scene) if self.detailed else self._coarse(scene)
+        picture = self._background.copy()
+        for cell in scene.collected:
+            if self.detailed:
+                self._put(picture, EMPTIED_SHAPES, cell, self.cell)
+            else:
+                picture.fill(FLOOR, pygame.Rect(self._corner(cell), (self.cell, self.cell)))
+        width = max(round(TRAIL_WIDTH * self.cell), NARROWEST_TRAIL)
+        for step in scene.steps:
+            first, last = (self._centre(cell) for cell in sorted(step))
+            line = pygame.Rect(first, (last[0] - first[0], last[1] - first[1]))
+            picture.fill(BLUE, line.inflate(width, width))
+        self._put_robot(picture, scene)
         longest = max(picture.get_size())
         if longest <= MAX_SIDE:
             return picture
-        width, height = (max(1, side * MAX_SIDE // longest) for side in picture.get_size())
-        return pygame.transform.smoothscale(picture, (width, height))
-
-    def _detailed(self, scene: Scene) -> pygame.Surface:
-        picture = self._background.copy()
-        for cell in scene.collected:
-            self._put(picture, EMPTIED_SHAPES, cell)
-        for cell, sides in self._sides(scene).items():
-            self._put(picture, trail_shapes(frozenset(sides)), cell)
-        self._put_robot(picture, scene, self.cell)
-        return picture
-
-    def _coarse(self, scene: Scene) -> pygame.Surface:
-        import pygame
-
-        colours = self._colours.copy()
-        colours.reshape(-1, 3)[list(scene.collected)] = FLOOR
-        pixels = colours.repeat(self.cell, axis=0).repeat(self.cell, axis=1)
-        picture = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
-        for step in scene.steps:
-            first, last = (self._centre(cell) for cell in sorted(step))
-            area = pygame.Rect(first, (last[0] - first[0] + 1, last[1] - first[1] + 1))
-            picture.fill(BLUE, area.inflate(TRAIL_MARKER, TRAIL_MARKER))
-        for cell, letter in self._landmarks:
-            self._put(picture, LETTER_SHAPES[letter], cell, MARKER)
-        self._put_robot(picture, scene, MARKER)
-        return picture
+        size = (max(1, side * MAX_SIDE // longest) for side in picture.get_size())
+        return pygame.transform.smoothscale(picture, tuple(size))
 
     @cached_property
     def _background(self) -> pygame.Surface:
-        """Floor, lines between its cells, and all that stands on it."""
+        """The map as it is without the robot."""
         import pygame
 
         size = (self.n_columns * self.cell, len(self.rows) * self.cell)
         picture = pygame.Surface(size)
         picture.fill(FLOOR)
+        if not self.detailed:
+            pixels = self._colours.repeat(self.cell, axis=0).repeat(self.cell, axis=1)
+            pygame.surfarray.blit_array(picture, pixels.swapaxes(0, 1))
+        drawn = LETTER_SHAPES.keys() if self.detailed else {"S", "G"}
         for row, letters in enumerate(self.rows):
-            for column, letter in enumerate(letters):
-                if letter in LETTER_SHAPES:
-                    cell = row * self.n_columns + column
-                    self._put(picture, LETTER_SHAPES[letter], cell)
-        for x in range(self.cell, size[0], self.cell):
-            pygame.draw.line(picture, GRID, (x, 0), (x, size[1]))
-        for y in range(self.cell, size[1], self.cell):
-            pygame.draw.line(picture, GRID, (0, y), (size[0], y))
+            if not drawn.isdisjoint(letters):
+                for column, letter in enumerate(letters):
+                    if letter in drawn:
+                        cell = row * self.n_columns + column
+                        self._put(picture, LETTER_SHAPES[letter], cell, self.marker)
+        if self.detailed:
+            for x in range(self.cell, size[0], self.cell):
+                pygame.draw.line(picture, GRID, (x, 0), (x, size[1]))
+            for y in range(self.cell, size[1], self.cell):
+                pygame.draw.line(picture, GRID, (0, y), (size[0], y))
         return picture
 
     @cached_property
@@ -351,55 +313,35 @@ class GridRenderer(Renderer):
         codes = np.frombuffer("".join(self.rows).encode("ascii"), np.uint8)
         return table[codes].reshape(len(self.rows), self.n_columns, 3)
 
-    @cached_property
-    def _landmarks(self) -> list[tuple[int, str]]:
-        """Cells of the start and the goals."""
-        return [
-            (row * self.n_columns + column, letter)
-            for row, letters in enumerate(self.rows)
-            if "S" in letters or "G" in letters
-            for column, letter in enumerate(letters)
-            if letter in "SG"
-        ]
-
-    def _sides(self, scene: Scene) -> dict[int, set[int]]:
-        """Through which sides the trail leaves each of its cells: 0 up, 1 down, 2 left, 3 right."""
-        # The keys would coincide on a map of one column, where left and right do not occur.
-        side_of = {-1: 2, 1: 3} | {-self.n_columns: 0, self.n_columns: 1}
-        sides: dict[int, set[int]] = defaultdict(set)
-        for origin, target in scene.steps:
-            sides[origin].add(side_of[target - origin])
-            sides[target].add(side_of[origin - target])
-        return sides
-
-    def _put_robot(self, picture: pygame.Surface, scene: Scene, size: int) -> None:
+    def _put_robot(self, picture: pygame.Surface, scene: Scene) -> None:
         import pygame
 
         row, column = scene.place(scene.robot)
         if self.rows[row][column] == "M":
-            self._put(picture, BURST_SHAPES, scene.robot, size * 3 // 2)
-        robot = self._sprite(ROBOT_SHAPES, size)
+            self._put(picture, BURST_SHAPES, scene.robot, self.marker * 3 // 2)
+        robot = self._sprite(ROBOT_SHAPES, self.marker)
         degrees = {None: 0, 0: 0, 1: 180, 2: 90, 3: 270}[scene.last_action]
         self._blit(picture, pygame.transform.rotate(robot, degrees), scene.robot)
 
     def _put(
-        self,
-        picture: pygame.Surface,
-        shapes: tuple[Shape, ...],
-        cell: int,
-        size: int | None = None,
+        self, picture: pygame.Surface, shapes: tuple[Shape, ...], cell: int, size: int
     ) -> None:
-        self._blit(picture, self._sprite(shapes, size or self.cell), cell)
+        self._blit(picture, self._sprite(shapes, size), cell)
 
     def _blit(self, picture: pygame.Surface, sprite: pygame.Surface, cell: int) -> None:
         """Draw a sprite centred on a cell; markers stay inside the picture."""
         area = sprite.get_rect(center=self._centre(cell))
         picture.blit(sprite, area if self.detailed else area.clamp(picture.get_rect()))
 
+    def _corner(self, cell: int) -> tuple[int, int]:
+        """The upper left pixel of a cell."""
+        row, column = divmod(cell, self.n_columns)
+        return column * self.cell, row * self.cell
+
     def _centre(self, cell: int) -> tuple[int, int]:
         """The pixel in the middle of a cell."""
-        row, column = divmod(cell, self.n_columns)
-        return column * self.cell + self.cell // 2, row * self.cell + self.cell // 2
+        x, y = self._corner(cell)
+        return x + self.cell // 2, y + self.cell // 2
 
     def _sprite(self, shapes: tuple[Shape, ...], size: int) -> pygame.Surface:
         """Shapes as a square picture with smooth edges, drawn once for each size."""
@@ -423,10 +365,7 @@ def _draw(surface: pygame.Surface, shape: Shape, scale: int) -> None:
         case Polygon():
             pygame.draw.polygon(surface, shape.colour, [point(at) for at in shape.points])
         case Disc():
-            pygame.draw.circle(surface, shape.colour, point(shape.centre), shape.radius * scale)
-        case Ring():
-            width = max(1, round(shape.width * scale))
-            radius = shape.radius * scale
+            width, radius = math.ceil(shape.width * scale), shape.radius * scale
             pygame.draw.circle(surface, shape.colour, point(shape.centre), radius, width)
         case Label():
             pygame.font.init()
@@ -454,6 +393,10 @@ class ShownEnv(gym.Env[Any, Any], ABC):
             check_choice("render_mode", render_mode, RENDER_MODES)
         self.render_mode = render_mode
         self._renderer: Renderer | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies, pickled ones included, open their own window when they need it.
+        return {**self.__dict__, "_renderer": None}
 
     def render(self) -> str | NDArray[np.uint8] | None:
         """As text (``ansi``), as a picture of shape (height, width, 3), or in a window."""

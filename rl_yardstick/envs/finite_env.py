@@ -6,22 +6,12 @@ from abc import abstractmethod
 from bisect import bisect_right
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from rl_yardstick.envs.drawing import (
-    BLUE,
-    GRID,
-    INK,
-    Box,
-    Chart,
-    ChartRenderer,
-    Label,
-    Shape,
-    ShownEnv,
-)
+from rl_yardstick.envs.drawing import ShownEnv
 from rl_yardstick.mdp.transition_model import Bools, Floats, TransitionModel
 
 Outcome = tuple[float, int, float, bool]
@@ -65,16 +55,16 @@ class FiniteEnv(ShownEnv):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[int, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; ``options`` are not used."""
         super().reset(seed=seed)
-        self.s = first_above(self.transition_model().initial.cumsum(), self.np_random.random())
+        self.s = self._draw_start()
         self.last_action = None
         if self.render_mode == "human":
             self.render()
-        return self._observe(), {}
+        return self._observe(), self._info()
 
-    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take an action; the class describes the results."""
         action = int(action)
         if not 0 <= action < self.n_actions:
@@ -85,14 +75,21 @@ class FiniteEnv(ShownEnv):
         self.s, self.last_action = state, action
         if self.render_mode == "human":
             self.render()
-        return self._observe(), reward, terminated, False, {}
+        return self._observe(), reward, terminated, False, self._info()
 
     def observation_of(self, states: Any) -> Any:
         """The observations of many states, shape (n,): by default their numbers."""
         return states
 
-    def _observe(self) -> int:
+    def _observe(self) -> Any:
         return int(self.observation_of(self.s))
+
+    def _info(self) -> dict[str, Any]:
+        """What `reset` and `step` give besides, at the end of each."""
+        return {}
+
+    def _draw_start(self) -> int:
+        return first_above(self.transition_model().initial.cumsum(), self.np_random.random())
 
     def _draw(self, action: int) -> tuple[int, float, bool]:
         """Sample the outcome: next state, reward, and whether the episode terminates."""
@@ -135,54 +132,6 @@ class MaskedFiniteEnv(FiniteEnv):
         """The allowed actions now, bool of shape (A,): sb3-contrib's convention."""
         mask: Bools = self.masks_of_states()[self.s]
         return mask.copy()
-
-
-# The length of a bar, in characters.
-BAR = 40
-# In pixels.
-WIDTH, MARGIN, TITLE, ROW, TEXT = 560, 24, 48, 64, 22
-
-
-class Gauge(NamedTuple):
-    """An amount between nothing and full."""
-
-    name: str
-    amount: int
-    full: int
-
-
-class GaugeEnv(MaskedFiniteEnv):
-    """An environment whose state is one or more amounts, shown as bars."""
-
-    @abstractmethod
-    def _gauges(self) -> tuple[str, list[Gauge]]:
-        """The last action, in words, and the amounts."""
-
-    def _text(self) -> str:
-        title, gauges = self._gauges()
-        longest = max(len(gauge.name) for gauge in gauges)
-        lines = [f"({title})"]
-        for name, amount, full in gauges:
-            bar = "=" * round(BAR * amount / full)
-            lines.append(f"{name:{longest}}  {amount:>{len(str(full))}}/{full} |{bar:{BAR}}|")
-        return "\n".join(lines) + "\n"
-
-    def _picture(self) -> Chart:
-        title, gauges = self._gauges()
-        shapes: list[Shape] = [Label(title, (MARGIN, TITLE / 2), TEXT + 4, INK, align=0)]
-        length, right = WIDTH - 2 * MARGIN, WIDTH - MARGIN
-        for i, (name, amount, full) in enumerate(gauges):
-            top = TITLE + i * ROW
-            shapes += [
-                Label(name, (MARGIN, top + 8), TEXT, INK, align=0),
-                Label(f"{amount} of {full}", (right, top + 8), TEXT, INK, align=1),
-                Box((MARGIN, top + 22), (length, 24), 4, GRID),
-                Box((MARGIN, top + 22), (length * amount / full, 24), 4, BLUE),
-            ]
-        return Chart((WIDTH, TITLE + ROW * len(gauges)), shapes)
-
-    def _make_renderer(self, fps: int, title: str) -> ChartRenderer:
-        return ChartRenderer(fps, title)
 
 
 def first_above(cumulative: Sequence[float] | Floats, uniform: float) -> int:

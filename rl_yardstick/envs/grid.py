@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from abc import abstractmethod
 from array import array
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -13,19 +12,17 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeGuard
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rl_yardstick.envs.argument_checks import check_flag, check_number
-from rl_yardstick.envs.drawing import GridRenderer, Scene, ShownEnv
+from rl_yardstick.envs.drawing import GridRenderer, Scene
 from rl_yardstick.envs.finite_env import (
     FiniteEnv,
-    Outcome,
-    as_dictionaries,
+    MaskedFiniteEnv,
     first_above,
     summing_to_one,
 )
-from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
+from rl_yardstick.mdp.transition_model import Bools, Floats, Ints, TransitionModel
 from rl_yardstick.safe_files.files import UnsafeFileError, read_file
 
 START = "S"
@@ -60,23 +57,27 @@ class GridMap:
 
         Raises:
             ValueError: if the file cannot be read, rows differ in length, a letter is unknown,
-                there is not exactly one start or no goal, or no way between them. Where there
-                is a place to name, the message names row and column, counted from one.
+                there is not exactly one start or no goal, or no way between them. Rows and columns
+                are counted from one.
         """
         rows, source = read_rows(desc), f"the map {desc}" if _is_path(desc) else "the map"
-        _check_shape(rows, source)
+        if not rows or not rows[0]:
+            raise ValueError(f"{source} is empty")
         letters, n_columns = "".join(rows), len(rows[0])
+        if len(letters) > MAX_STATES:
+            raise ValueError(f"{source} has {len(letters):,} cells, more than {MAX_STATES:,}")
+        for i, row in enumerate(rows, 1):
+            if len(row) != n_columns:
+                raise ValueError(f"{source}: row {i} has {len(row)} cells, row 1 has {n_columns}")
         if not set(letters) <= set(known):
             cell = next(cell for cell, letter in enumerate(letters) if letter not in known)
-            raise ValueError(
-                f"{source}: unknown letter {letters[cell]!r} at {_place(cell, n_columns)}; "
-                f"known are {' '.join(known)}"
-            )
-        codes = letters.encode("ascii")
-        start = _only_start(codes, n_columns, source)
-        goals = [cell for cell, code in enumerate(codes) if code == ord(GOAL)]
-        if not goals:
-            raise ValueError(f"{source} has no goal: mark it with the letter {GOAL}")
+            place = f"{letters[cell]!r} at {_place(cell, n_columns)}"
+            raise ValueError(f"{source}: unknown letter {place}; known are {' '.join(known)}")
+        goals = [cell for cell, letter in enumerate(letters) if letter == GOAL]
+        if letters.count(START) != 1 or not goals:
+            found = f"{letters.count(START)} starts {START} and {len(goals)} goals {GOAL}"
+            raise ValueError(f"{source} has {found}, it must have one start, and a goal")
+        codes, start = letters.encode("ascii"), letters.index(START)
         free = np.isin(np.frombuffer(codes, np.uint8), [ord(letter) for letter in passable])
         distances = distances_to(goals, free.reshape(len(rows), n_columns)).ravel()
         if distances[start] == UNREACHED:
@@ -154,43 +155,9 @@ def _is_path(desc: Description) -> TypeGuard[str | os.PathLike[str]]:
 def _read_file(path: Path) -> str:
     try:
         return read_file(path, MAX_MAP_BYTES).decode("utf-8-sig")
-    except OSError as error:
-        reason = str(error.strerror)
-    except UnsafeFileError as error:
-        raise ValueError(f"desc: {error}") from error
-    except UnicodeDecodeError:
-        reason = "it is not a text file in UTF-8"
-    raise ValueError(f"desc: cannot read the map file {path}: {reason}")
-
-
-def _check_shape(rows: tuple[str, ...], source: str) -> None:
-    if not rows or not rows[0]:
-        raise ValueError(f"{source} is empty")
-    n_columns = len(rows[0])
-    if len(rows) * n_columns > MAX_STATES:
-        raise ValueError(
-            f"{source} has {len(rows)} rows of {n_columns} cells, more than {MAX_STATES:,} cells"
-        )
-    for row, cells in enumerate(rows, 1):
-        if len(cells) != n_columns:
-            where = min(len(cells), n_columns)
-            raise ValueError(
-                f"{source}: row {row} has {len(cells)} cells and row 1 has {n_columns}: they "
-                f"differ from column {where + 1} on"
-            )
-
-
-def _only_start(codes: bytes, n_columns: int, source: str) -> int:
-    first = codes.find(ord(START))
-    if first < 0:
-        raise ValueError(f"{source} has no start: mark it with the letter {START}")
-    second = codes.find(ord(START), first + 1)
-    if second >= 0:
-        raise ValueError(
-            f"{source} has two starts, at {_place(first, n_columns)} and at "
-            f"{_place(second, n_columns)}; there must be one"
-        )
-    return first
+    except (OSError, UnsafeFileError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ValueError(f"desc: cannot read the map file {path}: {reason}") from error
 
 
 def _place(cell: int, n_columns: int) -> str:
@@ -373,17 +340,6 @@ TRAIL = "*"
 # What a terminal of common size shows; of larger maps the part around the robot is drawn.
 MAX_ROWS = 40
 MAX_COLUMNS = 100
-RESET = "\x1b[0m"
-# Select Graphic Rendition of ECMA-48: 1 bold, 2 faint, 3x colours, 44 on blue.
-STYLES = {
-    ROBOT: "\x1b[1;37;44m",
-    TRAIL: "\x1b[34m",
-    "#": "\x1b[2m",
-    "S": "\x1b[36m",
-    "G": "\x1b[1;32m",
-    "M": "\x1b[1;31m",
-    "P": "\x1b[1;33m",
-}
 
 
 def render_text(scene: Scene) -> str:
@@ -394,12 +350,8 @@ def render_text(scene: Scene) -> str:
     trail = {scene.place(cell) for step in scene.steps for cell in step}
     marks = {(row, column): TRAIL for row, column in trail if scene.rows[row][column] != START}
     marks[robot_row, robot_column] = ROBOT
-    opted_out = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
-    style = _coloured if sys.stdout.isatty() and not opted_out else str
     lines = [_title(scene, rows, columns)]
-    for row in rows:
-        letters = (marks.get((row, column), scene.rows[row][column]) for column in columns)
-        lines.append("".join(map(style, letters)))
+    lines += ["".join(marks.get((row, c), scene.rows[row][c]) for c in columns) for row in rows]
     return "\n".join(lines) + "\n"
 
 
@@ -415,185 +367,6 @@ def _window(centre: int, length: int, most: int) -> range:
     """At most ``most`` indices around ``centre``."""
     first = max(0, min(centre - most // 2, length - most))
     return range(first, min(first + most, length))
-
-
-def _coloured(letter: str) -> str:
-    return f"{STYLES[letter]}{letter}{RESET}" if letter in STYLES else letter
-
-
-Observation = int | NDArray[np.float32]
-
-
-class GridWorld(ShownEnv):
-    """A robot on a map of letters, moving up, down, left or right; the base of all grid worlds.
-
-    A subclass defines its letters in `tiles`; cells that neither block nor terminate can be walked
-    on. So that the arrays of `transition_model` replay an episode exactly, a subclass must keep
-    this rule: `reset` and `step` draw one uniform number each, even where nothing is random, and
-    choose by cumulative sum in the order of `initial_state_distrib` and `P`.
-
-    Args:
-        desc: the map: its rows, or the path to a text file. Exactly one ``S``, at least one ``G``.
-        tiles: what each letter means.
-        edge: the effect of trying to leave the map.
-        slip: probability that a move goes sideways, half of it to each side.
-        random_start: start each episode on any cell that can be walked on, holds nothing to
-            collect, and has a way to the goal, with equal probability, instead of on ``S``.
-        render_mode: ``"ansi"``, ``"rgb_array"``, ``"human"`` or None.
-
-    Attributes:
-        s: the state, an index; may be set to continue from another one.
-
-    Raises:
-        ValueError: if an argument is out of range or the map malformed; see `GridMap.read`.
-    """
-
-    def __init__(
-        self,
-        desc: Description,
-        tiles: Mapping[str, Tile],
-        edge: Tile,
-        *,
-        slip: float,
-        random_start: bool,
-        render_mode: str | None,
-    ) -> None:
-        slip = check_number("slip", slip, 0, 1)
-        self.random_start = check_flag("random_start", random_start)
-        super().__init__(render_mode)
-        passable = [
-            letter for letter, tile in tiles.items() if not (tile.blocked or tile.terminated)
-        ]
-        self.map = GridMap.read(desc, tiles, passable)
-        self.dynamics = GridDynamics(self.map, tiles, edge, slip)
-        self.observation_space = spaces.Discrete(self.dynamics.n_states)
-        self.action_space = spaces.Discrete(len(MOVES))
-        self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
-        self.s = self.map.start
-        self._steps: set[tuple[int, int]] = set()
-        self._last_action: int | None = None
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; ``options`` are not used."""
-        super().reset(seed=seed)
-        starts, thresholds = self._starts
-        drawn = np.searchsorted(thresholds, self.np_random.random(), side="right")
-        self.s = int(starts[drawn])
-        self._steps = set()
-        self._last_action = None
-        if self.render_mode == "human":
-            self.render()
-        return self._observe(), self._info(bumped=False)
-
-    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Try to move one cell; the class describes the results."""
-        action = int(action)
-        if not 0 <= action < len(MOVES):
-            raise ValueError(f"action {action} does not exist: 0 up, 1 down, 2 left, 3 right")
-        outcome = first_above(self._slip_thresholds, self.np_random.random())
-        move = self.dynamics.move(self.s, POSSIBLE_MOVES[action][outcome])
-        if self.render_mode is not None:
-            origin, target = self.s % self.map.n_cells, move.next_state % self.map.n_cells
-            if origin != target:
-                self._steps.add((origin, target))
-            self._last_action = action
-        self.s = move.next_state
-        if self.render_mode == "human":
-            self.render()
-        return self._observe(), move.reward, move.terminated, False, self._info(move.bumped)
-
-    def action_masks(self) -> Bools:
-        """Which moves neither a wall nor the edge stops, bool of shape (4,).
-
-        Where moves may slip, only the intended move counts. All moves are allowed in a cell that is
-        walled in, and where an episode has ended. The convention is that of sb3-contrib's agents.
-        """
-        return self.dynamics.action_mask(self.s)
-
-    def observation_of(self, states: AnyInts) -> NDArray[Any]:
-        """The observations of many states, shape (n,): here the states themselves."""
-        return states
-
-    def transition_model(self) -> TransitionModel:
-        """The exact dynamics as arrays; its states are numbered as `s`, whatever is observed."""
-        return self.dynamics.transition_model(self.initial_state_distrib)
-
-    @cached_property
-    def initial_state_distrib(self) -> Floats:
-        """Probabilities of the starting states, shape (S,)."""
-        starts, thresholds = self._starts
-        distribution = np.zeros(self.dynamics.n_states)
-        distribution[starts] = _equal(len(thresholds))
-        return distribution
-
-    @cached_property
-    def P(self) -> dict[int, dict[int, list[Outcome]]]:  # noqa: N802 (the name toy_text gave it)
-        """The dynamics as Gymnasium's toy_text environments hold them.
-
-        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built
-        on first access, from `transition_model`, whose arrays take a tenth of the memory.
-        """
-        return as_dictionaries(self.transition_model())
-
-    @property
-    def is_stationary(self) -> bool:
-        """Whether the dynamics do not change over time, so that their model always holds."""
-        return True
-
-    @property
-    def desc(self) -> NDArray[np.bytes_]:
-        """The map as FrozenLake holds it, single letters of shape (rows, columns)."""
-        return np.frombuffer(self.map.codes, "S1").reshape(self.map.n_rows, self.map.n_columns)
-
-    @property
-    def shortest_path_length(self) -> int:
-        """Moves from ``S`` to the nearest goal if none slips."""
-        return int(self.map.distances[self.map.start])
-
-    @cached_property
-    def _starts(self) -> tuple[Ints, Floats]:
-        """The cells where an episode may begin, in order, and their cumulative probabilities."""
-        if self.random_start:
-            starts = np.flatnonzero(self.map.distances > 0)
-            starts = starts[~np.isin(starts, list(self.dynamics.collectable_bits))]
-        else:
-            starts = np.array([self.map.start])
-        return starts, np.cumsum(_equal(len(starts)))
-
-    def _observe(self) -> Observation:
-        return self.s
-
-    def _info(self, bumped: bool) -> dict[str, Any]:
-        cell = self.s % self.map.n_cells
-        return {
-            "position": divmod(cell, self.map.n_columns),
-            "bumped": bumped,
-            # On every step, so that an episode cut off by a time limit counts as a failure.
-            "is_success": self.map.codes[cell] == ord(GOAL),
-        }
-
-    def _text(self) -> str:
-        return render_text(self._picture())
-
-    def _make_renderer(self, fps: int, title: str) -> GridRenderer:
-        return GridRenderer(self.map.rows, fps, title)
-
-    def _picture(self) -> Scene:
-        collected, cell = divmod(self.s, self.map.n_cells)
-        return Scene(
-            rows=self.map.rows,
-            robot=cell,
-            steps=self._steps,
-            collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
-            last_action=self._last_action,
-        )
-
-
-def _equal(n: int) -> Floats:
-    """Equal probabilities."""
-    return summing_to_one(np.full(n, 1 / n))
 
 
 # Longer chains are drawn in several rows, read as lines of text are.
@@ -635,3 +408,144 @@ class ChainEnv(MapEnv):
         length = min(len(letters), LONGEST_ROW)
         starts = range(0, len(letters), length)
         return tuple(letters[start : start + length].ljust(length, "#") for start in starts)
+
+
+class GridWorld(MapEnv, MaskedFiniteEnv):
+    """A robot on a map of letters, moving up, down, left or right; the base of all grid worlds.
+
+    A subclass defines its letters in `tiles`; cells that neither block nor terminate can be walked
+    on.
+
+    Args:
+        desc: the map: its rows, or the path to a text file. Exactly one ``S``, at least one ``G``.
+        tiles: what each letter means.
+        edge: the effect of trying to leave the map.
+        slip: probability that a move goes sideways, half of it to each side.
+        random_start: start each episode on any cell that can be walked on, holds nothing to
+            collect, and has a way to the goal, with equal probability, instead of on ``S``.
+        render_mode: ``"ansi"``, ``"rgb_array"``, ``"human"`` or None.
+
+    Raises:
+        ValueError: if an argument is out of range or the map malformed; see `GridMap.read`.
+    """
+
+    def __init__(
+        self,
+        desc: Description,
+        tiles: Mapping[str, Tile],
+        edge: Tile,
+        *,
+        slip: float,
+        random_start: bool,
+        render_mode: str | None,
+    ) -> None:
+        slip = check_number("slip", slip, 0, 1)
+        self.random_start = check_flag("random_start", random_start)
+        passable = [
+            letter for letter, tile in tiles.items() if not (tile.blocked or tile.terminated)
+        ]
+        self.map = GridMap.read(desc, tiles, passable)
+        self.dynamics = GridDynamics(self.map, tiles, edge, slip)
+        super().__init__(self.dynamics.n_states, len(MOVES), render_mode)
+        self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
+        self.s = self.map.start
+        self._bumped = False  # in the latest step
+        self._steps: set[tuple[int, int]] = set()  # those of the episode, where it is rendered
+
+    @property
+    def rows(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The rows of the map."""
+        return self.map.rows
+
+    def _draw_start(self) -> int:
+        starts, thresholds = self._starts
+        self._steps, self._bumped = set(), False
+        drawn = np.searchsorted(thresholds, self.np_random.random(), side="right")
+        return int(starts[drawn])
+
+    def _draw(self, action: int) -> tuple[int, float, bool]:
+        outcome = first_above(self._slip_thresholds, self.np_random.random())
+        state, reward, terminated, self._bumped = self.dynamics.move(
+            self.s, POSSIBLE_MOVES[action][outcome]
+        )
+        if self.render_mode is not None:
+            step = self.cell_of(self.s), self.cell_of(state)
+            self._steps |= {step} if step[0] != step[1] else set()
+        return state, reward, terminated
+
+    def action_masks(self) -> Bools:
+        """Which moves neither a wall nor the edge stops, bool of shape (4,).
+
+        Where moves may slip, only the intended move counts. All moves are allowed in a cell that is
+        walled in, and where an episode has ended. The convention is that of sb3-contrib's agents.
+        """
+        return self.dynamics.action_mask(self.s)
+
+    def masks_of_states(self) -> Bools:
+        """`action_masks` in each state, bool of shape (S, 4)."""
+        return self.dynamics.action_masks()
+
+    def cell_of(self, state: int) -> int:
+        """The cell of a state."""
+        return state % self.map.n_cells
+
+    def transition_model(self) -> TransitionModel:
+        """The exact dynamics as arrays; its states are numbered as `s`, whatever is observed."""
+        return self.dynamics.transition_model(self.initial_state_distrib)
+
+    @cached_property
+    def initial_state_distrib(self) -> Floats:
+        """Probabilities of the starting states, shape (S,)."""
+        starts, thresholds = self._starts
+        distribution = np.zeros(self.dynamics.n_states)
+        distribution[starts] = _equal(len(thresholds))
+        return distribution
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the dynamics do not change over time, so that their model always holds."""
+        return True
+
+    @property
+    def desc(self) -> NDArray[np.bytes_]:
+        """The map as FrozenLake holds it, single letters of shape (rows, columns)."""
+        return np.frombuffer(self.map.codes, "S1").reshape(self.map.n_rows, self.map.n_columns)
+
+    @property
+    def shortest_path_length(self) -> int:
+        """Moves from ``S`` to the nearest goal if none slips."""
+        return int(self.map.distances[self.map.start])
+
+    @cached_property
+    def _starts(self) -> tuple[Ints, Floats]:
+        """The cells where an episode may begin, in order, and their cumulative probabilities."""
+        if self.random_start:
+            starts = np.flatnonzero(self.map.distances > 0)
+            starts = starts[~np.isin(starts, list(self.dynamics.collectable_bits))]
+        else:
+            starts = np.array([self.map.start])
+        return starts, np.cumsum(_equal(len(starts)))
+
+    def _info(self) -> dict[str, Any]:
+        cell = self.cell_of(self.s)
+        return {
+            "position": divmod(cell, self.map.n_columns),
+            "bumped": self._bumped,
+            # On every step, so that an episode cut off by a time limit counts as a failure.
+            "is_success": self.map.codes[cell] == ord(GOAL),
+        }
+
+    def _picture(self) -> Scene:
+        collected, cell = divmod(self.s, self.map.n_cells)
+        return Scene(
+            rows=self.map.rows,
+            robot=cell,
+            steps=self._steps,
+            collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
+            last_action=self.last_action,
+        )
+
+
+def _equal(n: int) -> Floats:
+    """Equal probabilities."""
+    return summing_to_one(np.full(n, 1 / n))

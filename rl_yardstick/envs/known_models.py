@@ -172,9 +172,10 @@ def action_masks_of_states(env: Env) -> Bools | None:
         return np.array(idle[-1])
     # A subclass may have masks of its own.
     kind: Any = type(base)
-    if isinstance(base, GridWorld) and kind.action_masks is GridWorld.action_masks:
-        return base.dynamics.action_masks() if base.is_stationary else None
-    if isinstance(base, MaskedFiniteEnv) and kind.action_masks is MaskedFiniteEnv.action_masks:
+    if isinstance(base, GridWorld) and not base.is_stationary:
+        return None
+    own = GridWorld.action_masks, MaskedFiniteEnv.action_masks
+    if isinstance(base, MaskedFiniteEnv) and kind.action_masks in own:
         return base.masks_of_states()
     if isinstance(base, TaxiEnv) and kind.action_mask is TaxiEnv.action_mask:
         return np.array([base.action_mask(state) for state in sorted(base.P)], dtype=np.bool_)

@@ -63,8 +63,6 @@ class MineMazeEnv(GridWorld):
     wall) and `is_success` (whether it stands on the goal).
     `action_masks()` tells which moves do not run into the outer wall; with `slip` it
     considers the intended move, and in a cell that is walled in it allows all.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
 
     ## Arguments
     - `desc`: the map, as a list of rows or the path to a text file with one row per line
@@ -72,9 +70,6 @@ class MineMazeEnv(GridWorld):
     - `slip=0`: probability that the robot moves sideways instead, half of it to each side
     - `random_start=False`: see Starting State
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(

@@ -29,7 +29,7 @@ from rl_yardstick.mdp.transition_model import TransitionModel
 Env = gym.Env[Any, Any]
 
 TRUSTED_CLASSES = (FrozenLakeEnv, CliffWalkingEnv, TaxiEnv, BlackjackEnv)
-OWN_CLASSES = (GridWorld, ClickBandit, FiniteEnv)
+OWN_CLASSES = (ClickBandit, FiniteEnv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,6 @@ class Claim:
     @cached_property
     def observations(self) -> NDArray[Any] | None:
         """The observation of each state, states along the first axis; None if unknown."""
-        if isinstance(self.base, GridWorld):
-            return self.base.observation_of(np.arange(self.base.dynamics.n_states))
         if isinstance(self.base, FiniteEnv):
             return np.asarray(self.base.observation_of(np.arange(self.model.n_states)))
         if isinstance(self.base, BlackjackEnv):
@@ -74,22 +72,8 @@ class Claim:
     @cached_property
     def observes_states(self) -> bool:
         """Whether an observation is the number of the state."""
-        if isinstance(self.base, GridWorld):
-            return False
         seen = self.observations
         return seen is not None and np.array_equal(seen, np.arange(self.model.n_states))
-
-    def check_spaces(self) -> None:
-        """Make sure that the model has the environment's actions and as many states."""
-        base, model = self.base, self.model
-        if not isinstance(base.action_space, gym.spaces.Discrete) or (
-            int(base.action_space.n) != model.n_actions
-        ):
-            text = f"it has {model.n_actions} actions, where the space is {base.action_space}"
-            raise ValueError(text)
-        if self.observations is not None and len(self.observations) != model.n_states:
-            text = f"it has {model.n_states} states, where the space is {base.observation_space}"
-            raise ValueError(text)
 
 
 def claim_of(base: Env) -> Claim | None:
@@ -98,12 +82,18 @@ def claim_of(base: Env) -> Claim | None:
     Raises:
         ValueError: where the model is invalid, in one line.
     """
+    if not _brings_model(base):
+        return None
+    claim = Claim(base)
+    if is_ours(base):
+        return claim
     try:
-        if not _brings_model(base):
-            return None
-        claim = Claim(base)
-        if not is_ours(base):
-            claim.check_spaces()
+        model, actions, observations = claim.model, base.action_space, claim.observations
+        if not isinstance(actions, gym.spaces.Discrete) or actions.n != model.n_actions:
+            raise ValueError(f"it has {model.n_actions} actions, where the space is {actions}")
+        if observations is not None and len(observations) != model.n_states:
+            space = base.observation_space
+            raise ValueError(f"it has {model.n_states} states, where the space is {space}")
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise ValueError(f"the environment's P is no model: {one_line(error)}") from error
     return claim

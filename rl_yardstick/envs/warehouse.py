@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rl_yardstick.envs.argument_checks import check_choice, check_number, check_whole_number
-from rl_yardstick.envs.grid import MAX_STATES, MOVES, Description, GridWorld, Observation, Tile
+from rl_yardstick.envs.grid import MAX_STATES, MOVES, Description, GridWorld, Tile
 from rl_yardstick.mdp.transition_model import AnyInts, Bools
 
 MAX_SIZE = int(MAX_STATES**0.5)
@@ -162,9 +162,6 @@ class WarehouseEnv(GridWorld):
     - `random_start=False`: see Starting State
     - `observation="discrete"`: see Observation Space
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(
@@ -223,7 +220,7 @@ class WarehouseEnv(GridWorld):
         beside = [kinds[1 + y : 1 + y + height, 1 + x : 1 + x + width] for y, x in MOVES]
         return np.ravel_multi_index(tuple(beside), (3,) * len(MOVES)).ravel()
 
-    def _observe(self) -> Observation:
+    def _observe(self) -> int | NDArray[np.float32]:
         if self.observation == "discrete":
             return self.s
         if self.observation == "neighbours":
@@ -236,36 +233,19 @@ class RandomWarehouseEnv(WarehouseEnv):
     """A warehouse with shelves at random, of any size up to 4096 x 4096.
 
     ## Description
-    As Warehouse-v0, on a square map from `envs.warehouse.random_warehouse`: the start in the
-    lower left corner, the goal in the upper right one, and always a way between them.
-
-    ## Action Space
-    As Warehouse-v0.
-
-    ## Observation Space
-    As Warehouse-v0.
-
-    ## Rewards
-    As Warehouse-v0.
-
-    ## Starting State
-    As Warehouse-v0.
+    A square map from `envs.warehouse.random_warehouse`: the start in the lower left corner, the
+    goal in the upper right one, and always a way between them. Actions, observations, rewards and
+    information are those of Warehouse-v0.
 
     ## Episode End
     The episode terminates on the goal. When made by `gymnasium.make`, it is truncated after ten
     times as many steps as the shortest way has, or after `max_episode_steps` where that is given.
-
-    ## Information
-    As Warehouse-v0.
 
     ## Arguments
     - `size=10`: number of rows and of columns
     - `shelf_density=0.3`: the approximate share of cells that hold a shelf
     - `map_seed=0`: the same seed gives the same map
     - all of Warehouse-v0's but `desc`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(

@@ -194,17 +194,14 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
             Discrete, which is counted from zero afterwards.
 
     Raises:
-        ValueError: if the observations are none of these, or too many for a 64-bit number.
+        ValueError: if the observations are none of these.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gym.ObservationWrapper.__init__(self, env)
         self._sizes, self._first = _sizes_and_starts(env.observation_space)
-        n = math.prod(self._sizes)
-        if n > np.iinfo(np.int64).max:
-            raise ValueError(f"{env.observation_space} has {n} values, too many to be numbered")
-        self.observation_space = spaces.Discrete(n)
+        self.observation_space = spaces.Discrete(math.prod(self._sizes))
 
     def observation(self, observation: Any) -> int:
         """The number of one observation."""
@@ -306,14 +303,22 @@ class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstru
         space = env.observation_space
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"DiscretizeObservation needs a Box of one axis, not {space}")
-        self.dims = _chosen_dims(dims, space.shape[0])
+        n = space.shape[0]
+        chosen = range(n) if dims is None else dims
+        self.dims = [check_whole_number("dims", dim, 0, n - 1) for dim in chosen]
         counts = _per_dim("bins", bins, self.dims)
         self.bins = counts.astype(np.int64)
         if np.any(self.bins != counts) or np.any(self.bins < 1):
             raise ValueError(f"bins must be whole numbers from 1 on, not {bins}")
         self.low = _per_dim("low", space.low[self.dims] if low is None else low, self.dims)
         self.high = _per_dim("high", space.high[self.dims] if high is None else high, self.dims)
-        self._check_bounds()
+        ordered = np.isfinite(self.low) & np.isfinite(self.high) & (self.low < self.high)
+        if not ordered.all():
+            dim = int(np.argmin(ordered))
+            raise ValueError(
+                f"dimension {self.dims[dim]} of the observation has the bounds {self.low[dim]} and "
+                f"{self.high[dim]}: give finite low and high, low below high, or choose other dims"
+            )
         self.observation_space = spaces.Discrete(math.prod(self.bins.tolist()))
         self._cuts = list(
             zip(self.dims, *(a.tolist() for a in (self.low, self.high, self.bins)), strict=True)
@@ -334,28 +339,6 @@ class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstru
         indices: Ints = np.ravel_multi_index(tuple(places.T), tuple(self.bins))
         return indices
 
-    def _check_bounds(self) -> None:
-        for dim, low, high in zip(self.dims, self.low, self.high, strict=True):
-            if not (math.isfinite(low) and math.isfinite(high)):
-                raise ValueError(
-                    f"dimension {dim} of the observation has the bounds {low} and {high}: give "
-                    f"finite low and high, or choose other dims"
-                )
-            if not low < high:
-                raise ValueError(f"dimension {dim}: low {low} is not below high {high}")
-
-
-def _chosen_dims(dims: Sequence[int] | None, n_dims: int) -> list[int]:
-    if dims is None:
-        return list(range(n_dims))
-    try:
-        chosen = [check_whole_number("dims", dim, 0, n_dims - 1) for dim in dims]
-    except TypeError:
-        chosen = []
-    if not chosen or len(set(chosen)) < len(chosen):
-        raise ValueError(f"dims must list dimensions, each once, not {dims!r}")
-    return chosen
-
 
 def _per_dim(name: str, values: ArrayLike, dims: list[int]) -> Floats:
     """One value for each of the dimensions that count."""
@@ -367,32 +350,23 @@ def _per_dim(name: str, values: ArrayLike, dims: list[int]) -> Floats:
         ) from None
 
 
-def limit_by_shortest_path(
-    env: gym.Env[Any, Any], multiple: int, instead_of: int
+def own_time_limit(
+    env: gym.Env[Any, Any], attribute: str, multiple: int, instead_of: int
 ) -> gym.Env[Any, Any]:
-    """Limit the episodes of a grid world to a multiple of its shortest path.
+    """Limit the episodes of an environment to a multiple of one of its attributes.
 
     Args:
-        env: a grid world as `gymnasium.make` returns it.
-        multiple: the limit in shortest paths.
+        env: the environment as `gymnasium.make` returns it.
+        attribute: the name of a number of steps, such as the shortest path of a grid world.
+        multiple: how many times as many steps.
         instead_of: the default limit to replace. Another limit, or none, was chosen by the caller
             of `gymnasium.make`, and stays.
 
     Returns:
         The environment under the limit.
     """
-    base: Any = env.unwrapped
-    return _limited(env, multiple * base.shortest_path_length, instead_of)
-
-
-def limit_by_pulls(env: gym.Env[Any, Any], instead_of: int) -> gym.Env[Any, Any]:
-    """Limit the episodes of a bandit to its `pulls`; see `limit_by_shortest_path`."""
-    base: Any = env.unwrapped
-    return _limited(env, base.pulls, instead_of)
-
-
-def _limited(env: gym.Env[Any, Any], n_steps: int, instead_of: int) -> gym.Env[Any, Any]:
     if not isinstance(env, gym.wrappers.TimeLimit) or env.spec is None:
         return env
-    is_default = env.spec.max_episode_steps == instead_of
-    return gym.wrappers.TimeLimit(env.env, n_steps) if is_default else env
+    if env.spec.max_episode_steps != instead_of:
+        return env
+    return gym.wrappers.TimeLimit(env.env, multiple * getattr(env.unwrapped, attribute))

@@ -1,7 +1,7 @@
 """Compiling with Numba: decorators, a cache of machine code keyed by sources, compile times.
 
-The package imports no other package of this project. A package that wants its machine code cached
-on disk calls `machine_code.sources.keep_machine_code` with the packages its code depends on.
+The package imports no other package of this project. `cache.COMPILED` names the packages whose
+machine code is cached on disk.
 """
 
 from __future__ import annotations

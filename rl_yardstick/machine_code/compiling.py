@@ -1,9 +1,8 @@
 """The decorators of compiled functions.
 
-Numba ships no type annotations, so its own decorator would hide the signatures of functions. These
-decorators keep the signatures, and set the options in one place: machine code is cached by
-`machine_code.cache`, nothing compiles before the first call, and floating-point arithmetic follows
-IEEE 754.
+Numba's own decorator would hide the signatures of functions. These keep them, and set the options
+in one place: machine code is cached by `machine_code.cache`, nothing compiles before the first
+call, and floating-point arithmetic follows IEEE 754.
 
 For each function Numba makes machine code, with a wrapper for Python and another for C. A function
 that only compiled functions call needs none of these: each caller compiles it into its own code.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from rl_yardstick.machine_code.sources import keep_machine_code
 from rl_yardstick.mdp.transition_model import TransitionModel
 
 if TYPE_CHECKING:
@@ -47,27 +46,19 @@ __all__ = [
 ]
 
 _HOMES = {
-    "FiniteHorizonPlan": "rl_yardstick.mdp.finite_horizon",
-    "finite_horizon_optimum": "rl_yardstick.mdp.finite_horizon",
-    "Hardness": "rl_yardstick.mdp.hardness",
-    "hardness_of": "rl_yardstick.mdp.hardness",
-    "Plan": "rl_yardstick.mdp.planning",
-    "policy_iteration": "rl_yardstick.mdp.planning",
-    "value_iteration": "rl_yardstick.mdp.planning",
-    "PolicyReturn": "rl_yardstick.mdp.evaluation",
-    "baseline_return": "rl_yardstick.mdp.evaluation",
-    "baseline_policies": "rl_yardstick.mdp.evaluation",
-    "policy_return": "rl_yardstick.mdp.evaluation",
-    "state_visitation": "rl_yardstick.mdp.evaluation",
-    "optimal_choices": "rl_yardstick.mdp.evaluation",
-    "optimum_far_from_limit": "rl_yardstick.mdp.large_maps",
-    "state_values": "rl_yardstick.mdp.evaluation",
+    "evaluation": (
+        *("PolicyReturn", "baseline_policies", "baseline_return", "optimal_choices"),
+        *("policy_return", "state_values", "state_visitation"),
+    ),
+    "finite_horizon": ("FiniteHorizonPlan", "finite_horizon_optimum"),
+    "hardness": ("Hardness", "hardness_of"),
+    "large_maps": ("optimum_far_from_limit",),
+    "planning": ("Plan", "policy_iteration", "value_iteration"),
 }
-
-keep_machine_code("mdp")
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'mdp' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"rl_yardstick.mdp.{module}"), name)
+    raise AttributeError(f"module 'rl_yardstick.mdp' has no attribute {name!r}")

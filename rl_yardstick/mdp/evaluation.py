@@ -18,7 +18,15 @@ from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.finite_horizon import finite_horizon_optimum
 from rl_yardstick.mdp.graph import PolicyChain, reachable_states
 from rl_yardstick.mdp.large_maps import moments_along_ways, moments_by_spreading
-from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
+from rl_yardstick.mdp.planning import action_value
+from rl_yardstick.mdp.transition_model import (
+    AnyInts,
+    Bools,
+    Dynamics,
+    Floats,
+    Ints,
+    TransitionModel,
+)
 
 
 @dataclass(frozen=True)
@@ -77,10 +85,10 @@ def policy_return(
         ValueError: for arguments out of range or of the wrong shape, and, without time limit and
             discount, for a policy under which episodes may never end.
     """
-    _check(model, horizon, discount, success)
+    _check(horizon, discount)
     if model.reward_variance is not None:
         return _with_drawn_rewards(model, policy, horizon, discount, success)
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     ends_well = model.terminated if success is None else model.terminated & success
     if horizon is not None:
         episodes = LimitedEpisodes(model, policy, horizon)
@@ -101,8 +109,8 @@ def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None
     Raises:
         ValueError: as ``policy_return``.
     """
-    _check(model, horizon, 1.0, None)
-    policy = canonical_policy(model, policy, horizon)
+    _check(horizon, 1.0)
+    policy = canonical_policy(model, policy)
     if horizon is not None:
         return LimitedEpisodes(model, policy, horizon).visits()
     visits = np.zeros(model.n_states)
@@ -130,12 +138,12 @@ def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0)
     still beats them by far. (A fixed sequence of actions ignores observations too, but may be
     optimal where nothing is random.)
     """
-    _check(model, horizon, discount, None)
+    _check(horizon, discount)
     best = -np.inf
     uniform, *constant = baseline_policies(model)
     # Random actions visit most states: with a known floor, their evaluation often stops early.
     for policy in (*constant, uniform):
-        episodes = LimitedEpisodes(model, canonical_policy(model, policy, horizon), horizon)
+        episodes = LimitedEpisodes(model, canonical_policy(model, policy), horizon)
         floor = best if discount == 1 else -np.inf
         found = episodes.result(discount, model.terminated, with_success=False, floor=floor)
         best = max(best, found.expected_return)
@@ -161,15 +169,11 @@ def _with_drawn_rewards(
     return replace(result, return_variance=result.return_variance + added)
 
 
-def _check(
-    model: TransitionModel, horizon: int | None, discount: float, success: Bools | None
-) -> None:
+def _check(horizon: int | None, discount: float) -> None:
     if horizon is not None and horizon < 1:
         raise ValueError(f"horizon is {horizon}, it must be at least 1, or None for no limit")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
-    if success is not None and success.shape != model.prob.shape:
-        raise ValueError(f"success has shape {success.shape}, the model has {model.prob.shape}")
 
 
 def _moments_without_limit(chain: PolicyChain, discount: float, ends_well: Bools) -> Floats:
@@ -214,13 +218,8 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
 
     Returns:
         Shape (S,); zero for states that no policy reaches.
-
-    Raises:
-        ValueError: for a horizon below 1, or a malformed policy.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}, it must be at least 1")
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     states = np.flatnonzero(model.reachable)
     values = np.zeros(model.n_states)
     moments = LimitedEpisodes(model, policy, horizon).along_ways(states, 1.0, model.terminated)
@@ -229,10 +228,12 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
         return values
     place = np.cumsum(model.reachable) - 1
     values[states] = _returns_under_limit(
-        model.prob[states],
-        place[model.next_state[states]],
-        model.terminated[states],
-        model.expected_reward[states],
+        (
+            model.prob[states],
+            place[model.next_state[states]],
+            model.terminated[states],
+            model.expected_reward[states],
+        ),
         chances_in(model, policy, states),
         horizon,
     )
@@ -252,29 +253,19 @@ def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools
         The optimal expected undiscounted returns, shape (S,), zero for states that no policy
         reaches. And the actions whose value comes within 1e-9 of the best, relative to it where
         it is above 1: bool of shape (S, A), all actions in unreachable states.
-
-    Raises:
-        ValueError: for a horizon below 1.
     """
     values = finite_horizon_optimum(model, horizon).values
     later = finite_horizon_optimum(model, horizon - 1).values if horizon > 1 else 0 * values
-    following = np.where(model.terminated, 0.0, later[model.next_state])
-    action_values = model.expected_reward + np.einsum("sak,sak->sa", model.prob, following)
+    action_values = model.action_values(later)
     margin = OPTIMAL_TOLERANCE * np.maximum(1.0, np.abs(values))
     optimal = action_values >= (values - margin)[:, None]
     return values, optimal | ~model.reachable[:, None]
 
 
 @compiled
-def _returns_under_limit(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    mean_reward: Floats,
-    policy: Floats,
-    horizon: int,
-) -> Floats:
+def _returns_under_limit(model: Dynamics, policy: Floats, horizon: int) -> Floats:
     """The expected returns alone, as in ``moments_under_limit``, shape (n,)."""
+    prob = model[0]
     later = np.zeros(prob.shape[0])
     now = np.zeros(prob.shape[0])
     for step in range(horizon - 1, -1, -1):
@@ -284,10 +275,7 @@ def _returns_under_limit(
             value = 0.0
             for action in range(prob.shape[1]):
                 if chances[state, action] > 0:
-                    after = mean_reward[state, action]
-                    for k in range(prob.shape[2]):
-                        if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                            after += prob[state, action, k] * later[next_state[state, action, k]]
+                    after = action_value(model, state, action, later, 1.0)
                     value += chances[state, action] * after
             changed = changed or value != later[state]
             now[state] = value
@@ -306,24 +294,14 @@ Policy = NDArray[np.floating] | AnyInts
 POLICY_TOLERANCE = 1e-5
 
 
-def canonical_policy(model: TransitionModel, policy: Policy, horizon: int | None) -> Policy:
+def canonical_policy(model: TransitionModel, policy: Policy) -> Policy:
     """The policy as a float64 matrix (S, A), or as actions of shape (1 or horizon, S)."""
-    n_states, n_actions = model.n_states, model.n_actions
     if np.issubdtype(policy.dtype, np.integer):
         actions: AnyInts = np.atleast_2d(policy)
-        if actions.shape not in {(1, n_states), (horizon, n_states)}:
-            raise ValueError(
-                f"actions have shape {policy.shape}, they must have ({n_states},), or "
-                f"({horizon}, {n_states}) under a time limit"
-            )
         taken = actions[:, model.reachable]
-        if taken.min() < 0 or taken.max() >= n_actions:
-            raise ValueError(f"the policy takes an action outside 0..{n_actions - 1}")
+        if taken.min() < 0 or taken.max() >= model.n_actions:
+            raise ValueError(f"the policy takes an action outside 0..{model.n_actions - 1}")
         return actions
-    if policy.shape != (n_states, n_actions):
-        raise ValueError(
-            f"the policy matrix has shape {policy.shape}, it must have ({n_states}, {n_actions})"
-        )
     matrix = policy.astype(np.float64)
     total = matrix.sum(axis=1)
     # Written so that a NaN fails.
@@ -387,14 +365,15 @@ class LimitedEpisodes:
             ).tolist()
             return PolicyReturn(mean, variance, length, spread, rate if with_success else None)
         if moments is None:
-            rows = (*self._rows(states), self.model.reward[states], ends_well[states])
+            arrays = (*self._rows(states), self.model.reward[states], ends_well[states])
             chances = chances_in(self.model, self.policy, states)
             if len(chances) == 1 and ((chances == 0) | (chances == 1)).all():
                 # Keep the rows of these actions only: the sweeps would skip all others each time.
                 taken = np.arange(len(states)), chances[0].argmax(axis=1)
-                rows = tuple(array[taken][:, None] for array in rows)
+                arrays = tuple(array[taken][:, None] for array in arrays)
                 chances = np.ones((1, len(states), 1))
-            moments = moments_under_limit(*rows, chances, self.horizon, discount)
+            rows, good = arrays[:4], arrays[4]
+            moments = moments_under_limit(rows, good, chances, self.horizon, discount)
         return over_starts(self.model.initial[states], moments, with_success=with_success)
 
     def visits(self) -> Floats:
@@ -463,14 +442,7 @@ class LimitedEpisodes:
 
 @compiled
 def moments_under_limit(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    success: Bools,
-    policy: Floats,
-    horizon: int,
-    discount: float,
+    model: Dynamics, success: Bools, policy: Floats, horizon: int, discount: float
 ) -> Floats:
     """Moments of the episodes that start in each state.
 
@@ -481,6 +453,7 @@ def moments_under_limit(
         Shape (n, 5): mean and variance of the return, mean and variance of the length, and the
         probability of success.
     """
+    prob, next_state, terminated, reward = model
     later = np.zeros((prob.shape[0], 5))
     now = np.zeros((prob.shape[0], 5))
     for step in range(horizon - 1, -1, -1):
@@ -488,8 +461,8 @@ def moments_under_limit(
         changed = False
         for state in range(prob.shape[0]):
             outcomes = (prob[state], next_state[state], terminated[state], reward[state])
-            _means(*outcomes, success[state], chances[state], discount, later, now[state])
-            _variances(*outcomes, chances[state], discount, later, now[state])
+            _means(outcomes, success[state], chances[state], discount, later, now[state])
+            _variances(outcomes, chances[state], discount, later, now[state])
             for moment in range(5):
                 changed = changed or now[state, moment] != later[state, moment]
         now, later = later, now
@@ -501,17 +474,10 @@ def moments_under_limit(
 
 @called
 def _means(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    success: Bools,
-    chances: Floats,
-    discount: float,
-    later: Floats,
-    now: Floats,
+    model: Dynamics, success: Bools, chances: Floats, discount: float, later: Floats, now: Floats
 ) -> None:
     """The means of one state, from its rows of the model and the moments one step later."""
+    prob, next_state, terminated, reward = model
     now[0] = 0.0
     now[2] = 1.0
     now[4] = 0.0
@@ -530,16 +496,10 @@ def _means(
 
 @called
 def _variances(
-    prob: Floats,
-    next_state: Ints,
-    terminated: Bools,
-    reward: Floats,
-    chances: Floats,
-    discount: float,
-    later: Floats,
-    now: Floats,
+    model: Dynamics, chances: Floats, discount: float, later: Floats, now: Floats
 ) -> None:
     """The variances of one state, by the law of total variance."""
+    prob, next_state, terminated, reward = model
     now[1] = 0.0
     now[3] = 0.0
     for action in range(prob.shape[0]):

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rl_yardstick.machine_code.compiling import compiled
-from rl_yardstick.mdp.planning import TIE_TOLERANCE
+from rl_yardstick.mdp.planning import TIE_TOLERANCE, action_value
 from rl_yardstick.mdp.transition_model import (
-    AnyInts,
     Bools,
+    Dynamics,
     Floats,
     Ints,
     TransitionModel,
@@ -80,13 +80,12 @@ def finite_horizon_optimum(
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
     states = np.flatnonzero(model.reachable)
     allowed = allowed_actions(model, mask)
-    arrays = (model.prob, model.next_state, model.terminated, model.expected_reward, allowed)
     values = np.zeros(model.n_states)
     rows: list[Actions] = []
     for _ in range(horizon):
         earlier = np.zeros(model.n_states)
         actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
-        back_up(*arrays, float(discount), states, values, earlier, actions)
+        back_up(model.dynamics, allowed, float(discount), states, values, earlier, actions)
         rows.append(actions)
         if np.array_equal(earlier, values):
             break
@@ -96,10 +95,7 @@ def finite_horizon_optimum(
 
 @compiled
 def back_up(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
+    model: Dynamics,
     allowed: Bools,
     discount: float,
     states: Ints,
@@ -108,6 +104,7 @@ def back_up(
     actions: Actions,
 ) -> None:
     """Values one step earlier, and the actions to take there, into ``earlier`` and ``actions``."""
+    prob = model[0]
     action_values = np.empty(prob.shape[1])
     for state in states:
         # A loop: NumPy's maximum takes longer to compile than all of this.
@@ -116,11 +113,7 @@ def back_up(
             if not allowed[state, action]:
                 action_values[action] = -np.inf
                 continue
-            value = mean_reward[state, action]
-            for k in range(prob.shape[2]):
-                if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                    following = values[next_state[state, action, k]]
-                    value += discount * prob[state, action, k] * following
+            value = action_value(model, state, action, values, discount)
             action_values[action] = value
             best = max(best, value)
         tied = best - TIE_TOLERANCE * max(1.0, abs(best))

@@ -16,9 +16,11 @@ import numpy as np
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.evaluation import Policy, canonical_policy, chances_in, policy_return
 from rl_yardstick.mdp.finite_horizon import back_up
+from rl_yardstick.mdp.planning import action_value
 from rl_yardstick.mdp.transition_model import (
     AnyInts,
     Bools,
+    Dynamics,
     Floats,
     TransitionModel,
     allowed_actions,
@@ -32,10 +34,6 @@ MOST_CANDIDATES = 24
 MOST_OUTCOMES_REPAIRED = 20_000_000
 # Probabilities of two policies within this of each other count as equal.
 SAME = 1e-9
-
-
-class TooLargeError(ValueError):
-    """The values of all states at all steps do not fit into the memory set aside for them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +71,14 @@ def gap_by_state(model: TransitionModel, policy: Policy, horizon: int) -> GapByS
         horizon: the time limit in steps.
 
     Raises:
-        ValueError: for a horizon below 1 or a malformed policy; `TooLargeError` where horizon times
-            states are too many.
+        ValueError: for a malformed policy, and where horizon times states are too many.
     """
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     best = _optimal_rows(model, horizon)
     chances = chances_in(model, policy, np.arange(model.n_states))
     none = np.zeros(model.n_states, np.bool_)
     losses, visits, values = _losses(
-        *_arrays(model), chances, none, best[:1], model.initial, best, horizon
+        model.dynamics, chances, none, best[:1], model.initial, best, horizon
     )
     seen = visits > 0
     values[seen] /= visits[seen, None]
@@ -114,9 +111,9 @@ def greedy_repairs(
     """
     if model.prob.size * horizon > MOST_OUTCOMES_REPAIRED:
         return []
-    policy = canonical_policy(model, policy, horizon)
+    policy = canonical_policy(model, policy)
     chances = chances_in(model, policy, np.arange(model.n_states))
-    best, arrays = _optimal_rows(model, horizon), _arrays(model)
+    best = _optimal_rows(model, horizon)
     repaired = np.zeros(model.n_states, np.bool_)
     repairs: list[Repair] = []
     losses, value = split.losses, split.value
@@ -126,15 +123,15 @@ def greedy_repairs(
         tried: list[Repair] = []
         for state in worst[(losses[worst] > 0) & ~repaired[worst]]:
             one = repaired | (np.arange(model.n_states) == state)
-            rows = _policy_rows(*arrays, chances, one, horizon)
+            rows = _policy_rows(model.dynamics, chances, one, horizon)
             tried.append(Repair(int(state), float(model.initial @ rows[-1])))
         found = max(tried, key=lambda repair: repair.value, default=Repair(-1, value))
         if found.value <= value + least:
             break
         repairs.append(found)
         value, repaired[found.state] = found.value, True
-        rows = _policy_rows(*arrays, chances, repaired, horizon)
-        losses = _losses(*arrays, chances, repaired, rows, model.initial, best, horizon)[0]
+        rows = _policy_rows(model.dynamics, chances, repaired, horizon)
+        losses = _losses(model.dynamics, chances, repaired, rows, model.initial, best, horizon)[0]
     return repairs
 
 
@@ -161,15 +158,12 @@ def first_differences(
         ValueError: as `gap_by_state`.
     """
     _check_size(horizon + 1, model)
-    states, none, arrays = (
-        np.arange(model.n_states),
-        np.zeros(model.n_states, np.bool_),
-        _arrays(model),
-    )
-    chances = chances_in(model, canonical_policy(model, policy, horizon), states)
-    others = chances_in(model, canonical_policy(model, other, horizon), states)
-    rows, other_rows = (_policy_rows(*arrays, one, none, horizon) for one in (chances, others))
-    found = _partings(*arrays, chances, others, model.initial, rows, other_rows, horizon)
+    states, none = np.arange(model.n_states), np.zeros(model.n_states, np.bool_)
+    chances = chances_in(model, canonical_policy(model, policy), states)
+    others = chances_in(model, canonical_policy(model, other), states)
+    rows = _policy_rows(model.dynamics, chances, none, horizon)
+    other_rows = _policy_rows(model.dynamics, others, none, horizon)
+    found = _partings(model.dynamics, chances, others, model.initial, rows, other_rows, horizon)
     return FirstDifferences(*found)
 
 
@@ -183,19 +177,15 @@ def policy_gradient(model: TransitionModel, policy: Floats, horizon: int) -> tup
         The expected return, and its partial derivative with respect to each probability, shape
         (S, A).
     """
-    arrays, none = _arrays(model), np.zeros(model.n_states, np.bool_)
-    rows = _policy_rows(*arrays, policy[None], none, horizon)
-    slope = _losses(*arrays, policy[None], none, rows, model.initial, rows, horizon)[2]
+    none = np.zeros(model.n_states, np.bool_)
+    rows = _policy_rows(model.dynamics, policy[None], none, horizon)
+    slope = _losses(model.dynamics, policy[None], none, rows, model.initial, rows, horizon)[2]
     return float(model.initial @ rows[-1]), slope
-
-
-def _arrays(model: TransitionModel) -> tuple[Floats, AnyInts, Bools, Floats]:
-    return model.prob, model.next_state, model.terminated, model.expected_reward
 
 
 def _check_size(n_rows: int, model: TransitionModel) -> None:
     if n_rows * model.n_states > MOST_VALUES:
-        raise TooLargeError(
+        raise ValueError(
             f"the values of {model.n_states:,} states at {n_rows:,} steps and more are too many to "
             "keep"
         )
@@ -206,14 +196,12 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
 
     With m steps or more left they are those of the last row.
     """
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}, it must be at least 1")
     states = np.flatnonzero(model.reachable)
     allowed = allowed_actions(model, None)
     rows = [np.zeros(model.n_states)]
     for _ in range(horizon):
         earlier, actions = np.zeros(model.n_states), np.zeros(model.n_states, np.uint64)
-        back_up(*_arrays(model), allowed, 1.0, states, rows[-1], earlier, actions)
+        back_up(model.dynamics, allowed, 1.0, states, rows[-1], earlier, actions)
         if np.array_equal(earlier, rows[-1]):
             break
         rows.append(earlier)
@@ -222,24 +210,6 @@ def _optimal_rows(model: TransitionModel, horizon: int) -> Floats:
 
 
 # Compiled. With more steps left than there are rows of values, the last row applies.
-
-
-@called
-def action_value(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    state: int,
-    action: int,
-    later: Floats,
-) -> float:
-    """The undiscounted value of an action, from the state values one step later."""
-    value = float(mean_reward[state, action])
-    for k in range(prob.shape[2]):
-        if prob[state, action, k] > 0 and not terminated[state, action, k]:
-            value += prob[state, action, k] * later[next_state[state, action, k]]
-    return value
 
 
 @called
@@ -263,10 +233,7 @@ def _spread(
 
 @compiled
 def _losses(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
+    model: Dynamics,
     chances: Floats,
     repaired: Bools,
     rows: Floats,
@@ -278,6 +245,7 @@ def _losses(
 
     In repaired states the policy is greedy for its own values, ``rows``.
     """
+    prob, next_state, terminated, mean_reward = model
     n_states, n_actions = mean_reward.shape
     losses, visits = np.zeros(n_states), np.zeros(n_states)
     values, weights = np.zeros((n_states, n_actions)), np.zeros(n_actions)
@@ -295,18 +263,14 @@ def _losses(
             if repaired[state]:
                 chosen, highest = 0, -np.inf
                 for action in range(n_actions):
-                    value = action_value(
-                        prob, next_state, terminated, mean_reward, state, action, own
-                    )
+                    value = action_value(model, state, action, own, 1.0)
                     if value > highest:
                         chosen, highest = action, value
                 weights[:] = 0.0
                 weights[chosen] = 1.0
             visits[state] += here[state]
             for action in range(n_actions):
-                value = action_value(
-                    prob, next_state, terminated, mean_reward, state, action, later
-                )
+                value = action_value(model, state, action, later, 1.0)
                 values[state, action] += here[state] * value
                 weight = here[state] * weights[action]
                 if weight > 0:
@@ -319,16 +283,9 @@ def _losses(
 
 
 @compiled
-def _policy_rows(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    chances: Floats,
-    repaired: Bools,
-    horizon: int,
-) -> Floats:
+def _policy_rows(model: Dynamics, chances: Floats, repaired: Bools, horizon: int) -> Floats:
     """Values with 0, 1, ... steps left, shape (m, S); repaired states take the best action."""
+    mean_reward = model[3]
     n_states, n_actions = mean_reward.shape
     rows = np.zeros((horizon + 1, n_states))
     for left in range(1, horizon + 1):
@@ -340,9 +297,7 @@ def _policy_rows(
             for action in range(n_actions):
                 if taken[state, action] == 0 and not repaired[state]:
                     continue
-                value = action_value(
-                    prob, next_state, terminated, mean_reward, state, action, later
-                )
+                value = action_value(model, state, action, later, 1.0)
                 highest = max(highest, value)
                 mean += taken[state, action] * value
             now[state] = highest if repaired[state] else mean
@@ -355,10 +310,7 @@ def _policy_rows(
 
 @compiled
 def _partings(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
+    model: Dynamics,
     chances: Floats,
     others: Floats,
     initial: Floats,
@@ -367,6 +319,7 @@ def _partings(
     horizon: int,
 ) -> tuple[Floats, Floats]:
     """Probabilities (S,) of the first difference in each state, and its gains (S,)."""
+    prob, next_state, terminated, mean_reward = model
     n_states, n_actions = mean_reward.shape
     met, gains = np.zeros(n_states), np.zeros(n_states)
     here = initial.copy()

@@ -21,10 +21,9 @@ from rl_yardstick.mdp.evaluation import (
     state_visitation,
 )
 from rl_yardstick.mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
-from rl_yardstick.mdp.gaps import action_value
 from rl_yardstick.mdp.graph import steps_to_end
-from rl_yardstick.mdp.planning import policy_iteration, surely_ending
-from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, TransitionModel
+from rl_yardstick.mdp.planning import action_value, policy_iteration, surely_ending
+from rl_yardstick.mdp.transition_model import AnyInts, Bools, Dynamics, Floats, TransitionModel
 
 # Above these limits, a measure is None. Outcomes of reachable states, times these states.
 MOST_FOR_DIAMETER = 5_000_000
@@ -60,9 +59,6 @@ def hardness_of(model: TransitionModel, horizon: int, success: Bools | None = No
         model: the decision process.
         horizon: the time limit in steps.
         success: the outcomes that end an episode well, bool of shape (S, A, K), or None.
-
-    Raises:
-        ValueError: for a horizon below 1, or ``success`` of another shape.
     """
     plan = finite_horizon_optimum(model, horizon)
     spanned = diameter(model)
@@ -169,8 +165,7 @@ def action_gaps(
     horizon = plan.horizon
     values, optimal = optimal_choices(model, horizon)
     later = finite_horizon_optimum(model, horizon - 1).values if horizon > 1 else 0 * values
-    following = np.where(model.terminated, 0.0, later[model.next_state])
-    worth = model.expected_reward + np.einsum("sak,sak->sa", model.prob, following)
+    worth = model.action_values(later)
     gaps = values - np.where(optimal, -np.inf, worth).max(axis=1)
     visits = np.where(np.isfinite(gaps), state_visitation(model, plan.policy, horizon), 0.0)
     seen = visits > 0
@@ -242,13 +237,13 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
     deepest = min(steps, MOST_LOOKED_AT // (steps * rows[0].size))
     if steps * len(states) > MOST_VALUES or deepest < min(steps, LEAST_DEPTHS):
         return None, None
-    best, worst, current = _value_rows(*arrays, steps)
+    best, worst, current = _value_rows(arrays, steps)
     n_actions = model.n_actions
     is_random = ((rows[0] > 0).sum(axis=2) > 1).any() or model.reward_variance is not None
     bounded = n_actions > 1 and not is_random
     lookahead, bound = None, float(steps)
     for k in range(1, deepest + 1):
-        solves, spread = _greedy_is_optimal(*arrays, start, best, worst, current, OPTIMAL_TOLERANCE)
+        solves, spread = _greedy_is_optimal(arrays, start, best, worst, current, OPTIMAL_TOLERANCE)
         if solves and lookahead is None:
             lookahead = k
         if bounded and np.isfinite(spread):
@@ -257,7 +252,7 @@ def looking_ahead(model: TransitionModel, horizon: int) -> tuple[int | None, flo
             bound = min(bound, k + math.log(episodes) / math.log(n_actions))
         if lookahead is not None and (k + 1 >= bound or not bounded):
             break
-        _look_further(*arrays, current)
+        _look_further(arrays, current)
     return lookahead, bound if bounded and lookahead is not None else None
 
 
@@ -284,10 +279,9 @@ def _longest_episode(
 
 
 @compiled
-def _value_rows(
-    prob: Floats, next_state: AnyInts, terminated: Bools, mean_reward: Floats, horizon: int
-) -> tuple[Floats, Floats, Floats]:
+def _value_rows(model: Dynamics, horizon: int) -> tuple[Floats, Floats, Floats]:
     """Highest and lowest values, and those of random actions, with 0, 1, ... steps left."""
+    mean_reward = model[3]
     n_states, n_actions = mean_reward.shape
     best = np.zeros((horizon + 1, n_states))
     worst, mean = best.copy(), best.copy()
@@ -295,47 +289,37 @@ def _value_rows(
         for state in range(n_states):
             highest, lowest, total = -np.inf, np.inf, 0.0
             for action in range(n_actions):
-                at = prob, next_state, terminated, mean_reward, state, action
-                highest = max(highest, action_value(*at, best[left - 1]))
-                lowest = min(lowest, action_value(*at, worst[left - 1]))
-                total += action_value(*at, mean[left - 1])
+                highest = max(highest, action_value(model, state, action, best[left - 1], 1.0))
+                lowest = min(lowest, action_value(model, state, action, worst[left - 1], 1.0))
+                total += action_value(model, state, action, mean[left - 1], 1.0)
             best[left, state], worst[left, state] = highest, lowest
             mean[left, state] = total / n_actions
     return best, worst, mean
 
 
 @compiled
-def _look_further(
-    prob: Floats, next_state: AnyInts, terminated: Bools, mean_reward: Floats, rows: Floats
-) -> None:
+def _look_further(model: Dynamics, rows: Floats) -> None:
     """One sweep of value iteration over values with 0, 1, ... steps left, in place."""
+    mean_reward = model[3]
     n_states, n_actions = mean_reward.shape
     for left in range(len(rows) - 1, 0, -1):
         for state in range(n_states):
             highest = -np.inf
             for action in range(n_actions):
-                at = prob, next_state, terminated, mean_reward, state, action
-                highest = max(highest, action_value(*at, rows[left - 1]))
+                highest = max(highest, action_value(model, state, action, rows[left - 1], 1.0))
             rows[left, state] = highest
 
 
 @compiled
 def _greedy_is_optimal(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    start: Bools,
-    best: Floats,
-    worst: Floats,
-    current: Floats,
-    tolerance: float,
+    model: Dynamics, start: Bools, best: Floats, worst: Floats, current: Floats, tolerance: float
 ) -> tuple[bool, float]:
     """Whether all greedy policies are optimal, and the largest (v + b d / 6) / d^2 for GORP.
 
     Q(k) follows from the state values ``current``. Greedy policies take the best actions; GORP may
     take each action that looks better than the best mistake, see `looking_ahead`.
     """
+    prob, next_state, terminated, mean_reward = model
     n_states, n_actions = mean_reward.shape
     is_optimal, spread = True, 0.0
     greedy, likely = start.copy(), start.copy()
@@ -348,10 +332,9 @@ def _greedy_is_optimal(
             top, mistake = -np.inf, -np.inf
             least = best[left, state] - tolerance * max(1.0, abs(best[left, state]))
             for action in range(n_actions):
-                at = prob, next_state, terminated, mean_reward, state, action
-                seems[action] = action_value(*at, current[left - 1])
-                truly[action] = action_value(*at, best[left - 1])
-                lowest[action] = action_value(*at, worst[left - 1])
+                seems[action] = action_value(model, state, action, current[left - 1], 1.0)
+                truly[action] = action_value(model, state, action, best[left - 1], 1.0)
+                lowest[action] = action_value(model, state, action, worst[left - 1], 1.0)
                 top = max(top, seems[action])
                 if truly[action] < least:
                     mistake = max(mistake, seems[action])

@@ -17,7 +17,14 @@ import numpy as np
 
 from rl_yardstick.machine_code.compiling import compiled, inlined, kernel
 from rl_yardstick.mdp.planning import value_iteration
-from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
+from rl_yardstick.mdp.transition_model import (
+    AnyInts,
+    Bools,
+    Dynamics,
+    Floats,
+    Ints,
+    TransitionModel,
+)
 
 # A distant limit.
 
@@ -68,7 +75,7 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
     lowest_start = float(plan.values[model.initial > 0].min())
     highest, lowest = max(float(values.max()), 0.0), min(float(values.min()), 0.0)
     rows = model.prob, model.next_state, model.terminated, model.reward
-    step_cost, fall, variance = drift(*rows, reached, plan.values)
+    step_cost, fall, variance = drift(rows, reached, plan.values)
     slack = 4 * plan.error_bound  # error of differences of values, each within the bound
     overdue = horizon * step_cost - (highest - lowest_start) - slack
     fall, deviation = fall + slack, math.sqrt(variance) + slack
@@ -91,20 +98,14 @@ def chance_of_losing(loss: float, fall: float, variance: float, horizon: int) ->
 
 
 @compiled
-def drift(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    reward: Floats,
-    reached: Bools,
-    values: Floats,
-) -> tuple[float, float, float]:
+def drift(model: Dynamics, reached: Bools, values: Floats) -> tuple[float, float, float]:
     """How a step changes the value: the worst cases over all reachable states and actions.
 
     Returns the least cost of a step that goes on, the largest fall of the value below its mean in a
     step, and the largest variance of the value after a step. An end with reward r counts as a step
     of least cost e to a state of value r + e.
     """
+    prob, next_state, terminated, reward = model
     step_cost = np.inf
     for state in range(prob.shape[0]):
         if reached[state]:

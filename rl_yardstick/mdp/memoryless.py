@@ -24,7 +24,14 @@ from numpy.typing import NDArray
 from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.evaluation import policy_return
 from rl_yardstick.mdp.gaps import policy_gradient
-from rl_yardstick.mdp.transition_model import AnyInts, Bools, Floats, Ints, TransitionModel
+from rl_yardstick.mdp.planning import action_value
+from rl_yardstick.mdp.transition_model import (
+    Bools,
+    Dynamics,
+    Floats,
+    Ints,
+    TransitionModel,
+)
 
 # Limits for a search of some seconds. Work is in outcomes and choices of all states at all steps.
 MOST_OUTCOMES_CLIMBED = 100_000_000  # for one return; above, there is no search
@@ -106,10 +113,9 @@ def best_memoryless(
         return -value, -(shares * (by_group - mean)).ravel()
 
     seen = np.unique(groups[states])
-    arrays = model.prob, model.next_state, model.terminated, model.expected_reward
 
     def returns(choices: Ints) -> Floats:
-        return _firm_returns(*arrays, model.initial, states, groups, choices, horizon)
+        return _firm_returns(model.dynamics, model.initial, states, groups, choices, horizon)
 
     n_firm, per_firm = n_actions ** len(seen), len(states) * model.n_outcomes * horizon
     is_firm_known = n_firm <= MOST_FIRM and n_firm * per_firm <= MOST_WORK
@@ -179,7 +185,6 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
     """A return that no memoryless policy exceeds, from branch and bound."""
     model = found.model
     enough = found.value + PROVED * max(1.0, abs(found.value))
-    arrays = model.prob, model.next_state, model.terminated, model.expected_reward
     states: Ints = np.flatnonzero(model.reachable)
     shape, groups = found.policy.shape, found.groups
     order = count()  # breaks ties, so that arrays are never compared
@@ -188,7 +193,7 @@ def _bound_of_all(found: _Best, seen: Ints, horizon: int, work: int) -> float:
 
     def add(low: Floats, high: Floats, most: float) -> None:
         nonlocal work
-        values = _return_in_box(*arrays, states, groups, low, high, horizon)
+        values = _return_in_box(model.dynamics, states, groups, low, high, horizon)
         most = min(most, float(model.initial @ values))
         work -= 1
         if most > enough and work >= n_slopes:
@@ -224,15 +229,16 @@ def _bound_by_slopes(
     (Kakade and Langford, 2002). An agent that sees the state bounds that sum from both sides.
     """
     model, groups = found.model, found.groups
-    arrays, middle = (model.prob, model.next_state, model.terminated), _inside(low, high)
+    middle = _inside(low, high)
     policy = middle[groups]
-    values, advantages = _advantages(*arrays, model.expected_reward, states, policy, horizon)
+    values, advantages = _advantages(model.dynamics, states, policy, horizon)
     bound = float(model.initial @ values)
     for group in seen:
         for action in range(model.n_actions):
             more = np.ascontiguousarray(advantages[:, :, action])
+            box = states, groups, low, high, group
             up, down = (
-                float(model.initial @ _most_met(*arrays, states, groups, low, high, group, each))
+                float(model.initial @ _most_met(model.dynamics, *box, each))
                 for each in (more, -more)
             )
             rises, falls = (high - middle)[group, action], (middle - low)[group, action]
@@ -255,23 +261,16 @@ def _inside(low: Floats, high: Floats) -> Floats:
 
 @compiled
 def _return_in_box(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    states: Ints,
-    groups: Ints,
-    low: Floats,
-    high: Floats,
-    horizon: int,
+    model: Dynamics, states: Ints, groups: Ints, low: Floats, high: Floats, horizon: int
 ) -> Floats:
     """The returns (S,) of an agent that sees the state and chooses within the box at each step."""
+    prob, mean_reward = model[0], model[3]
     later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
     values, is_used = np.zeros(prob.shape[1]), np.zeros(prob.shape[1], np.bool_)
     for _ in range(horizon):
         changed = False
         for state in states:
-            _look_ahead(prob, next_state, terminated, state, later, values)
+            _look_ahead(model, state, later, values)
             for action in range(prob.shape[1]):
                 values[action] += mean_reward[state, action]
             group = groups[state]
@@ -285,17 +284,10 @@ def _return_in_box(
 
 @compiled
 def _firm_returns(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    initial: Floats,
-    states: Ints,
-    groups: Ints,
-    choices: Ints,
-    horizon: int,
+    model: Dynamics, initial: Floats, states: Ints, groups: Ints, choices: Ints, horizon: int
 ) -> Floats:
     """The returns (P,) of deterministic policies, as actions by observation (P, G)."""
+    prob = model[0]
     returns, later, now = np.zeros(len(choices)), np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
     for row in range(len(choices)):
         later[:] = 0.0
@@ -303,10 +295,7 @@ def _firm_returns(
             changed = False
             for state in states:
                 action = choices[row, groups[state]]
-                value = mean_reward[state, action]
-                for k in range(prob.shape[2]):
-                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                        value += prob[state, action, k] * later[next_state[state, action, k]]
+                value = action_value(model, state, action, later, 1.0)
                 changed = changed or value != later[state]
                 now[state] = value
             now, later = later, now
@@ -319,21 +308,16 @@ def _firm_returns(
 
 @compiled
 def _advantages(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    states: Ints,
-    policy: Floats,
-    horizon: int,
+    model: Dynamics, states: Ints, policy: Floats, horizon: int
 ) -> tuple[Floats, Floats]:
     """The returns (S,) of a policy (S, A), and its advantages (horizon, S, A)."""
+    mean_reward = model[3]
     n_states, n_actions = policy.shape
     advantages, values = np.zeros((horizon, n_states, n_actions)), np.zeros(n_actions)
     later, now = np.zeros(n_states), np.zeros(n_states)
     for step in range(horizon - 1, -1, -1):
         for state in states:
-            _look_ahead(prob, next_state, terminated, state, later, values)
+            _look_ahead(model, state, later, values)
             now[state] = 0.0
             for action in range(n_actions):
                 values[action] += mean_reward[state, action]
@@ -346,9 +330,7 @@ def _advantages(
 
 @compiled
 def _most_met(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
+    model: Dynamics,
     states: Ints,
     groups: Ints,
     low: Floats,
@@ -357,11 +339,12 @@ def _most_met(
     rewards: Floats,
 ) -> Floats:
     """As `_return_in_box`, for rewards (horizon, S) received in states of ``group`` alone."""
+    prob = model[0]
     later, now = np.zeros(prob.shape[0]), np.zeros(prob.shape[0])
     values, is_used = np.zeros(prob.shape[1]), np.zeros(prob.shape[1], np.bool_)
     for step in range(len(rewards) - 1, -1, -1):
         for state in states:
-            _look_ahead(prob, next_state, terminated, state, later, values)
+            _look_ahead(model, state, later, values)
             of = groups[state]
             now[state] = _best_in_box(values, low[of], high[of], is_used)
             if of == group:
@@ -371,15 +354,9 @@ def _most_met(
 
 
 @called
-def _look_ahead(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    state: int,
-    later: Floats,
-    values: Floats,
-) -> None:
+def _look_ahead(model: Dynamics, state: int, later: Floats, values: Floats) -> None:
     """Write the expected value after each action of a state into ``values``."""
+    prob, next_state, terminated, _ = model
     for action in range(prob.shape[1]):
         values[action] = 0.0
         for k in range(prob.shape[2]):

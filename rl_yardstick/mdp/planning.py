@@ -17,11 +17,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rl_yardstick.machine_code.compiling import compiled
+from rl_yardstick.machine_code.compiling import called, compiled
 from rl_yardstick.mdp.graph import PolicyChain, end_components, steps_to_end
 from rl_yardstick.mdp.transition_model import (
-    AnyInts,
     Bools,
+    Dynamics,
     Floats,
     Ints,
     TransitionModel,
@@ -112,8 +112,9 @@ def value_iteration(
                 rough += len(order) if left > enough else 0
                 solving = discount < 1 and rough > ROUGH_STATES
         tie = FINE_TIE if solving else TIE_TOLERANCE
+        allowed = problem.part.allowed
         rise, fall = improve(
-            *problem.rows, problem.part.allowed, floor, problem.discount, order, values, policy, tie
+            model.dynamics, allowed, floor, problem.discount, order, values, policy, tie
         )
         change = max(rise, fall)
         iterations += 1
@@ -359,12 +360,6 @@ class PlanningProblem:
         steps, order = steps_to_end(self.model, self.part.allowed, self.part.resting)
         return np.concatenate([order, np.flatnonzero(self.part.states & (steps < 0))])
 
-    @property
-    def rows(self) -> tuple[Floats, AnyInts, Bools, Floats]:
-        """The arrays of the model as the sweeps take them."""
-        model = self.model
-        return model.prob, model.next_state, model.terminated, model.expected_reward
-
     def start(self) -> tuple[Floats, Ints]:
         """First values, shape (S,), and a policy, shape (S,), that surely ends or comes to rest.
 
@@ -376,7 +371,7 @@ class PlanningProblem:
         policy = part.rest_actions.argmax(axis=1)
         order = self.order[~part.resting[self.order]]
         known = part.resting.copy()
-        first_guess(*self.rows, part.allowed, self.discount, known, order, values, policy)
+        first_guess(self.model.dynamics, part.allowed, self.discount, known, order, values, policy)
         if part.resting.any():
             reward = self.model.expected_reward
             for _ in range(MOST_EVALUATIONS):
@@ -395,7 +390,7 @@ class PlanningProblem:
         """
         model = self.model
         arrays = (model.prob, model.next_state, model.terminated, reward)
-        rows = policy_rows(*arrays, self.discount, order, policy)
+        rows = policy_rows(arrays, self.discount, order, policy)
         settled = rows[3]
         settled[settled < LEAST_SETTLED] = 1.0
         found = values[order]
@@ -416,7 +411,8 @@ class PlanningProblem:
         """
         from scipy.sparse.linalg import LinearOperator, bicgstab
 
-        weight, following, reward, _ = policy_rows(*self.rows, self.discount, order, policy)
+        rows = policy_rows(self.model.dynamics, self.discount, order, policy)
+        weight, following, reward, _ = rows
         n = len(order)
         stays = following == np.arange(n)[:, None]
         diagonal = 1.0 - np.where(stays, weight, 0.0).sum(axis=1)
@@ -444,7 +440,7 @@ class PlanningProblem:
 
     def action_values(self, values: Floats) -> Floats:
         """Values of shape (S, A), minus infinity for actions that are not allowed."""
-        return action_values(*self.rows, self.part.allowed, self.discount, values)
+        return action_values(self.model.dynamics, self.part.allowed, self.discount, values)
 
     def rounding(self, values: Floats) -> float:
         """The change of a value that rounding alone may make in one sweep."""
@@ -497,12 +493,20 @@ class PlanningProblem:
 TIE_TOLERANCE = 1e-12
 
 
+@called
+def action_value(model: Dynamics, state: int, action: int, later: Floats, discount: float) -> float:
+    """The value of an action, from the state values one step later."""
+    prob, next_state, terminated, mean_reward = model
+    value = float(mean_reward[state, action])
+    for k in range(prob.shape[2]):
+        if prob[state, action, k] > 0 and not terminated[state, action, k]:
+            value += discount * prob[state, action, k] * later[next_state[state, action, k]]
+    return value
+
+
 @compiled
 def improve(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
+    model: Dynamics,
     allowed: Bools,
     floor: Floats,
     discount: float,
@@ -519,6 +523,7 @@ def improve(
     Returns:
         The largest rise and the largest fall of a value.
     """
+    prob = model[0]
     rise = 0.0
     fall = 0.0
     for state in order:
@@ -528,11 +533,7 @@ def improve(
         for action in range(prob.shape[1]):
             if not allowed[state, action]:
                 continue
-            value = mean_reward[state, action]
-            for k in range(prob.shape[2]):
-                if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                    following = values[next_state[state, action, k]]
-                    value += discount * prob[state, action, k] * following
+            value = action_value(model, state, action, values, discount)
             if value > best:
                 best = value
                 best_action = action
@@ -550,10 +551,7 @@ def improve(
 
 @compiled
 def first_guess(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
+    model: Dynamics,
     allowed: Bools,
     discount: float,
     known: Bools,
@@ -568,6 +566,7 @@ def first_guess(
     ``known`` before, with positive probability wherever it can, so that the policy ends every
     episode. ``known``, bool of shape (S,), is extended on the way.
     """
+    prob, next_state, terminated, mean_reward = model
     for state in order:
         best = -np.inf
         for action in range(prob.shape[1]):
@@ -595,13 +594,7 @@ def first_guess(
 
 @compiled
 def policy_rows(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    discount: float,
-    order: Ints,
-    policy: Ints,
+    model: Dynamics, discount: float, order: Ints, policy: Ints
 ) -> tuple[Floats, NDArray[np.int32], Floats, Floats]:
     """The rows of a policy's actions in sweep order, with states as indices into that order.
 
@@ -611,6 +604,7 @@ def policy_rows(
         Discounted weights and indices of the following states, both (n, K); rewards (n,); and 1
         minus the weight of states at the same or a later index, (n,).
     """
+    prob, next_state, terminated, mean_reward = model
     n_outcomes = prob.shape[2]
     place_of = np.full(prob.shape[0], -1, np.int32)
     for place in range(len(order)):
@@ -674,27 +668,15 @@ def residuals(
 
 
 @compiled
-def action_values(
-    prob: Floats,
-    next_state: AnyInts,
-    terminated: Bools,
-    mean_reward: Floats,
-    allowed: Bools,
-    discount: float,
-    values: Floats,
-) -> Floats:
+def action_values(model: Dynamics, allowed: Bools, discount: float, values: Floats) -> Floats:
     """The action values, shape (S, A), that follow from the state values ``values``.
 
     Actions that are not allowed get minus infinity.
     """
+    prob, mean_reward = model[0], model[3]
     result = np.full(mean_reward.shape, -np.inf)
     for state in range(prob.shape[0]):
         for action in range(prob.shape[1]):
             if allowed[state, action]:
-                value = mean_reward[state, action]
-                for k in range(prob.shape[2]):
-                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
-                        following = values[next_state[state, action, k]]
-                        value += discount * prob[state, action, k] * following
-                result[state, action] = value
+                result[state, action] = action_value(model, state, action, values, discount)
     return result

@@ -130,7 +130,7 @@ def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horiz
     rows: list[tuple[Bools, Bools, Ints, Ints]] = []
     for _ in range(horizon):
         found = [
-            _action_values(model, later)
+            model.action_values(later)
             for model, later in zip((original, shaped, original, original), values, strict=True)
         ]
         optimal, theirs = _best(found[0]), _best(found[1]) | ~shaped.reachable[:, None]
@@ -158,20 +158,12 @@ def effect_under_limit(original: TransitionModel, shaped: TransitionModel, horiz
 
 
 def _check(original: TransitionModel, shaped: TransitionModel, horizon: int) -> None:
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}, it must be at least 1")
     told = [f"{m.n_states:,} states and {m.n_actions} actions" for m in (shaped, original)]
     if told[0] != told[1]:
         raise ValueError(f"{told[0]} cannot be compared with {told[1]}")
     size = max(original.prob.size, shaped.prob.size)
     if size > MOST_OUTCOMES or size * horizon > MOST_BACKED_UP:
         raise ValueError(f"{told[0]} under a limit of {horizon:,} steps are too many to plan")
-
-
-def _action_values(model: TransitionModel, later: Floats) -> Floats:
-    """The undiscounted action values, from the state values one step later."""
-    following = np.where(model.terminated, 0.0, later[model.next_state])
-    return np.asarray(model.expected_reward + np.einsum("sak,sak->sa", model.prob, following))
 
 
 def _best(action_values: Floats) -> Bools:

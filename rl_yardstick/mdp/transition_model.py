@@ -26,6 +26,9 @@ Bools = NDArray[np.bool_]
 # Integers of any width, such as the int32 that halves the size of a large map.
 AnyInts = NDArray[np.integer]
 
+# The arrays prob, next_state, terminated, and a reward, as compiled functions take them.
+Dynamics = tuple[Floats, AnyInts, Bools, Floats]
+
 PROBABILITY_TOLERANCE = 1e-9
 
 Outcomes = Sequence[tuple[float, int, float, bool]]
@@ -73,7 +76,6 @@ class TransitionModel:
             self._freeze("reward_variance", np.float64)
         self._check_shapes()
         self._check_outcomes()
-        self._check_initial()
 
     @classmethod
     def from_gymnasium(
@@ -128,10 +130,21 @@ class TransitionModel:
         """K, the largest number of outcomes of any state and action, padding included."""
         return int(self.prob.shape[2])
 
+    @property
+    def dynamics(self) -> Dynamics:
+        """``prob``, ``next_state``, ``terminated`` and ``expected_reward``."""
+        return self.prob, self.next_state, self.terminated, self.expected_reward
+
     @cached_property
     def expected_reward(self) -> Floats:
         """The mean reward of one step, shape (S, A)."""
         return _read_only(np.einsum("sak,sak->sa", self.prob, self.reward))
+
+    def action_values(self, later: Floats) -> Floats:
+        """The undiscounted action values, shape (S, A), from the state values one step later."""
+        following = np.where(self.terminated, 0.0, later[self.next_state])
+        values: Floats = self.expected_reward + np.einsum("sak,sak->sa", self.prob, following)
+        return values
 
     @cached_property
     def reachable(self) -> Bools:
@@ -140,7 +153,7 @@ class TransitionModel:
         These are the possible starting states and all states that transitions reach from them
         without ending the episode. The rows of all other states are meaningless.
         """
-        from rl_yardstick.mdp.reachability import reached_from
+        from rl_yardstick.mdp.graph import reached_from
 
         allowed = np.ones((self.n_states, self.n_actions), np.bool_)
         start = self.initial > 0
@@ -156,13 +169,10 @@ class TransitionModel:
         shape = self.prob.shape
         if len(shape) != 3 or 0 in shape:
             raise ValueError(f"prob has shape {shape}, it must be (states, actions, outcomes)")
-        for name in ("next_state", "reward", "terminated"):
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has shape {getattr(self, name).shape}, prob has {shape}")
-        if self.reward_variance is not None and self.reward_variance.shape != shape:
-            raise ValueError(
-                f"reward_variance has shape {self.reward_variance.shape}, prob has {shape}"
-            )
+        for name in ("next_state", "reward", "terminated", "reward_variance"):
+            array = getattr(self, name)
+            if array is not None and array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}, prob has {shape}")
         if self.initial.shape != shape[:1]:
             raise ValueError(f"initial has shape {self.initial.shape}, it must be {shape[:1]}")
 
@@ -179,13 +189,9 @@ class TransitionModel:
         if self.reward_variance is not None:
             valid = np.isfinite(self.reward_variance) & (self.reward_variance >= 0)
             self._require(valid, "a variance of the reward that is negative or not finite")
-
-    def _check_initial(self) -> None:
-        bad = np.flatnonzero(~((self.initial >= 0) & (self.initial <= 1)))
-        if bad.size:
-            raise ValueError(f"initial has a probability outside [0, 1] at state {bad[0]}")
-        if not abs(self.initial.sum() - 1) <= PROBABILITY_TOLERANCE:
-            raise ValueError(f"initial sums to {self.initial.sum()}, it must sum to one")
+        is_sum = abs(self.initial.sum() - 1) <= PROBABILITY_TOLERANCE
+        if not (is_sum and (self.initial >= 0).all()):
+            raise ValueError(f"initial holds no probabilities that sum to one: {self.initial}")
 
     @staticmethod
     def _require(valid: Bools, problem: str) -> None:
@@ -202,14 +208,11 @@ def allowed_actions(model: TransitionModel, mask: Bools | None) -> Bools:
         mask: bool of shape (S, A), or None for all actions.
 
     Raises:
-        ValueError: if the mask has another shape, or allows nothing in a reachable state.
+        ValueError: if the mask allows nothing in a reachable state.
     """
-    shape = (model.n_states, model.n_actions)
     reachable = model.reachable[:, None]
     if mask is None:
         return np.repeat(reachable, model.n_actions, axis=1)
-    if mask.shape != shape:
-        raise ValueError(f"the mask has shape {mask.shape}, it must be {shape}")
     stuck = np.flatnonzero(model.reachable & ~mask.any(axis=1))
     if stuck.size:
         raise ValueError(f"the mask allows nothing in state {stuck[0]}")

@@ -174,10 +174,9 @@ OF_TRAINING = ("safe_files", "machine_code", "mdp", "envs", "agents", "pipeline"
 @cache
 def source_digest(*more: str) -> str:
     """The digest of the sources of `OF_TRAINING` and ``more``; cached at the first call."""
-    from rl_yardstick.machine_code.sources import content_lines, source_paths
-    from rl_yardstick.machine_code.sources import digest_of as digest_of_lines
+    from rl_yardstick.machine_code import sources
 
-    return digest_of_lines(content_lines(source_paths({*OF_TRAINING, *more})))
+    return sources.source_digest(sorted({*OF_TRAINING, *more}))
 
 
 def _seal(record: Mapping[str, Any]) -> str:

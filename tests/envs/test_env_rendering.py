@@ -6,8 +6,6 @@ in the place of the old one.
 """
 
 import copy
-import io
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -18,7 +16,7 @@ from PIL import Image
 
 from rl_yardstick.envs import drawing
 from rl_yardstick.envs.bandits import BernoulliBandit, GaussianBandit, ReplayBandit
-from rl_yardstick.envs.bandits.bandit import Tally, render_chart
+from rl_yardstick.envs.bars import Bar, Bars
 from rl_yardstick.envs.drawing import ChartRenderer, GridRenderer, Scene
 from rl_yardstick.envs.mine_maze import MineMazeEnv
 from rl_yardstick.envs.warehouse import WarehouseEnv
@@ -56,28 +54,6 @@ def test_text_of_a_map():
     assert shown(maze, RIGHT, DOWN) == "(down)\nS*PM\n.R.G\n"
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-@pytest.mark.parametrize(
-    ("out", "no_color", "is_coloured"),
-    [(Terminal, "", True), (Terminal, "1", False), (io.StringIO, "", False)],
-    ids=["terminal", "opted out", "file"],
-)
-def test_text_has_colour_on_a_terminal_unless_opted_out(monkeypatch, out, no_color, is_coloured):
-    # Tests run without a terminal.
-    monkeypatch.setenv("NO_COLOR", no_color)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(sys, "stdout", out())
-    codes = zip("SRGPM", ("36", "1;37;44", "1;32", "1;33", "1;31"), strict=True)
-    styled = {letter: f"\x1b[{code}m{letter}\x1b[0m" for letter, code in codes}
-    found = shown(MineMazeEnv(desc=["S.G", "PM."], render_mode="ansi"), RIGHT)
-    letters = (styled.get(c, c) if is_coloured else c for c in "SRG\nPM.\n")
-    assert found == "(right)\n" + "".join(letters)
-
-
 # --- maps as pictures -----------------------------------------------------------------------------
 
 
@@ -99,15 +75,16 @@ def test_a_picture_fits_belongs_to_the_caller_and_is_as_before_after_reset():
     assert np.array_equal(shown(env), before)
 
 
-def arms_of_two_contexts():
-    """A few pulls of some of the arms, and means on both sides of zero."""
-    tally = Tally.empty(2, 9)
-    for i in range(27):
-        if i % 9 != 1:
-            tally.add(i % 2, i % 9, 0.25 * (i % 7) - 0.5)
-    return render_chart(tally, np.linspace(-1, 2, 18).reshape(2, 9), 1)
-
-
+# Values on both sides of zero, a mark beyond them, and no value.
+BARS = Bars.fitting(
+    "pull 3: arm 1, reward -0.5",
+    [
+        Bar("arm 0", 1.25, "2 pulls", 1.0),
+        Bar("arm 1", -0.5, "1 pulls", -1.0, is_latest=True),
+        Bar("arm 2", None, "-", 2.0),
+    ],
+    [1.25, -1.0, 2.0],
+)
 SCENES = {
     # Every thing there is; a trail that bends; a power source that was collected.
     "map": Scene(("SP#M", "...G", "M.P#"), 6, [(0, 1), (1, 5), (5, 6)], [1], 3),
@@ -119,7 +96,7 @@ SCENES = {
 @pytest.mark.parametrize("name", [*SCENES, "arms"])
 def test_a_picture_is_as_it_was(name, tmp_path):
     if name == "arms":
-        found = ChartRenderer(10, "arms").pixels(arms_of_two_contexts())
+        found = ChartRenderer(10, "arms").pixels(BARS.chart())
     else:
         found = GridRenderer(SCENES[name].rows, 10, "a map").pixels(SCENES[name])
     Image.fromarray(found).save(tmp_path / f"{name}.png", optimize=True)
@@ -160,17 +137,18 @@ def test_text_of_bandits():
     env = BernoulliBandit([0.0, 0.5, 1.0], render_mode="ansi")
     assert shown(env, 0, 2, 2) == (
         "pull 3: arm 2, reward 1\n"
-        "  arm    pulls  observed  true now\n"
-        "    0        1     0.000     0.000  |\n"
-        "    1        0         -     0.500                |\n"
-        ">   2        2     1.000     1.000  =============================|\n"
+        "  arm 0       1 pulls, mean   0.000, true now 0.000  |\n"
+        "  arm 1       0 pulls, mean       -, true now 0.500                      |\n"
+        "> arm 2       2 pulls, mean   1.000, true now 1.000  "
+        "=======================================|\n"
     )
     assert shown(env).startswith("no pull yet\n")
-    # Of a replay what matched counts.
+    # Of a replay only matched pulls count.
     text = shown(ReplayBandit(LOG, render_mode="ansi"), *[0] * 7)
-    assert text.startswith("pull 4: arm 0, reward 0.25\ncontext 0 (next)\n")
-    assert ">   0        2     0.625  ==============================\n" in text
+    assert text.startswith(
+        "pull 4: arm 0, reward 0.25\n> context 0 (next), arm 0       2 pulls, mean   0.625  ="
+    )
     # Means are shown as they are now.
     env = GaussianBandit([1.0, -1.0], drift_std=0.5, render_mode="ansi")
     text = shown(env, 0)
-    assert all(f"{mean:10.3f}" in text for mean in env.means[0])
+    assert all(f"true now {mean:.3f}" in text for mean in env.means[0])

@@ -147,56 +147,30 @@ def test_p_is_the_model_as_dictionaries(env_id, kwargs):
 
 # --- arguments ------------------------------------------------------------------------------------
 
-INF, NAN = float("inf"), float("nan")
 MANY = {"segment_probabilities": [1 / 1024] * 1024, "click_rates": [[0.5, 0.5]] * 1024}
 ONE = {"segment_probabilities": [1], "click_rates": [[0.5]]}
-CHANGING = {"maze": "blocking", "changed": True}
 REFUSED = [
     ("Warehouse", {"slip": -0.1}, "slip must be a finite number from 0 to 1, not -0.1"),
-    ("Warehouse", {"slip": NAN}, "slip must be a finite number from 0 to 1, not nan"),
+    ("Warehouse", {"slip": float("nan")}, "slip must be a finite number from 0 to 1, not nan"),
     ("Warehouse", {"slip": True}, "slip must be a finite number from 0 to 1, not True"),
     ("Warehouse", {"shelf_reward": "a"}, "shelf_reward must be a finite number, not 'a'"),
     ("Warehouse", {"observation": "positon"}, "'positon': did you mean 'position'? It must be one"),
-    ("MineMaze", {"step_reward": INF}, "step_reward must be a finite number, not inf"),
     ("MineMaze", {"random_start": 1}, "random_start must be true or false, not 1"),
     ("RandomWarehouse", {"size": 1}, "size must be a whole number from 2 to 4096, not 1"),
-    ("RandomWarehouse", {"shelf_density": 1.1}, "shelf_density must be a finite number from 0 to"),
-    ("RandomWarehouse", {"map_seed": -1}, "map_seed must be a whole number from 0 to 9223372036"),
-    ("DynaMaze", {"maze": "block"}, "unknown maze 'block': did you mean 'blocking'"),
     ("DynaMaze", {"changed": True}, "changed: the maze 'dyna' never changes"),
     ("DynaMaze", {"maze": "blocking", "change_after_steps": 5}, "change_after_steps needs changed"),
-    ("DynaMaze", {**CHANGING, "change_after_steps": 0}, "change_after_steps must be a whole num"),
-    ("RandomWalk", {"n_states": 0}, "n_states must be a whole number from 1 to 10000"),
     ("RandomWalk", {"n_states": 9999, "max_jump": 9999}, "is too much: twice their product"),
-    ("WindyGridworld", {"moves": "queen"}, "unknown moves 'queen'"),
-    ("WindyGridworld", {"stochastic": 1}, "stochastic must be true or false"),
-    ("GamblersProblem", {"heads_probability": 2}, "heads_probability must be a finite"),
-    ("GamblersProblem", {"start_capital": 100}, "start_capital must be a whole number"),
-    ("MaximizationBias", {"n_actions": 1}, "n_actions must be a whole number from 2"),
-    ("MaximizationBias", {"reward_std": -1}, "reward_std must be a finite number"),
-    ("RiverSwim", {"n_states": 1}, "n_states must be a whole number from 2"),
-    ("DeepSea", {"size": 1}, "size must be a whole number from 2"),
-    ("Racetrack", {"track": "middle"}, "unknown track 'middle'"),
-    ("JacksCarRental", {"variant": "exam"}, "unknown variant 'exam': did you mean 'exam"),
-    ("JacksCarRental", {"first_cars": 21}, "first_cars must be a whole number from 0 to 20"),
     ("BernoulliBandit", {"probabilities": [0.5]}, "must hold 2 numbers or more, not 1"),
     ("BernoulliBandit", {"probabilities": 0.5}, "must be a list of numbers, not 0.5"),
     ("BernoulliBandit", {"probabilities": [0.5, 1.5]}, "[1] must be a finite number from"),
-    ("BernoulliBandit", {"pulls": 0}, "pulls must be a whole number from 1 to 1000000000, not 0"),
     ("GaussianBandit", {"means": [1, 2], "n_arms": 3}, "n_arms is 3, but 2 are given: leave it"),
     ("GaussianBandit", {"means": [1, 2], "mean_loc": 4}, "mean_loc is for means that are drawn"),
-    ("GaussianBandit", {"means": [1, None]}, "means[1] must be a finite number, not None"),
-    ("GaussianBandit", {"reward_std": -1}, "reward_std must be a finite number"),
     ("LinearBandit", {"arm_parameters": []}, "arm_parameters must be a list of rows of numbers"),
     ("LinearBandit", {"arm_parameters": [[1, 2]]}, "arm_parameters must have two rows or more"),
     ("LinearBandit", {"arm_parameters": [[1, 2], [1]]}, "[1] has length 1, arm_parameters[0] has"),
-    ("LinearBandit", {"arm_parameters": [[1, 2], [3, 4]], "n_features": 3}, "is 3, but 2 are"),
-    ("LinearBandit", {"n_features": 0}, "n_features must be a whole number from 1 to 10000, not 0"),
     ("SegmentBandit", {"segment_probabilities": [0.3, 0.6]}, "must sum to 1, not to 0.9"),
     ("SegmentBandit", {"segment_probabilities": [0.3, 0.3, 0.4]}, "a row for each segment: 3"),
     ("SegmentBandit", ONE, "click_rates must have a column for each treatment, two or more"),
-    ("SegmentBandit", {"click_rates": [[0.1, 0.2], [0.3, -0.1]]}, "[1][1] must be a finite"),
-    ("SegmentBandit", {"batch_size": 0}, "batch_size must be a whole number from 1 to"),
     ("SegmentBandit", MANY, "1024 contexts and 2 arms are too many: twice"),
 ]
 
@@ -293,12 +267,11 @@ def test_rewards_are_scaled_and_the_last_one_is_replaced(limit, on_truncation, r
 BOX, DISCRETE = spaces.Box(0, 1, (2,)), spaces.Discrete(2)
 MISTAKEN = [
     (lambda: cart_pole(low=None), "dimension 3 of the observation has the bounds -inf and 50.0: g"),
-    (lambda: cart_pole(low=[1, -50]), "dimension 2: low 1.0 is not below high 0.418"),
-    (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
     (
-        lambda: DiscretizeObservation(Showing(DISCRETE), bins=2),
-        "DiscretizeObservation needs a Box of",
+        lambda: cart_pole(low=[1, -50]),
+        "dimension 2 of the observation has the bounds 1.0 and 0.418",
     ),
+    (lambda: cart_pole(bins=0), "bins must be whole numbers from 1 on, not 0"),
     (lambda: FlattenToDiscrete(Showing(BOX)), "FlattenToDiscrete needs MultiDiscrete, a Tuple of"),
     (lambda: ScaleReward(Showing(DISCRETE), 0), "scale must not be 0"),
     (lambda: ActionMasks(gym.make("CartPole-v1")), "^CartPole-v1 has no action masks: neither a m"),

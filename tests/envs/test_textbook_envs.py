@@ -259,9 +259,9 @@ def test_optimal_values_and_policy_are_those_of_figure_4_2():
     assert moves[0].tolist() == [0] * 8 + [-1, -1, -2, -2, -2, -3, -3, -3, -3, -3, -4, -4, -4]
     env = gym.make("JacksCarRental-v0", first_cars=2, second_cars=0, render_mode="ansi")
     assert env.reset(seed=0)[0] == 2 * N
-    assert re.search(r"cars at the \w+ place +2/20", env.render())
+    assert re.search(r"cars at the \w+ place +2 of 20  =+\n", env.render())
     env.step(7)
-    assert env.render().startswith("(moved +2)")
+    assert env.render().startswith("moved +2\n")
 
 
 # --- what they share ------------------------------------------------------------------------------

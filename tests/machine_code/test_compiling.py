@@ -65,7 +65,7 @@ def test_without_the_compiler_python_plans_and_evaluates():
 import gymnasium
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.mdp import finite_horizon_optimum, policy_return
-for name in ("envs:Warehouse-v0", "FrozenLake-v1"):
+for name in ("rl_yardstick.envs:Warehouse-v0", "FrozenLake-v1"):
     model = transition_model(gymnasium.make(name))
     plan = finite_horizon_optimum(model, 100)
     print(plan.start_value, policy_return(model, plan.policy, 100).expected_return)

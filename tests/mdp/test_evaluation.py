@@ -21,7 +21,7 @@ from tests.mdp.test_random_models import deterministic
 
 
 def model_of(env_id, **kwargs):
-    return transition_model(gym.make(f"envs:{env_id}", **kwargs))
+    return transition_model(gym.make(f"rl_yardstick.envs:{env_id}", **kwargs))
 
 
 def coin(end, reward=1.0):
@@ -111,8 +111,6 @@ def test_what_a_policy_says_of_unreachable_states_is_ignored():
     [
         ([1], None, "from state 0 the policy never ends the episode"),
         ([2], 5, "the policy takes an action outside 0..1"),
-        ([[0]] * 4, 5, r"actions have shape \(4, 1\), they must have \(1,\), or \(5"),
-        ([[1.0] * 3], 5, r"the policy matrix has shape \(1, 3\), it must have \(1, 2\)"),
         ([[0.5, 0.6]], 5, r"in state 0 the policy's probabilities are \[0.5 0.6\]"),
         ([0], 0, "horizon is 0, it must be at least 1, or None"),
     ],

@@ -247,7 +247,7 @@ def test_sizes_and_derived_arrays():
         ("prob", (0, 1), [1.5, -0.5], r"state 0, action 1 has a probability outside \[0, 1\]"),
         ("next_state", (1, 1, 0), 2, r"state 1, action 1 has a next state outside 0..1"),
         ("reward", (0, 0, 1), np.inf, "state 0, action 0 has a reward that is not finite"),
-        ("initial", 0, 0.5, "initial sums to 0.5, it must sum to one"),
+        ("initial", 0, 0.5, r"initial holds no probabilities that sum to one: \[0.5 0. \]"),
     ],
 )
 def test_wrong_arrays_are_refused(name, place, value, message):

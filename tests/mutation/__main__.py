@@ -155,15 +155,12 @@ class Copy:
 
     def _keep_machine_code(self, code: Path, fresh: bool) -> None:
         """Give what was compiled before the error the error's digest, if it is not about that."""
-        import rl_yardstick.agents  # noqa: F401  # tells which packages keep machine code
-        from rl_yardstick.machine_code import cache, sources
+        from rl_yardstick.machine_code.cache import digest
 
-        for package in sources.kept_packages():
-            digests = (self.place / "kept" / "yardstick" / package).iterdir()
-            before, digest = max(digests, key=lambda p: p.stat().st_mtime), cache.digest(package)
-            if digest == before.name or not fresh:
-                new = code / "yardstick" / package / digest
-                shutil.copytree(before, new, copy_function=os.link)
+        digests = (self.place / "kept" / "yardstick").iterdir()
+        before = max(digests, key=lambda p: p.stat().st_mtime)
+        if digest() == before.name or not fresh:
+            shutil.copytree(before, code / "yardstick" / digest(), copy_function=os.link)
 
     def judge(self, mutant: Mutant, first: str | None) -> str:
         """The test that catches an error, or another fate; a test that did so before goes first."""

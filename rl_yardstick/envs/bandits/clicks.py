@@ -136,9 +136,6 @@ class BernoulliBandit(ClickBandit):
     - `probabilities=(0.2, 0.5, 0.75)`: of the arms, two or more
     - `pulls=1000`: the length of an episode
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(
@@ -206,9 +203,6 @@ class SegmentBandit(ClickBandit):
     - `batch_size=1`: after how many pulls feedback arrives
     - `pulls=1000`: the length of an episode
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(

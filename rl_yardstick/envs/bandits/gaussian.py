@@ -54,9 +54,6 @@ class GaussianBandit(StochasticBandit):
     - `drift_std=0`: standard deviation of the step that every mean takes after each pull
     - `pulls=1000`: the length of an episode
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     kind = "gaussian"

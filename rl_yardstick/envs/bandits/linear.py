@@ -56,9 +56,6 @@ class LinearBandit(StochasticBandit):
     - `reward_std=1`: standard deviation of the rewards
     - `pulls=1000`: the length of an episode
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     kind = "linear"

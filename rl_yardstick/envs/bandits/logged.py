@@ -7,13 +7,10 @@ Each row is one pull, under a header with the columns ``arm``, ``reward`` and, i
 from __future__ import annotations
 
 import csv
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from io import TextIOWrapper
-from itertools import islice
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +21,9 @@ from rl_yardstick.envs.bandits.bandit import MAX_ARMS, Bandit
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 from rl_yardstick.safe_files.files import UnsafeFileError, opened
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
 
 MAX_BYTES = 1 << 30
@@ -31,120 +31,7 @@ MAX_BYTES = 1 << 30
 MAX_COLUMNS = 1000
 # Bounds within which squares of numbers, and the weights of rare pulls, stay usable.
 MAX_NUMBER, MIN_PROPENSITY = 1e15, 1e-9
-# Characters of a row; a thousand numbers take a tenth of that.
-MAX_ROW = 1 << 20
-MAX_CATEGORIES = 1_000_000
-ROWS_AT_ONCE = 10_000
-LONGEST_SHOWN, MOST_SHOWN = 60, 12  # characters of a name, and names, in a message
 NUMBER = "a finite number of no more than 1e15"
-
-
-class _LogReader:
-    """Reads a file in pieces as numbers: as text, a large file would take gigabytes."""
-
-    def __init__(self, path: Path, file: TextIO) -> None:
-        self.path = path
-        self.columns: dict[str, Floats] = {}
-        # The distinct values of text, numbered, if the context is one column of text.
-        self.words: dict[str, int] = {}
-        self.codes: list[Ints] = []  # the number of each row's text, in pieces
-        self._file = file
-        self._room = MAX_ROW  # characters that the present row may still have
-        self._reader = csv.reader(self._lines(), strict=True)
-
-    def read(self) -> None:
-        """Read all rows; ValueError where this is no such log, see `read_log`."""
-        rows = self._rows()
-        header = [name for _, cells in islice(rows, 1) for name in cells]
-        context = [name for name in header if name not in _WANTED]
-        either = context[0] if len(context) == 1 else None  # text in all rows, or numbers in all
-        any_number, mistake = False, None
-        pieces: dict[str, list[Floats]] = {name: [] for name in header}
-        while piece := list(islice(rows, ROWS_AT_ONCE)):
-            lines = [line for line, _ in piece]
-            columns_of_text = zip(*(cells for _, cells in piece), strict=True)
-            for name, texts in zip(header, columns_of_text, strict=True):
-                values = np.fromiter(map(_as_float, texts), np.float64)
-                pieces[name].append(values)
-                found = self._mistake(name, lines, texts, values)
-                if name != either:
-                    if found is not None:
-                        raise found
-                    continue
-                mistake = mistake or found
-                any_number |= not np.isnan(values).all()
-                if not any_number:
-                    self._number_words(name, texts)
-        if not (header and pieces[ARM]):
-            raise ValueError(f"{self.path} holds no pulls: a header and a row for each are needed")
-        if any_number:
-            self.words.clear()
-            if mistake is not None:
-                raise mistake
-        self.columns = {name: np.concatenate(values) for name, values in pieces.items()}
-
-    def _lines(self) -> Iterator[str]:
-        while line := self._file.readline(MAX_ROW + 1):  # one may go on for gigabytes
-            self._room -= len(line)
-            if self._room < 0:
-                raise csv.Error(f"a row has more than {MAX_ROW:,} characters")
-            yield line
-
-    def _rows(self) -> Iterator[tuple[int, list[str]]]:
-        """The header and each row below it, of as many cells, each with its line number."""
-        n_cells = None
-        for row in self._reader:
-            self._room = MAX_ROW
-            if not row:
-                continue
-            cells, line = [cell.strip() for cell in row], self._reader.line_num
-            if n_cells is None:
-                self._check_header(cells)
-                n_cells = len(cells)
-            if len(cells) != n_cells:
-                raise ValueError(f"{self.path}, line {line} has {len(cells)} values, not {n_cells}")
-            yield line, cells
-
-    def _check_header(self, header: list[str]) -> None:
-        if len(header) > MAX_COLUMNS:
-            raise ValueError(f"{self.path} has {len(header):,} columns, more than {MAX_COLUMNS:,}")
-        for name in (ARM, REWARD):
-            if name not in header:
-                raise ValueError(f"{self.path} has no column {name!r}, only {some(header)}")
-        twice = next((name for name in header if header.count(name) > 1), None)
-        if twice is not None:
-            raise ValueError(f"{self.path} has two columns {twice[:LONGEST_SHOWN]!r}")
-
-    def _mistake(
-        self, name: str, lines: list[int], texts: tuple[str, ...], values: Floats
-    ) -> ValueError | None:
-        """The error for the first number that is invalid or too large; None without one."""
-        wanted, valid = _WANTED.get(name, _CONTEXT)
-        wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
-        if not len(wrong):
-            return None
-        line, text = lines[wrong[0]], texts[wrong[0]]
-        shown = text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
-        return ValueError(f"{self.path}, line {line}: {name} is {shown!r}, it must be {wanted}")
-
-    def _number_words(self, name: str, texts: tuple[str, ...]) -> None:
-        known = self.words
-        self.codes.append(np.array([known.setdefault(text, len(known)) for text in texts]))
-        if len(known) > MAX_CATEGORIES:
-            raise ValueError(f"{self.path}: {name} has more than {MAX_CATEGORIES:,} values of text")
-
-
-def some(names: Sequence[str]) -> str:
-    """The first of some names, as a message lists them."""
-    text = ", ".join(name[:LONGEST_SHOWN] for name in names[:MOST_SHOWN])
-    return text if len(names) <= MOST_SHOWN else f"{text} and {len(names) - MOST_SHOWN:,} more"
-
-
-def _as_float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 def _is_arm(values: Floats) -> Bools:
@@ -163,6 +50,12 @@ _WANTED: Mapping[str, tuple[str, Callable[[Floats], Bools]]] = {
     REWARD: (NUMBER, np.isfinite),
     PROPENSITY: (f"a probability from {MIN_PROPENSITY} to 1", _is_propensity),
 }
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of some names, as a message lists them."""
+    text = ", ".join(names[:12])
+    return text if len(names) <= 12 else f"{text} and {len(names) - 12:,} more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,33 +97,20 @@ class LoggedData:
 
         Shape (n,) for Discrete, (n, d) for a Box; a ValueError if they do not fit.
         """
-        if isinstance(space, spaces.Discrete):
-            return self._as_discrete(int(space.n))
         n_columns = len(self.context_names)
-        if not isinstance(space, spaces.Box) or space.shape != (n_columns,) or self.categories:
-            raise ValueError(f"{self.source} has {self._described()}, the agent observes {space}")
-        return self.contexts.astype(np.float32)
-
-    def _as_discrete(self, n_contexts: int) -> Ints:
-        if n_contexts == 1 and not self.context_names:
-            return np.zeros(len(self), np.int64)
-        codes = self.contexts.astype(np.int64)
-        fits = len(self.context_names) == 1 and np.array_equal(codes, self.contexts)
-        if self.categories is not None:
-            fits = len(self.categories) == n_contexts
-        if not fits or codes.min() < 0 or codes.max() >= n_contexts:
-            wanted = f"one column of whole numbers from 0 to {n_contexts - 1}"
-            raise ValueError(f"{self.source} has {self._described()}, the agent observes {wanted}")
-        return codes[:, 0]
-
-    def _described(self) -> str:
-        """The contexts in words."""
-        if not self.context_names:
-            return "no context"
-        names = some(self.context_names)
-        if self.categories is None:
-            return f"the context {names}"
-        return f"the context {names} with {len(self.categories)} values of text"
+        if isinstance(space, spaces.Box) and space.shape == (n_columns,) and not self.categories:
+            return self.contexts.astype(np.float32)
+        if isinstance(space, spaces.Discrete):
+            codes = self.contexts.astype(np.int64)
+            if space.n == 1 and not n_columns:
+                return np.zeros(len(self), np.int64)
+            n_words = len(self.categories or ())
+            fits = n_columns == 1 and np.array_equal(codes, self.contexts)
+            if fits and n_words in {0, space.n} and codes.min() >= 0 and codes.max() < space.n:
+                return codes[:, 0]
+        context = f"the context {some(self.context_names)}" if n_columns else "no context"
+        words = "" if self.categories is None else f" with {len(self.categories)} values of text"
+        raise ValueError(f"{self.source} has {context}{words}, the agent observes {space}")
 
 
 def read_log(path: str | Path) -> LoggedData:
@@ -242,33 +122,81 @@ def read_log(path: str | Path) -> LoggedData:
     Raises:
         ValueError: if it cannot be read, a column is missing or duplicated, a row is too short or
             too long, an arm is not a whole number from 0, a number not finite or beyond 1e15, or a
-            propensity not from 1e-9 to 1. The message names file and line.
+            propensity not from 1e-9 to 1. The message names file and row.
     """
-    file = Path(path)
     try:
-        with opened(file, MAX_BYTES) as binary:
-            log = _LogReader(file, TextIOWrapper(binary, encoding="utf-8-sig", newline=""))
-            log.read()
-    except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ValueError(f"cannot read {file}: {reason}") from error
-    columns, categories = log.columns, tuple(sorted(log.words))
-    names = tuple(name for name in columns if name not in _WANTED)
-    contexts = np.empty((len(columns[ARM]), len(names)))
-    for i, name in enumerate(names):
-        contexts[:, i] = columns[name]
-    if categories:
-        place = {word: i for i, word in enumerate(categories)}
-        contexts[:, 0] = np.array([place[word] for word in log.words])[np.concatenate(log.codes)]
+        with opened(Path(path), MAX_BYTES) as binary:
+            found = _read_columns(binary)
+    except (OSError, UnsafeFileError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error).strip()
+        raise ValueError(f"cannot read {path}: {reason}") from error
+    names = tuple(name for name in found if name not in _WANTED)
+    categories = None
+    if len(names) == 1 and _is_text(found[names[0]]):
+        text = found[names[0]].astype("category")
+        categories, found[names[0]] = tuple(text.cat.categories), text.cat.codes
+    columns = {name: _numbers(str(path), name, column) for name, column in found.items()}
+    contexts = [columns[name] for name in names]
     return LoggedData(
         source=str(path),
         context_names=names,
-        contexts=contexts,
+        contexts=np.stack(contexts, axis=1) if names else np.empty((len(columns[ARM]), 0)),
         arms=columns[ARM].astype(np.int64),
         rewards=columns[REWARD],
         propensities=columns.get(PROPENSITY),
-        categories=categories or None,
+        categories=categories,
     )
+
+
+def _read_columns(binary: BinaryIO) -> dict[str, pd.Series[Any]]:
+    """The columns of a log by name, each of numbers or of text."""
+    import pandas as pd
+
+    settings: Any = {
+        "encoding": "utf-8-sig",
+        "skipinitialspace": True,
+        "keep_default_na": False,
+        "low_memory": False,
+    }
+    header = pd.read_csv(binary, header=None, nrows=1, dtype=str, **settings).iloc[0].tolist()
+    if len(header) > MAX_COLUMNS:
+        raise ValueError(f"it has {len(header):,} columns, more than {MAX_COLUMNS:,}")
+    for name in (ARM, REWARD, *header):
+        if header.count(name) != 1:
+            number = "no" if name not in header else "more than one"
+            raise ValueError(f"it has {number} column {name!r}, but {some(header)}")
+    binary.seek(0)
+    frame = pd.read_csv(binary, **settings)
+    if not isinstance(frame.index, pd.RangeIndex):
+        raise ValueError("its rows have more values than its header")
+    if not len(frame):
+        raise ValueError("it holds no pulls: a header and a row for each are needed")
+    return {name: _stripped(frame.iloc[:, i]) for i, name in enumerate(header)}
+
+
+def _stripped(column: pd.Series[Any]) -> pd.Series[Any]:
+    return column if column.dtype.kind in "if" else column.astype(str).str.strip()
+
+
+def _is_text(column: pd.Series[Any]) -> bool:
+    """Whether no value of a column is a number."""
+    import pandas as pd
+
+    return bool(pd.to_numeric(column, errors="coerce").isna().all())
+
+
+def _numbers(source: str, name: str, column: pd.Series[Any]) -> Floats:
+    """The values of a column, shape (n,); ValueError for the first one that is invalid."""
+    import pandas as pd
+
+    values: Floats = pd.to_numeric(column, errors="coerce").to_numpy(np.float64)
+    wanted, valid = _WANTED.get(name, _CONTEXT)
+    wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
+    if len(wrong):
+        text = str(column.iloc[wrong[0]])
+        shown = text if len(text) <= 60 else f"{text[:60]}..."
+        raise ValueError(f"{source}, row {wrong[0] + 1}: {name} is {shown!r}, it must be {wanted}")
+    return values
 
 
 def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -> None:
@@ -351,9 +279,6 @@ class ReplayBandit(Bandit):
       each part of the context; see `envs.bandits.logged`. Every propensity must be one in
       `n_arms`, within 2 %.
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     kind = "replay"

@@ -74,9 +74,6 @@ class HallwayEnv(MapEnv):
 
     ## Arguments
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     rows = ROWS

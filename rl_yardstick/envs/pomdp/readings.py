@@ -32,20 +32,9 @@ def with_readings(hidden: TransitionModel, first: Floats, later: Floats) -> Worl
         first: the probability of each reading in a starting state, shape (H, O).
         later: the probability of each reading after an action that led to a state, shape (A, H, O).
             Where the episode ends, only the first reading that is possible is kept.
-
-    Raises:
-        ValueError: if the shapes disagree or chances do not sum to one.
     """
     n_hidden, n_actions, n_outcomes = hidden.prob.shape
     n_readings = first.shape[-1]
-    if first.shape != (n_hidden, n_readings) or later.shape != (n_actions, *first.shape):
-        raise ValueError(
-            f"first has shape {first.shape} and later {later.shape}, they must be "
-            f"({n_hidden}, readings) and ({n_actions}, {n_hidden}, readings)"
-        )
-    for name, chances in (("first", first), ("later", later)):
-        if not (chances >= 0).all() or not np.allclose(chances.sum(axis=-1), 1):
-            raise ValueError(f"{name} has readings whose chances do not sum to one")
     is_there = (first > 0) | (later > 0).any(axis=0)
     state_hidden, state_reading = np.nonzero(is_there)
     number = np.zeros(is_there.shape, np.int64)

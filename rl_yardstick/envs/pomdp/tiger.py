@@ -58,9 +58,6 @@ class TigerEnv(ChainEnv):
     ## Arguments
     - `accuracy=0.85`: probability to hear the tiger where it is
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("listen", "open left", "open right")

@@ -64,9 +64,6 @@ class DeepSeaEnv(MapEnv):
     - `move_cost=0.01`: the cost of `size` moves to the right together
     - `map_seed=0`: the same seed gives the same meaning of actions; None makes 1 always right
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("action 0", "action 1")

@@ -10,7 +10,7 @@ from rl_yardstick.envs.argument_checks import (
     check_number,
     check_whole_number,
 )
-from rl_yardstick.envs.grid import GridDynamics, GridMap, GridWorld, Observation, Tile
+from rl_yardstick.envs.grid import GridDynamics, GridMap, GridWorld, Tile
 
 DYNA = (
     ".......#G",
@@ -100,9 +100,6 @@ class DynaMazeEnv(GridWorld):
     - `slip=0`: probability that the robot moves sideways instead, half of it to each side
     - `random_start=False`: see Starting State
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(
@@ -147,7 +144,7 @@ class DynaMazeEnv(GridWorld):
         """Whether the maze stays as it is."""
         return self.change_after_steps is None
 
-    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         result = super().step(action)
         if self._becomes is not None and self.change_after_steps is not None:
             self.steps_done += 1
@@ -164,7 +161,7 @@ class DynaMazeEnv(GridWorld):
         edge, slip = self.dynamics.edge, 1 - self.dynamics.outcome_prob[0]
         self.dynamics = GridDynamics(self.map, self._tiles, edge, slip)
         for worked_out in ("P", "initial_state_distrib", "_starts"):
-            vars(self).pop(worked_out, None)
+            self.__dict__.pop(worked_out, None)
         # The next picture is of another map.
         self.close()
         self._steps = set()

@@ -7,13 +7,14 @@ from functools import lru_cache
 import numpy as np
 
 from rl_yardstick.envs.argument_checks import check_number, check_whole_number
-from rl_yardstick.envs.finite_env import Gauge, GaugeEnv, summing_to_one
+from rl_yardstick.envs.bars import Bar, Bars, BarsEnv
+from rl_yardstick.envs.finite_env import MaskedFiniteEnv, summing_to_one
 from rl_yardstick.mdp.transition_model import Bools, TransitionModel
 
 LARGEST_GOAL = 2000
 
 
-class GamblersProblemEnv(GaugeEnv):
+class GamblersProblemEnv(BarsEnv, MaskedFiniteEnv):
     """Stakes on a coin that comes up heads with a known probability: all at once, or a little?
 
     ## Description
@@ -44,17 +45,12 @@ class GamblersProblemEnv(GaugeEnv):
     ## Information
     `reset` and `step` give nothing more. One uniform number is drawn by each: it is heads if it
     lies below `heads_probability`.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
 
     ## Arguments
     - `heads_probability=0.4`: of the coin
     - `goal=100`: the capital to reach, 2 or more
     - `start_capital=None`: see Starting State
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     def __init__(
@@ -77,9 +73,9 @@ class GamblersProblemEnv(GaugeEnv):
     def masks_of_states(self) -> Bools:
         return allowed_stakes(self.goal)
 
-    def _gauges(self) -> tuple[str, list[Gauge]]:
+    def _bars(self) -> Bars:
         title = "start" if self.last_action is None else f"stake {self.last_action}"
-        return title, [Gauge("capital", self.s, self.goal)]
+        return Bars(title, [Bar("capital", self.s, f"{self.s} of {self.goal}")], 0, self.goal)
 
 
 def allowed_stakes(goal: int) -> Bools:

@@ -9,7 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from rl_yardstick.envs.argument_checks import check_choice, check_whole_number
-from rl_yardstick.envs.finite_env import Gauge, GaugeEnv
+from rl_yardstick.envs.bars import Bar, Bars, BarsEnv
+from rl_yardstick.envs.finite_env import MaskedFiniteEnv
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints, TransitionModel
 
 MOST_CARS = 20
@@ -26,7 +27,7 @@ VARIANTS = ("example", "exercise")
 N_SIDE = MOST_CARS + 1
 
 
-class JacksCarRentalEnv(GaugeEnv):
+class JacksCarRentalEnv(BarsEnv, MaskedFiniteEnv):
     """Cars are rented out at two places, and moved between them so that few customers go away.
 
     ## Description
@@ -75,9 +76,6 @@ class JacksCarRentalEnv(GaugeEnv):
     - `variant="example"`: or `"exercise"`
     - `first_cars=10`, `second_cars=10`: in the first evening
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = tuple(
@@ -116,14 +114,13 @@ class JacksCarRentalEnv(GaugeEnv):
             evening.append(min(cars - rented + back, MOST_CARS))
         return evening[0] * N_SIDE + evening[1], earned, False
 
-    def _gauges(self) -> tuple[str, list[Gauge]]:
+    def _bars(self) -> Bars:
         moved = None if self.last_action is None else self.last_action - MOST_MOVED
-        first, second = divmod(self.s, N_SIDE)
         title = "start" if moved is None else f"moved {moved:+d}"
-        return title, [
-            Gauge("cars at the first place", first, MOST_CARS),
-            Gauge("cars at the second place", second, MOST_CARS),
-        ]
+        names = "cars at the first place", "cars at the second place"
+        cars = zip(names, divmod(self.s, N_SIDE), strict=True)
+        bars = [Bar(name, n, f"{n:2} of {MOST_CARS}") for name, n in cars]
+        return Bars(title, bars, 0, MOST_CARS)
 
 
 @lru_cache(maxsize=2)

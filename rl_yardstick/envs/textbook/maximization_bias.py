@@ -59,9 +59,6 @@ class MaximizationBiasEnv(ChainEnv, MaskedFiniteEnv):
     - `n_actions=10`: the number of actions
     - `reward_mean=-0.1`, `reward_std=1`: of the rewards in B
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = tuple(f"action {i}" for i in range(MOST_ACTIONS))

@@ -96,19 +96,11 @@ class RacetrackEnv(MapEnv):
     The episode terminates when the car crosses the finishing line. It is truncated after 1000 steps
     when made by `gymnasium.make`.
 
-    ## Information
-    `reset` and `step` give nothing more. One uniform number is drawn by each.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
-
     ## Arguments
     - `track="left"`: or `"right"`, as in the figure
     - `noise=0.1`: probability that the velocity does not change
     - `step_reward=-1`: the reward of each step
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = tuple(

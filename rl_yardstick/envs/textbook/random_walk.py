@@ -48,20 +48,12 @@ class RandomWalkEnv(ChainEnv):
     The episode terminates beyond either end. It is truncated after 1000 steps when made by
     `gymnasium.make`; the values above are those without a limit.
 
-    ## Information
-    `reset` and `step` give nothing more. One uniform number is drawn by each.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
-
     ## Arguments
     - `n_states=5`: the length of the row
     - `max_jump=1`: a step goes 1 to this many states to the left or to the right, to each with
       equal probability
     - `left_reward=0`, `right_reward=1`: for leaving on that side
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("step",)

@@ -45,18 +45,10 @@ class RiverSwimEnv(ChainEnv):
     ## Episode End
     It never terminates. It is truncated after 20 steps when made by `gymnasium.make`.
 
-    ## Information
-    `reset` and `step` give nothing more. One uniform number is drawn by each.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
-
     ## Arguments
     - `n_states=6`: the length of the river
     - `left_reward=0.005`, `right_reward=1`: see Rewards
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("left", "right")

@@ -56,9 +56,6 @@ class ShortCorridorEnv(ChainEnv):
 
     ## Arguments
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     action_names: ClassVar[tuple[str, ...]] = ("left", "right")

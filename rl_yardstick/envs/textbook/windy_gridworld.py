@@ -67,19 +67,11 @@ class WindyGridworldEnv(MapEnv):
     The episode terminates on the goal. It is truncated after 1000 steps when made by
     `gymnasium.make`; the book has no limit.
 
-    ## Information
-    `reset` and `step` give nothing more. One uniform number is drawn by each.
-    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
-    `initial_state_distrib` as in Gymnasium's FrozenLake.
-
     ## Arguments
     - `moves="rook"`: see Action Space
     - `stochastic=False`: whether the wind varies
     - `step_reward=-1`: the reward of each step
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
-
-    ## Version History
-    - v0: the first version
     """
 
     rows = MAP
