@@ -28,12 +28,11 @@ from rl_yardstick.agents.bandits.choosing import (
 from rl_yardstick.agents.common.exploration import choose_action
 from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import (
+    EPSILONS,
+    NOT_NEGATIVE,
+    POSITIVE,
     ExplorationDecay,
-    check_above_zero,
-    check_at_least,
-    check_epsilons,
     check_vectors,
-    settings_of,
 )
 from rl_yardstick.agents.compiled.generators import generator_of, handles_of
 from rl_yardstick.machine_code.compiling import inlined
@@ -157,6 +156,7 @@ class LinearBanditAgent(RuleBandit):
     learn_from_reward = learn_by_model
     choose_allowed = choose_by_allowed_models
     pick = best_arm
+    ranges = {"ridge": POSITIVE}  # noqa: RUF012
 
     def __init__(
         self,
@@ -171,7 +171,6 @@ class LinearBanditAgent(RuleBandit):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_vectors(self, self.observation_space)
-        check_above_zero(settings_of(self, "ridge"))
 
     def _make_policy(self) -> LinearBanditPolicy:
         policy: Any = self.policy_class
@@ -229,6 +228,7 @@ class LinUCB(LinearBanditAgent):
     """
 
     parameters = {"alpha": np.float64}  # noqa: RUF012
+    ranges = {"alpha": NOT_NEGATIVE}  # noqa: RUF012
     bonus = confidence_bonus
 
     def __init__(
@@ -240,10 +240,6 @@ class LinUCB(LinearBanditAgent):
     ) -> None:
         self.alpha = alpha
         super().__init__(policy, env, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0, settings_of(self, "alpha"))
 
 
 class LinThompson(LinUCB):
@@ -274,6 +270,7 @@ class LinEpsilonGreedy(LinearBanditAgent):
 
     bonus = no_bonus
     pick = pick_epsilon_greedily
+    ranges = EPSILONS
 
     def __init__(
         self,
@@ -290,10 +287,6 @@ class LinEpsilonGreedy(LinearBanditAgent):
         self.exploration_fraction = exploration_fraction
         self.exploration_decay = exploration_decay
         super().__init__(policy, env, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_epsilons(self)
 
     def _make_exploration_schedule(self) -> Schedule:
         return epsilon_schedule(self)

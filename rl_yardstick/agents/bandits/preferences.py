@@ -19,7 +19,7 @@ from rl_yardstick.agents.common.exploration import (
     drawn_action,
     make_probabilities,
 )
-from rl_yardstick.agents.common.settings import check_above_zero, check_share, settings_of
+from rl_yardstick.agents.common.settings import POSITIVE_SHARE
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats
@@ -159,6 +159,7 @@ class Exp3(PreferenceBandit):
     """
 
     parameters = {"mixing": np.float64}  # noqa: RUF012
+    ranges = {"mixing": POSITIVE_SHARE}  # noqa: RUF012
     rewards_known = UNIT
     choose_arm = draw_by_weight
     choice_probability = probability_of
@@ -173,11 +174,6 @@ class Exp3(PreferenceBandit):
     ) -> None:
         self.mixing = mixing
         super().__init__(policy, env, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_share(settings_of(self, "mixing"))
-        check_above_zero(settings_of(self, "mixing"))
 
     def action_probabilities(self, observations: NDArray[Any]) -> Floats:
         """As above, mixed with uniform."""

@@ -13,12 +13,7 @@ from rl_yardstick.agents.bandits.algorithm import ANY, BINARY
 from rl_yardstick.agents.bandits.choosing import ScoreAgent, ScoreTables
 from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit
 from rl_yardstick.agents.common.exploration import greedy_action
-from rl_yardstick.agents.common.settings import (
-    check_above_zero,
-    check_finite,
-    check_option,
-    settings_of,
-)
+from rl_yardstick.agents.common.settings import FINITE, POSITIVE
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats
@@ -84,6 +79,10 @@ class Thompson(TableBandit):
         "prior_precision": np.float64,
         "reward_precision": np.float64,
     }
+    ranges = {  # noqa: RUF012
+        "prior_mean": FINITE,
+        **dict.fromkeys(("prior_successes", "prior_failures", "prior_std", "reward_std"), POSITIVE),
+    }
     choose_arm = sample_posteriors
     learn_from_pull = update_mean
 
@@ -133,13 +132,6 @@ class Thompson(TableBandit):
     def reward_precision(self) -> float:
         """One over the variance of the noise."""
         return self.reward_std**-2
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("likelihood", self.likelihood, Likelihood)
-        check_finite(settings_of(self, "prior_mean"))
-        names = ("prior_successes", "prior_failures", "prior_std", "reward_std")
-        check_above_zero(settings_of(self, *names))
 
     def posterior(self, tables: ScoreTables) -> Floats:
         """The posterior of each arm's mean reward.

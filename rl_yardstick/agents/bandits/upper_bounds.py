@@ -13,7 +13,7 @@ from rl_yardstick.agents.bandits.algorithm import UNIT
 from rl_yardstick.agents.bandits.choosing import ScoreAgent, total_count
 from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit
 from rl_yardstick.agents.common.exploration import greedy_action
-from rl_yardstick.agents.common.settings import check_at_least, check_option, settings_of
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.machine_code.compiling import inlined
@@ -93,6 +93,7 @@ class UCB(UpperBoundBandit):
     """
 
     parameters = {"width": np.float64, "is_textbook": np.bool_}  # noqa: RUF012
+    ranges = {"c": NOT_NEGATIVE}  # noqa: RUF012
     upper_bound = ucb_bound
 
     def __init__(
@@ -117,11 +118,6 @@ class UCB(UpperBoundBandit):
         """The degree of exploration ``c``, or its default."""
         default = 2.0 if self.is_textbook else 1.0
         return default if self.c is None else self.c
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("variant", self.variant, Variant)
-        check_at_least(0, settings_of(self, "c"))
 
 
 # Upper confidence bounds by the divergence of Bernoulli distributions.
@@ -190,6 +186,7 @@ class KLUCB(UpperBoundBandit):
     """
 
     parameters = {"c": np.float64}  # noqa: RUF012
+    ranges = {"c": NOT_NEGATIVE}  # noqa: RUF012
     rewards_known = UNIT
     upper_bound = kl_ucb_bound
 
@@ -202,7 +199,3 @@ class KLUCB(UpperBoundBandit):
     ) -> None:
         self.c = c
         super().__init__(policy, env, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0, settings_of(self, "c"))

@@ -18,13 +18,7 @@ from rl_yardstick.agents.common.exploration import (
     choose_action,
 )
 from rl_yardstick.agents.common.schedules import epsilon_schedule
-from rl_yardstick.agents.common.settings import (
-    ExplorationDecay,
-    check_above_zero,
-    check_epsilons,
-    settings_of,
-    step_size,
-)
+from rl_yardstick.agents.common.settings import EPSILONS, POSITIVE, ExplorationDecay, step_size
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.machine_code.compiling import inlined
@@ -89,6 +83,7 @@ class EpsilonGreedy(ValueBandit):
     """
 
     strategy = EPSILON_GREEDY
+    ranges = EPSILONS
 
     def __init__(
         self,
@@ -109,10 +104,6 @@ class EpsilonGreedy(ValueBandit):
         self.exploration_decay = exploration_decay
         super().__init__(policy, env, learning_rate, **kwargs)
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_epsilons(self)
-
     def _make_exploration_schedule(self) -> Schedule:
         return epsilon_schedule(self)
 
@@ -130,6 +121,7 @@ class Boltzmann(ValueBandit):
     """
 
     strategy = BOLTZMANN
+    ranges = {"temperature": POSITIVE}  # noqa: RUF012
 
     def __init__(
         self,
@@ -143,10 +135,6 @@ class Boltzmann(ValueBandit):
         self.initial_q = initial_q
         self.temperature = temperature
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_above_zero(settings_of(self, "temperature"))
 
     def _make_exploration_schedule(self) -> Schedule:
         return FloatSchedule(self.temperature)

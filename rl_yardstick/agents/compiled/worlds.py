@@ -99,22 +99,6 @@ PROGRESS = np.dtype(
         ("budget_episodes", np.int64),  # episodes that have counted towards it
         ("logged_episodes", np.int64),  # those in the log
         ("mean_td_error", np.float64),
-        ("record_interval", np.int64),  # episodes between two records of the log; 0 for none
-        ("next_record", np.int64),  # the number of episodes at which the next one is due
-        ("n_records", np.int64),  # of the block
-    ],
-    align=True,
-)
-
-# The data of a log record: a moment of a block, after learning.
-RECORD = np.dtype(
-    [
-        ("step", np.int64),  # of the block
-        ("logged_episodes", np.int64),  # of the block so far
-        ("episodes", np.int64),  # of the training
-        ("exploration", np.float64),
-        ("learning_rate", np.float64),
-        ("mean_td_error", np.float64),
     ],
     align=True,
 )

@@ -15,13 +15,7 @@ from rl_yardstick.agents.common.exploration import (
     highest_value,
 )
 from rl_yardstick.agents.common.schedules import epsilon_schedule
-from rl_yardstick.agents.common.settings import (
-    ExplorationDecay,
-    TieBreaking,
-    check_epsilons,
-    check_finite,
-    settings_of,
-)
+from rl_yardstick.agents.common.settings import EPSILONS, FINITE, ExplorationDecay, TieBreaking
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
@@ -116,6 +110,7 @@ class SemiGradientAlgorithm(TileAlgorithm):
     choose_by_sums = choose_epsilon_greedily
     learn_from_step = semi_gradient_learning
     commit = no_commitment
+    ranges = {"initial_q": FINITE, **EPSILONS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -136,11 +131,6 @@ class SemiGradientAlgorithm(TileAlgorithm):
         self.exploration_decay = exploration_decay
         self.initial_q = initial_q
         super().__init__(policy, env, learning_rate, tie_breaking, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_epsilons(self)
-        check_finite(settings_of(self, "initial_q"))
 
     def _initial_sums(self) -> Floats:
         return np.full(self.n_actions, float(self.initial_q))

@@ -13,23 +13,19 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.agents.common.settings import (
+    SHARE,
     CommonArguments,
     TieBreaking,
-    check_option,
-    check_share,
     check_space,
     check_vectors,
-    settings_of,
 )
 from rl_yardstick.agents.compiled.engine import CompiledEngine, EngineChoice, choose_engine
 from rl_yardstick.agents.compiled.generators import handles_of
-from rl_yardstick.agents.compiled.greedy_play import Playground
 from rl_yardstick.agents.compiled.worlds import env_dtype
 from rl_yardstick.agents.linear.tiles import (
     Bound,
@@ -50,7 +46,6 @@ from rl_yardstick.agents.networks.network_worlds import (
     BEFORE,
     NetworkEnvStates,
     move_on,
-    network_playground,
     network_world,
 )
 from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
@@ -151,9 +146,6 @@ class TileEngine(CompiledEngine):
     def _make_states(self) -> NetworkEnvStates:
         return NetworkEnvStates(self.agent.env, self.world, self.seen)
 
-    def _playground(self, vec_env: VecEnv) -> Playground:
-        return network_playground(vec_env)
-
     def _compiled_agent(self) -> Any:
         return self.agent.compiled_agent(self.agent.rng, self.seen)
 
@@ -219,6 +211,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TilePolicy": TilePolicy}
     policy: TilePolicy
     parameters = {"gamma": np.float64}  # noqa: RUF012
+    ranges = {"gamma": SHARE}  # noqa: RUF012
     values_states: ClassVar[bool] = False
 
     act = act_on_tiles
@@ -248,15 +241,10 @@ class TileAlgorithm(WorkspaceAlgorithm):
     def _check_arguments(self) -> None:
         check_space(self, "actions", self.action_space)
         check_vectors(self, self.observation_space)
-        check_option("engine", self.engine, EngineChoice)
-        if isinstance(self.learning_rate, str):
-            raise ValueError(
-                f"learning_rate must be a number or a schedule, not {self.learning_rate!r}"
-            )
-        check_share(settings_of(self, "gamma"))
 
     def _make_policy(self) -> TilePolicy:
-        tiling = dict(settings_of(self, "n_tilings", "n_tiles", "low", "high"))
+        names = ("n_tilings", "n_tiles", "low", "high")
+        tiling = {name: getattr(self, name) for name in names}
         policy: Any = self.policy_class
         made: TilePolicy = policy(
             self.observation_space,

@@ -16,12 +16,7 @@ from rl_yardstick.agents.common.exploration import (
     drawn_action,
     make_probabilities,
 )
-from rl_yardstick.agents.common.settings import (
-    check_at_least,
-    check_finite,
-    check_option,
-    settings_of,
-)
+from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm, TileArguments
@@ -117,7 +112,8 @@ class SoftmaxAlgorithm(TileAlgorithm):
                 f"initial_preferences must be a number or {self.n_actions} numbers, "
                 f"not {self.initial_preferences}"
             )
-        check_finite([("initial_preferences", float(number)) for number in given.flat])
+        for number in given.flat:
+            FINITE.check("initial_preferences", float(number))
         return np.broadcast_to(given, self.n_actions)
 
     def _probabilities(self, sums: Floats) -> Floats:
@@ -178,6 +174,7 @@ class ActorCritic(SoftmaxAlgorithm):
     """
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
+    ranges = {"value_step_size": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = actor_critic_learning
     values_states = True
 
@@ -194,10 +191,6 @@ class ActorCritic(SoftmaxAlgorithm):
         self.value_step_size = value_step_size
         self._discounts = np.ones(0)
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0, settings_of(self, "value_step_size"))
 
     def _begin_episodes(self) -> None:
         super()._begin_episodes()
@@ -311,6 +304,7 @@ class Reinforce(SoftmaxAlgorithm):
     """
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
+    ranges = {"value_step_size": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = learn_at_ends
 
     # A loaded agent begins new episodes.
@@ -333,11 +327,6 @@ class Reinforce(SoftmaxAlgorithm):
         self._kept_actions = np.zeros((0, 0), dtype=np.int64)
         self._kept_rewards = np.zeros((0, 0))
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("baseline", self.baseline, Baseline)
-        check_at_least(0, settings_of(self, "value_step_size"))
 
     @property
     def values_states(self) -> bool:  # type: ignore[override]

@@ -209,9 +209,3 @@ class NetworkEnvStates(EnvStates):
         if not fits.any():
             raise ValueError("no state has the observation that the training is to go on from")
         return state if fits[state] else int(np.argmax(fits))
-
-
-def network_playground(vec_env: VecEnv) -> tuple[Any, NetworkEnvStates, Any]:
-    """Environments to evaluate on: compiled, their states, and how to read observations."""
-    world, seen = network_world(vec_env)
-    return world, NetworkEnvStates(vec_env, world, seen), seen

@@ -28,19 +28,17 @@ from rl_yardstick.agents.common.masks import (
 )
 from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import (
+    EPSILONS,
+    POSITIVE,
+    SHARE,
     CommonArguments,
     ExplorationDecay,
     TieBreaking,
-    check_above_zero,
-    check_epsilons,
-    check_option,
-    check_share,
     check_space,
-    settings_of,
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice, choose_engine
 from rl_yardstick.agents.compiled.generators import handles_of
-from rl_yardstick.agents.compiled.greedy_play import Explorer, Plan
+from rl_yardstick.agents.compiled.greedy_play import Plan
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.tabular.policy import QTablePolicy
@@ -169,6 +167,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     policy: QTablePolicy
     n_tables: ClassVar[int] = 1
     parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
+    ranges = {"gamma": SHARE, "temperature": POSITIVE, **EPSILONS}  # noqa: RUF012
 
     # Called by the training loops; each algorithm defines `next_value`.
     act = act_on_values
@@ -227,11 +226,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             check_masks_exist(self.env)
         check_space(self, "observations", self.observation_space)
         check_space(self, "actions", self.action_space)
-        check_option("exploration", self.exploration, ExplorationStrategy)
-        check_option("engine", self.engine, EngineChoice)
-        check_epsilons(self)
-        check_share(settings_of(self, "gamma"))
-        check_above_zero(settings_of(self, "temperature"))
 
     def _make_policy(self) -> QTablePolicy:
         policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
@@ -317,10 +311,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         """A player with the greedy actions of `predict` on compiled environments."""
         numbers = np.arange(self.policy.q_tables.shape[1])
         return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
-
-    def exploring_player(self, seen: Any) -> Explorer:
-        """A player with the exploring actions of `predict`, drawn from the same generator."""
-        return Explorer(self.compiled_agent(self.predict_rng), self.progress())
 
     # Training.
 
@@ -460,11 +450,3 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     def _record_training(self) -> None:
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
         super()._record_training()
-
-    def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
-        """As in the base class, but Gaussian noise decreases with the episodes."""
-        columns = super().log_columns(records)
-        if self.exploration == "gaussian_noise":
-            rates = records["exploration"] / (records["episodes"] + 1)
-            columns["rollout/exploration_rate"] = rates.tolist()
-        return columns

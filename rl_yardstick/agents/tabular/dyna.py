@@ -12,13 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
-from rl_yardstick.agents.common.settings import (
-    check_at_least,
-    check_finite,
-    check_whole,
-    settings_of,
-    step_size,
-)
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
@@ -184,8 +178,6 @@ class ModelPolicy(QTablePolicy):
 
 # The base of tabular agents that learn a model of their environment.
 
-MOST_PLANNING = 10**6  # updates after one step
-
 
 class ModelKeeper(TabularAlgorithm):
     """Passes the model in its policy to compiled functions as ``agent.memory``."""
@@ -295,6 +287,7 @@ class DynaQ(ModelKeeper, QLearning):
     """
 
     parameters = {"planning_steps": np.int64}  # noqa: RUF012
+    ranges = {"planning_steps": whole(0), "outcomes_kept": whole(1)}  # noqa: RUF012
     learn_from_step = learn_and_plan
     remember = remember_outcome
     imagined_reward = remembered_reward
@@ -305,11 +298,6 @@ class DynaQ(ModelKeeper, QLearning):
         self.planning_steps = planning_steps
         self.outcomes_kept = outcomes_kept
         super().__init__(*args, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
-        check_whole(1, settings_of(self, "outcomes_kept"))
 
 
 # Dyna-Q+.
@@ -382,14 +370,10 @@ class DynaQPlus(DynaQ):
 
     policy_aliases = {"QTablePolicy": DatedModelPolicy}  # noqa: RUF012
     parameters = {"kappa": np.float64}  # noqa: RUF012
+    ranges = {"kappa": NOT_NEGATIVE}  # noqa: RUF012
     remember = remember_outcome_and_time
     imagined_reward = reward_for_trying
 
     def __init__(self, *args: Any, kappa: float = 0.001, **kwargs: Any) -> None:
         self.kappa = kappa
         super().__init__(*args, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0.0, settings_of(self, "kappa"))
-        check_finite(settings_of(self, "kappa"))

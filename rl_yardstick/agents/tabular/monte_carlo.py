@@ -11,11 +11,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from rl_yardstick.agents.common.exploration import greedy_action, highest_value
-from rl_yardstick.agents.common.settings import check_whole, settings_of
+from rl_yardstick.agents.common.settings import whole
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.tabular.n_step import (
-    MOST_STEPS,
     NOTHING_LEARNT,
     EpisodicAlgorithm,
     place_of,
@@ -84,6 +83,7 @@ class RecordAlgorithm(EpisodicAlgorithm):
     """
 
     learn_in = record_and_learn
+    ranges = {"longest_episode": whole(1)}  # noqa: RUF012
 
     def __init__(
         self,
@@ -95,10 +95,6 @@ class RecordAlgorithm(EpisodicAlgorithm):
     ) -> None:
         self.longest_episode = longest_episode
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_whole(1, settings_of(self, "longest_episode"), MOST_STEPS // self.n_envs)
 
     def _make_memory(self) -> EpisodeRecords:
         shape = (self.n_envs, self.longest_episode)

@@ -7,14 +7,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from rl_yardstick.agents.common.settings import (
-    check_at_least,
-    check_finite,
-    check_whole,
-    settings_of,
-    step_size,
-)
-from rl_yardstick.agents.tabular.dyna import MOST_PLANNING, ModelKeeper, ModelPolicy, note_outcome
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
+from rl_yardstick.agents.tabular.dyna import ModelKeeper, ModelPolicy, note_outcome
 from rl_yardstick.agents.tabular.updates import TabularAgent, best_value
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -288,6 +282,7 @@ class PrioritizedSweeping(ModelKeeper):
 
     policy_aliases = {"QTablePolicy": SweepingPolicy}  # noqa: RUF012
     parameters = {"planning_steps": np.int64, "threshold": np.float64}  # noqa: RUF012
+    ranges = {"planning_steps": whole(0), "threshold": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = remember_and_sweep
 
     def __init__(
@@ -296,9 +291,3 @@ class PrioritizedSweeping(ModelKeeper):
         self.planning_steps = planning_steps
         self.threshold = threshold
         super().__init__(*args, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
-        check_at_least(0.0, settings_of(self, "threshold"))
-        check_finite(settings_of(self, "threshold"))

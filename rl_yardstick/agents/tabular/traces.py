@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.common.exploration import highest_value
-from rl_yardstick.agents.common.settings import check_option, check_share, settings_of
+from rl_yardstick.agents.common.settings import SHARE
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.tabular.n_step import EpisodicAlgorithm
@@ -137,6 +137,7 @@ class TraceAlgorithm(EpisodicAlgorithm):
     """
 
     parameters = {"trace_decay": np.float64, "trace_kind": np.int64}  # noqa: RUF012
+    ranges = {"trace_decay": SHARE}  # noqa: RUF012
     learn_in = learn_along_traces
     trace_kept = kept_whole
 
@@ -157,11 +158,6 @@ class TraceAlgorithm(EpisodicAlgorithm):
     def trace_kind(self) -> int:
         """The number of ``trace_type``."""
         return TRACE_TYPES[self.trace_type]
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("trace_type", self.trace_type, TraceType)
-        check_share(settings_of(self, "trace_decay"))
 
     def _make_memory(self) -> Traces:
         sizes = cast(Any, (self.observation_space, self.action_space))

@@ -58,8 +58,6 @@ class WorkspaceAlgorithm(LearningAlgorithm):
         mean_td_error: mean absolute TD error of the last updates.
     """
 
-    logs_by_records = True
-
     _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions", "_in_use")
     excluded_from_states = ("_in_use",)
 
