@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -17,7 +17,6 @@ from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.agents.common.settings import (
     NOT_NEGATIVE,
     SHARE,
-    CommonArguments,
     TieBreaking,
     check_space,
     check_vectors,
@@ -157,12 +156,14 @@ class MABWiserAgent(BanditAlgorithm):
     policy: MABWiserPolicy
     kind: ClassVar[str]  # one of `KINDS`
 
+    hidden_arguments = ("learning_rate", "mask_actions")
+
     def __init__(
         self,
         policy: str | type[BasePolicy] = "MABWiserPolicy",
         env: GymEnv | str | None = None,
         tie_breaking: TieBreaking = "first",
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         super().__init__(policy, env, tie_breaking=tie_breaking, **kwargs)
 

@@ -7,7 +7,7 @@ calls as from any other agent.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -21,7 +21,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.model_files import TablePolicy
-from rl_yardstick.agents.common.settings import CommonArguments
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
     model_check,
@@ -112,6 +111,7 @@ class PlanningAgent(OnlineAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
     policy: ActionTablePolicy
     default_gamma: ClassVar[float]
+    hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class PlanningAgent(OnlineAlgorithm):
         env: GymEnv | str | None = None,
         gamma: float | None = None,
         mask_actions: bool = False,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.gamma = self.default_gamma if gamma is None else gamma
         self.mask_actions = mask_actions

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
-from rl_yardstick.agents.common.settings import CommonArguments
 
 POLE_ANGLE = 2
 LEFT, RIGHT = 0, 1
@@ -57,13 +56,10 @@ class ReferenceAgent(OnlineAlgorithm):
         kwargs: as in `OnlineAlgorithm`.
     """
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy],
-        env: GymEnv | str | None = None,
-        **kwargs: Unpack[CommonArguments],
-    ) -> None:
-        super().__init__(policy, env, **kwargs)
+    hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from typing import Any, NamedTuple, Unpack, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -30,7 +30,7 @@ from rl_yardstick.agents.common.masks import (
     checked_masks,
     present_masks,
 )
-from rl_yardstick.agents.common.settings import LearningArguments, check_space
+from rl_yardstick.agents.common.settings import check_space
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -84,12 +84,6 @@ BINARY = "0 or 1"
 UNBOUNDED_KINDS = ("gaussian", "linear")
 
 
-class BanditArguments(LearningArguments, total=False):
-    """Arguments that constructors of agents with masks pass on; see `BanditAlgorithm`."""
-
-    mask_actions: bool
-
-
 class Pull(NamedTuple):
     """A pull and its reward, kept until the feedback is due."""
 
@@ -123,6 +117,7 @@ class BanditAlgorithm(LearningAlgorithm):
             a mask is malformed or allows no arm.
     """
 
+    hidden_arguments = ("policy_kwargs",)
     rewards_known: str = ANY  # rewards that the agent can learn from: `ANY`, `UNIT` or `BINARY`
 
     _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
@@ -133,7 +128,7 @@ class BanditAlgorithm(LearningAlgorithm):
         env: GymEnv | str | None = None,
         learning_rate: StepSize = 0.0,
         mask_actions: bool = False,
-        **kwargs: Unpack[LearningArguments],
+        **kwargs: Any,
     ) -> None:
         self.mask_actions = mask_actions
         self._masks: Bools = np.ones((0, 0), dtype=np.bool_)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from rl_yardstick.agents.bandits.algorithm import ArmPolicy, BanditArguments, Pull, RuleBandit
+from rl_yardstick.agents.bandits.algorithm import ArmPolicy, Pull, RuleBandit
 from rl_yardstick.agents.bandits.choosing import (
     PULL,
     Feedback,
@@ -97,12 +97,6 @@ def features(space: spaces.Space[Any], observations: NDArray[Any]) -> Floats:
 # Contextual agents with a linear model of each arm's reward.
 
 
-class LinearArguments(BanditArguments, total=False):
-    """Arguments of these agents' constructors; see `LinearBanditAgent`."""
-
-    ridge: float
-
-
 @inlined
 def no_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
     """Arms are judged by their predicted rewards."""
@@ -156,6 +150,7 @@ class LinearBanditAgent(RuleBandit):
     learn_from_reward = learn_by_model
     choose_allowed = choose_by_allowed_models
     pick = best_arm
+    hidden_arguments = ("learning_rate",)
     ranges = {"ridge": POSITIVE}  # noqa: RUF012
 
     def __init__(
@@ -163,7 +158,7 @@ class LinearBanditAgent(RuleBandit):
         policy: str | type[BasePolicy] = "LinearBanditPolicy",
         env: GymEnv | str | None = None,
         ridge: float = 1.0,
-        **kwargs: Unpack[BanditArguments],
+        **kwargs: Any,
     ) -> None:
         self.ridge = ridge
         super().__init__(policy, env, **kwargs)
@@ -221,8 +216,7 @@ class LinUCB(LinearBanditAgent):
     """Linear upper confidence bounds with disjoint models (Li et al., 2010).
 
     Args:
-        policy: ``"LinearBanditPolicy"``.
-        env: as in `LinearBanditAgent`.
+        args: as in `LinearBanditAgent`.
         alpha: how many standard deviations the bound lies above the predicted reward.
         kwargs: as in `LinearBanditAgent`.
     """
@@ -231,15 +225,9 @@ class LinUCB(LinearBanditAgent):
     ranges = {"alpha": NOT_NEGATIVE}  # noqa: RUF012
     bonus = confidence_bonus
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "LinearBanditPolicy",
-        env: GymEnv | str | None = None,
-        alpha: float = 1.0,
-        **kwargs: Unpack[LinearArguments],
-    ) -> None:
+    def __init__(self, *args: Any, alpha: float = 1.0, **kwargs: Any) -> None:
         self.alpha = alpha
-        super().__init__(policy, env, **kwargs)
+        super().__init__(*args, **kwargs)
 
 
 class LinThompson(LinUCB):
@@ -259,8 +247,7 @@ class LinEpsilonGreedy(LinearBanditAgent):
     """Epsilon-greedy in the predicted rewards.
 
     Args:
-        policy: ``"LinearBanditPolicy"``.
-        env: as in `LinearBanditAgent`.
+        args: as in `LinearBanditAgent`.
         exploration_initial_eps: epsilon at the start.
         exploration_final_eps: epsilon at the end of ``exploration_fraction``.
         exploration_fraction: share of training over which epsilon falls.
@@ -274,19 +261,18 @@ class LinEpsilonGreedy(LinearBanditAgent):
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "LinearBanditPolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         exploration_initial_eps: float = 0.1,
         exploration_final_eps: float = 0.01,
         exploration_fraction: float = 1.0,
         exploration_decay: ExplorationDecay = "constant",
-        **kwargs: Unpack[LinearArguments],
+        **kwargs: Any,
     ) -> None:
         self.exploration_initial_eps = exploration_initial_eps
         self.exploration_final_eps = exploration_final_eps
         self.exploration_fraction = exploration_fraction
         self.exploration_decay = exploration_decay
-        super().__init__(policy, env, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _make_exploration_schedule(self) -> Schedule:
         return epsilon_schedule(self)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch as th
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from rl_yardstick.agents.bandits.algorithm import ArmPolicy, BanditArguments, Pull, RuleBandit
+from rl_yardstick.agents.bandits.algorithm import ArmPolicy, Pull, RuleBandit
 from rl_yardstick.agents.bandits.choosing import (
     PULL,
     Feedback,
@@ -87,12 +87,6 @@ def mean_rewards(sums: Floats, counts: Ints) -> Floats:
 # The base of agents that keep a score for each arm in each context.
 
 
-class TableArguments(BanditArguments, total=False):
-    """Arguments of these agents' constructors; see `TableBandit`."""
-
-    ignore_context: bool
-
-
 class TableBandit(RuleBandit):
     """An agent with a score for each arm in each context; contexts are independent.
 
@@ -121,7 +115,7 @@ class TableBandit(RuleBandit):
         env: GymEnv | str | None = None,
         learning_rate: StepSize = 0.0,
         ignore_context: bool = False,
-        **kwargs: Unpack[BanditArguments],
+        **kwargs: Any,
     ) -> None:
         self.ignore_context = ignore_context
         super().__init__(policy, env, learning_rate, **kwargs)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Unpack
+from typing import Any, Literal
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.bandits.algorithm import ANY, BINARY
 from rl_yardstick.agents.bandits.choosing import ScoreAgent, ScoreTables
-from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit
+from rl_yardstick.agents.bandits.tables import TableBandit
 from rl_yardstick.agents.common.exploration import greedy_action
 from rl_yardstick.agents.common.settings import FINITE, POSITIVE
 from rl_yardstick.agents.compiled.generators import generator_of
@@ -59,8 +57,7 @@ class Thompson(TableBandit):
     """Thompson sampling: pulls an arm with the probability that it is best (Thompson, 1933).
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         likelihood: ``"bernoulli"``: rewards of 0 and 1 and a Beta prior; ``"gaussian"``: rewards
             with normal noise of a known deviation and a normal prior.
         prior_successes: first parameter of the Beta prior.
@@ -86,17 +83,18 @@ class Thompson(TableBandit):
     choose_arm = sample_posteriors
     learn_from_pull = update_mean
 
+    hidden_arguments = ("learning_rate",)
+
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         likelihood: Likelihood = "bernoulli",
         prior_successes: float = 1.0,
         prior_failures: float = 1.0,
         prior_mean: float = 0.0,
         prior_std: float = 1.0,
         reward_std: float = 1.0,
-        **kwargs: Unpack[TableArguments],
+        **kwargs: Any,
     ) -> None:
         self.likelihood = likelihood
         self.prior_successes = prior_successes
@@ -104,7 +102,7 @@ class Thompson(TableBandit):
         self.prior_mean = prior_mean
         self.prior_std = prior_std
         self.reward_std = reward_std
-        super().__init__(policy, env, **kwargs)
+        super().__init__(*args, **kwargs)
 
     @property
     def is_gaussian(self) -> bool:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Unpack
+from typing import Any
 
 from numpy.typing import NDArray
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from rl_yardstick.agents.bandits.choosing import ScoreAgent
-from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit
+from rl_yardstick.agents.bandits.tables import TableBandit
 from rl_yardstick.agents.common.exploration import (
     BOLTZMANN,
     EPSILON_GREEDY,
@@ -71,8 +70,7 @@ class EpsilonGreedy(ValueBandit):
     """Epsilon-greedy (Sutton and Barto, sections 2.2 to 2.6).
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
         initial_q: estimate of every arm at the start; high values are optimistic.
         exploration_initial_eps: epsilon at the start.
@@ -87,22 +85,21 @@ class EpsilonGreedy(ValueBandit):
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         learning_rate: StepSize = "sample_average",
         initial_q: float = 0.0,
         exploration_initial_eps: float = 0.1,
         exploration_final_eps: float = 0.01,
         exploration_fraction: float = 1.0,
         exploration_decay: ExplorationDecay = "constant",
-        **kwargs: Unpack[TableArguments],
+        **kwargs: Any,
     ) -> None:
         self.initial_q = initial_q
         self.exploration_initial_eps = exploration_initial_eps
         self.exploration_final_eps = exploration_final_eps
         self.exploration_fraction = exploration_fraction
         self.exploration_decay = exploration_decay
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, learning_rate=learning_rate, **kwargs)
 
     def _make_exploration_schedule(self) -> Schedule:
         return epsilon_schedule(self)
@@ -112,8 +109,7 @@ class Boltzmann(ValueBandit):
     """Softmax of value / temperature.
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
         initial_q: estimate of every arm at the start.
         temperature: above 0, constant or scheduled.
@@ -125,16 +121,15 @@ class Boltzmann(ValueBandit):
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         learning_rate: StepSize = "sample_average",
         initial_q: float = 0.0,
         temperature: float | Schedule = 0.1,
-        **kwargs: Unpack[TableArguments],
+        **kwargs: Any,
     ) -> None:
         self.initial_q = initial_q
         self.temperature = temperature
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, learning_rate=learning_rate, **kwargs)
 
     def _make_exploration_schedule(self) -> Schedule:
         return FloatSchedule(self.temperature)

@@ -6,39 +6,14 @@ import inspect
 import math
 from abc import ABCMeta
 from numbers import Integral
-from typing import Any, Literal, NamedTuple, TypedDict, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
-import torch as th
 from gymnasium import spaces
 
 from rl_yardstick.machine_code.compiling import inlined
 
-# Constructors that pass arguments on to their base class, and still name all of them.
-#
-# A constructor may take ``**kwargs: Unpack[CommonArguments]``. Hyperparameter files are checked
-# against the signature, and `help` shows it. So the signature lists the arguments in ``**kwargs``.
-
 TieBreaking = Literal["random", "first"]
 ExplorationDecay = Literal["constant", "linear", "exponential"]
-
-_STARRED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-
-
-class CommonArguments(TypedDict, total=False):
-    """Arguments of every hand-written agent's constructor; see `OnlineAlgorithm`."""
-
-    stats_window_size: int
-    tensorboard_log: str | None
-    verbose: int
-    seed: int | None
-    device: th.device | str
-    _init_setup_model: bool
-
-
-class LearningArguments(CommonArguments, total=False):
-    """Arguments of every learning agent's constructor; see `LearningAlgorithm`."""
-
-    tie_breaking: TieBreaking
 
 
 class CheckedConstructor(ABCMeta):
@@ -56,8 +31,8 @@ class CheckedConstructor(ABCMeta):
 def full_signature(cls: type) -> inspect.Signature:
     """The constructor's signature, with the base class's arguments in place of ``**kwargs``.
 
-    If ``**kwargs`` is annotated with its possible keys, only these are added. A constructor that
-    takes ``*args`` passes positional arguments on as well, and adds keyword arguments.
+    A class's ``hidden_arguments`` are those of its base class that it sets itself. Hyperparameter
+    files are checked against the signature, and `help` shows it.
     """
     merged = _merged([base for base in cls.__mro__ if "__init__" in vars(base)])
     return inspect.Signature(sorted(merged.values(), key=lambda parameter: parameter.kind))
@@ -68,14 +43,12 @@ def _merged(owners: list[Any]) -> dict[str, inspect.Parameter]:
     if owners[0] is object:
         return {}
     own = _parameters(owners[0])
-    merged = {p.name: p for p in own if p.name != "self" and p.kind not in _STARRED}
-    rest = next((p for p in own if p.kind is p.VAR_KEYWORD), None)
-    if rest is not None:
-        known = get_args(rest.annotation)
-        names = get_type_hints(known[0]) if known else None
-        for name, parameter in _merged(owners[1:]).items():
-            if names is None or name in names:
-                merged.setdefault(name, parameter)
+    starred = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    merged = {p.name: p for p in own if p.name != "self" and p.kind not in starred}
+    if any(p.kind is p.VAR_KEYWORD for p in own):
+        hidden = vars(owners[0]).get("hidden_arguments", ())
+        passed_on = _merged(owners[1:]).items()
+        merged = {**{n: p for n, p in passed_on if n not in hidden}, **merged}
     return merged
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any, ClassVar, Literal, Unpack, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_row
 from rl_yardstick.agents.common.settings import (
     NOT_NEGATIVE,
     SAMPLE_AVERAGE,
-    CommonArguments,
     Range,
     TieBreaking,
     check_settings,
@@ -66,6 +65,8 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
 
+    hidden_arguments = ("supported_action_spaces",)
+
     _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspaces")
     excluded_from_states: ClassVar[tuple[str, ...]] = ("_workspaces",)
 
@@ -76,7 +77,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         learning_rate: StepSize = 0.0,
         tie_breaking: TieBreaking = "random",
         policy_kwargs: dict[str, Any] | None = None,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.tie_breaking = tie_breaking
         self.exploration_schedule: Schedule = FloatSchedule(0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -19,7 +19,6 @@ from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.agents.common.settings import (
     SHARE,
-    CommonArguments,
     TieBreaking,
     check_space,
     check_vectors,
@@ -172,17 +171,6 @@ class TilePlayer(NamedTuple):
             move_on(self.seen, envs[i])
 
 
-class TileArguments(CommonArguments, total=False):
-    """Arguments that these agents' constructors pass on; see `TileAlgorithm`."""
-
-    gamma: float
-    n_tilings: int
-    n_tiles: int | Sequence[int]
-    low: Bound
-    high: Bound
-    engine: EngineChoice
-
-
 class TileAlgorithm(WorkspaceAlgorithm):
     """Learns weights of tiles: by tile coding, or as a table if observations are numbers.
 
@@ -213,12 +201,13 @@ class TileAlgorithm(WorkspaceAlgorithm):
     parameters = {"gamma": np.float64}  # noqa: RUF012
     ranges = {"gamma": SHARE}  # noqa: RUF012
     values_states: ClassVar[bool] = False
+    hidden_arguments = ("policy_kwargs",)
 
     act = act_on_tiles
 
     def __init__(
         self,
-        policy: str | type[BasePolicy],
+        policy: str | type[BasePolicy] = "TilePolicy",
         env: GymEnv | str | None = None,
         learning_rate: float | Schedule = 0.1,
         tie_breaking: TieBreaking = "random",
@@ -228,7 +217,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         low: Bound = None,
         high: Bound = None,
         engine: EngineChoice = "auto",
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.gamma = gamma
         self.n_tilings = n_tilings

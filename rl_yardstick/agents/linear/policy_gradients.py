@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.common.exploration import (
@@ -19,7 +17,7 @@ from rl_yardstick.agents.common.exploration import (
 from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm, TileArguments
+from rl_yardstick.agents.linear.algorithm import TileAlgorithm
 from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, look, move_sum
 from rl_yardstick.agents.networks.network_worlds import AFTER, BEFORE, move_on
 from rl_yardstick.envs.known_models import time_limit
@@ -69,19 +67,11 @@ def move_state_value(weights: Floats, tiles: Ints, step: float) -> None:
         weights[tiles[k]] += step
 
 
-class SoftmaxArguments(TileArguments, total=False):
-    """Arguments that these agents' constructors pass on; see `SoftmaxAlgorithm`."""
-
-    initial_preferences: float | Sequence[float]
-    gamma_power: bool
-
-
 class SoftmaxAlgorithm(TileAlgorithm):
     """A policy gradient on preferences that are sums of weights over active tiles.
 
     Args:
-        policy: ``"TilePolicy"``; its greedy action is the most probable one.
-        env: as in `TileAlgorithm`.
+        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, as in `TileAlgorithm`.
         initial_preferences: each action's preference at the start, a number or a list of A.
         gamma_power: multiply the policy's update at step t of an episode by gamma to the power t,
@@ -92,18 +82,18 @@ class SoftmaxAlgorithm(TileAlgorithm):
     parameters = {"gamma_power": np.bool_}  # noqa: RUF012
     choose_by_sums = draw_by_preference
 
+    hidden_arguments = ("tie_breaking",)
+
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "TilePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.1,
+        *args: Any,
         initial_preferences: float | Sequence[float] = 0.0,
         gamma_power: bool = True,
-        **kwargs: Unpack[TileArguments],
+        **kwargs: Any,
     ) -> None:
         self.initial_preferences = initial_preferences
         self.gamma_power = gamma_power
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _initial_sums(self) -> Floats:
         given = np.asarray(self.initial_preferences, dtype=np.float64)
@@ -166,8 +156,7 @@ class ActorCritic(SoftmaxAlgorithm):
     episode is truncated, the target bootstraps from its last state.
 
     Args:
-        policy: ``"TilePolicy"``.
-        env: as in `TileAlgorithm`.
+        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
         value_step_size: step size of the state values, also divided by the number of tilings.
         kwargs: as in `SoftmaxAlgorithm`.
@@ -180,17 +169,10 @@ class ActorCritic(SoftmaxAlgorithm):
 
     _rebuilt = (*SoftmaxAlgorithm._rebuilt, "_discounts")
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "TilePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.1,
-        value_step_size: float = 0.2,
-        **kwargs: Unpack[SoftmaxArguments],
-    ) -> None:
+    def __init__(self, *args: Any, value_step_size: float = 0.2, **kwargs: Any) -> None:
         self.value_step_size = value_step_size
         self._discounts = np.ones(0)
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _begin_episodes(self) -> None:
         super()._begin_episodes()
@@ -295,8 +277,7 @@ class Reinforce(SoftmaxAlgorithm):
     last state.
 
     Args:
-        policy: ``"TilePolicy"``.
-        env: as in `TileAlgorithm`.
+        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
         baseline: subtracted from returns: ``"none"``, or ``"value"``, a learnt state value.
         value_step_size: step size of that value, also divided by the number of tilings.
@@ -312,13 +293,7 @@ class Reinforce(SoftmaxAlgorithm):
     _rebuilt = (*SoftmaxAlgorithm._rebuilt, *_kept)
 
     def __init__(
-        self,
-        policy: str | type[BasePolicy] = "TilePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.1,
-        baseline: Baseline = "none",
-        value_step_size: float = 0.2,
-        **kwargs: Unpack[SoftmaxArguments],
+        self, *args: Any, baseline: Baseline = "none", value_step_size: float = 0.2, **kwargs: Any
     ) -> None:
         self.baseline = baseline
         self.value_step_size = value_step_size
@@ -326,7 +301,7 @@ class Reinforce(SoftmaxAlgorithm):
         self._kept_tiles = np.zeros((0, 0, 1), dtype=np.int64)
         self._kept_actions = np.zeros((0, 0), dtype=np.int64)
         self._kept_rewards = np.zeros((0, 0))
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     @property
     def values_states(self) -> bool:  # type: ignore[override]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Unpack, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch as th
@@ -31,7 +31,6 @@ from rl_yardstick.agents.common.settings import (
     EPSILONS,
     POSITIVE,
     SHARE,
-    CommonArguments,
     ExplorationDecay,
     TieBreaking,
     check_space,
@@ -109,12 +108,6 @@ class TableWorkspace(Workspace):
         self.take_outcomes(transitions)
         self._check("next_obs", learn_from_all(*self.arrays))
         return float(self.mean_td_error[0])
-
-
-class MaskedArguments(CommonArguments, total=False):
-    """Arguments that constructors of tabular agents pass on; see `TabularAlgorithm`."""
-
-    mask_actions: bool
 
 
 class TabularAlgorithm(WorkspaceAlgorithm):
@@ -200,7 +193,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         engine: EngineChoice = "auto",
         policy_kwargs: dict[str, Any] | None = None,
         mask_actions: bool = False,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.gamma = gamma
         self.exploration = exploration
@@ -227,12 +220,16 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         check_space(self, "observations", self.observation_space)
         check_space(self, "actions", self.action_space)
 
+    def _policy_arguments(self) -> dict[str, Any]:
+        """Arguments of the policy besides spaces and the user's."""
+        return {"n_tables": self.n_tables}
+
     def _make_policy(self) -> QTablePolicy:
         policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
             self.action_space,
             self.lr_schedule,
-            n_tables=self.n_tables,
+            **self._policy_arguments(),
             **self.policy_kwargs,
         )
         if self.mask_actions:
@@ -257,8 +254,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
         """The agent for compiled functions, with its tables in the memory of its policy."""
-        self._check_tables()
-        self._check_memory()
         policy = self.policy
         values, counts = policy.q_tables.numpy(), policy.visit_counts.numpy()
         n_actions = values.shape[2]
@@ -273,18 +268,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             self._memory_in_use(),
         )
 
-    def _check_tables(self) -> None:
-        """Raise ValueError for tables of a wrong shape, which compiled code does not check."""
-        sizes = cast(Any, (self.observation_space, self.action_space))
-        shape = (self.n_tables, *(int(space.n) for space in sizes))
-        found = tuple(self.policy.q_tables.shape), tuple(self.policy.visit_counts.shape)
-        if found != (shape, shape) or self.n_tables not in (1, 2):
-            raise ValueError(f"tables must be 1 or 2, of shape {shape}, not {found[0]}")
-        if self.mask_actions and self.policy.masks.shape != shape[1:]:
-            raise ValueError(f"masks must be of shape {shape[1:]}, not {self.policy.masks.shape}")
-        if self.strategy not in STRATEGIES.values():
-            raise ValueError(f"unknown exploration strategy {self.strategy}")
-
     def _make_memory(self) -> tuple[Any, ...]:
         """An empty memory for ``n_envs`` environments."""
         return ()
@@ -292,20 +275,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     def _memory_in_use(self) -> tuple[Any, ...]:
         """The memory for compiled functions; a subclass may add to it."""
         return self._memory
-
-    def _check_memory(self) -> None:
-        """Raise ValueError for a memory of wrong shapes, which compiled code does not check."""
-        expected: Any = self._make_memory()
-        if type(self._memory) is not type(expected):
-            raise ValueError(f"the agent's memory must be a {type(expected).__name__}")
-        for name, found, like in zip(
-            getattr(expected, "_fields", ()), self._memory, expected, strict=True
-        ):
-            if (found.dtype, found.shape) != (like.dtype, like.shape):
-                raise ValueError(
-                    f"the agent's memory was made for other settings: {name} must be of shape "
-                    f"{like.shape} and {like.dtype}, not {found.shape} and {found.dtype}"
-                )
 
     def greedy_player(self, seen: Any) -> Plan:
         """A player with the greedy actions of `predict` on compiled environments."""

@@ -21,7 +21,6 @@ from rl_yardstick.agents.tabular.policy import QTablePolicy
 from rl_yardstick.agents.tabular.updates import TabularAgent, action_at, best_value, room_at, update
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.safe_files.files import MAX_ARCHIVE_BYTES
 
 # The learnt model of the environment: the last outcomes of each pair of state and action.
 #
@@ -66,9 +65,6 @@ def add_pair(model: Any, obs: int, action: int) -> None:
 
 # The policy of tabular agents that learn a model, which their model file contains, too.
 
-# The largest size of the arrays, so that a model file can be read again.
-MOST_BYTES = MAX_ARCHIVE_BYTES * 15 // 16
-
 
 class ModelPolicy(QTablePolicy):
     """Greedy in a table, with a learnt model of the environment beside it."""
@@ -85,35 +81,13 @@ class ModelPolicy(QTablePolicy):
         **kwargs: Any,
     ) -> None:
         super().__init__(observation_space, action_space, lr_schedule, n_tables, **kwargs)
-        self.outcomes_kept = 0
-        self.keep_outcomes(outcomes_kept)
+        self.outcomes_kept = outcomes_kept
+        n_states, n_actions = self.visit_counts.shape[1:]
+        for name, array in self._nothing_learnt(n_states, n_actions, outcomes_kept).items():
+            self.register_buffer(f"model_{name}", th.from_numpy(array))
 
     def _sizes(self) -> dict[str, Any]:
         return {**super()._sizes(), "outcomes_kept": self.outcomes_kept}
-
-    def keep_outcomes(self, n: int) -> None:
-        """Allocate the model for ``n`` outcomes of each pair; if n changes, it starts empty."""
-        most = self._most_outcomes()
-        if n > most:
-            raise ValueError(
-                f"{n} outcomes of {self.visit_counts[0].numel()} pairs of state and action are too "
-                f"many to keep: at most {most} of each"
-            )
-        if n != self.outcomes_kept:
-            self.outcomes_kept = n
-            n_states, n_actions = self.visit_counts.shape[1:]
-            for name, array in self._nothing_learnt(n_states, n_actions, n).items():
-                self.register_buffer(f"model_{name}", th.from_numpy(array))
-
-    def _most_outcomes(self) -> int:
-        """The largest number of outcomes of each pair that fits into a model file."""
-        n_states, n_actions = self.visit_counts.shape[1:]
-        with_one, with_two = (
-            n_states * sum(a.nbytes for a in self._nothing_learnt(1, n_actions, n).values())
-            for n in (1, 2)
-        )
-        tables = self.q_tables.nbytes + self.visit_counts.nbytes
-        return max(1 + int((MOST_BYTES - tables - with_one) // (with_two - with_one)), 0)
 
     def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
         """The arrays of an empty model, by name."""
@@ -155,18 +129,6 @@ class ModelPolicy(QTablePolicy):
         self.check_places()
         return result
 
-    def check_shapes(self) -> None:
-        """Raise ValueError for arrays of wrong shapes, which compiled code does not check."""
-        n_states, n_actions = self.visit_counts.shape[1:]
-        expected = self._nothing_learnt(n_states, n_actions, self.outcomes_kept)
-        for name, like in expected.items():
-            found = getattr(self.model, name)
-            if (found.dtype, found.shape) != (like.dtype, like.shape):
-                raise ValueError(
-                    f"model_{name} must be of shape {like.shape} and {like.dtype}, not "
-                    f"{found.shape} and {found.dtype}"
-                )
-
     def check_places(self) -> None:
         """Raise ValueError for a model with indices out of range."""
         n_states, n_actions = self.visit_counts.shape[1:]
@@ -186,18 +148,11 @@ class ModelKeeper(TabularAlgorithm):
     policy: ModelPolicy
     outcomes_kept: int = 1  # number of outcomes in the model for each pair of state and action
 
-    def _make_policy(self) -> QTablePolicy:
-        policy = super()._make_policy()
-        assert isinstance(policy, ModelPolicy)
-        policy.keep_outcomes(self.outcomes_kept)
-        return policy
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {**super()._policy_arguments(), "outcomes_kept": self.outcomes_kept}
 
     def _memory_in_use(self) -> Any:
         return self.policy.model
-
-    def _check_tables(self) -> None:
-        super()._check_tables()
-        self.policy.check_shapes()
 
 
 # Dyna-Q.

@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.common.exploration import greedy_action, highest_value
 from rl_yardstick.agents.common.settings import whole
@@ -75,8 +75,7 @@ class RecordAlgorithm(EpisodicAlgorithm):
     treated as truncated after ``longest_episode`` steps, and its rest as another episode.
 
     Args:
-        policy: as in `TabularAlgorithm`.
-        env: as in `TabularAlgorithm`.
+        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`; the textbook's is ``"sample_average"``.
         longest_episode: maximal number of stored steps of an episode, at least 1.
         kwargs: as in `TabularAlgorithm`.
@@ -87,14 +86,13 @@ class RecordAlgorithm(EpisodicAlgorithm):
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "QTablePolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         learning_rate: StepSize = "sample_average",
         longest_episode: int = 10_000,
         **kwargs: Any,
     ) -> None:
         self.longest_episode = longest_episode
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, learning_rate=learning_rate, **kwargs)
 
     def _make_memory(self) -> EpisodeRecords:
         shape = (self.n_envs, self.longest_episode)
@@ -275,14 +273,6 @@ class OffPolicyMonteCarlo(RecordAlgorithm):
             raise ValueError(
                 "off_policy_monte_carlo takes weighted means: learning_rate must be "
                 f"'sample_average', not {self.learning_rate!r}"
-            )
-
-    def _check_tables(self) -> None:
-        super()._check_tables()
-        if self.policy.weights.shape != self.policy.q_tables.shape:
-            shape = tuple(self.policy.q_tables.shape)
-            raise ValueError(
-                f"weights must be of shape {shape}, not {tuple(self.policy.weights.shape)}"
             )
 
     def _memory_in_use(self) -> WeightedRecords:

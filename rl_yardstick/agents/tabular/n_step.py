@@ -6,12 +6,9 @@ import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.common.exploration import action_probability, expected_value, highest_value
 from rl_yardstick.agents.common.settings import whole
-from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
@@ -184,8 +181,7 @@ class WindowAlgorithm(EpisodicAlgorithm):
     A truncated episode bootstraps from its last state.
 
     Args:
-        policy: as in `TabularAlgorithm`.
-        env: as in `TabularAlgorithm`.
+        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`.
         n_steps: number of rewards in a target, at least 1.
         kwargs: as in `TabularAlgorithm`.
@@ -194,16 +190,9 @@ class WindowAlgorithm(EpisodicAlgorithm):
     learn_in = learn_from_window
     ranges = {"n_steps": whole(1)}  # noqa: RUF012
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "QTablePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: StepSize = 0.1,
-        n_steps: int = 4,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, *args: Any, n_steps: int = 4, **kwargs: Any) -> None:
         self.n_steps = n_steps
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _make_memory(self) -> Windows:
         shape = (self.n_envs, self.n_steps)

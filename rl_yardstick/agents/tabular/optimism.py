@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE, POSITIVE, TieBreaking, whole
+from rl_yardstick.agents.common.settings import (
+    EPSILONS,
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    TieBreaking,
+    whole,
+)
 from rl_yardstick.agents.compiled.engine import EngineChoice
-from rl_yardstick.agents.tabular.algorithm import MaskedArguments, TabularAlgorithm
+from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
 from rl_yardstick.agents.tabular.dyna import ModelKeeper, ModelPolicy
 from rl_yardstick.agents.tabular.updates import TabularAgent, best_value
 from rl_yardstick.machine_code.compiling import inlined
@@ -46,6 +53,10 @@ class OptimisticAlgorithm(TabularAlgorithm):
 
     parameters = {"highest_worth": np.float64}  # noqa: RUF012
     ranges = {"value_bound": FINITE}  # noqa: RUF012
+    hidden_arguments = (
+        *("learning_rate", "exploration", "exploration_decay", *EPSILONS, "temperature"),
+        *("noise_std", "initial_q", "initial_q_std", "skip_terminal_update"),
+    )
 
     def __init__(
         self,
@@ -56,7 +67,7 @@ class OptimisticAlgorithm(TabularAlgorithm):
         tie_breaking: TieBreaking = "random",
         engine: EngineChoice = "auto",
         policy_kwargs: dict[str, Any] | None = None,
-        **kwargs: Unpack[MaskedArguments],
+        **kwargs: Any,
     ) -> None:
         self.value_bound = value_bound
         super().__init__(
