@@ -32,10 +32,8 @@ from rl_yardstick.agents.linear.tiles import (
     LinearAgent,
     Room,
     Tiles,
-    act_in_all,
     act_on_tiles,
     add_up,
-    learn_from_all,
     look,
     make_tiles,
     tiles_of_all,
@@ -102,31 +100,28 @@ NUMBERED_ENV = env_dtype(("number", np.int64))
 
 
 class TileWorkspace(Workspace):
-    """A workspace with an agent, whose weights are changed in place."""
+    """A workspace of an agent on tiles."""
 
-    def __init__(self, agent: LinearAgent, space: spaces.Space[Any], n: int) -> None:
-        super().__init__(n, NUMBERED_ENV)
-        self.envs["number"] = np.arange(n)
+    def __init__(
+        self, agent: LinearAgent, space: spaces.Space[Any], rng: np.random.Generator, n: int
+    ) -> None:
         self.space = space
-        n_dims = len(agent.room.vector)
-        self.seen = HandedVectors(np.zeros((n, n_dims)), np.zeros((n, n_dims)))
-        self.agent = agent._replace(seen=self.seen)
+        before, after = np.zeros((2, n, len(agent.room.vector)))
+        self.seen = HandedVectors(before, after)
+        super().__init__(agent._replace(seen=self.seen), rng, n, NUMBERED_ENV)
+        self.envs["number"] = np.arange(n)
 
     def act(self, observations: Any) -> Ints:
-        """An action for each observation: the one committed to, if there is one."""
+        """An action for each observation."""
         self.seen.before[:] = vectors_of(self.space, observations)
-        act_in_all(self.agent, self.envs, self.progress[0])
-        actions: Ints = self.fields["action"].copy()
-        return actions
+        return self.choose()
 
     def learn(self, transitions: Transitions) -> float:
         """Learn from a step of each environment, and return the mean absolute TD error."""
         self.seen.before[:] = vectors_of(self.space, transitions.obs)
         self.seen.after[:] = vectors_of(self.space, transitions.next_obs)
         self.fields["action"][:] = transitions.actions
-        self.take_outcomes(transitions)
-        learn_from_all(self.agent, self.envs, self.progress[0])
-        return float(self.mean_td_error[0])
+        return self.learn_from(transitions)
 
 
 class TileEngine(CompiledEngine):
@@ -290,7 +285,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         super()._run(total_timesteps, callback, log_interval)
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> TileWorkspace:
-        return TileWorkspace(self.compiled_agent(rng), self.observation_space, n)
+        return TileWorkspace(self.compiled_agent(rng), self.observation_space, rng, n)
 
     def predict(
         self,

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.masks import numbers_in
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, act, by_type, learn_from_step
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.networks.network_worlds import BEFORE, observe
 from rl_yardstick.machine_code.compiling import called, kernel
@@ -300,16 +300,3 @@ def act_on_tiles(agent: LinearAgent, env: Any, progress: Any) -> None:
     if env.action == UNDECIDED:
         look(agent, env, BEFORE, agent.room.tiles)
         env.action = choose(agent, agent.room.tiles, progress)
-
-
-@kernel
-def act_in_all(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """`act` in each environment, for the interpreted loop."""
-    for i in range(len(envs)):
-        act(agent, envs[i], progress)
-
-
-@kernel
-def learn_from_all(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """`learn_from_step` of all environments, for the interpreted loop."""
-    learn_from_step(agent, envs, progress)

@@ -13,17 +13,12 @@ from rl_yardstick.agents.common.callbacks import EpisodeBudget, Horizon, horizon
 from rl_yardstick.agents.compiled.engine import CompiledEngine
 from rl_yardstick.agents.compiled.generators import handles_of
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
-from rl_yardstick.agents.compiled.worlds import NotCompilable
+from rl_yardstick.agents.compiled.references import Reference, address_of
 from rl_yardstick.agents.networks.network_worlds import (
     NetworkEnvStates,
     Numbers,
 )
-from rl_yardstick.agents.networks.torch_bridge import (
-    FlatTensors,
-    Reference,
-    SharedOptimizer,
-    address_of,
-)
+from rl_yardstick.agents.networks.torch_bridge import FlatTensors, SharedOptimizer
 
 # A placeholder of an address, until there is a reference to the learner.
 NOWHERE = np.uintp(0)
@@ -59,25 +54,14 @@ class NetworkTraining:
 
     def begin(self, held: Any, improve: Callable[[Any, float, float], int]) -> None:
         """Set the learner, and its compiled function that learns from a minibatch."""
-        self.held = held
         self.learner = Reference(held)
-        self.hold(improve=address_of(improve, self.learner))
-
-    def hold(self, **parts: Any) -> None:
-        """Replace parts of the learner."""
-        self.held = self.held._replace(**parts)
+        self.held = held._replace(improve=address_of(improve, self.learner))
         self.learner.hold(self.held)
 
     def read_tensors(self) -> None:
-        """Use weights and an optimizer that a callback may have replaced."""
+        """Use weights that a callback may have replaced."""
         self.trained.take_over()
         self.lagging.take_over()
-        try:
-            optimizer = self.optimizer.current()
-        except NotCompilable as reason:
-            raise ValueError(f"engine: compiled cannot go on: {reason}") from None
-        if optimizer is not self.held.optimizer:
-            self.hold(optimizer=optimizer)
 
     def read_generator(self) -> None:
         """Use the agent's generator, which a callback may have replaced."""

@@ -21,6 +21,7 @@ from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_value
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
+from rl_yardstick.agents.compiled.references import Reference, address_of, call
 from rl_yardstick.agents.compiled.worlds import SCHEDULE, NotCompilable
 from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
 from rl_yardstick.agents.networks.engine_setting import CompiledNetworks, Work, work_of
@@ -46,13 +47,7 @@ from rl_yardstick.agents.networks.perceptron import (
     make_outputs,
     n_parameters,
 )
-from rl_yardstick.agents.networks.torch_bridge import (
-    Network,
-    Reference,
-    address_of,
-    call,
-    network_of,
-)
+from rl_yardstick.agents.networks.torch_bridge import Network, network_of
 from rl_yardstick.machine_code.compiling import called, inlined, kernel
 from rl_yardstick.mdp.transition_model import Bools, Ints
 

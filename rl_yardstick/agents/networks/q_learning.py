@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
+from rl_yardstick.agents.compiled.references import Reference, address_of, call
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
 from rl_yardstick.agents.networks.engine_setting import (
@@ -45,13 +46,7 @@ from rl_yardstick.agents.networks.perceptron import (
     make_inputs,
     make_outputs,
 )
-from rl_yardstick.agents.networks.torch_bridge import (
-    Network,
-    Reference,
-    address_of,
-    call,
-    network_of,
-)
+from rl_yardstick.agents.networks.torch_bridge import Network, network_of
 from rl_yardstick.machine_code.compiling import called, inlined, kernel
 from rl_yardstick.mdp.transition_model import Floats, Ints
 

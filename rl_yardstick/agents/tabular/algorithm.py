@@ -46,9 +46,7 @@ from rl_yardstick.agents.tabular.updates import (
     Room,
     Tables,
     TabularAgent,
-    act_in_all,
     act_on_values,
-    learn_from_all,
     no_commitment,
     td_learning,
 )
@@ -60,54 +58,24 @@ ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
 class TableWorkspace(Workspace):
-    """A workspace with an agent, whose tables are changed in place.
+    """A workspace of an agent on tables."""
 
-    ``masks`` has the allowed actions at each observation; without rows all actions are allowed.
-    """
-
-    def __init__(self, agent: TabularAgent, masks: Bools, rng: np.random.Generator, n: int) -> None:
-        super().__init__(n)
-        self.rng = rng  # kept here, because its handle does not keep it alive
-        # The arguments of `act_in_all` and `learn_from_all`, in order.
-        self.arrays = (
-            np.array([agent.settings]),
-            self.envs,
-            self.progress,
-            *agent.tables[:2],
-            masks,
-            *agent.room,
-            handles_of([rng]),
-            agent.memory,
-        )
-        self._chosen: Ints | None = None
-
-    def _check(self, field: str, outside: int) -> None:
-        """Raise ValueError for an observation without a row, unless ``outside`` is -1."""
-        if outside >= 0:
-            n_states = self.arrays[3].shape[1]
-            obs = self.fields[field][outside]
-            raise ValueError(f"observation {obs} is not in Discrete({n_states}), the agent's space")
+    _chosen: Ints | None = None
 
     def act(self, obs: Any) -> Ints:
-        """An action for each observation: the one committed to, if there is one."""
-        fields = self.fields
-        fields["obs"][:] = obs
-        self._check("obs", act_in_all(*self.arrays))
-        actions: Ints = fields["action"].copy()
-        self._chosen = actions
-        return actions
+        """An action for each observation."""
+        self.fields["obs"][:] = obs
+        self._chosen = self.choose()
+        return self._chosen
 
     def learn(self, transitions: Transitions) -> float:
         """Learn from a step of each environment, and return the mean absolute TD error."""
-        fields = self.fields
         if transitions.actions is not self._chosen:
             # After `act`, its observations and actions are in the records already.
-            fields["obs"][:] = transitions.obs
-            fields["action"][:] = transitions.actions
-        fields["next_obs"][:] = transitions.next_obs
-        self.take_outcomes(transitions)
-        self._check("next_obs", learn_from_all(*self.arrays))
-        return float(self.mean_td_error[0])
+            self.fields["obs"][:] = transitions.obs
+            self.fields["action"][:] = transitions.actions
+        self.fields["next_obs"][:] = transitions.next_obs
+        return self.learn_from(transitions)
 
 
 class TabularAlgorithm(WorkspaceAlgorithm):
@@ -319,7 +287,8 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self.last_steps = envs
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> TableWorkspace:
-        return TableWorkspace(self.compiled_agent(rng), self.policy.masks, rng, n)
+        n_states = self.policy.q_tables.shape[1]
+        return TableWorkspace(self.compiled_agent(rng), rng, n, n_numbers=n_states)
 
     def _choose_actions(self) -> Ints:
         if self.asks_for_masks:
