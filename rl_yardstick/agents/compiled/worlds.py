@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from rl_yardstick.agents.compiled.generators import next_uniform, skip_uniform
+from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.envs.known_models import (
     model_check,
     observations_of_states,
@@ -172,12 +172,9 @@ class FiniteModel(NamedTuple):
     @inlined
     def step(self, env: Any, handle: Any) -> None:
         """Take ``env.action`` in ``env.state``."""
-        outcome = 0
+        outcome, uniform = 0, next_uniform(handle)
         if self.outcomes.shape[2] > 1:
-            uniform = next_uniform(handle)
             outcome = pick_outcome(self.outcomes, env.state, env.action, uniform)
-        else:
-            skip_uniform(handle)
         result = self.outcomes[env.state, env.action, outcome]
         env.state = result.next_state
         env.reward = result.agent_reward
