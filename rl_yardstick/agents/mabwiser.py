@@ -6,10 +6,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.bandits.algorithm import BINARY, BanditAlgorithm, Pull
 from rl_yardstick.agents.bandits.linear import features
@@ -51,20 +50,19 @@ class MABWiserPolicy(TablePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
+        *args: Any,
         kind: str = "EpsilonGreedy",
         settings: dict[str, float] | None = None,
         **kwargs: Any,
     ) -> None:
         from mabwiser.mab import MAB, LearningPolicy
 
-        super().__init__(observation_space, action_space, **kwargs)
+        super().__init__(*args, **kwargs)
         self.kind, self.settings = kind, settings or {}
         self.statistics = KINDS[kind].statistics
         learning_policy = getattr(LearningPolicy, kind)(**self.settings)
-        self.mab: Any = MAB(list(range(int(action_space.n))), learning_policy)
+        n_arms = int(self.action_space.n)  # type: ignore[attr-defined]
+        self.mab: Any = MAB(list(range(n_arms)), learning_policy)
         self.fitted = False
 
     def _sizes(self) -> dict[str, Any]:
@@ -176,13 +174,9 @@ class MABWiserAgent(BanditAlgorithm):
         else:
             check_vectors(self, self.observation_space)
 
-    def _make_policy(self) -> MABWiserPolicy:
-        policy: Any = self.policy_class
+    def _policy_arguments(self) -> dict[str, Any]:
         settings = {name: getattr(self, ours) for name, ours in KINDS[self.kind].settings.items()}
-        made: MABWiserPolicy = policy(
-            self.observation_space, self.action_space, kind=self.kind, settings=settings
-        )
-        return made
+        return {"kind": self.kind, "settings": settings}
 
     def _contexts(self, obs: NDArray[Any]) -> Floats:
         return features(self.observation_space, obs)

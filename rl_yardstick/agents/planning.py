@@ -15,7 +15,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
@@ -47,15 +47,9 @@ class ActionTablePolicy(TablePolicy):
     actions: th.Tensor
     horizon: th.Tensor  # steps of an episode, int64 of shape (); only used if m is above 1
 
-    def __init__(
-        self,
-        observation_space: spaces.Discrete,
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-        shape = (1, int(observation_space.n))
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        shape = (1, int(self.observation_space.n))  # type: ignore[attr-defined]
         self.register_buffer("actions", th.zeros(shape, dtype=th.int64))
         self.register_buffer("horizon", th.tensor(1))
 

@@ -8,28 +8,15 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
+from rl_yardstick.agents.common.model_files import TablePolicy
 
 POLE_ANGLE = 2
 LEFT, RIGHT = 0, 1
 
 
-class FixedPolicy(BasePolicy):
-    """A policy without parameters."""
-
-    def __init__(
-        self,
-        observation_space: Any,
-        action_space: Any,
-        lr_schedule: Schedule | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-
-
-class RandomPolicy(FixedPolicy):
+class RandomPolicy(TablePolicy):
     """Uniformly random actions from the action space's own generator."""
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
@@ -37,7 +24,7 @@ class RandomPolicy(FixedPolicy):
         return th.from_numpy(np.stack([self.action_space.sample() for _ in range(len(first))]))
 
 
-class AnglePolicy(FixedPolicy):
+class AnglePolicy(TablePolicy):
     """Push the cart towards the side that the pole leans to."""
 
     def _predict(

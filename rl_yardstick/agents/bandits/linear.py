@@ -9,9 +9,14 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 
-from rl_yardstick.agents.bandits.algorithm import ArmPolicy, Pull, RuleBandit
+from rl_yardstick.agents.bandits.algorithm import (
+    ArmPolicy,
+    EpsilonGreedyBandit,
+    Pull,
+    RuleBandit,
+)
 from rl_yardstick.agents.bandits.choosing import (
     PULL,
     Feedback,
@@ -22,16 +27,13 @@ from rl_yardstick.agents.bandits.choosing import (
     choose_by_model,
     deviation,
     learn_by_model,
-    learn_one,
+    learn_one_by_model,
     row_of_vector,
 )
 from rl_yardstick.agents.common.exploration import choose_action
-from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import (
-    EPSILONS,
     NOT_NEGATIVE,
     POSITIVE,
-    ExplorationDecay,
     check_vectors,
 )
 from rl_yardstick.agents.compiled.generators import generator_of, handles_of
@@ -49,16 +51,10 @@ class LinearBanditPolicy(ArmPolicy):
     coefficients: th.Tensor  # of each arm's regression, float64 of shape (A, d)
     counts: th.Tensor  # number of rewards of each arm, int64 of shape (A,)
 
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        ridge: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-        n_arms, n_features = int(action_space.n), number_of_features(observation_space)
+    def __init__(self, *args: Any, ridge: float = 1.0, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        n_arms = int(self.action_space.n)  # type: ignore[attr-defined]
+        n_features = number_of_features(self.observation_space)
         identity = ridge * th.eye(n_features, dtype=th.float64)
         self.register_buffer("factors", identity.repeat(n_arms, 1, 1))
         self.register_buffer("moments", th.zeros((n_arms, n_features), dtype=th.float64))
@@ -167,12 +163,8 @@ class LinearBanditAgent(RuleBandit):
         super()._check_arguments()
         check_vectors(self, self.observation_space)
 
-    def _make_policy(self) -> LinearBanditPolicy:
-        policy: Any = self.policy_class
-        made: LinearBanditPolicy = policy(
-            self.observation_space, self.action_space, self.lr_schedule, ridge=self.ridge
-        )
-        return made
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"ridge": self.ridge}
 
     def compiled_agent(
         self,
@@ -209,7 +201,7 @@ class LinearBanditAgent(RuleBandit):
     def _learn(self, pull: Pull) -> None:
         agent = self._workspace_for(self.rng, 1)
         agent.contexts[0] = pull.context
-        learn_one(agent, np.array([(0, *pull[1:4])], dtype=PULL)[0], None)
+        learn_one_by_model(agent, np.array([(0, *pull[1:4])], dtype=PULL)[0])
 
 
 class LinUCB(LinearBanditAgent):
@@ -234,8 +226,7 @@ class LinThompson(LinUCB):
     """Linear Thompson sampling (Agrawal and Goyal, 2013), with a model for each arm.
 
     Args:
-        policy: ``"LinearBanditPolicy"``.
-        env: as in `LinearBanditAgent`.
+        args: as in `LinearBanditAgent`.
         alpha: factor of the posterior's standard deviation; correct is the noise's of the rewards.
         kwargs: as in `LinearBanditAgent`.
     """
@@ -243,36 +234,11 @@ class LinThompson(LinUCB):
     bonus = sampled_bonus
 
 
-class LinEpsilonGreedy(LinearBanditAgent):
+class LinEpsilonGreedy(EpsilonGreedyBandit, LinearBanditAgent):
     """Epsilon-greedy in the predicted rewards.
 
-    Args:
-        args: as in `LinearBanditAgent`.
-        exploration_initial_eps: epsilon at the start.
-        exploration_final_eps: epsilon at the end of ``exploration_fraction``.
-        exploration_fraction: share of training over which epsilon falls.
-        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
-        kwargs: as in `LinearBanditAgent`.
+    Takes the arguments of `EpsilonGreedyBandit` and `LinearBanditAgent`.
     """
 
     bonus = no_bonus
     pick = pick_epsilon_greedily
-    ranges = EPSILONS
-
-    def __init__(
-        self,
-        *args: Any,
-        exploration_initial_eps: float = 0.1,
-        exploration_final_eps: float = 0.01,
-        exploration_fraction: float = 1.0,
-        exploration_decay: ExplorationDecay = "constant",
-        **kwargs: Any,
-    ) -> None:
-        self.exploration_initial_eps = exploration_initial_eps
-        self.exploration_final_eps = exploration_final_eps
-        self.exploration_fraction = exploration_fraction
-        self.exploration_decay = exploration_decay
-        super().__init__(*args, **kwargs)
-
-    def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(self)

@@ -23,7 +23,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import open_path
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import (
     ConstantSchedule,
     FloatSchedule,
@@ -421,6 +421,15 @@ def _system_info() -> str:
 
 class TablePolicy(BasePolicy):
     """A policy that stores what it has learnt in buffers on the CPU."""
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
 
     def _sizes(self) -> dict[str, Any]:
         """The constructor's arguments that determine the shapes of the buffers."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick.agents.common.callbacks import (
     EpisodeBudget,
@@ -18,8 +17,8 @@ from rl_yardstick.agents.common.callbacks import (
     unknown_callbacks,
     wants_position,
 )
+from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM, EnvStates, observed_world
 from rl_yardstick.agents.compiled.generators import handles_of
-from rl_yardstick.agents.compiled.greedy_play import COMPENSATED_SUM, EnvStates
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 from rl_yardstick.agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
 from rl_yardstick.agents.compiled.records import Episodes, record_in_monitors
@@ -27,8 +26,6 @@ from rl_yardstick.agents.compiled.worlds import (
     EPISODE,
     PROGRESS,
     NotCompilable,
-    World,
-    compile_envs,
     draws_alike,
 )
 
@@ -44,16 +41,20 @@ class CompiledEngine:
     counts_where_stopped = True
 
     def __init__(
-        self, agent: Any, world: World, callback: BaseCallback, log_interval: int | None
+        self,
+        agent: Any,
+        world: tuple[Any, Any],
+        callback: BaseCallback,
+        log_interval: int | None,
     ) -> None:
         assert isinstance(agent.env, DummyVecEnv)
         self.agent = agent
-        self.world = world
+        self.world, self.seen = world
         self.callback = callback
         self.log_interval = log_interval
         self.reports_success = ["is_success" in (info or {}) for info in agent.env.reset_infos]
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
-        self.states = self._make_states()
+        self.states = EnvStates(agent.env, self.world, self.seen)
         self.envs = self.states.records
         # Handles do not keep their generators alive.
         self.generators = [env.unwrapped.np_random for env in agent.env.envs]
@@ -67,23 +68,17 @@ class CompiledEngine:
         self.learner: Any = None
         self._read()
 
-    def _make_states(self) -> EnvStates:
-        return EnvStates(self.agent.env, self.world)
-
     def _learner(self) -> Any:
         """The agent for compiled functions, updated after changes by callbacks."""
         agent, progress = self.agent, self.progress[0]
         made_from = agent.made_from(agent.rng)
         if made_from != self.made_from:
-            self.made_from, self.learner = made_from, self._compiled_agent()
+            self.made_from, self.learner = made_from, agent.compiled_agent(agent.rng, self.seen)
         for name, schedule in agent.schedules().items():
             progress[f"{name}_schedule"] = compiled_schedule(schedule)
             progress[name] = schedule(agent._current_progress_remaining)
         self._take_generators()
         return self.learner
-
-    def _compiled_agent(self) -> Any:
-        return self.agent.compiled_agent(self.agent.rng)
 
     def _take_generators(self) -> None:
         """Make new handles, because a callback may have reseeded the environments."""
@@ -263,11 +258,7 @@ SETTINGS = (
 
 
 def choose_engine(
-    agent: Any,
-    callback: BaseCallback,
-    log_interval: int | None,
-    make_world: Callable[[VecEnv], Any] = compile_envs,
-    engine: type[CompiledEngine] = CompiledEngine,
+    agent: Any, callback: BaseCallback, log_interval: int | None
 ) -> CompiledEngine | None:
     """The compiled engine, if the agent asks for it and can be compiled; else None.
 
@@ -279,7 +270,7 @@ def choose_engine(
         agent.engine_in_use = "interpreted: asked for"
         return None
     try:
-        world = _world_for(agent, callback, make_world)
+        world = _world_for(agent, callback)
     except NotCompilable as reason:
         if agent.engine == "compiled":
             raise ValueError(f"engine: compiled is not possible: {reason}") from None
@@ -294,16 +285,11 @@ def choose_engine(
             )
             return None
         agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"
-    return engine(agent, world, callback, log_interval)
+    return CompiledEngine(agent, world, callback, log_interval)
 
 
-def _world_for(
-    agent: LearningAlgorithm, callback: BaseCallback, make_world: Callable[[VecEnv], Any]
-) -> Any:
+def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> tuple[Any, Any]:
     check_class(type(agent))
-    for name in vars(agent):
-        if callable(vars(agent)[name]) and callable(getattr(type(agent), name, None)):
-            raise NotCompilable(f"this agent has a {name} of its own in Python")
     unknown = unknown_callbacks(callback)
     if unknown:
         raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
@@ -311,7 +297,7 @@ def _world_for(
     for schedule in agent.schedules().values():
         compiled_schedule(schedule)
     assert agent.env is not None
-    return make_world(agent.env)
+    return observed_world(agent.env)
 
 
 def check_class(algorithm: type) -> None:

@@ -106,9 +106,15 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     def _check_arguments(self) -> None:
         """Refuse invalid arguments before anything is built."""
 
-    @abstractmethod
+    def _policy_arguments(self) -> dict[str, Any]:
+        """The policy's arguments besides spaces and schedule."""
+        return self.policy_kwargs
+
     def _make_policy(self) -> BasePolicy:
         """Make the untrained policy."""
+        return self.policy_class(
+            self.observation_space, self.action_space, self.lr_schedule, **self._policy_arguments()
+        )
 
     def _make_exploration_schedule(self) -> Schedule:
         """Make the schedule of the exploration rate."""

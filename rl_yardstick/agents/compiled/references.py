@@ -83,7 +83,8 @@ def _n_words(kind: Any) -> int:
     if isinstance(kind, types.Record):
         return -(-kind.size // WORD)
     if isinstance(kind, types.BaseTuple):
-        return sum(_n_words(part) for part in kind.types)
+        parts: Any = kind
+        return sum(map(_n_words, parts.types))
     return 5 + 2 * int(kind.ndim) if hasattr(kind, "ndim") else 1
 
 

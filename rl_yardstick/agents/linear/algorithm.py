@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -23,7 +23,8 @@ from rl_yardstick.agents.common.settings import (
     check_space,
     check_vectors,
 )
-from rl_yardstick.agents.compiled.engine import CompiledEngine, EngineChoice, choose_engine
+from rl_yardstick.agents.compiled.engine import EngineChoice, choose_engine
+from rl_yardstick.agents.compiled.env_states import BEFORE, move_on
 from rl_yardstick.agents.compiled.generators import handles_of
 from rl_yardstick.agents.compiled.worlds import env_dtype
 from rl_yardstick.agents.linear.tiles import (
@@ -38,12 +39,6 @@ from rl_yardstick.agents.linear.tiles import (
     make_tiles,
     tiles_of_all,
     vectors_of,
-)
-from rl_yardstick.agents.networks.network_worlds import (
-    BEFORE,
-    NetworkEnvStates,
-    move_on,
-    network_world,
 )
 from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
 from rl_yardstick.machine_code.compiling import called
@@ -60,17 +55,15 @@ class TilePolicy(TablePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
+        *args: Any,
         tiling: dict[str, Any] | None = None,
         values_states: bool = False,
         **kwargs: Any,
     ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
+        super().__init__(*args, **kwargs)
         self.tiling = dict(tiling or {})
-        n_actions = int(action_space.n)
-        self.tiles = make_tiles(observation_space, **self.tiling, n_actions=n_actions)
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        self.tiles = make_tiles(self.observation_space, **self.tiling, n_actions=n_actions)
         n_tiles = self.tiles.n_tiles
         self.register_buffer("weights", th.zeros((n_tiles, n_actions), dtype=th.float64))
         n_valued = n_tiles if values_states else 0
@@ -122,26 +115,6 @@ class TileWorkspace(Workspace):
         self.seen.after[:] = vectors_of(self.space, transitions.next_obs)
         self.fields["action"][:] = transitions.actions
         return self.learn_from(transitions)
-
-
-class TileEngine(CompiledEngine):
-    """One call of ``learn`` on the compiled loop, in a world made by `network_world`."""
-
-    def __init__(
-        self,
-        agent: Any,
-        world_and_seen: tuple[Any, Any],
-        callback: BaseCallback,
-        log_interval: int | None,
-    ) -> None:
-        world, self.seen = world_and_seen
-        super().__init__(agent, world, callback, log_interval)
-
-    def _make_states(self) -> NetworkEnvStates:
-        return NetworkEnvStates(self.agent.env, self.world, self.seen)
-
-    def _compiled_agent(self) -> Any:
-        return self.agent.compiled_agent(self.agent.rng, self.seen)
 
 
 class TilePlayer(NamedTuple):
@@ -226,19 +199,14 @@ class TileAlgorithm(WorkspaceAlgorithm):
         check_space(self, "actions", self.action_space)
         check_vectors(self, self.observation_space)
 
-    def _make_policy(self) -> TilePolicy:
-        names = ("n_tilings", "n_tiles", "low", "high")
-        tiling = {name: getattr(self, name) for name in names}
-        policy: Any = self.policy_class
-        made: TilePolicy = policy(
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
-            tiling=tiling,
-            values_states=self.values_states,
-        )
-        made.weights[:] = th.from_numpy(self._initial_sums() / made.tiles.n_tilings)
-        return made
+    def _policy_arguments(self) -> dict[str, Any]:
+        tiling = {name: getattr(self, name) for name in ("n_tilings", "n_tiles", "low", "high")}
+        return {"tiling": tiling, "values_states": self.values_states}
+
+    def _make_policy(self) -> BasePolicy:
+        policy = cast(TilePolicy, super()._make_policy())
+        policy.weights[:] = th.from_numpy(self._initial_sums() / policy.tiles.n_tilings)
+        return policy
 
     @property
     def n_actions(self) -> int:
@@ -253,10 +221,6 @@ class TileAlgorithm(WorkspaceAlgorithm):
     def _probabilities(self, sums: Floats) -> Floats:
         """The probabilities of actions for sums of shape (n, A), same shape."""
 
-    def _memory_record(self) -> Any:
-        """Further state for compiled functions, in the memory of the agent."""
-        return ()
-
     def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> LinearAgent:
         """The agent for compiled functions, with its weights in the memory of its policy."""
         tiles = self.policy.tiles
@@ -265,7 +229,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         return LinearAgent(
             self.settings()[0],
             self.policy.weights.numpy(),
-            self._memory_record(),
+            self._memory_in_use(),
             tiles,
             seen,
             room,
@@ -278,7 +242,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         return TilePlayer(agent.weights, agent.tiles, agent.seen, agent.room)
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        engine = choose_engine(self, callback, log_interval, network_world, TileEngine)
+        engine = choose_engine(self, callback, log_interval)
         if engine is not None:
             engine.run(total_timesteps)
             return

@@ -15,11 +15,11 @@ from rl_yardstick.agents.common.exploration import (
     make_probabilities,
 )
 from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.linear.algorithm import TileAlgorithm
 from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, look, move_sum
-from rl_yardstick.agents.networks.network_worlds import AFTER, BEFORE, move_on
 from rl_yardstick.envs.known_models import time_limit
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats, Ints
@@ -166,23 +166,17 @@ class ActorCritic(SoftmaxAlgorithm):
     ranges = {"value_step_size": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = actor_critic_learning
     values_states = True
-
-    _rebuilt = (*SoftmaxAlgorithm._rebuilt, "_discounts")
+    _memory: Critic
 
     def __init__(self, *args: Any, value_step_size: float = 0.2, **kwargs: Any) -> None:
         self.value_step_size = value_step_size
-        self._discounts = np.ones(0)
         super().__init__(*args, **kwargs)
 
-    def _begin_episodes(self) -> None:
-        super()._begin_episodes()
-        self._discounts = np.ones(self.n_envs)
+    def _make_memory(self) -> Critic:
+        return Critic(self.policy.state_weights.numpy(), np.ones(self.n_envs))
 
-    def _memory_record(self) -> Critic:
-        return Critic(self.policy.state_weights.numpy(), self._discounts)
-
-    def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
-        return (*super().made_from(rng), id(self._discounts))
+    def _memory_in_use(self) -> Critic:
+        return self._memory._replace(values=self.policy.state_weights.numpy())
 
 
 # REINFORCE, with and without a baseline.
@@ -190,8 +184,6 @@ class ActorCritic(SoftmaxAlgorithm):
 Baseline = Literal["none", "value"]
 
 FIRST_CAPACITY = 64
-# Eight bytes each: stored steps times tilings, over all environments.
-MOST_KEPT = 50_000_000
 
 
 class KeptEpisodes(NamedTuple):
@@ -287,20 +279,13 @@ class Reinforce(SoftmaxAlgorithm):
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
     ranges = {"value_step_size": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = learn_at_ends
-
-    # A loaded agent begins new episodes.
-    _kept = ("_lengths", "_kept_tiles", "_kept_actions", "_kept_rewards")
-    _rebuilt = (*SoftmaxAlgorithm._rebuilt, *_kept)
+    _memory: KeptEpisodes
 
     def __init__(
         self, *args: Any, baseline: Baseline = "none", value_step_size: float = 0.2, **kwargs: Any
     ) -> None:
         self.baseline = baseline
         self.value_step_size = value_step_size
-        self._lengths = np.zeros(0, dtype=np.int64)
-        self._kept_tiles = np.zeros((0, 0, 1), dtype=np.int64)
-        self._kept_actions = np.zeros((0, 0), dtype=np.int64)
-        self._kept_rewards = np.zeros((0, 0))
         super().__init__(*args, **kwargs)
 
     @property
@@ -308,43 +293,39 @@ class Reinforce(SoftmaxAlgorithm):
         """Whether the policy has weights of state values."""
         return self.baseline == "value"
 
-    def _begin_episodes(self) -> None:
-        super()._begin_episodes()
-        self._lengths = np.zeros(self.n_envs, dtype=np.int64)
-        self._keep_up_to(FIRST_CAPACITY)
+    def _make_memory(self, capacity: int = FIRST_CAPACITY) -> KeptEpisodes:
+        n_envs, n_tilings = self.n_envs, self.policy.tiles.n_tilings
+        return KeptEpisodes(
+            self.policy.state_weights.numpy(),
+            np.zeros(n_envs, dtype=np.int64),
+            np.zeros((n_envs, capacity, n_tilings), dtype=np.int64),
+            np.zeros((n_envs, capacity), dtype=np.int64),
+            np.zeros((n_envs, capacity)),
+        )
+
+    def _memory_in_use(self) -> KeptEpisodes:
+        return self._memory._replace(values=self.policy.state_weights.numpy())
 
     def _keep_up_to(self, n_steps: int) -> None:
-        """Enlarge the buffers to ``n_steps`` steps of each episode, keeping stored steps."""
-        n_tilings, n_envs = self.policy.tiles.n_tilings, self.n_envs
-        shapes = (n_envs, n_steps, n_tilings), (n_envs, n_steps), (n_envs, n_steps)
-        for name, shape in zip(self._kept[1:], shapes, strict=True):
-            old = getattr(self, name)
-            new = np.zeros(shape, dtype=old.dtype)
-            if len(old) == n_envs:
-                new[:, : old.shape[1]] = old[:, :n_steps]
-            setattr(self, name, new)
+        """Enlarge the memory to ``n_steps`` steps of each episode, keeping stored steps."""
+        old, self._memory = self._memory, self._make_memory(n_steps)
+        self._memory.lengths[:] = old.lengths
+        for name in ("tiles", "actions", "rewards"):
+            stored = getattr(old, name)
+            getattr(self._memory, name)[:, : stored.shape[1]] = stored
 
     def check_compilable(self) -> None:
         super().check_compilable()
         assert self.env is not None
         limits = [time_limit(env) or 0 for env in getattr(self.env, "envs", [])]
-        longest = max(limits, default=0)
         if not all(limits):
             raise NotCompilable("episodes are kept, and there is no limit to their length")
-        if self.n_envs * longest * self.policy.tiles.n_tilings > MOST_KEPT:
-            raise NotCompilable(f"episodes are kept, and {longest:,} steps are too many for that")
-        if longest > self._kept_rewards.shape[1]:
+        longest = max(limits, default=0)
+        if longest > self._memory.rewards.shape[1]:
             self._keep_up_to(longest)
 
     def _learn_from(self, transitions: Transitions) -> None:
-        capacity = self._kept_rewards.shape[1]
-        if self._lengths.max() >= capacity:
+        capacity = self._memory.rewards.shape[1]
+        if self._memory.lengths.max() >= capacity:
             self._keep_up_to(2 * capacity)
         super()._learn_from(transitions)
-
-    def _memory_record(self) -> KeptEpisodes:
-        kept = (getattr(self, name) for name in self._kept)
-        return KeptEpisodes(self.policy.state_weights.numpy(), *kept)
-
-    def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
-        return (*super().made_from(rng), *(id(getattr(self, name)) for name in self._kept))

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.settings import FINITE, whole
+from rl_yardstick.agents.compiled.env_states import BEFORE, observe
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
-from rl_yardstick.agents.networks.network_worlds import BEFORE, observe
 from rl_yardstick.machine_code.compiling import called, kernel
 from rl_yardstick.mdp.transition_model import Floats, Ints
 

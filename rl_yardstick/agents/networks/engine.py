@@ -11,13 +11,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from rl_yardstick.agents.common.callbacks import EpisodeBudget, Horizon, horizon, members
 from rl_yardstick.agents.compiled.engine import CompiledEngine
+from rl_yardstick.agents.compiled.env_states import Numbers
 from rl_yardstick.agents.compiled.generators import handles_of
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.references import Reference, address_of
-from rl_yardstick.agents.networks.network_worlds import (
-    NetworkEnvStates,
-    Numbers,
-)
 from rl_yardstick.agents.networks.torch_bridge import FlatTensors, SharedOptimizer
 
 # A placeholder of an address, until there is a reference to the learner.
@@ -103,8 +100,6 @@ class NetworkEngine(CompiledEngine):
 
     counts_where_stopped = False  # as in the library
 
-    states: NetworkEnvStates
-
     def __init__(
         self,
         training: Any,  # a `QTraining` or a `PolicyTraining`
@@ -118,10 +113,7 @@ class NetworkEngine(CompiledEngine):
         self.in_loop = training.in_loop()
         # With rollouts of a fixed length, a budget of episodes does not change schedules.
         self.total_timesteps = training.agent._total_timesteps
-        super().__init__(training.agent, world, callback, log_interval)
-
-    def _make_states(self) -> NetworkEnvStates:
-        return NetworkEnvStates(self.agent.env, self.world, self.training.seen)
+        super().__init__(training.agent, (world, training.seen), callback, log_interval)
 
     def _learner(self) -> Any:
         for name, schedule in self.training.schedules().items():

@@ -33,10 +33,10 @@ from rl_yardstick.agents.common.callbacks import (
     unknown_callbacks,
 )
 from rl_yardstick.agents.common.settings import full_signature
+from rl_yardstick.agents.compiled.env_states import Numbers, OwnVectors, observed_world
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.networks.engine import NetworkEngine
-from rl_yardstick.agents.networks.network_worlds import Numbers, OwnVectors, network_world
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
 from rl_yardstick.agents.networks.playing import NetworkPlayer, network_player
 from rl_yardstick.agents.networks.torch_bridge import Network, check_optimizer, in_rows
@@ -399,7 +399,7 @@ class CompiledNetworks(BaseAlgorithm):
         for schedule in self._schedules():
             compiled_schedule(schedule)
         assert self.env is not None
-        return network_world(self.env)
+        return observed_world(self.env)
 
     def _seen_in_python(self) -> Any:
         space = self.observation_space

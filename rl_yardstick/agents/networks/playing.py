@@ -14,8 +14,9 @@ import numpy as np
 import torch as th
 
 from rl_yardstick.agents.common.exploration import first_best
+from rl_yardstick.agents.compiled.env_states import BEFORE, move_on
 from rl_yardstick.agents.compiled.references import Reference, address_of, call
-from rl_yardstick.agents.networks.network_worlds import BEFORE, look, move_on
+from rl_yardstick.agents.networks.network_worlds import look
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,

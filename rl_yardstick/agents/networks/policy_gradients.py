@@ -19,21 +19,20 @@ from torch import nn
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_value
+from rl_yardstick.agents.compiled.env_states import (
+    AFTER,
+    BEFORE,
+    Numbers,
+    move_on,
+    observe,
+)
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.references import Reference, address_of, call
 from rl_yardstick.agents.compiled.worlds import SCHEDULE, NotCompilable
 from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
 from rl_yardstick.agents.networks.engine_setting import CompiledNetworks, Work, work_of
-from rl_yardstick.agents.networks.network_worlds import (
-    AFTER,
-    BEFORE,
-    Numbers,
-    look,
-    move_on,
-    observe,
-    show,
-)
+from rl_yardstick.agents.networks.network_worlds import look, show
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,

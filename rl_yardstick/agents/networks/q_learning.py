@@ -15,6 +15,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.exploration import first_best
+from rl_yardstick.agents.compiled.env_states import (
+    AFTER,
+    BEFORE,
+    Numbers,
+    move_on,
+    observe,
+)
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.references import Reference, address_of, call
 from rl_yardstick.agents.compiled.worlds import NotCompilable
@@ -25,15 +32,7 @@ from rl_yardstick.agents.networks.engine_setting import (
     Work,
     work_of,
 )
-from rl_yardstick.agents.networks.network_worlds import (
-    AFTER,
-    BEFORE,
-    Numbers,
-    look,
-    move_on,
-    observe,
-    show,
-)
+from rl_yardstick.agents.networks.network_worlds import look, show
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,

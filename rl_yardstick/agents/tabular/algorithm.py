@@ -137,7 +137,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     _rebuilt = (
         *WorkspaceAlgorithm._rebuilt,
-        *("masks_are_known", "_infos", "_memory", "last_steps"),
+        *("masks_are_known", "_infos", "last_steps"),
     )
     excluded_from_states = ("last_steps",)
 
@@ -179,7 +179,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self.masks_are_known = False
         self.last_steps: NDArray[np.void] | None = None
         self._infos: list[dict[str, Any]] = []
-        self._memory: tuple[Any, ...] = ()
         super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
@@ -189,17 +188,10 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         check_space(self, "actions", self.action_space)
 
     def _policy_arguments(self) -> dict[str, Any]:
-        """Arguments of the policy besides spaces and the user's."""
-        return {"n_tables": self.n_tables}
+        return {"n_tables": self.n_tables, **self.policy_kwargs}
 
-    def _make_policy(self) -> QTablePolicy:
-        policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
-            **self._policy_arguments(),
-            **self.policy_kwargs,
-        )
+    def _make_policy(self) -> BasePolicy:
+        policy = cast(QTablePolicy, super()._make_policy())
         if self.mask_actions:
             policy.keep_masks()
         noise = self.rng.standard_normal(policy.q_tables.shape)
@@ -220,7 +212,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     # Arguments of compiled functions.
 
-    def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
+    def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> TabularAgent:
         """The agent for compiled functions, with its tables in the memory of its policy."""
         policy = self.policy
         values, counts = policy.q_tables.numpy(), policy.visit_counts.numpy()
@@ -235,14 +227,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             handles_of([rng])[0],
             self._memory_in_use(),
         )
-
-    def _make_memory(self) -> tuple[Any, ...]:
-        """An empty memory for ``n_envs`` environments."""
-        return ()
-
-    def _memory_in_use(self) -> tuple[Any, ...]:
-        """The memory for compiled functions; a subclass may add to it."""
-        return self._memory
 
     def greedy_player(self, seen: Any) -> Plan:
         """A player with the greedy actions of `predict` on compiled environments."""
@@ -265,10 +249,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     def check_compilable(self) -> None:
         if self.asks_for_masks:
             raise NotCompilable("the action masks are not known of all states")
-
-    def _begin_episodes(self) -> None:
-        super()._begin_episodes()
-        self._memory = self._make_memory()
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
         engine = choose_engine(self, callback, log_interval)

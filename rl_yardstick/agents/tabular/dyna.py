@@ -8,9 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
 from rl_yardstick.agents.compiled.generators import next_uniform
@@ -71,16 +69,8 @@ class ModelPolicy(QTablePolicy):
 
     model_type: ClassVar[Any] = LearntModel  # the model's NamedTuple of arrays
 
-    def __init__(
-        self,
-        observation_space: spaces.Discrete,
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        n_tables: int = 1,
-        outcomes_kept: int = 1,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, lr_schedule, n_tables, **kwargs)
+    def __init__(self, *args: Any, outcomes_kept: int = 1, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self.outcomes_kept = outcomes_kept
         n_states, n_actions = self.visit_counts.shape[1:]
         for name, array in self._nothing_learnt(n_states, n_actions, outcomes_kept).items():

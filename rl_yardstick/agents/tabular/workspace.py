@@ -134,7 +134,7 @@ class WorkspaceAlgorithm(LearningAlgorithm):
         mean_td_error: mean absolute TD error of the last updates.
     """
 
-    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions", "_in_use")
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions", "_in_use", "_memory")
     excluded_from_states = ("_in_use",)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -147,8 +147,17 @@ class WorkspaceAlgorithm(LearningAlgorithm):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_in_use": None}
 
+    def _make_memory(self) -> tuple[Any, ...]:
+        """An empty memory for ``n_envs`` environments: a NamedTuple of arrays."""
+        return ()
+
+    def _memory_in_use(self) -> tuple[Any, ...]:
+        """The memory for compiled functions; a subclass may add to it."""
+        return self._memory
+
     def _begin_episodes(self) -> None:
         self._next_actions = np.full(self.n_envs, UNDECIDED)
+        self._memory = self._make_memory()
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Write the agent's state into the records of the compiled loop."""
