@@ -7,7 +7,7 @@ calls as from any other agent.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -15,13 +15,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
 from rl_yardstick.agents.common.masks import numbers_in
 from rl_yardstick.agents.common.model_files import TablePolicy
-from rl_yardstick.agents.common.settings import CommonArguments
 from rl_yardstick.envs.known_models import (
     action_masks_of_states,
     model_check,
@@ -48,15 +47,9 @@ class ActionTablePolicy(TablePolicy):
     actions: th.Tensor
     horizon: th.Tensor  # steps of an episode, int64 of shape (); only used if m is above 1
 
-    def __init__(
-        self,
-        observation_space: spaces.Discrete,
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-        shape = (1, int(observation_space.n))
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        shape = (1, int(self.observation_space.n))  # type: ignore[attr-defined]
         self.register_buffer("actions", th.zeros(shape, dtype=th.int64))
         self.register_buffer("horizon", th.tensor(1))
 
@@ -112,6 +105,7 @@ class PlanningAgent(OnlineAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
     policy: ActionTablePolicy
     default_gamma: ClassVar[float]
+    hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
 
     def __init__(
         self,
@@ -119,7 +113,7 @@ class PlanningAgent(OnlineAlgorithm):
         env: GymEnv | str | None = None,
         gamma: float | None = None,
         mask_actions: bool = False,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.gamma = self.default_gamma if gamma is None else gamma
         self.mask_actions = mask_actions

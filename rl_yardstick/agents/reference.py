@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
-from rl_yardstick.agents.common.settings import CommonArguments
+from rl_yardstick.agents.common.model_files import TablePolicy
 
 POLE_ANGLE = 2
 LEFT, RIGHT = 0, 1
 
 
-class FixedPolicy(BasePolicy):
-    """A policy without parameters."""
-
-    def __init__(
-        self,
-        observation_space: Any,
-        action_space: Any,
-        lr_schedule: Schedule | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-
-
-class RandomPolicy(FixedPolicy):
+class RandomPolicy(TablePolicy):
     """Uniformly random actions from the action space's own generator."""
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
@@ -38,7 +24,7 @@ class RandomPolicy(FixedPolicy):
         return th.from_numpy(np.stack([self.action_space.sample() for _ in range(len(first))]))
 
 
-class AnglePolicy(FixedPolicy):
+class AnglePolicy(TablePolicy):
     """Push the cart towards the side that the pole leans to."""
 
     def _predict(
@@ -57,13 +43,10 @@ class ReferenceAgent(OnlineAlgorithm):
         kwargs: as in `OnlineAlgorithm`.
     """
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy],
-        env: GymEnv | str | None = None,
-        **kwargs: Unpack[CommonArguments],
-    ) -> None:
-        super().__init__(policy, env, **kwargs)
+    hidden_arguments = ("learning_rate", "policy_kwargs", "supported_action_spaces")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import importlib.util
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -117,87 +118,36 @@ NETWORK_ENGINES = ("auto", "compiled", "library")
 VECTOR_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
 
-def _tabular(place: str, summary: str) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        f"rl_yardstick.agents.tabular.{place}", summary, DISCRETE, DISCRETE, engines=TABLE_ENGINES
-    )
+def _family(
+    prefix: str, observations: tuple[str, ...], actions: tuple[str, ...], **fields: Any
+) -> Callable[..., AlgorithmEntry]:
+    """A function that makes the entries of similar agents."""
+
+    def entry(place: str, summary: str, **own: Any) -> AlgorithmEntry:
+        spaces_of_all = {"observations": observations, "actions": actions}
+        return AlgorithmEntry(prefix + place, summary, **{**spaces_of_all, **fields, **own})
+
+    return entry
 
 
-def _tiled(place: str, summary: str) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        f"rl_yardstick.agents.linear.{place}",
-        summary,
-        LINEAR_INPUTS,
-        DISCRETE,
-        engines=TABLE_ENGINES,
-    )
-
-
-def _network(
-    name: str,
-    summary: str,
-    actions: tuple[str, ...] = DISCRETE,
-    engines: tuple[str, ...] = LIBRARY_ENGINES,
-) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        f"rl_yardstick.agents.library:{name}", summary, NETWORK_INPUTS, actions, engines=engines
-    )
-
-
-def _continuous(name: str, summary: str) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        f"stable_baselines3:{name}",
-        f"{summary} (Stable-Baselines3)",
-        NETWORK_INPUTS,
-        CONTINUOUS,
-        engines=LIBRARY_ENGINES[:1],
-    )
-
-
-def _contrib(
-    entry_point: str,
-    summary: str,
-    actions: tuple[str, ...],
-    observations: tuple[str, ...] = NETWORK_INPUTS,
-    *,
-    needs_masks: bool = False,
-    has_memory: bool = False,
-) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        entry_point,
-        f"{summary} (sb3-contrib)",
-        observations,
-        actions,
-        needs_masks=needs_masks,
-        has_memory=has_memory,
-        package="sb3_contrib",
-        extra="contrib",
-        engines=LIBRARY_ENGINES[:1],
-    )
-
-
-def _planning(name: str, summary: str) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        f"rl_yardstick.agents.planning:{name}", f"planning: {summary}", DISCRETE, DISCRETE
-    )
-
-
-def _bandit(place: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        f"rl_yardstick.agents.bandits.{place}", summary, observations, DISCRETE, for_bandits=True
-    )
-
-
-def _mabwiser(name: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
-    return AlgorithmEntry(
-        f"rl_yardstick.agents.mabwiser:{name}",
-        f"{summary} (MABWiser)",
-        observations,
-        DISCRETE,
-        for_bandits=True,
-        package="mabwiser",
-        extra="bandits",
-    )
+OURS = "rl_yardstick.agents."
+_tabular = _family(f"{OURS}tabular.", DISCRETE, DISCRETE, engines=TABLE_ENGINES)
+_tiled = _family(f"{OURS}linear.", LINEAR_INPUTS, DISCRETE, engines=TABLE_ENGINES)
+_network = _family(f"{OURS}library:", NETWORK_INPUTS, DISCRETE, engines=LIBRARY_ENGINES)
+_continuous = _family("stable_baselines3:", NETWORK_INPUTS, CONTINUOUS, engines=LIBRARY_ENGINES[:1])
+_contrib = _family(
+    "",
+    NETWORK_INPUTS,
+    DISCRETE,
+    package="sb3_contrib",
+    extra="contrib",
+    engines=LIBRARY_ENGINES[:1],
+)
+_planning = _family(f"{OURS}planning:", DISCRETE, DISCRETE)
+_bandit = _family(f"{OURS}bandits.", DISCRETE, DISCRETE, for_bandits=True)
+_mabwiser = _family(
+    f"{OURS}mabwiser:", DISCRETE, DISCRETE, for_bandits=True, package="mabwiser", extra="bandits"
+)
 
 
 ALGORITHMS: dict[str, AlgorithmEntry] = {
@@ -233,48 +183,63 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         "policy_gradients:Reinforce", "REINFORCE on tiles or a table, with or without a baseline"
     ),
     "dqn": _network("DQN", "deep Q-network (Stable-Baselines3)"),
-    "double_dqn": _network("DoubleDQN", "DQN with van Hasselt's target", DISCRETE, NETWORK_ENGINES),
+    "double_dqn": _network("DoubleDQN", "DQN with van Hasselt's target", engines=NETWORK_ENGINES),
     "deep_qlearning": _network(
-        "DeepQLearning", "DQN of 2013: squared loss, no target network", DISCRETE, NETWORK_ENGINES
+        "DeepQLearning",
+        "DQN of 2013: squared loss, no target network",
+        engines=NETWORK_ENGINES,
     ),
     "ppo": _network(
-        "PPO", "proximal policy optimisation (Stable-Baselines3)", POLICY_GRADIENT_OUTPUTS
+        "PPO",
+        "proximal policy optimisation (Stable-Baselines3)",
+        actions=POLICY_GRADIENT_OUTPUTS,
     ),
-    "a2c": _network("A2C", "advantage actor-critic (Stable-Baselines3)", POLICY_GRADIENT_OUTPUTS),
-    "sac": _continuous("SAC", "soft actor-critic"),
-    "td3": _continuous("TD3", "twin delayed policy gradient"),
-    "ddpg": _continuous("DDPG", "deep deterministic policy gradient"),
-    "qrdqn": _contrib("sb3_contrib:QRDQN", "quantile-regression DQN", DISCRETE),
-    "tqc": _contrib("sb3_contrib:TQC", "truncated quantile critics", CONTINUOUS),
+    "a2c": _network(
+        "A2C", "advantage actor-critic (Stable-Baselines3)", actions=POLICY_GRADIENT_OUTPUTS
+    ),
+    "sac": _continuous("SAC", "soft actor-critic (Stable-Baselines3)"),
+    "td3": _continuous("TD3", "twin delayed policy gradient (Stable-Baselines3)"),
+    "ddpg": _continuous("DDPG", "deep deterministic policy gradient (Stable-Baselines3)"),
+    "qrdqn": _contrib("sb3_contrib:QRDQN", "quantile-regression DQN (sb3-contrib)"),
+    "tqc": _contrib(
+        "sb3_contrib:TQC", "truncated quantile critics (sb3-contrib)", actions=CONTINUOUS
+    ),
     "crossq": _contrib(
-        "sb3_contrib:CrossQ", "SAC without target networks", CONTINUOUS, VECTOR_INPUTS
+        "sb3_contrib:CrossQ",
+        "SAC without target networks (sb3-contrib)",
+        observations=VECTOR_INPUTS,
+        actions=CONTINUOUS,
     ),
     "trpo": _contrib(
-        "sb3_contrib:TRPO", "trust-region policy optimisation", POLICY_GRADIENT_OUTPUTS
+        "sb3_contrib:TRPO",
+        "trust-region policy optimisation (sb3-contrib)",
+        actions=POLICY_GRADIENT_OUTPUTS,
     ),
     "ars": _contrib(
-        "rl_yardstick.agents.random_search:ARS",
-        "augmented random search",
-        (*CONTINUOUS, *DISCRETE),
-        VECTOR_INPUTS,
+        f"{OURS}random_search:ARS",
+        "augmented random search (sb3-contrib)",
+        observations=VECTOR_INPUTS,
+        actions=(*CONTINUOUS, *DISCRETE),
     ),
     "ppo_lstm": _contrib(
         "sb3_contrib:RecurrentPPO",
-        "PPO with a memory",
+        "PPO with a memory (sb3-contrib)",
         # sb3-contrib 2.9 fails on the other spaces.
-        ("Box", "Discrete", "MultiDiscrete"),
-        ("Box", "Discrete", "MultiBinary", "Dict"),
+        observations=("Box", "Discrete", "MultiBinary", "Dict"),
+        actions=("Box", "Discrete", "MultiDiscrete"),
         has_memory=True,
     ),
     "ppo_mask": _contrib(
         "sb3_contrib:MaskablePPO",
-        "PPO that is told which actions are valid",
-        ("Discrete", "MultiDiscrete", "MultiBinary"),
+        "PPO that is told which actions are valid (sb3-contrib)",
+        actions=("Discrete", "MultiDiscrete", "MultiBinary"),
         needs_masks=True,
     ),
-    "value_iteration": _planning("ValueIteration", "greedy in the optimal values"),
-    "policy_iteration": _planning("PolicyIteration", "policies evaluated and improved in turn"),
-    "optimal": _planning("Optimal", "the optimum under the time limit"),
+    "value_iteration": _planning("ValueIteration", "planning: greedy in the optimal values"),
+    "policy_iteration": _planning(
+        "PolicyIteration", "planning: policies evaluated and improved in turn"
+    ),
+    "optimal": _planning("Optimal", "planning: the optimum under the time limit"),
     "random": AlgorithmEntry(
         "rl_yardstick.agents.reference:RandomAgent",
         "uniformly random actions",
@@ -296,18 +261,28 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "exp3": _bandit("preferences:Exp3", "bandit: exponential weights against an adversary"),
     "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),
     "linucb": _bandit(
-        "linear:LinUCB", "contextual bandit: linear upper confidence bounds", LINEAR_INPUTS
+        "linear:LinUCB",
+        "contextual bandit: linear upper confidence bounds",
+        observations=LINEAR_INPUTS,
     ),
     "lin_thompson": _bandit(
-        "linear:LinThompson", "contextual bandit: linear Thompson sampling", LINEAR_INPUTS
+        "linear:LinThompson",
+        "contextual bandit: linear Thompson sampling",
+        observations=LINEAR_INPUTS,
     ),
     "lin_epsilon_greedy": _bandit(
-        "linear:LinEpsilonGreedy", "contextual bandit: linear, epsilon-greedy", LINEAR_INPUTS
+        "linear:LinEpsilonGreedy",
+        "contextual bandit: linear, epsilon-greedy",
+        observations=LINEAR_INPUTS,
     ),
-    "mabwiser_epsilon_greedy": _mabwiser("MABWiserEpsilonGreedy", "bandit: epsilon-greedy"),
-    "mabwiser_ucb1": _mabwiser("MABWiserUCB1", "bandit: UCB1"),
-    "mabwiser_thompson": _mabwiser("MABWiserThompson", "bandit: Thompson sampling"),
-    "mabwiser_linucb": _mabwiser("MABWiserLinUCB", "contextual bandit: LinUCB", LINEAR_INPUTS),
+    "mabwiser_epsilon_greedy": _mabwiser(
+        "MABWiserEpsilonGreedy", "bandit: epsilon-greedy (MABWiser)"
+    ),
+    "mabwiser_ucb1": _mabwiser("MABWiserUCB1", "bandit: UCB1 (MABWiser)"),
+    "mabwiser_thompson": _mabwiser("MABWiserThompson", "bandit: Thompson sampling (MABWiser)"),
+    "mabwiser_linucb": _mabwiser(
+        "MABWiserLinUCB", "contextual bandit: LinUCB (MABWiser)", observations=LINEAR_INPUTS
+    ),
 }
 
 

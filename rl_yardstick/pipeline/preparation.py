@@ -20,8 +20,8 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.common.callbacks import EpisodeBudget
+from rl_yardstick.agents.compiled.env_states import observed_world
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.networks.network_worlds import network_world
 from rl_yardstick.pipeline import loading_libraries
 from rl_yardstick.pipeline.callbacks import (
     EvaluationCallback,
@@ -420,7 +420,7 @@ def engine_outlook(
     auto = model.engine_plan(n_timesteps, callbacks, "auto")
     work = None
     with suppress(NotCompilable):
-        network_world(model.env)
+        observed_world(model.env)
         work = model.work(n_timesteps, callbacks)
     return EngineOutlook(plan, auto, work)
 

@@ -189,23 +189,32 @@ DAMAGES = {  # agent: arrays, and what is written all over them
     "dyna_q_plus": {"next_obs": 16},
     "dyna_q": {"next_obs": -1, "pairs": 64, "n_pairs": 65, "counts": -1},
     "prioritized_sweeping": {
-        "queue": 64, "place": -1, "n_queued": 64, "behind": 3, "before": 3, "first_into": 3},
+        "queue": 64, "place": 64, "n_queued": 65, "behind": 64, "before": -2, "first_into": 64},
     "r_max": {"next_obs": 16, "tallies": 2, "counts": 4, "states": 16, "n_states": 17},
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_arrays_are_refused(name, tmp_path):
-    """Compiled code would read and write beside them, or never come to an end."""
+    """Compiled code would read and write beside them."""
     model = make(name, engine="interpreted").learn(300)
     for array, value in DAMAGES[name].items():
         buffer = getattr(model.policy, f"model_{array}")
         right = buffer.clone()
-        for wrong in (value, 0) if array == "queue" else (value,):
-            buffer.fill_(wrong)
-            model.save(tmp_path / "agent")
-            with pytest.raises(ValueError, match=r"^holds no "):
-                type(model).load(tmp_path / "agent")
+        buffer.fill_(value)
+        model.save(tmp_path / "agent")
+        with pytest.raises(ValueError, match=r"^holds no "):
+            type(model).load(tmp_path / "agent")
         buffer.copy_(right)
     model.save(tmp_path / "agent")
     type(model).load(tmp_path / "agent")
+
+
+def test_damaged_lists_and_queues_come_to_an_end(tmp_path):
+    """All pairs follow the fourth, which follows itself; and nothing says where the queue is."""
+    model = make("prioritized_sweeping", engine="interpreted").learn(300)
+    for array, value in {"behind": 3, "first_into": 3, "place": -1, "n_queued": 64}.items():
+        getattr(model.policy, f"model_{array}").fill_(value)
+    model.save(tmp_path / "agent")
+    loaded = type(model).load(tmp_path / "agent", env=env_of("prioritized_sweeping"))
+    assert loaded.learn(100).num_timesteps == 100

@@ -230,7 +230,7 @@ def test_actor_critic_by_hand():
         assert values[2] == pytest.approx(0.8)
         third = 0.1 * 4 * 0.5 * (0.25 if gamma_power else 1)
         np.testing.assert_allclose(weights[2], [third, -third], rtol=1e-14)
-        assert told.agent._discounts.tolist() == [1]
+        assert told.agent._memory.discounts.tolist() == [1]
         # Truncated, it counts.
         values[:] = 0, 2, 0
         told.step(0, 0, 1, 1, "truncated")

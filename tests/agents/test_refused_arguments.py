@@ -21,8 +21,6 @@ REFUSED = {
         ({"gamma": 1.5}, "gamma must lie between 0 and 1"),
         (TWO, "initial_q and initial_q_std must give finite values, not 0 and 1"),
         ({"exploration": "greedy"}, "exploration must be one of epsilon_greedy"),
-        ({"tie_breaking": "last"}, "tie_breaking must be one of random, first"),
-        ({"exploration_decay": "cosine"}, "exploration_decay must be one of"),
         ({"learning_rate": "average"}, "learning_rate must be a number"),
         ({"learning_rate": -0.1}, "learning_rate must be at least 0, not -0.1"),
         ({"learning_rate": INF}, "learning_rate must be finite, not inf"),
@@ -36,59 +34,31 @@ REFUSED = {
     "n_step_tree_backup": [
         *(({"n_steps": n}, "n_steps must be a whole number of at least 1, not")
           for n in (0, 1.5, True)),
-        ({"n_steps": 50_000_001}, "n_steps must be at most 50000000, not 50000001"),
         ({"exploration": "gaussian_noise"}, "target_policy: exploring needs the probabilities"),
-    ],
-    "sarsa_lambda": [
-        ({"trace_type": "green"}, "trace_type must be one of accumulating, replacing, dutch"),
-        ({"trace_decay": 1.1}, "trace_decay must lie between 0 and 1, not 1.1"),
-        ({"skip_terminal_update": True}, TERMINAL),
     ],
     "off_policy_monte_carlo": [
         ({"learning_rate": 0.1}, "learning_rate must be 'sample_average', not 0.1"),
         ({"exploration": "gaussian_noise"}, PROBABILITIES),
-        ({"longest_episode": 0}, "longest_episode must be a whole number of at least 1"),
     ],
-    "dyna_q": [
-        ({"planning_steps": -1}, "planning_steps must be a whole number of at least 0"),
-        ({"outcomes_kept": 0}, "outcomes_kept must be a whole number of at least 1"),
-        ({"outcomes_kept": 10**7}, "at most 925212 of each"),
-    ],
-    "dyna_q_plus": [({"kappa": -0.1}, "kappa must be at least 0")],
-    "prioritized_sweeping": [
-        ({"threshold": -1.0}, "threshold must be at least 0"),
-        ({"planning_steps": 1e9}, "planning_steps must be a whole number"),
-    ],
+    "dyna_q": [({"planning_steps": -1}, "planning_steps must be a whole number of at least 0")],
+    "q_lambda": [({"skip_terminal_update": True}, TERMINAL)],
     "r_max": [
         ({"gamma": 1.0, "value_bound": 1.0}, "gamma must be below 1"),
-        ({"known_after": 0}, "known_after must be a whole number of at least 1, not 0"),
         ({"known_after": 10**30}, "known_after must be at most 1000000000, not 1000"),
-        ({"tolerance": 0.0}, "tolerance must be above 0"),
     ],
     "qlearning_ucb": [
         ({"gamma": 1.0}, "value_bound has to be given where gamma is 1"),
         ({"gamma": 1.0, "value_bound": 1.0}, "horizon has to be given where gamma is 1"),
-        ({"bonus_scale": -1.0}, "bonus_scale must be at least 0, not -1"),
-        ({"horizon": INF}, "horizon must be finite, not inf"),
     ],
-    "semi_gradient_q": [({"initial_q": INF}, "initial_q must be finite, not inf")],
     "reinforce": [
         ({"initial_preferences": [1, 2, 3]}, "initial_preferences must be a number or 4 numbers"),
         ({"initial_preferences": INF}, "initial_preferences must be finite, not inf"),
-        ({"baseline": "mean"}, "baseline must be one of none, value, not 'mean'"),
-        ({"value_step_size": -1}, "value_step_size must be at least 0, not -1"),
-        ({"gamma": 1.1}, "gamma must lie between 0 and 1, not 1.1"),
         ({"learning_rate": "sample_average"}, "learning_rate must be a number or a schedule"),
     ],
     "epsilon_greedy": [
-        ({"exploration_initial_eps": 1.5}, "must lie between 0 and 1, not 1.5"),
-        ({"exploration_decay": "slow"}, "constant, linear, exponential, not 'slow'"),
         ({"learning_rate": "averge"}, "a schedule or 'sample_average', not 'averge'"),
     ],
-    "boltzmann": [({"temperature": 0.0}, "temperature must be above 0, not 0.0")],
     "ucb": [
-        ({"variant": "ucb2"}, "variant must be one of ucb1, sutton_barto, not 'ucb2'"),
-        ({"c": -1.0}, "c must be at least 0, not -1.0"),
         (VECTORS, "observations in a Discrete space"),
         ({"mask_actions": True}, r"^mask_actions: the environment has no method action_masks\(\)"),
     ],
@@ -98,15 +68,11 @@ REFUSED = {
         ({"mixing": 1.1}, "mixing must lie between 0 and 1, not 1.1"),
     ],
     "thompson": [
-        ({"likelihood": "poisson"}, "bernoulli, gaussian, not 'poisson'"),
-        ({"prior_failures": 0.0}, "prior_failures must be above 0, not 0.0"),
         ({"prior_mean": INF}, "prior_mean must be finite, not inf"),
     ],
     "linucb": [
-        ({"ridge": 0.0}, "ridge must be above 0, not 0.0"),
         (MATRICES, r"observations of shape \(d,\) in a Box space or in a Discrete space"),
     ],
-    "lin_thompson": [({"alpha": -0.5}, "alpha must be at least 0, not -0.5")],
     "mabwiser_ucb1": [({"tie_breaking": "random"}, "tie_breaking must be first: MABWiser")],
     "ppo": [({"engine": "fast", "policy": "MlpPolicy"}, "engine must be one of")],
 }  # fmt: skip

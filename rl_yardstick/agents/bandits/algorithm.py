@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from typing import Any, NamedTuple, Unpack, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -12,25 +12,26 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.bandits.choosing import (
     act_in_context,
     allowed_room,
-    choose_allowed_arms,
     choose_arms,
     learn_from_feedback,
     no_probability,
 )
 from rl_yardstick.agents.common.algorithm import Transitions
+from rl_yardstick.agents.common.exploration import EPSILON_GREEDY
 from rl_yardstick.agents.common.masks import (
     MaskBufferPolicy,
     check_masks_exist,
     checked_masks,
     present_masks,
 )
-from rl_yardstick.agents.common.settings import LearningArguments, check_space
+from rl_yardstick.agents.common.schedules import epsilon_schedule
+from rl_yardstick.agents.common.settings import EPSILONS, ExplorationDecay, check_space
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -84,12 +85,6 @@ BINARY = "0 or 1"
 UNBOUNDED_KINDS = ("gaussian", "linear")
 
 
-class BanditArguments(LearningArguments, total=False):
-    """Arguments that constructors of agents with masks pass on; see `BanditAlgorithm`."""
-
-    mask_actions: bool
-
-
 class Pull(NamedTuple):
     """A pull and its reward, kept until the feedback is due."""
 
@@ -123,6 +118,7 @@ class BanditAlgorithm(LearningAlgorithm):
             a mask is malformed or allows no arm.
     """
 
+    hidden_arguments = ("policy_kwargs",)
     rewards_known: str = ANY  # rewards that the agent can learn from: `ANY`, `UNIT` or `BINARY`
 
     _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
@@ -133,7 +129,7 @@ class BanditAlgorithm(LearningAlgorithm):
         env: GymEnv | str | None = None,
         learning_rate: StepSize = 0.0,
         mask_actions: bool = False,
-        **kwargs: Unpack[LearningArguments],
+        **kwargs: Any,
     ) -> None:
         self.mask_actions = mask_actions
         self._masks: Bools = np.ones((0, 0), dtype=np.bool_)
@@ -328,11 +324,44 @@ class RuleBandit(BanditAlgorithm):
         arms, probabilities = np.empty(n, dtype=np.int64), np.empty(n)
         agent = self._workspace_for(rng, n)
         rows, n_rows = self._rows(agent, contexts)
-        arguments = agent, rows, n_rows, self.progress()[0], arms, probabilities
         if masks is None:
-            outside = choose_arms(*arguments)
-        else:
-            outside = choose_allowed_arms(*arguments, masks, allowed_room(self.n_arms))
+            masks = np.ones((n, self.n_arms), dtype=np.bool_)
+        room, progress = allowed_room(self.n_arms), self.progress()[0]
+        outside = choose_arms(agent, rows, n_rows, progress, arms, probabilities, masks, room)
         if outside >= 0:
             raise ValueError(f"context {rows[outside]} is not in Discrete({n_rows})")
         return arms, probabilities
+
+
+class EpsilonGreedyBandit(RuleBandit):
+    """Pulls a random arm with probability epsilon.
+
+    Args:
+        args: as in `BanditAlgorithm`.
+        exploration_initial_eps: epsilon at the start.
+        exploration_final_eps: epsilon at the end of ``exploration_fraction``.
+        exploration_fraction: share of training over which epsilon falls.
+        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
+        kwargs: as in `BanditAlgorithm`.
+    """
+
+    strategy = EPSILON_GREEDY
+    ranges = EPSILONS
+
+    def __init__(
+        self,
+        *args: Any,
+        exploration_initial_eps: float = 0.1,
+        exploration_final_eps: float = 0.01,
+        exploration_fraction: float = 1.0,
+        exploration_decay: ExplorationDecay = "constant",
+        **kwargs: Any,
+    ) -> None:
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_fraction = exploration_fraction
+        self.exploration_decay = exploration_decay
+        super().__init__(*args, **kwargs)
+
+    def _make_exploration_schedule(self) -> Schedule:
+        return epsilon_schedule(self)

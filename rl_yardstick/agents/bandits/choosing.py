@@ -189,22 +189,6 @@ def learn_from_feedback(agent: Any, envs: Any, progress: Any) -> None:
 
 @kernel
 def choose_arms(
-    agent: Any, rows: Ints, n_rows: int, progress: Any, arms: Ints, probabilities: Floats
-) -> int:
-    """Fill in an arm for each of the contexts ``rows``, and its probability; shapes (n,).
-
-    Returns -1, or the index of the first context without a row, where it stops.
-    """
-    for i in range(len(rows)):
-        if not 0 <= rows[i] < n_rows:
-            return i
-        arms[i] = choose_arm(agent, rows[i], progress)
-        probabilities[i] = choice_probability(agent, rows[i], arms[i])
-    return -1
-
-
-@kernel
-def choose_allowed_arms(
     agent: Any,
     rows: Ints,
     n_rows: int,
@@ -214,7 +198,11 @@ def choose_allowed_arms(
     masks: Bools,
     room: AllowedRoom,
 ) -> int:
-    """As `choose_arms`, among the arms in ``masks``, of shape (n, arms)."""
+    """Fill in an arm of those in ``masks`` for each of the contexts ``rows``, and its probability.
+
+    Shapes are (n,), of ``masks`` (n, arms). Returns -1, or the index of the first context without a
+    row, where it stops.
+    """
     for i in range(len(rows)):
         if not 0 <= rows[i] < n_rows:
             return i
@@ -222,17 +210,11 @@ def choose_allowed_arms(
     return -1
 
 
-@kernel
-def learn_one(agent: Any, pull: Any, progress: Any) -> None:
-    """`learn_from_reward`, for the interpreted loop."""
-    learn_from_reward(agent, pull, progress)
-
-
 # Scores of the arms that the environment allows.
 #
 # A rule gets a smaller bandit: a copy of the agent's knowledge of the allowed arms in the present
 # context. So no rule needs code for masks, and if all arms are allowed the result is the same bit
-# for bit. Agents without masks do not use this.
+# for bit. Only the interpreted loop uses this.
 
 
 class AllowedTables(NamedTuple):
@@ -303,10 +285,8 @@ def choose_by_allowed_scores(
 
 
 @kernel
-def learn_one_allowed(
-    agent: ScoreAgent, pull: Any, mask: Bools, room: AllowedRoom, progress: Any
-) -> None:
-    """As `learn_one`, of a pull at which the arms in ``mask`` were allowed, of shape (arms,)."""
+def learn_one(agent: ScoreAgent, pull: Any, mask: Bools, room: AllowedRoom, progress: Any) -> None:
+    """Learn from a pull at which the arms in ``mask`` were allowed, of shape (arms,)."""
     tables, row, place = agent.tables, pull.row, 0
     known = allowed_tables(tables, row, mask, room)
     n = known.scores.shape[1]
@@ -486,3 +466,9 @@ def choose_by_allowed_models(
         agent.rng,
     )
     return int(room.arms[choose_by_model(smaller, row, progress)]), 1.0
+
+
+@kernel
+def learn_one_by_model(agent: LinearAgent, pull: Any) -> None:
+    """`learn_by_model`, for the interpreted loop."""
+    learn_by_model(agent, pull, None)

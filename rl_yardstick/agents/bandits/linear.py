@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 
-from rl_yardstick.agents.bandits.algorithm import ArmPolicy, BanditArguments, Pull, RuleBandit
+from rl_yardstick.agents.bandits.algorithm import (
+    ArmPolicy,
+    EpsilonGreedyBandit,
+    Pull,
+    RuleBandit,
+)
 from rl_yardstick.agents.bandits.choosing import (
     PULL,
     Feedback,
@@ -22,18 +27,14 @@ from rl_yardstick.agents.bandits.choosing import (
     choose_by_model,
     deviation,
     learn_by_model,
-    learn_one,
+    learn_one_by_model,
     row_of_vector,
 )
 from rl_yardstick.agents.common.exploration import choose_action
-from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import (
-    ExplorationDecay,
-    check_above_zero,
-    check_at_least,
-    check_epsilons,
+    NOT_NEGATIVE,
+    POSITIVE,
     check_vectors,
-    settings_of,
 )
 from rl_yardstick.agents.compiled.generators import generator_of, handles_of
 from rl_yardstick.machine_code.compiling import inlined
@@ -50,16 +51,10 @@ class LinearBanditPolicy(ArmPolicy):
     coefficients: th.Tensor  # of each arm's regression, float64 of shape (A, d)
     counts: th.Tensor  # number of rewards of each arm, int64 of shape (A,)
 
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        ridge: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-        n_arms, n_features = int(action_space.n), number_of_features(observation_space)
+    def __init__(self, *args: Any, ridge: float = 1.0, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        n_arms = int(self.action_space.n)  # type: ignore[attr-defined]
+        n_features = number_of_features(self.observation_space)
         identity = ridge * th.eye(n_features, dtype=th.float64)
         self.register_buffer("factors", identity.repeat(n_arms, 1, 1))
         self.register_buffer("moments", th.zeros((n_arms, n_features), dtype=th.float64))
@@ -96,12 +91,6 @@ def features(space: spaces.Space[Any], observations: NDArray[Any]) -> Floats:
 
 
 # Contextual agents with a linear model of each arm's reward.
-
-
-class LinearArguments(BanditArguments, total=False):
-    """Arguments of these agents' constructors; see `LinearBanditAgent`."""
-
-    ridge: float
 
 
 @inlined
@@ -157,13 +146,15 @@ class LinearBanditAgent(RuleBandit):
     learn_from_reward = learn_by_model
     choose_allowed = choose_by_allowed_models
     pick = best_arm
+    hidden_arguments = ("learning_rate",)
+    ranges = {"ridge": POSITIVE}  # noqa: RUF012
 
     def __init__(
         self,
         policy: str | type[BasePolicy] = "LinearBanditPolicy",
         env: GymEnv | str | None = None,
         ridge: float = 1.0,
-        **kwargs: Unpack[BanditArguments],
+        **kwargs: Any,
     ) -> None:
         self.ridge = ridge
         super().__init__(policy, env, **kwargs)
@@ -171,14 +162,9 @@ class LinearBanditAgent(RuleBandit):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_vectors(self, self.observation_space)
-        check_above_zero(settings_of(self, "ridge"))
 
-    def _make_policy(self) -> LinearBanditPolicy:
-        policy: Any = self.policy_class
-        made: LinearBanditPolicy = policy(
-            self.observation_space, self.action_space, self.lr_schedule, ridge=self.ridge
-        )
-        return made
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"ridge": self.ridge}
 
     def compiled_agent(
         self,
@@ -215,43 +201,32 @@ class LinearBanditAgent(RuleBandit):
     def _learn(self, pull: Pull) -> None:
         agent = self._workspace_for(self.rng, 1)
         agent.contexts[0] = pull.context
-        learn_one(agent, np.array([(0, *pull[1:4])], dtype=PULL)[0], None)
+        learn_one_by_model(agent, np.array([(0, *pull[1:4])], dtype=PULL)[0])
 
 
 class LinUCB(LinearBanditAgent):
     """Linear upper confidence bounds with disjoint models (Li et al., 2010).
 
     Args:
-        policy: ``"LinearBanditPolicy"``.
-        env: as in `LinearBanditAgent`.
+        args: as in `LinearBanditAgent`.
         alpha: how many standard deviations the bound lies above the predicted reward.
         kwargs: as in `LinearBanditAgent`.
     """
 
     parameters = {"alpha": np.float64}  # noqa: RUF012
+    ranges = {"alpha": NOT_NEGATIVE}  # noqa: RUF012
     bonus = confidence_bonus
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "LinearBanditPolicy",
-        env: GymEnv | str | None = None,
-        alpha: float = 1.0,
-        **kwargs: Unpack[LinearArguments],
-    ) -> None:
+    def __init__(self, *args: Any, alpha: float = 1.0, **kwargs: Any) -> None:
         self.alpha = alpha
-        super().__init__(policy, env, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0, settings_of(self, "alpha"))
+        super().__init__(*args, **kwargs)
 
 
 class LinThompson(LinUCB):
     """Linear Thompson sampling (Agrawal and Goyal, 2013), with a model for each arm.
 
     Args:
-        policy: ``"LinearBanditPolicy"``.
-        env: as in `LinearBanditAgent`.
+        args: as in `LinearBanditAgent`.
         alpha: factor of the posterior's standard deviation; correct is the noise's of the rewards.
         kwargs: as in `LinearBanditAgent`.
     """
@@ -259,41 +234,11 @@ class LinThompson(LinUCB):
     bonus = sampled_bonus
 
 
-class LinEpsilonGreedy(LinearBanditAgent):
+class LinEpsilonGreedy(EpsilonGreedyBandit, LinearBanditAgent):
     """Epsilon-greedy in the predicted rewards.
 
-    Args:
-        policy: ``"LinearBanditPolicy"``.
-        env: as in `LinearBanditAgent`.
-        exploration_initial_eps: epsilon at the start.
-        exploration_final_eps: epsilon at the end of ``exploration_fraction``.
-        exploration_fraction: share of training over which epsilon falls.
-        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
-        kwargs: as in `LinearBanditAgent`.
+    Takes the arguments of `EpsilonGreedyBandit` and `LinearBanditAgent`.
     """
 
     bonus = no_bonus
     pick = pick_epsilon_greedily
-
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "LinearBanditPolicy",
-        env: GymEnv | str | None = None,
-        exploration_initial_eps: float = 0.1,
-        exploration_final_eps: float = 0.01,
-        exploration_fraction: float = 1.0,
-        exploration_decay: ExplorationDecay = "constant",
-        **kwargs: Unpack[LinearArguments],
-    ) -> None:
-        self.exploration_initial_eps = exploration_initial_eps
-        self.exploration_final_eps = exploration_final_eps
-        self.exploration_fraction = exploration_fraction
-        self.exploration_decay = exploration_decay
-        super().__init__(policy, env, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_epsilons(self)
-
-    def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(self)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.bandits.algorithm import UNIT
 from rl_yardstick.agents.bandits.choosing import ScoreAgent, ScoreTables, mean_reward, total_count
-from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit, mean_rewards
+from rl_yardstick.agents.bandits.tables import TableBandit, mean_rewards
 from rl_yardstick.agents.common.exploration import (
     BOLTZMANN,
     action_probabilities,
@@ -19,7 +18,7 @@ from rl_yardstick.agents.common.exploration import (
     drawn_action,
     make_probabilities,
 )
-from rl_yardstick.agents.common.settings import check_above_zero, check_share, settings_of
+from rl_yardstick.agents.common.settings import POSITIVE_SHARE
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats
@@ -87,8 +86,7 @@ class GradientBandit(PreferenceBandit):
     """Gradient ascent on preferences (Sutton and Barto, section 2.8).
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         learning_rate: step size, constant or scheduled.
         baseline: compare a reward with the average of those before it, as in the book's second
             edition (its drafts included the reward itself); else with 0.
@@ -102,14 +100,13 @@ class GradientBandit(PreferenceBandit):
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         learning_rate: float | Schedule = 0.1,
         baseline: bool = True,
-        **kwargs: Unpack[TableArguments],
+        **kwargs: Any,
     ) -> None:
         self.baseline = baseline
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, learning_rate=learning_rate, **kwargs)
 
 
 # Exponential weights against an adversary.
@@ -152,32 +149,23 @@ class Exp3(PreferenceBandit):
     Rewards lie between 0 and 1.
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         mixing: share of uniformly random pulls, in (0, 1]; the paper's gamma.
         kwargs: as in `TableBandit`.
     """
 
     parameters = {"mixing": np.float64}  # noqa: RUF012
+    ranges = {"mixing": POSITIVE_SHARE}  # noqa: RUF012
     rewards_known = UNIT
     choose_arm = draw_by_weight
     choice_probability = probability_of
     learn_from_pull = raise_weight
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
-        mixing: float = 0.1,
-        **kwargs: Unpack[TableArguments],
-    ) -> None:
-        self.mixing = mixing
-        super().__init__(policy, env, **kwargs)
+    hidden_arguments = ("learning_rate",)
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_share(settings_of(self, "mixing"))
-        check_above_zero(settings_of(self, "mixing"))
+    def __init__(self, *args: Any, mixing: float = 0.1, **kwargs: Any) -> None:
+        self.mixing = mixing
+        super().__init__(*args, **kwargs)
 
     def action_probabilities(self, observations: NDArray[Any]) -> Floats:
         """As above, mixed with uniform."""

@@ -159,10 +159,6 @@ class PullRecord(NamedTuple):
         self.rewards[pull] = env.reward
         self.regrets[pull] = env.regret
 
-    @inlined
-    def note_progress(self, progress: Any, step: int) -> None:
-        """Do nothing: only pulls are recorded."""
-
 
 def check_bandit(env: gym.Env[Any, Any]) -> None:
     """Raise `NotCompilable` if the environment or a wrapper has no compiled counterpart."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
 
-from rl_yardstick.agents.bandits.algorithm import ArmPolicy, BanditArguments, Pull, RuleBandit
+from rl_yardstick.agents.bandits.algorithm import ArmPolicy, Pull, RuleBandit
 from rl_yardstick.agents.bandits.choosing import (
     PULL,
     Feedback,
@@ -21,7 +21,6 @@ from rl_yardstick.agents.bandits.choosing import (
     choose_by_allowed_scores,
     count_and_learn,
     learn_one,
-    learn_one_allowed,
     nothing_before,
     row_of_scores,
 )
@@ -44,16 +43,10 @@ class BanditPolicy(ArmPolicy):
     counts: th.Tensor  # number of the rewards, int64 of shape (C, A)
 
     def __init__(
-        self,
-        observation_space: spaces.Discrete,
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        n_contexts: int = 1,
-        initial_score: float = 0.0,
-        **kwargs: Any,
+        self, *args: Any, n_contexts: int = 1, initial_score: float = 0.0, **kwargs: Any
     ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-        shape = (n_contexts, int(action_space.n))
+        super().__init__(*args, **kwargs)
+        shape = (n_contexts, int(self.action_space.n))  # type: ignore[attr-defined]
         self.register_buffer("scores", th.full(shape, initial_score, dtype=th.float64))
         self.register_buffer("sums", th.zeros(shape, dtype=th.float64))
         self.register_buffer("counts", th.zeros(shape, dtype=th.int64))
@@ -87,12 +80,6 @@ def mean_rewards(sums: Floats, counts: Ints) -> Floats:
 # The base of agents that keep a score for each arm in each context.
 
 
-class TableArguments(BanditArguments, total=False):
-    """Arguments of these agents' constructors; see `TableBandit`."""
-
-    ignore_context: bool
-
-
 class TableBandit(RuleBandit):
     """An agent with a score for each arm in each context; contexts are independent.
 
@@ -121,7 +108,7 @@ class TableBandit(RuleBandit):
         env: GymEnv | str | None = None,
         learning_rate: StepSize = 0.0,
         ignore_context: bool = False,
-        **kwargs: Unpack[BanditArguments],
+        **kwargs: Any,
     ) -> None:
         self.ignore_context = ignore_context
         super().__init__(policy, env, learning_rate, **kwargs)
@@ -130,17 +117,10 @@ class TableBandit(RuleBandit):
         super()._check_arguments()
         check_space(self, "observations", self.observation_space)
 
-    def _make_policy(self) -> BanditPolicy:
+    def _policy_arguments(self) -> dict[str, Any]:
         n_observations = int(cast(spaces.Discrete, self.observation_space).n)
-        policy: Any = self.policy_class
-        made: BanditPolicy = policy(
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
-            n_contexts=1 if self.ignore_context else n_observations,
-            initial_score=self.initial_score,
-        )
-        return made
+        n_contexts = 1 if self.ignore_context else n_observations
+        return {"n_contexts": n_contexts, "initial_score": self.initial_score}
 
     def compiled_agent(
         self, rng: np.random.Generator, tables: ScoreTables | None = None, capacity: int = 1
@@ -168,11 +148,8 @@ class TableBandit(RuleBandit):
     def _learn(self, pull: Pull) -> None:
         agent, progress = self._workspace_for(self.rng, 1), self.progress()[0]
         record = np.array([pull[:4]], dtype=PULL)[0]
-        if pull.mask is None:
-            learn_one(agent, record, progress)
-        else:
-            mask = np.array(pull.mask, dtype=np.bool_)
-            learn_one_allowed(agent, record, mask, allowed_room(self.n_arms), progress)
+        mask = np.ones(self.n_arms, np.bool_) if pull.mask is None else np.array(pull.mask)
+        learn_one(agent, record, mask, allowed_room(self.n_arms), progress)
 
     def estimates(self, tables: ScoreTables) -> Floats:
         """The agent's estimates of the arms' mean rewards, shapes (..., contexts, arms)."""

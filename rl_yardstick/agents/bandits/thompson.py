@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Unpack
+from typing import Any, Literal
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.bandits.algorithm import ANY, BINARY
 from rl_yardstick.agents.bandits.choosing import ScoreAgent, ScoreTables
-from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit
+from rl_yardstick.agents.bandits.tables import TableBandit
 from rl_yardstick.agents.common.exploration import greedy_action
-from rl_yardstick.agents.common.settings import (
-    check_above_zero,
-    check_finite,
-    check_option,
-    settings_of,
-)
+from rl_yardstick.agents.common.settings import FINITE, POSITIVE
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Floats
@@ -64,8 +57,7 @@ class Thompson(TableBandit):
     """Thompson sampling: pulls an arm with the probability that it is best (Thompson, 1933).
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         likelihood: ``"bernoulli"``: rewards of 0 and 1 and a Beta prior; ``"gaussian"``: rewards
             with normal noise of a known deviation and a normal prior.
         prior_successes: first parameter of the Beta prior.
@@ -84,20 +76,25 @@ class Thompson(TableBandit):
         "prior_precision": np.float64,
         "reward_precision": np.float64,
     }
+    ranges = {  # noqa: RUF012
+        "prior_mean": FINITE,
+        **dict.fromkeys(("prior_successes", "prior_failures", "prior_std", "reward_std"), POSITIVE),
+    }
     choose_arm = sample_posteriors
     learn_from_pull = update_mean
 
+    hidden_arguments = ("learning_rate",)
+
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         likelihood: Likelihood = "bernoulli",
         prior_successes: float = 1.0,
         prior_failures: float = 1.0,
         prior_mean: float = 0.0,
         prior_std: float = 1.0,
         reward_std: float = 1.0,
-        **kwargs: Unpack[TableArguments],
+        **kwargs: Any,
     ) -> None:
         self.likelihood = likelihood
         self.prior_successes = prior_successes
@@ -105,7 +102,7 @@ class Thompson(TableBandit):
         self.prior_mean = prior_mean
         self.prior_std = prior_std
         self.reward_std = reward_std
-        super().__init__(policy, env, **kwargs)
+        super().__init__(*args, **kwargs)
 
     @property
     def is_gaussian(self) -> bool:
@@ -133,13 +130,6 @@ class Thompson(TableBandit):
     def reward_precision(self) -> float:
         """One over the variance of the noise."""
         return self.reward_std**-2
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("likelihood", self.likelihood, Likelihood)
-        check_finite(settings_of(self, "prior_mean"))
-        names = ("prior_successes", "prior_failures", "prior_std", "reward_std")
-        check_above_zero(settings_of(self, *names))
 
     def posterior(self, tables: ScoreTables) -> Floats:
         """The posterior of each arm's mean reward.

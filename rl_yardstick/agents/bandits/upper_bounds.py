@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Unpack
+from typing import Any, Literal
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.bandits.algorithm import UNIT
 from rl_yardstick.agents.bandits.choosing import ScoreAgent, total_count
-from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit
+from rl_yardstick.agents.bandits.tables import TableBandit
 from rl_yardstick.agents.common.exploration import greedy_action
-from rl_yardstick.agents.common.settings import check_at_least, check_option, settings_of
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.machine_code.compiling import inlined
@@ -84,8 +82,7 @@ class UCB(UpperBoundBandit):
     Each arm is pulled once before any bound counts.
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         variant: ``"ucb1"``: mean + c sqrt(2 ln t / n) after t pulls; ``"sutton_barto"``: mean +
             c sqrt(ln t / n) at the t-th pull.
         c: degree of exploration; by default 1 for UCB1 and 2 for Sutton and Barto's.
@@ -93,19 +90,17 @@ class UCB(UpperBoundBandit):
     """
 
     parameters = {"width": np.float64, "is_textbook": np.bool_}  # noqa: RUF012
+    ranges = {"c": NOT_NEGATIVE}  # noqa: RUF012
     upper_bound = ucb_bound
 
+    hidden_arguments = ("learning_rate",)
+
     def __init__(
-        self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
-        variant: Variant = "ucb1",
-        c: float | None = None,
-        **kwargs: Unpack[TableArguments],
+        self, *args: Any, variant: Variant = "ucb1", c: float | None = None, **kwargs: Any
     ) -> None:
         self.variant = variant
         self.c = c
-        super().__init__(policy, env, **kwargs)
+        super().__init__(*args, **kwargs)
 
     @property
     def is_textbook(self) -> bool:
@@ -117,11 +112,6 @@ class UCB(UpperBoundBandit):
         """The degree of exploration ``c``, or its default."""
         default = 2.0 if self.is_textbook else 1.0
         return default if self.c is None else self.c
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("variant", self.variant, Variant)
-        check_at_least(0, settings_of(self, "c"))
 
 
 # Upper confidence bounds by the divergence of Bernoulli distributions.
@@ -183,26 +173,18 @@ class KLUCB(UpperBoundBandit):
     Each arm is pulled once first. Rewards must be in [0, 1]. Source: Garivier and Cappe (2011).
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
+        args: as in `TableBandit`.
         c: of the bound's ln t + c ln ln t; the authors prove with 3 and recommend 0.
         kwargs: as in `TableBandit`.
     """
 
     parameters = {"c": np.float64}  # noqa: RUF012
+    ranges = {"c": NOT_NEGATIVE}  # noqa: RUF012
     rewards_known = UNIT
     upper_bound = kl_ucb_bound
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
-        c: float = 0.0,
-        **kwargs: Unpack[TableArguments],
-    ) -> None:
-        self.c = c
-        super().__init__(policy, env, **kwargs)
+    hidden_arguments = ("learning_rate",)
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0, settings_of(self, "c"))
+    def __init__(self, *args: Any, c: float = 0.0, **kwargs: Any) -> None:
+        self.c = c
+        super().__init__(*args, **kwargs)

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Unpack
+from typing import Any
 
 from numpy.typing import NDArray
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
+from rl_yardstick.agents.bandits.algorithm import EpsilonGreedyBandit
 from rl_yardstick.agents.bandits.choosing import ScoreAgent
-from rl_yardstick.agents.bandits.tables import TableArguments, TableBandit
+from rl_yardstick.agents.bandits.tables import TableBandit
 from rl_yardstick.agents.common.exploration import (
     BOLTZMANN,
-    EPSILON_GREEDY,
     action_probabilities,
     choose_action,
 )
-from rl_yardstick.agents.common.schedules import epsilon_schedule
-from rl_yardstick.agents.common.settings import (
-    ExplorationDecay,
-    check_above_zero,
-    check_epsilons,
-    settings_of,
-    step_size,
-)
+from rl_yardstick.agents.common.settings import POSITIVE, step_size
 from rl_yardstick.agents.compiled.generators import generator_of
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.machine_code.compiling import inlined
@@ -54,12 +46,27 @@ def move_value(agent: ScoreAgent, pull: Any, progress: Any) -> None:
 
 
 class ValueBandit(TableBandit):
-    """Explores around estimates of the arms' mean rewards, as the tabular agents do."""
+    """Explores around estimates of the arms' mean rewards, as the tabular agents do.
 
-    initial_q: float
+    Args:
+        args: as in `TableBandit`.
+        learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
+        initial_q: estimate of every arm at the start; high values are optimistic.
+        kwargs: as in `TableBandit`.
+    """
 
     choose_arm = choose_by_value
     learn_from_pull = move_value
+
+    def __init__(
+        self,
+        *args: Any,
+        learning_rate: StepSize = "sample_average",
+        initial_q: float = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        self.initial_q = initial_q
+        super().__init__(*args, learning_rate=learning_rate, **kwargs)
 
     @property
     def initial_score(self) -> float:  # type: ignore[override]
@@ -73,80 +80,28 @@ class ValueBandit(TableBandit):
         return action_probabilities(self.strategy, values, rate, random_ties=ties)
 
 
-class EpsilonGreedy(ValueBandit):
+class EpsilonGreedy(EpsilonGreedyBandit, ValueBandit):
     """Epsilon-greedy (Sutton and Barto, sections 2.2 to 2.6).
 
-    Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
-        learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
-        initial_q: estimate of every arm at the start; high values are optimistic.
-        exploration_initial_eps: epsilon at the start.
-        exploration_final_eps: epsilon at the end of ``exploration_fraction``.
-        exploration_fraction: share of training over which epsilon falls.
-        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
-        kwargs: as in `TableBandit`.
+    Takes the arguments of `EpsilonGreedyBandit` and `ValueBandit`.
     """
-
-    strategy = EPSILON_GREEDY
-
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: StepSize = "sample_average",
-        initial_q: float = 0.0,
-        exploration_initial_eps: float = 0.1,
-        exploration_final_eps: float = 0.01,
-        exploration_fraction: float = 1.0,
-        exploration_decay: ExplorationDecay = "constant",
-        **kwargs: Unpack[TableArguments],
-    ) -> None:
-        self.initial_q = initial_q
-        self.exploration_initial_eps = exploration_initial_eps
-        self.exploration_final_eps = exploration_final_eps
-        self.exploration_fraction = exploration_fraction
-        self.exploration_decay = exploration_decay
-        super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_epsilons(self)
-
-    def _make_exploration_schedule(self) -> Schedule:
-        return epsilon_schedule(self)
 
 
 class Boltzmann(ValueBandit):
     """Softmax of value / temperature.
 
     Args:
-        policy: ``"BanditPolicy"``.
-        env: as in `TableBandit`.
-        learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
-        initial_q: estimate of every arm at the start.
+        args: as in `ValueBandit`.
         temperature: above 0, constant or scheduled.
-        kwargs: as in `TableBandit`.
+        kwargs: as in `ValueBandit`.
     """
 
     strategy = BOLTZMANN
+    ranges = {"temperature": POSITIVE}  # noqa: RUF012
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "BanditPolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: StepSize = "sample_average",
-        initial_q: float = 0.0,
-        temperature: float | Schedule = 0.1,
-        **kwargs: Unpack[TableArguments],
-    ) -> None:
-        self.initial_q = initial_q
+    def __init__(self, *args: Any, temperature: float | Schedule = 0.1, **kwargs: Any) -> None:
         self.temperature = temperature
-        super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_above_zero(settings_of(self, "temperature"))
+        super().__init__(*args, **kwargs)
 
     def _make_exploration_schedule(self) -> Schedule:
         return FloatSchedule(self.temperature)

@@ -18,7 +18,6 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import DISABLED, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -60,6 +59,7 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
     """
 
     __signature__: ClassVar[inspect.Signature]
+    hidden_arguments: ClassVar[tuple[str, ...]] = ()  # see `full_signature`
 
     rng: np.random.Generator
     predict_rng: np.random.Generator
@@ -219,7 +219,7 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         If nothing reads the log, this computes nothing. It still clears the recorded values, as
         writing them would.
         """
-        if not is_read(self.logger):
+        if not self.logger.output_formats:
             self.logger.dump(self.num_timesteps)
             return
         self._record_training()
@@ -237,17 +237,6 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         self.action_space.seed(seed)
         if self.env is not None:
             self.env.seed(seed)
-
-
-def is_read(logger: Logger) -> bool:
-    """Whether a logger writes anything; True for a logger that was changed by hand.
-
-    ``learn`` makes a logger without outputs if the user asked for none. A disabled logger keeps
-    recorded values.
-    """
-    by_hand = any(hasattr(Logger, name) for name in vars(logger))
-    changed = type(logger) is not Logger or by_hand
-    return changed or bool(logger.output_formats) or logger.level == DISABLED
 
 
 def true_outcome(new_obs: Any, dones: Bools, infos: list[dict[str, Any]]) -> tuple[Any, Bools]:

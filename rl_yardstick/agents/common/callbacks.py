@@ -53,7 +53,8 @@ class BlockCallback(BaseCallback):
             call comes after the step that reaches or passes a multiple. ``n_calls`` still counts
             all steps. None: `horizon` decides.
         takes_blocks: whether the engine may call ``_on_rollout_start`` and ``_on_rollout_end``
-            around each block of compiled networks. If not, a block ends with each rollout.
+            around each block of compiled networks. If not, and if it has one of these, their
+            environment runs in Python, and they are called at each rollout.
 
     Raises:
         ValueError: at the start of the training, if ``every_n_steps`` is not a number >= 1.
@@ -93,10 +94,6 @@ class BlockCallback(BaseCallback):
     def wants_position(self) -> bool:
         """Whether the callback reads or changes environments at the start of the next rollout."""
         return False
-
-    def wants_rollout_end(self) -> bool:
-        """Whether `_on_rollout_end` acts on this rollout; asked of callbacks that have it."""
-        return True
 
     def at_safe_moment(self) -> None:
         """Hook between two updates, when no step is running; called inside rollouts too."""

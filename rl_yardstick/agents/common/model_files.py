@@ -23,7 +23,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import open_path
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import (
     ConstantSchedule,
     FloatSchedule,
@@ -39,7 +39,6 @@ from rl_yardstick.safe_files.files import (
     Budget,
     UnsafeFileError,
     content_of,
-    read_file,
     shown,
 )
 from rl_yardstick.safe_files.known_objects import check_values, load_tensors
@@ -423,41 +422,18 @@ def _system_info() -> str:
 class TablePolicy(BasePolicy):
     """A policy that stores what it has learnt in buffers on the CPU."""
 
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
+
     def _sizes(self) -> dict[str, Any]:
         """The constructor's arguments that determine the shapes of the buffers."""
         return {}
 
-    @classmethod
-    def _remade(cls, arguments: Mapping[str, Any]) -> Self:
-        """A new policy from its spaces and the result of `_sizes`."""
-        return cls(**arguments)
-
-    def save(self, path: str) -> None:
-        """Write the tensors, and the policy's arguments as JSON, so that loading runs no code."""
-        data = {
-            "observation_space": self.observation_space,
-            "action_space": self.action_space,
-            **self._sizes(),
-        }
-        text = json.dumps({name: encode(value) for name, value in data.items()})
-        th.save({"state_dict": self.state_dict(), "data": text}, path)
-
-    @classmethod
-    def load(cls, path: str, device: th.device | str = "cpu") -> Self:
-        """Load a policy that `save` wrote; loading runs no code from the file."""
-        content = read_file(Path(path), MAX_ARCHIVE_BYTES)
-        budget = Budget(len(content))
-        saved = load_tensors(content, budget)
-        if not (isinstance(saved, dict) and isinstance(saved.get("data"), str)):
-            raise UnsafeFileError(f"{path} holds no policy of this kind")
-        check_values({"the policy": saved.get("state_dict")})
-        budget.charge_json(saved["data"].encode())
-        try:
-            data = {name: decode(value) for name, value in json.loads(saved["data"]).items()}
-            with charged_tensors(budget):
-                policy = cls._remade(data)
-            policy.load_state_dict(saved["state_dict"])
-        except (TypeError, LookupError, AttributeError, RuntimeError, AssertionError) as error:
-            raise UnsafeFileError(f"{path} holds no {cls.__name__}: {error}") from error
-        policy.set_training_mode(False)
-        return policy
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self._sizes()}

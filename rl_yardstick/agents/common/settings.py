@@ -5,41 +5,15 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABCMeta
-from collections.abc import Iterable
 from numbers import Integral
-from typing import Any, Literal, TypedDict, get_args, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
-import torch as th
 from gymnasium import spaces
 
 from rl_yardstick.machine_code.compiling import inlined
 
-# Constructors that pass arguments on to their base class, and still name all of them.
-#
-# A constructor may take ``**kwargs: Unpack[CommonArguments]``. Hyperparameter files are checked
-# against the signature, and `help` shows it. So the signature lists the arguments in ``**kwargs``.
-
 TieBreaking = Literal["random", "first"]
 ExplorationDecay = Literal["constant", "linear", "exponential"]
-
-_STARRED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-
-
-class CommonArguments(TypedDict, total=False):
-    """Arguments of every hand-written agent's constructor; see `OnlineAlgorithm`."""
-
-    stats_window_size: int
-    tensorboard_log: str | None
-    verbose: int
-    seed: int | None
-    device: th.device | str
-    _init_setup_model: bool
-
-
-class LearningArguments(CommonArguments, total=False):
-    """Arguments of every learning agent's constructor; see `LearningAlgorithm`."""
-
-    tie_breaking: TieBreaking
 
 
 class CheckedConstructor(ABCMeta):
@@ -57,8 +31,8 @@ class CheckedConstructor(ABCMeta):
 def full_signature(cls: type) -> inspect.Signature:
     """The constructor's signature, with the base class's arguments in place of ``**kwargs``.
 
-    If ``**kwargs`` is annotated with its possible keys, only these are added. A constructor that
-    takes ``*args`` passes positional arguments on as well, and adds keyword arguments.
+    A class's ``hidden_arguments`` are those of its base class that it sets itself. Hyperparameter
+    files are checked against the signature, and `help` shows it.
     """
     merged = _merged([base for base in cls.__mro__ if "__init__" in vars(base)])
     return inspect.Signature(sorted(merged.values(), key=lambda parameter: parameter.kind))
@@ -69,14 +43,12 @@ def _merged(owners: list[Any]) -> dict[str, inspect.Parameter]:
     if owners[0] is object:
         return {}
     own = _parameters(owners[0])
-    merged = {p.name: p for p in own if p.name != "self" and p.kind not in _STARRED}
-    rest = next((p for p in own if p.kind is p.VAR_KEYWORD), None)
-    if rest is not None:
-        known = get_args(rest.annotation)
-        names = get_type_hints(known[0]) if known else None
-        for name, parameter in _merged(owners[1:]).items():
-            if names is None or name in names:
-                merged.setdefault(name, parameter)
+    starred = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    merged = {p.name: p for p in own if p.name != "self" and p.kind not in starred}
+    if any(p.kind is p.VAR_KEYWORD for p in own):
+        hidden = vars(owners[0]).get("hidden_arguments", ())
+        passed_on = _merged(owners[1:]).items()
+        merged = {**{n: p for n, p in passed_on if n not in hidden}, **merged}
     return merged
 
 
@@ -104,12 +76,71 @@ def step_size(learning_rate: float, sample_average: bool, visit_count: int) -> f
 
 # Checks of arguments: each error is one line that names the argument and its range.
 
-Settings = Iterable[tuple[str, Any]]
+
+class Range(NamedTuple):
+    """The finite numbers that an argument may be; schedules and None pass."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    is_open: bool = False  # whether ``low`` itself is left out
+    is_whole: bool = False
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise ValueError for another number."""
+        if value is None or callable(value):
+            return
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if self.is_whole and not (whole and value >= self.low):
+            raise ValueError(
+                f"{name} must be a whole number of at least {self.low:g}, not {value!r}"
+            )
+        if self.is_open and not value > self.low:
+            raise ValueError(f"{name} must be above {self.low:g}, not {value}")
+        if self.is_whole and value > self.high:
+            raise ValueError(f"{name} must be at most {self.high:.0f}, not {value}")
+        if self.high < math.inf and not self.low <= value <= self.high:
+            raise ValueError(f"{name} must lie between {self.low:g} and {self.high:g}, not {value}")
+        if self.low > -math.inf and not value >= self.low:
+            raise ValueError(f"{name} must be at least {self.low:g}, not {value}")
+        if not math.isfinite(value):
+            raise ValueError(f"{name} must be finite, not {value}")
 
 
-def settings_of(agent: object, *names: str) -> Settings:
-    """The values of the named arguments of an agent."""
-    return [(name, getattr(agent, name)) for name in names]
+FINITE, NOT_NEGATIVE, POSITIVE = Range(), Range(0), Range(0, is_open=True)
+SHARE, POSITIVE_SHARE = Range(0, 1), Range(0, 1, is_open=True)
+
+
+def whole(low: int, high: float = 1e9) -> Range:
+    """The whole numbers from ``low`` to ``high``."""
+    return Range(low, high, is_whole=True)
+
+
+EPSILONS = dict.fromkeys(
+    ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"), SHARE
+)
+
+
+def check_settings(agent: Any) -> None:
+    """Check an agent's settings by the ``ranges`` of its classes and the words of its signature."""
+    ranges: dict[str, Range] = {}
+    for cls in type(agent).__mro__:
+        ranges = {**vars(cls).get("ranges", {}), **ranges}
+    for name, parameter in type(agent).__signature__.parameters.items():
+        value, words = getattr(agent, name, None), _words(parameter.annotation)
+        if not isinstance(value, str):
+            if name in ranges:
+                ranges[name].check(name, value)
+        elif value not in words and name in ranges:
+            last = f", a schedule or {words[0]!r}" if words else " or a schedule"
+            raise ValueError(f"{name} must be a number{last}, not {value!r}")
+        elif value not in words and words:
+            raise ValueError(f"{name} must be one of {', '.join(words)}, not {value!r}")
+
+
+def _words(annotation: Any) -> list[str]:
+    """The words that an annotation allows."""
+    kinds = (annotation, *get_args(annotation))
+    return [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
 
 
 def check_space(agent: object, role: str, space: spaces.Space[Any]) -> None:
@@ -124,65 +155,3 @@ def check_vectors(agent: object, space: spaces.Space[Any]) -> None:
     """Refuse observation spaces that hold no vectors and that `check_space` refuses."""
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
         check_space(agent, "observations of shape (d,) in a Box space or", space)
-
-
-def check_option(name: str, value: object, options: Any) -> None:
-    """Refuse a word that is not in the Literal ``options``."""
-    if value not in get_args(options):
-        raise ValueError(f"{name} must be one of {', '.join(get_args(options))}, not {value!r}")
-
-
-def check_at_least(low: float, settings: Settings) -> None:
-    """Refuse numbers below ``low``; other types pass."""
-    for name, value in settings:
-        if isinstance(value, int | float) and not value >= low:
-            raise ValueError(f"{name} must be at least {low:g}, not {value}")
-
-
-def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
-    """Refuse values that are not integers from ``low`` to ``high``."""
-    for name, value in settings:
-        if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
-            raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
-        if int(value) > high:
-            raise ValueError(f"{name} must be at most {high}, not {value}")
-
-
-def check_above_zero(settings: Settings) -> None:
-    """Refuse numbers that are not above 0; other types pass."""
-    for name, value in settings:
-        if isinstance(value, int | float) and not value > 0:
-            raise ValueError(f"{name} must be above 0, not {value}")
-
-
-def check_share(settings: Settings) -> None:
-    """Refuse numbers outside [0, 1]."""
-    for name, value in settings:
-        if not 0 <= value <= 1:
-            raise ValueError(f"{name} must lie between 0 and 1, not {value}")
-
-
-def check_finite(settings: Settings) -> None:
-    """Refuse infinite numbers and nan."""
-    for name, value in settings:
-        if not math.isfinite(value):
-            raise ValueError(f"{name} must be finite, not {value}")
-
-
-def check_epsilons(agent: Any) -> None:
-    """Check the settings of the epsilon schedule."""
-    check_option("exploration_decay", agent.exploration_decay, ExplorationDecay)
-    names = ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
-    check_share(settings_of(agent, *names))
-
-
-def check_learning_rate(learning_rate: object) -> None:
-    """Refuse words except ``"sample_average"``, and numbers that are not step sizes."""
-    if isinstance(learning_rate, int | float):
-        check_at_least(0.0, [("learning_rate", learning_rate)])
-        check_finite([("learning_rate", learning_rate)])
-    if isinstance(learning_rate, str) and learning_rate != SAMPLE_AVERAGE:
-        raise ValueError(
-            f"learning_rate must be a number, a schedule or {SAMPLE_AVERAGE!r}, "
-            f"not {learning_rate!r}"
-        )

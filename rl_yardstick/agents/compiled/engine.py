@@ -2,100 +2,35 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from types import FrameType
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from rl_yardstick.agents.common.algorithm import is_read
 from rl_yardstick.agents.common.callbacks import (
-    NEVER,
     EpisodeBudget,
+    Horizon,
     horizon,
     members,
     pass_over,
     unknown_callbacks,
     wants_position,
 )
+from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM, EnvStates, observed_world
 from rl_yardstick.agents.compiled.generators import handles_of
-from rl_yardstick.agents.compiled.greedy_play import (
-    COMPENSATED_SUM,
-    CompiledEvaluations,
-    EnvStates,
-    Playground,
-)
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 from rl_yardstick.agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
-from rl_yardstick.agents.compiled.records import (
-    Episodes,
-    Statistics,
-    keeps_records,
-    record_in_monitors,
-    time_columns,
-    write_records,
-)
+from rl_yardstick.agents.compiled.records import Episodes, record_in_monitors
 from rl_yardstick.agents.compiled.worlds import (
     EPISODE,
     PROGRESS,
-    RECORD,
     NotCompilable,
-    World,
-    compile_envs,
     draws_alike,
 )
 
-Handler = Callable[[int, FrameType | None], object]
-
-# Windows has no SIGHUP.
-_SIGNALS = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")]
-
-
-@contextmanager
-def interrupts_held() -> Iterator[Callable[[], bool]]:
-    """Delay the exception of the first signal to the end of the ``with`` statement.
-
-    The handlers of SIGINT, SIGTERM and SIGHUP run at once; only the exception of the first one is
-    delayed. Outside the main thread, where Python delivers no signals, this does nothing. Yields
-    a function that tells whether an exception is waiting.
-    """
-    n_signals = 0
-    waiting: list[BaseException] = []
-
-    def held(handler: Handler) -> Handler:
-        def hold(number: int, frame: FrameType | None) -> None:
-            nonlocal n_signals
-            n_signals += 1
-            try:
-                handler(number, frame)
-            except BaseException as error:
-                if n_signals > 1:
-                    raise
-                waiting.append(error)
-
-        return hold
-
-    try:
-        with ExitStack() as restoring:
-            if threading.current_thread() is threading.main_thread():
-                for number in filter(None, _SIGNALS):
-                    handler = signal.getsignal(number)
-                    if callable(handler):
-                        restoring.callback(signal.signal, number, handler)
-                        signal.signal(number, held(handler))
-            yield lambda: bool(waiting)
-    finally:
-        if waiting:
-            raise waiting[0]
-
-
-# A block takes some hundredths of a second, for which a signal may have to wait.
+# A block takes some hundredths of a second, for which a signal may have to wait. The log has at
+# most one record of each block.
 MAX_BLOCK_STEPS = 262_144
 
 
@@ -106,16 +41,20 @@ class CompiledEngine:
     counts_where_stopped = True
 
     def __init__(
-        self, agent: Any, world: World, callback: BaseCallback, log_interval: int | None
+        self,
+        agent: Any,
+        world: tuple[Any, Any],
+        callback: BaseCallback,
+        log_interval: int | None,
     ) -> None:
         assert isinstance(agent.env, DummyVecEnv)
         self.agent = agent
-        self.world = world
+        self.world, self.seen = world
         self.callback = callback
         self.log_interval = log_interval
         self.reports_success = ["is_success" in (info or {}) for info in agent.env.reset_infos]
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
-        self.states = self._make_states()
+        self.states = EnvStates(agent.env, self.world, self.seen)
         self.envs = self.states.records
         # Handles do not keep their generators alive.
         self.generators = [env.unwrapped.np_random for env in agent.env.envs]
@@ -124,43 +63,22 @@ class CompiledEngine:
         self.log = EpisodeLog(
             np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
             np.empty((self.block_steps, agent.n_envs)),
-            np.zeros(self._most_records(), dtype=RECORD),
         )
         self.made_from: tuple[Any, ...] = ()
         self.learner: Any = None
-        self.evaluations = CompiledEvaluations(agent, callback, self._playground)
         self._read()
-
-    def _make_states(self) -> EnvStates:
-        return EnvStates(self.agent.env, self.world)
-
-    def _most_records(self) -> int:
-        """The largest number of log records that can be due in a block."""
-        takes_records = getattr(self.agent, "logs_by_records", False)
-        if not takes_records or self.log_interval is None or self.log_interval < 1:
-            return 0
-        n_episodes = self.block_steps * self.agent.n_envs
-        return int(min(self.block_steps, n_episodes // self.log_interval + 1))
-
-    def _playground(self, vec_env: VecEnv) -> Playground:
-        """The compiled counterpart of evaluation environments."""
-        world: Any = compile_envs(vec_env)
-        return world, EnvStates(cast(DummyVecEnv, vec_env), world), None
 
     def _learner(self) -> Any:
         """The agent for compiled functions, updated after changes by callbacks."""
         agent, progress = self.agent, self.progress[0]
         made_from = agent.made_from(agent.rng)
         if made_from != self.made_from:
-            self.made_from, self.learner = made_from, self._compiled_agent()
+            self.made_from, self.learner = made_from, agent.compiled_agent(agent.rng, self.seen)
         for name, schedule in agent.schedules().items():
             progress[f"{name}_schedule"] = compiled_schedule(schedule)
             progress[name] = schedule(agent._current_progress_remaining)
         self._take_generators()
         return self.learner
-
-    def _compiled_agent(self) -> Any:
-        return self.agent.compiled_agent(self.agent.rng)
 
     def _take_generators(self) -> None:
         """Make new handles, because a callback may have reseeded the environments."""
@@ -170,113 +88,92 @@ class CompiledEngine:
 
     def run(self, total_timesteps: int) -> None:
         """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
-        with interrupts_held() as interrupted:
-            try:
-                while not self._is_over(total_timesteps):
-                    if not self._run_block(total_timesteps) or interrupted():
-                        break
-            finally:
-                self._write()
+        try:
+            while not self._is_over(total_timesteps) and self._run_block(total_timesteps):
+                pass
+        finally:
+            self._write()
 
     def _is_over(self, total_timesteps: int) -> bool:
         return bool(self.agent.num_timesteps >= total_timesteps)
 
     def _run_block(self, total_timesteps: int) -> bool:
-        agent = self.agent
+        """Train for a block of steps; False once a callback asks to stop."""
+        self._begin_block()
+        self.progress[0]["episodes"] = self.agent._episode_num
+        n_logged = self._log_count
+        n_steps = self._step(self._limit(total_timesteps))
+        episodes = Episodes.of(self.log.episodes[: self.progress[0]["logged_episodes"]])
+        earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
+        keep_going = self._tell(episodes, n_steps, earlier)
+        self._learn_from_last(len(episodes.envs) - earlier, keep_going)
+        interval = self.log_interval
+        if interval is not None and self._log_count // interval > n_logged // interval:
+            self._write_log()
+        self.callback.on_rollout_end()
+        return keep_going
+
+    def _begin_block(self) -> None:
+        """Call the callbacks, with environments up to date if one of them asks for that."""
         if wants_position(self.callback):
             self._write()
             self.callback.on_rollout_start()
             self._read()
         else:
             self.callback.on_rollout_start()
-        self.progress[0]["episodes"] = agent._episode_num
-        self._keep_records()
+
+    def _limit(self, total_timesteps: int) -> Horizon:
+        """The number of steps and episodes until the block must end."""
         ahead = horizon(self.callback)
-        began = time.time_ns()
-        steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
-        n_steps = run_block(
+        steps_left = -(-(total_timesteps - self.agent.num_timesteps) // self.agent.n_envs)
+        return Horizon(min(ahead.calls, steps_left, self.block_steps), ahead.episodes)
+
+    def _step(self, limit: Horizon) -> int:
+        """Act and learn in compiled code, but for the last step; returns the number of steps."""
+        return run_block(
             self.world,
             self._learner(),
             self.envs,
             self.handles,
             self.progress[0],
             self.log,
-            min(ahead.calls, steps_left, self.block_steps),
-            min(ahead.episodes, self._episodes_to_log()),
+            limit.calls,
+            limit.episodes,
             COMPENSATED_SUM,
         )
-        episodes = Episodes.of(self.log.episodes[: self.progress[0]["logged_episodes"]])
-        keep_going = self._tell(episodes, n_steps, began)
+
+    def _learn_from_last(self, n_episodes: int, keep_going: bool) -> None:
+        """Learn from the last step, at which ``n_episodes`` ended."""
         learn_from_last_step(self._learner(), self.envs, self.progress[0])
-        last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
-        self._take_over_counts(1, len(episodes.envs) - last_step)
-        self.callback.on_rollout_end()
-        return keep_going
+        self._take_over_counts(1, n_episodes)
 
-    def _keep_records(self) -> None:
-        """Let the loop store log records, if writing them can wait until the block ends."""
-        progress, interval = self.progress[0], self.log_interval
-        progress["record_interval"] = progress["n_records"] = 0
-        if interval is not None and keeps_records(self.agent, interval):
-            progress["record_interval"] = interval
-            progress["next_record"] = (self.agent._episode_num // interval + 1) * interval
+    @property
+    def _log_count(self) -> int:
+        """The count by which the log is due."""
+        return int(self.agent._episode_num)
 
-    def _episodes_to_log(self) -> int:
-        """Episodes until the next log record that cannot wait for the end of the block."""
-        waits = self.progress[0]["record_interval"] > 0
-        if self.log_interval is None or waits or not is_read(self.agent.logger):
-            return NEVER
-        return self.log_interval - int(self.agent._episode_num) % self.log_interval
+    def _write_log(self) -> None:
+        self.agent.dump_logs()
 
-    def _tell(self, episodes: Episodes, n_steps: int, began: int = 0) -> bool:
-        """Update Monitor, statistics and callbacks; False once a callback asks to stop."""
+    def _tell(self, episodes: Episodes, n_steps: int, earlier: int) -> bool:
+        """Update Monitor, statistics and callbacks; False once a callback asks to stop.
+
+        The first ``earlier`` episodes ended before the last step.
+        """
         agent = self.agent
-        records = self.log.records[: self.progress[0]["n_records"]]
-        before = Statistics(agent) if len(records) else None
         self.states.keep_rewards(episodes, self.log.rewards[:n_steps])
         times = record_in_monitors(self.states.monitors, episodes, n_steps)
         # As in the interpreted loop, the statistics get the last step after the callbacks.
-        earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._update_statistics(episodes, 0, earlier, times)
         agent.num_timesteps += n_steps * agent.n_envs
-        n_recorded = 0
-        if before is not None:
-            n_recorded = self._write_records(before, records, episodes, n_steps, began)
         # Callbacks run before the agent learns from the last step, so the counters exclude it yet.
-        self._take_over_counts(n_steps - 1, earlier - n_recorded)
-        if n_steps > 1:
-            self._record_earlier()
+        self._take_over_counts(n_steps - 1, earlier)
         pass_over(self.callback, n_steps - 1, earlier)
         self.callback.update_locals(self._last_step(episodes, earlier, times))
-        with self.evaluations.taking_over():
-            keep_going = self.callback.on_step()
+        keep_going = self.callback.on_step()
         if keep_going or self.counts_where_stopped:
             self._update_statistics(episodes, earlier, len(episodes.envs), times)
         return keep_going
-
-    def _write_records(
-        self, before: Statistics, records: Any, episodes: Episodes, n_steps: int, began: int
-    ) -> int:
-        """Write the log records, and return the number of episodes that they count."""
-        agent = self.agent
-        n_done = (records["step"] + 1) * agent.n_envs
-        steps = agent.num_timesteps - n_steps * agent.n_envs + n_done
-        now = time.time_ns()
-        times = began + (now - began) * (records["step"] + 1) // n_steps
-        n_before = int(agent._episode_num)
-        agent._episode_num = int(records["episodes"][-1])
-        columns = {
-            "time/episodes": records["episodes"].tolist(),
-            "train/n_updates": (agent._n_updates + n_done).tolist(),
-            **time_columns(agent, steps, times),
-            **before.columns(episodes, records["logged_episodes"]),
-            **agent.log_columns(records),
-        }
-        write_records(agent, columns, times)
-        return int(records["episodes"][-1]) - n_before
-
-    def _record_earlier(self) -> None:
-        """Give the logger values that callbacks may read there, of all steps except the last."""
 
     def _update_statistics(
         self, episodes: Episodes, start: int, stop: int, times: list[float]
@@ -309,13 +206,12 @@ class CompiledEngine:
         }
 
     def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
-        """Update the algorithm's own counters, and write the log if it is due."""
+        """Update the algorithm's own counters."""
         agent = self.agent
         agent._current_progress_remaining = float(self.progress[0]["remaining"])
         agent._n_updates += n_steps * agent.n_envs
+        agent._episode_num += n_episodes
         self._take_over_position()
-        if n_episodes:
-            agent._count_episodes(n_episodes, self.log_interval)
 
     def _take_over_position(self) -> None:
         self.agent._last_obs = self.states.observations(self.envs, "")
@@ -362,11 +258,7 @@ SETTINGS = (
 
 
 def choose_engine(
-    agent: Any,
-    callback: BaseCallback,
-    log_interval: int | None,
-    make_world: Callable[[VecEnv], Any] = compile_envs,
-    engine: type[CompiledEngine] = CompiledEngine,
+    agent: Any, callback: BaseCallback, log_interval: int | None
 ) -> CompiledEngine | None:
     """The compiled engine, if the agent asks for it and can be compiled; else None.
 
@@ -378,7 +270,7 @@ def choose_engine(
         agent.engine_in_use = "interpreted: asked for"
         return None
     try:
-        world = _world_for(agent, callback, make_world)
+        world = _world_for(agent, callback)
     except NotCompilable as reason:
         if agent.engine == "compiled":
             raise ValueError(f"engine: compiled is not possible: {reason}") from None
@@ -393,16 +285,11 @@ def choose_engine(
             )
             return None
         agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"
-    return engine(agent, world, callback, log_interval)
+    return CompiledEngine(agent, world, callback, log_interval)
 
 
-def _world_for(
-    agent: LearningAlgorithm, callback: BaseCallback, make_world: Callable[[VecEnv], Any]
-) -> Any:
+def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> tuple[Any, Any]:
     check_class(type(agent))
-    for name in vars(agent):
-        if callable(vars(agent)[name]) and callable(getattr(type(agent), name, None)):
-            raise NotCompilable(f"this agent has a {name} of its own in Python")
     unknown = unknown_callbacks(callback)
     if unknown:
         raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
@@ -410,7 +297,7 @@ def _world_for(
     for schedule in agent.schedules().values():
         compiled_schedule(schedule)
     assert agent.env is not None
-    return make_world(agent.env)
+    return observed_world(agent.env)
 
 
 def check_class(algorithm: type) -> None:

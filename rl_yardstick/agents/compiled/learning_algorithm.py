@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any, ClassVar, Literal, Unpack, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,11 @@ from rl_yardstick.agents.common.algorithm import OnlineAlgorithm
 from rl_yardstick.agents.common.exploration import EPSILON_GREEDY
 from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_row
 from rl_yardstick.agents.common.settings import (
+    NOT_NEGATIVE,
     SAMPLE_AVERAGE,
-    CommonArguments,
+    Range,
     TieBreaking,
-    check_learning_rate,
-    check_option,
+    check_settings,
 )
 from rl_yardstick.agents.compiled.loop import CompiledClass, check_functions, settings_dtype
 from rl_yardstick.agents.compiled.worlds import PROGRESS, NotCompilable
@@ -50,9 +50,8 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
 
     Attributes:
         parameters: types of the settings that compiled functions read, by attribute name.
+        ranges: the numbers that settings may be; each class may add some.
         settings_type: the type of the record.
-        logs_by_records: whether `log_columns` has everything that `_record_training` logs, apart
-            from the number of updates.
     """
 
     parameters: ClassVar[Mapping[str, Any]] = {
@@ -60,11 +59,13 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         "averages_samples": np.bool_,
         "strategy": np.int64,
     }
+    ranges: ClassVar[Mapping[str, Range]] = {"learning_rate": NOT_NEGATIVE}
     settings_type: ClassVar[np.dtype[np.void]]
-    logs_by_records: ClassVar[bool] = False
     # The algorithm's own arrays for compiled functions.
     _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
+
+    hidden_arguments = ("supported_action_spaces",)
 
     _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspaces")
     excluded_from_states: ClassVar[tuple[str, ...]] = ("_workspaces",)
@@ -76,7 +77,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         learning_rate: StepSize = 0.0,
         tie_breaking: TieBreaking = "random",
         policy_kwargs: dict[str, Any] | None = None,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.tie_breaking = tie_breaking
         self.exploration_schedule: Schedule = FloatSchedule(0.0)
@@ -92,9 +93,8 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         cls._read_settings = attrgetter(*fields)
 
     def _setup_model(self) -> None:
+        check_settings(self)
         self._check_arguments()
-        check_option("tie_breaking", self.tie_breaking, TieBreaking)
-        check_learning_rate(self.learning_rate)
         self.lr_schedule = FloatSchedule(1.0 if self.averages_samples else self.learning_rate)
         self.exploration_schedule = self._make_exploration_schedule()
         self.set_random_seed(self.seed)
@@ -106,9 +106,15 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     def _check_arguments(self) -> None:
         """Refuse invalid arguments before anything is built."""
 
-    @abstractmethod
+    def _policy_arguments(self) -> dict[str, Any]:
+        """The policy's arguments besides spaces and schedule."""
+        return self.policy_kwargs
+
     def _make_policy(self) -> BasePolicy:
         """Make the untrained policy."""
+        return self.policy_class(
+            self.observation_space, self.action_space, self.lr_schedule, **self._policy_arguments()
+        )
 
     def _make_exploration_schedule(self) -> Schedule:
         """Make the schedule of the exploration rate."""
@@ -163,14 +169,6 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
             known = made_from, self._make_workspace(rng, n)
             self._workspaces[id(rng), n] = known
         return known[1]
-
-    def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
-        """The values that `_record_training` logs, at many moments of the training."""
-        return {
-            "rollout/exploration_rate": records["exploration"].tolist(),
-            "train/mean_absolute_td_error": records["mean_td_error"].tolist(),
-            "train/learning_rate": records["learning_rate"].tolist(),
-        }
 
     def __getstate__(self) -> dict[str, Any]:
         # A copied workspace would not share its arrays with the copied policy.

@@ -168,39 +168,18 @@ def note_step(log: Any, env: Any, i: int, step: int) -> None:
     """Record the step of environment ``i``."""
 
 
-@by_type
-def note_progress(log: Any, progress: Any, step: int) -> None:
-    """Record the training's progress if a log record is due."""
-
-
 class EpisodeLog(NamedTuple):
-    """Data of a block for Monitor and the logger."""
+    """Data of a block for Monitor and the statistics."""
 
     episodes: NDArray[Any]  # of type `EPISODE`, filled with those that end, shape (capacity,)
     # Rewards that Monitor sees in the running episode, from its first step in the block on; shape
     # (steps, n_envs).
     rewards: Floats
-    records: NDArray[Any]  # of type `RECORD`, filled where the log is due, shape (capacity,)
 
     @inlined
     def note_step(self, env: Any, i: int, step: int) -> None:
         """Store the reward, which overwrites one of the previous episode."""
         self.rewards[min(step, env.elapsed - 1), i] = env.monitor_reward
-
-    @inlined
-    def note_progress(self, progress: Any, step: int) -> None:
-        """Store a log record every ``record_interval`` episodes."""
-        interval = progress.record_interval
-        if interval > 0 and progress.episodes >= progress.next_record:
-            record = self.records[progress.n_records]
-            record.step = step
-            record.logged_episodes = progress.logged_episodes
-            record.episodes = progress.episodes
-            record.exploration = progress.exploration
-            record.learning_rate = progress.learning_rate
-            record.mean_td_error = progress.mean_td_error
-            progress.next_record = (progress.episodes // interval + 1) * interval
-            progress.n_records += 1
 
 
 @inlined
@@ -278,5 +257,4 @@ def run_block(
         if t == n_steps - 1 or progress.logged_episodes >= max_episodes:
             return t + 1
         learn_and_count(agent, envs, progress)
-        note_progress(log, progress, t)
     return n_steps

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from rl_yardstick.agents.compiled.generators import next_uniform, skip_uniform
+from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.envs.known_models import (
     model_check,
     observations_of_states,
@@ -99,22 +99,6 @@ PROGRESS = np.dtype(
         ("budget_episodes", np.int64),  # episodes that have counted towards it
         ("logged_episodes", np.int64),  # those in the log
         ("mean_td_error", np.float64),
-        ("record_interval", np.int64),  # episodes between two records of the log; 0 for none
-        ("next_record", np.int64),  # the number of episodes at which the next one is due
-        ("n_records", np.int64),  # of the block
-    ],
-    align=True,
-)
-
-# The data of a log record: a moment of a block, after learning.
-RECORD = np.dtype(
-    [
-        ("step", np.int64),  # of the block
-        ("logged_episodes", np.int64),  # of the block so far
-        ("episodes", np.int64),  # of the training
-        ("exploration", np.float64),
-        ("learning_rate", np.float64),
-        ("mean_td_error", np.float64),
     ],
     align=True,
 )
@@ -188,12 +172,9 @@ class FiniteModel(NamedTuple):
     @inlined
     def step(self, env: Any, handle: Any) -> None:
         """Take ``env.action`` in ``env.state``."""
-        outcome = 0
+        outcome, uniform = 0, next_uniform(handle)
         if self.outcomes.shape[2] > 1:
-            uniform = next_uniform(handle)
             outcome = pick_outcome(self.outcomes, env.state, env.action, uniform)
-        else:
-            skip_uniform(handle)
         result = self.outcomes[env.state, env.action, outcome]
         env.state = result.next_state
         env.reward = result.agent_reward

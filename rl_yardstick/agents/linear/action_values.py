@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.common.exploration import (
     EPSILON_GREEDY,
@@ -15,19 +14,13 @@ from rl_yardstick.agents.common.exploration import (
     highest_value,
 )
 from rl_yardstick.agents.common.schedules import epsilon_schedule
-from rl_yardstick.agents.common.settings import (
-    ExplorationDecay,
-    TieBreaking,
-    check_epsilons,
-    check_finite,
-    settings_of,
-)
+from rl_yardstick.agents.common.settings import EPSILONS, FINITE, ExplorationDecay
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm, TileArguments
+from rl_yardstick.agents.linear.algorithm import TileAlgorithm
 from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, choose, look, move_sum, sum_of
-from rl_yardstick.agents.networks.network_worlds import AFTER, BEFORE, move_on
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats
 
@@ -100,8 +93,7 @@ class SemiGradientAlgorithm(TileAlgorithm):
     """Epsilon-greedy control on action values that are sums of weights over active tiles.
 
     Args:
-        policy: ``"TilePolicy"``.
-        env: as in `TileAlgorithm`.
+        args: as in `TileAlgorithm`.
         learning_rate: as in `TileAlgorithm`.
         exploration_fraction: share of training over which epsilon falls.
         exploration_initial_eps: epsilon at the start.
@@ -116,31 +108,24 @@ class SemiGradientAlgorithm(TileAlgorithm):
     choose_by_sums = choose_epsilon_greedily
     learn_from_step = semi_gradient_learning
     commit = no_commitment
+    ranges = {"initial_q": FINITE, **EPSILONS}  # noqa: RUF012
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "TilePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.1,
+        *args: Any,
         exploration_fraction: float = 0.5,
         exploration_initial_eps: float = 1.0,
         exploration_final_eps: float = 0.05,
         exploration_decay: ExplorationDecay = "linear",
-        tie_breaking: TieBreaking = "random",
         initial_q: float = 0.0,
-        **kwargs: Unpack[TileArguments],
+        **kwargs: Any,
     ) -> None:
         self.exploration_fraction = exploration_fraction
         self.exploration_initial_eps = exploration_initial_eps
         self.exploration_final_eps = exploration_final_eps
         self.exploration_decay = exploration_decay
         self.initial_q = initial_q
-        super().__init__(policy, env, learning_rate, tie_breaking, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_epsilons(self)
-        check_finite(settings_of(self, "initial_q"))
+        super().__init__(*args, **kwargs)
 
     def _initial_sums(self) -> Floats:
         return np.full(self.n_actions, float(self.initial_q))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -13,23 +13,19 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.common.exploration import first_best
 from rl_yardstick.agents.common.model_files import TablePolicy
 from rl_yardstick.agents.common.settings import (
-    CommonArguments,
+    SHARE,
     TieBreaking,
-    check_option,
-    check_share,
     check_space,
     check_vectors,
-    settings_of,
 )
-from rl_yardstick.agents.compiled.engine import CompiledEngine, EngineChoice, choose_engine
+from rl_yardstick.agents.compiled.engine import EngineChoice, choose_engine
+from rl_yardstick.agents.compiled.env_states import BEFORE, move_on
 from rl_yardstick.agents.compiled.generators import handles_of
-from rl_yardstick.agents.compiled.greedy_play import Playground
 from rl_yardstick.agents.compiled.worlds import env_dtype
 from rl_yardstick.agents.linear.tiles import (
     Bound,
@@ -37,21 +33,12 @@ from rl_yardstick.agents.linear.tiles import (
     LinearAgent,
     Room,
     Tiles,
-    act_in_all,
     act_on_tiles,
     add_up,
-    learn_from_all,
     look,
     make_tiles,
     tiles_of_all,
     vectors_of,
-)
-from rl_yardstick.agents.networks.network_worlds import (
-    BEFORE,
-    NetworkEnvStates,
-    move_on,
-    network_playground,
-    network_world,
 )
 from rl_yardstick.agents.tabular.workspace import Workspace, WorkspaceAlgorithm
 from rl_yardstick.machine_code.compiling import called
@@ -68,17 +55,15 @@ class TilePolicy(TablePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
+        *args: Any,
         tiling: dict[str, Any] | None = None,
         values_states: bool = False,
         **kwargs: Any,
     ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
+        super().__init__(*args, **kwargs)
         self.tiling = dict(tiling or {})
-        n_actions = int(action_space.n)
-        self.tiles = make_tiles(observation_space, **self.tiling, n_actions=n_actions)
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+        self.tiles = make_tiles(self.observation_space, **self.tiling, n_actions=n_actions)
         n_tiles = self.tiles.n_tiles
         self.register_buffer("weights", th.zeros((n_tiles, n_actions), dtype=th.float64))
         n_valued = n_tiles if values_states else 0
@@ -108,54 +93,28 @@ NUMBERED_ENV = env_dtype(("number", np.int64))
 
 
 class TileWorkspace(Workspace):
-    """A workspace with an agent, whose weights are changed in place."""
+    """A workspace of an agent on tiles."""
 
-    def __init__(self, agent: LinearAgent, space: spaces.Space[Any], n: int) -> None:
-        super().__init__(n, NUMBERED_ENV)
-        self.envs["number"] = np.arange(n)
+    def __init__(
+        self, agent: LinearAgent, space: spaces.Space[Any], rng: np.random.Generator, n: int
+    ) -> None:
         self.space = space
-        n_dims = len(agent.room.vector)
-        self.seen = HandedVectors(np.zeros((n, n_dims)), np.zeros((n, n_dims)))
-        self.agent = agent._replace(seen=self.seen)
+        before, after = np.zeros((2, n, len(agent.room.vector)))
+        self.seen = HandedVectors(before, after)
+        super().__init__(agent._replace(seen=self.seen), rng, n, NUMBERED_ENV)
+        self.envs["number"] = np.arange(n)
 
     def act(self, observations: Any) -> Ints:
-        """An action for each observation: the one committed to, if there is one."""
+        """An action for each observation."""
         self.seen.before[:] = vectors_of(self.space, observations)
-        act_in_all(self.agent, self.envs, self.progress[0])
-        actions: Ints = self.fields["action"].copy()
-        return actions
+        return self.choose()
 
     def learn(self, transitions: Transitions) -> float:
         """Learn from a step of each environment, and return the mean absolute TD error."""
         self.seen.before[:] = vectors_of(self.space, transitions.obs)
         self.seen.after[:] = vectors_of(self.space, transitions.next_obs)
         self.fields["action"][:] = transitions.actions
-        self.take_outcomes(transitions)
-        learn_from_all(self.agent, self.envs, self.progress[0])
-        return float(self.mean_td_error[0])
-
-
-class TileEngine(CompiledEngine):
-    """One call of ``learn`` on the compiled loop, in a world made by `network_world`."""
-
-    def __init__(
-        self,
-        agent: Any,
-        world_and_seen: tuple[Any, Any],
-        callback: BaseCallback,
-        log_interval: int | None,
-    ) -> None:
-        world, self.seen = world_and_seen
-        super().__init__(agent, world, callback, log_interval)
-
-    def _make_states(self) -> NetworkEnvStates:
-        return NetworkEnvStates(self.agent.env, self.world, self.seen)
-
-    def _playground(self, vec_env: VecEnv) -> Playground:
-        return network_playground(vec_env)
-
-    def _compiled_agent(self) -> Any:
-        return self.agent.compiled_agent(self.agent.rng, self.seen)
+        return self.learn_from(transitions)
 
 
 class TilePlayer(NamedTuple):
@@ -178,17 +137,6 @@ class TilePlayer(NamedTuple):
         """Learn nothing; move on to the next observations."""
         for i in range(len(envs)):
             move_on(self.seen, envs[i])
-
-
-class TileArguments(CommonArguments, total=False):
-    """Arguments that these agents' constructors pass on; see `TileAlgorithm`."""
-
-    gamma: float
-    n_tilings: int
-    n_tiles: int | Sequence[int]
-    low: Bound
-    high: Bound
-    engine: EngineChoice
 
 
 class TileAlgorithm(WorkspaceAlgorithm):
@@ -219,13 +167,15 @@ class TileAlgorithm(WorkspaceAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TilePolicy": TilePolicy}
     policy: TilePolicy
     parameters = {"gamma": np.float64}  # noqa: RUF012
+    ranges = {"gamma": SHARE}  # noqa: RUF012
     values_states: ClassVar[bool] = False
+    hidden_arguments = ("policy_kwargs",)
 
     act = act_on_tiles
 
     def __init__(
         self,
-        policy: str | type[BasePolicy],
+        policy: str | type[BasePolicy] = "TilePolicy",
         env: GymEnv | str | None = None,
         learning_rate: float | Schedule = 0.1,
         tie_breaking: TieBreaking = "random",
@@ -235,7 +185,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         low: Bound = None,
         high: Bound = None,
         engine: EngineChoice = "auto",
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.gamma = gamma
         self.n_tilings = n_tilings
@@ -248,25 +198,15 @@ class TileAlgorithm(WorkspaceAlgorithm):
     def _check_arguments(self) -> None:
         check_space(self, "actions", self.action_space)
         check_vectors(self, self.observation_space)
-        check_option("engine", self.engine, EngineChoice)
-        if isinstance(self.learning_rate, str):
-            raise ValueError(
-                f"learning_rate must be a number or a schedule, not {self.learning_rate!r}"
-            )
-        check_share(settings_of(self, "gamma"))
 
-    def _make_policy(self) -> TilePolicy:
-        tiling = dict(settings_of(self, "n_tilings", "n_tiles", "low", "high"))
-        policy: Any = self.policy_class
-        made: TilePolicy = policy(
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
-            tiling=tiling,
-            values_states=self.values_states,
-        )
-        made.weights[:] = th.from_numpy(self._initial_sums() / made.tiles.n_tilings)
-        return made
+    def _policy_arguments(self) -> dict[str, Any]:
+        tiling = {name: getattr(self, name) for name in ("n_tilings", "n_tiles", "low", "high")}
+        return {"tiling": tiling, "values_states": self.values_states}
+
+    def _make_policy(self) -> BasePolicy:
+        policy = cast(TilePolicy, super()._make_policy())
+        policy.weights[:] = th.from_numpy(self._initial_sums() / policy.tiles.n_tilings)
+        return policy
 
     @property
     def n_actions(self) -> int:
@@ -281,10 +221,6 @@ class TileAlgorithm(WorkspaceAlgorithm):
     def _probabilities(self, sums: Floats) -> Floats:
         """The probabilities of actions for sums of shape (n, A), same shape."""
 
-    def _memory_record(self) -> Any:
-        """Further state for compiled functions, in the memory of the agent."""
-        return ()
-
     def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> LinearAgent:
         """The agent for compiled functions, with its weights in the memory of its policy."""
         tiles = self.policy.tiles
@@ -293,7 +229,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
         return LinearAgent(
             self.settings()[0],
             self.policy.weights.numpy(),
-            self._memory_record(),
+            self._memory_in_use(),
             tiles,
             seen,
             room,
@@ -306,14 +242,14 @@ class TileAlgorithm(WorkspaceAlgorithm):
         return TilePlayer(agent.weights, agent.tiles, agent.seen, agent.room)
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        engine = choose_engine(self, callback, log_interval, network_world, TileEngine)
+        engine = choose_engine(self, callback, log_interval)
         if engine is not None:
             engine.run(total_timesteps)
             return
         super()._run(total_timesteps, callback, log_interval)
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> TileWorkspace:
-        return TileWorkspace(self.compiled_agent(rng), self.observation_space, n)
+        return TileWorkspace(self.compiled_agent(rng), self.observation_space, rng, n)
 
     def predict(
         self,

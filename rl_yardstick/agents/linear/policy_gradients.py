@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.common.exploration import (
@@ -16,17 +14,12 @@ from rl_yardstick.agents.common.exploration import (
     drawn_action,
     make_probabilities,
 )
-from rl_yardstick.agents.common.settings import (
-    check_at_least,
-    check_finite,
-    check_option,
-    settings_of,
-)
+from rl_yardstick.agents.common.settings import FINITE, NOT_NEGATIVE
+from rl_yardstick.agents.compiled.env_states import AFTER, BEFORE, move_on
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.linear.algorithm import TileAlgorithm, TileArguments
+from rl_yardstick.agents.linear.algorithm import TileAlgorithm
 from rl_yardstick.agents.linear.tiles import LinearAgent, add_up, look, move_sum
-from rl_yardstick.agents.networks.network_worlds import AFTER, BEFORE, move_on
 from rl_yardstick.envs.known_models import time_limit
 from rl_yardstick.machine_code.compiling import called
 from rl_yardstick.mdp.transition_model import Floats, Ints
@@ -74,19 +67,11 @@ def move_state_value(weights: Floats, tiles: Ints, step: float) -> None:
         weights[tiles[k]] += step
 
 
-class SoftmaxArguments(TileArguments, total=False):
-    """Arguments that these agents' constructors pass on; see `SoftmaxAlgorithm`."""
-
-    initial_preferences: float | Sequence[float]
-    gamma_power: bool
-
-
 class SoftmaxAlgorithm(TileAlgorithm):
     """A policy gradient on preferences that are sums of weights over active tiles.
 
     Args:
-        policy: ``"TilePolicy"``; its greedy action is the most probable one.
-        env: as in `TileAlgorithm`.
+        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, as in `TileAlgorithm`.
         initial_preferences: each action's preference at the start, a number or a list of A.
         gamma_power: multiply the policy's update at step t of an episode by gamma to the power t,
@@ -97,18 +82,18 @@ class SoftmaxAlgorithm(TileAlgorithm):
     parameters = {"gamma_power": np.bool_}  # noqa: RUF012
     choose_by_sums = draw_by_preference
 
+    hidden_arguments = ("tie_breaking",)
+
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "TilePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.1,
+        *args: Any,
         initial_preferences: float | Sequence[float] = 0.0,
         gamma_power: bool = True,
-        **kwargs: Unpack[TileArguments],
+        **kwargs: Any,
     ) -> None:
         self.initial_preferences = initial_preferences
         self.gamma_power = gamma_power
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _initial_sums(self) -> Floats:
         given = np.asarray(self.initial_preferences, dtype=np.float64)
@@ -117,7 +102,8 @@ class SoftmaxAlgorithm(TileAlgorithm):
                 f"initial_preferences must be a number or {self.n_actions} numbers, "
                 f"not {self.initial_preferences}"
             )
-        check_finite([("initial_preferences", float(number)) for number in given.flat])
+        for number in given.flat:
+            FINITE.check("initial_preferences", float(number))
         return np.broadcast_to(given, self.n_actions)
 
     def _probabilities(self, sums: Floats) -> Floats:
@@ -170,44 +156,27 @@ class ActorCritic(SoftmaxAlgorithm):
     episode is truncated, the target bootstraps from its last state.
 
     Args:
-        policy: ``"TilePolicy"``.
-        env: as in `TileAlgorithm`.
+        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
         value_step_size: step size of the state values, also divided by the number of tilings.
         kwargs: as in `SoftmaxAlgorithm`.
     """
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
+    ranges = {"value_step_size": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = actor_critic_learning
     values_states = True
+    _memory: Critic
 
-    _rebuilt = (*SoftmaxAlgorithm._rebuilt, "_discounts")
-
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "TilePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.1,
-        value_step_size: float = 0.2,
-        **kwargs: Unpack[SoftmaxArguments],
-    ) -> None:
+    def __init__(self, *args: Any, value_step_size: float = 0.2, **kwargs: Any) -> None:
         self.value_step_size = value_step_size
-        self._discounts = np.ones(0)
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0, settings_of(self, "value_step_size"))
+    def _make_memory(self) -> Critic:
+        return Critic(self.policy.state_weights.numpy(), np.ones(self.n_envs))
 
-    def _begin_episodes(self) -> None:
-        super()._begin_episodes()
-        self._discounts = np.ones(self.n_envs)
-
-    def _memory_record(self) -> Critic:
-        return Critic(self.policy.state_weights.numpy(), self._discounts)
-
-    def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
-        return (*super().made_from(rng), id(self._discounts))
+    def _memory_in_use(self) -> Critic:
+        return self._memory._replace(values=self.policy.state_weights.numpy())
 
 
 # REINFORCE, with and without a baseline.
@@ -215,8 +184,6 @@ class ActorCritic(SoftmaxAlgorithm):
 Baseline = Literal["none", "value"]
 
 FIRST_CAPACITY = 64
-# Eight bytes each: stored steps times tilings, over all environments.
-MOST_KEPT = 50_000_000
 
 
 class KeptEpisodes(NamedTuple):
@@ -302,8 +269,7 @@ class Reinforce(SoftmaxAlgorithm):
     last state.
 
     Args:
-        policy: ``"TilePolicy"``.
-        env: as in `TileAlgorithm`.
+        args: as in `TileAlgorithm`.
         learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
         baseline: subtracted from returns: ``"none"``, or ``"value"``, a learnt state value.
         value_step_size: step size of that value, also divided by the number of tilings.
@@ -311,76 +277,55 @@ class Reinforce(SoftmaxAlgorithm):
     """
 
     parameters = {"value_step_size": np.float64}  # noqa: RUF012
+    ranges = {"value_step_size": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = learn_at_ends
-
-    # A loaded agent begins new episodes.
-    _kept = ("_lengths", "_kept_tiles", "_kept_actions", "_kept_rewards")
-    _rebuilt = (*SoftmaxAlgorithm._rebuilt, *_kept)
+    _memory: KeptEpisodes
 
     def __init__(
-        self,
-        policy: str | type[BasePolicy] = "TilePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.1,
-        baseline: Baseline = "none",
-        value_step_size: float = 0.2,
-        **kwargs: Unpack[SoftmaxArguments],
+        self, *args: Any, baseline: Baseline = "none", value_step_size: float = 0.2, **kwargs: Any
     ) -> None:
         self.baseline = baseline
         self.value_step_size = value_step_size
-        self._lengths = np.zeros(0, dtype=np.int64)
-        self._kept_tiles = np.zeros((0, 0, 1), dtype=np.int64)
-        self._kept_actions = np.zeros((0, 0), dtype=np.int64)
-        self._kept_rewards = np.zeros((0, 0))
-        super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("baseline", self.baseline, Baseline)
-        check_at_least(0, settings_of(self, "value_step_size"))
+        super().__init__(*args, **kwargs)
 
     @property
     def values_states(self) -> bool:  # type: ignore[override]
         """Whether the policy has weights of state values."""
         return self.baseline == "value"
 
-    def _begin_episodes(self) -> None:
-        super()._begin_episodes()
-        self._lengths = np.zeros(self.n_envs, dtype=np.int64)
-        self._keep_up_to(FIRST_CAPACITY)
+    def _make_memory(self, capacity: int = FIRST_CAPACITY) -> KeptEpisodes:
+        n_envs, n_tilings = self.n_envs, self.policy.tiles.n_tilings
+        return KeptEpisodes(
+            self.policy.state_weights.numpy(),
+            np.zeros(n_envs, dtype=np.int64),
+            np.zeros((n_envs, capacity, n_tilings), dtype=np.int64),
+            np.zeros((n_envs, capacity), dtype=np.int64),
+            np.zeros((n_envs, capacity)),
+        )
+
+    def _memory_in_use(self) -> KeptEpisodes:
+        return self._memory._replace(values=self.policy.state_weights.numpy())
 
     def _keep_up_to(self, n_steps: int) -> None:
-        """Enlarge the buffers to ``n_steps`` steps of each episode, keeping stored steps."""
-        n_tilings, n_envs = self.policy.tiles.n_tilings, self.n_envs
-        shapes = (n_envs, n_steps, n_tilings), (n_envs, n_steps), (n_envs, n_steps)
-        for name, shape in zip(self._kept[1:], shapes, strict=True):
-            old = getattr(self, name)
-            new = np.zeros(shape, dtype=old.dtype)
-            if len(old) == n_envs:
-                new[:, : old.shape[1]] = old[:, :n_steps]
-            setattr(self, name, new)
+        """Enlarge the memory to ``n_steps`` steps of each episode, keeping stored steps."""
+        old, self._memory = self._memory, self._make_memory(n_steps)
+        self._memory.lengths[:] = old.lengths
+        for name in ("tiles", "actions", "rewards"):
+            stored = getattr(old, name)
+            getattr(self._memory, name)[:, : stored.shape[1]] = stored
 
     def check_compilable(self) -> None:
         super().check_compilable()
         assert self.env is not None
         limits = [time_limit(env) or 0 for env in getattr(self.env, "envs", [])]
-        longest = max(limits, default=0)
         if not all(limits):
             raise NotCompilable("episodes are kept, and there is no limit to their length")
-        if self.n_envs * longest * self.policy.tiles.n_tilings > MOST_KEPT:
-            raise NotCompilable(f"episodes are kept, and {longest:,} steps are too many for that")
-        if longest > self._kept_rewards.shape[1]:
+        longest = max(limits, default=0)
+        if longest > self._memory.rewards.shape[1]:
             self._keep_up_to(longest)
 
     def _learn_from(self, transitions: Transitions) -> None:
-        capacity = self._kept_rewards.shape[1]
-        if self._lengths.max() >= capacity:
+        capacity = self._memory.rewards.shape[1]
+        if self._memory.lengths.max() >= capacity:
             self._keep_up_to(2 * capacity)
         super()._learn_from(transitions)
-
-    def _memory_record(self) -> KeptEpisodes:
-        kept = (getattr(self, name) for name in self._kept)
-        return KeptEpisodes(self.policy.state_weights.numpy(), *kept)
-
-    def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
-        return (*super().made_from(rng), *(id(getattr(self, name)) for name in self._kept))

@@ -11,9 +11,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.masks import numbers_in
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, act, by_type, learn_from_step
+from rl_yardstick.agents.common.settings import FINITE, whole
+from rl_yardstick.agents.compiled.env_states import BEFORE, observe
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
-from rl_yardstick.agents.networks.network_worlds import BEFORE, observe
 from rl_yardstick.machine_code.compiling import called, kernel
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
@@ -133,16 +134,38 @@ def make_tiles(
         return tiles_between(np.zeros(1), np.ones(1), np.array([int(space.n)]), 1)
     assert isinstance(space, spaces.Box)
     (n_dims,) = space.shape
-    tilings = _whole_number("n_tilings", n_tilings)
-    given = _for_each("n_tiles", n_tiles, n_dims)
-    counts = np.array([_whole_number("n_tiles", count) for count in given], dtype=np.int64)
-    lows = _bounds("low", low, space.low)
-    highs = _bounds("high", high, space.high)
+    whole(1).check("n_tilings", n_tilings)
+    counts = _for_each("n_tiles", n_tiles, np.ones(n_dims))
+    for count in counts:
+        whole(1).check("n_tiles", int(count) if count == int(count) else count)
+    lows, highs = _for_each("low", low, space.low), _for_each("high", high, space.high)
     for d, (lower, upper) in enumerate(zip(lows, highs, strict=True)):
+        if not (abs(lower) < UNBOUNDED and abs(upper) < UNBOUNDED):
+            raise ValueError(
+                f"dimension {d} of the observations has no bounds: give low and high, a number or "
+                f"{n_dims} of them (null for the space's own bound)"
+            )
         if not lower < upper:
             raise ValueError(f"low must be below high, not {lower:g} and {upper:g} (dimension {d})")
-    _check_size(counts, tilings, n_actions)
-    return tiles_between(lows, counts / (highs - lows), counts, tilings)
+    n_weights = n_actions * n_tilings * math.prod(int(n) + (n_tilings > 1) for n in counts)
+    if n_weights > MOST_WEIGHTS:
+        raise ValueError(
+            f"n_tilings {n_tilings} and n_tiles {n_tiles} make {n_weights:,} weights for "
+            f"{n_actions} actions, more than {MOST_WEIGHTS:,}: lower them"
+        )
+    return tiles_between(lows, counts / (highs - lows), counts.astype(np.int64), int(n_tilings))
+
+
+def _for_each(name: str, given: Any, of_space: NDArray[Any]) -> Floats:
+    """A number for each dimension, the space's own where none is given."""
+    n_dims = len(of_space)
+    values = list(given) if isinstance(given, list | tuple | np.ndarray) else [given] * n_dims
+    if len(values) != n_dims:
+        raise ValueError(f"{name} must be a number or {n_dims} numbers, not {given}")
+    for value in values:
+        FINITE.check(name, value)
+    own = of_space.tolist()
+    return np.array([b if a is None else a for a, b in zip(values, own, strict=True)], np.float64)
 
 
 def vectors_of(space: spaces.Space[Any], observations: Any) -> Floats:
@@ -152,52 +175,6 @@ def vectors_of(space: spaces.Space[Any], observations: Any) -> Floats:
         assert space.shape is not None
         return given.reshape(-1, *space.shape).astype(np.float32).astype(np.float64)
     return numbers_in(space, given).reshape(-1, 1).astype(np.float64)
-
-
-def _check_size(counts: Ints, n_tilings: int, n_actions: int) -> None:
-    n_weights = math.prod(int(count) + (n_tilings > 1) for count in counts) * n_tilings * n_actions
-    if n_weights > MOST_WEIGHTS:
-        raise ValueError(
-            f"n_tilings {n_tilings} and n_tiles {counts.tolist()} make {n_weights:,} weights for "
-            f"{n_actions} actions, more than {MOST_WEIGHTS:,}: lower them"
-        )
-
-
-def _bounds(name: str, given: Any, of_space: NDArray[Any]) -> Floats:
-    """A bound for each dimension, the space's own where none is given."""
-    values = _for_each(name, given, len(of_space))
-    for d, value in enumerate(values):
-        if value is None:
-            if not abs(float(of_space[d])) < UNBOUNDED:
-                raise ValueError(
-                    f"dimension {d} of the observations has no bounds: give low and high, a number "
-                    f"or {len(of_space)} of them (null for the space's own bound)"
-                )
-            values[d] = float(of_space[d])
-        elif not _is_number(value):
-            raise ValueError(f"{name} must be finite numbers, not {value!r}")
-    return np.array(values, dtype=np.float64)
-
-
-def _for_each(name: str, given: Any, n: int) -> list[Any]:
-    """A value for each of n dimensions."""
-    values = list(given) if isinstance(given, list | tuple | np.ndarray) else [given] * n
-    if len(values) != n:
-        raise ValueError(f"{name} must be a number or {n} numbers, not {given}")
-    return values
-
-
-def _is_number(value: Any) -> bool:
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return is_number and math.isfinite(value)
-
-
-def _whole_number(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ValueError(f"{name} must be whole numbers, not {value!r}")
-    if not 1 <= value <= MOST_WEIGHTS:
-        raise ValueError(f"{name} must be from 1 to {MOST_WEIGHTS:,}, not {value:,}")
-    return int(value)
 
 
 # Agents whose values or preferences are sums of weights: one for each active tile and action.
@@ -300,16 +277,3 @@ def act_on_tiles(agent: LinearAgent, env: Any, progress: Any) -> None:
     if env.action == UNDECIDED:
         look(agent, env, BEFORE, agent.room.tiles)
         env.action = choose(agent, agent.room.tiles, progress)
-
-
-@kernel
-def act_in_all(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """`act` in each environment, for the interpreted loop."""
-    for i in range(len(envs)):
-        act(agent, envs[i], progress)
-
-
-@kernel
-def learn_from_all(agent: LinearAgent, envs: Any, progress: Any) -> None:
-    """`learn_from_step` of all environments, for the interpreted loop."""
-    learn_from_step(agent, envs, progress)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 import torch as th
@@ -26,12 +26,17 @@ from stable_baselines3.dqn.policies import DQNPolicy
 from torch import nn
 from torch.optim import Optimizer
 
-from rl_yardstick.agents.common.callbacks import EpisodeBudget, members, unknown_callbacks
-from rl_yardstick.agents.common.settings import check_option, full_signature
+from rl_yardstick.agents.common.callbacks import (
+    EpisodeBudget,
+    heeds_rollouts,
+    members,
+    unknown_callbacks,
+)
+from rl_yardstick.agents.common.settings import full_signature
+from rl_yardstick.agents.compiled.env_states import Numbers, OwnVectors, observed_world
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.worlds import NotCompilable
-from rl_yardstick.agents.networks.engine import NetworkEngine, RolloutEvents
-from rl_yardstick.agents.networks.network_worlds import Numbers, OwnVectors, network_world
+from rl_yardstick.agents.networks.engine import NetworkEngine
 from rl_yardstick.agents.networks.perceptron import Inputs, one_thread
 from rl_yardstick.agents.networks.playing import NetworkPlayer, network_player
 from rl_yardstick.agents.networks.torch_bridge import Network, check_optimizer, in_rows
@@ -265,7 +270,9 @@ class CompiledNetworks(BaseAlgorithm):
         cls.__signature__ = full_signature(cls)
 
     def __init__(self, *args: Any, engine: NetworkEngineChoice = "library", **kwargs: Any) -> None:
-        check_option("engine", engine, NetworkEngineChoice)
+        if engine not in get_args(NetworkEngineChoice):
+            engines = ", ".join(get_args(NetworkEngineChoice))
+            raise ValueError(f"engine must be one of {engines}, not {engine!r}")
         self.engine: NetworkEngineChoice = engine
         self.engine_in_use = ""
         self._training: Any = None
@@ -386,10 +393,13 @@ class CompiledNetworks(BaseAlgorithm):
         unknown = unknown_callbacks(CallbackList(_each(callback))) if known else ["a function"]
         if unknown:
             raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
+        waited_for = [type(each).__name__ for each in _each(callback) if heeds_rollouts(each)]
+        if waited_for:
+            raise NotCompilable(f"{', '.join(waited_for)} must be asked at each rollout")
         for schedule in self._schedules():
             compiled_schedule(schedule)
         assert self.env is not None
-        return network_world(self.env)
+        return observed_world(self.env)
 
     def _seen_in_python(self) -> Any:
         space = self.observation_space
@@ -414,7 +424,7 @@ class CompiledNetworks(BaseAlgorithm):
         callback.on_training_start(locals(), globals())
         if self.num_timesteps < total_timesteps:
             # An interrupted run restores its last state here.
-            RolloutEvents(self, callback).begin()
+            callback.on_rollout_start()
             with one_thread(), closing(self.training_kind(self, seen)) as training:
                 NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
         callback.on_training_end()

@@ -14,7 +14,9 @@ import numpy as np
 import torch as th
 
 from rl_yardstick.agents.common.exploration import first_best
-from rl_yardstick.agents.networks.network_worlds import BEFORE, look, move_on
+from rl_yardstick.agents.compiled.env_states import BEFORE, move_on
+from rl_yardstick.agents.compiled.references import Reference, address_of, call
+from rl_yardstick.agents.networks.network_worlds import look
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -26,13 +28,7 @@ from rl_yardstick.agents.networks.perceptron import (
     outputs_of,
     weights_of,
 )
-from rl_yardstick.agents.networks.torch_bridge import (
-    FlatTensors,
-    Network,
-    Reference,
-    address_of,
-    call,
-)
+from rl_yardstick.agents.networks.torch_bridge import FlatTensors, Network
 from rl_yardstick.machine_code.compiling import inlined, kernel
 
 # The best output must be ahead by this share of the sum of magnitudes (ten times the rounding error

@@ -19,20 +19,20 @@ from torch import nn
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.schedules import ScheduleRow, schedule_value
-from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
-from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
-from rl_yardstick.agents.compiled.worlds import SCHEDULE, NotCompilable
-from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
-from rl_yardstick.agents.networks.engine_setting import CompiledNetworks, Work, work_of
-from rl_yardstick.agents.networks.network_worlds import (
+from rl_yardstick.agents.compiled.env_states import (
     AFTER,
     BEFORE,
     Numbers,
-    look,
     move_on,
     observe,
-    show,
 )
+from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
+from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
+from rl_yardstick.agents.compiled.references import Reference, address_of, call
+from rl_yardstick.agents.compiled.worlds import SCHEDULE, NotCompilable
+from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
+from rl_yardstick.agents.networks.engine_setting import CompiledNetworks, Work, work_of
+from rl_yardstick.agents.networks.network_worlds import look, show
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -46,13 +46,7 @@ from rl_yardstick.agents.networks.perceptron import (
     make_outputs,
     n_parameters,
 )
-from rl_yardstick.agents.networks.torch_bridge import (
-    Network,
-    Reference,
-    address_of,
-    call,
-    network_of,
-)
+from rl_yardstick.agents.networks.torch_bridge import Network, network_of
 from rl_yardstick.machine_code.compiling import called, inlined, kernel
 from rl_yardstick.mdp.transition_model import Bools, Ints
 
@@ -337,7 +331,6 @@ RULES = np.dtype(
         ("target_kl", np.float64),  # infinite for none
         ("normalize_advantage", np.bool_),
         ("n_epochs", np.int64),
-        ("waits", np.bool_),  # for callbacks, before learning from a rollout
         ("clip_range", SCHEDULE),
         ("clip_range_vf", SCHEDULE),
     ],
@@ -491,8 +484,7 @@ class PolicyAgent(NamedTuple):
             for i in range(len(envs)):
                 learner.last_values[i] = np.float32(value_at(self, envs[i], BEFORE))
             call(self.estimate, learner, 0.0, 0.0)
-            if not learner.rules[0].waits:
-                call(self.train, learner, progress.remaining, progress.learning_rate)
+            call(self.train, learner, progress.remaining, progress.learning_rate)
 
 
 @inlined
@@ -549,15 +541,12 @@ def evaluate_rows(learner: Any, shown: Any, values: Singles) -> None:
 # The clip range for no clipping.
 UNBOUNDED = 1e30
 
-# The largest number of rollouts in a block if nothing is logged.
-_MOST_ROLLOUTS = 10_000
-
 
 class PolicyTraining(NetworkTraining):
     """PPO or A2C in training; the first of its networks gives action probabilities."""
 
-    # As in the library, a budget of episodes does not affect the schedules.
-    heeds_budgets = False
+    # It logs by rollouts; as in the library, a budget of episodes does not affect the schedules.
+    goes_by_episodes = False
 
     def __init__(self, agent: Any, seen: Any) -> None:
         super().__init__(agent, seen)
@@ -616,7 +605,6 @@ class PolicyTraining(NetworkTraining):
             target_kl=np.inf if target_kl is None else target_kl,
             normalize_advantage=agent.normalize_advantage,
             n_epochs=getattr(agent, "n_epochs", 1),
-            waits=self.waits,
             clip_range=tuple(bound(getattr(agent, "clip_range", None))),
             clip_range_vf=tuple(bound(getattr(agent, "clip_range_vf", None))),
         )
@@ -681,7 +669,7 @@ class PolicyTraining(NetworkTraining):
         agent.collected = int(place["step"])
         agent._last_episode_starts = self.held.starts.astype(bool)
         buffer = agent.rollout_buffer
-        buffer.full = self.is_rollout_over or (bool(place["n_rollouts"]) and place["step"] == 0)
+        buffer.full = bool(place["n_rollouts"]) and place["step"] == 0
         buffer.pos = len(buffer.rewards) if buffer.full else int(place["step"])
 
     def until_end(self, total_timesteps: int) -> int:
@@ -691,40 +679,19 @@ class PolicyTraining(NetworkTraining):
 
     def until_log(self, log_interval: int | None) -> Horizon:
         """The steps until the next log record."""
-        in_rollout = self.agent.n_steps - int(self.place["step"][0])
         if log_interval is None:
             return Horizon()
-        iteration = int(self.place["n_rollouts"][0]) + 1
-        # Searched for, because the interval of a resumed training continues its count.
-        for n_more in range(_MOST_ROLLOUTS):
-            if (iteration + n_more) % log_interval == 0:
-                break
-        # That log record is of the training before, which must end a block.
-        return Horizon(in_rollout + max(n_more - 1, 0) * self.agent.n_steps)
-
-    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
-        """Do nothing: this agent logs by rollouts."""
+        in_rollout = self.agent.n_steps - int(self.place["step"][0])
+        return Horizon(in_rollout + -(self.log_count + 1) % log_interval * self.agent.n_steps)
 
     @property
-    def is_rollout_over(self) -> bool:
-        """Whether a rollout is complete."""
-        return bool(self.place["step"][0] == self.agent.n_steps)
+    def log_count(self) -> int:
+        """The number of rollouts."""
+        return int(self.place["n_rollouts"][0])
 
-    def until_rollout_end(self) -> Horizon:
-        """The steps until the end of the rollout, if it waits for callbacks."""
-        in_rollout = self.agent.n_steps - int(self.place["step"][0])
-        return Horizon(in_rollout) if self.waits else Horizon()
-
-    def learn_from_rollout(self, remaining: float) -> None:
-        """Learn from the complete rollout; ``remaining`` is the share of the training left."""
-        train(self.learner, remaining, float(self.agent.lr_schedule(remaining)))
-
-    def before_training(self, log_interval: int | None) -> None:
-        """Log as the library does, at the end of a rollout and before learning from it."""
-        iteration = int(self.place["n_rollouts"][0]) + 1
-        ends = self.place["step"][0] >= self.agent.n_steps - 1
-        if ends and log_interval is not None and iteration % log_interval == 0:
-            self.agent.dump_logs(iteration)
+    def write_log(self) -> None:
+        """Write a log record."""
+        self.agent.dump_logs(self.log_count)
 
     def train(self) -> None:
         """Learn from the rollout, with environments in Python."""
@@ -847,10 +814,6 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
     def minibatch_size(self) -> int | None:
         """Steps in a minibatch; None for a whole rollout."""
         return getattr(self, "batch_size", None)
-
-    @property
-    def is_within_rollout(self) -> bool:
-        return self.collected > 0
 
     def _check_own(self) -> None:
         if type(self.rollout_buffer) is not RolloutBuffer:

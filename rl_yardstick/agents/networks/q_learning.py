@@ -15,7 +15,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from rl_yardstick.agents.common.callbacks import Horizon
 from rl_yardstick.agents.common.exploration import first_best
+from rl_yardstick.agents.compiled.env_states import (
+    AFTER,
+    BEFORE,
+    Numbers,
+    move_on,
+    observe,
+)
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
+from rl_yardstick.agents.compiled.references import Reference, address_of, call
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
 from rl_yardstick.agents.networks.engine_setting import (
@@ -24,15 +32,7 @@ from rl_yardstick.agents.networks.engine_setting import (
     Work,
     work_of,
 )
-from rl_yardstick.agents.networks.network_worlds import (
-    AFTER,
-    BEFORE,
-    Numbers,
-    look,
-    move_on,
-    observe,
-    show,
-)
+from rl_yardstick.agents.networks.network_worlds import look, show
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -45,13 +45,7 @@ from rl_yardstick.agents.networks.perceptron import (
     make_inputs,
     make_outputs,
 )
-from rl_yardstick.agents.networks.torch_bridge import (
-    Network,
-    Reference,
-    address_of,
-    call,
-    network_of,
-)
+from rl_yardstick.agents.networks.torch_bridge import Network, network_of
 from rl_yardstick.machine_code.compiling import called, inlined, kernel
 from rl_yardstick.mdp.transition_model import Floats, Ints
 
@@ -233,7 +227,6 @@ RULES = np.dtype(
         ("learning_starts", np.int64),
         ("train_freq", np.int64),
         ("counts_episodes", np.bool_),  # instead of steps, for train_freq
-        ("waits", np.bool_),  # for callbacks, before learning from a rollout
         ("gradient_steps", np.int64),
         ("target_interval", np.int64),  # in steps of all environments
         ("normalises_observations", np.bool_),  # by VecNormalize
@@ -260,8 +253,6 @@ PLACE = np.dtype(
         ("losses", np.float64),  # sum over the last training
         ("n_losses", np.int64),
         ("learning_rate", np.float64),  # of the last training
-        ("is_over", np.bool_),  # whether the rollout is complete, and the agent can learn from it
-        ("n_due", np.int64),  # the number of minibatches to learn from then
     ],
     align=True,
 )
@@ -341,9 +332,7 @@ class QAgent(NamedTuple):
             move_on(self.seen, envs[i])
         count_step(self, progress.exploration, n_done)
         n_updates = updates_due(self.learner, progress.num_timesteps, len(envs))
-        if self.learner.rules[0].waits:
-            self.learner.place[0].n_due = n_updates
-        elif n_updates > 0:
+        if n_updates > 0:
             call(self.train, self.learner, float(n_updates), progress.learning_rate)
 
 
@@ -407,8 +396,7 @@ def updates_due(learner: Any, num_timesteps: int, n_envs: int) -> int:
     """The number of minibatches to learn from now: 0 unless enough has been collected."""
     place, rules = learner.place[0], learner.rules[0]
     collected = place.collected_episodes if rules.counts_episodes else place.collected
-    place.is_over = collected >= rules.train_freq
-    if not place.is_over:
+    if collected < rules.train_freq:
         return 0
     n_steps = place.collected * n_envs
     place.collected = place.collected_episodes = 0
@@ -424,7 +412,7 @@ _TARGETS = {"double_q": DOUBLE, "online": ONLINE_NETWORK, "target": TARGET_NETWO
 class QTraining(NetworkTraining):
     """DQN, double DQN or deep Q-learning in training."""
 
-    heeds_budgets = True  # a budget of episodes affects the schedules
+    goes_by_episodes = True  # in its log; and a budget of episodes affects the schedules
 
     def __init__(self, agent: Any, seen: Any) -> None:
         super().__init__(agent, seen)
@@ -481,7 +469,6 @@ class QTraining(NetworkTraining):
             learning_starts=agent.learning_starts,
             train_freq=agent.train_freq.frequency,
             counts_episodes=agent.train_freq.unit == TrainFrequencyUnit.EPISODE,
-            waits=self.waits,
             gradient_steps=agent.gradient_steps,
             target_interval=max(agent.target_update_interval // agent.n_envs, 1),
             **normalising_rules(agent.get_vec_normalize_env()),
@@ -562,14 +549,14 @@ class QTraining(NetworkTraining):
             return Horizon()
         return Horizon(episodes=log_interval - self.agent._episode_num % log_interval)
 
-    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
-        """Count episodes that have ended, and log if it is due."""
-        agent = self.agent
-        agent.logger.record("rollout/exploration_rate", agent.exploration_rate)
-        for _ in range(n_episodes):
-            agent._episode_num += 1
-            if log_interval is not None and agent._episode_num % log_interval == 0:
-                agent.dump_logs()
+    @property
+    def log_count(self) -> int:
+        """The number of episodes."""
+        return int(self.agent._episode_num)
+
+    def write_log(self) -> None:
+        """Write a log record."""
+        self.agent.dump_logs()
 
     def act(self, learning_starts: int) -> Ints:
         """Actions for the agent's present observations, with environments in Python."""
@@ -591,29 +578,6 @@ class QTraining(NetworkTraining):
         train(self.learner, float(n_updates), learning_rate)
         agent._n_updates += n_updates
         self._record_training()
-
-    def before_training(self, log_interval: int | None) -> None:
-        """Do nothing: this agent logs by episodes."""
-
-    @property
-    def is_rollout_over(self) -> bool:
-        """Whether a rollout is complete, even if no minibatches are due yet."""
-        return bool(self.place["is_over"][0])
-
-    def until_rollout_end(self) -> Horizon:
-        """The steps or episodes until the end of the rollout, if it waits for callbacks."""
-        place, rules = self.place[0], self.held.rules[0]
-        if not self.waits:
-            return Horizon()
-        if rules["counts_episodes"]:
-            return Horizon(episodes=int(rules["train_freq"] - place["collected_episodes"]))
-        return Horizon(int(rules["train_freq"] - place["collected"]))
-
-    def learn_from_rollout(self, remaining: float) -> None:
-        """Learn from the complete rollout; ``remaining`` is the share of the training left."""
-        n_due, self.place["is_over"] = int(self.place["n_due"][0]), False
-        if n_due:
-            train(self.learner, float(n_due), float(self.agent.lr_schedule(remaining)))
 
     def record(self) -> None:
         """Record the last training in the agent's logger."""
@@ -659,10 +623,6 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.collected = (0, 0)  # steps and episodes since the last training
         super().__init__(*args, **kwargs)
-
-    @property
-    def is_within_rollout(self) -> bool:
-        return self.collected != (0, 0)
 
     def _check_own(self) -> None:
         if getattr(self, "mask_actions", False):

@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch as th
-from numba import typeof as _typeof
-from numba.core import cgutils, types
-from numba.core.typing.templates import AttributeTemplate
-from numba.extending import (
-    NativeValue,
-    infer_getattr,
-    intrinsic,
-    lower_getattr_generic,
-    models,
-    register_model,
-    typeof_impl,
-    unbox,
-)
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from torch import nn
 
@@ -40,7 +27,6 @@ from rl_yardstick.agents.networks.perceptron import (
     make_layers,
     n_parameters,
 )
-from rl_yardstick.machine_code.compiling import internal
 
 _ACTIVATIONS: dict[type[nn.Module], int] = {nn.Identity: IDENTITY, nn.ReLU: RELU, nn.Tanh: TANH}
 
@@ -107,9 +93,6 @@ def check_optimizer(optimizer: th.optim.Optimizer) -> None:
 # the parameters at any time. Afterwards the tensors have their own memory again, in PyTorch's
 # layout.
 
-# The settings of an optimizer's group that compiled steps use.
-_SETTINGS = ("betas", "alpha", "eps", "weight_decay", "decoupled_weight_decay")
-
 
 class FlatTensors:
     """A flat vector of networks' parameters, with a view of it for each parameter."""
@@ -142,27 +125,11 @@ class SharedOptimizer:
     """The state of a policy's optimizer for the networks' parameters, in flat vectors."""
 
     def __init__(self, policy: Any, networks: Sequence[Network]) -> None:
-        self.policy = policy
-        self.networks = networks
         self.parameters = [p for network in networks for p in network.parameters]
-        self._share()
-
-    def current(self) -> Optimizer:
-        """The optimizer for compiled code; a new one if it has been changed or replaced.
-
-        Raises NotCompilable if compiled code does not support the new one.
-        """
-        if self._made_from() != self.made_from:
-            self.give_back()
-            check_optimizer(self.policy.optimizer)
-            self._share()
-        return self.compiled
-
-    def _share(self) -> None:
-        self.optimizer = self.policy.optimizer
+        self.optimizer = policy.optimizer
         known: Any = self.optimizer.state
         kind, names = _kind(self.optimizer)
-        means = {name: FlatTensors(self.networks) for name in names}
+        means = {name: FlatTensors(networks) for name in names}
         n_steps = np.zeros(1, np.float32)
         if self.parameters[0] in known:
             n_steps[0] = float(known[self.parameters[0]]["step"])
@@ -187,21 +154,6 @@ class SharedOptimizer:
             vectors[-1],
             n_steps,
         )
-        self.made_from = self._made_from()
-
-    def _made_from(self) -> tuple[Any, ...]:
-        """A key that changes when another state is loaded, or another optimizer is used."""
-        optimizer = self.policy.optimizer
-        group = optimizer.param_groups[0]
-        settings = [group.get(name) for name in _SETTINGS]
-        states = [optimizer.state.get(parameter, {}) for parameter in self.parameters]
-        memory = [
-            value.data_ptr() if isinstance(value, th.Tensor) else value
-            for state in states
-            for value in state.values()
-        ]
-        trained = [parameter.requires_grad for parameter in self.parameters]
-        return id(optimizer), settings, memory, trained
 
     def give_back(self) -> None:
         """Give its state its own memory again; without a step, it has no state."""
@@ -244,140 +196,3 @@ def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:
     if isinstance(optimizer, RMSpropTFLike):
         return RMSPROP_TENSORFLOW, ("square_avg",)
     return RMSPROP, ("square_avg",)
-
-
-# Named tuples and functions that compiled functions get by address.
-#
-# LLVM optimises a function again in each of its callers, and Numba passes a named tuple as all the
-# numbers that describe its arrays. With a learner of thirty arrays, four calls below the loop,
-# compiling takes almost a minute. A reference is one address: compiled functions read
-# ``reference.name`` from there, as from the tuple. Learning functions are called by address, too,
-# so that they are compiled separately, and once for all environments.
-ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
-
-# Numba ships no types.
-typeof: Any = _typeof
-_typed_unbox: Any = unbox
-_typed_getattr: Any = lower_getattr_generic
-
-# All parts of a tuple consist of words of this many bytes.
-WORD = 8
-
-
-class Reference:
-    """A named tuple of arrays and numbers, to pass by address."""
-
-    def __init__(self, held: Any) -> None:
-        self.held = held  # the tuple; its arrays live as long as the reference
-        self._words = np.array(list(_words(held)), dtype=np.int64)
-        self.address = int(self._words.ctypes.data)  # for compiled functions
-        # Stored, because `typeof` takes longer than most functions that get a reference.
-        self.kind = ReferenceType(typeof(held))  # Numba's type of the reference
-
-    def hold(self, held: Any) -> None:
-        """Refer to another tuple of the same kind, at the same address."""
-        self.held = held
-        self._words[:] = list(_words(held))
-
-
-def _words(value: Any) -> Iterator[int]:
-    """The words of a value in Numba's memory layout."""
-    if isinstance(value, tuple):
-        for part in value:
-            yield from _words(part)
-    elif isinstance(value, np.ndarray):
-        # The first two words are zero: references are not counted here.
-        yield from (0, 0, value.size, value.itemsize, value.ctypes.data)
-        yield from value.shape
-        yield from value.strides
-    elif isinstance(value, float):
-        yield int(np.float64(value).view(np.int64))
-    elif isinstance(value, int | np.uintp) and not isinstance(value, bool):
-        yield int(value)
-    else:
-        raise TypeError(f"a reference cannot hold {type(value).__name__}")
-
-
-def _n_words(kind: Any) -> int:
-    """The number of words of a value of this type in Numba's memory layout."""
-    if hasattr(kind, "instance_class"):
-        return sum(_n_words(part) for part in kind.types)
-    return 5 + 2 * int(kind.ndim) if hasattr(kind, "ndim") else 1
-
-
-class ReferenceType(types.Type):
-    """The type of a reference."""
-
-    def __init__(self, content: Any) -> None:
-        self.content = content
-        self.types = (content,)  # for code that inspects the parts of types
-        super().__init__(name=f"Reference({content})")
-
-
-@typeof_impl.register(Reference)
-def _type_of(value: Reference, context: Any) -> ReferenceType:
-    return value.kind
-
-
-register_model(ReferenceType)(models.OpaqueModel)
-
-
-@_typed_unbox(ReferenceType)  # type: ignore[untyped-decorator]
-def _unbox(kind: Any, value: Any, c: Any) -> Any:
-    number = c.pyapi.object_getattr_string(value, "address")
-    address = c.pyapi.long_as_ulonglong(number)
-    c.pyapi.decref(number)
-    native: Any = NativeValue
-    return native(c.builder.inttoptr(address, cgutils.voidptr_t))
-
-
-@infer_getattr
-class _Attributes(AttributeTemplate):
-    key = ReferenceType
-
-    def generic_resolve(self, kind: Any, name: str) -> Any:  # type: ignore[override]
-        fields = kind.content.fields
-        return kind.content.types[fields.index(name)] if name in fields else None
-
-
-@_typed_getattr(ReferenceType)  # type: ignore[untyped-decorator]
-def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any:
-    fields, parts = kind.content.fields, kind.content.types
-    index = fields.index(name)
-    offset = WORD * sum(_n_words(part) for part in parts[:index])
-    model = context.data_model_manager[parts[index]]
-    pointer_add: Any = cgutils.pointer_add
-    place = pointer_add(builder, address, offset, model.get_data_type().as_pointer())
-    return model.load_from_data_pointer(builder, place)
-
-
-def address_of(function: Any, reference: Reference) -> np.uintp:
-    """The address of a compiled function's machine code, for `call`."""
-    arguments = reference.kind, types.float64, types.float64
-    code = function.get_compile_result(types.int64(*arguments))
-    name = code.fndesc.llvm_cfunc_wrapper_name
-    return np.uintp(code.library.get_pointer_to_function(name))
-
-
-@intrinsic
-def _call(typing_context: Any, address: Any, reference: Any, first: Any, second: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        address, reference, *numbers = arguments
-        if isinstance(reference.type, ir.IntType):
-            reference = builder.inttoptr(reference, cgutils.voidptr_t)
-        passed = [reference, *numbers]
-        kind = ir.FunctionType(ir.IntType(64), [value.type for value in passed])
-        return builder.call(builder.inttoptr(address, kind.as_pointer()), passed)
-
-    return types.int64(types.uintp, reference, types.float64, types.float64), build
-
-
-# Numba removes the first argument, which type checkers cannot see.
-_call_address: Any = _call
-
-
-@internal
-def call(address: Any, reference: Any, first: float, second: float) -> int:
-    """Call the function at an address of `address_of`, with a reference or its address."""
-    result: int = _call_address(address, reference, first, second)
-    return result

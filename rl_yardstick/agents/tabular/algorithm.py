@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Unpack, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 import torch as th
@@ -28,19 +28,16 @@ from rl_yardstick.agents.common.masks import (
 )
 from rl_yardstick.agents.common.schedules import epsilon_schedule
 from rl_yardstick.agents.common.settings import (
-    CommonArguments,
+    EPSILONS,
+    POSITIVE,
+    SHARE,
     ExplorationDecay,
     TieBreaking,
-    check_above_zero,
-    check_epsilons,
-    check_option,
-    check_share,
     check_space,
-    settings_of,
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice, choose_engine
 from rl_yardstick.agents.compiled.generators import handles_of
-from rl_yardstick.agents.compiled.greedy_play import Explorer, Plan
+from rl_yardstick.agents.compiled.greedy_play import Plan
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.worlds import NotCompilable
 from rl_yardstick.agents.tabular.policy import QTablePolicy
@@ -49,9 +46,7 @@ from rl_yardstick.agents.tabular.updates import (
     Room,
     Tables,
     TabularAgent,
-    act_in_all,
     act_on_values,
-    learn_from_all,
     no_commitment,
     td_learning,
 )
@@ -63,60 +58,24 @@ ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
 class TableWorkspace(Workspace):
-    """A workspace with an agent, whose tables are changed in place.
+    """A workspace of an agent on tables."""
 
-    ``masks`` has the allowed actions at each observation; without rows all actions are allowed.
-    """
-
-    def __init__(self, agent: TabularAgent, masks: Bools, rng: np.random.Generator, n: int) -> None:
-        super().__init__(n)
-        self.rng = rng  # kept here, because its handle does not keep it alive
-        # The arguments of `act_in_all` and `learn_from_all`, in order.
-        self.arrays = (
-            np.array([agent.settings]),
-            self.envs,
-            self.progress,
-            *agent.tables[:2],
-            masks,
-            *agent.room,
-            handles_of([rng]),
-            agent.memory,
-        )
-        self._chosen: Ints | None = None
-
-    def _check(self, field: str, outside: int) -> None:
-        """Raise ValueError for an observation without a row, unless ``outside`` is -1."""
-        if outside >= 0:
-            n_states = self.arrays[3].shape[1]
-            obs = self.fields[field][outside]
-            raise ValueError(f"observation {obs} is not in Discrete({n_states}), the agent's space")
+    _chosen: Ints | None = None
 
     def act(self, obs: Any) -> Ints:
-        """An action for each observation: the one committed to, if there is one."""
-        fields = self.fields
-        fields["obs"][:] = obs
-        self._check("obs", act_in_all(*self.arrays))
-        actions: Ints = fields["action"].copy()
-        self._chosen = actions
-        return actions
+        """An action for each observation."""
+        self.fields["obs"][:] = obs
+        self._chosen = self.choose()
+        return self._chosen
 
     def learn(self, transitions: Transitions) -> float:
         """Learn from a step of each environment, and return the mean absolute TD error."""
-        fields = self.fields
         if transitions.actions is not self._chosen:
             # After `act`, its observations and actions are in the records already.
-            fields["obs"][:] = transitions.obs
-            fields["action"][:] = transitions.actions
-        fields["next_obs"][:] = transitions.next_obs
-        self.take_outcomes(transitions)
-        self._check("next_obs", learn_from_all(*self.arrays))
-        return float(self.mean_td_error[0])
-
-
-class MaskedArguments(CommonArguments, total=False):
-    """Arguments that constructors of tabular agents pass on; see `TabularAlgorithm`."""
-
-    mask_actions: bool
+            self.fields["obs"][:] = transitions.obs
+            self.fields["action"][:] = transitions.actions
+        self.fields["next_obs"][:] = transitions.next_obs
+        return self.learn_from(transitions)
 
 
 class TabularAlgorithm(WorkspaceAlgorithm):
@@ -169,6 +128,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     policy: QTablePolicy
     n_tables: ClassVar[int] = 1
     parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
+    ranges = {"gamma": SHARE, "temperature": POSITIVE, **EPSILONS}  # noqa: RUF012
 
     # Called by the training loops; each algorithm defines `next_value`.
     act = act_on_values
@@ -177,7 +137,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     _rebuilt = (
         *WorkspaceAlgorithm._rebuilt,
-        *("masks_are_known", "_infos", "_memory", "last_steps"),
+        *("masks_are_known", "_infos", "last_steps"),
     )
     excluded_from_states = ("last_steps",)
 
@@ -201,7 +161,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         engine: EngineChoice = "auto",
         policy_kwargs: dict[str, Any] | None = None,
         mask_actions: bool = False,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Any,
     ) -> None:
         self.gamma = gamma
         self.exploration = exploration
@@ -219,7 +179,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self.masks_are_known = False
         self.last_steps: NDArray[np.void] | None = None
         self._infos: list[dict[str, Any]] = []
-        self._memory: tuple[Any, ...] = ()
         super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
@@ -227,20 +186,12 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             check_masks_exist(self.env)
         check_space(self, "observations", self.observation_space)
         check_space(self, "actions", self.action_space)
-        check_option("exploration", self.exploration, ExplorationStrategy)
-        check_option("engine", self.engine, EngineChoice)
-        check_epsilons(self)
-        check_share(settings_of(self, "gamma"))
-        check_above_zero(settings_of(self, "temperature"))
 
-    def _make_policy(self) -> QTablePolicy:
-        policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
-            n_tables=self.n_tables,
-            **self.policy_kwargs,
-        )
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"n_tables": self.n_tables, **self.policy_kwargs}
+
+    def _make_policy(self) -> BasePolicy:
+        policy = cast(QTablePolicy, super()._make_policy())
         if self.mask_actions:
             policy.keep_masks()
         noise = self.rng.standard_normal(policy.q_tables.shape)
@@ -261,10 +212,8 @@ class TabularAlgorithm(WorkspaceAlgorithm):
 
     # Arguments of compiled functions.
 
-    def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
+    def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> TabularAgent:
         """The agent for compiled functions, with its tables in the memory of its policy."""
-        self._check_tables()
-        self._check_memory()
         policy = self.policy
         values, counts = policy.q_tables.numpy(), policy.visit_counts.numpy()
         n_actions = values.shape[2]
@@ -279,48 +228,10 @@ class TabularAlgorithm(WorkspaceAlgorithm):
             self._memory_in_use(),
         )
 
-    def _check_tables(self) -> None:
-        """Raise ValueError for tables of a wrong shape, which compiled code does not check."""
-        sizes = cast(Any, (self.observation_space, self.action_space))
-        shape = (self.n_tables, *(int(space.n) for space in sizes))
-        found = tuple(self.policy.q_tables.shape), tuple(self.policy.visit_counts.shape)
-        if found != (shape, shape) or self.n_tables not in (1, 2):
-            raise ValueError(f"tables must be 1 or 2, of shape {shape}, not {found[0]}")
-        if self.mask_actions and self.policy.masks.shape != shape[1:]:
-            raise ValueError(f"masks must be of shape {shape[1:]}, not {self.policy.masks.shape}")
-        if self.strategy not in STRATEGIES.values():
-            raise ValueError(f"unknown exploration strategy {self.strategy}")
-
-    def _make_memory(self) -> tuple[Any, ...]:
-        """An empty memory for ``n_envs`` environments."""
-        return ()
-
-    def _memory_in_use(self) -> tuple[Any, ...]:
-        """The memory for compiled functions; a subclass may add to it."""
-        return self._memory
-
-    def _check_memory(self) -> None:
-        """Raise ValueError for a memory of wrong shapes, which compiled code does not check."""
-        expected: Any = self._make_memory()
-        if type(self._memory) is not type(expected):
-            raise ValueError(f"the agent's memory must be a {type(expected).__name__}")
-        for name, found, like in zip(
-            getattr(expected, "_fields", ()), self._memory, expected, strict=True
-        ):
-            if (found.dtype, found.shape) != (like.dtype, like.shape):
-                raise ValueError(
-                    f"the agent's memory was made for other settings: {name} must be of shape "
-                    f"{like.shape} and {like.dtype}, not {found.shape} and {found.dtype}"
-                )
-
     def greedy_player(self, seen: Any) -> Plan:
         """A player with the greedy actions of `predict` on compiled environments."""
         numbers = np.arange(self.policy.q_tables.shape[1])
         return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
-
-    def exploring_player(self, seen: Any) -> Explorer:
-        """A player with the exploring actions of `predict`, drawn from the same generator."""
-        return Explorer(self.compiled_agent(self.predict_rng), self.progress())
 
     # Training.
 
@@ -339,10 +250,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         if self.asks_for_masks:
             raise NotCompilable("the action masks are not known of all states")
 
-    def _begin_episodes(self) -> None:
-        super()._begin_episodes()
-        self._memory = self._make_memory()
-
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
         engine = choose_engine(self, callback, log_interval)
         if engine is not None:
@@ -360,7 +267,8 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self.last_steps = envs
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> TableWorkspace:
-        return TableWorkspace(self.compiled_agent(rng), self.policy.masks, rng, n)
+        n_states = self.policy.q_tables.shape[1]
+        return TableWorkspace(self.compiled_agent(rng), rng, n, n_numbers=n_states)
 
     def _choose_actions(self) -> Ints:
         if self.asks_for_masks:
@@ -460,11 +368,3 @@ class TabularAlgorithm(WorkspaceAlgorithm):
     def _record_training(self) -> None:
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
         super()._record_training()
-
-    def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
-        """As in the base class, but Gaussian noise decreases with the episodes."""
-        columns = super().log_columns(records)
-        if self.exploration == "gaussian_noise":
-            rates = records["exploration"] / (records["episodes"] + 1)
-            columns["rollout/exploration_rate"] = rates.tolist()
-        return columns

@@ -8,17 +8,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import Schedule
 
-from rl_yardstick.agents.common.settings import (
-    check_at_least,
-    check_finite,
-    check_whole,
-    settings_of,
-    step_size,
-)
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
 from rl_yardstick.agents.compiled.generators import next_uniform
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
@@ -27,7 +19,6 @@ from rl_yardstick.agents.tabular.policy import QTablePolicy
 from rl_yardstick.agents.tabular.updates import TabularAgent, action_at, best_value, room_at, update
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
-from rl_yardstick.safe_files.files import MAX_ARCHIVE_BYTES
 
 # The learnt model of the environment: the last outcomes of each pair of state and action.
 #
@@ -72,54 +63,21 @@ def add_pair(model: Any, obs: int, action: int) -> None:
 
 # The policy of tabular agents that learn a model, which their model file contains, too.
 
-# The largest size of the arrays, so that a model file can be read again.
-MOST_BYTES = MAX_ARCHIVE_BYTES * 15 // 16
-
 
 class ModelPolicy(QTablePolicy):
     """Greedy in a table, with a learnt model of the environment beside it."""
 
     model_type: ClassVar[Any] = LearntModel  # the model's NamedTuple of arrays
 
-    def __init__(
-        self,
-        observation_space: spaces.Discrete,
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        n_tables: int = 1,
-        outcomes_kept: int = 1,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, lr_schedule, n_tables, **kwargs)
-        self.outcomes_kept = 0
-        self.keep_outcomes(outcomes_kept)
+    def __init__(self, *args: Any, outcomes_kept: int = 1, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.outcomes_kept = outcomes_kept
+        n_states, n_actions = self.visit_counts.shape[1:]
+        for name, array in self._nothing_learnt(n_states, n_actions, outcomes_kept).items():
+            self.register_buffer(f"model_{name}", th.from_numpy(array))
 
     def _sizes(self) -> dict[str, Any]:
         return {**super()._sizes(), "outcomes_kept": self.outcomes_kept}
-
-    def keep_outcomes(self, n: int) -> None:
-        """Allocate the model for ``n`` outcomes of each pair; if n changes, it starts empty."""
-        most = self._most_outcomes()
-        if n > most:
-            raise ValueError(
-                f"{n} outcomes of {self.visit_counts[0].numel()} pairs of state and action are too "
-                f"many to keep: at most {most} of each"
-            )
-        if n != self.outcomes_kept:
-            self.outcomes_kept = n
-            n_states, n_actions = self.visit_counts.shape[1:]
-            for name, array in self._nothing_learnt(n_states, n_actions, n).items():
-                self.register_buffer(f"model_{name}", th.from_numpy(array))
-
-    def _most_outcomes(self) -> int:
-        """The largest number of outcomes of each pair that fits into a model file."""
-        n_states, n_actions = self.visit_counts.shape[1:]
-        with_one, with_two = (
-            n_states * sum(a.nbytes for a in self._nothing_learnt(1, n_actions, n).values())
-            for n in (1, 2)
-        )
-        tables = self.q_tables.nbytes + self.visit_counts.nbytes
-        return max(1 + int((MOST_BYTES - tables - with_one) // (with_two - with_one)), 0)
 
     def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
         """The arrays of an empty model, by name."""
@@ -161,18 +119,6 @@ class ModelPolicy(QTablePolicy):
         self.check_places()
         return result
 
-    def check_shapes(self) -> None:
-        """Raise ValueError for arrays of wrong shapes, which compiled code does not check."""
-        n_states, n_actions = self.visit_counts.shape[1:]
-        expected = self._nothing_learnt(n_states, n_actions, self.outcomes_kept)
-        for name, like in expected.items():
-            found = getattr(self.model, name)
-            if (found.dtype, found.shape) != (like.dtype, like.shape):
-                raise ValueError(
-                    f"model_{name} must be of shape {like.shape} and {like.dtype}, not "
-                    f"{found.shape} and {found.dtype}"
-                )
-
     def check_places(self) -> None:
         """Raise ValueError for a model with indices out of range."""
         n_states, n_actions = self.visit_counts.shape[1:]
@@ -184,8 +130,6 @@ class ModelPolicy(QTablePolicy):
 
 # The base of tabular agents that learn a model of their environment.
 
-MOST_PLANNING = 10**6  # updates after one step
-
 
 class ModelKeeper(TabularAlgorithm):
     """Passes the model in its policy to compiled functions as ``agent.memory``."""
@@ -194,18 +138,11 @@ class ModelKeeper(TabularAlgorithm):
     policy: ModelPolicy
     outcomes_kept: int = 1  # number of outcomes in the model for each pair of state and action
 
-    def _make_policy(self) -> QTablePolicy:
-        policy = super()._make_policy()
-        assert isinstance(policy, ModelPolicy)
-        policy.keep_outcomes(self.outcomes_kept)
-        return policy
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {**super()._policy_arguments(), "outcomes_kept": self.outcomes_kept}
 
     def _memory_in_use(self) -> Any:
         return self.policy.model
-
-    def _check_tables(self) -> None:
-        super()._check_tables()
-        self.policy.check_shapes()
 
 
 # Dyna-Q.
@@ -295,6 +232,7 @@ class DynaQ(ModelKeeper, QLearning):
     """
 
     parameters = {"planning_steps": np.int64}  # noqa: RUF012
+    ranges = {"planning_steps": whole(0), "outcomes_kept": whole(1)}  # noqa: RUF012
     learn_from_step = learn_and_plan
     remember = remember_outcome
     imagined_reward = remembered_reward
@@ -305,11 +243,6 @@ class DynaQ(ModelKeeper, QLearning):
         self.planning_steps = planning_steps
         self.outcomes_kept = outcomes_kept
         super().__init__(*args, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
-        check_whole(1, settings_of(self, "outcomes_kept"))
 
 
 # Dyna-Q+.
@@ -382,14 +315,10 @@ class DynaQPlus(DynaQ):
 
     policy_aliases = {"QTablePolicy": DatedModelPolicy}  # noqa: RUF012
     parameters = {"kappa": np.float64}  # noqa: RUF012
+    ranges = {"kappa": NOT_NEGATIVE}  # noqa: RUF012
     remember = remember_outcome_and_time
     imagined_reward = reward_for_trying
 
     def __init__(self, *args: Any, kappa: float = 0.001, **kwargs: Any) -> None:
         self.kappa = kappa
         super().__init__(*args, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_at_least(0.0, settings_of(self, "kappa"))
-        check_finite(settings_of(self, "kappa"))

@@ -6,16 +6,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from rl_yardstick.agents.common.exploration import greedy_action, highest_value
-from rl_yardstick.agents.common.settings import check_whole, settings_of
+from rl_yardstick.agents.common.settings import whole
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.tabular.n_step import (
-    MOST_STEPS,
     NOTHING_LEARNT,
     EpisodicAlgorithm,
     place_of,
@@ -45,6 +42,8 @@ class EpisodeRecords(NamedTuple):
     rewards: Floats  # shape (n_envs, longest_episode)
     probabilities: Floats  # of the actions, by the policy, shape (n_envs, longest_episode)
     lengths: Ints  # number of steps so far, shape (n_envs,)
+    # Of each entry: its first visit (scratch), shape (S, A); or its weight, shape (1, S, A).
+    of_entries: Any
 
 
 @by_type
@@ -76,35 +75,33 @@ class RecordAlgorithm(EpisodicAlgorithm):
     treated as truncated after ``longest_episode`` steps, and its rest as another episode.
 
     Args:
-        policy: as in `TabularAlgorithm`.
-        env: as in `TabularAlgorithm`.
+        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`; the textbook's is ``"sample_average"``.
         longest_episode: maximal number of stored steps of an episode, at least 1.
         kwargs: as in `TabularAlgorithm`.
     """
 
     learn_in = record_and_learn
+    _memory: EpisodeRecords
+    ranges = {"longest_episode": whole(1)}  # noqa: RUF012
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "QTablePolicy",
-        env: GymEnv | str | None = None,
+        *args: Any,
         learning_rate: StepSize = "sample_average",
         longest_episode: int = 10_000,
         **kwargs: Any,
     ) -> None:
         self.longest_episode = longest_episode
-        super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_whole(1, settings_of(self, "longest_episode"), MOST_STEPS // self.n_envs)
+        super().__init__(*args, learning_rate=learning_rate, **kwargs)
 
     def _make_memory(self) -> EpisodeRecords:
         shape = (self.n_envs, self.longest_episode)
         states, actions = (np.zeros(shape, dtype=np.int64) for _ in range(2))
         lengths = np.zeros(self.n_envs, dtype=np.int64)
-        return EpisodeRecords(states, actions, np.zeros(shape), np.zeros(shape), lengths)
+        return EpisodeRecords(
+            states, actions, np.zeros(shape), np.zeros(shape), lengths, np.zeros(0)
+        )
 
 
 # The policy of off-policy Monte Carlo control: action values, and the sums of their weights.
@@ -116,29 +113,12 @@ class ImportanceTablePolicy(QTablePolicy):
     # Sum of the weights of the returns of each entry, float64 of shape (T, S, A).
     weights: th.Tensor
 
-    def __init__(
-        self,
-        observation_space: spaces.Discrete,
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self.register_buffer("weights", th.zeros_like(self.q_tables))
 
 
 # On-policy Monte Carlo control.
-
-
-class VisitRecords(NamedTuple):
-    """The fields of `EpisodeRecords`, and scratch for each entry's first visit, shape (S, A)."""
-
-    states: Ints
-    actions: Ints
-    rewards: Floats
-    probabilities: Floats
-    lengths: Ints
-    first_visits: Ints
 
 
 @inlined
@@ -155,7 +135,7 @@ def note_first_visits(agent: TabularAgent, i: int, length: int) -> None:
     """Fill in the step of each entry's first visit in the episode."""
     records = agent.memory
     for k in range(length - 1, -1, -1):
-        records.first_visits[records.states[i, k], records.actions[i, k]] = k
+        records.of_entries[records.states[i, k], records.actions[i, k]] = k
 
 
 @inlined
@@ -168,7 +148,7 @@ def learn_from_visits(agent: TabularAgent, env: Any, progress: Any, i: int, leng
     for k in range(length - 1, -1, -1):
         state, action = records.states[i, k], records.actions[i, k]
         later = records.rewards[i, k] + agent.settings.gamma * later
-        if agent.settings.every_visit or records.first_visits[state, action] == k:
+        if agent.settings.every_visit or records.of_entries[state, action] == k:
             total_error += abs(move_towards(agent, progress, 0, state, action, later))
             n_learnt += 1
     return total_error / n_learnt
@@ -193,26 +173,15 @@ class MonteCarlo(RecordAlgorithm):
         self.every_visit = every_visit
         super().__init__(*args, **kwargs)
 
-    def _memory_in_use(self) -> VisitRecords:
+    def _memory_in_use(self) -> EpisodeRecords:
         room = np.empty(self.policy.q_tables.shape[1:], dtype=np.int64)
-        return VisitRecords._make((*self._memory, room))
+        return self._memory._replace(of_entries=room)
 
 
 # Off-policy Monte Carlo control.
 
 # With larger weights their sum could become infinite.
 LARGEST_WEIGHT = 1e150
-
-
-class WeightedRecords(NamedTuple):
-    """The fields of `EpisodeRecords`, and the weights of the policy, shape (1, S, A)."""
-
-    states: Ints
-    actions: Ints
-    rewards: Floats
-    probabilities: Floats
-    lengths: Ints
-    weights: Floats
 
 
 @inlined
@@ -239,10 +208,10 @@ def learn_by_importance(agent: TabularAgent, env: Any, progress: Any, i: int, le
     for k in range(length - 1, -1, -1):
         state, action = records.states[i, k], records.actions[i, k]
         later = records.rewards[i, k] + agent.settings.gamma * later
-        records.weights[0, state, action] += weight
+        records.of_entries[0, state, action] += weight
         agent.tables.visit_counts[0, state, action] += 1
         error = later - values[0, state, action]
-        values[0, state, action] += weight / records.weights[0, state, action] * error
+        values[0, state, action] += weight / records.of_entries[0, state, action] * error
         total_error += abs(error)
         n_learnt += 1
         if records.probabilities[i, k] <= 0.0 or not is_first_best(agent, state, action):
@@ -281,13 +250,5 @@ class OffPolicyMonteCarlo(RecordAlgorithm):
                 f"'sample_average', not {self.learning_rate!r}"
             )
 
-    def _check_tables(self) -> None:
-        super()._check_tables()
-        if self.policy.weights.shape != self.policy.q_tables.shape:
-            shape = tuple(self.policy.q_tables.shape)
-            raise ValueError(
-                f"weights must be of shape {shape}, not {tuple(self.policy.weights.shape)}"
-            )
-
-    def _memory_in_use(self) -> WeightedRecords:
-        return WeightedRecords._make((*self._memory, self.policy.weights.numpy()))
+    def _memory_in_use(self) -> EpisodeRecords:
+        return self._memory._replace(of_entries=self.policy.weights.numpy())

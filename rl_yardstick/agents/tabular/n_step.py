@@ -6,12 +6,9 @@ import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.common.exploration import action_probability, expected_value, highest_value
-from rl_yardstick.agents.common.settings import check_option, check_whole, settings_of
-from rl_yardstick.agents.compiled.learning_algorithm import StepSize
+from rl_yardstick.agents.common.settings import whole
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
 from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
@@ -32,9 +29,6 @@ from rl_yardstick.mdp.transition_model import Floats, Ints
 # Learning from the environments one after the other, with a memory of each of their episodes.
 
 NOTHING_LEARNT = -1.0
-
-# Stored steps of all environments together: about 32 bytes each, also in a saved state.
-MOST_STEPS = 50_000_000
 
 
 @by_type
@@ -187,29 +181,18 @@ class WindowAlgorithm(EpisodicAlgorithm):
     A truncated episode bootstraps from its last state.
 
     Args:
-        policy: as in `TabularAlgorithm`.
-        env: as in `TabularAlgorithm`.
+        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`.
         n_steps: number of rewards in a target, at least 1.
         kwargs: as in `TabularAlgorithm`.
     """
 
     learn_in = learn_from_window
+    ranges = {"n_steps": whole(1)}  # noqa: RUF012
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy] = "QTablePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: StepSize = 0.1,
-        n_steps: int = 4,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, *args: Any, n_steps: int = 4, **kwargs: Any) -> None:
         self.n_steps = n_steps
-        super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_whole(1, settings_of(self, "n_steps"), MOST_STEPS // self.n_envs)
+        super().__init__(*args, **kwargs)
 
     def _make_memory(self) -> Windows:
         shape = (self.n_envs, self.n_steps)
@@ -308,6 +291,5 @@ class NStepTreeBackup(WindowAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_option("target_policy", self.target_policy, TargetPolicy)
         if not self.targets_greedy:
             self._refuse_gaussian_noise("target_policy: exploring")

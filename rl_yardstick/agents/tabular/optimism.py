@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.common.settings import (
+    EPSILONS,
+    FINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
     TieBreaking,
-    check_above_zero,
-    check_at_least,
-    check_finite,
-    check_share,
-    check_whole,
-    settings_of,
+    whole,
 )
 from rl_yardstick.agents.compiled.engine import EngineChoice
-from rl_yardstick.agents.tabular.algorithm import MaskedArguments, TabularAlgorithm
+from rl_yardstick.agents.tabular.algorithm import TabularAlgorithm
 from rl_yardstick.agents.tabular.dyna import ModelKeeper, ModelPolicy
 from rl_yardstick.agents.tabular.updates import TabularAgent, best_value
 from rl_yardstick.machine_code.compiling import inlined
@@ -53,6 +52,11 @@ class OptimisticAlgorithm(TabularAlgorithm):
     """
 
     parameters = {"highest_worth": np.float64}  # noqa: RUF012
+    ranges = {"value_bound": FINITE}  # noqa: RUF012
+    hidden_arguments = (
+        *("learning_rate", "exploration", "exploration_decay", *EPSILONS, "temperature"),
+        *("noise_std", "initial_q", "initial_q_std", "skip_terminal_update"),
+    )
 
     def __init__(
         self,
@@ -63,7 +67,7 @@ class OptimisticAlgorithm(TabularAlgorithm):
         tie_breaking: TieBreaking = "random",
         engine: EngineChoice = "auto",
         policy_kwargs: dict[str, Any] | None = None,
-        **kwargs: Unpack[MaskedArguments],
+        **kwargs: Any,
     ) -> None:
         self.value_bound = value_bound
         super().__init__(
@@ -79,10 +83,7 @@ class OptimisticAlgorithm(TabularAlgorithm):
         )
 
     def _check_arguments(self) -> None:
-        check_share(settings_of(self, "gamma"))
-        if self.value_bound is not None:
-            check_finite(settings_of(self, "value_bound"))
-        elif self.gamma == 1:
+        if self.value_bound is None and self.gamma == 1:
             raise ValueError("value_bound has to be given where gamma is 1")
         self.initial_q = self.highest_worth
         super()._check_arguments()
@@ -149,6 +150,7 @@ class QLearningUCB(OptimisticAlgorithm):
     """
 
     parameters = {"bonus_scale": np.float64, "steps_remembered": np.float64}  # noqa: RUF012
+    ranges = {"bonus_scale": NOT_NEGATIVE, "horizon": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = learn_with_bonus
 
     def __init__(
@@ -160,11 +162,7 @@ class QLearningUCB(OptimisticAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_at_least(0.0, settings_of(self, "bonus_scale", "horizon"))
-        check_finite(settings_of(self, "bonus_scale"))
-        if self.horizon is not None:
-            check_finite(settings_of(self, "horizon"))
-        elif self.gamma == 1:
+        if self.horizon is None and self.gamma == 1:
             raise ValueError("horizon has to be given where gamma is 1")
 
     @property
@@ -348,6 +346,7 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
 
     policy_aliases = {"QTablePolicy": CountedModelPolicy}  # noqa: RUF012
     parameters = {"tolerance": np.float64}  # noqa: RUF012
+    ranges = {"known_after": whole(1), "tolerance": POSITIVE}  # noqa: RUF012
     learn_from_step = learn_and_replan
 
     def __init__(
@@ -361,9 +360,6 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
         super()._check_arguments()
         if self.gamma == 1:
             raise ValueError("gamma must be below 1, so that planning comes to an end")
-        check_whole(1, settings_of(self, "known_after"))
-        check_above_zero(settings_of(self, "tolerance"))
-        check_finite(settings_of(self, "tolerance"))
 
     @property
     def outcomes_kept(self) -> int:  # type: ignore[override]

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule
 
 from rl_yardstick.agents.common.masks import MaskBufferPolicy, numbers_in
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -25,16 +23,10 @@ class QTablePolicy(MaskBufferPolicy):
     q_tables: th.Tensor  # action values, float64 of shape (T, S, A)
     visit_counts: th.Tensor  # number of updates of each entry, int64 of shape (T, S, A)
 
-    def __init__(
-        self,
-        observation_space: spaces.Discrete,
-        action_space: spaces.Discrete,
-        lr_schedule: Schedule | None = None,
-        n_tables: int = 1,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, **kwargs)
-        shape = (n_tables, int(observation_space.n), int(action_space.n))
+    def __init__(self, *args: Any, n_tables: int = 1, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        sizes: Any = self.observation_space, self.action_space
+        shape = (n_tables, *(int(space.n) for space in sizes))
         self.register_buffer("q_tables", th.zeros(shape, dtype=th.float64))
         self.register_buffer("visit_counts", th.zeros(shape, dtype=th.int64))
 

@@ -7,14 +7,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from rl_yardstick.agents.common.settings import (
-    check_at_least,
-    check_finite,
-    check_whole,
-    settings_of,
-    step_size,
-)
-from rl_yardstick.agents.tabular.dyna import MOST_PLANNING, ModelKeeper, ModelPolicy, note_outcome
+from rl_yardstick.agents.common.settings import NOT_NEGATIVE, step_size, whole
+from rl_yardstick.agents.tabular.dyna import ModelKeeper, ModelPolicy, note_outcome
 from rl_yardstick.agents.tabular.updates import TabularAgent, best_value
 from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
@@ -88,6 +82,8 @@ def enqueue(model: SweepingModel, pair: int, urgency: float) -> None:
     """Put a pair into the queue; a pair that is there already keeps at least its urgency."""
     place = model.place[pair]
     if place == NONE:
+        if model.n_queued[0] == len(model.queue):  # in a damaged file only
+            return
         place = model.n_queued[0]
         model.n_queued[0] += 1
     elif urgency <= model.urgency[pair]:
@@ -163,46 +159,6 @@ class SweepingPolicy(ModelPolicy):
             "place": (NONE, n_pairs),
         }
 
-    def check_places(self) -> None:
-        """Raise ValueError for indices out of range, or inconsistent lists or queue."""
-        super().check_places()
-        if not _is_queue(self.model):
-            raise ValueError("holds no queue: model_queue and model_place disagree")
-        if not _are_lists(self.model):
-            raise ValueError(
-                "holds no lists of what leads to a state: model_behind and model_before"
-            )
-
-
-def _is_queue(model: SweepingModel) -> bool:
-    """Whether ``place`` is correct for pairs in the queue, and `NONE` for the others."""
-    queued = model.queue[: int(model.n_queued[0])]
-    places = np.full(len(model.queue), NONE)
-    places[queued] = np.arange(len(queued))
-    return np.array_equal(places, model.place) and len(np.unique(queued)) == len(queued)
-
-
-def _are_lists(model: SweepingModel) -> bool:
-    """Whether each list has exactly the pairs that lead to its state, and is finite.
-
-    It is finite because each pair but the first has a predecessor.
-    """
-    leads = ((model.counts > 0) & ~model.terminated[..., 0]).ravel()
-    goal = np.where(leads, model.next_obs.ravel(), NONE)
-    pairs = np.flatnonzero(leads)
-    before, behind = model.before[pairs], model.behind[pairs]
-    is_first, is_last = before == NONE, behind == NONE
-    firsts = model.first_into[goal[pairs]]
-    inner, rest = pairs[~is_first], pairs[~is_last]
-    n_lists = len(np.unique(goal[pairs]))
-    return bool(
-        (firsts[is_first] == pairs[is_first]).all()
-        and (model.behind[before[~is_first]] == inner).all()
-        and (model.before[behind[~is_last]] == rest).all()
-        and (goal[behind[~is_last]] == goal[rest]).all()
-        and is_first.sum() == n_lists == (model.first_into != NONE).sum()
-    )
-
 
 # Prioritised sweeping.
 
@@ -238,7 +194,9 @@ def sweep(agent: TabularAgent, progress: Any) -> None:
     size = step_size(progress.learning_rate, agent.settings.averages_samples, max(count, 1))
     tables.values[0, obs, action] += size * expected_error(agent, pair)
     leading = model.first_into[obs]
-    while leading != NONE:
+    for _ in range(len(model.behind)):  # lists of a damaged file may have no end
+        if leading == NONE:
+            break
         notice(agent, leading)
         leading = model.behind[leading]
 
@@ -288,6 +246,7 @@ class PrioritizedSweeping(ModelKeeper):
 
     policy_aliases = {"QTablePolicy": SweepingPolicy}  # noqa: RUF012
     parameters = {"planning_steps": np.int64, "threshold": np.float64}  # noqa: RUF012
+    ranges = {"planning_steps": whole(0), "threshold": NOT_NEGATIVE}  # noqa: RUF012
     learn_from_step = remember_and_sweep
 
     def __init__(
@@ -296,9 +255,3 @@ class PrioritizedSweeping(ModelKeeper):
         self.planning_steps = planning_steps
         self.threshold = threshold
         super().__init__(*args, **kwargs)
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
-        check_at_least(0.0, settings_of(self, "threshold"))
-        check_finite(settings_of(self, "threshold"))

@@ -5,12 +5,9 @@ from __future__ import annotations
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from rl_yardstick.agents.common.exploration import highest_value
-from rl_yardstick.agents.common.settings import check_option, check_share, settings_of
-from rl_yardstick.agents.compiled.learning_algorithm import StepSize
+from rl_yardstick.agents.common.settings import SHARE
 from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.tabular.n_step import EpisodicAlgorithm
 from rl_yardstick.agents.tabular.one_step import (
@@ -125,8 +122,7 @@ class TraceAlgorithm(EpisodicAlgorithm):
     step size falls below 1e-12.
 
     Args:
-        policy: as in `TabularAlgorithm`.
-        env: as in `TabularAlgorithm`.
+        args: as in `TabularAlgorithm`.
         learning_rate: as in `TabularAlgorithm`; an entry's trace keeps that of its last visit.
         trace_decay: lambda, in [0, 1]; with 0 only the last step's entry is updated.
         trace_type: the new trace at a visit, given the decayed trace e of earlier visits:
@@ -137,31 +133,25 @@ class TraceAlgorithm(EpisodicAlgorithm):
     """
 
     parameters = {"trace_decay": np.float64, "trace_kind": np.int64}  # noqa: RUF012
+    ranges = {"trace_decay": SHARE}  # noqa: RUF012
     learn_in = learn_along_traces
     trace_kept = kept_whole
 
     def __init__(
         self,
-        policy: str | type[BasePolicy] = "QTablePolicy",
-        env: GymEnv | str | None = None,
-        learning_rate: StepSize = 0.1,
+        *args: Any,
         trace_decay: float = 0.9,
         trace_type: TraceType = "replacing",
         **kwargs: Any,
     ) -> None:
         self.trace_decay = trace_decay
         self.trace_type = trace_type
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     @property
     def trace_kind(self) -> int:
         """The number of ``trace_type``."""
         return TRACE_TYPES[self.trace_type]
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        check_option("trace_type", self.trace_type, TraceType)
-        check_share(settings_of(self, "trace_decay"))
 
     def _make_memory(self) -> Traces:
         sizes = cast(Any, (self.observation_space, self.action_space))

@@ -12,9 +12,9 @@ from rl_yardstick.agents.common.exploration import (
 )
 from rl_yardstick.agents.common.settings import step_size
 from rl_yardstick.agents.compiled.generators import generator_of, next_uniform
-from rl_yardstick.agents.compiled.loop import CompiledOnlyError, act, by_type, learn_from_step
+from rl_yardstick.agents.compiled.loop import CompiledOnlyError, by_type
 from rl_yardstick.agents.compiled.worlds import UNDECIDED
-from rl_yardstick.machine_code.compiling import inlined, kernel
+from rl_yardstick.machine_code.compiling import inlined
 from rl_yardstick.mdp.transition_model import Bools, Floats, Ints
 
 # The tables of an agent for compiled functions, and scratch arrays.
@@ -64,10 +64,7 @@ def best_value(tables: Any, obs: int, room: Room) -> float:
 
 
 class Tables(NamedTuple):
-    """The tables of an agent, in the memory of its policy, if all actions are allowed.
-
-    `MaskedTables` without rows mean the same, but slow the compiled loop by a sixth.
-    """
+    """The tables of an agent, in the memory of its policy, if all actions are allowed."""
 
     values: Floats  # action values, shape (T, S, A)
     visit_counts: Ints  # updates of each entry so far, shape (T, S, A)
@@ -96,18 +93,17 @@ class MaskedTables(NamedTuple):
     values: Floats
     visit_counts: Ints
     # The allowed actions at each observation, bool of shape (S, A); all actions if a row is all
-    # False (mask unknown), or there are no rows.
+    # False (mask unknown).
     allowed: Bools
 
     @inlined
     def room_at(self, obs: int, room: Room) -> Room:
         """The part of the room for the allowed actions, which it lists."""
         actions, n_allowed = room.actions, 0
-        if len(self.allowed) > 0:
-            for action in range(len(actions)):
-                if self.allowed[obs, action]:
-                    actions[n_allowed] = action
-                    n_allowed += 1
+        for action in range(len(actions)):
+            if self.allowed[obs, action]:
+                actions[n_allowed] = action
+                n_allowed += 1
         if n_allowed == 0:
             n_allowed = len(actions)
             for action in range(n_allowed):
@@ -271,58 +267,3 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
         if env.done:
             env.next_action = UNDECIDED
     progress.mean_td_error = total_error if len(envs) == 1 else total_error / len(envs)
-
-
-# Python passes arrays one by one, which is faster than unpacking tuples of them.
-
-
-@kernel
-def act_in_all(
-    settings: Any,
-    envs: Any,
-    progress: Any,
-    values: Floats,
-    visit_counts: Ints,
-    allowed: Bools,
-    room: Floats,
-    actions: Ints,
-    draws: Floats,
-    rng: Any,
-    memory: Any,
-) -> int:
-    """`act` in each environment, for the interpreted loop.
-
-    Returns -1, or the number of an environment whose observation has no row; none acts then.
-    """
-    for i in range(len(envs)):
-        if not 0 <= envs[i].obs < values.shape[1]:
-            return i
-    tables = MaskedTables(values, visit_counts, allowed)
-    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0], memory)
-    for i in range(len(envs)):
-        act(agent, envs[i], progress[0])
-    return -1
-
-
-@kernel
-def learn_from_all(
-    settings: Any,
-    envs: Any,
-    progress: Any,
-    values: Floats,
-    visit_counts: Ints,
-    allowed: Bools,
-    room: Floats,
-    actions: Ints,
-    draws: Floats,
-    rng: Any,
-    memory: Any,
-) -> int:
-    """`learn_from_step` of all environments, for the interpreted loop; returns as `act_in_all`."""
-    for i in range(len(envs)):
-        if not 0 <= envs[i].next_obs < values.shape[1]:
-            return i
-    tables = MaskedTables(values, visit_counts, allowed)
-    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0], memory)
-    learn_from_step(agent, envs, progress[0])
-    return -1

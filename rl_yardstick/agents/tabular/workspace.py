@@ -5,7 +5,8 @@ Compiled functions read and write these records. In the interpreted loop a `Work
 
 from __future__ import annotations
 
-from typing import Any
+import ctypes
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +14,77 @@ from stable_baselines3.common.utils import is_vectorized_observation
 
 from rl_yardstick.agents.common.algorithm import Transitions
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm
+from rl_yardstick.agents.compiled.loop import act, learn_from_step
+from rl_yardstick.agents.compiled.references import Reference, address_of
 from rl_yardstick.agents.compiled.worlds import ENV, PROGRESS, UNDECIDED, env_records
+from rl_yardstick.machine_code.compiling import kernel
 from rl_yardstick.mdp.transition_model import Ints
 
 
-class Workspace:
-    """Records of n environments and of the training's progress, for the interpreted loop."""
+class Bench(NamedTuple):
+    """What compiled functions of the interpreted loop work on."""
 
-    def __init__(self, n: int, kind: np.dtype[np.void] = ENV) -> None:
+    agent: Any  # the agent for compiled functions
+    envs: NDArray[np.void]  # records of its environments, shape (n,)
+    progress: NDArray[np.void]  # a record of type `PROGRESS`, shape (1,)
+    n_numbers: int  # observations that are numbers must be below this
+
+
+@kernel
+def act_in_all(bench: Any, _: float, __: float) -> int:
+    """`act` in each environment.
+
+    Returns -1, or the number of an environment whose observation is no number; none acts then.
+    """
+    for i in range(len(bench.envs)):
+        if not 0 <= bench.envs[i].obs < bench.n_numbers:
+            return i
+    for i in range(len(bench.envs)):
+        act(bench.agent, bench.envs[i], bench.progress[0])
+    return -1
+
+
+@kernel
+def learn_from_all(bench: Any, _: float, __: float) -> int:
+    """`learn_from_step` of all environments; returns as `act_in_all`."""
+    for i in range(len(bench.envs)):
+        if not 0 <= bench.envs[i].next_obs < bench.n_numbers:
+            return i
+    learn_from_step(bench.agent, bench.envs, bench.progress[0])
+    return -1
+
+
+_CALLED = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_double)
+
+
+class Workspace:
+    """Records of n environments and of the training's progress, for the interpreted loop.
+
+    Args:
+        agent: the agent for compiled functions, whose tables are changed in place.
+        rng: its generator, kept here because a handle does not keep it alive.
+        n: the number of environments.
+        kind: the type of their records.
+        n_numbers: observations that are numbers must be below this.
+    """
+
+    def __init__(
+        self,
+        agent: Any,
+        rng: np.random.Generator,
+        n: int,
+        kind: np.dtype[np.void] = ENV,
+        n_numbers: int = 1,
+    ) -> None:
+        self.rng = rng
         self.envs = env_records(n, kind)
         self.envs["next_action"] = UNDECIDED
         self.progress = np.zeros(1, dtype=PROGRESS)
+        self.bench = Reference(Bench(agent, self.envs, self.progress, n_numbers))
+        self._act, self._learn = (
+            _CALLED(int(address_of(function, self.bench)))
+            for function in (act_in_all, learn_from_all)
+        )
         # Looked up once, because finding a field takes longer than filling it.
         self.fields = {name: self.envs[name] for name in kind.names or ()}
         # The action committed to in each environment, or `UNDECIDED`, shape (n,).
@@ -42,12 +103,27 @@ class Workspace:
         self.episodes[0] = episodes
         self.mean_td_error[0] = mean_td_error
 
-    def take_outcomes(self, transitions: Transitions) -> None:
-        """Write rewards and ends of the environments' step into their records."""
+    def choose(self) -> Ints:
+        """An action for each observation: the one committed to, if there is one."""
+        self._check("obs", self._act(self.bench.address, 0.0, 0.0))
+        actions: Ints = self.fields["action"].copy()
+        return actions
+
+    def learn_from(self, transitions: Transitions) -> float:
+        """Learn from rewards and ends of a step, and return the mean absolute TD error."""
         fields = self.fields
         fields["reward"][:] = transitions.rewards
         fields["terminated"][:] = transitions.terminated
         fields["done"][:] = transitions.dones
+        self._check("next_obs", self._learn(self.bench.address, 0.0, 0.0))
+        return float(self.mean_td_error[0])
+
+    def _check(self, field: str, outside: int) -> None:
+        """Raise ValueError for an observation that is no number, unless ``outside`` is -1."""
+        if outside >= 0:
+            space = f"Discrete({self.bench.held.n_numbers})"
+            obs = self.fields[field][outside]
+            raise ValueError(f"observation {obs} is not in {space}, the agent's space")
 
 
 class WorkspaceAlgorithm(LearningAlgorithm):
@@ -58,9 +134,7 @@ class WorkspaceAlgorithm(LearningAlgorithm):
         mean_td_error: mean absolute TD error of the last updates.
     """
 
-    logs_by_records = True
-
-    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions", "_in_use")
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions", "_in_use", "_memory")
     excluded_from_states = ("_in_use",)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -73,8 +147,17 @@ class WorkspaceAlgorithm(LearningAlgorithm):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_in_use": None}
 
+    def _make_memory(self) -> tuple[Any, ...]:
+        """An empty memory for ``n_envs`` environments: a NamedTuple of arrays."""
+        return ()
+
+    def _memory_in_use(self) -> tuple[Any, ...]:
+        """The memory for compiled functions; a subclass may add to it."""
+        return self._memory
+
     def _begin_episodes(self) -> None:
         self._next_actions = np.full(self.n_envs, UNDECIDED)
+        self._memory = self._make_memory()
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Write the agent's state into the records of the compiled loop."""

@@ -368,15 +368,15 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
     """The compiled copy of CartPole or MountainCar, plain or in Monitor; None for others."""
     from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
 
+    from rl_yardstick.agents.compiled.env_states import observed_world
     from rl_yardstick.agents.compiled.worlds import NotCompilable, monitor_of
-    from rl_yardstick.agents.networks.network_worlds import network_world
 
     if not isinstance(env, DummyVecEnv) or any(monitor_of(each) is None for each in env.envs):
         return None
     if not isinstance(env.envs[0].unwrapped, CartPoleEnv | MountainCarEnv):
         return None
     try:
-        return CompiledCopy(env, *network_world(env))
+        return CompiledCopy(env, *observed_world(env))
     except NotCompilable:
         return None
 
@@ -387,7 +387,7 @@ def evaluate_compiled(
     """Like `evaluate`, in compiled code; the library's network decides near ties."""
     from rl_yardstick.agents.compiled.greedy_play import play_episodes
     from rl_yardstick.agents.compiled.records import DECIMALS
-    from rl_yardstick.agents.networks.network_worlds import NetworkEnvStates
+    from rl_yardstick.agents.networks.network_worlds import EnvStates
     from rl_yardstick.agents.networks.perceptron import one_thread
 
     env, n_envs = copy.env, copy.env.num_envs
@@ -395,7 +395,7 @@ def evaluate_compiled(
         env.seed(seed)
     # As many episodes per environment as in `evaluate_policy`.
     wanted = (n_episodes + np.arange(n_envs)) // n_envs
-    states = NetworkEnvStates(env, copy.world, copy.seen)
+    states = EnvStates(env, copy.world, copy.seen)
     acting = cast(Any, model).greedy_player(copy.seen)
     with one_thread() if is_network(model) else nullcontext():
         found = play_episodes(copy.world, acting, states, env.reset(), wanted)

@@ -1,0 +1,284 @@
+"""The state of environments in the records of the compiled loop, and what agents observe of it.
+
+Environments keep numbers of states; CartPole and MountainCar, with infinitely many states, keep
+vectors. Functions are chosen by type (`agents.compiled.loop`).
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from rl_yardstick.agents.compiled.loop import add_to_return, by_type, reset, step
+from rl_yardstick.agents.compiled.records import Episodes
+from rl_yardstick.agents.compiled.worlds import (
+    CAR_STATE,
+    STATE,
+    CartPole,
+    MountainCar,
+    NotCompilable,
+    compile_envs,
+    env_dtype,
+    env_records,
+    layers,
+    monitor_of,
+)
+from rl_yardstick.envs.known_models import observations_of_states
+from rl_yardstick.machine_code.compiling import inlined
+from rl_yardstick.mdp.transition_model import Floats
+
+# Before a step; and after it, before any reset.
+BEFORE, AFTER = range(2)
+
+
+@by_type
+def observe(seen: Any, env: Any, moment: int, row: Any) -> None:
+    """Write the observation at this moment of the environment's last step into ``row``."""
+
+
+@by_type
+def move_on(seen: Any, env: Any) -> None:
+    """Make the new observation the one that the next action is chosen for."""
+
+
+@inlined
+def number_at(env: Any, moment: int) -> int:
+    """The number of the observation."""
+    return int(env.obs if moment == BEFORE else env.next_obs)
+
+
+class Numbers(NamedTuple):
+    """Observations are numbers, which networks get as one-hot vectors."""
+
+    n: int  # how many there are
+
+    @inlined
+    def observe(self, env: Any, moment: int, row: Any) -> None:
+        """The number itself, shape (1,)."""
+        row[0] = number_at(env, moment)
+
+    @inlined
+    def move_on(self, env: Any) -> None:
+        """Only the number changes."""
+        env.obs = env.new_obs
+
+
+class StateVectors(NamedTuple):
+    """Observations are vectors, one for each state of a known model."""
+
+    table: NDArray[np.float32]  # the observation of each state, shape (S, d)
+
+    @inlined
+    def observe(self, env: Any, moment: int, row: Any) -> None:
+        """The vector of that state, shape (d,)."""
+        vector = self.table[number_at(env, moment)]
+        for j in range(len(row)):
+            row[j] = vector[j]
+
+    @inlined
+    def move_on(self, env: Any) -> None:
+        """Only the number changes."""
+        env.obs = env.new_obs
+
+
+class OwnVectors(NamedTuple):
+    """Observations are vectors that the environments' records hold."""
+
+    n: int  # length of the vectors
+
+    @inlined
+    def observe(self, env: Any, moment: int, row: Any) -> None:
+        """The vector of that moment, shape (n,)."""
+        for j in range(self.n):
+            row[j] = env.vector[j] if moment == BEFORE else env.next_vector[j]
+
+    @inlined
+    def move_on(self, env: Any) -> None:
+        """All of the vector changes."""
+        for j in range(self.n):
+            env.vector[j] = env.new_vector[j]
+
+
+class InFull(NamedTuple):
+    """CartPole or MountainCar, with its state as the observation."""
+
+    time_limit: int  # steps after which an episode is truncated, or 0 for never
+    dynamics: CartPole | MountainCar  # its compiled dynamics
+
+    @inlined
+    def step(self, env: Any, handle: Any) -> None:
+        """Take ``env.action``."""
+        step(self.dynamics, env, handle)
+        show_state(self.dynamics, env, env.next_vector)
+        show_state(self.dynamics, env, env.new_vector)
+
+    @inlined
+    def reset(self, env: Any, handle: Any) -> None:
+        """Draw a state."""
+        reset(self.dynamics, env, handle)
+        show_state(self.dynamics, env, env.new_vector)
+
+
+@by_type
+def show_state(world: Any, env: Any, vector: Any) -> None:
+    """Write the state of an environment into a vector."""
+
+
+def observed_world(vec_env: VecEnv) -> tuple[Any, Any]:
+    """The compiled counterpart of environments, and how to read its observations."""
+    world = compile_envs(vec_env)
+    space = vec_env.observation_space
+    if isinstance(space, spaces.Discrete):
+        return world, Numbers(int(space.n))
+    if isinstance(world, CartPole | MountainCar):
+        return InFull(world.time_limit, world), OwnVectors(len(VECTOR_STATES[type(world)]))
+    observed = observations_of_states(vec_env.envs[0])  # type: ignore[attr-defined]
+    if observed is None or observed.ndim < 2:
+        raise NotCompilable("the observations of the states are not known")
+    return world, StateVectors(np.ascontiguousarray(observed.reshape(len(observed), -1), "f4"))
+
+
+# The state of environments, read into records and written back. Interpreted or compiled code can
+# then continue from the same state.
+
+# From this version on, Python's sum of floats compensates for rounding.
+COMPENSATED_SUM = sys.version_info >= (3, 12)
+
+# For environments with a vector as state: the names of its parts.
+VECTOR_STATES: dict[type, tuple[str, ...]] = {CartPole: STATE, MountainCar: CAR_STATE}
+
+
+# Fields that acting fills in for learning.
+_ESTIMATES = (("value", np.float64), ("log_probability", np.float64))
+
+
+@lru_cache(maxsize=8)
+def record_type(names: tuple[str, ...], *, has_vectors: bool) -> np.dtype[np.void]:
+    """The record type of environments with a state of these numbers, also as vectors."""
+    state: Any = [(name, np.float64) for name in names] or [("state", np.int64)]
+    vectors: Any = [
+        (name, np.float32, (len(names),)) for name in ("vector", "next_vector", "new_vector")
+    ]
+    return env_dtype(*state, *_ESTIMATES, *(vectors if has_vectors else ()))
+
+
+class EnvStates:
+    """Environments, with a record for each of them.
+
+    Args:
+        vec_env: the environments.
+        world: their compiled counterpart.
+        seen: how to read its observations.
+    """
+
+    def __init__(self, vec_env: DummyVecEnv, world: Any, seen: Any) -> None:
+        self.vec_env = vec_env
+        self.seen = seen
+        # The state is a vector of these names, or a number if there are none.
+        self.vector_state = VECTOR_STATES.get(type(getattr(world, "dynamics", world)), ())
+        kind = record_type(self.vector_state, has_vectors=isinstance(seen, OwnVectors))
+        self.records = env_records(vec_env.num_envs, kind)
+        self.monitors = [monitor_of(env) for env in vec_env.envs]
+        # Monitor keeps the rewards of the running episode, so we keep them too.
+        self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]
+
+    def observations(self, records: Any, prefix: str) -> Any:
+        """The observations now (no prefix), before (``next_``) or after a reset (``new_``)."""
+        if isinstance(self.seen, Numbers):
+            return records[f"{prefix}obs"].copy()
+        if isinstance(self.seen, OwnVectors):
+            return records[f"{prefix}vector"].copy()
+        shape = self.vec_env.observation_space.shape
+        assert shape is not None
+        return self.seen.table[records[f"{prefix}obs"]].reshape(len(records), *shape)
+
+    def take_observations(self, last_obs: Any) -> None:
+        """Set the records to these observations, shape (n, ...)."""
+        if isinstance(self.seen, Numbers):
+            self.records["obs"] = last_obs
+        elif isinstance(self.seen, OwnVectors):
+            self.records["vector"] = last_obs
+        else:
+            for record, shown in zip(self.records, last_obs, strict=True):
+                record["obs"] = self._state_of(shown.ravel(), int(record["state"]))
+
+    def _state_of(self, shown: Any, state: int) -> int:
+        """A state with this observation: ``state`` if its observation fits, else the first such."""
+        fits = (self.seen.table == shown.astype(np.float32)).all(axis=1)
+        if not fits.any():
+            raise ValueError("no state has the observation that the training is to go on from")
+        return state if fits[state] else int(np.argmax(fits))
+
+    def read(self) -> None:
+        """Copy the state of the environments into the records."""
+        for i, env in enumerate(self.vec_env.envs):
+            base: Any = env.unwrapped
+            record = self.records[i]
+            if self.vector_state:
+                for name, value in zip(self.vector_state, base.state, strict=True):
+                    record[name] = value
+            else:
+                record["state"] = base.s
+            record["elapsed"] = _elapsed_steps(env)
+            record["episode_return"] = record["compensation"] = 0.0
+            self._unfinished[i] = []
+            monitor = self.monitors[i]
+            if monitor is not None and monitor.rewards:
+                for reward in monitor.rewards:
+                    add_to_return(record, reward, COMPENSATED_SUM)
+                self._unfinished[i] = [np.array(monitor.rewards)]
+
+    def write(self) -> None:
+        """Copy the records into the state of the environments."""
+        for i, env in enumerate(self.vec_env.envs):
+            self._write_state(env.unwrapped, self.records[i])
+            for layer in layers(env):
+                if isinstance(layer, TimeLimit):
+                    vars(layer)["_elapsed_steps"] = int(self.records[i]["elapsed"])
+                elif isinstance(layer, Monitor):
+                    chunks = self._unfinished[i]
+                    layer.rewards = np.concatenate(chunks).tolist() if chunks else []
+                    layer.needs_reset = False
+            (shown,) = self.observations(self.records[i : i + 1], "")
+            next(iter(self.vec_env.buf_obs.values()))[i] = shown
+
+    def _write_state(self, base: Any, record: Any) -> None:
+        if self.vector_state:
+            base.state = np.array([record[name] for name in self.vector_state])
+            if hasattr(base, "steps_beyond_terminated"):
+                base.steps_beyond_terminated = None
+            return
+        base.s = int(record["state"])
+        if hasattr(base, "lastaction"):
+            base.lastaction = None if record["elapsed"] == 0 else int(record["action"])
+        if hasattr(base, "pulls_done"):
+            base.pulls_done = int(record["elapsed"])
+
+    def keep_rewards(self, episodes: Episodes, rewards: Floats) -> None:
+        """Keep the rewards of unfinished episodes after a block."""
+        for i in range(len(self.records)):
+            ends = episodes.steps[episodes.envs == i]
+            if len(ends):
+                self._unfinished[i] = []
+            n_new = len(rewards) - (int(ends[-1]) + 1 if len(ends) else 0)
+            if n_new > 0:
+                self._unfinished[i].append(rewards[:n_new, i].copy())
+
+
+def _elapsed_steps(env: gym.Env[Any, Any]) -> int:
+    """Steps of the running episode, by the first wrapper that counts them."""
+    for layer in layers(env):
+        if isinstance(layer, TimeLimit):
+            return int(vars(layer)["_elapsed_steps"] or 0)
+        if isinstance(layer, Monitor):
+            return len(layer.rewards)
+    return 0
