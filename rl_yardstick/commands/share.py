@@ -104,7 +104,7 @@ def inspect() -> int:
     parser.add_argument("model", metavar="ZIP", help="zip of an agent of Stable-Baselines3 or ours")
     path = Path(parser.parse_args().model)
     from rl_yardstick.commands.terminal import say, table_console
-    from rl_yardstick.safe_files import inspect_model
+    from rl_yardstick.safe_files.models import inspect_model
 
     try:
         report = inspect_model(path)

@@ -54,7 +54,6 @@ from rl_yardstick.safe_files.files import (
     MAX_ARCHIVE_BYTES,
     Budget,
     UnsafeFileError,
-    hold,
     read_file,
 )
 
@@ -361,7 +360,6 @@ def is_study(folder: Path) -> bool:
 
 def pack_study(root: Path, target: Path, say: Callable[[str], object]) -> StudyPack:
     """Write a study as a zip, which may replace another; no other command may use the study."""
-    hold(root)
     if target.suffix != ".zip" or target.is_dir():
         raise UserError(f"{target}: a study is packed as a file: name it {target.name}.zip")
     _check_parent(target)
