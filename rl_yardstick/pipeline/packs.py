@@ -236,7 +236,7 @@ def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
             content = _run_of(study, path.relative_to(study).as_posix())
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             _check_members(archive.infolist())
-        files = read_members(content, most=_MOST)
+        files = read_members(content)
     except _DAMAGE as error:
         raise UserError(f"{path} is no pack that may be opened: {one_line(error)}") from error
     with tempfile.TemporaryDirectory(prefix="yardstick-pack-") as name:

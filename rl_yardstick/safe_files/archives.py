@@ -19,7 +19,6 @@ SETTINGS = "data"
 _TEXTS = frozenset({SETTINGS, "_stable_baselines3_version", "system_info.txt"})
 TENSORS = ".pth"  # the ending of files of tensors
 
-MAX_MEMBERS = 64
 # The signature of each entry in a zip's directory, and the bytes of Python's object for it.
 _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
 # The library stores members uncompressed. A repacked zip may deflate them; then the budget is
@@ -38,15 +37,11 @@ _DAMAGE = (
 )
 
 
-def read_members(
-    content: bytes, budget: Budget | None = None, most: int = MAX_MEMBERS
-) -> dict[str, bytes]:
-    """Read at most ``most`` members of a zip, by name."""
+def read_members(content: bytes, budget: Budget | None = None) -> dict[str, bytes]:
+    """Read the members of a zip, by name."""
     budget = budget or Budget(len(content))
     with opened_zip(content, budget) as archive:
         infos = archive.infolist()
-        if len(infos) > most:
-            raise UnsafeFileError(f"holds more than {most} members")
         budget.charge(sum(info.file_size * _COPIES[info.compress_type] for info in infos))
         return {info.filename: read_member(archive, info) for info in infos}
 
@@ -54,11 +49,11 @@ def read_members(
 def read_model_members(content: bytes, budget: Budget) -> dict[str, bytes]:
     """Read the members of a model's zip; refuses others than models have."""
     members = read_members(content, budget)
-    for name in members:
-        if name not in _TEXTS and not name.endswith(TENSORS):
-            raise UnsafeFileError(f"holds {shown(name)}, which no model file has")
-    if SETTINGS not in members:
-        raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
+    strange = [name for name in members if name not in _TEXTS and not name.endswith(TENSORS)]
+    if strange:
+        raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
+    if SETTINGS not in members or not any(name.endswith(TENSORS) for name in members):
+        raise UnsafeFileError("lacks parts that a model has")
     return members
 
 
@@ -89,10 +84,7 @@ def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
 def first_look(content: bytes) -> dict[str, Any]:
     """Read the settings in a model's zip, without the libraries; pickled settings stay text."""
     budget = Budget(len(content))
-    members = read_model_members(content, budget)
-    if not any(name.endswith(TENSORS) for name in members):
-        raise UnsafeFileError("lacks parts that a model has")
-    return parse_settings(members, budget)
+    return parse_settings(read_model_members(content, budget), budget)
 
 
 def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import stat
-import sys
 from pathlib import Path
 
 NO_LIMIT = 1 << 62  # bytes
@@ -15,12 +13,10 @@ MAX_ARCHIVE_BYTES = 1 << 30
 MAX_STATISTICS_BYTES = 64 << 20
 MAX_BUFFER_BYTES = 32 << 30
 # Reading a file may take this multiple of its size, plus these bytes.
-_TIMES = 4
+_TIMES = 5
 _FREE_BYTES = 64 << 20
 # An empty dictionary and its slot in a container: no value takes more in addition to its text.
 _BYTES_PER_JSON_VALUE = 100
-# If the system does not report its memory.
-_MEMORY_IF_UNKNOWN = 16 << 30
 
 # A file to read: a path, or a stream of bytes that were read already.
 Source = Path | str | io.BufferedIOBase
@@ -68,12 +64,11 @@ class Budget:
 
 
 def memory_bytes() -> int:
-    """The memory of this machine in bytes."""
-    size = _MEMORY_IF_UNKNOWN
-    if sys.platform != "win32":
-        with contextlib.suppress(ValueError, OSError):
-            size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return size
+    """The memory of this machine in bytes; 16 GB if the system does not report it."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 16 << 30
 
 
 def opened(path: Path, limit: int) -> io.BufferedReader:

@@ -6,7 +6,6 @@ import contextlib
 import importlib
 import io
 import math
-import zipfile
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache, partial
@@ -27,7 +26,7 @@ from torch import nn, optim
 from torch.distributions.transforms import AffineTransform, ComposeTransform, ExpTransform
 from torch.nn.modules import activation
 
-from rl_yardstick.safe_files.archives import opened_zip, read_member
+from rl_yardstick.safe_files.archives import read_members
 from rl_yardstick.safe_files.files import Budget, UnsafeFileError, shown
 from rl_yardstick.safe_files.pickles import (
     PERSISTENT_ID,
@@ -56,10 +55,6 @@ def filled(cls: Any, made: Made, build: Build) -> Any:
     # Fails for spaces without the attributes that others need.
     assert new == new  # noqa: PLR0124
     return new
-
-
-def _called(make: Callable[..., Any], made: Made, build: Build) -> Any:
-    return make(*build(made.args))
 
 
 # --- NumPy's types, arrays, numbers and generators ------------------------------------------------
@@ -152,29 +147,23 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
     budget = budget or Budget(len(content))
     storages: dict[str, th.Tensor] = {}
     try:
-        with opened_zip(content, budget) as archive:
-            # PyTorch stores its records uncompressed; a deflated one is a zip bomb.
-            members = {
-                info.filename.partition("/")[2]: info
-                for info in archive.infolist()
-                if info.compress_type == zipfile.ZIP_STORED
-            }
-            if "data.pkl" not in members:
-                raise UnsafeFileError("no pickle of tensors")
+        # The name of a member begins with that of a folder.
+        members = {
+            name.partition("/")[2]: held for name, held in read_members(content, budget).items()
+        }
 
-            def storage(made: Made, build: Build) -> th.Tensor:
-                """A storage, which the file may name several times, but is read once."""
-                (pid,) = made.args
-                key = pid[2]
-                if not isinstance(key, str):
-                    raise wrong(made)
-                if key not in storages:
-                    storages[key] = _flat(pid, read_member(archive, members[f"data/{key}"]))
-                budget.charge(storages[key].nbytes)
-                return storages[key]
+        def storage(made: Made, build: Build) -> th.Tensor:
+            """A storage, which the file may name several times."""
+            key = made.args[0][2]
+            if not isinstance(key, str):
+                raise wrong(made)
+            if key not in storages:
+                storages[key] = _flat(made.args[0], members.pop(f"data/{key}"))
+            budget.charge(storages[key].nbytes)
+            return storages[key]
 
-            tree = Reader(io.BytesIO(read_member(archive, members["data.pkl"])), budget).load()
-            return Build({**_OF_TENSORS, PERSISTENT_ID: storage}, {}, budget)(tree)
+        tree = Reader(io.BytesIO(members.get("data.pkl", b"")), budget).load()
+        return Build({**_OF_TENSORS, PERSISTENT_ID: storage}, {}, budget)(tree)
     except UnsafeFileError as error:
         raise UnsafeFileError(f"holds tensors that cannot be read: {error}") from error
 
@@ -207,11 +196,6 @@ def _tensor(made: Made, build: Build) -> th.Tensor:
     return tensor.requires_grad_(bool(requires_grad))
 
 
-def _parameter(made: Made, build: Build) -> nn.Parameter:
-    tensor, requires_grad, _ = build(made.args)
-    return nn.Parameter(tensor, bool(requires_grad))
-
-
 def _ordered(made: Made, build: Build) -> OrderedDict[Any, Any]:
     """An OrderedDict, without the versions of modules that PyTorch gives it."""
     return OrderedDict((key, build(value)) for key, value in pairs(made))
@@ -220,7 +204,7 @@ def _ordered(made: Made, build: Build) -> OrderedDict[Any, Any]:
 _OF_TENSORS: Mapping[str, Maker] = {
     "collections.OrderedDict": _ordered,
     "torch._utils._rebuild_tensor_v2": _tensor,
-    "torch._utils._rebuild_parameter": _parameter,
+    "torch._utils._rebuild_parameter": lambda made, build: build(made.args[0]),
     "torch.storage._load_from_bytes": _lone_storage,
 }
 
@@ -255,6 +239,10 @@ _FILLED = (
 _CALLED = (TrainFreq, TrainFrequencyUnit, GoalSelectionStrategy)
 
 
+def _called(make: Callable[..., Any], made: Made, build: Build) -> Any:
+    return make(*build(made.args))
+
+
 def _deque(made: Made, build: Build) -> deque[Any]:
     # The arguments are its contents, always empty, and its maximum length.
     return deque(build(made.items), *build(made.args[1:2]))
@@ -279,27 +267,17 @@ _MAKERS: Mapping[str, Maker] = {
 # --- classes that a file may name -----------------------------------------------------------------
 
 
-def _subclasses_in(module: object, base: type) -> Iterable[Any]:
-    return (cls for cls in vars(module).values() if isinstance(cls, type) and issubclass(cls, base))
-
-
 @cache
 def _library_classes() -> Mapping[str, type]:
     """Buffers, feature extractors, activations and optimizers, by their full names."""
-    modules: list[object] = [buffers]
+    modules: list[object] = [buffers, torch_layers, activation, optim]
     with contextlib.suppress(ImportError):
         names = (f"sb3_contrib.common.{kind}.buffers" for kind in ("maskable", "recurrent"))
-        modules += [*map(importlib.import_module, names)]
-    found = by_name(
-        [
-            *(cls for module in modules for cls in _subclasses_in(module, buffers.BaseBuffer)),
-            *(HerReplayBuffer, RMSpropTFLike, nn.Identity),
-            *_subclasses_in(torch_layers, torch_layers.BaseFeaturesExtractor),
-            *_subclasses_in(activation, nn.Module),
-            *_subclasses_in(optim, optim.Optimizer),
-        ]
-    )
-    return {**_CLASSES_OF_NUMPY, **found}
+        modules += map(importlib.import_module, names)
+    kinds = (buffers.BaseBuffer, nn.Module, optim.Optimizer)
+    members = (cls for module in modules for cls in vars(module).values() if isinstance(cls, type))
+    found = [cls for cls in members if issubclass(cls, kinds)]
+    return {**_CLASSES_OF_NUMPY, **by_name([*found, HerReplayBuffer, RMSpropTFLike, nn.Identity])}
 
 
 def read_pickle(

@@ -12,11 +12,9 @@ import contextlib
 import inspect
 import io
 import json
-import math
 import textwrap
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -50,10 +48,7 @@ from rl_yardstick.safe_files.known_objects import (
 )
 from rl_yardstick.safe_files.pickles import Reader
 
-# Trained variables outside networks, such as the entropy coefficient of SAC.
-_OF_ENTROPY = frozenset({"log_ent_coef", "ent_coef_tensor"})
-
-# The files of these variables; the second name is the older one.
+# Files of trained variables outside networks; the second name is the older one.
 _VARIABLES = ("pytorch_variables.pth", "tensors.pth")
 
 # Attributes that models do not keep: the caller sets them, regardless of the file.
@@ -113,13 +108,11 @@ def load_model(
     check_values(tensors)
     try:
         _check_variables(tensors, algorithm)
-        _check_sizes({**plain, **objects, **replaced})
+        _check_buffers({**plain, **objects, **replaced})
         # The library applies only custom objects whose keys are in the file.
         checked = _zipped({**plain, **dict.fromkeys(objects)}, tensors)
         with charged_tensors(budget):
-            return algorithm.load(
-                checked, env=env, device=device, custom_objects=objects, **replaced
-            )
+            return algorithm.load(checked, env, device, objects, **replaced)
     except ValueError:
         raise  # the model does not fit the environment
     except Exception as error:  # settings and weights that do not match can fail anywhere
@@ -160,17 +153,14 @@ def _decoded(text: Any) -> bytes:
 
 def _check_variables(tensors: Mapping[str, Any], algorithm: type[BaseAlgorithm]) -> None:
     """Refuse variables that the library never writes, because it would set any attribute."""
-    known = _OF_ENTROPY
+    known = {"log_ent_coef", "ent_coef_tensor"}  # the entropy coefficient of SAC
     # For the libraries' classes, an empty instance is enough, or these are the variables.
     with contextlib.suppress(AttributeError):
         known |= set(algorithm._get_torch_save_params(algorithm.__new__(algorithm))[1])
     for name in _VARIABLES:
-        for key, value in tensors.get(name, {}).items():
+        for key in tensors.get(name, {}):
             if key not in known:
                 raise UnsafeFileError(f"sets {shown(key)}, which is no variable of a model")
-            # Old files have None for a fixed entropy coefficient.
-            if key in _OF_ENTROPY and value is not None and value.numel() != 1:
-                raise UnsafeFileError(f"{name}: {key} is not one number")
 
 
 def _zipped(data: Mapping[str, Any], tensors: dict[str, Any]) -> io.BytesIO:
@@ -187,12 +177,8 @@ def _zipped(data: Mapping[str, Any], tensors: dict[str, Any]) -> io.BytesIO:
 
 # --- sizes ----------------------------------------------------------------------------------------
 
-# A buffer may have this many rows, and fit into memory with four bytes for each number.
-_MAX_ROWS, _BYTES = 1_000_000_000, 4
-# Settings that determine the rows of a buffer; several of them multiply.
-_BUFFERS = (("buffer_size",), ("n_steps", "n_envs"))
-# `HerReplayBuffer` keeps a dictionary for each step.
-_BYTES_PER_INFO = 136
+# Bytes of a number in a buffer, and of the dictionary that `HerReplayBuffer` keeps for each step.
+_BYTES_PER_NUMBER, _BYTES_PER_INFO = 4, 136
 # Operations that make new tensors of given sizes, or of existing ones.
 _MAKERS = frozenset(
     {th.empty, th.zeros, th.ones, th.full, th.rand, th.randn, th.eye, th.arange, th.Tensor.repeat}
@@ -221,60 +207,48 @@ class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a funct
         return function(*args, **kwargs)
 
 
-def _check_sizes(settings: Mapping[str, Any]) -> None:
+def _check_buffers(settings: Mapping[str, Any]) -> None:
     """Check that the buffers in the settings fit into memory."""
-    row = get_flattened_obs_dim(settings["observation_space"]) * _BYTES + _BYTES_PER_INFO
-    for names in _BUFFERS:
-        values = [settings.get(name, 1) for name in names]
-        if not all(isinstance(value, int) and 0 < value <= _MAX_ROWS for value in values):
-            raise UnsafeFileError(f"has {' and '.join(names)} outside the allowed range", names[0])
-        if math.prod(values) * row > memory_bytes():
-            raise UnsafeFileError(
-                f"asks for a buffer larger than the memory here, {memory_bytes():,} bytes: "
-                f"give another {names[0]}",
-                names[0],
-            )
+    row = get_flattened_obs_dim(settings["observation_space"]) * _BYTES_PER_NUMBER + _BYTES_PER_INFO
+    for name, factor in (("buffer_size", 1), ("n_steps", settings.get("n_envs", 1))):
+        if not 0 < settings.get(name, 1) * factor * row <= memory_bytes():
+            raise UnsafeFileError(f"does not fit into memory here: give another {name}", name)
 
 
 # --- inspecting a zip, without making a model from it ---------------------------------------------
 
 
-@dataclass(frozen=True)
-class Report:
-    """The contents of a model file."""
+def inspect_model(path: Path | str) -> dict[str, dict[str, str]]:
+    """What a model's zip holds, in words; UnsafeFileError if the file is not one.
 
-    sizes: dict[str, int]  #: bytes of each member of the zip
-    weights: dict[str, tuple[int, ...]]  #: shapes of the tensors, by member and name
-    settings: dict[str, str]  #: each attribute as a text of one line
-    suspicious: tuple[str, ...]  #: warnings for the reader, each in one line
-
-
-def inspect_model(path: Path | str) -> Report:
-    """Inspect a model's zip; UnsafeFileError if the file is not one."""
+    Returns:
+        for each of ``"members"``, ``"weights"``, ``"settings"`` and ``"suspicious"``, texts of one
+        line by name.
+    """
     content = read_file(Path(path), MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     members = read_model_members(content, budget)
-    weights: dict[str, tuple[int, ...]] = {}
-    settings: dict[str, str] = {}
-    doubts: list[str] = []
+    found: dict[str, dict[str, str]] = {"members": {}, "weights": {}, "settings": {}}
+    doubts: dict[str, str] = {}
     for key, value in parse_settings(members, budget).items():
-        name = shown(key).strip("'")
         try:
-            settings[name] = _setting(key, value, budget)
+            found["settings"][_quoted(key)] = _setting(key, value, budget)
         except UnsafeFileError as error:
-            settings[name] = "suspicious"
-            doubts.append(f"{name} {error}")
-    for name in sorted(name for name in members if name.endswith(TENSORS)):
+            doubts[_quoted(key)] = str(error)
+    for name, held in members.items():
+        found["members"][_quoted(name)] = f"{len(held):,} bytes"
         try:
-            tensors = load_tensors(members[name], budget)
-            check_values({name: tensors})
+            tensors = {name: load_tensors(held, budget)} if name.endswith(TENSORS) else {}
+            check_values(tensors)
+            for where, tensor in tensors_in(tensors):
+                found["weights"][_quoted(where)] = str(tuple(tensor.shape))
         except UnsafeFileError as error:
-            doubts.append(f"{name} {error}")
-        else:
-            found = tensors_in(tensors, name.removesuffix(TENSORS))
-            weights |= {shown(where).strip("'"): tuple(each.shape) for where, each in found}
-    sizes = {name: len(held) for name, held in members.items()}
-    return Report(sizes, weights, settings, tuple(doubts))
+            doubts[_quoted(name)] = str(error)
+    return {**found, "suspicious": doubts}
+
+
+def _quoted(name: str) -> str:
+    return shown(name).strip("'")
 
 
 def _setting(key: str, value: Any, budget: Budget) -> str:
@@ -286,7 +260,7 @@ def _setting(key: str, value: Any, budget: Budget) -> str:
     pickled = _decoded(value[_SERIALIZED])
     reader = Reader(io.BytesIO(pickled), budget)
     reader.load()
-    names = [shown(name).strip("'") for name in sorted(reader.names)]
+    names = [_quoted(name) for name in sorted(reader.names)]
     if key != "policy_class" or not names[0].startswith(("stable_baselines3.", "sb3_contrib.")):
         read_pickle(pickled, budget=budget)
     return "a pickle of " + (", ".join(names) or "plain data")

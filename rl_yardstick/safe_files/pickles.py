@@ -35,10 +35,8 @@ MAX_DEPTH, MAX_INTEGER_BITS = 40, 128
 _END_OF_KEYS = (1 << 61) - 1
 # Packages that were renamed: NumPy's inner one, and Gym, whose spaces Gymnasium took over.
 _RENAMED = {"numpy.core.": "numpy._core.", "gym.spaces.": "gymnasium.spaces."}
-_REFUSED = "which may not stand in such a file"
-
 # The names of records of dictionaries and of persistent ids. Names in a file have a dot.
-DICTIONARY, PERSISTENT_ID = "dict", "a persistent id"
+DICTIONARY, PERSISTENT_ID = "dict", "persistent id"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +80,13 @@ class Reader(pickle._Unpickler):
         start = self.file.tell()
         try:
             for instruction, argument, _ in pickletools.genops(self.file):
-                self._check(instruction.name, argument)
+                if instruction.name not in INSTRUCTIONS:
+                    raise UnsafeFileError(f"a pickle with the instruction {instruction.name}")
+                if isinstance(argument, int) and argument.bit_length() > MAX_INTEGER_BITS:
+                    raise UnsafeFileError("holds an absurdly large number")
+                factor = _BYTES_PER_SIGN if isinstance(argument, str) else 1
+                length = len(argument) if isinstance(argument, str | bytes | bytearray) else 0
+                self.budget.charge(_PRICE + factor * length)
             self.file.seek(start)
             return super().load()
         except UnsafeFileError:
@@ -90,16 +94,6 @@ class Reader(pickle._Unpickler):
         except Exception as error:  # a damaged pickle can fail at any instruction
             reason = str(error) or type(error).__name__
             raise UnsafeFileError(f"is no whole pickle: {reason}") from error
-
-    def _check(self, instruction: str, argument: Any) -> None:
-        """Check an instruction, and charge what following it allocates."""
-        if instruction not in INSTRUCTIONS:
-            raise UnsafeFileError(f"a pickle with the instruction {instruction}")
-        if isinstance(argument, int) and argument.bit_length() > MAX_INTEGER_BITS:
-            raise UnsafeFileError("holds an absurdly large number")
-        is_text = isinstance(argument, str)
-        n_bytes = 0 if argument is None or isinstance(argument, int | float) else len(argument)
-        self.budget.charge(_PRICE + n_bytes * (_BYTES_PER_SIGN if is_text else 1))
 
     def find_class(self, module: str, name: str) -> Name:
         """Record a name where Python would import a class, as it is in current libraries."""
@@ -143,6 +137,7 @@ class Reader(pickle._Unpickler):
 Maker = Callable[[Made, "Build"], Any]
 
 
+@dataclass
 class Build:
     """Builds values from records, by tables of makers and classes with the full names in the file.
 
@@ -150,13 +145,10 @@ class Build:
     a thousand times.
     """
 
-    def __init__(
-        self, makers: Mapping[str, Maker], classes: Mapping[str, type], budget: Budget
-    ) -> None:
-        self.makers = makers
-        self.classes = classes
-        self.budget = budget
-        self._depth = 0
+    makers: Mapping[str, Maker]
+    classes: Mapping[str, type]
+    budget: Budget
+    depth: int = 0
 
     def __call__(self, tree: Any) -> Any:
         """Build a part of the tree; a part that contains itself is too deep."""
@@ -164,11 +156,11 @@ class Build:
         self.budget.charge(_PRICE + n_bytes)
         if not isinstance(tree, Name | Made | list | tuple):
             return tree
-        self._depth += 1
-        if self._depth > MAX_DEPTH:
+        self.depth += 1
+        if self.depth > MAX_DEPTH:
             raise UnsafeFileError(f"is nested more than {MAX_DEPTH} deep")
         value = self._make(tree)
-        self._depth -= 1
+        self.depth -= 1
         return value
 
     def _make(self, tree: Any) -> Any:
@@ -176,15 +168,14 @@ class Build:
             return type(tree)(map(self, tree))
         if tree.name == DICTIONARY:
             return {key: self(value) for key, value in pairs(tree)}
-        name = shown(tree.name).strip("'")
+        table: Mapping[str, Any] = self.classes if isinstance(tree, Name) else self.makers
+        if tree.name not in table:
+            name = shown(tree.name).strip("'")
+            raise UnsafeFileError(f"holds {name}, which may not stand in such a file")
         if isinstance(tree, Name):
-            if tree.name not in self.classes:
-                raise UnsafeFileError(f"refers to {name}, {_REFUSED}")
-            return self.classes[tree.name]
-        if tree.name not in self.makers:
-            raise UnsafeFileError(f"holds {name}, {_REFUSED}")
+            return table[tree.name]
         try:
-            return self.makers[tree.name](tree, self)
+            return table[tree.name](tree, self)
         except UnsafeFileError:
             raise
         except Exception as error:  # the libraries' constructors can fail in any way
