@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from rl_yardstick import agents
+import rl_yardstick
 from rl_yardstick.machine_code import cache as code_cache
 from rl_yardstick.machine_code import sources
 
-ROOT = Path(agents.__file__).resolve().parent.parent
+PACKAGES = Path(rl_yardstick.__file__).resolve().parent
 
 # What is compiled in this process, and what is said of it besides.
 NOTE = """
@@ -24,7 +24,7 @@ names = []
 class Note(logging.Handler):
     def emit(self, record):
         names.append(record.getMessage())
-log = logging.getLogger("machine_code")
+log = logging.getLogger("rl_yardstick.machine_code")
 log.addHandler(Note()); log.setLevel(logging.INFO); log.propagate = False
 """
 
@@ -54,11 +54,13 @@ print(int(run_small(4.0)), "compiled", int("compiling run_small" in names))
 def checkout(tmp_path_factory):
     """A copy of what trains, and nothing compiled in it."""
     root = tmp_path_factory.mktemp("checkout")
+    packages = root / "rl_yardstick"
     for package in ("safe_files", "machine_code", "mdp", "agents", "envs"):
         ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / package, root / package, ignore=ignored)
-    (root / "agents" / "common" / "small_rule.py").write_text(RULE)
-    (root / "agents" / "small_loop.py").write_text(LOOP)
+        shutil.copytree(PACKAGES / package, packages / package, ignore=ignored)
+    shutil.copy(PACKAGES / "__init__.py", packages)
+    (packages / "agents" / "common" / "small_rule.py").write_text(RULE)
+    (packages / "agents" / "small_loop.py").write_text(LOOP)
     return root
 
 
@@ -95,12 +97,13 @@ class Payload:
 
 def test_a_changed_rule_is_what_runs_and_files_that_do_not_serve_are_replaced(checkout, tmp_path):
     # The rule stands in another file than the loop. Back again, what was compiled is still there.
-    rule = checkout / "agents" / "common" / "small_rule.py"
+    rule = checkout / "rl_yardstick" / "agents" / "common" / "small_rule.py"
     first, second = RULE.replace("3.0", "7.0"), RULE.replace("3.0", "5.0")
     for text, value, is_compiled in ((first, 29, True), (second, 21, True), (first, 29, False)):
         rule.write_text(text)
         assert outcome(checkout) == (value, "compiled", is_compiled)
-    files = sorted((checkout / "agents" / "__pycache__" / "machine_code").rglob("*.nb[ic]"))
+    cached = checkout / "rl_yardstick" / "agents" / "__pycache__" / "machine_code"
+    files = sorted(cached.rglob("*.nb[ic]"))
     for place, path in enumerate(files):
         path.write_bytes(path.read_bytes()[: place % 2 * path.stat().st_size // 2])
     for is_compiled in (True, False):
@@ -227,20 +230,21 @@ def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
     """It has the old sources or the new: the digest cannot tell, so nothing is kept."""
     code = """
     from pathlib import Path
-    from rl_yardstick import agents
+    import rl_yardstick
     from rl_yardstick.machine_code import cache
     folder = cache.folder("agents")
-    source = Path("mdp/graph.py")
+    source = Path("rl_yardstick/mdp/graph.py")
     source.write_text(source.read_text() + "\\n")
     from rl_yardstick.agents.small_loop import run_small
     print(run_small(4.0), len(list(folder.rglob("*.nb[ic]"))))
     """
-    before = (checkout / "mdp" / "graph.py").read_text()
-    (checkout / "mdp" / "graph.py").write_text(f"# Another digest.\n{before}")
+    source = checkout / "rl_yardstick" / "mdp" / "graph.py"
+    before = source.read_text()
+    source.write_text(f"# Another digest.\n{before}")
     try:
         assert run(checkout, code).stdout.split() == ["13.0", "0"]
     finally:
-        (checkout / "mdp" / "graph.py").write_text(before)
+        source.write_text(before)
 
 
 def test_names_and_contents_count_and_other_files_do_not(tmp_path, monkeypatch):

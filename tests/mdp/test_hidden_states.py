@@ -3,13 +3,17 @@
 from itertools import product
 
 import gymnasium as gym
-import mdp.beliefs
-import mdp.memoryless
 import numpy as np
 import pytest
 
 from rl_yardstick.envs.known_models import observations_of_states, transition_model
-from rl_yardstick.mdp import TransitionModel, finite_horizon_optimum, policy_return
+from rl_yardstick.mdp import (
+    TransitionModel,
+    beliefs,
+    finite_horizon_optimum,
+    memoryless,
+    policy_return,
+)
 from rl_yardstick.mdp.beliefs import memory_optimum
 from rl_yardstick.mdp.memoryless import best_memoryless, observation_groups
 
@@ -60,8 +64,8 @@ def test_brackets_of_trees_that_are_cut_hold_the_optimum(seed, monkeypatch):
     model, groups = random_world(seed, n_states=6, n_actions=3, n_groups=3)
     exact = memory_optimum(model, groups, 7)
     assert exact.lower == exact.upper <= finite_horizon_optimum(model, 7).start_value + 1e-9
-    monkeypatch.setattr(mdp.beliefs, "MOST_BELIEFS", 3)
-    monkeypatch.setattr(mdp.beliefs, "MOST_OF_MORE", 3)
+    monkeypatch.setattr(beliefs, "MOST_BELIEFS", 3)
+    monkeypatch.setattr(beliefs, "MOST_OF_MORE", 3)
     cut = memory_optimum(model, groups, 7)
     assert cut.lower <= exact.upper + 1e-9
     assert exact.upper <= cut.upper + 1e-9
@@ -128,8 +132,8 @@ def test_no_policy_of_a_fine_grid_is_above_the_bound(seed):
 
 @pytest.mark.parametrize("most_tried", [100_000, 0], ids=["all tried", "hill climbing"])
 def test_the_best_deterministic_policy_is_that_of_brute_force(most_tried, monkeypatch):
-    monkeypatch.setattr(mdp.memoryless, "MOST_FIRM", most_tried)
-    monkeypatch.setattr(mdp.memoryless, "MOST_RETURNS", 1)
+    monkeypatch.setattr(memoryless, "MOST_FIRM", most_tried)
+    monkeypatch.setattr(memoryless, "MOST_RETURNS", 1)
     for seed in range(3):
         model, groups = random_world(seed, n_states=6, n_actions=3, n_groups=4)
         found = best_memoryless(model, groups, 6)
@@ -148,7 +152,7 @@ def test_the_best_deterministic_policy_is_that_of_brute_force(most_tried, monkey
 def test_bounds_without_time_hold_too(seed, monkeypatch):
     model, groups = random_world(seed, n_states=6, n_actions=3, n_groups=3)
     known = best_memoryless(model, groups, 6)
-    monkeypatch.setattr(mdp.memoryless, "MOST_RETURNS", 1)
+    monkeypatch.setattr(memoryless, "MOST_RETURNS", 1)
     cut = best_memoryless(model, groups, 6)
     assert cut.lower == known.lower
     assert known.upper <= cut.upper <= finite_horizon_optimum(model, 6).start_value + 1e-9
