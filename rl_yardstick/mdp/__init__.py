@@ -69,5 +69,5 @@ keep_machine_code("mdp")
 
 def __getattr__(name: str) -> object:
     if name not in _HOMES:
-        raise AttributeError(f"module 'mdp' has no attribute {name!r}")
+        raise AttributeError(f"module 'rl_yardstick.mdp' has no attribute {name!r}")
     return getattr(importlib.import_module(_HOMES[name]), name)
