@@ -230,7 +230,7 @@ def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
     """It has the old sources or the new: the digest cannot tell, so nothing is kept."""
     code = """
     from pathlib import Path
-    import rl_yardstick
+    from rl_yardstick import agents
     from rl_yardstick.machine_code import cache
     folder = cache.folder("agents")
     source = Path("rl_yardstick/mdp/graph.py")
