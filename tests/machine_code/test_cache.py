@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-import rl_yardstick
+from rl_yardstick import agents
 from rl_yardstick.machine_code import cache as code_cache
 from rl_yardstick.machine_code import sources
 
-PACKAGES = Path(rl_yardstick.__file__).resolve().parent
+PACKAGES = Path(agents.__file__).resolve().parents[1]
 
 # What is compiled in this process, and what is said of it besides.
 NOTE = """
