@@ -7,9 +7,6 @@ PACKAGE ?= mdp
 N ?= 25
 SEED ?= 0
 
-# What is installed, which has to work on other systems too.
-PACKAGES := rl_yardstick
-
 BIN := .venv/bin
 STAMP := .venv/.installed
 PINS := constraints.txt requirements.txt
@@ -44,7 +41,7 @@ lint: style types types-elsewhere ## Check style, formatting, types and import c
 # Separate targets, so that make -j2 runs them in parallel.
 style: $(STAMP)
 	$(BIN)/ruff check .
-	$(BIN)/ruff check --preview --select PLW1514 $(PACKAGES) # Windows does not take text for UTF-8
+	$(BIN)/ruff check --preview --select PLW1514 rl_yardstick # Windows does not take text for UTF-8
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
@@ -52,7 +49,7 @@ types: $(STAMP)
 	$(BIN)/python -m mypy
 
 types-elsewhere: $(STAMP)
-	$(BIN)/python -m mypy --platform win32 --no-warn-unreachable --cache-dir .mypy_cache/win32 $(PACKAGES)
+	$(BIN)/python -m mypy --platform win32 --no-warn-unreachable --cache-dir .mypy_cache/win32 rl_yardstick
 
 format: $(STAMP) ## Format the code, and apply ruff's fixes
 	$(BIN)/ruff check --fix-only .
@@ -62,7 +59,7 @@ bench: peers ## Time everything, with one round
 	$(BIN)/python benchmarks/timing.py --rounds 1 tabular networks bandits evaluation planning processes
 
 mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0
-	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED)
+	$(BIN)/python tests/mutation rl_yardstick/$(PACKAGE) -n $(N) --seed $(SEED)
 
 docs: $(STAMP) ## Build the site, build/site/index.html, and check its links
 	rm -rf build/site

@@ -30,7 +30,10 @@ from recommended_commands import (  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 COMPARE = (ROOT / "docs" / "compare.md").read_text()
-COMMAND = re.compile(r"python ((?:train|enjoy|compare|tune|explain|shaping|audit)\.py [^`\n)#]*)")
+COMMAND = re.compile(
+    r"python ((?:(?:train|enjoy|compare|tune)\.py|-m rl_yardstick (?:explain|shaping|audit))"
+    r" [^`\n)#]*)"
+)
 # Each with the first document that it stands in.
 FOUND_IN = {
     command.strip(): document.name
@@ -40,16 +43,16 @@ FOUND_IN = {
     )
 }
 PARSED_ALONE = {
-    "explain.py": explain.build_parser,
-    "shaping.py": shaping.build_parser,
-    "audit.py": audit.build_parser,
+    "explain": explain.build_parser,
+    "shaping": shaping.build_parser,
+    "audit": audit.build_parser,
 }
 COMMANDS = [pytest.param(each, id=f"{name}: {each}") for each, name in FOUND_IN.items()]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
-    script, *words = shlex.split(command)
+    script, *words = shlex.split(command.removeprefix("-m rl_yardstick "))
     if script == "train.py":
         # What the commands take for granted.
         (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
@@ -77,10 +80,11 @@ def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
 
 
 def test_there_are_commands_to_check():
-    counts = Counter(command.split()[0] for command in FOUND_IN)
+    counts = Counter(command.removeprefix("-m rl_yardstick ").split()[0] for command in FOUND_IN)
     assert counts["compare.py"] >= 20
     assert counts["train.py"] >= 6
     assert min(counts[script] for script in ("enjoy.py", "tune.py")) >= 2
+    assert all(counts[command] for command in PARSED_ALONE)
     assert len(SAMPLE) > 10
 
 

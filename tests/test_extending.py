@@ -59,7 +59,7 @@ def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
 def contributed(title, entry):
     """A rule as CONTRIBUTING writes it, and its entry in the table of agents."""
     (text,) = re.findall(rf'```python\n("""{title}\."""\n.*?)```', CONTRIBUTING, re.DOTALL)
-    return f"{text}\n\nimport agents\n\nagents.register({entry})\n"
+    return f"{text}\n\nfrom rl_yardstick import agents\n\nagents.register({entry})\n"
 
 
 RULE = contributed(

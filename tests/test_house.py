@@ -17,6 +17,7 @@ from packaging.utils import canonicalize_name
 from rl_yardstick.machine_code.cache import COMPILED
 
 ROOT = Path(__file__).resolve().parent.parent
+HOUSE = ROOT / "rl_yardstick"
 PACKAGES = (
     "safe_files",
     "machine_code",
@@ -35,9 +36,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def sources() -> list[Path]:
-    """Every module of the packages, and the commands beside them."""
-    inside = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    return sorted([*inside, *ROOT.glob("*.py")])
+    """Every module of the package, and the scripts beside it."""
+    return sorted([*HOUSE.rglob("*.py"), *ROOT.glob("*.py")])
 
 
 def module_name(path: Path) -> str:
@@ -58,9 +58,10 @@ def python(code: str, cwd: Path) -> str:
 def test_importing_a_package_is_cheap(package: str, tmp_path: Path) -> None:
     """Run from elsewhere, so it also shows that the installed project is this checkout."""
     heavy = "{'torch', 'numba', 'scipy', 'pandas', 'matplotlib', 'pygame', 'stable_baselines3'}"
-    code = f"import sys, {package} as p; print(p.__file__, *sorted({heavy} & sys.modules.keys()))"
+    code = f"import sys, rl_yardstick.{package} as p\n"
+    code += f"print(p.__file__, *sorted({heavy} & sys.modules.keys()))"
     of_verdicts = " scipy" if package == "verdicts" else ""  # which is SciPy's functions
-    assert python(code, cwd=tmp_path) == str(ROOT / package / "__init__.py") + of_verdicts
+    assert python(code, cwd=tmp_path) == str(HOUSE / package / "__init__.py") + of_verdicts
 
 
 def test_every_imported_library_is_a_declared_dependency() -> None:
@@ -82,7 +83,7 @@ def test_every_imported_library_is_a_declared_dependency() -> None:
 
 def imported_libraries(path: Path) -> Iterator[str]:
     """Top-level names of the third-party modules that a file imports, anywhere in it."""
-    own = {*PACKAGES, *(command.stem for command in ROOT.glob("*.py"))}
+    own = {HOUSE.name, *(command.stem for command in ROOT.glob("*.py"))}
     for name in imported_names(path):
         if name not in own and name not in sys.stdlib_module_names:
             yield name
@@ -141,12 +142,7 @@ def files_entered(tmp_path: Path) -> list[str]:
         text=True,
         check=True,
     )
-    folders = {str(ROOT / package) for package in PACKAGES}
-    return [
-        line
-        for line in done.stderr.splitlines()
-        if any(line.startswith(f"{folder}/") for folder in folders)
-    ]
+    return [line for line in done.stderr.splitlines() if line.startswith(f"{HOUSE}/")]
 
 
 def test_a_run_enters_no_more_files_than_it_did(tmp_path: Path) -> None:
@@ -180,8 +176,7 @@ def test_no_file_names_a_path_of_somebodys_machine() -> None:
 def published_files() -> Iterator[Path]:
     """Every text file of the project, with or without git at hand."""
     text = {".py", ".md", ".yml", ".yaml", ".toml", ".txt", ".json", ".html", ".css", ".js", ".csv"}
-    data = ("hyperparams", "studies")
-    folders = (*PACKAGES, *data, "tests", "benchmarks", "docs", ".ci")
+    folders = (HOUSE.name, "studies", "tests", "benchmarks", "docs", ".ci")
     inside = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
     beside = [path for path in ROOT.iterdir() if path.is_file()]
     return (path for path in [*inside, *beside] if path.suffix in {*text, ""})
@@ -190,10 +185,10 @@ def published_files() -> Iterator[Path]:
 def test_all_that_is_compiled_stands_where_the_digest_of_machine_code_looks() -> None:
     """Compiled functions, and what is compiled into them, are sources of `mdp` and `agents`."""
     compiling = {
-        str(path.relative_to(ROOT))
-        for path in sources()
+        path.relative_to(HOUSE).parts[0]
+        for path in HOUSE.rglob("*.py")
         if re.search(
             r"^\s*(import numba|from numba)|^@?(inlined|kernel|compiled)$", path.read_text(), re.M
         )
     }
-    assert {Path(name).parts[0] for name in compiling} == set(COMPILED)
+    assert compiling == set(COMPILED)

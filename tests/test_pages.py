@@ -65,7 +65,7 @@ def test_the_table_of_hardness_has_each_environment_with_a_model(fill_pages):
 
 def test_a_line_is_filled_and_others_stay(fill_pages):
     with pytest.raises(ValueError, match=r"mdp/graph\.py defines no nothing"):
-        fill_pages.filled('[x](../mdp/graph.py "code: nothing")', DOCS)
+        fill_pages.filled('[x](../rl_yardstick/mdp/graph.py "code: nothing")', DOCS)
     other = 'See [code](x.py "code: f") and [a title](x.md "agents of ours").\n'
     filled = fill_pages.filled(f'{other}[Agents](x.py "agents")\n', DOCS)
     assert filled.startswith(other)

@@ -15,7 +15,7 @@ class AgentClasses(SphinxDirective):
         from rl_yardstick.agents import ALGORITHMS
 
         places = [entry.entry_point.replace(":", ".") for entry in ALGORITHMS.values()]
-        own = [place for place in dict.fromkeys(places) if place.startswith("agents.")]
+        own = [place for place in dict.fromkeys(places) if place.startswith("rl_yardstick.agents.")]
         lines = [line for place in own for line in (f".. autoclass:: {place}", "")]
         node = nodes.container()
         self.state.nested_parse(StringList(lines, source="agents"), self.content_offset, node)

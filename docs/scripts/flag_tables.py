@@ -9,7 +9,9 @@ from importlib import import_module
 
 def flags_block(command: str) -> str:
     """A row for each argument of a command, with what its help says."""
-    parser: argparse.ArgumentParser = import_module(f"rl_yardstick.commands.{command}").build_parser()
+    parser: argparse.ArgumentParser = import_module(
+        f"rl_yardstick.commands.{command}"
+    ).build_parser()
     lines = ["| argument | what it does |", "|---|---|"]
     for action in parser._actions:
         if action.dest == "help" or action.help == argparse.SUPPRESS:

@@ -18,7 +18,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "documented-commands.md"
 RESULTS = PAGE.with_suffix(".json")
-PACKAGES = ("agents", "commands", "envs", "experiments", "pipeline", "report", "tuning")
 # Where a command ends: a backtick, a comment, a cell of a table or the line.
 COMMAND = re.compile(
     r"(?:python (?:~/yardstick/)?(train|compare|tune)\.py|\byardstick (train|compare|tune)"
@@ -94,7 +93,7 @@ def documented() -> tuple[Command, ...]:
     pages = [
         p for p in sorted(ROOT.glob("docs/**/*.md")) if p != PAGE and "decisions" not in p.parts
     ]
-    code = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
+    code = sorted((ROOT / "rl_yardstick").rglob("*.py"))
     found: dict[Command, Command] = {}
     for path in (ROOT / "README.md", *pages, *sorted(ROOT.glob("*.py")), *code):
         for one in commands_in(path.read_text(encoding="utf-8")):

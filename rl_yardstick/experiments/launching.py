@@ -388,7 +388,7 @@ class EarlyResults:
     def get_ready(self) -> None:
         """Load the slow imports of reading; best called during the first runs."""
         with loading_libraries():
-            import experiments.results  # noqa: F401
+            import rl_yardstick.experiments.results  # noqa: F401
 
     def read(self, planned: PlannedRun) -> RunResults | None:
         """Read a run that has just ended; damage is reported later."""

@@ -29,10 +29,6 @@ from rl_yardstick.pipeline.errors import UserError, one_line, shown
 from rl_yardstick.pipeline.files import files_below, replacing
 from rl_yardstick.safe_files.files import NO_LIMIT, read_file
 
-# If this project is installed, libraries are beside it.
-_PROJECT = Path(__file__).resolve().parents[2]
-_OWN = "rl_yardstick"
-
 
 @dataclass(frozen=True)
 class UserModule:
@@ -216,9 +212,7 @@ def _places(top: str) -> set[Path]:
 
 def is_ours(name: str) -> bool:
     """Whether a module of that name belongs to this project."""
-    top = name.partition(".")[0]
-    own = {_PROJECT / f"{top}.py", _PROJECT / top / "__init__.py"}
-    return top in _OWN.split() and not own.isdisjoint(_places(top))
+    return name.partition(".")[0] == "rl_yardstick"
 
 
 def _what_failed(error: BaseException, module: UserModule) -> str:

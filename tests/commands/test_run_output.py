@@ -167,7 +167,7 @@ def test_what_to_type_next(monkeypatch):
     compared = "compare.py --env Lake-v1 --algos qlearning"
     assert next_commands(spec, run, "sarsa", has_model=True) == [
         ("watch", f"python enjoy.py {chosen}"),
-        ("explain", f"python explain.py {chosen}"),
+        ("explain", f"python -m rl_yardstick explain {chosen}"),
         ("compare", f"python {compared} sarsa --env-kwargs size:5 --seeds 10 --engine auto"),
     ]
     own = replace(spec, algo="cautious", hyperparams=split({"n_episodes": 30}))

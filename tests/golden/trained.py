@@ -7,6 +7,8 @@ by the functions that README shows. So this runs on any commit, wherever its mod
 from __future__ import annotations
 
 import hashlib
+import importlib
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -168,27 +170,32 @@ def trainings() -> Iterator[Thing]:
 
 def environments() -> list[str]:
     """Ids of the project's environments and of those that everybody knows."""
-    import rl_yardstick.envs  # noqa: F401  # registers them
-
-    own = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("envs.")]
+    folder = package("envs").__name__  # and importing it registers them
+    places = {name: str(spec.entry_point) for name, spec in gym.registry.items()}
+    own = [name for name, place in places.items() if place.startswith(f"{folder}.")]
     return sorted([*own, *OTHER_ENVIRONMENTS])
+
+
+def package(name: str) -> Any:
+    """A package of the checkout that is looked at; early commits have it at the top."""
+    # Not by trying: another checkout, whose packages are installed, would take its place.
+    is_inside = (Path(os.environ["PYTHONPATH"]) / "rl_yardstick").is_dir()
+    return importlib.import_module(f"rl_yardstick.{name}" if is_inside else name)
 
 
 def fitting(env_id: str, arguments: dict[str, Any]) -> list[str]:
     """Names of the agents that can work with an environment, in the order of the alphabet."""
-    from rl_yardstick import agents
-
     with gym.make(env_id, **arguments) as env:
         masks = hasattr(env.unwrapped, "action_masks")
         spaces = env.observation_space, env.action_space
+    agents = package("agents")
     return sorted(agents.fitting_algorithms(*spaces, "Bandit-" in env_id, masks))
 
 
 def engines(algo: str) -> tuple[str, ...]:
     """The engines that can be asked for; one empty word where there is no choice."""
-    from rl_yardstick import agents
-
-    chosen = tuple(word for word in agents.ALGORITHMS[algo].engines if word != "auto")
+    entry = package("agents").ALGORITHMS[algo]
+    chosen = tuple(word for word in entry.engines if word != "auto")
     return tuple(sorted(chosen)) if len(chosen) > 1 else ("",)
 
 
@@ -226,8 +233,6 @@ def trained(case: Case, engine: str) -> str:
     from stable_baselines3.common.utils import LinearSchedule
     from stable_baselines3.common.vec_env import DummyVecEnv
 
-    from rl_yardstick import agents
-
     env_id, env_arguments, algo, given = case
     n_steps, arguments = NETWORKS.get(algo, (N_STEPS, {}))
     arguments = {**arguments, **given, **({"engine": engine} if engine else {})}
@@ -238,7 +243,7 @@ def trained(case: Case, engine: str) -> str:
     monitors = [Monitor(gym.make(env_id, **env_arguments)) for _ in range(n_envs)]
     makers = [lambda env=env: env for env in monitors]
     env: Any = DummyVecEnv(makers) if n_envs > 1 else monitors[0]
-    algorithm = agents.load_algorithm(algo)
+    algorithm = package("agents").load_algorithm(algo)
     policies = algorithm.policy_aliases
     policy = "MlpPolicy" if "MlpPolicy" in policies else next(iter(policies))
     agent = algorithm(policy, env, seed=0, **arguments)
@@ -273,18 +278,15 @@ def plans() -> Iterator[Thing]:
 
 def model_of(env: gym.Env[Any, Any]) -> Any:
     """The transition model of one of the project's environments, or of Gymnasium's toy_text."""
-    from rl_yardstick.mdp import TransitionModel
-
     base: Any = env.unwrapped
     if hasattr(base, "transition_model"):
         return base.transition_model()
-    return TransitionModel.from_gymnasium(base.P, base.initial_state_distrib)
+    return package("mdp").TransitionModel.from_gymnasium(base.P, base.initial_state_distrib)
 
 
 def planned(env_id: str, what: str) -> str:
     """What planning or evaluating on the model of an environment comes to."""
-    from rl_yardstick import mdp
-
+    mdp = package("mdp")
     with gym.make(env_id, **ENVIRONMENT_ARGUMENTS.get(env_id, {})) as env:
         model, limit = model_of(env), env.spec.max_episode_steps if env.spec else None
     horizon = min(limit or 200, 200)

@@ -29,7 +29,7 @@ from pathlib import Path
 import hypothesis  # noqa: F401  # pytest's plugin imports it, in every child that has not
 import pytest
 from drawing import Mutant, drawn
-from quick import chosen, weights
+from quick import chosen, packages_of, weights
 
 NOT_COPIED = shutil.ignore_patterns(".*", "logs", "runs", "build", "__pycache__")
 LIBRARIES = "torch._dynamo scipy.stats pandas matplotlib.pyplot gymnasium stable_baselines3 numba"
@@ -82,8 +82,8 @@ class Copy:
         self.place = root / "build" / "mutants"
         self.path, self.report = self.place / "copy", self.place / "report"
         shutil.rmtree(self.path, ignore_errors=True)
-        shutil.copytree(root, self.path, ignore=NOT_COPIED)
-        sources = [file.parent for file in sorted(self.path.glob("*/__init__.py"))]
+        shutil.copytree(root, self.path, symlinks=True, ignore=NOT_COPIED)
+        sources = packages_of(self.path)
         self.broken: list[str] = []
         self.costs: dict[str, float] = {}
         self.entering: dict[str, set[str]] = defaultdict(set)
@@ -204,7 +204,7 @@ class Copy:
         places = [place for place in self.entering if place.startswith(f"{mutant.path}:")]
         entering = covering or set().union(*map(self.entering.get, places))
         files = {test.split("::")[0] for test in entering}
-        own = f"tests/{mutant.path.split('/')[0]}/"
+        own = f"tests/{mutant.path.removeprefix('rl_yardstick/').split('/')[0]}/"
 
         def rank(test: str) -> tuple[bool, bool, bool, bool, float]:
             file = test.partition("::")[0]
@@ -231,7 +231,7 @@ def main() -> None:
     """Draw errors, or take those drawn before; judge each, and count."""
     root = Path(__file__).resolve().parents[2]
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("packages", nargs="*", help="packages of the project, such as mdp")
+    parser.add_argument("packages", nargs="*", help="folders of sources, such as rl_yardstick/mdp")
     parser.add_argument("-n", type=int, default=25, help="how many errors in each (25)")
     parser.add_argument("--seed", type=int, default=0, help="which errors (0)")
     parser.add_argument("--record", type=Path, help="write the errors and their fates to a file")

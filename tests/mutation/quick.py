@@ -20,10 +20,16 @@ from drawing import mutants_of
 LEFT_OUT = ("test_what_a_killed_worker_has_saved_is_gone_on_with",)
 
 
+def packages_of(root: Path) -> list[Path]:
+    """The folders of a checkout's packages; some have links to them beside them."""
+    found = sorted(file.parent for file in root.glob("*/__init__.py"))
+    return [folder for folder in found if not folder.is_symlink()]
+
+
 def weights(root: Path) -> Counter[str]:
     """How many errors can be made in each function, by ``path:line`` as a code object has it."""
     found: Counter[str] = Counter()
-    for folder in sorted(file.parent for file in root.glob("*/__init__.py")):
+    for folder in packages_of(root):
         for file in sorted(folder.rglob("*.py")):
             path, source = file.relative_to(root).as_posix(), file.read_text()
             functions = [

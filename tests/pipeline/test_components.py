@@ -157,7 +157,8 @@ def test_a_module_is_found_by_its_name_and_by_its_path(write, own_folder, monkey
     write(my_package__in__part="x = 2", my_space__in__part="x = 3", my_other="import my_first")
     words = ["my_first", "./my_other.py", "my_package/", "my_package/part.py", "my_space.part"]
     names = ["my_first", "my_other", "my_package", "my_package.part", "my_space.part"]
-    assert import_typed(["envs"], ["envs:Warehouse-v0", "CartPole-v1"]) == ()
+    ours = "rl_yardstick.envs"
+    assert import_typed([ours], [f"{ours}:Warehouse-v0", "CartPole-v1"]) == ()
     modules = import_typed(words)
     assert [(module.typed, module.name) for module in modules] == [*zip(words, names, strict=True)]
     assert {module.search_folder for module in modules} == {str(own_folder)}
@@ -182,7 +183,7 @@ def test_a_module_is_found_by_its_name_and_by_its_path(write, own_folder, monkey
     ("words", "complaint"),
     [
         (["json"], "json is the name of one of Python's own modules: rename"),
-        (["train"], "train is the name of one of Yardstick's own modules: rename"),
+        (["rl_yardstick"], "rl_yardstick is the name of one of Yardstick's own modules: rename"),
         (["my_first", "agents/../below/my_first.py"], "Python finds another my_first first, at "),
         (["no_such"], "cannot import no_such: it is neither in "),
         (["./no_such.py"], "there is no such file or folder"),
@@ -192,7 +193,7 @@ def test_a_module_is_found_by_its_name_and_by_its_path(write, own_folder, monkey
 )
 def test_what_cannot_be_imported(write, own_folder, words, complaint):
     poison = "raise SystemExit('it was imported')"
-    write(agents__in____init__=poison, json=poison, train=poison)
+    write(agents__in____init__=poison, json=poison, rl_yardstick=poison)
     write(my_first="x = 1", below__in__my_first=poison)
     (own_folder / "notes.txt").touch()
     (own_folder / "my-agents.py").touch()

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pipeline.evaluation.histories
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -12,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.mdp import policy_return, value_iteration
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
-from rl_yardstick.pipeline.evaluation import policies
+from rl_yardstick.pipeline.evaluation import histories, policies
 from rl_yardstick.pipeline.evaluation.advice import advice
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of_single, exact_evaluator
 from rl_yardstick.pipeline.evaluation.histories import by_histories, world_of_memory
@@ -472,7 +471,7 @@ def test_who_counts_readings_reaches_the_optimum_of_memory():
 
 def test_histories_that_an_agent_does_not_tell_apart_are_one(monkeypatch):
     # Ten steps: 2^10 sequences of sounds and more, but few counts.
-    monkeypatch.setattr(pipeline.evaluation.histories, "MOST_HISTORIES", 10)
+    monkeypatch.setattr(histories, "MOST_HISTORIES", 10)
     found = worth(Counting(), TIGER)
     # By hand, by how much more often the tiger was heard where it is; opening begins anew.
     total, counts = 0.0, {0: 1.0}

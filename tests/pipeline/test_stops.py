@@ -152,7 +152,7 @@ if __name__ == "__main__":
 def test_workers_outlive_a_signal_to_all_but_not_the_training(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    root = Path(stopping.__file__).parents[1]
+    root = Path(stopping.__file__).parents[2]
     done = subprocess.run(
         [sys.executable, str(script)],
         env={**os.environ, "PYTHONPATH": str(root)},

@@ -190,7 +190,7 @@ import sys
 
 class Nothing:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"agents", "envs", "machine_code", "mdp", "pipeline"}:
+        if name.split(".")[0] == "rl_yardstick":
             raise ModuleNotFoundError(name)
 
 sys.meta_path.insert(0, Nothing())
