@@ -86,15 +86,20 @@ def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
     return kwargs
 
 
+def usual_kwargs(env_id: str) -> dict[str, Any]:
+    """The default arguments of an environment, as far as they are known."""
+    parameters, registered = _parameters(env_id), gym.spec(env_id)
+    defaults = {p.name: p.default for p in parameters.values() if p.default is not p.empty}
+    limit = {"max_episode_steps": registered.max_episode_steps}
+    return {**limit, **defaults, **registered.kwargs}
+
+
 def training_changes(spec: TrainSpec) -> tuple[str, ...]:
     """How training's environment differs from the one of evaluations, in words; often empty.
 
     The returns of a training with changes are not compared with the optimum.
     """
-    parameters = _parameters(spec.env_id)
-    usual = {p.name: p.default for p in parameters.values() if p.default is not p.empty}
-    usual |= {**gym.spec(spec.env_id).kwargs, **spec.env_kwargs}
-    usual.setdefault("max_episode_steps", gym.spec(spec.env_id).max_episode_steps)
+    usual = {**usual_kwargs(spec.env_id), **spec.env_kwargs}
     training, evaluation, told = spec.train_env_kwargs, spec.eval_env_kwargs, []
     for key in {**training, **evaluation}:
         if key == "max_episode_steps" and key not in training:
@@ -136,6 +141,12 @@ def wrapped(spec: TrainSpec, env: Env, training: bool, folder: Path | None = Non
     # Without masks, `check_fit` names the agents that fit.
     needs_masks = spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks
     return ActionMasks(env) if needs_masks and has_masks(env) else env
+
+
+def remembers(spec: TrainSpec) -> bool:
+    """Whether the agent is recurrent or observations are stacked, according to the settings."""
+    entry = ALGORITHMS.get(spec.algo)
+    return (entry is not None and entry.has_memory) or (spec.frame_stack or 1) > 1
 
 
 def check_fit(spec: TrainSpec) -> None:

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.pipeline.errors import UserError
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 MAX_TEXT = 10_000_000  # bytes of a settings file
+MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
 LONGEST_NAME = 100  # bytes; Windows limits a whole path to 260 characters
 
 _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
@@ -66,6 +71,38 @@ def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
         return json.loads(read_text(path, limit))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is no valid JSON: {error}") from error
+
+
+def read_arrays(
+    path: Path, shapes: Mapping[str, str], optional: Collection[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Arrays of numbers in a NumPy archive, which is read as data.
+
+    Args:
+        path: the archive.
+        shapes: names of arrays, and of their axes: axes of one name must have the same length.
+        optional: names of arrays that may be missing.
+    """
+    from numpy.lib.format import read_array
+
+    from rl_yardstick.safe_files.archives import read_members
+
+    found: dict[str, NDArray[Any]] = {}
+    lengths: dict[str, int] = {}
+    try:
+        members = read_members(read_bytes(path, MAX_ARRAYS), most=100)
+        for name, axes in shapes.items():
+            if name in optional and f"{name}.npy" not in members:
+                continue
+            content = members[f"{name}.npy"]
+            found[name] = read_array(io.BytesIO(content), allow_pickle=False)
+            sizes = zip(axes.split(), found[name].shape, strict=True)
+            wanted = [int(a) if a.isdigit() else lengths.setdefault(a, n) for a, n in sizes]
+            if found[name].dtype.kind not in "biuf" or tuple(wanted) != found[name].shape:
+                raise ValueError(f"{name} has another shape or kind")
+    except (ValueError, LookupError, OverflowError, MemoryError) as error:
+        raise UserError(f"{path} is damaged: {error}") from error
+    return found
 
 
 @contextmanager

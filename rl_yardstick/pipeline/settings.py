@@ -49,8 +49,8 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     """Plain values only; the same key twice is a mistake."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        keys = [key.value for key, _ in node.value if key.value != "<<"]  # before they are merged
         found = super().construct_mapping(node, deep=deep)
-        keys = [key.value for key, _ in node.value if key.value != "<<"]
         if len(set(keys)) < len(keys):
             twice = next(key for key in keys if keys.count(key) > 1)
             line = node.start_mark.line + 1

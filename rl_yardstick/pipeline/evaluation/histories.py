@@ -18,11 +18,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
-from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.agents.reference import RandomAgent
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Ints
-from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.environments import make_single_env, remembers
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator, evaluator_of_single
 from rl_yardstick.pipeline.evaluation.policies import KNOWN_LIBRARIES, has_memory, takes_masks
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
@@ -47,12 +46,6 @@ def world_of_memory(spec: TrainSpec, agent: BaseAlgorithm) -> ExactEvaluator | N
     if is_covered or not is_known or not (has_memory(agent) or remembers(spec)):
         return None
     return evaluator_of_single(spec)
-
-
-def remembers(spec: TrainSpec) -> bool:
-    """Whether the agent is recurrent or observations are stacked, according to the settings."""
-    entry = ALGORITHMS.get(spec.algo)
-    return (entry is not None and entry.has_memory) or (spec.frame_stack or 1) > 1
 
 
 class HistoryEvaluator(SampledEvaluator):
