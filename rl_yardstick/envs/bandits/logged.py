@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TextIO
 
 import gymnasium as gym
@@ -42,8 +43,9 @@ NUMBER = "a finite number of no more than 1e15"
 class _LogReader:
     """Reads a file in pieces as numbers: as text, a large file would take gigabytes."""
 
-    def __init__(self, path: Path, file: TextIO) -> None:
+    def __init__(self, path: Path, file: TextIO, names: Mapping[str, str]) -> None:
         self.path = path
+        self.names = {own: name for name, own in names.items()}
         self.columns: dict[str, Floats] = {}
         # The distinct values of text, numbered, if the context is one column of text.
         self.words: dict[str, int] = {}
@@ -99,6 +101,7 @@ class _LogReader:
                 continue
             cells, line = [cell.strip() for cell in row], self._reader.line_num
             if n_cells is None:
+                cells = [self.names.get(cell, cell) for cell in cells]
                 self._check_header(cells)
                 n_cells = len(cells)
             if len(cells) != n_cells:
@@ -233,11 +236,12 @@ class LoggedData:
         return f"the context {names} with {len(self.categories)} values of text"
 
 
-def read_log(path: str | Path) -> LoggedData:
+def read_log(path: str | Path, columns: Mapping[str, str] = MappingProxyType({})) -> LoggedData:
     """Read logged pulls.
 
     Args:
         path: a CSV file, separated by commas, with a header; see the module.
+        columns: the file's own names of the columns ``arm``, ``reward`` and ``propensity``.
 
     Raises:
         ValueError: if it cannot be read, a column is missing or duplicated, a row is too short or
@@ -247,7 +251,8 @@ def read_log(path: str | Path) -> LoggedData:
     file = Path(path)
     try:
         with opened(file, MAX_BYTES) as binary:
-            log = _LogReader(file, TextIOWrapper(binary, encoding="utf-8-sig", newline=""))
+            text = TextIOWrapper(binary, encoding="utf-8-sig", newline="")
+            log = _LogReader(file, text, columns)
             log.read()
     except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
