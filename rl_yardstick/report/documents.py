@@ -123,7 +123,7 @@ _FILTERS: Mapping[Markup, Mapping[str, Callable[[str], str]]] = {
 @cache
 def _templates(markup: Markup) -> Environment:
     environment = Environment(  # noqa: S701  # no HTML; what is markup here the filters escape
-        loader=PackageLoader("report"),
+        loader=PackageLoader("rl_yardstick.report"),
         variable_start_string="<<",
         variable_end_string=">>",
         block_start_string="<%",
