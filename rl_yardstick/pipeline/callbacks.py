@@ -24,6 +24,7 @@ from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_u
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.critics import CriticRecorder
+from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
 from rl_yardstick.pipeline.files import replacing
@@ -140,10 +141,11 @@ class StateCallback(BlockCallback):
     takes_blocks = True
     share_of_time, shortest_pause = 0.02, 1.0
 
-    def __init__(self, run: Run, resumes: bool, clock: Any, **process: Any) -> None:
+    def __init__(self, run: Run, resumes: bool, clock: Any, judge: Judge) -> None:
         super().__init__()
         self.run, self.resumes, self.clock = run, resumes, clock
-        self.process = {"run": run, **process}
+        self.evaluator = judge.evaluator
+        self.process = {"run": run, "exact": judge.exact, "eval_env": judge.env}
         self.is_possible = True
         self.others: list[BaseCallback] = []
         self.saved_at, self.pause = time.monotonic(), self.shortest_pause
@@ -155,7 +157,9 @@ class StateCallback(BlockCallback):
         return self.is_possible and time.monotonic() - self.saved_at >= self.pause
 
     def _roots(self) -> dict[str, Any]:
-        return roots_of(self.model, self.others, **self.process)
+        roots = roots_of(self.model, self.others, **self.process)
+        is_exact = self.evaluator is self.process["exact"]  # which has no state of its own
+        return roots if is_exact else {**roots, "evaluator": self.evaluator}
 
     def _on_rollout_start(self) -> None:
         if self.resumes:

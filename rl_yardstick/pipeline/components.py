@@ -28,7 +28,7 @@ _CLASSES = {
     "RMSpropTFLike": "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
     "HerReplayBuffer": "stable_baselines3.her.her_replay_buffer.HerReplayBuffer",
 }
-_PLACES = re.compile(r"(path|dir|folder|file|filename|log)$")
+_PLACES = re.compile(r"(path|dir|folder|file|filename|log|prefix)$")
 
 
 def find_class(name: str, bases: tuple[type, ...], where: str, typed: list[str]) -> type:
@@ -91,6 +91,10 @@ def build(
 def _inside(name: str, value: Any, folder: Path | None, where: str) -> Any:
     """A path among the arguments, inside the run folder."""
     if not (isinstance(value, str) and _PLACES.search(name)) or folder is None:
+        return value
+    if name.endswith("prefix"):
+        if Path(value).name != value:
+            raise UserError(f"{where}: {name} begins the names of files, unlike {shown(value)}")
         return value
     path = (folder / value).resolve()
     if not path.is_relative_to(folder.resolve()):

@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 
@@ -198,7 +198,7 @@ class Parts:
             EpisodeBudget(spec.n_episodes) if spec.n_episodes is not None else None,
             *(self.clock, self.progress),
         ]
-        saver = StateCallback(run, resumes, self.clock, **self.judge.process)
+        saver = StateCallback(run, resumes, self.clock, self.judge)
         saver.others = [callback for callback in others if callback is not None]
         return CallbackList([NumberWatch(), saver, *saver.others])
 
@@ -353,6 +353,11 @@ def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) ->
         raise UserError(f"{spec.algo} on {spec.place}: {one_line(error)}") from error
     if not (spec.tensorboard_log or spec.library_log):
         agent.set_logger(Logger(folder=None, output_formats=[]))
+    elif appending and spec.tensorboard_log:
+        logs = (Path(spec.tensorboard_log) / spec.env_name).glob(f"{spec.algo}_*")
+        newest = max(logs, key=lambda path: path.stat().st_mtime, default=None)
+        if newest is not None:  # the library would begin another log
+            agent.set_logger(configure(str(newest), ["tensorboard"]))
     # The library seeds environment i with seed + i, so neighbouring seeds would share most.
     env.seed(first_seed(spec))
     return agent

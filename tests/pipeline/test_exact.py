@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pipeline.evaluation.histories
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -472,7 +471,7 @@ def test_who_counts_readings_reaches_the_optimum_of_memory():
 
 def test_histories_that_an_agent_does_not_tell_apart_are_one(monkeypatch):
     # Ten steps: 2^10 sequences of sounds and more, but few counts.
-    monkeypatch.setattr(pipeline.evaluation.histories, "MOST_HISTORIES", 10)
+    monkeypatch.setattr(histories, "MOST_HISTORIES", 10)
     found = worth(Counting(), TIGER)
     # By hand, by how much more often the tiger was heard where it is; opening begins anew.
     total, counts = 0.0, {0: 1.0}
@@ -506,11 +505,11 @@ def test_all_histories_say_what_many_episodes_say():
 
 def test_runs_say_by_which_scale_they_are_measured(tmp_path):
     brief = {**SHORT, "env_kwargs": {"max_episode_steps": 4}}
-    outcome = trained("ppo_lstm", TIGER, brief, n_timesteps=32, log_folder=tmp_path)
+    run, outcome = trained("ppo_lstm", TIGER, brief, n_timesteps=32, folder=tmp_path)
     assert outcome.final.is_exact
-    assert outcome.run.read_info()["final"]["measured_by"] == "memory"
-    plain = trained("qlearning", TIGER, n_timesteps=200, log_folder=tmp_path)
-    final = plain.run.read_info()["final"]
+    assert run.recorded()["final"]["measured_by"] == "memory"
+    plain, _ = trained("qlearning", TIGER, n_timesteps=200, folder=tmp_path)
+    final = plain.recorded()["final"]
     assert (final["measured_by"], final["optimum"], final["full_optimum"]) == (
         "observation", -10, 100,
     )  # fmt: skip

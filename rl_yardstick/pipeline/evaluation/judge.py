@@ -69,11 +69,6 @@ class Judge:
         self.yardstick = found.yardstick
         return found
 
-    @property
-    def process(self) -> dict[str, Any]:
-        """What a saved state refers to by name: an exact evaluator has no state of its own."""
-        return {"exact": self.exact, "eval_env": self.env}
-
     def _say(self, line: str) -> None:
         self.console.print(line, style="dim", markup=False, highlight=False)
 
