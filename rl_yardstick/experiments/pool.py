@@ -134,7 +134,7 @@ class Workers:
     def submit(self, planned: PlannedRun, command: str) -> Future[None]:
         """Do a run as soon as a worker is free; the future raises what `do_run` raises."""
         if self._pool is None:
-            self._pool = _process_pool(self.n_at_once)
+            self._pool = process_pool(self.n_at_once)
         return self._pool.submit(do_run, self.timeout, planned, command)
 
     def end(self) -> None:
@@ -151,7 +151,7 @@ class Workers:
             self._pool = None
 
 
-def _process_pool(n_workers: int) -> ProcessPool:
+def process_pool(n_workers: int) -> ProcessPool:
     """A pool of processes that have imported the libraries, and use one thread each."""
     context = multiprocessing.get_context("spawn" if _WINDOWS_OR_MAC else "forkserver")
     context.set_forkserver_preload(["rl_yardstick.pipeline.training"])
@@ -174,7 +174,7 @@ def _follow_parent() -> None:
 
 def do_aside(function: Callable[..., Any], *args: Any) -> Any:
     """Call a function in another process, so that this one need not import the libraries."""
-    with _process_pool(1) as pool:
+    with process_pool(1) as pool:
         return pool.schedule(function, args=args).result()
 
 
