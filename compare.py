@@ -1,10 +1,6 @@
-"""Compare agents over seeds: ``python compare.py --env FrozenLake-v1 --algos qlearning dqn``."""
+"""``python compare.py --help``."""
 
-try:
-    from rl_yardstick.commands.cli import run_command
-    from rl_yardstick.commands.compare import main
-except KeyboardInterrupt:  # during the imports
-    raise SystemExit(130) from None
+from rl_yardstick.commands import run_command
 
 if __name__ == "__main__":
-    run_command(main)
+    run_command("compare")

@@ -1,10 +1,6 @@
-"""Play a trained agent: ``python enjoy.py --env Warehouse-v0 --algo ppo``."""
+"""``python enjoy.py --help``."""
 
-try:
-    from rl_yardstick.commands.cli import run_command
-    from rl_yardstick.commands.enjoy import main
-except KeyboardInterrupt:  # during the imports
-    raise SystemExit(130) from None
+from rl_yardstick.commands import run_command
 
 if __name__ == "__main__":
-    run_command(main)
+    run_command("enjoy")

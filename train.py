@@ -1,10 +1,6 @@
-"""Train an agent on an environment: ``python train.py --env Warehouse-v0 --algo ppo``."""
+"""``python train.py --help``."""
 
-try:
-    from rl_yardstick.commands.cli import run_command
-    from rl_yardstick.commands.train import main
-except KeyboardInterrupt:  # during the imports
-    raise SystemExit(130) from None
+from rl_yardstick.commands import run_command
 
 if __name__ == "__main__":
-    run_command(main)
+    run_command("train")

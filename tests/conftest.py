@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import gc
-import multiprocessing
 import os
 import signal
 import sys
@@ -16,8 +15,7 @@ from types import SimpleNamespace
 import hypothesis
 import pytest
 
-from rl_yardstick.experiments.child_processes import PRELOADED
-from rl_yardstick.pipeline.stopping import SIGNALS
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -28,11 +26,6 @@ for library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):
 # The key to saved states is the user's own, which tests leave alone.
 CONFIGURATION = tempfile.TemporaryDirectory(prefix="yardstick-tests-")
 os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
-
-# One server for all tests, whichever needs it first: from one that has imported nothing, as the
-# library starts it, each child would import everything anew, and what PyTorch's optimizers import.
-PRELOADED.append("torch._dynamo")
-multiprocessing.set_forkserver_preload(PRELOADED)
 
 # No deadline: the first example of a compiled function pays for its compilation. In CI the examples
 # are the same every time, so that a failure there can be repeated.
@@ -62,15 +55,15 @@ def pytest_collection_finish():
 @pytest.fixture(autouse=True, scope="session")
 def shipped_settings_are_parsed_once():
     """Each run asks for them, and to parse a file takes longer than to check what it says."""
-    from rl_yardstick.pipeline.settings import hyperparams as entries
+    from rl_yardstick.pipeline import settings
 
-    read, parsed = entries.read_yaml, cache(entries.read_yaml)
+    read, parsed = settings.read_yaml, cache(settings.read_yaml)
 
     def read_once(path):
-        return copy.deepcopy(parsed(path)) if path.parent == entries._FOLDER else read(path)
+        return copy.deepcopy(parsed(path)) if path.parent == settings.HYPERPARAMS else read(path)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(entries, "read_yaml", read_once)
+        patch.setattr(settings, "read_yaml", read_once)
         yield
 
 
@@ -153,39 +146,38 @@ def _is_of(module, folder):
 
 
 @pytest.fixture
-def type_in_own_folder(own_folder, monkeypatch, capsys):
-    """Run a command line in this process, inside a user's folder: exit code, output, errors."""
-    import compare
-    import enjoy
-    import train
-    import tune
-    from rl_yardstick.commands.cli import run_command
-
-    commands = {f"{each.__name__}.py": each.main for each in (train, enjoy, compare, tune)}
+def typed(monkeypatch, capsys):
+    """Run a command line in this process: exit code, output, errors."""
+    from rl_yardstick import commands
 
     def run(*words):
-        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-        with pytest.raises(SystemExit) as stop:
-            run_command(commands[words[0]])
+        name = str(words[0]).removesuffix(".py")
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *(str(word) for word in words[1:])])
+        code = commands._exit_code(name)
         captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
+        return code, captured.out, captured.err
 
     return run
+
+
+@pytest.fixture
+def type_in_own_folder(own_folder, typed):
+    """As `typed`, inside a user's folder."""
+    return typed
 
 
 @pytest.fixture(scope="session")
 def do_study():
     """Does the runs of a study that are missing, in this process, and reads its results."""
     from rl_yardstick.experiments.plan import plan
+    from rl_yardstick.experiments.pool import do_run
     from rl_yardstick.experiments.results import read_results
-    from rl_yardstick.experiments.run_folders import draft_path
-    from rl_yardstick.experiments.run_in_child import do_run
 
     def do(study, root):
         planned = plan(study, root)
         for run in planned:
             if not run.is_finished:
-                do_run(run, draft_path(root, run), "compare.py s.yml")
+                do_run(run, "compare.py s.yml")
         return read_results(study, planned, root)
 
     return do
@@ -196,9 +188,8 @@ def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
     from rl_yardstick.experiments.analysis import analyse
     from rl_yardstick.experiments.plan import plan
+    from rl_yardstick.experiments.pool import do_run
     from rl_yardstick.experiments.results import read_results
-    from rl_yardstick.experiments.run_folders import draft_path
-    from rl_yardstick.experiments.run_in_child import do_run
     from rl_yardstick.report import films
     from rl_yardstick.report.page import world_sections, write_report
     from rl_yardstick.report.page.frame import Report
@@ -208,7 +199,7 @@ def report_study(tmp_path_factory):
     planned = plan(study, root)
     failed = planned[-1]
     for run in planned[:-1]:
-        do_run(run, draft_path(root, run), "compare.py small.yml")
+        do_run(run, "compare.py small.yml")
     details = {failed.path: "Traceback:\nValueError: <the> disk & all is full\n"}
     analysis = analyse(dataclasses.replace(read_results(study, planned, root), failures=details))
     page = root / "report.html"

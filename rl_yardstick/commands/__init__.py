@@ -1,56 +1,76 @@
-"""The commands: flags, actions and output; ``main`` is the entry point of ``yardstick``."""
+"""The commands. `run_command` is the only place that catches `UserError`."""
 
 from __future__ import annotations
 
+import gc
+import os
 import sys
-from collections.abc import Callable
-from functools import partial
-from importlib import import_module
+from contextlib import suppress
 from typing import NoReturn
+
+NAME, MISTAKE = "yardstick", 2
+SCRIPTS = ("train", "enjoy", "compare", "tune")  # a checkout has a script for each of these
+COMMANDS = {
+    "train": "train an agent on an environment",
+    "enjoy": "watch a trained agent",
+    "compare": "compare agents over seeds, and write a page",
+    "tune": "search for an agent's settings, and test them on other seeds",
+    "explain": "show where an agent loses return against the optimum",
+    "shaping": "show whether other rewards in training change the optimum, and their cost",
+    "audit": "test an implementation for known bugs",
+    "inspect": "list the content of a model file without running any of it",
+}
 
 
 def main() -> NoReturn:
-    """``yardstick``: run the command that the first argument names, and exit with its code."""
-    try:
-        from rl_yardstick.commands.cli import COMMANDS, NAME, run_command
-    except KeyboardInterrupt:  # before anything has begun
-        raise SystemExit(130) from None
-
+    """``yardstick COMMAND`` and ``python -m rl_yardstick COMMAND``."""
     command = sys.argv[1] if len(sys.argv) > 1 else ""
     if command not in COMMANDS:
-        _explain()
-    # From here on the command has the name that a script of its own would have.
+        run_command("help")
     sys.argv = [f"{NAME} {command}", *sys.argv[2:]]
-    run_command(partial(_carry_out, command))
+    run_command(command)
 
 
-def _carry_out(command: str) -> int:
-    """Import the command's module only, and run its main function."""
-    if command in ("pack", "inspect"):
-        from rl_yardstick.commands import share
+def run_command(name: str) -> NoReturn:
+    """Run ``rl_yardstick.commands.<name>.main`` and leave the process.
 
-        return share.pack() if command == "pack" else share.inspect()
-    main: Callable[[], int] = import_module(f"rl_yardstick.commands.{command}").main
-    return main()
+    Exit codes: 0; 1 if a study has runs that failed; 2 after a mistake, told in one line; 128 + the
+    number of a signal.
+    """
+    gc.set_threshold(100_000)  # importing the libraries makes many objects that stay
+    code = _exit_code(name)
+    with suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code)  # torch takes half a second to clean up
 
 
-def _explain() -> NoReturn:
-    """Print the help, the version, or an error message on the first argument."""
-    from importlib.metadata import version
+def _exit_code(name: str) -> int:
+    from importlib import import_module
 
-    from rl_yardstick.commands.cli import COMMANDS, NAME, OneLineParser
-    from rl_yardstick.pipeline.errors import unknown
+    from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, visible
 
-    lines = [f"  {NAME} {command:<9}{summary}" for command, summary in COMMANDS.items()]
-    parser = OneLineParser(
-        prog=NAME,
-        usage=f"{NAME} [-h] [--version] COMMAND ...",
-        description="Tabular, bandit and deep reinforcement learning, measured by the optimum.",
-        epilog="\n".join(["commands:", *lines, "", f"Each has its own help: {NAME} train --help"]),
-    )
-    parser.add_argument("--version", action="version", version=version("rl-yardstick"))
-    parser.add_argument("command", nargs="?", metavar="COMMAND", help=" or ".join(COMMANDS))
-    given = parser.parse_args(sys.argv[1:2]).command
-    if given is None:
-        parser.error(f"which command? {', '.join(COMMANDS)}")
-    parser.error(str(unknown("unknown command", given, COMMANDS)))
+    try:
+        return int(import_module(f"rl_yardstick.commands.{name}").main() or 0)
+    except UserError as error:
+        message = str(error)
+    except BrokenPipeError:  # such as ``| head``
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:  # no space, no permission
+        message = f"{error.filename or 'a file'}: {(error.strerror or str(error)).lower()}"
+    except MemoryError as error:
+        message = f"not enough memory: {one_line(error)}"
+    except Stopped as stopped:
+        return 128 + stopped.number
+    except KeyboardInterrupt:
+        return 130
+    except SystemExit as stop:  # argparse's, after --help
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    except Exception:  # noqa: BLE001  # of the user's own code, or a bug
+        import traceback
+
+        traceback.print_exc()
+        return 1
+    print(f"{os.path.basename(sys.argv[0])}: error: {visible(message)}", file=sys.stderr)  # noqa: PTH119, T201
+    return MISTAKE

@@ -1,23 +1,24 @@
-"""``audit.py``: its flags, the algorithm they select, and the output of the audit."""
+"""``audit``: its flags, the algorithm that they select, and its verdict in words."""
 
 from __future__ import annotations
 
 import argparse
-import json
+import sys
 import textwrap
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl_yardstick.commands.cli import FIRST_SEED, OneLineParser, add_shared, filled, whole_number
-from rl_yardstick.pipeline import loading_libraries
-from rl_yardstick.pipeline.errors import UserError, one_line
-from rl_yardstick.pipeline.failures import exits_as_mistakes
-from rl_yardstick.pipeline.stopping import stops_noticed
+from rl_yardstick.commands.cli import (
+    OneLineParser,
+    add_shared,
+    filled,
+    whole_number,
+    with_engine,
+)
+from rl_yardstick.pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.audit import Verdict
-    from rl_yardstick.diagnosis.probes import Finding
     from rl_yardstick.diagnosis.subjects import Subject
 
 # As in `diagnosis.subjects`, which takes long to import.
@@ -25,9 +26,7 @@ KINDS = (
     *("q_learning", "off_policy_monte_carlo", "sarsa", "expected_sarsa"),
     *("actor_critic", "policy_gradient"),
 )
-
 WORDS = {"ok": "ok", "fault": "FAULT", "unsaid": "nothing can be said", "skipped": "skipped"}
-WIDTH = 100
 
 EPILOG = """\
 examples:
@@ -46,8 +45,7 @@ Exit code: 0 if it is right, 1 if it has a fault, 2 if nothing can be said.
 def build_parser() -> argparse.ArgumentParser:
     """The flags."""
     parser = OneLineParser(
-        description="Train an algorithm on tiny worlds whose values are known exactly, and say "
-        "whether it is right, or which fault it has.",
+        description="Test an implementation for known bugs, on tiny worlds with exact values.",
         epilog=EPILOG,
     )
     what = parser.add_mutually_exclusive_group(required=True)
@@ -58,104 +56,72 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add_shared(parser, "--gym-packages", "--engine")
     add_shared(parser, "--hyperparams", help="hyperparameters to change, e.g. learning_rate:0.01")
-    kind = "what the algorithm claims to be (default: what its class says)"
-    add("--kind", choices=KINDS, help=kind)
-    spaces = "what {} (default: the first that works)"
+    add("--kind", choices=KINDS, help="the kind of algorithm (default: as its class)")
     choices = ("discrete", "box")
-    add("--observations", choices=choices, help=spaces.format("it observes: numbers or vectors"))
-    add("--actions", choices=choices, help=spaces.format("it does: one of two, or a number"))
+    spaces = "kind of {} (default: the first that works)"
+    add("--observations", choices=choices, help=spaces.format("observations: numbers or vectors"))
+    add("--actions", choices=choices, help=spaces.format("actions: one of two, or a number"))
     seeds = "seeds for a probe that is not ok with the first; the majority decides (default: 3)"
     add("--seeds", type=whole_number(1, 100), default=3, metavar="N", help=seeds)
-    add("--first-seed", type=FIRST_SEED, default=0, metavar="SEED", help="the first seed (0)")
-    add("--json", type=filled, metavar="FILE", help="also write the findings to this file")
+    first = whole_number(0, 2**31)
+    add("--first-seed", type=first, default=0, metavar="SEED", help="the first seed (0)")
+    add("--json", type=Path, metavar="FILE", help="also write the findings to this file")
     return parser
 
 
 def main() -> int:
-    """Parse the arguments and audit; return the exit code."""
+    """Audit an algorithm; return the exit code."""
     args = build_parser().parse_args()
-    with stops_noticed(), exits_as_mistakes():
-        target = None if args.json is None else Path(args.json)
-        if target is not None and (target.is_dir() or not target.absolute().parent.is_dir()):
-            raise UserError(f"--json: {target} is no place for a file")
-        from rl_yardstick.commands.terminal import TextConsole, say
-        from rl_yardstick.pipeline.signs_of_life import doing
+    if args.json is not None and not args.json.absolute().parent.is_dir():
+        raise UserError(f"--json: there is no folder {args.json.parent}")
+    from rl_yardstick.commands.terminal import TextConsole, say
+    from rl_yardstick.pipeline.files import write_json
 
-        console = TextConsole(highlight=False)
-        with doing(console, "loading the libraries"), loading_libraries():
-            subject = _subject(args)
-            from rl_yardstick.diagnosis.audit import Verdict, audit
-        say(console, f"audit of {subject.name}")
-        findings = []
-        with _one_thread():
-            for finding in audit(subject, range(args.first_seed, args.first_seed + args.seeds)):
-                findings.append(finding)
-                for line in finding_lines(finding):
-                    say(console, line)
-        verdict = Verdict(subject.name, tuple(findings))
-        for line in verdict_lines(verdict):
-            say(console, line)
-        if target is not None:
-            text = json.dumps(verdict.as_json(), indent=2) + "\n"
-            target.write_text(text, encoding="utf-8", newline="\n")
+    console = TextConsole()
+    with console.status("loading the libraries"):
+        import torch as th
+
+        th.set_num_threads(1)  # networks as small as these are slower with two
+        subject = _subject(args)
+        from rl_yardstick.diagnosis.audit import Verdict, audit
+    say(console, f"audit of {subject.name}")
+    findings = []
+    for finding in audit(subject, range(args.first_seed, args.first_seed + args.seeds)):
+        findings.append(finding)
+        reason = "" if finding.state in ("fault", "ok") else f": {finding.text}"
+        say(console, f"  {finding.probe:<36}{WORDS[finding.state]}{reason}")
+    verdict = Verdict(subject.name, tuple(findings))
+    for line in verdict_lines(verdict):
+        say(console, line)
+    if args.json is not None:
+        write_json(args.json, verdict.as_json())
     return verdict.exit_code
 
 
 def _subject(args: argparse.Namespace) -> Subject:
-    """The algorithm that the arguments select."""
-    from rl_yardstick.pipeline.agent_settings import with_engine
-    from rl_yardstick.pipeline.settings.values import parse_assignments
-    from rl_yardstick.pipeline.user_modules import import_typed
+    """The algorithm that the arguments select; imports its module."""
+    from rl_yardstick.pipeline.modules import import_modules
+    from rl_yardstick.pipeline.settings import check_agent, parse_assignments
 
     name = args.algo or args.script
-    if args.script is not None and ":" not in name:
-        raise UserError(f"--script takes module:function, not {name!r}")
-    import_typed(args.gym_packages, [name])
-    from rl_yardstick.diagnosis.subjects import (
-        ClassSubject,
-        ScriptSubject,
-        class_named,
-        function_named,
-    )
+    module, colon, attribute = name.rpartition(":")
+    import_modules([*args.gym_packages, *filter(None, [module])])
+    from rl_yardstick.diagnosis.subjects import ClassSubject, ScriptSubject, register_class
 
     typed: dict[str, Any] = parse_assignments(args.hyperparams, "-params")
     wanted = args.observations, args.actions
-    if args.script is not None:
-        if args.engine is not None:
-            raise UserError("--engine: a script has none")
-        return ScriptSubject(name, function_named(name), typed, args.kind, wanted)
-    cls = class_named(name)
-    typed = with_engine(name, typed, args.engine)
-    try:
-        return ClassSubject(name, cls, typed, args.kind, wanted)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{name}: {one_line(error)}") from error
+    if args.script is None:
+        register_class(name) if colon else check_agent(name)
+        return ClassSubject(name, with_engine(name, typed, args.engine), args.kind, wanted)
+    function = getattr(sys.modules.get(module), attribute, None)
+    if not callable(function):
+        raise UserError(f"--script takes module:function, and there is no function {name}")
+    if args.engine is not None:
+        raise UserError("--engine: a script has none")
+    return ScriptSubject(name, function, typed, args.kind, wanted)
 
 
-class _one_thread:  # noqa: N801 (used as a function)
-    """PyTorch with one thread: networks as small as these are slower with two."""
-
-    def __enter__(self) -> None:
-        import torch as th
-
-        self.before = th.get_num_threads()
-        th.set_num_threads(1)
-
-    def __exit__(self, *exception: object) -> None:
-        import torch as th
-
-        th.set_num_threads(self.before)
-
-
-def finding_lines(finding: Finding) -> Sequence[str]:
-    """A line for a probe, with its finding if it is neither ok nor a fault."""
-    head = f"  {finding.probe:<36}{WORDS[finding.state]}"
-    if finding.state in ("fault", "ok"):
-        return [head]
-    return [f"{head}: {finding.text}"]
-
-
-def verdict_lines(verdict: Verdict) -> Sequence[str]:
+def verdict_lines(verdict: Verdict) -> list[str]:
     """The verdict, in a few lines."""
     from rl_yardstick.diagnosis.faults import FAULTS
 
@@ -168,12 +134,8 @@ def verdict_lines(verdict: Verdict) -> Sequence[str]:
     lines = []
     for finding in verdict.faults:
         fault = FAULTS[finding.fault]
+        told = f"measured: {finding.text}; right would be: {finding.right}"
         lines += [f"fault: {finding.fault}. {fault.sentence}"]
-        lines += textwrap.wrap(
-            f"measured: {finding.text}; right would be: {finding.right}",
-            WIDTH,
-            initial_indent="  ",
-            subsequent_indent="  ",
-        )
+        lines += textwrap.wrap(told, 100, initial_indent="  ", subsequent_indent="  ")
         lines += [f"  see: {fault.source}"]
     return lines

@@ -2,58 +2,36 @@
 
 from __future__ import annotations
 
-import _thread
 import argparse
-import importlib.util
-import signal
-import time
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from rl_yardstick.commands.cli import (
     COUNT,
-    COUNT_OR_NONE,
-    FIRST_SEED,
-    LONGEST_FOLDER_NAME,
     OneLineParser,
     add_shared,
+    called_as,
     check_tensorboard,
     command_line,
     folder_name,
-    go_on_unread,
-    number_at_least_zero,
     whole_number,
+    with_engine,
 )
-from rl_yardstick.commands.kept_runs import keep_few, make_again, named_runs, repair, whose
-from rl_yardstick.commands.logged import compare_on_log
-from rl_yardstick.commands.terminal import LiveProgress, say, table_console
-from rl_yardstick.pipeline import loading_libraries
-from rl_yardstick.pipeline.errors import UserError, unknown
-from rl_yardstick.pipeline.failures import exits_as_mistakes
-from rl_yardstick.pipeline.signs_of_life import doing, duration
-from rl_yardstick.pipeline.stopping import stops_noticed
+from rl_yardstick.pipeline.errors import UserError, shown, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
-    from rich.table import Table
 
+    from rl_yardstick.commands.terminal import TextConsole
     from rl_yardstick.experiments.analysis import StudyAnalysis
-    from rl_yardstick.experiments.cluster.schedulers import Cluster
-    from rl_yardstick.experiments.figures_store import FigureStore
-    from rl_yardstick.experiments.launching import EarlyResults, Launcher, RunFailure
-    from rl_yardstick.experiments.plan import PlannedRun
+    from rl_yardstick.experiments.plan import PlannedRun, StudyRecord
+    from rl_yardstick.experiments.pool import Workers
     from rl_yardstick.experiments.results import StudyResults
-    from rl_yardstick.experiments.run_limits import RunLimits
     from rl_yardstick.experiments.study import AgentSpec, StudySpec
-    from rl_yardstick.pipeline.signs_of_life import Activity
-    from rl_yardstick.report.page.frame import LearningPage
+    from rl_yardstick.pipeline.run import Stop
     from rl_yardstick.verdicts import Study
 
 # --- flags ----------------------------------------------------------------------------------------
@@ -67,6 +45,7 @@ examples:
   python compare.py studies/warehouse-learning-rate.yml
   python compare.py studies/warehouse-learning-rate.yml --quick
   python compare.py studies/warehouse-learning-rate.yml --until-decided
+  python compare.py --resume logs/studies/warehouse-learning-rate
   python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
 
 The same command again does the missing runs, and no others.
@@ -85,59 +64,39 @@ def build_parser() -> argparse.ArgumentParser:
     add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (train --list has them)")
     add("--seeds", type=SEEDS, metavar="N", help="how many seeds (default: the study's, or 10)")
     first = "the first of these seeds (default: the study's, or 0)"
-    add("--first-seed", type=FIRST_SEED, metavar="N", help=first)
+    add("--first-seed", type=whole_number(0, 2**31), metavar="N", help=first)
     decided = "give agents in undecided pairs more seeds, at looks that are fixed beforehand"
     add("--until-decided", action="store_true", help=decided)
     add("--max-seeds", type=SEEDS, metavar="N", help="the most seeds for that (default: 80)")
     add_shared(parser, "--n-timesteps", "--n-episodes")
     add_shared(parser, "--hyperparams", help="hyperparameters to change in every agent")
     add_shared(parser, "--engine")
-    add(
-        *("-conf", "--conf-file"),
-        nargs="+",
-        default=[],
-        metavar="[AGENT:]YAML",
-        help="hyperparameters from another file; with several agents, for which: dqn:mine.yml",
-    )
+    files = "hyperparameters from another file; with several agents, for which: dqn:mine.yml"
+    add("-conf", "--conf-file", nargs="+", default=[], metavar="[AGENT:]YAML", help=files)
     add_shared(parser, "--env-kwargs")
-    add(
-        "--as-it-comes",
-        action="store_true",
-        help="train every agent on the environment as it comes, without the changes that settings "
-        "make in training only (train_env_kwargs, train_env_wrapper)",
-    )
+    unmodified = "train every agent on the unmodified environment, without the changes that "
+    unmodified += "settings make in training only (train_env_kwargs, train_env_wrapper)"
+    add("--as-it-comes", action="store_true", help=unmodified)
     add_shared(parser, "--gym-packages")
     quick = "few seeds and a small budget, for a first look"
     add("--quick", action="store_true", dest="is_quick", help=quick)
 
     group = parser.add_argument_group("runs")
-    add_shared(group, "--jobs", "--cluster", "--insecure-cluster", "--run-timeout", "--run-memory")
+    add_shared(group, "--jobs", "--cluster", "--run-timeout")
     add = group.add_argument
-    repaired = "do damaged runs again; the old folders are kept"
-    add("--repair", action="store_true", help=repaired)
     replaced = "do finished runs with other settings again; the old folders are kept"
     add("--replace", action="store_true", help=replaced)
-    kept = "keep all run folders, or figures and few folders: the best, median and worst (all)"
-    add("--keep", choices=("all", "figures"), help=kept)
-    again = "make the folders of these runs again, after --keep figures"
-    add("--make-again", nargs="+", default=[], metavar="AGENT:SEED", help=again)
+    resumed = "do what is left of the study in this folder, as it was asked for"
+    add("--resume", type=Path, metavar="STUDY", help=resumed)
 
-    _add_output_flags(parser)
-    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
-    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
-    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
-    return parser
-
-
-def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("judgement and output")
     add = group.add_argument
     add("--metric", help="the figure that verdicts compare: final, best, area, regret, ...")
     margin = "difference of the means within which agents are tied"
-    add("--margin", type=number_at_least_zero, help=margin)
+    add("--margin", type=_margin, help=margin)
     add("--episodes-table", type=COUNT, metavar="N", help="average, min, max of every N episodes")
     filmed = "film one episode after every N episodes"
-    add("--render-every", type=COUNT_OR_NONE, default=0, metavar="N", help=filmed)
+    add("--render-every", type=whole_number(0), default=0, metavar="N", help=filmed)
     add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
     add_shared(group, "--log-folder", default="logs/studies", help="folder of all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
@@ -145,207 +104,237 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add("--diagnose", action="store_true", default=None, help=compared)
     watched = "train the first run of each agent again, and link pages that play how it learns"
     add("--watch-learning", action="store_true", dest="learning_pages", help=watched)
-    add(
-        "--figures",
-        nargs="+",
-        choices=("png", "svg", "pdf"),
-        metavar="FORMAT",
-        help="formats of the figures: png, svg, pdf (default: png svg)",
-    )
+    formats = "formats of the figures: png, svg, pdf (default: png svg)"
+    kinds = ("png", "svg", "pdf")
+    add("--figures", nargs="+", choices=kinds, metavar="FORMAT", help=formats)
     add("--no-report", action="store_true", help="only tables: no figures and no page")
+
+    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
+    add("--logged", type=Path, metavar="LOG.csv", help="judge trained agents on logged pulls")
+    add("--policy", nargs="+", default=[], type=Path, metavar="RUN", help="run folders or zips")
+    named = "the log's own names of columns, e.g. arm=item_id reward=click"
+    add("--columns", nargs="+", default=[], metavar="NAME=COLUMN", help=named)
+    return parser
+
+
+def _margin(text: str) -> float:
+    with suppress(ValueError):
+        if 0 <= (number := float(text)) < float("inf"):
+            return number
+    raise argparse.ArgumentTypeError(f"must be a number of at least 0, not {text!r}")
 
 
 # --- the steps of a study -------------------------------------------------------------------------
 
 
 def main() -> int:
-    """Parse the arguments and compare; return the exit code."""
+    """Do a study, or judge policies on a log; return the exit code."""
     args = build_parser().parse_args()
-    with stops_noticed(), exits_as_mistakes():
-        if args.logged or args.policy:
-            return compare_on_log(args)
-        return _compare(args)
+    from rl_yardstick.pipeline.modules import import_modules, split_id
+    from rl_yardstick.pipeline.run import Stop
+
+    stop = Stop().listen()
+    ids = [split_id(env_id) for env_id in args.env]
+    args.gym_packages += [module for module, _ in ids if module]
+    args.env = [env_id for _, env_id in ids]
+    import_modules(args.gym_packages)
+    if args.logged or args.policy:
+        from rl_yardstick.commands.logged import compare_on_log
+
+        return compare_on_log(args)
+    from rl_yardstick.commands.terminal import table_console
+    from rl_yardstick.experiments.plan import StudyRecord, specs_of
+
+    if args.resume is not None:
+        check_alone(args)
+        root, record = args.resume, StudyRecord.read(args.resume)
+        check_typed(record.study.gym_packages, args.gym_packages, str(root))
+    else:
+        study = study_spec(args)
+        root, record = Path(args.log_folder) / study.name, StudyRecord(study, specs_of(study))
+    workers = workers_of(args, root, record.study.run_timeout)
+    job = Job(root, command_line(), table_console(), stop, workers, not args.no_report)
+    job.console.print(record.study.title, style="bold")
+    with held(root), workers:
+        if args.until_decided:
+            from rl_yardstick.experiments.growing import plan_of_looks
+
+            looks = plan_of_looks(record.study, root, args.max_seeds)
+            record = replace(record, looks=looks)
+        return carry_out(job, record, args.replace)
 
 
-def _compare(args: argparse.Namespace) -> int:
-    """Do a study under the lock of its folder."""
-    study = study_spec(args)
-    from rl_yardstick.experiments.child_processes import end_server
-    from rl_yardstick.experiments.growing import looks_of
+def check_typed(recorded: Sequence[str], typed: Sequence[str], where: str) -> None:
+    """Refuse to import what only a file names."""
+    from rl_yardstick.pipeline.modules import check_typed as check
+
+    check(recorded, typed, where)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the steps of a study share: its folder, the command, and who does the runs."""
+
+    root: Path  #: the folder of the study
+    command: str  #: recorded in run folders
+    console: TextConsole
+    stop: Stop
+    workers: Workers
+    with_page: bool = True  #: draw the figures and write the page, beside the tables
+
+
+@contextmanager
+def held(root: Path) -> Iterator[None]:
+    """Hold a study's folder; it is removed again if nothing comes of it."""
+    from filelock import FileLock, Timeout
+
+    root.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(root / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise UserError(f"{root} is in use by another command") from None
+    except NotImplementedError as error:  # no flock
+        raise UserError(f"{root}: {error}") from error
+    try:
+        yield
+    finally:
+        if [path.name for path in root.iterdir()] == [".lock"]:
+            (root / ".lock").unlink()
+            root.rmdir()
+        lock.release()
+
+
+def workers_of(args: argparse.Namespace, root: Path, timeout: float | None) -> Workers:
+    """The workers that the flags ask for."""
+    from rl_yardstick.experiments.pool import Workers, available_cores
+
+    jobs = max(args.jobs, 0)
+    if args.cluster is None:
+        return Workers(jobs or available_cores(), timeout)
+    try:
+        from rl_yardstick.experiments.cluster import ClusterWorkers
+
+        return ClusterWorkers(args.cluster, jobs, root, timeout)
+    except ImportError:
+        raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'") from None
+
+
+def carry_out(job: Job, record: StudyRecord, replaces: bool = False) -> int:
+    """Do a study, and judge it; return 0 if all runs are finished, else 1."""
+    from rl_yardstick.experiments.growing import first_counts
     from rl_yardstick.experiments.plan import plan
-    from rl_yardstick.experiments.run_limits import RunLimits
-    from rl_yardstick.pipeline.locks import folder_lock, told_if_gone
 
-    go_on_unread()
-    root = Path(args.log_folder) / study.name
-    console = table_console()
-    limits = RunLimits(study.run_timeout, study.run_memory)
-    context = run_context(args, root, command_line(), limits, console)
-    planned = plan(study, root)
-    to_make_again = named_runs(planned, args.make_again)
-    if study.keep == "figures" or to_make_again or any(root.glob("runs/*/*.sqlite")):
-        from rl_yardstick.experiments.figures_store import FigureStore  # with slow libraries
-
-        context.store = FigureStore(folds=study.keep == "figures", first_seed=study.first_seed)
-    console.print(study.title, style="bold", highlight=False)
-    with folder_lock(root, give_way, partial(say, console)), told_if_gone(root):
-        try:
-            if to_make_again:
-                return make_again(context, study, to_make_again)
-            if args.until_decided:
-                return _grow_study(args, study, context)
-            looks_of(root)  # fails early if the plan of looks cannot be read
-            if args.repair:
-                repair(console, study, planned, context.store)
-            _prepare(study, planned, context, args.replace)
-            return run_study(context, study, planned)
-        except KeyboardInterrupt:
-            end_server()
-            raise
-
-
-def results_of(study: StudySpec, context: RunContext) -> StudyResults:
-    """Do the missing runs of a study under the lock of its folder, and read all results."""
-    from rl_yardstick.experiments.child_processes import end_server
-    from rl_yardstick.experiments.launching import EarlyResults
-    from rl_yardstick.experiments.plan import plan
-    from rl_yardstick.pipeline.locks import folder_lock, told_if_gone
-
-    root = context.root
-    planned, early = plan(study, root), EarlyResults(study)
-    with folder_lock(root, give_way, partial(say, context.console)), told_if_gone(root):
-        try:
-            _prepare(study, planned, context)
-            do_missing(context, planned, early)
-            return read(context, study, planned, early)
-        except KeyboardInterrupt:
-            end_server()
-            raise
-
-
-def _prepare(
-    study: StudySpec, planned: Sequence[PlannedRun], context: RunContext, replaces: bool = False
-) -> None:
-    """Check that the runs can be done before the first begins, and load the libraries."""
-    with doing(context.console, "looking for runs that are there") as activity, loading_libraries():
-        from rl_yardstick.experiments.child_processes import do_aside
-        from rl_yardstick.experiments.plan import check_settings
-        from rl_yardstick.experiments.run_folders import check_settings_kept
-
-        apart = context.not_stored(planned)
-        if not replaces:
-            stored = [] if context.store is None else context.store.differences(planned)
-            others = [(n, there) for _, n, there in stored]
-            check_settings_kept(apart, context.root, others)
-        if any(run.is_to_do for run in apart):
-            context.get_ready(apart)
-        activity.now("loading the libraries")
-        first = [run for run in planned if run.seed == study.first_seed]
-        do_aside(check_settings, study, first)
-        line, context.expected = _engines(apart)
-    if line:
-        say(context.console, f"engines: {line}")
-
-
-def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], float]]:
-    """The engines of the missing runs of networks, in words, and the expected seconds of a run."""
-    from rl_yardstick.pipeline.train_spec import NETWORKS
-
-    missing: dict[tuple[str, str], list[PlannedRun]] = {}
-    for run in planned:
-        if run.spec.algo in NETWORKS and run.is_to_do:
-            missing.setdefault(run.labels, []).append(run)
-    if not missing:  # without the libraries
-        return "", {}
-    from rl_yardstick.agents.networks.engine_setting import machine_pace
-    from rl_yardstick.commands.terminal import seconds_of, study_line
-    from rl_yardstick.experiments.launching import expected_seconds
-    from rl_yardstick.pipeline.preparation import planned_outlook
-
-    found = {key: planned_outlook(runs[0].spec) for key, runs in missing.items()}
-    outlooks = {key: each for key, each in found.items() if each is not None}
-    pace = machine_pace() if outlooks else 1.0
-    expected = {
-        key: seconds
-        for key, each in outlooks.items()
-        if (seconds := expected_seconds(missing[key][0].spec, pace * seconds_of(each.plan, each)))
-    }
-    lines = [(key[0], each, len(missing[key])) for key, each in outlooks.items()]
-    return study_line(lines), expected
-
-
-def run_study(context: RunContext, study: StudySpec, planned: Sequence[PlannedRun]) -> int:
-    """Do a study as planned, and judge it; return 0 if all runs are finished and undamaged."""
-    from rl_yardstick.experiments.launching import EarlyResults
-
-    early = EarlyResults(study)
-    failures = do_missing(context, planned, early)
-    return conclude(context, read(context, study, planned, early), failures)
-
-
-def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext) -> int:
-    """Do a study with more and more seeds until every pair is decided, and judge it at the end.
-
-    The numbers of seeds of all looks are fixed before the first look.
-    """
-    from rl_yardstick.experiments.growing import first_counts, plan_of_looks, write_looks
-    from rl_yardstick.experiments.plan import plan
-    from rl_yardstick.report.words import seeds
-
-    looks = plan_of_looks(study, context.root, args.max_seeds)
-    counts = first_counts(study)
-    planned = plan(study, context.root, counts)
-    if args.repair:
-        repair(context.console, study, planned, context.store)
-    _prepare(study, planned, context)
-    write_looks(context.root, looks)
-    results, said, failures = look_by_look(context, study, looks["looks"])
-    code = conclude(context, results, failures)
+    study, looks = record.study, record.looks
+    counts = first_counts(study) if looks else None
+    planned = plan(study, job.root, counts, record.specs)
+    check_settings_kept(job, planned, replaces)
+    record.write(job.root)
+    if engines := _engines(planned):
+        job.console.print(f"engines: {engines}")
+    if not looks:
+        return conclude(job, do_study(job, study, planned), ())
+    results, said = look_by_look(job, record)
+    code = conclude(job, results, looks)
     # The number of runs, compared with a design that gives every agent all seeds.
-    undecided = [
-        f"{pair.first} and {pair.second} on {pair.environment}"
-        for pair in said.pairs
-        if pair.word == "undecided"
-    ]
-    left = f"undecided: {'; '.join(undecided)}" if undecided else "all is decided"
-    most, n_runs = looks["looks"][-1], sum(sum(by.values()) for by in said.seeds.values())
-    design = f"{seeds(most)} of each agent would be {most * len(counts):,}"
-    say(context.console, f"{n_runs:,} runs, where {design}; {left}")
+    open_ = [p for p in said.pairs if p.word == "undecided"]
+    undecided = "; ".join(f"{p.first} and {p.second} on {p.environment}" for p in open_)
+    left = f"undecided: {undecided}" if undecided else "all is decided"
+    n_runs = sum(sum(by.values()) for by in said.seeds.values())
+    design = f"{looks[-1]:,} seeds of each agent would be {looks[-1] * len(record.specs):,}"
+    job.console.print(f"{n_runs:,} runs, where {design}; {left}")
     return code
 
 
+def check_settings_kept(job: Job, planned: Sequence[PlannedRun], replaces: bool) -> None:
+    """Refuse to do runs again that finished with other settings, or move them aside."""
+    from rl_yardstick.experiments.plan import other_settings
+
+    others = other_settings(planned)
+    if not others:
+        return
+    if not replaces:
+        named = {key: f"{key}: {shown(was)} there, {shown(now)} now"
+                 for _, settings in others for key, (was, now) in settings.items()}  # fmt: skip
+        words = "; ".join(list(named.values())[:3]) + ("; ..." if len(named) > 3 else "")
+        runs = "1 finished run has" if len(others) == 1 else f"{len(others)} finished runs have"
+        raise UserError(
+            f"{job.root}: {runs} other settings ({words}): --name NAME makes another study of it, "
+            "--replace does them again and moves the old ones to replaced/"
+        )
+    place = job.root / "replaced" / str(len([*job.root.glob("replaced/*")]) + 1)
+    for run, _ in others:
+        target = place / run.path.relative_to(job.root / "runs")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        run.path.rename(target)
+    job.console.print(f"{len(others)} runs are done again: the old folders are in {place} now")
+
+
+def _engines(planned: Sequence[PlannedRun]) -> str:
+    """The engines of the missing runs of networks, in words."""
+    from rl_yardstick.experiments.plan import NETWORKS
+
+    missing: dict[tuple[str, str], list[PlannedRun]] = {}
+    for run in planned:
+        if run.spec.algo in NETWORKS and not run.is_finished:
+            missing.setdefault(run.labels, []).append(run)
+    if not missing:  # without the libraries
+        return ""
+    from rl_yardstick.commands.engines import planned_outlook, study_line
+
+    found = [(labels[0], planned_outlook(r[0].spec), len(r)) for labels, r in missing.items()]
+    return study_line([(label, each, n) for label, each, n in found if each is not None])
+
+
+def do_study(
+    job: Job, study: StudySpec, planned: Sequence[PlannedRun], known: dict[Any, Any] | None = None
+) -> StudyResults:
+    """Do the missing runs of a study, and read all results; ``known`` were read or failed before."""
+    from rl_yardstick.experiments.pool import do_runs
+
+    known = {} if known is None else known
+    failures: dict[Path, str] = known.setdefault("failures", {})
+    to_do = [run for run in planned if run.path not in failures and not run.is_finished]
+    n_done = len(planned) - len(to_do)
+    job.console.print(
+        f"{len(planned)} runs, {n_done} of them there already; {job.workers.words}, in {job.root}"
+    )
+    try:
+        failures |= do_runs(to_do, job.workers, job.command, job.console, job.stop)
+    finally:
+        if job.stop.number:
+            again = f"{called_as('compare')} --resume {job.root}"
+            job.console.print(f"stopped; continue with: {again}")
+    from rl_yardstick.experiments.results import read_results
+
+    with job.console.status("reading the results"):
+        results = read_results(study, planned, job.root, known.setdefault("results", {}))
+    return replace(results, failures=failures)
+
+
 def look_by_look(
-    context: RunContext,
-    study: StudySpec,
-    looks: Sequence[int],
-    is_enough: Callable[[Study], bool] = lambda said: False,
-) -> tuple[StudyResults, Study, list[RunFailure]]:
+    job: Job, record: StudyRecord, is_enough: Callable[[Study], bool] = lambda said: False
+) -> tuple[StudyResults, Study]:
     """Do the runs of one planned look after another, until no agent needs seeds or ``is_enough``.
 
     It begins with the first look: finished runs may already be enough.
     """
     from rl_yardstick.experiments.growing import first_counts, grown, looked, next_counts
-    from rl_yardstick.experiments.launching import EarlyResults
     from rl_yardstick.experiments.plan import plan
 
-    failures: list[RunFailure] = []
-    counts, n_said = first_counts(study), 0
-    with context.held():  # keep the launcher open from one look to the next
-        while True:
-            now = grown(study, counts)
-            planned = plan(now, context.root, counts)
-            given_up = {failure.planned.path for failure in failures}
-            early = EarlyResults(now)
-            failures += do_missing(context, planned, early, given_up)
-            results = read(context, now, planned, early)
-            said = looked(results, tuple(looks))
-            is_over = said.is_done or is_enough(said)
-            if said.n_looks != n_said:
-                n_said = said.n_looks
-                say(context.console, _on_look(said, looks, is_over=is_over))
-            if is_over:
-                return results, said, failures
-            counts = {**counts, **next_counts(said)}
+    counts, n_said, known = first_counts(record.study), 0, dict[Any, Any]()
+    while True:
+        study = grown(record.study, counts)
+        planned = plan(study, job.root, counts, record.specs)
+        results = do_study(job, study, planned, known)
+        said = looked(results, record.looks)
+        is_over = said.is_done or is_enough(said)
+        if said.n_looks != n_said:
+            n_said = said.n_looks
+            job.console.print(_on_look(said, record.looks, is_over=is_over))
+        if is_over:
+            return results, said
+        counts = {**counts, **next_counts(said)}
 
 
 def _on_look(said: Study, looks: Sequence[int], *, is_over: bool) -> str:
@@ -369,290 +358,100 @@ def _on_look(said: Study, looks: Sequence[int], *, is_over: bool) -> str:
     return f"{text}; {enumeration(names)} {'goes' if len(names) == 1 else 'go'} on to {seeds(size)}"
 
 
-def do_missing(
-    context: RunContext,
-    planned: Sequence[PlannedRun],
-    early: EarlyResults,
-    given_up: Collection[Path] = (),
-) -> list[RunFailure]:
-    """Do the missing runs, except those with folders in ``given_up``; return the failures.
-
-    Each run is read as soon as it has ended.
-    """
-    from rl_yardstick.experiments.launching import execute
-    from rl_yardstick.experiments.run_folders import move_replaced_aside
-
-    console, root, store = context.console, context.root, context.store
-    if store is not None:
-        store.move_others_aside(planned, root)
-    apart = context.not_stored(planned)
-    moved, place = move_replaced_aside(apart, root)
-    if place is not None:
-        runs = "1 run that is" if len(moved) == 1 else f"{len(moved)} runs that are"
-        say(console, f"{runs} done again: the old folders are in {place} now")
-    missing = [run for run in apart if run.is_to_do and run.path not in given_up]
-    there = {id(run) for run in apart}
-    done = [run for run in planned if id(run) not in there or run.is_finished]
-    console.print(
-        f"{len(planned)} runs, {len(done)} of them there already; {context.words}, in {root}",
-        highlight=False,
-    )
-    if store is not None and store.folds:
-        store.tidy(planned)
-        for run in done:
-            if id(run) in there:
-                store.add(run, early.read(run))
-    begun = [*done, *missing]
-    with StudyProgress(console, begun, done, context.expected) as progress:
-        for run in done:
-            if id(run) in there:
-                progress.note_refusal(run)
-
-        def note(planned: PlannedRun, failure: RunFailure | None) -> None:
-            progress.note(planned, failure)
-            if failure is None:
-                found = early.read(planned)
-                if store is not None and store.add(planned, found):
-                    early.forget(planned)
-
-        try:
-            return execute(
-                missing, root, progress.watching(context.launchers), note, early.get_ready
-            )
-        finally:
-            if store is not None:
-                store.commit()
-
-
-def read(
-    context: RunContext, study: StudySpec, planned: Sequence[PlannedRun], early: EarlyResults
-) -> StudyResults:
-    """Read the finished runs, except those that were read early."""
-    with doing(context.console, "reading the results") as activity:
-        from rl_yardstick.experiments.results import read_results
-
-        stored = None if context.store is None else context.store.runs(planned)
-        return read_results(study, planned, context.root, activity.at, early.of, stored)
-
-
-def conclude(
-    context: RunContext,
-    results: StudyResults,
-    failures: Sequence[RunFailure],
-) -> int:
-    """Judge the finished runs, and say which are missing and why; return the exit code."""
+def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
+    """Judge the finished runs, and say which are missing; return the exit code."""
     from rl_yardstick.experiments.results import mixed_versions
 
-    tell = partial(say, context.console)
-    results, more, is_same = keep_few(context, results)
-    failures = [*failures, *more]
-    results = replace(results, failures={one.planned.path: one.details for one in failures})
-    try:
-        if len(results.summary):
-            _judge(context, results)
-            note = mixed_versions(info for *_, info in results.infos())
-            if note:
-                tell(note)
-    finally:
-        for failure in failures:
-            run, log = failure.planned, failure.log
-            details = "the details could not be written" if log is None else f"see {log}"
-            who = f"{run.agent} on {run.environment}, seed {run.seed}"
-            tell(f"failed: {who}: {failure.reason}; {details}")
-        for damaged in results.left_out:
-            tell(f"left out: {whose(damaged)}")
-        if results.left_out:
-            n_runs = sum(damaged.planned.n_runs for damaged in results.left_out)
-            runs = "1 run is" if n_runs == 1 else f"{n_runs} runs are"
-            tell(f"{runs} damaged and in no figure; --repair does such runs again")
-    if results.n_unchecked:
-        runs = "1 run" if results.n_unchecked == 1 else f"{results.n_unchecked} runs"
-        tell(f"{runs} of an earlier version recorded no digests: damage may go unseen")
+    tell = job.console.print
+    if len(results.summary):
+        _judge(job, results, looks)
+        records = {run.environment: run.recorded() for run in results.finished[::-1]}
+        for environment, record in records.items():
+            if refusal := record.get("model_refused"):
+                tell(f"{environment}: {refusal}; figures are sampled")
+        if note := mixed_versions(run.recorded() for run in results.finished):
+            tell(note)
+    for path, reason in results.failures.items():
+        run = next(run for run in results.planned if run.path == path)
+        tell(f"failed: {run.title}: {reason}")
+    for one in results.left_out:
+        again = f"remove {one.planned.path} to do it again"
+        tell(f"left out: {one.planned.title}: {one.reason}; {again}")
     n_missing = len(results.planned) - len(results.finished)
-    if n_missing > len(failures) + len(results.left_out):
-        which = f"{n_missing} of {len(results.planned)} runs are missing"
-        tell(f"{which}; the same command continues")
-    return 1 if n_missing or more or not is_same else 0
+    if n_missing > len(results.failures) + len(results.left_out):
+        tell(f"{n_missing} of {len(results.planned)} runs are missing; the same command continues")
+    return int(n_missing > 0)
 
 
-def _judge(context: RunContext, results: StudyResults) -> None:
+def _judge(job: Job, results: StudyResults, looks: tuple[int, ...]) -> None:
     """Print the judgement, and write tables, figures and page."""
-    console = context.console
-    with doing(console, "judging the agents") as activity:
-        from rl_yardstick.experiments.analysis import analyse, with_advice
-        from rl_yardstick.experiments.growing import looks_of
-        from rl_yardstick.report.terminal import print_analysis, print_episodes_table
+    from rl_yardstick.experiments.analysis import analyse, with_advice
 
-        analysis = analyse(results, activity.at, looks_of(context.root))
-        activity.now("looking at runs that failed")
-        analysis = with_advice(analysis)
+    console, width = job.console, results.study.episodes_table
+    with console.status("judging the agents"):
+        analysis = with_advice(analyse(results, looks))
+    job.stop.check()
+    from rl_yardstick.report.documents import write_tables, write_verdicts
+    from rl_yardstick.report.terminal import print_analysis, print_episodes_table
+
     print_analysis(console, analysis)
-    width = results.study.episodes_table
-    with doing(console, "writing the tables") as activity:
-        from rl_yardstick.experiments.study import write_study
-        from rl_yardstick.report.documents import write_tables, write_verdicts
+    with console.status("writing the tables"):
+        files = [*write_tables(results), *write_verdicts(analysis, job.command)]
+    blocks = None
+    if width:
         from rl_yardstick.report.series import episodes_table
 
-        files = [*write_tables(results), *write_verdicts(analysis, context.command)]
-        write_study(results.root, results.study)
-        blocks = episodes_table(results, width) if width else None
-        if blocks is not None:
-            print_episodes_table(console, blocks, width)
-        if results.study.render_every:
-            activity.now("filming")
-            from rl_yardstick.report.films import write_films
+        blocks = episodes_table(results, width)
+        print_episodes_table(console, blocks, width)
+    if results.study.render_every:
+        from rl_yardstick.report.films import write_films
 
-            films, refused = write_films(results, activity.at)
-            files += films
-            for reason in refused:
-                activity.say(f"no film: {reason}")
-        if context.with_page:
-            files += _draw(context, analysis, blocks, activity)
-    console.print()
-    console.print(f"files: {results.root}", highlight=False)
+        with console.status("filming"):
+            films, refused = write_films(results)
+        files += films
+        for reason in refused:
+            console.print(f"no film: {reason}")
+    if job.with_page:
+        files += _draw(job, analysis, blocks)
+    console.print(f"\nfiles: {results.root}")
     for path in files:
-        console.print(f"  {path.relative_to(results.root)}", highlight=False)
+        console.print(f"  {path.relative_to(results.root)}")
 
 
-def _draw(
-    context: RunContext, analysis: StudyAnalysis, blocks: pd.DataFrame | None, activity: Activity
-) -> list[Path]:
+def _draw(job: Job, analysis: StudyAnalysis, blocks: pd.DataFrame | None) -> list[Path]:
     """Draw the figures and write the page; return the files."""
-    activity.now("working out the curves")
     from rl_yardstick.report.figures import write_figures
     from rl_yardstick.report.page import write_report
     from rl_yardstick.report.page.frame import Report
     from rl_yardstick.report.series import study_series
 
-    page = analysis.results.root / "report.html"
-    series = study_series(analysis, activity.at)
-    activity.now("drawing the figures")
-    files = write_figures(series, blocks, activity.at)
-    learning: list[LearningPage] = []
+    root = analysis.results.root
+    with job.console.status("drawing the figures"):
+        series = study_series(analysis)
+        files = write_figures(series, blocks)
+    job.stop.check()
+    learning = []
     if analysis.study.learning_pages:
-        activity.now("watching")
         from rl_yardstick.report.page.learning import write_first_pages
 
-        learning = write_first_pages(analysis, context.n_workers, activity.at)
-    activity.now("writing the page")
-    write_report(Report(series, context.command, activity.at, learning), page)
-    pages = [analysis.results.root / one.place for one in learning if one.place]
-    return [*files, *pages, page]
-
-
-# --- execution of runs ----------------------------------------------------------------------------
-
-
-@dataclass
-class RunContext:
-    """Shared by the runs of a study or a search: folder, command, limits, workers or cluster."""
-
-    root: Path  # the folder of the study
-    command: str  # recorded in run folders
-    limits: RunLimits  # of time and memory of each run
-    console: Console
-    with_page: bool = True  # draw the figures and write the page, beside the tables
-    n_workers: int = 1  # processes that may work on this machine at once
-    cluster: Cluster | None = None
-    address: str = ""  # of the cluster, as it was typed
-    # Expected seconds of a run by agent and environment, where known.
-    expected: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    _warm_ups: str = "[]"  # trainings that the cluster's workers compile once, as JSON
-    store: FigureStore | None = None  # the runs that are in files instead of folders
-    _held: ExitStack | None = None
-    _launcher: Launcher | None = None  # the one kept open by `held`
-
-    @property
-    def words(self) -> str:
-        """The number of workers or the cluster, in words."""
-        here = f"{self.n_workers} at once"
-        return here if self.cluster is None else f"on the cluster {self.address}"
-
-    def not_stored(self, planned: Sequence[PlannedRun]) -> list[PlannedRun]:
-        """Those of these runs that are not in the store."""
-        return [run for run in planned if self.store is None or not self.store.holds(run)]
-
-    def get_ready(self, planned: Sequence[PlannedRun]) -> None:
-        """Start the server that runs are forked from, with warm-ups that compile code once.
-
-        Only users' own modules need warm-ups. The server imports the libraries in parallel with
-        this process.
-        """
-        from rl_yardstick.experiments.child_processes import start_server
-
-        compiled = "[]"
-        if any(run.spec.user_modules for run in planned):
-            from rl_yardstick.experiments.run_in_child import warm_ups
-
-            compiled = warm_ups(planned)
-        if self.cluster is None:
-            start_server(compiled)
-        else:
-            self._warm_ups = compiled
-
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep the launcher open between two uses, until the ``with`` statement ends."""
-        with ExitStack() as self._held:
-            yield
-        self._held = self._launcher = None
-
-    def launchers(self) -> AbstractContextManager[Launcher]:
-        """Open a launcher, or reuse the one that `held` keeps open."""
-        if self._held is None:
-            return self._opened()
-        if self._launcher is None:
-            self._launcher = self._held.enter_context(self._opened())
-        return nullcontext(self._launcher)
-
-    def _opened(self) -> AbstractContextManager[Launcher]:
-        if self.cluster is None:
-            from rl_yardstick.experiments.launching import local_launcher
-
-            return local_launcher(self.root, self.command, self.n_workers, self.limits)
-        from rl_yardstick.experiments.cluster.cluster_launcher import cluster_launcher
-
-        tell = partial(say, self.console)
-        return cluster_launcher(
-            self.cluster, self.root, self.command, self.limits, self._warm_ups, tell
-        )
-
-
-def run_context(
-    args: argparse.Namespace, root: Path, command: str, limits: RunLimits, console: Console
-) -> RunContext:
-    """The context that the flags ask for."""
-    context = RunContext(root, command, limits, console, with_page=not args.no_report)
-    if args.cluster is None:
-        if args.insecure_cluster:
-            raise UserError("--insecure-cluster belongs to --cluster: give --cluster too")
-        from rl_yardstick.experiments.launching import available_cores
-
-        return replace(context, n_workers=max(args.jobs, 0) or available_cores())
-    for library in ("distributed", "cryptography", "dask_jobqueue"):
-        if importlib.util.find_spec(library) is None:
-            raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'")
-    from rl_yardstick.experiments.cluster.schedulers import JobQueue, checked_cluster
-
-    cluster = checked_cluster(args.cluster, args.insecure_cluster)
-    if isinstance(cluster, JobQueue):
-        if args.jobs < 1:
-            raise UserError(f"{cluster.file}: say how many runs to do at once: --jobs N")
-        cluster = replace(cluster, n_workers=args.jobs)
-    elif args.jobs > 0:
-        raise UserError("--jobs is for this machine or a queue of jobs; a cluster has its workers")
-    return replace(context, cluster=cluster, address=args.cluster)
-
-
-def give_way() -> None:
-    """Stop, because another process has taken over the study's folder, or it is gone."""
-    from rl_yardstick.experiments.child_processes import stop_all
-
-    stop_all()
-    _thread.interrupt_main(signal.SIGTERM)
+        with job.console.status("watching"):
+            learning = write_first_pages(analysis, job.workers.n_at_once)
+    with job.console.status("writing the page"):
+        write_report(Report(series, job.command, learning=learning), root / "report.html")
+    return [*files, *(root / one.place for one in learning if one.place), root / "report.html"]
 
 
 # --- from flags to a study ------------------------------------------------------------------------
+
+_BESIDE_RESUME = {"resume", "gym_packages", "jobs", "cluster", "no_report", "log_folder"}
+
+
+def check_alone(args: argparse.Namespace) -> None:
+    """Refuse flags of the study itself beside ``--resume``."""
+    usual = vars(build_parser().parse_args([]))
+    others = [name for name, value in vars(args).items() if value != usual[name]]
+    if names := [name for name in others if name not in _BESIDE_RESUME]:
+        raise UserError(f"--resume does a study as it was asked for: leave out {', '.join(names)}")
 
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
@@ -664,21 +463,17 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         read_study,
         with_maps_named,
     )
-    from rl_yardstick.pipeline.user_modules import import_typed
 
     if args.max_seeds is not None and not args.until_decided:
         raise UserError("--max-seeds belongs to --until-decided: give both, or --seeds")
     for flag, is_given in (("quick", args.is_quick), ("replace", args.replace)):
         if args.until_decided and is_given:
             raise UserError(f"--until-decided and --{flag} do not go together: give one of them")
-    if args.make_again and args.until_decided:
-        raise UserError("--until-decided and --make-again do not go together: give one of them")
     if args.learning_pages and args.no_report:
         raise UserError("--watch-learning is a section of the page: leave out --no-report")
     if args.metric is not None and args.metric not in METRICS:
         raise unknown("--metric: unknown metric", args.metric, METRICS)
     check_tensorboard(args.tensorboard)
-    modules = import_typed(args.gym_packages, args.env)
     if not args.study:
         study = _study_of_flags(args)
     elif args.env or args.algos:
@@ -687,40 +482,32 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         study = read_study(find_study(args.study))
     # A flag with the name of a field sets that field, if it is given.
     named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
-    names = tuple(module.name for module in modules)
-    changes = {**named, "n_seeds": args.seeds, "gym_packages": names, "user_modules": modules}
+    changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}
+    changes["figures"] = None if args.figures is None else tuple(args.figures)
     changes = {key: value for key, value in changes.items() if value is not None}
     study = with_maps_named(replace(_with_settings(study, args), **changes))
     if not args.study:
         environments = ", ".join(each.label for each in study.environments)
         study = replace(study, title=f"{', '.join(args.algos)} on {environments}")
-    if study.keep == "figures" and (study.episodes_table or study.tensorboard):
-        what = "--episodes-table" if study.episodes_table else "--tensorboard"
-        raise UserError(
-            f"{what} needs more of each run than --keep figures keeps: give one of them"
-        )
     return study.quickened() if args.is_quick else study
 
 
 def _study_of_flags(args: argparse.Namespace) -> StudySpec:
-    from rl_yardstick.agents import ALGORITHMS
     from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name
     from rl_yardstick.pipeline.environments import check_env_id
-    from rl_yardstick.pipeline.runs import environment_name
+    from rl_yardstick.pipeline.settings import check_agent
 
     if not (args.env and args.algos):
         raise UserError("what to compare? give --env and --algos, or a study file")
     for algo in args.algos:
-        if algo not in ALGORITHMS:
-            raise unknown("unknown agent", algo, ALGORITHMS)
+        check_agent(algo)
     for env_id in args.env:
         check_env_id(env_id)
     for flag, names in (("--env", args.env), ("--algos", args.algos)):
         if len(set(names)) < len(names):
             raise UserError(f"{flag} names one of them twice")
-    folders = "-".join(map(environment_name, args.env))
     return StudySpec(
-        name=file_name(f"{folders}_{'-'.join(args.algos)}", LONGEST_FOLDER_NAME),
+        name=file_name(f"{'-'.join(args.env).replace('/', '-')}_{'-'.join(args.algos)}"),
         title="",
         agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
         environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),
@@ -735,10 +522,9 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
         algo, colon, name = word.partition(":")
         if not (colon and algo in algos):
             if len(algos) > 1:
-                example = f"{algos[0]}:{word}"
                 raise UserError(
                     f"--conf-file {word}: whose hyperparameters? a file has those of one "
-                    f"agent ({', '.join(algos)}): {example}"
+                    f"agent ({', '.join(algos)}): {algos[0]}:{word}"
                 )
             algo, name = algos[0], word
         if algo in files:
@@ -752,7 +538,7 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
 def typed_settings(args: argparse.Namespace) -> dict[str, Any]:
     """The settings that the flags of a study or a search give to every agent."""
     from rl_yardstick.experiments.study import layered
-    from rl_yardstick.pipeline.settings.values import parse_assignments
+    from rl_yardstick.pipeline.settings import parse_assignments
 
     settings: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
     if args.env_kwargs:
@@ -765,119 +551,18 @@ def typed_settings(args: argparse.Namespace) -> dict[str, Any]:
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
     from rl_yardstick.experiments.study import AS_IT_COMES, layered
-    from rl_yardstick.pipeline.agent_settings import with_engine
+    from rl_yardstick.pipeline.arguments import arguments_of
 
     files = _conf_files(study, args.conf_file)
     changes = {**(AS_IT_COMES if args.as_it_comes else {}), **typed_settings(args)}
-    is_free = args.is_quick and "engine" not in changes
+    is_free = args.is_quick and args.engine is None and "engine" not in changes
 
-    def engine(agent: AgentSpec) -> str | None:
-        is_own = "engine" in agent.settings
-        return "auto" if is_free and not is_own and args.engine is None else args.engine
+    def changed(agent: AgentSpec) -> AgentSpec:
+        own = with_engine(agent.algo, changes, args.engine)
+        has_auto = "=auto" in arguments_of(agent.algo).get("engine", ())
+        if is_free and has_auto and "engine" not in agent.settings:
+            own["engine"] = "auto"
+        conf_file = files.get(agent.algo, agent.conf_file)
+        return replace(agent, settings=layered(agent.settings, own), conf_file=conf_file)
 
-    agents = tuple(
-        replace(
-            agent,
-            settings=layered(agent.settings, with_engine(agent.algo, changes, engine(agent))),
-            conf_file=files.get(agent.algo, agent.conf_file),
-        )
-        for agent in study.agents
-    )
-    return replace(study, agents=agents)
-
-
-# --- progress: a live table, or a line now and then -----------------------------------------------
-
-
-class StudyProgress(LiveProgress):
-    """The progress of a study's runs, by agent and environment."""
-
-    def __init__(
-        self,
-        console: Console,
-        runs: Sequence[PlannedRun],
-        done: Sequence[PlannedRun],
-        expected: Mapping[tuple[str, str], float] | None = None,
-    ) -> None:
-        from rl_yardstick.experiments.launching import TimeLeft
-
-        super().__init__(console)
-        there = {id(run) for run in done}
-        self.left = TimeLeft([run for run in runs if id(run) not in there], expected or {})
-        self.total = Counter(run.labels for run in runs)
-        self.done = Counter(run.labels for run in done)
-        self.failed: Counter[tuple[str, str]] = Counter()
-        self._refused: set[str] = set()
-        self.n_missing = len(runs) - len(done)
-        self.n_ended = 0
-
-    def note(self, run: PlannedRun, failure: RunFailure | None) -> None:
-        """Count a run that has ended now."""
-        self.n_ended += 1
-        now = time.monotonic()
-        self.left.start(self.started if self.n_ended == 1 else now, self.n_workers)
-        self.left.end(run, now)
-        self.left.start(now, self.n_workers)
-        key = run.labels
-        if failure is None:
-            self.done[key] += 1
-            self.note_refusal(run)
-        else:
-            self.failed[key] += 1
-            self.say(f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}")
-        if self.live is None and self.is_over:
-            self.say(self.figures())
-        else:
-            self.look()
-
-    def look(self) -> None:
-        """Show the progress; the first call also starts the estimate of the remaining time."""
-        self.left.start(time.monotonic(), self.n_workers)
-        super().look()
-
-    @property
-    def n_workers(self) -> int:
-        """The number of runs at once."""
-        return 1 if self._launcher is None else self._launcher.n_workers
-
-    def note_refusal(self, run: PlannedRun) -> None:
-        """Say once for each environment why its own model is refused, if it is."""
-        refusal = run.run.read_info().get("model_refused")
-        if isinstance(refusal, str) and run.environment not in self._refused:
-            self._refused.add(run.environment)
-            self.say(f"{run.environment}: {refusal}; figures are sampled")
-
-    @property
-    def is_over(self) -> bool:
-        """Whether all runs have ended."""
-        return self.n_ended >= self.n_missing
-
-    def figures(self) -> str:
-        """The number of ended runs, and an estimate of the remaining time."""
-        seconds = time.monotonic() - self.started
-        text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
-        if 0 < self.n_ended < self.n_missing:
-            left = self.left.seconds(time.monotonic(), self.n_workers)
-            text += "" if left is None else f", about {duration(left)} left by the clock"
-        text += self.place_words
-        n_failed = self.failed.total()
-        return f"{text}, {n_failed} failed" if n_failed else text
-
-    def picture(self) -> Table:
-        """The progress by agent and environment, as a table."""
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table(box=None, pad_edge=False, caption=self.figures(), caption_justify="left")
-        for heading in ("agent", "environment", "runs", "", "failed"):
-            table.add_column(heading)
-        for key, total in self.total.items():
-            done, failed = self.done[key], self.failed[key]
-            table.add_row(
-                *key,
-                f"{done}/{total}",
-                ProgressBar(total=total, completed=done, width=24),
-                Text(str(failed), "red") if failed else "",
-            )
-        return table
+    return replace(study, agents=tuple(map(changed, study.agents)))

@@ -1,18 +1,15 @@
-"""``shaping.py``: whether rewards in training change the optimal policies, and at what cost."""
+"""``shaping``: whether rewards in training change the optimal policies, and at what cost."""
 
 from __future__ import annotations
 
 import argparse
-import inspect
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rl_yardstick.commands.cli import OneLineParser, add_shared, assignments, filled
+from rl_yardstick.commands.cli import OneLineParser, add_shared, assignments
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.failures import exits_as_mistakes
-from rl_yardstick.pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,7 +18,7 @@ if TYPE_CHECKING:
 
     from rl_yardstick.mdp.shaping import Effect
     from rl_yardstick.mdp.transition_model import TransitionModel
-    from rl_yardstick.pipeline.train_spec import TrainSpec
+    from rl_yardstick.pipeline.spec import TrainSpec
 
 # The largest number of states printed in which other actions are best.
 MOST_STATES = 3
@@ -40,8 +37,8 @@ examples:
 def build_parser() -> argparse.ArgumentParser:
     """The flags."""
     parser = OneLineParser(
-        description="Say whether training on other rewards changes the optimal policies, and what "
-        "that costs, exactly. Default: the changes that an agent's settings make in training.",
+        description="Show whether training on other rewards changes the optimal policies, and "
+        "the exact cost. Default: the changes that an agent's settings make in training.",
         epilog=EPILOG,
     )
     add = parser.add_argument
@@ -57,32 +54,29 @@ def build_parser() -> argparse.ArgumentParser:
     add("--gamma", type=float, help="discount (default: the agent's)")
     add_shared(parser, "--hyperparams", help="hyperparameters to change, e.g. gamma:0.9")
     add_shared(parser, "--conf-file", "--gym-packages")
-    add("--json", type=filled, metavar="FILE", help="also write the result to this file")
+    add("--json", type=Path, metavar="FILE", help="also write the result to this file")
     return parser
 
 
 def main() -> int:
-    """Parse the arguments and print the effect of the training rewards; return the exit code."""
+    """Print the effect of the training rewards."""
     args = build_parser().parse_args()
-    with stops_noticed(), exits_as_mistakes():
-        from rl_yardstick.commands.terminal import TextConsole, say
-        from rl_yardstick.pipeline.environments import make_single_env, training_changes
-        from rl_yardstick.pipeline.signs_of_life import doing
+    from rl_yardstick.commands.terminal import TextConsole, say
+    from rl_yardstick.pipeline.environments import make_single_env, training_changes
+    from rl_yardstick.pipeline.files import write_json
 
-        console = TextConsole(highlight=False)
-        spec = _spec(args)
-        discount = _discount(args, spec)
-        changes = ", ".join(training_changes(spec)) or "nothing"
-        say(console, f"{spec.env_id}; changed in training: {changes}")
-        with closing(make_single_env(spec)) as env:
-            with doing(console, "planning"):
-                compared = _compared(spec, env, discount)
-            for line in compared.lines():
-                say(console, line)
+    console = TextConsole()
+    spec = _spec(args)
+    discount = _discount(args, spec)
+    changes = ", ".join(training_changes(spec)) or "nothing"
+    say(console, f"{spec.env_id}; changed in training: {changes}")
+    with closing(make_single_env(spec)) as env:
+        with console.status("planning"):
+            compared = _compared(spec, env, discount)
+        for line in compared.lines():
+            say(console, line)
         if args.json is not None:
-            from rl_yardstick.pipeline.files import write_json
-
-            write_json(Path(args.json), {"changes": changes, **compared.as_data()})
+            write_json(args.json, {"changes": changes, **compared.as_data()})
     return 0
 
 
@@ -91,47 +85,49 @@ def main() -> int:
 
 def _spec(args: argparse.Namespace) -> TrainSpec:
     """The settings of the agent, with the changes in training."""
-    from rl_yardstick.pipeline.agent_settings import (
-        check_algorithm,
-        resolved_spec,
+    from rl_yardstick.pipeline.environments import check_env_id, with_files_read
+    from rl_yardstick.pipeline.modules import import_modules, split_id
+    from rl_yardstick.pipeline.settings import (
+        check_agent,
+        override,
+        parse_assignments,
+        read_entry,
+        read_spec,
         training_follows,
     )
-    from rl_yardstick.pipeline.environments import check_env_id, with_maps_read
-    from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
-    from rl_yardstick.pipeline.settings.values import parse_assignments
-    from rl_yardstick.pipeline.user_modules import import_typed
 
-    modules = import_typed(args.gym_packages, [args.env])
-    check_algorithm(args.algo)
-    check_env_id(args.env)
-    changes = parse_assignments(args.hyperparams, "-params")
-    typed = parse_assignments(args.env_kwargs, "--env-kwargs")
-    entry = read_hyperparams(args.algo, args.env, args.conf_file, typed)
-    if typed:
-        changes["env_kwargs"] = {**(entry.get("env_kwargs") or {}), **typed}
+    module, env_id = split_id(args.env)
+    typed = [*args.gym_packages, *filter(None, [module])]
+    import_modules(typed)
+    check_agent(args.algo)
+    check_env_id(env_id)
+    changes = {"n_timesteps": 1, **parse_assignments(args.hyperparams, "-params")}
+    given = parse_assignments(args.env_kwargs, "--env-kwargs")
+    entry = read_entry(args.algo, env_id, args.conf_file, given)
+    if given:
+        changes["env_kwargs"] = {**(entry.get("env_kwargs") or {}), **given}
     if args.train_env_kwargs or args.wrapper:
         changes["train_env_kwargs"] = parse_assignments(args.train_env_kwargs, "--train-env-kwargs")
         changes["train_env_wrapper"] = [
-            {name: parse_assignments(given, "--wrapper")} for name, *given in args.wrapper
+            {name: parse_assignments(kwargs, "--wrapper")} for name, *kwargs in args.wrapper
         ]
-    raw, _ = training_follows(override(entry, changes), {**changes, "env_kwargs": typed})
-    raw, packages = with_maps_read(args.env, raw), tuple(module.name for module in modules)
-    spec = resolved_spec(raw, algo=args.algo, env_id=args.env, seed=0, gym_packages=packages)
+    entry, _ = training_follows(override(entry, changes), {**changes, "env_kwargs": given})
+    spec = read_spec(args.algo, env_id, with_files_read(env_id, entry), gym_packages=typed)
     for key in ("normalize", "vec_env_wrapper"):
-        if getattr(spec.hyperparams, key):
+        if getattr(spec, key):
             raise UserError(f"{key}: the rewards that it makes have no model to compare")
     return spec
 
 
 def _discount(args: argparse.Namespace, spec: TrainSpec) -> float:
     """The discount of the flag, else of the settings, else the default of the agent's class."""
-    found = spec.hyperparams.algorithm.get("gamma") if args.gamma is None else args.gamma
+    found = spec.algorithm.get("gamma") if args.gamma is None else args.gamma
     if found is None:
         from rl_yardstick.agents import load_algorithm
+        from rl_yardstick.pipeline.arguments import constructor_parameters
 
-        classes = load_algorithm(spec.algo).__mro__
-        given = [inspect.signature(each).parameters.get("gamma") for each in classes[:-1]]
-        found = next((one.default for one in given if one is not None), None)
+        parameter = constructor_parameters(load_algorithm(spec.algo)).get("gamma")
+        found = None if parameter is None else parameter.default
     if not isinstance(found, int | float) or not 0 <= found <= 1:
         raise UserError(f"--gamma: a discount from 0 to 1 is needed, not {found}")
     return float(found)
@@ -167,13 +163,12 @@ class Compared:
         """The comparison in words."""
         optimum = self.effects[1.0].optimum
         for discount, found in self.effects.items():
-            of = f"{int(found.differs.sum()):,} of {int(self.model.reachable.sum()):,} states"
-            differ = f"NOT the same policies are optimal: the best actions differ in {of}"
-            told = "the same policies are optimal" if found.is_same else differ
-            where = (
-                f"discount {discount:g}" if discount < 1 else f"no discount, {self.horizon:,} steps"
-            )
-            yield f"{where}: {told}"
+            told = "the same policies are optimal"
+            if not found.is_same:
+                of = f"{int(found.differs.sum()):,} of {int(self.model.reachable.sum()):,} states"
+                told = f"NOT {told}: the best actions differ in {of}"
+            limit = f"no discount, {self.horizon:,} steps"
+            yield f"{f'discount {discount:g}' if discount < 1 else limit}: {told}"
             met = [place for place in self.places(found) if place["met"] > 0]
             for place in met[:MOST_STATES]:
                 told = f"{place['met']:.1%} of episodes part here, worth {place['gain']:.4g}"
@@ -217,20 +212,16 @@ class Compared:
 
     def as_data(self) -> dict[str, Any]:
         """The comparison as JSON data."""
+        plain = ("optimum", "returns", "judged", "judged_before", "factor", "potential")
         objectives = [
             {
+                **{name: getattr(found, name) for name in plain},
                 "discount": discount,
                 "time_limit": None if discount < 1 else self.horizon,
                 "same": found.is_same,
                 "n_states": int(self.model.reachable.sum()),
                 "n_differing": int(found.differs.sum()),
-                "optimum": found.optimum,
-                "returns": found.returns,
                 "cost": [found.optimum - each for each in found.returns],
-                "judged": found.judged,
-                "judged_before": found.judged_before,
-                "factor": found.factor,
-                "potential": None if found.potential is None else found.potential.tolist(),
                 "states": self.places(found),
             }
             for discount, found in self.effects.items()

@@ -1,16 +1,11 @@
-"""Output shared by the commands: consoles, progress, evaluations and engines in words."""
+"""Output shared by the commands: the console, and evaluations in words."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
-from io import StringIO
+from collections.abc import Iterable, Sequence
 from shutil import get_terminal_size
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
@@ -18,24 +13,12 @@ from rich.text import Text
 
 from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.evaluation.yardstick import ROUNDING, rounding
-from rl_yardstick.pipeline.signs_of_life import (
-    SECONDS_BETWEEN_LINES,
-    SECONDS_BETWEEN_LOOKS,
-    Heartbeat,
-    Silence,
-    can_move,
-)
 
 if TYPE_CHECKING:
     from rich.table import Table
-    from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.callbacks import BaseCallback
 
-    from rl_yardstick.agents.networks.engine_setting import EnginePlan
-    from rl_yardstick.experiments.launching import Launcher, Launchers
     from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
     from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-    from rl_yardstick.pipeline.preparation import EngineOutlook
 
 UNBOUNDED = 10_000  # columns
 APART = "   "  # between the figures of a result
@@ -44,25 +27,23 @@ APART = "   "  # between the figures of a result
 class TextConsole(Console):
     """A console that shows control characters in a text instead of obeying them.
 
-    Labels, titles and names come from files, so Rich's markup in them is plain text, too: it could
-    crash, or make links. Cursor movements and colours come only from Rich itself: see ``style``.
+    Labels, titles and names come from files, so Rich's markup in them is plain text, too. Strings
+    are never broken in a file or a pipe, so that `grep` finds them.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(markup=False, emoji=False, **options)
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print as Rich does, but break no line in a file or a pipe, so that `grep` finds it."""
+        """Print as Rich does, but break no line in a file or a pipe."""
         if not self.is_terminal and all(isinstance(item, str) for item in objects):
             options.setdefault("soft_wrap", True)
+        options["markup"] = False
         super().print(*objects, **options)
 
     def on_broken_pipe(self) -> None:
-        """Leave a closed pipe to `commands.cli.Output`; Rich would be silent from then on.
-
-        If the thread that prints progress found the closed pipe, the main thread would not know.
-        """
-        raise BrokenPipeError
+        """Go on in silence: a training is worth more than its output."""
+        self.quiet = True
 
     def render_str(self, text: str, **options: Any) -> Text:
         """As Rich does, with control characters made visible, so that the width is right."""
@@ -77,110 +58,27 @@ class TextConsole(Console):
             yield segment if control else Segment(visible(text), style)
 
 
-def table_console(*, highlight: bool = True) -> Console:
+def table_console() -> Console:
     """A console as wide as the terminal; in a file or a pipe, of `COLUMNS` or 80 columns."""
-    console = TextConsole(highlight=highlight)
-    if console.is_terminal:
-        return console
-    return TextConsole(highlight=highlight, width=get_terminal_size().columns)
+    console = TextConsole()
+    return console if console.is_terminal else TextConsole(width=get_terminal_size().columns)
 
 
 def print_rows(console: Console, table: Table) -> None:
     """Print a table without borders; in a file or a pipe each row is one line, however long."""
     if console.is_terminal:
-        console.print(table, highlight=False)
+        console.print(table)
         return
-    wide = TextConsole(file=StringIO(), width=UNBOUNDED)
-    wide.print(table, highlight=False)
-    for line in wide.file.getvalue().splitlines():  # type: ignore[attr-defined]  # it is ours
-        console.print(line.rstrip(), highlight=False, soft_wrap=True)
+    wide = TextConsole(width=UNBOUNDED)
+    with wide.capture() as captured:
+        wide.print(table)
+    for line in captured.get().splitlines():
+        console.print(line.rstrip())
 
 
 def say(console: Console, line: str, style: str | None = None) -> None:
     """Print a line without breaking it, however long."""
-    console.print(line, style=style, highlight=False, soft_wrap=True)
-
-
-def print_refusal(console: Console, refusal: str | None) -> None:
-    """Say why the environment's own model is refused, if it is."""
-    if refusal is not None:
-        say(console, f"{refusal}; figures are sampled")
-
-
-class LiveProgress(ABC):
-    """Shows progress while its ``with`` statement runs."""
-
-    def __init__(self, console: Console) -> None:
-        from rich.live import Live
-
-        self.console = console
-        self.started = time.monotonic()
-        self.silence = Silence(SECONDS_BETWEEN_LINES)
-        self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
-        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
-        self._launcher: Launcher | None = None
-
-    def watching(self, launchers: Launchers) -> Launchers:
-        """The same launchers, with the words of the open one shown in the progress."""
-
-        @contextlib.contextmanager
-        def watched() -> Iterator[Launcher]:
-            with launchers() as self._launcher:
-                yield self._launcher
-            self._launcher = None
-
-        return watched
-
-    @property
-    def place_words(self) -> str:
-        """The launcher's words, to append to a line; mostly empty."""
-        words = self._launcher.words if self._launcher is not None else ""
-        return f", {words}" if words else ""
-
-    @abstractmethod
-    def figures(self) -> str:
-        """The progress in a line."""
-
-    def picture(self) -> RenderableType:
-        """The progress for a live display."""
-        return Text(self.figures())
-
-    @property
-    def is_over(self) -> bool:
-        """Whether there is nothing more to wait for."""
-        return False
-
-    def __enter__(self) -> Self:
-        if self.live is not None:
-            self.live.start()
-            self.look()
-        self.heart.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.heart.stop()
-        if self.live is not None:
-            self.look()
-            self.live.stop()
-        if isinstance(error, KeyboardInterrupt):
-            self.say(f"{self.figures()}; the same command continues")
-
-    def look(self) -> None:
-        """Show the progress; called at intervals, too."""
-        if self.live is not None:
-            self.live.update(self.picture(), refresh=True)
-        elif self.silence.is_too_long and not self.is_over:
-            self.say(self.figures())
-
-    def say(self, line: str) -> None:
-        """Print a line that stays."""
-        self.silence.end()
-        say(self.console, line)
+    console.print(line, style=style, soft_wrap=True)
 
 
 # --- evaluations in words -------------------------------------------------------------------------
@@ -286,140 +184,3 @@ def percent(share: float) -> str:
 def episodes(n: int) -> str:
     """A number of episodes in words."""
     return f"{n:,} episode{'s' if n != 1 else ''}"
-
-
-# --- engines in words -----------------------------------------------------------------------------
-
-
-LIBRARY = "library (Stable-Baselines3's own loop)"
-
-HOW_NOT_TO_BE_ASKED = (
-    "made a BlockCallback, it would be asked only when it acts (docs/training.md#from-python)"
-)
-
-
-def about(seconds: float) -> str:
-    """A time that is known up to a factor of two."""
-    if seconds < 1:
-        return "less than 1 s"
-    if seconds < 120:
-        return f"about {seconds:.0f} s"
-    if seconds < 7200:
-        return f"about {seconds / 60:.0f} min"
-    return f"about {seconds / 3600:.0f} h"
-
-
-def training_line(
-    outlook: EngineOutlook | None, model: BaseAlgorithm, callback: BaseCallback
-) -> str:
-    """The line on the engine of one training; empty if there is nothing to say."""
-    from stable_baselines3.common.callbacks import CallbackList
-
-    from rl_yardstick.agents.common.callbacks import members, unknown_callbacks
-    from rl_yardstick.agents.networks.engine_setting import machine_pace
-
-    # The user's own callbacks that must be called after each step.
-    told = [each for each in members(callback) if not isinstance(each, CallbackList)]
-    theirs = [each for each in told if not type(each).__module__.startswith("pipeline.")]
-    asked = [name for each in theirs for name in unknown_callbacks(each)]
-    if outlook is None:
-        if not asked or getattr(model, "engine", "compiled") != "auto":
-            return ""
-        return (
-            f"interpreted, about a hundred times slower or more: {', '.join(asked)} must be asked "
-            f"after each step; {HOW_NOT_TO_BE_ASKED}"
-        )
-    pace = machine_pace()
-    advice = ""
-    if asked and outlook.auto.is_compiled:
-        advice = f"; {HOW_NOT_TO_BE_ASKED}"
-        if outlook.work is not None:
-            advice += f", and training take {about(outlook.work.compiled_seconds * pace)}"
-    line = _words(outlook.plan, outlook, pace, "of processor time")
-    if outlook.plan.is_compiled:
-        if outlook.work is not None:
-            taken = about(outlook.work.library_seconds * pace)
-            line += f" (Stable-Baselines3's own loop: {taken})"
-    elif outlook.auto.is_compiled:
-        why = f" but for the environment ({outlook.auto.in_python})" * bool(outlook.auto.in_python)
-        taken = _takes(outlook.auto, outlook, pace, "")
-        line += f"; --engine auto: the same networks and updates compiled{why}{taken}"
-    return f"{line}{advice}"
-
-
-def _words(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> str:
-    """An engine, its expected time, and the reason why it is not another."""
-    name = str(plan).partition(":")[0] if plan.is_compiled else LIBRARY
-    reason = plan.in_python or plan.reason
-    return f"{name}{_takes(plan, outlook, pace, unit)}{': ' if reason else ''}{reason}"
-
-
-def _takes(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> str:
-    work = outlook.work
-    if work is None:
-        return ""
-    from rl_yardstick.agents.networks.engine_setting import compiling_seconds
-
-    text = f", {about(seconds_of(plan, outlook) * pace)} {unit}".rstrip()
-    compiling = compiling_seconds(work) * pace if plan.is_compiled else 0.0
-    return f"{text} and once {about(compiling)} of compiling" if compiling else text
-
-
-def seconds_of(plan: EnginePlan, outlook: EngineOutlook) -> float:
-    """Seconds of a training on the machine of the measured constants; 0 if unknown."""
-    if outlook.work is None:
-        return 0.0
-    if not plan.is_compiled:
-        return outlook.work.library_seconds
-    return outlook.work.bridged_seconds if plan.in_python else outlook.work.compiled_seconds
-
-
-def study_line(planned: Sequence[tuple[str, EngineOutlook, int]]) -> str:
-    """The line on the engines of many trainings; empty if none has networks.
-
-    ``planned`` has labels of agents, the outlooks of their runs, and the numbers of their runs.
-    """
-    from rl_yardstick.agents.networks.engine_setting import machine_pace
-
-    pace, parts = machine_pace() if planned else 1.0, []
-    for is_compiled in (False, True):
-        group = [each for each in planned if each[1].plan.is_compiled is is_compiled]
-        if not group:
-            continue
-        names = ", ".join(dict.fromkeys(label for label, _, _ in group))
-        n_runs = sum(count for _, _, count in group)
-        runs = "1 run" if n_runs == 1 else f"{n_runs} runs"
-        taken = _together([(outlook, outlook.plan, n) for _, outlook, n in group], pace)
-        parts.append(
-            f"{names}: {'compiled' if is_compiled else LIBRARY}{taken}"
-            f"{' of processor time' if taken else ''} in {runs}"
-        )
-        if not is_compiled and any(outlook.auto.is_compiled for _, outlook, _ in group):
-            taken = _together([(outlook, outlook.auto, n) for _, outlook, n in group], pace)
-            parts.append(f"with --engine auto compiled{taken}")
-    return "; ".join(parts)
-
-
-def _together(trainings: Sequence[tuple[EngineOutlook, EnginePlan, int]], pace: float) -> str:
-    """The expected time of all trainings together; empty if that of one is unknown."""
-    if any(outlook.work is None for outlook, _, _ in trainings):
-        return ""
-    seconds = sum(seconds_of(plan, outlook) * n for outlook, plan, n in trainings)
-    return f", {about(seconds * pace)}"
-
-
-def search_line(algo: str, search: EngineOutlook | None, retest: EngineOutlook | None) -> str:
-    """The line on the engines of a search and its re-test, for one run; empty without outlooks."""
-    if search is None or retest is None:
-        return ""
-    from rl_yardstick.agents.networks.engine_setting import machine_pace
-
-    pace = machine_pace()
-    searched = _words(search.plan, search, pace, "of processor time a run")
-    if search.plan.is_compiled == retest.plan.is_compiled:
-        return f"search and re-test: {searched}"
-    again = _words(retest.plan, retest, pace, "a run")
-    return (
-        f"search: {searched}; re-test: {again}, in which train runs {algo}; "
-        "--engine auto re-tests compiled, if you train with it"
-    )

@@ -3,24 +3,35 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from rl_yardstick.diagnosis.faults import FAULTS
-from rl_yardstick.diagnosis.probes import (
-    NEEDS_VALUES,
-    PROBES,
-    Finding,
-    Lab,
-    NotSettled,
-    Probe,
-    probe_discount,
-    probe_ends,
-)
-from rl_yardstick.diagnosis.subjects import Subject
+from rl_yardstick.diagnosis import agent_probes, target_probes
+from rl_yardstick.diagnosis.faults import FAULTS, Finding
+from rl_yardstick.diagnosis.subjects import Lab, NotSettled, Subject
 from rl_yardstick.pipeline.errors import UserError, one_line
 
+Probe = Callable[[Lab], Finding | None]
+PROBES: Mapping[Probe, str] = {
+    target_probes.probe_ends: "the end of an episode",
+    target_probes.probe_discount: "the discount",
+    target_probes.probe_cuts: "an episode that is cut off",
+    target_probes.probe_next_action: "the next action",
+    target_probes.probe_ratio: "the importance ratio",
+    target_probes.probe_target_network: "the target network",
+    target_probes.probe_age: "the age of training data",
+    target_probes.probe_copies: "observations that change in place",
+    target_probes.probe_n_steps: "targets of several steps",
+    target_probes.probe_advantages: "advantages of rollouts",
+    target_probes.probe_traces: "traces",
+    agent_probes.probe_choice: "what it does when evaluated",
+    agent_probes.probe_entropy: "the entropy term",
+    agent_probes.probe_schedules: "the schedule of the learning rate",
+    agent_probes.probe_exploration: "the schedule of exploration",
+    agent_probes.probe_seeds: "seeds",
+    agent_probes.probe_files: "saving and loading",
+}
 # A fault of one-step targets explains these faults of targets of several steps.
 _OF_ONE_STEP = frozenset(list(FAULTS)[: list(FAULTS).index("importance-ratio")])
 _OF_SEVERAL = frozenset({"n-step-return", "traces"})
@@ -39,15 +50,14 @@ class Verdict:
         found = [finding for finding in self.findings if finding.state == "fault"]
         if _OF_ONE_STEP & {finding.fault for finding in found}:
             found = [finding for finding in found if finding.fault not in _OF_SEVERAL]
-        found.sort(key=lambda finding: list(FAULTS).index(finding.fault))
-        return found
+        return sorted(found, key=lambda finding: list(FAULTS).index(finding.fault))
 
     @property
     def is_right(self) -> bool:
         """Whether the targets were checked and no fault was found."""
         states = {f.probe: f.state for f in self.findings}
-        decided = [states.get(_title(probe)) for probe in (probe_ends, probe_discount)]
-        return not self.faults and decided == ["ok", "ok"]
+        deciding = (target_probes.probe_ends, target_probes.probe_discount)
+        return not self.faults and all(states.get(PROBES[probe]) == "ok" for probe in deciding)
 
     @property
     def exit_code(self) -> int:
@@ -57,11 +67,11 @@ class Verdict:
     def as_json(self) -> dict[str, Any]:
         """The verdict as JSON: the findings, and the sentence and source of each fault."""
         words = ("right", "fault", "nothing can be said")
-        faults = []
-        for finding in self.faults:
-            fault = FAULTS[finding.fault]
-            entry = {"fault": finding.fault, "sentence": fault.sentence, "source": fault.source}
-            faults.append({**entry, "measured": finding.text, "right": finding.right})
+        faults = [
+            {"fault": finding.fault, **FAULTS[finding.fault]._asdict()}
+            | {"measured": finding.text, "right": finding.right}
+            for finding in self.faults
+        ]
         return {
             "algorithm": self.subject,
             "verdict": words[self.exit_code],
@@ -72,7 +82,7 @@ class Verdict:
 
 
 def audit(
-    subject: Subject, seeds: Sequence[int], probes: Sequence[Probe] = PROBES
+    subject: Subject, seeds: Sequence[int], probes: Collection[Probe] | None = None
 ) -> Iterator[Finding]:
     """Yield the findings of each probe.
 
@@ -80,62 +90,40 @@ def audit(
     other seeds, and the majority counts.
     """
     labs = [Lab(subject, seed) for seed in seeds]
+    reads_values = {*list(PROBES)[:11], agent_probes.probe_schedules}
     if not subject.has_values:
-        probes = [probe for probe in probes if probe not in NEEDS_VALUES]
-        yield Finding("its values", "skipped", "it has no values, so its targets cannot be checked")
-    for probe in probes:
-        found: list[list[Finding]] = []
+        text = "it has no values, so its targets cannot be checked"
+        yield Finding("skipped", text, probe="its values")
+    for probe in PROBES if probes is None else probes:
+        if probe in reads_values and not subject.has_values:
+            continue
+        found: list[Finding | None] = []
         for lab in labs:
-            found.append(_findings(probe, lab))
-            if all(finding.state in ("ok", "skipped") for finding in found[0]):
+            found.append(_finding(probe, lab))
+            if found[0] is None or found[0].state in ("ok", "skipped"):
                 break
-        yield from _most_agreed(found)
+        if (agreed := _most_agreed(found)) is not None:
+            yield replace(agreed, probe=PROBES.get(probe, probe.__name__))
 
 
-def _findings(probe: Probe, lab: Lab) -> list[Finding]:
-    """The findings of a probe with one seed; "unsaid" where the probe fails."""
-    name = _title(probe)
+def _finding(probe: Probe, lab: Lab) -> Finding | None:
+    """The finding of a probe with one seed; "unsaid" where the probe fails."""
     try:
-        return list(probe(lab))
+        return probe(lab)
     except NotSettled as error:
-        return [Finding(name, "unsaid", str(error))]
+        return Finding("unsaid", str(error))
     except UserError:
         raise
     except Exception as error:  # noqa: BLE001 (user code may raise anything)
         text = f"{type(error).__name__}: {one_line(error)}"
-        return [Finding(name, "unsaid", f"it cannot train here: {text}")]
+        return Finding("unsaid", f"it cannot train here: {text}")
 
 
-def _most_agreed(found: list[list[Finding]]) -> list[Finding]:
-    """The findings of the majority of seeds, as the first of these seeds gave them."""
-    signs = [tuple((each.probe, each.state, each.fault) for each in findings) for findings in found]
+def _most_agreed(found: list[Finding | None]) -> Finding | None:
+    """The finding of the majority of seeds, as the first of these seeds gave it."""
+    signs = [(None, "") if each is None else (each.state, each.fault) for each in found]
     (sign, n), *_ = Counter(signs).most_common()
     if 2 * n > len(signs):
         return found[signs.index(sign)]
-    name = found[0][0].probe
-    told = {each.fault or each.state for findings in found for each in findings}
-    return [Finding(name, "unsaid", f"seeds disagree: {', '.join(sorted(told))}")]
-
-
-def _title(probe: Probe) -> str:
-    return TITLES[probe]
-
-
-_NAMES = (
-    "the end of an episode",
-    "the discount",
-    "an episode that is cut off",
-    "the next action",
-    "the importance ratio",
-    "the target network",
-    "the age of training data",
-    "observations that change in place",
-    "targets of several steps",
-    "traces",
-    "what it does when evaluated",
-    "the entropy term",
-    "the schedule of the learning rate",
-    "seeds",
-    "saving and loading",
-)
-TITLES: dict[Probe, str] = dict(zip(PROBES, _NAMES, strict=True))
+    told = sorted({fault or str(state) for state, fault in signs})
+    return Finding("unsaid", f"seeds disagree: {', '.join(told)}")

@@ -44,7 +44,6 @@ from rl_yardstick.mdp import (
 from rl_yardstick.mdp.evaluation import canonical_policy, policy_matrix
 from rl_yardstick.mdp.gaps import (
     GapByState,
-    Repair,
     first_differences,
     gap_by_state,
     greedy_repairs,
@@ -57,7 +56,7 @@ from rl_yardstick.pipeline.evaluation.advice import how_episodes_end, still_runn
 from rl_yardstick.pipeline.evaluation.critics import learns_exploring_values
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.policies import believed_values
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec
 
 # The largest model to plan in for an agent's objective, which takes about a second.
 MOST_OUTCOMES = 500_000
@@ -107,14 +106,13 @@ class Explanation:
     value: float  #: the agent's expected return
     score: float  #: on the scale of the yardstick
     ending: str  #: how its episodes end
-    parts: tuple[Part, ...]  #: their losses sum to the gap; empty where they are not known
-    states: tuple[StateLoss, ...]  #: the states that lose most, at most 20, the worst first
-    n_states: int  #: states in which it loses anything
     losses: Floats  #: the loss in each state, shape (S,); losses sum to the gap
-    repairs: tuple[tuple[str, float], ...]  #: state, and return after its and all earlier repairs
-    #: the discount of its training, and the gap at the start in that objective
-    discount: float | None = None
-    own_gap: float | None = None
+    n_states: int  #: states in which it loses anything
+    parts: tuple[Part, ...] = ()  #: their losses sum to the gap; empty where they are not known
+    states: tuple[StateLoss, ...] = ()  #: the states that lose most, at most 20, the worst first
+    repairs: tuple[tuple[str, float], ...] = ()  #: state, return after it and all earlier repairs
+    discount: float | None = None  #: of its training
+    own_gap: float | None = None  #: the gap at the start in that objective
     #: where losses are spread, what its policy does along the best road; or which states look alike
     road: str = ""
     is_caught: bool = False  #: whether most of its episodes run out of time
@@ -144,20 +142,15 @@ class Explanation:
 
     def as_data(self) -> dict[str, Any]:
         """The explanation as JSON."""
+        plain = ("optimum", "score", "ending", "n_states", "discount", "road", "proposals")
         return {
-            "optimum": self.optimum,
+            **{name: getattr(self, name) for name in plain},
             "return": self.value,
             "gap": self.gap,
-            "score": self.score,
-            "ending": self.ending,
             "parts": [vars(part) for part in self.parts],
             "states": [vars(state) for state in self.states],
-            "n_states": self.n_states,
             "repairs": [{"name": name, "return": value} for name, value in self.repairs],
-            "discount": self.discount,
             "gap_in_own_objective": self.own_gap,
-            "road": self.road,
-            "proposals": self.proposals,
         }
 
 
@@ -184,44 +177,39 @@ def explanation(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator
     """
     if reason := evaluator.obstacle(agent):
         raise UserError(f"{spec.algo} cannot be explained: {reason}")
-    model, horizon = evaluator.model, evaluator.horizon
     policy = evaluator.policy(agent, deterministic=True)
     try:
-        split = gap_by_state(model, policy, horizon)
+        split = gap_by_state(evaluator.model, policy, evaluator.horizon)
     except ValueError as error:
         raise UserError(f"{spec.algo} on {spec.env_id} cannot be explained: {error}") from error
+    explained = Explanation(
+        optimum=split.optimum,
+        value=split.value,
+        score=evaluator.yardstick.score(split.value),
+        ending=how_episodes_end(evaluator, policy),
+        losses=split.losses,
+        n_states=int((split.losses > 0).sum()),
+    )
+    if explained.is_optimal:
+        return explained
+    task = _task(spec, agent, evaluator)
+    found = Found(evaluator, agent, policy, split, task)
     with closing(make_single_env(spec)) as env:
         words = _Words(env, evaluator)
-        explained = Explanation(
-            optimum=split.optimum,
-            value=split.value,
-            score=evaluator.yardstick.score(split.value),
-            ending=how_episodes_end(evaluator, policy),
-            parts=(),
-            states=(),
-            n_states=int((split.losses > 0).sum()),
-            losses=split.losses,
-            repairs=(),
-        )
-        if explained.is_optimal:
-            return explained
-        task = _task(spec, agent, evaluator)
-        found = Found(evaluator, agent, policy, split, task)
+        alike = None if found.groups is None else found.alike(words)
         explained = replace(
             explained,
             parts=found.parts(),
             states=found.states(words),
-            repairs=tuple((words.place(state), value) for state, value in found.repairs()),
+            repairs=() if alike else found.repairs(words),
             discount=None if task is None else task.discount,
             own_gap=found.own_gap(),
             is_caught=found.is_caught(),
+            looks_alike=alike is not None,
         )
-        if found.groups is not None:
-            alike = found.alike(words)
-            explained = replace(explained, road=alike, repairs=(), looks_alike=True)
-        elif not explained.is_concentrated:
-            explained = replace(explained, road=found.road(words))
-        return replace(explained, proposals=proposals(spec, found, explained.parts))
+        if alike is not None or not explained.is_concentrated:
+            explained = replace(explained, road=alike or found.road(words))
+    return replace(explained, proposals=proposals(spec, found, explained.parts))
 
 
 def _task(spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator) -> _Task | None:
@@ -405,51 +393,46 @@ class Found:
 
     def states(self, words: _Words, most: int = 20) -> tuple[StateLoss, ...]:
         """The states that lose most, the worst first."""
-        split = self.split
-        order = [int(state) for state in np.argsort(-split.losses, kind="stable")[:most]]
-        return tuple(self._state(state, words) for state in order if split.losses[state] > 0)
+        losses = self.split.losses
+        order = np.argsort(-losses, kind="stable")[:most]
+        return tuple(self._state(int(state), words) for state in order if losses[state] > 0)
 
     def _state(self, state: int, words: _Words) -> StateLoss:
-        split, best = self.split, int(self.split.action_values[state].argmax())
-        taken = int(self.taken[state])
-        pair = [taken, best]
+        split = self.split
+        pair = [int(self.taken[state]), int(split.action_values[state].argmax())]
 
         def of(table: NDArray[Any] | None) -> tuple[Any, Any] | None:
-            if table is None or table.ndim != 2:
+            if table is None or table.ndim != 2 or self.groups is not None:
                 return None
             first, second = table[state, pair].tolist()
             return first, second
 
-        is_seen = self.groups is None
         return StateLoss(
             state=state,
             name=words.place(state),
             loss=float(split.losses[state]),
             visits=float(split.visits[state]),
-            action=words.action(taken),
-            best=words.action(best),
-            believed=of(self.beliefs) if is_seen else None,
-            true=of(self.own_values) if is_seen else None,
-            updates=of(self.updates) if is_seen else None,
+            action=words.action(pair[0]),
+            best=words.action(pair[1]),
+            believed=of(self.beliefs),
+            true=of(self.own_values),
+            updates=of(self.updates),
         )
 
-    def repairs(self) -> list[Repair]:
+    def repairs(self, words: _Words) -> tuple[tuple[str, float], ...]:
         """The greedy repairs that each regain a share of the gap that is worth a line."""
         found = greedy_repairs(self.model, self.policy, self.horizon, self.split, MOST_STATES)
-        value, kept = self.split.value, []
-        for repair in found:
-            if repair.value - value < WORTH_A_LINE * self.split.gap:
-                break
-            kept.append(repair)
-            value = repair.value
-        return kept
+        reached = [self.split.value, *(repair.value for repair in found)]
+        too_little = np.diff(reached) < WORTH_A_LINE * self.split.gap
+        n_kept = int(too_little.argmax()) if too_little.any() else len(found)
+        return tuple((words.place(repair.state), repair.value) for repair in found[:n_kept])
 
     def alike(self, words: _Words) -> str:
         """The states of the observation that the agent sees most, where several states share it."""
         assert self.groups is not None
         visits = np.bincount(self.groups, self.split.visits)
         counts = np.bincount(self.groups, self.model.reachable)
-        most = int(np.where(counts > 1, visits, -1.0).argmax())
+        most = np.where(counts > 1, visits, -1.0).argmax()
         states = np.flatnonzero((self.groups == most) & self.model.reachable)
         names = "; ".join(words.place(int(state)) for state in states[:MOST_STATES])
         more = f" and {len(states) - MOST_STATES} more" if len(states) > MOST_STATES else ""
@@ -464,36 +447,28 @@ class Found:
             return ""
         model, evaluator = self.model, self.evaluator
         ends_well = model.terminated if evaluator.success is None else evaluator.success
-        counted = replace(
-            model,
-            reward=(ends_well & model.terminated).astype(np.float64),
-            reward_variance=None,
-        )
+        reward = (ends_well & model.terminated).astype(np.float64)
+        counted = replace(model, reward=reward, reward_variance=None)
         reached = state_values(counted, self.policy, self.horizon)
-        optimal = evaluator.optimum[1]
-        planned = self.direct
-        road, state = [], int(model.initial.argmax())
-        for _ in range(min(self.horizon, model.n_states)):
+        planned, taken = self.direct, self.taken
+        road, state = [int(model.initial.argmax())], 0
+        while len(road) < min(self.horizon, model.n_states):
+            pair = road[-1], planned[road[-1]]
+            likeliest = int(model.prob[pair].argmax())
+            state = int(model.next_state[pair][likeliest])
+            if model.terminated[pair][likeliest] or state in road:
+                break
             road.append(state)
-            action = int(planned[state])
-            likeliest = int(model.prob[state, action].argmax())
-            if model.terminated[state, action, likeliest]:
-                break
-            state = int(model.next_state[state, action, likeliest])
-            if state in road:
-                break
-        is_lost = (reached <= SURELY) & (self.taken != planned)
-        is_wrong = is_lost | ~optimal[np.arange(model.n_states), self.taken]
+        is_lost = (reached <= SURELY) & (taken != planned)
+        is_wrong = is_lost | ~evaluator.optimum[1][np.arange(model.n_states), taken]
         wrong = [place for place in road if is_wrong[place]]
         if not wrong:
             return ""
-        n_sure = int((reached[road] > SURELY).sum())
-        last = wrong[-1]
-        told = f"on the best road of {len(road)} states it reaches the end from {n_sure}"
-        best = words.action(int(planned[last]))
-        does = words.action(int(self.taken[last]))
+        n_sure, last = int((reached[road] > SURELY).sum()), wrong[-1]
+        does, best = (words.action(int(policy[last])) for policy in (taken, planned))
         return (
-            f"{told}; its last wrong turn is at {words.place(last)}: {does}, where {best} is best"
+            f"on the best road of {len(road)} states it reaches the end from {n_sure}; its last "
+            f"wrong turn is at {words.place(last)}: {does}, where {best} is best"
         )
 
 
@@ -545,15 +520,15 @@ def parting(one: Side, other: Side) -> Parting:
     names = [spec.algo for spec, _, _ in (one, other)]
     if names[0] == names[1]:
         names = [f"{name} {number}" for number, name in enumerate(names, 1)]
-    order = [0, 1] if returns[0] >= returns[1] else [1, 0]
-    better, worse = (policies[i] for i in order)
+    better, worse = (0, 1) if returns[0] >= returns[1] else (1, 0)
     try:
-        found = first_differences(model, better, worse, horizon)
+        found = first_differences(model, policies[better], policies[worse], horizon)
     except ValueError as error:
         raise UserError(f"{one[0].env_id}: {error}") from error
+    taken = [_first_actions(model, policies[side], horizon) for side in (better, worse)]
+    order = np.argsort(-np.abs(found.gains), kind="stable")[:20]
     with closing(make_single_env(one[0])) as env:
         words = _Words(env, evaluator)
-        taken = [_first_actions(model, policy, horizon) for policy in (better, worse)]
         places = [
             Place(
                 state=int(state),
@@ -562,12 +537,12 @@ def parting(one: Side, other: Side) -> Parting:
                 gain=float(found.gains[state]),
                 actions=(words.action(int(taken[0][state])), words.action(int(taken[1][state]))),
             )
-            for state in np.argsort(-np.abs(found.gains), kind="stable")[:20]
+            for state in order
             if found.met[state] > 0
         ]
     return Parting(
-        names=(names[order[0]], names[order[1]]),
-        difference=returns[order[0]] - returns[order[1]],
+        names=(names[better], names[worse]),
+        difference=returns[better] - returns[worse],
         met=float(found.met.sum()),
         places=tuple(places),
     )

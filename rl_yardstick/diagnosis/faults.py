@@ -1,9 +1,10 @@
-"""The faults that an audit can name, and the sources of what is right."""
+"""The faults that an audit can name, with the sources of what is right, and findings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 BOOK = "Sutton and Barto (2nd edition)"
 
@@ -114,3 +115,23 @@ FAULTS: Mapping[str, Fault] = {
         "Stable-Baselines3: BaseAlgorithm.save",
     ),
 }
+
+
+State = Literal["ok", "fault", "unsaid", "skipped"]
+UNEXPLAINED = "no fault known here explains it"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one check."""
+
+    state: State
+    text: str = ""  #: what was measured, or why nothing can be said
+    fault: str = ""  #: a key of `FAULTS`
+    right: str = ""  #: the correct result
+    probe: str = ""  #: the name of the check
+
+
+def checked(is_wrong: bool, text: str, fault: str, right: str) -> Finding:
+    """The finding of a check with two outcomes."""
+    return Finding("fault", text, fault, right) if is_wrong else Finding("ok", text)

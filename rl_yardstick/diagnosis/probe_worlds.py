@@ -15,6 +15,7 @@ from rl_yardstick.mdp.transition_model import Floats
 
 Observations = Literal["discrete", "box"]
 Actions = Literal["discrete", "box"]
+Outcomes = list[tuple[float, int, float, bool]]
 
 N_ACTIONS = 2
 
@@ -88,15 +89,10 @@ class ProbeEnv(gym.Env[Any, Any]):
         self.world, self.record = world, record
         self.n_observations = world.n_states + 1
         self.is_discrete = observations == "discrete"
-        n = self.n_observations
-        self.observation_space = (
-            spaces.Discrete(n) if self.is_discrete else spaces.Box(0, 1, (n,), np.float32)
-        )
-        self.action_space = (
-            spaces.Discrete(N_ACTIONS)
-            if actions == "discrete"
-            else spaces.Box(-1, 1, (1,), np.float32)
-        )
+        n, numbers = self.n_observations, spaces.Box(-1, 1, (1,), np.float32)
+        vectors = spaces.Box(0, 1, (n,), np.float32)
+        self.observation_space = spaces.Discrete(n) if self.is_discrete else vectors
+        self.action_space = spaces.Discrete(N_ACTIONS) if actions == "discrete" else numbers
         self.state = 0
         self._shown = np.zeros(n, np.float32)
 
@@ -128,10 +124,8 @@ class ProbeEnv(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Go to the next state, and record the step."""
         action = action_number(action, self.action_space)
-        reward, (following, terminated) = (
-            self.world.pays[self.state][action],
-            self.world.following(self.state),
-        )
+        reward = self.world.pays[self.state][action]
+        following, terminated = self.world.following(self.state)
         if self.state == 0 and self.world.quits and self.np_random.random() < self.world.quits:
             reward, following, terminated = 0.0, self.world.n_states, True
         if self.world.noise:
@@ -155,19 +149,19 @@ class ModelledProbeEnv(ProbeEnv):
         return start
 
     @property
-    def P(self) -> dict[int, dict[int, list[tuple[float, int, float, bool]]]]:  # noqa: N802 (Gymnasium's name)
+    def P(self) -> dict[int, dict[int, Outcomes]]:  # noqa: N802 (Gymnasium's name)
         """Lists of (probability, next observation, reward, terminated)."""
-        outcomes: dict[int, dict[int, list[tuple[float, int, float, bool]]]] = {}
         n = self.world.n_states
-        for state in range(n):
+        end: Outcomes = [(1.0, n, 0.0, True)]
+        outcomes = {n: dict.fromkeys(range(N_ACTIONS), end)}
+        for state, pays in enumerate(self.world.pays):
             following, terminated = self.world.following(state)
-            stays = 1.0 - (self.world.quits if state == 0 else 0.0)
-            outcomes[state] = {}
-            for action, pay in enumerate(self.world.pays[state]):
-                outcomes[state][action] = [(stays, following, pay, terminated)]
-                if stays < 1:
-                    outcomes[state][action].append((1 - stays, n, 0.0, True))
-        outcomes[n] = {action: [(1.0, n, 0.0, True)] for action in range(N_ACTIONS)}
+            quits = self.world.quits if state == 0 else 0.0
+            early: Outcomes = [(quits, n, 0.0, True)] if quits else []
+            outcomes[state] = {
+                action: [(1 - quits, following, pay, terminated), *early]
+                for action, pay in enumerate(pays)
+            }
         return outcomes
 
 
@@ -185,3 +179,18 @@ def make_env(
     kind = ModelledProbeEnv if is_modelled else ProbeEnv
     env: gym.Env[Any, Any] = kind(world, record, observations, actions)
     return TimeLimit(env, world.cut) if world.cut else env
+
+
+CHAIN = World(((0, 0), (1, 1)))
+SEES_START = World(((0, 0), (1, 1)), end_shows=0)
+START_PAYS = World(((5, 5), (1, 1)))
+END_PAYS_MORE = World(((0, 0), (2, 2)))
+LOOP = World(((0, 0), (1, 1)), ends=False, cut=4)
+LOOP_START_PAYS = World(((5, 5), (1, 1)), ends=False, cut=4)
+LONG_LOOP = World(((0, 0), (1, 1)), ends=False, cut=40)
+SAFE_FORK = World(((0, 0), (1, 0)))
+DEAR_FORK = World(((0, 0), (1, -4)))
+ARM_0, ARM_1 = World(((1, 0),)), World(((0, 1),))
+EQUAL_ARMS = World(((0, 0),))
+COIN = World(((0, 0),), noise=1.0)
+STAIRS = World(((0.5, 0.5), (0, 0), (1, 1), (0, 0), (1, 1)))

@@ -28,16 +28,12 @@ from rl_yardstick.mdp import (
     state_visitation,
 )
 from rl_yardstick.mdp.transition_model import Floats, Ints
-from rl_yardstick.pipeline.agent_settings import shipped_settings
+from rl_yardstick.pipeline.arguments import constructor_parameters
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
 from rl_yardstick.pipeline.evaluation.advice import share_of_standing_still
 from rl_yardstick.pipeline.evaluation.policies import is_network
-from rl_yardstick.pipeline.settings.values import (
-    algorithm_parameters,
-    parse_literal,
-    parse_schedule,
-)
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.settings import literal, shipped_hyperparams
+from rl_yardstick.pipeline.spec import TrainSpec
 
 if TYPE_CHECKING:
     from rl_yardstick.diagnosis.explanation import Found, Part
@@ -92,11 +88,11 @@ class _Case:
         self.lost = {part.name: part.loss / self.gap for part in parts}
         rest = sum(self.lost.get(name, 0.0) for name in LEARNING)
         self.rest = min(max(rest, 0.0), 1.0) if parts else 1.0
-        parameters = algorithm_parameters(load_algorithm(spec.algo)).values()
+        parameters = constructor_parameters(load_algorithm(spec.algo)).values()
         known = {one.name: one.default for one in parameters if one.default is not one.empty}
         self.known = {*known} - _NO_CAUSE
-        self.own = {**known, **spec.saved_hyperparams}
-        self.usual = {**known, **shipped_settings(spec)}
+        self.own = {**known, **spec.hyperparams}
+        self.usual = {**known, **shipped_hyperparams(spec)}
         self.is_network = is_network(found.agent)
         self.model = found.model if found.task is None else found.task.model
         random = (self.model.prob > 0).sum(axis=2)[self.model.reachable].max() > 1
@@ -310,10 +306,10 @@ class _Case:
 def _course(value: Any) -> Floats | None:
     """A number or a schedule at some moments of the training; None for other values."""
     if isinstance(value, str) and value[:4] in ("lin_", "exp_"):
-        read = parse_schedule(value, "")
-        if read.kind == "linear":
-            return np.asarray(read.start + MOMENTS * (read.end - read.start))
-        return np.asarray(read.start * (read.end / read.start) ** MOMENTS)
+        first, last = [*map(float, value[4:].split("_")), 0.0][:2]
+        is_linear = value.startswith("lin_")
+        share = MOMENTS * (last - first) if is_linear else (last / first) ** MOMENTS
+        return np.asarray(first + share if is_linear else first * share)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return np.full(len(MOMENTS), float(value)) if is_number else None
 
@@ -347,4 +343,4 @@ def _text(value: Any) -> str:
 def _policy_kwargs(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments of a network's policy, with the widths of its hidden layers."""
     value = settings.get("policy_kwargs") or {}
-    return {"net_arch": [64, 64], **(parse_literal(value) if isinstance(value, str) else value)}
+    return {"net_arch": [64, 64], **(literal(value) if isinstance(value, str) else value)}

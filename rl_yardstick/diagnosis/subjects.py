@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,10 +24,12 @@ from rl_yardstick.diagnosis.probe_worlds import (
     make_env,
 )
 from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.arguments import arguments_of, check_arguments, constructor_parameters
+from rl_yardstick.pipeline.components import constructor_arguments
 from rl_yardstick.pipeline.errors import UserError, one_line, unknown
+from rl_yardstick.pipeline.spec import TrainSpec
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
 
 GAMMA = 0.8
@@ -41,6 +45,7 @@ KINDS: Mapping[str, Target] = {
     "actor_critic": "states",
     "policy_gradient": "states",
 }
+Spaces = tuple[Observations | None, Actions | None]
 
 # Settings of all audits, unless others are given: full exploration, and targets of one step.
 BASE: Mapping[str, Any] = {
@@ -58,10 +63,11 @@ OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
 
 
 class Trained(ABC):
-    """A learner that was trained in a world."""
+    """A learner that is trained in a world."""
 
-    def __init__(self, world: World, record: Record, env: ProbeEnv) -> None:
-        self.world, self.record, self._env = world, record, env
+    def __init__(self, world: World, spaces: tuple[Observations, Actions]) -> None:
+        self.world, self.record = world, Record(world.n_states)
+        self._env = ProbeEnv(world, self.record, *spaces)
 
     def observation(self, state: int) -> Any:
         """The observation of a state."""
@@ -101,16 +107,18 @@ class Subject(ABC):
         uses_ratio: whether it uses importance sampling, for a greedy target policy.
         is_on_policy: whether it learns from rollouts, as the library's on-policy agents do.
         has_values: whether its values can be read.
+        stepwise: settings under which an agent of ours calls its environment at each step.
         spaces: kinds of observations and actions.
     """
 
     typed: Mapping[str, Any]
     steps = 2000
     target: Target | None = None
-    uses_ratio = False
-    is_on_policy = False
+    uses_ratio = is_on_policy = False
     has_values = True
+    stepwise: Mapping[str, str] = {}
     spaces: tuple[Observations, Actions]
+    parameters: Mapping[str, inspect.Parameter]
 
     def __init__(self, name: str, kind: str | None) -> None:
         self.name = name
@@ -120,25 +128,40 @@ class Subject(ABC):
             self.uses_ratio = kind == "off_policy_monte_carlo"
 
     @abstractmethod
-    def named(self, setting: str) -> str | None:
-        """The learner's name for this setting; None where it has no such setting."""
+    def start(self, world: World, seed: int, changes: Mapping[str, Any]) -> Trained:
+        """A learner with some settings changed, before its training."""
 
-    @abstractmethod
     def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
         """Train for that many steps with some settings changed."""
+        trained = self.start(world, seed, changes)
+        trained.train(steps)
+        return trained
+
+    def named(self, setting: str) -> str | None:
+        """The learner's name for this setting; None where it has no such setting."""
+        names = OTHER_NAMES.get(setting, (setting,))
+        return next((name for name in names if name in self.parameters), None)
 
     def accepts(self, setting: str) -> bool:
         """Whether the learner has this setting."""
         return self.named(setting) is not None
 
-    def find_spaces(self, wanted: tuple[Observations | None, Actions | None]) -> None:
+    def descends_from(self, name: str) -> bool:
+        """Whether the class or one of its base classes has this name; never for a script."""
+        return False
+
+    def settings(self, changes: Mapping[str, Any], **defaults: Any) -> dict[str, Any]:
+        """All settings under the learner's own names; a copy, since learners write into them."""
+        wanted = {**self.base, **defaults, **self.typed, **changes}
+        named = {self.named(key): value for key, value in wanted.items()}
+        return {name: deepcopy(value) for name, value in named.items() if name is not None}
+
+    def find_spaces(self, wanted: Spaces) -> None:
         """Take the first kinds of observations and actions that the learner can train on."""
         errors = []
         for observations in ("discrete", "box") if wanted[0] is None else (wanted[0],):
             for actions in ("discrete", "box") if wanted[1] is None else (wanted[1],):
                 self.spaces = observations, actions
-                if self.misfit():
-                    continue
                 try:
                     trained = self.begin(World(((0, 0), (1, 1))), 0, 40, {})
                     trained.act(0)
@@ -148,88 +171,17 @@ class Subject(ABC):
                     raise
                 except Exception as error:  # noqa: BLE001 (user code may raise anything)
                     errors.append(error)
-        if not errors:
-            raise UserError(f"{self.name} {self.misfit()}")
         raise UserError(
             f"{self.name} cannot train on a tiny world: {type(errors[0]).__name__}: "
-            f"{one_line(errors[0])} (--observations and --actions say what it needs)"
+            f"{one_line(errors[0])} (--observations and --actions set the kinds of its spaces)"
         )
-
-    def misfit(self) -> str:
-        """Why it cannot train with its spaces; empty where it can."""
-        return ""
-
-    def world_env(self, world: World, record: Record) -> ProbeEnv:
-        """An environment to read observations and spaces from."""
-        return ProbeEnv(world, record, *self.spaces)
 
 
 # --- classes --------------------------------------------------------------------------------------
 
-
-class ClassSubject(Subject):
-    """A subclass of Stable-Baselines3's `BaseAlgorithm`."""
-
-    def __init__(
-        self,
-        name: str,
-        cls: type[BaseAlgorithm],
-        typed: Mapping[str, Any],
-        kind: str | None = None,
-        wanted: tuple[Observations | None, Actions | None] = (None, None),
-    ) -> None:
-        from rl_yardstick.pipeline.settings.components import build_algorithm_kwargs, default_policy
-        from rl_yardstick.pipeline.settings.values import algorithm_parameters
-
-        super().__init__(name, kind)
-        self.cls = cls
-        self.parameters = algorithm_parameters(cls)
-        entries = (entry for entry in ALGORITHMS.values() if _is_entry_of(entry, cls))
-        self.entry = next(entries, None)
-        self._find_family()
-        policy = self.parameters.get("policy")
-        settings: dict[str, Any] = dict(typed)
-        if policy is not None and policy.default is policy.empty and "policy" not in typed:
-            settings["policy"] = default_policy(cls, is_dict=False)
-        self.typed = build_algorithm_kwargs(cls, settings, "-params", (cls.__module__,))
-        self.find_spaces(wanted)
-
-    def _find_family(self) -> None:
-        """Set the settings that learn tiny worlds fast, and what the family claims to be."""
-        from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-        from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-
-        names = {ancestor.__name__ for ancestor in self.cls.__mro__}
-        family = next((name for name in _FAMILIES if name in names), None)
-        if family is not None:
-            target, self.steps, settings = _FAMILIES[family]
-            self.base |= settings
-            self.target = self.target or target
-        self.uses_ratio |= family == "OffPolicyMonteCarlo"
-        self.is_on_policy = issubclass(self.cls, OnPolicyAlgorithm)
-        self.engines = () if self.entry is None else self.entry.engines
-        self.has_network = self.is_on_policy or issubclass(self.cls, OffPolicyAlgorithm)
-        if self.is_on_policy or self.target == "states":
-            self.target = "states"
-
-    def misfit(self) -> str:
-        env = self.world_env(World(((0, 0),)), Record(1))
-        if self.entry is None:
-            return ""
-        return self.entry.misfit(env.observation_space, env.action_space)
-
-    def named(self, setting: str) -> str | None:
-        names = OTHER_NAMES.get(setting, (setting,))
-        return next((name for name in names if name in self.parameters), None)
-
-    def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
-        trained = TrainedModel(self, world, seed, changes)
-        trained.train(steps)
-        return trained
-
-
 # Families of the library and of ours, subclasses before base classes: kind of target, steps, and
 # settings that learn tiny worlds fast. Rates are constant, and exploration is full.
+_NET: Mapping[str, Any] = {"policy_kwargs": {"net_arch": [32]}}
 _OFF_POLICY: Mapping[str, Any] = {
     "learning_rate": 3e-3,
     "buffer_size": 2000,
@@ -238,7 +190,7 @@ _OFF_POLICY: Mapping[str, Any] = {
     "train_freq": 2,
     "gradient_steps": 1,
     "target_update_interval": 50,
-    "policy_kwargs": {"net_arch": [32]},
+    **_NET,
 }
 _ACTOR = {key: value for key, value in _OFF_POLICY.items() if key != "target_update_interval"}
 _ACTOR |= {"tau": 0.2, "ent_coef": 1e-3}
@@ -250,6 +202,8 @@ _ON_POLICY: Mapping[str, Any] = {
     "gae_lambda": 0.0,
     "policy_kwargs": {"net_arch": {"pi": [32], "vf": [32]}},
 }
+_QUANTILES = {"policy_kwargs": {"net_arch": [32], "n_quantiles": 10}}
+_LSTM = {"policy_kwargs": {**_ON_POLICY["policy_kwargs"], "lstm_hidden_size": 16}}
 _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
     "OptimisticAlgorithm": ("maximises", 1000, {"bonus_scale": 1e-3, "known_after": 1}),
     "RMax": ("maximises", 1000, {"known_after": 1}),
@@ -268,59 +222,110 @@ _FAMILIES: Mapping[str, tuple[Target | None, int, Mapping[str, Any]]] = {
     "SemiGradientQ": ("maximises", 1000, {}),
     "ActorCritic": ("states", 1000, {}),
     "Reinforce": ("states", 1000, {"baseline": "value"}),
-    "QRDQN": (
-        "maximises",
-        250,
-        {**_OFF_POLICY, "policy_kwargs": {"net_arch": [32], "n_quantiles": 10}},
-    ),
+    "QRDQN": ("maximises", 250, {**_OFF_POLICY, **_QUANTILES}),
     "DQN": ("maximises", 250, _OFF_POLICY),
     "DeepQLearning": ("maximises", 250, {**_OFF_POLICY, "learning_rate": 1e-3}),
-    "TQC": (
-        None,
-        250,
-        {**_ACTOR, "top_quantiles_to_drop_per_net": 0, "policy_kwargs": {"net_arch": [32]}},
-    ),
+    "TQC": (None, 250, {**_ACTOR, "top_quantiles_to_drop_per_net": 0, **_NET}),
     "CrossQ": (None, 1000, _ACTOR),
     "SAC": (None, 250, _ACTOR),
     "TD3": (None, 250, _ACTOR),
     "A2C": ("states", 400, {**_ON_POLICY, "n_steps": 1, "learning_rate": 1e-2}),
-    "RecurrentPPO": (
-        "states",
-        256,
-        {
-            **_ON_POLICY,
-            "policy_kwargs": {"net_arch": {"pi": [32], "vf": [32]}, "lstm_hidden_size": 16},
-        },
-    ),
+    "RecurrentPPO": ("states", 256, {**_ON_POLICY, **_LSTM}),
     "TRPO": ("states", 256, {**_ON_POLICY, "n_critic_updates": 10}),
     "OnPolicyAlgorithm": ("states", 256, _ON_POLICY),
     "ARS": (None, 2000, {"n_delta": 4, "learning_rate": 0.05, "delta_std": 0.1}),
 }
 
 
-def _is_entry_of(entry: AlgorithmEntry, cls: type) -> bool:
-    module, _, name = entry.entry_point.partition(":")
-    return name == cls.__name__ and cls.__module__.split(".")[0] == module.split(".")[0]
+class ClassSubject(Subject):
+    """A subclass of Stable-Baselines3's `BaseAlgorithm`.
+
+    Args:
+        name: an agent of the registry, see also `register_class`.
+        typed: settings that the user gave.
+        kind: what it claims to be, among `KINDS`; None: as its family.
+        wanted: kinds of observations and actions; None: the first that works.
+
+    Raises:
+        UserError: if the agent cannot be audited, or a setting is wrong.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        typed: Mapping[str, Any],
+        kind: str | None = None,
+        wanted: Spaces = (None, None),
+    ) -> None:
+        super().__init__(name, kind)
+        if ALGORITHMS[name].for_bandits:
+            raise UserError(f"--algo {name}: it is for bandits, and these worlds have states")
+        if ALGORITHMS[name].family in ("planning", "reference"):
+            raise UserError(f"--algo {name}: it does not learn")
+        self.cls: Any = load_algorithm(name)
+        self.parameters = constructor_parameters(self.cls)
+        known = arguments_of(name)
+        for key in typed:
+            if key not in known:
+                raise unknown(f"{name} has no hyperparameter", key, known)
+        self._find_family()
+        if "=interpreted" in known.get("engine", []) and "engine" not in typed:
+            self.stepwise = {"engine": "interpreted"}
+        spec = TrainSpec(algo=name, env_id="", algorithm=check_arguments(name, typed))
+        self.typed = constructor_arguments(spec, self.cls, is_dict=False)
+        self.find_spaces(wanted)
+
+    def _find_family(self) -> None:
+        """Set the settings that learn tiny worlds fast, and what the family claims to be."""
+        from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+        from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+        family = next((name for name in _FAMILIES if self.descends_from(name)), None)
+        if family is not None:
+            target, self.steps, settings = _FAMILIES[family]
+            self.base |= settings
+            self.target = self.target or target
+        self.uses_ratio |= family == "OffPolicyMonteCarlo"
+        self.is_on_policy = issubclass(self.cls, OnPolicyAlgorithm)
+        self.has_network = self.is_on_policy or issubclass(self.cls, OffPolicyAlgorithm)
+        if self.is_on_policy:
+            self.target = "states"
+
+    def descends_from(self, name: str) -> bool:
+        return name in {ancestor.__name__ for ancestor in self.cls.__mro__}
+
+    def start(self, world: World, seed: int, changes: Mapping[str, Any]) -> TrainedModel:
+        return TrainedModel(self, world, seed, changes)
+
+
+def register_class(name: str) -> None:
+    """Register a class of the user, ``module:Class`` of a module that is imported."""
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    module, _, attribute = name.rpartition(":")
+    found = getattr(sys.modules[module], attribute, None)
+    if found is None:
+        raise UserError(f"--algo {name}: {module} has no {attribute}")
+    if not (isinstance(found, type) and issubclass(found, BaseAlgorithm)):
+        raise UserError(
+            f"--algo {name}: {attribute} is no subclass of Stable-Baselines3's BaseAlgorithm; a "
+            f"function that trains is audited by --script {name}"
+        )
+    ALGORITHMS[name] = AlgorithmEntry(name, attribute)
 
 
 class TrainedModel(Trained):
-    """A `BaseAlgorithm` that was trained in a world."""
+    """A `BaseAlgorithm` that is trained in a world."""
 
     def __init__(
         self, subject: ClassSubject, world: World, seed: int, changes: Mapping[str, Any]
     ) -> None:
         from stable_baselines3.common.logger import Logger
 
-        record = Record(world.n_states)
-        super().__init__(world, record, subject.world_env(world, record))
-        self.subject = subject
-        wanted = {**subject.base, "gamma": GAMMA, "seed": seed, "device": "cpu"}
-        wanted = {**wanted, **subject.typed, **changes}
-        named = {subject.named(key): value for key, value in wanted.items()}
-        settings = {name: value for name, value in named.items() if name is not None}
-        self.env = make_env(world, record, *subject.spaces)
-        # Copies: the library writes into policy_kwargs.
-        self.model = subject.cls(env=self.env, **deepcopy(settings))
+        super().__init__(world, subject.spaces)
+        settings = subject.settings(changes, gamma=GAMMA, seed=seed, device="cpu")
+        env = make_env(world, self.record, *subject.spaces)
+        self.model = subject.cls(env=env, **settings)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self._has_begun = False
 
@@ -329,12 +334,8 @@ class TrainedModel(Trained):
         self._has_begun = True
 
     def act(self, state: int) -> int:
-        return self.choose(state, deterministic=True)
-
-    def choose(self, state: int, *, deterministic: bool) -> int:
-        """The action in evaluation (``deterministic``), or one that may explore."""
         observation = np.asarray(self.observation(state))
-        action, _ = self.model.predict(observation, deterministic=deterministic)
+        action, _ = self.model.predict(observation, deterministic=True)
         return action_number(action, self._env.action_space)
 
     def drawn_actions(self, state: int, n: int) -> Floats:
@@ -344,39 +345,24 @@ class TrainedModel(Trained):
         return np.asarray(actions, dtype=np.float64).reshape(n)
 
     def values(self) -> Floats | None:
-        states = list(range(self.world.n_states))
+        states = range(self.world.n_states)
         return values_of(self.model, [np.asarray(self.observation(s)) for s in states])
-
-
-def _takes_one_argument(function: Any) -> bool:
-    """Whether a user's method can be called with an observation alone."""
-    if not callable(function):
-        return False
-    try:
-        inspect.signature(function).bind(None)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def values_of(model: Any, observations: list[Any]) -> Floats | None:
     """A model's values at observations, shape (n, 2) or (n, 1); None where it has none."""
-    policy = model.policy
-    batch = np.stack(observations)
-    for holder in (policy, model):
-        if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
-            found: Floats = np.asarray(table, dtype=np.float64)[batch]
-            return found
-    if hasattr(policy, "state_weights"):  # tiles
-        if len(policy.state_weights):
-            from rl_yardstick.agents.linear.tiles import tiles_of_all, vectors_of
-
-            vectors = vectors_of(policy.observation_space, batch)
-            active = tiles_of_all(policy.tiles, vectors)
-            return np.asarray(policy.state_weights.numpy()[active].sum(axis=1, keepdims=True))
-        return None if hasattr(model, "initial_preferences") else np.asarray(policy.sums(batch))
     import torch as th
 
+    from rl_yardstick.agents.linear.algorithm import TileAlgorithm
+    from rl_yardstick.pipeline.evaluation.critics import own_values
+
+    policy, batch = model.policy, np.stack(observations)
+    for holder in (policy, model):
+        if isinstance(table := getattr(holder, "q_table", None), np.ndarray) and batch.ndim == 1:
+            return np.asarray(table, dtype=np.float64)[batch]
+    if isinstance(model, TileAlgorithm):
+        found = own_values(model, batch)
+        return None if found is None else found.reshape(len(batch), -1)
     if _takes_one_argument(getattr(model, "values", None)):
         return np.stack([np.atleast_1d(model.values(obs)) for obs in observations]).astype(float)
     if not hasattr(policy, "obs_to_tensor"):
@@ -385,8 +371,16 @@ def values_of(model: Any, observations: list[Any]) -> Floats | None:
     with th.no_grad():
         tensor, _ = policy.obs_to_tensor(batch)
         told = _network_values(model, policy, tensor)
-    values: Floats | None = None if told is None else told.double().numpy()
-    return values
+    return None if told is None else np.asarray(told.double().numpy())
+
+
+def _takes_one_argument(function: Any) -> bool:
+    """Whether a user's method can be called with an observation alone."""
+    try:
+        inspect.signature(function).bind(None)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
@@ -416,6 +410,8 @@ def _network_values(model: Any, policy: Any, tensor: Any) -> Any:
 
 # --- single files ---------------------------------------------------------------------------------
 
+_NEEDED = ("make_env", "seed", "gamma", "steps")
+
 
 class ScriptSubject(Subject):
     """A function ``train(make_env, seed, gamma, steps, ...)`` that returns a trained agent.
@@ -430,40 +426,29 @@ class ScriptSubject(Subject):
         function: Callable[..., Any],
         typed: Mapping[str, Any],
         kind: str | None = None,
-        wanted: tuple[Observations | None, Actions | None] = (None, None),
+        wanted: Spaces = (None, None),
     ) -> None:
         super().__init__(name, kind)
         self.function, self.typed = function, typed
         if self.target == "states":  # ``n_steps`` may be the length of a rollout
-            self.base = {key: value for key, value in BASE.items() if key != "n_steps"}
+            self.base.pop("n_steps")
         try:
             self.parameters = inspect.signature(function).parameters
         except (TypeError, ValueError) as error:
             raise UserError(f"{name}: {one_line(error)}") from error
-        needed = ("make_env", "seed", "gamma", "steps")
-        missing = [each for each in needed if self.named(each) is None]
+        takes_any = any(p.kind is p.VAR_KEYWORD for p in self.parameters.values())
+        missing = [each for each in _NEEDED if not (takes_any or self.accepts(each))]
         if missing:
             raise UserError(
-                f"{name} must take {', '.join(needed)}: {', '.join(missing)} is missing"
+                f"{name} must take {', '.join(_NEEDED)}: {', '.join(missing)} is missing"
             )
         for key in typed:
-            if self.named(key) is None:
+            if not self.accepts(key):
                 raise unknown(f"-params: unknown argument of {name}", key, self.parameters)
         self.find_spaces(wanted)
 
-    def named(self, setting: str) -> str | None:
-        kinds = {parameter.kind for parameter in self.parameters.values()}
-        names = OTHER_NAMES.get(setting, (setting,))
-        if setting in ("make_env", "seed", "gamma", "steps") and (
-            inspect.Parameter.VAR_KEYWORD in kinds
-        ):
-            return setting
-        return next((name for name in names if name in self.parameters), None)
-
-    def begin(self, world: World, seed: int, steps: int, changes: Mapping[str, Any]) -> Trained:
-        trained = TrainedScript(self, world, seed, changes)
-        trained.train(steps)
-        return trained
+    def start(self, world: World, seed: int, changes: Mapping[str, Any]) -> TrainedScript:
+        return TrainedScript(self, world, seed, changes)
 
 
 class TrainedScript(Trained):
@@ -472,13 +457,9 @@ class TrainedScript(Trained):
     def __init__(
         self, subject: ScriptSubject, world: World, seed: int, changes: Mapping[str, Any]
     ) -> None:
-        record = Record(world.n_states)
-        super().__init__(world, record, subject.world_env(world, record))
+        super().__init__(world, subject.spaces)
         self.subject, self.seed = subject, seed
-        wanted = {**subject.base, **subject.typed, **changes}
-        self.settings = {
-            name: value for key, value in wanted.items() if (name := subject.named(key)) is not None
-        }
+        self.settings = subject.settings(changes)
         self.agent: Any = None
         self.steps = 0
 
@@ -503,43 +484,69 @@ class TrainedScript(Trained):
         return np.stack([np.asarray(each, dtype=np.float64).reshape(-1) for each in found])
 
 
-# --- the command line -----------------------------------------------------------------------------
+# --- trainings whose values are read --------------------------------------------------------------
+
+MOST_DOUBLINGS = 3  # of a training whose values still change
 
 
-def class_named(name: str) -> type[BaseAlgorithm]:
-    """The class that ``--algo`` names: an agent of the table, or ``module:Class`` as imported."""
-    import sys
-
-    from stable_baselines3.common.base_class import BaseAlgorithm
-
-    from rl_yardstick.pipeline.agent_settings import check_algorithm
-
-    module, colon, attribute = name.rpartition(":")
-    if not colon:
-        check_algorithm(name)
-        entry = ALGORITHMS[name]
-        if entry.for_bandits:
-            raise UserError(f"--algo {name}: it is for bandits, and these worlds have states")
-        if entry.family in ("planning", "reference"):
-            raise UserError(f"--algo {name}: it does not learn")
-        return load_algorithm(name)
-    found = getattr(sys.modules[module], attribute, None)
-    if found is None:
-        raise UserError(f"--algo {name}: {module} has no {attribute}")
-    if not (isinstance(found, type) and issubclass(found, BaseAlgorithm)):
-        raise UserError(
-            f"--algo {name}: {attribute} is no subclass of Stable-Baselines3's BaseAlgorithm; a "
-            f"function that trains is audited by --script {name}"
-        )
-    return found
+class NotSettled(Exception):  # noqa: N818 (not an error)
+    """Values after n and after 2n steps still differ at the largest number of steps."""
 
 
-def function_named(name: str) -> Callable[..., Any]:
-    """The function that ``--script module:function`` names, of a module that is imported."""
-    import sys
+@dataclass
+class Lab:
+    """Trains one subject with one seed, and caches the values that have settled."""
 
-    module, colon, attribute = name.rpartition(":")
-    found = getattr(sys.modules[module], attribute, None) if colon else None
-    if not callable(found):
-        raise UserError(f"--script takes module:function, and there is no function {name}")
-    return found  # type: ignore[no-any-return]
+    subject: Subject
+    seed: int
+    _values: dict[Any, Floats | None] = field(default_factory=dict)
+
+    def begin(self, world: World, steps: int | None = None, **changes: Any) -> Trained:
+        """Train for some steps."""
+        steps = self.subject.steps if steps is None else steps
+        return self.subject.begin(world, self.seed, steps, changes)
+
+    def settled(self, world: World, **changes: Any) -> Floats:
+        """The values of all states, shape (S,), once they no longer change.
+
+        Raises:
+            NotSettled: if they go on changing.
+        """
+        known = {**self.subject.base, **self.subject.typed}
+        changes = {name: value for name, value in changes.items() if known.get(name) != value}
+        key = world, tuple(sorted(changes.items()))
+        most = self.subject.steps * 2**MOST_DOUBLINGS
+        if key not in self._values:
+            self._values[key] = self._settle(world, most, changes)
+        values = self._values[key]
+        if values is None:
+            raise NotSettled(f"values did not settle within {most:,} steps")
+        return values
+
+    def _settle(self, world: World, most: int, changes: Mapping[str, Any]) -> Floats | None:
+        steps = self.subject.steps
+        trained = self.begin(world, steps, **changes)
+        before = trained.state_values()
+        while before is not None and np.isfinite(before).all() and steps < most:
+            trained.train(steps)
+            steps *= 2
+            values = trained.state_values()
+            assert values is not None
+            if np.abs(values - before).max() <= 0.05 * max(1.0, np.abs(values).max()):
+                return values
+            before = values
+        return None
+
+    def mean(self, world: World) -> tuple[Floats, float]:
+        """Mean values in the second half of training, (S,), and action 1's share in the last state.
+
+        For learners whose values depend on the actions taken, and so never settle.
+        """
+        trained, readings = self.begin(world), []
+        n = 10 if isinstance(self.subject, ClassSubject) else 1  # a script trains from the start
+        for _ in range(n):
+            trained.train(self.subject.steps // n)
+            readings.append(trained.state_values())
+        counts = trained.record.counts()[-1]
+        share = counts[1] / counts.sum() if counts.sum() else 0.5
+        return np.mean(np.array(readings), axis=0), float(share)

@@ -7,25 +7,24 @@ their task.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
 
-from rl_yardstick.agents import ALGORITHMS
+from rl_yardstick.agents.registry import ALGORITHMS
 from rl_yardstick.envs.return_bounds import return_bounds
-from rl_yardstick.experiments.child_processes import do_aside
 from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.pool import do_aside
 from rl_yardstick.experiments.results import StudyResults, values_over_seeds
 from rl_yardstick.experiments.study import COSTS, OF_TRAINING, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.environments import make_single_env, training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import FAILED, Yardstick
-from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.verdicts import (
     AgentRuns,
     Best,
@@ -35,7 +34,6 @@ from rl_yardstick.verdicts import (
     Study,
     Summary,
     ThresholdSummary,
-    failure_threshold,
     judge,
     mean_over_runs,
     performance_profile,
@@ -147,11 +145,8 @@ def _bounds(results: StudyResults, environment: str, optimum: float | None) -> B
     first = {run.agent: run for run in results.planned if run.environment == environment}
     if study.metric in OF_TRAINING and any(training_changes(r.spec) for r in first.values()):
         return -np.inf, np.inf  # returns of training on a changed environment
-    env = make_single_env(next(iter(first.values())).spec)
-    try:
+    with closing(make_single_env(next(iter(first.values())).spec)) as env:
         low, high = return_bounds(env)
-    finally:
-        env.close()
     return low, high if optimum is None or study.metric in OF_TRAINING else min(high, optimum)
 
 
@@ -355,14 +350,11 @@ class StudyAnalysis:
         return self.results.study
 
 
-def analyse(
-    results: StudyResults, tell: Tell = tell_nobody, looks: Sequence[int] = ()
-) -> StudyAnalysis:
+def analyse(results: StudyResults, looks: Sequence[int] = ()) -> StudyAnalysis:
     """Analyse the runs of a study.
 
     Args:
         results: the runs.
-        tell: receives the progress.
         looks: the seeds at each look, if the study grows until its pairs are decided.
     """
     found = [evidence_on(results, environment.label) for environment in results.study.environments]
@@ -370,10 +362,7 @@ def analyse(
     scores = scores_over_all(results)
     means = {name: matrix.mean(axis=1) for name, matrix in scores.items()} if scores else None
     said = verdicts_on(results.study, evidence, looks, None if looks else means)
-    environments = []
-    for one in evidence:
-        tell(one.environment)
-        environments.append(_analyse_environment(results, one, said, looks))
+    environments = [_analyse_environment(results, one, said, looks) for one in evidence]
     overall = _overall(scores, said) if scores else None
     return StudyAnalysis(results, said, tuple(environments), overall)
 
@@ -468,7 +457,8 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
         score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
     of_returns = evidence.bounds if study.metric in ON_THE_SCALE else (-np.inf, np.inf)
-    changes = _recorded_changes(results, agent, environment)
+    first = next(run for run in results.planned if run.labels == (agent, environment))
+    changes = training_changes(first.spec)
     return AgentAnalysis(
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
@@ -488,11 +478,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         episodes_to_stay=summarise_steps(values("episodes_to_stay")) if has_threshold else None,
         success_rate=mean("success_rate", UNIT) if table["success_rate"].notna().any() else None,
         seconds=mean("cpu_seconds", (0.0, np.inf)),
-        on_variant=any(
-            training_changes(run.spec)
-            for run in results.planned
-            if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
-        ),
+        on_variant=bool(changes),
         changes=changes,
         stochastic=mean("stochastic_return") if table["stochastic_return"].notna().any() else None,
         acts_by=_only(table["acts_by"]),
@@ -506,41 +492,6 @@ def _only(texts: pd.Series) -> str:
     """The text that is the same in all runs; empty if it differs."""
     found = texts.dropna().unique()
     return str(found[0]) if len(found) == 1 else ""
-
-
-def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:
-    """The recorded changes of the agent's first run, because all seeds share the settings."""
-    run = next((r for r in results.finished if r.labels == (agent, environment)), None)
-    if run is None:
-        return ()
-    info = results.stored[run.labels].infos()[0] if results.is_stored(run) else run.run.read_info()
-    return training_changes(TrainSpec.of_data(info["spec"]))
-
-
-def runs_to_keep(results: StudyResults) -> list[PlannedRun]:
-    """The stored runs whose agents are kept: the best, median and worst, and those for the page.
-
-    The page plays the first run, splits the gap of the median final return, and asks the first
-    failed run for advice.
-    """
-    study, table = results.study, results.summary
-    runs = {(*run.labels, run.seed): run for run in results.finished if results.is_stored(run)}
-    kept = {(*labels, study.first_seed) for labels in results.stored}
-    for environment in study.environments:
-        evidence = evidence_on(results, environment.label)
-        scores = {} if evidence is None or not evidence.is_score else evidence.scores
-        threshold = failure_threshold(0.0, scores.values())
-        kept |= {
-            (*run.labels, run.seed)
-            for several, _ in _failed_runs(results, environment.label, threshold)
-            for run in several[:1]
-        }
-    for labels, rows in table.groupby(["agent", "environment"], sort=False):
-        for column in (study.metric, "final"):
-            order = rows[["seed", column]].dropna().sort_values(column, kind="stable")["seed"]
-            places = {0, (len(order) - 1) // 2, len(order) - 1} if len(order) else ()
-            kept |= {(*map(str, labels), int(order.iloc[place])) for place in places}  # type: ignore[misc]
-    return [run for key, run in runs.items() if key in kept]
 
 
 # --- Advice on failed runs, once for each agent.
@@ -604,17 +555,18 @@ def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]
 def _advice_on(planned: PlannedRun) -> tuple[str, str | None] | None:
     from rl_yardstick.pipeline.evaluation.advice import advice
     from rl_yardstick.pipeline.evaluation.exact import evaluator_of
-    from rl_yardstick.pipeline.models.load import load_model
+    from rl_yardstick.pipeline.models import load_agent, model_of_run
 
     run, spec = planned.run, planned.spec
     with suppress(UserError, OSError):
+        import_modules(spec.gym_packages)
         evaluator = evaluator_of(spec)
         if evaluator is None:
             return None
-        agent = load_model(spec.algo, run.model_path, modules=spec.user_modules, device="cpu")
+        agent = load_agent(model_of_run(run))
         if evaluator.obstacle(agent):
             return None
-        n_steps = int(run.read_info()["n_timesteps"])
+        n_steps = int(planned.recorded()["n_timesteps"])
         found = advice(spec, agent, evaluator, evaluator(agent), n_steps)
         return None if found is None else (found.instead, found.try_first)
     return None

@@ -1,8 +1,4 @@
-"""Does runs on bandits as one batch for each agent, and computes figures pull by pull.
-
-Functions that read raise `DamagedFileError` for a file that is missing, changed, or has another
-schema.
-"""
+"""Does runs on bandits as one batch for each agent, and computes figures pull by pull."""
 
 from __future__ import annotations
 
@@ -18,19 +14,11 @@ from numpy.typing import NDArray
 
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.mdp.transition_model import AnyInts, Floats, Ints
-from rl_yardstick.pipeline.digests import DamagedFileError, read_shaped
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.pipeline.loaded_code import recorded_code
-from rl_yardstick.pipeline.runs import (
-    FINISHED,
-    PULLS_FILE,
-    Run,
-    recorded_machine,
-    recorded_versions,
-    write_settings,
-)
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.files import read_arrays, replacing
+from rl_yardstick.pipeline.run import FINISHED, PULLS_FILE, Run
+from rl_yardstick.pipeline.spec import TrainSpec
 
 if TYPE_CHECKING:
     from rl_yardstick.agents.bandits.runs import BatchResult
@@ -76,24 +64,18 @@ class PullStatistics:
     def save(self, path: Path) -> None:
         """Write all arrays to a NumPy archive."""
         arrays: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        with replacing(path) as file:
-            np.savez(file, allow_pickle=False, **arrays)
+        with replacing(path) as beside:
+            np.savez(beside, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> PullStatistics:
         """Read the file that `save` wrote.
 
         Raises:
-            DamagedFileError: if the file is missing, changed, or has another schema.
+            UserError: if the file is missing, or has another schema.
         """
         kinds = get_type_hints(cls, include_extras=True)
-        shapes = {name: kind.__metadata__[0] for name, kind in kinds.items()}
-        arrays = read_shaped(path, Run(path.parent, "").files.read(path), shapes)
-        found = cls(**{name: arrays[name] for name in shapes})
-        n_kept = found.moments.size if found.posteriors.size else len(found.posteriors)
-        if not found.pulls.size or len(found.posteriors) != n_kept:
-            raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
-        return found
+        return cls(**read_arrays(path, {n: kind.__metadata__[0] for n, kind in kinds.items()}))
 
 
 def points_of(n_pulls: int) -> Ints:
@@ -197,7 +179,7 @@ def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int
     return result
 
 
-# --- Results of batches, and of single runs.
+# --- results of batches, and of single runs -------------------------------------------------------
 
 STATISTICS_FILE = "pull_statistics.npz"
 _PULLS = ("arms", "rewards", "regrets")  # the arrays of a run, besides contexts
@@ -209,7 +191,7 @@ def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStat
     pulls = {run.labels: PullStatistics.load(run.path / STATISTICS_FILE) for run in batches}
     one_by_one: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in finished:
-        if run.run.files.matching(PULLS_FILE):
+        if (run.path / PULLS_FILE).exists():
             one_by_one.setdefault(run.labels, []).append(run)
     for labels, runs in one_by_one.items():
         pulls[labels] = stacked_statistics(runs[0].spec, [run.path for run in runs])
@@ -218,13 +200,9 @@ def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStat
 
 def run_regret(planned: PlannedRun) -> float | None:
     """The regret of a single run, or None if it was not on a bandit."""
-    files = planned.run.files
-    if not files.matching(PULLS_FILE):
+    if not (planned.path / PULLS_FILE).exists():
         return None
-    if files.digests is None:
-        check_pulls(planned.spec, planned.path)
-    pulls = read_run(planned.path, planned.spec.hyperparams.n_timesteps)
-    return float(pulls["regrets"].sum())
+    return float(read_run(planned.path, planned.spec.n_timesteps)["regrets"].sum())
 
 
 def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
@@ -232,32 +210,14 @@ def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
 
     Agents that collect whole rollouts exceed ``n_timesteps``; the surplus is dropped.
     """
-    path = folder / PULLS_FILE
     shapes = dict.fromkeys((*_PULLS, "contexts"), "environments pulls")
-    arrays = read_shaped(path, Run(folder, "").files.read(path), shapes, ("contexts",))
-    if not arrays["arms"].size:
-        raise DamagedFileError(path, "is damaged: it holds no pull")
-    for name in ("arms", "contexts"):
-        numbers = arrays.get(name)
-        if numbers is not None and (numbers.dtype.kind not in "iu" or (numbers < 0).any()):
-            raise DamagedFileError(path, f"is damaged: {name} are no numbers from 0 on")
-    return {name: arrays[name].T.ravel()[:n_timesteps] for name in shapes if name in arrays}
-
-
-def check_pulls(spec: TrainSpec, folder: Path) -> None:
-    """Check that a run's arms and contexts exist in the environment of its spec."""
-    pulls = read_run(folder, spec.hyperparams.n_timesteps)
-    with closing(make_single_env(spec)) as env:
-        bandit: Any = env.unwrapped
-        sizes = {"arms": bandit.n_arms, "contexts": bandit.n_contexts}
-    for name, size in sizes.items():
-        if size > 0 and name in pulls and pulls[name].max() >= size:
-            raise DamagedFileError(folder / PULLS_FILE, f"is damaged: {name} are of another bandit")
+    arrays = read_arrays(folder / PULLS_FILE, shapes, ("contexts",))
+    return {name: array.T.ravel()[:n_timesteps] for name, array in arrays.items()}
 
 
 def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
     """The statistics of single runs, from the pulls in their folders."""
-    runs = [read_run(folder, spec.hyperparams.n_timesteps) for folder in folders]
+    runs = [read_run(folder, spec.n_timesteps) for folder in folders]
     n_pulls = min(len(run["arms"]) for run in runs)
     stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
     return _statistics_on(spec, *(stacked.get(name) for name in (*_PULLS, "contexts")))
@@ -291,10 +251,10 @@ def _is_drifting(bandit: Any) -> bool:
     return bool(getattr(bandit, "drift_std", 0.0) > 0)
 
 
-# --- All runs of an agent as one batch: each a fresh agent and one episode.
+# --- all runs of an agent as one batch: each a fresh agent and one episode ------------------------
 
 
-def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
+def do_batch(spec: TrainSpec, n_runs: int, run: Run) -> None:
     """Do ``n_runs`` runs, from the spec's seed on, and save their statistics in the run folder."""
     from rl_yardstick.machine_code import WorkTime
     from rl_yardstick.machine_code.compiling import compile_timer
@@ -314,34 +274,25 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
         posteriors=result.posteriors,
     )
     statistics.save(run.path / STATISTICS_FILE)
-    write_settings(run, spec, command)
-    run.end(
-        state=FINISHED,
-        env_name=run.env_name,
-        spec=spec.as_data(),
-        n_runs=n_runs,
-        n_timesteps=len(result.arms[0]),
-        versions=recorded_versions(),
-        machine=recorded_machine(),
-        **recorded_code(spec.user_modules),
-        engine=engine,
-        **(WorkTime.now() - started - time_compiling()).as_data(),
-    )
+    taken = WorkTime.now() - started - time_compiling()
+    figures = {"n_runs": n_runs, "n_timesteps": len(result.arms[0]), "engine": engine}
+    run.record(spec, FINISHED, **figures, **taken.as_data())
 
 
 def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
-    # A slow import that only processes with runs need.
+    # Slow imports that only processes with runs need.
+    from rl_yardstick.agents import load_algorithm
     from rl_yardstick.agents.bandits.runs import run_batch, run_one_by_one
     from rl_yardstick.agents.compiled.worlds import NotCompilable
-    from rl_yardstick.pipeline.preparation import algorithm_kwargs
+    from rl_yardstick.pipeline.components import constructor_arguments
 
     arguments: tuple[Any, ...] = (
         spec.algo,
-        algorithm_kwargs(spec),
+        constructor_arguments(spec, load_algorithm(spec.algo), is_dict=False),
         spec.env_id,
-        spec.hyperparams.env_kwargs,
+        spec.env_kwargs,
         range(spec.seed, spec.seed + n_runs),
-        spec.hyperparams.n_timesteps,
+        spec.n_timesteps,
     )
     try:
         return run_batch(*arguments), "compiled batch"
@@ -351,10 +302,7 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
 
 def _check_rewards(result: BatchResult, first_seed: int) -> None:
     """Refuse rewards that are not finite."""
-    from rl_yardstick.pipeline.finite_numbers import NotFiniteError, is_finite
-
     for seed, rewards in enumerate(result.rewards, start=first_seed):
-        if not is_finite(rewards):
+        if not np.isfinite(rewards).all():
             pull = int(np.argmin(np.isfinite(rewards)))
-            what = f"reward of seed {seed} at step {pull + 1:,}"
-            raise NotFiniteError(what, float(rewards[pull]))
+            raise UserError(f"reward of seed {seed} at step {pull + 1:,} is {rewards[pull]}")

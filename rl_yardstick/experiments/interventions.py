@@ -14,11 +14,10 @@ from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.results import StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.agent_settings import shipped_settings, with_engine
-from rl_yardstick.pipeline.environments import titled
+from rl_yardstick.pipeline.arguments import arguments_of
 from rl_yardstick.pipeline.files import plain
-from rl_yardstick.pipeline.settings.values import parse_assignments
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.settings import parse_assignments, shipped_hyperparams
+from rl_yardstick.pipeline.spec import TrainSpec
 
 SEEDS = 4
 SHIPPED, AS_IT_IS = "as shipped", "as it is"
@@ -54,7 +53,7 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
     Raises:
         UserError: if a change cannot be parsed.
     """
-    own, shipped = dict(spec.saved_hyperparams), shipped_settings(spec)
+    own, shipped = spec.hyperparams, shipped_hyperparams(spec)
     settings = {
         change: layered(own, parse_assignments(change.split(), "--test")) for change in changes
     }
@@ -71,28 +70,28 @@ def intervention_study(spec: TrainSpec, changes: Sequence[str], name: str) -> St
         agents.append(AgentSpec(label, spec.algo, _fast(spec.algo, values), tuned=False))
     # Two models of one name share a folder only if their settings are the same.
     digest = sha256(repr(sorted(plain(own).items())).encode()).hexdigest()[:8]
-    environment = titled(spec.env_id, spec.map_name)
+    environment = f"{spec.env_id} ({spec.map_name})" if spec.map_name else spec.env_id
     return StudySpec(
         name=file_name(f"explain_{name}_{digest}"),
         title=f"What helps {spec.algo} on {environment}",
         agents=tuple(agents),
         environments=(EnvironmentSpec(environment, spec.env_id, map_name=spec.map_name),),
         n_seeds=SEEDS,
-        gym_packages=spec.gym_packages,
-        user_modules=spec.user_modules,
+        gym_packages=tuple(spec.gym_packages),
     )
 
 
 def _fast(algo: str, settings: dict[str, Any]) -> dict[str, Any]:
     """The settings with compiled code if possible, unless they name an engine."""
-    return settings if "engine" in settings else with_engine(algo, settings, "auto")
+    has_auto = "=auto" in arguments_of(algo).get("engine", ())
+    return {"engine": "auto", **settings} if has_auto else settings
 
 
 def relative_length(runs: Sequence[PlannedRun], spec: TrainSpec, steps: int) -> float:
     """The length of all runs, in runs of ``spec``, which took so many steps."""
-    episode = steps / (spec.hyperparams.n_episodes or steps)  # 1 where the length is unknown
-    budgets = [run.spec.hyperparams for run in runs]
-    return sum((one.n_timesteps or (one.n_episodes or 0) * episode) / steps for one in budgets)
+    episode = steps / (spec.n_episodes or steps)  # 1 where the length is unknown
+    budgets = [run.spec.n_timesteps or (run.spec.n_episodes or 0) * episode for run in runs]
+    return sum(budgets) / steps
 
 
 def tried(results: StudyResults) -> list[Tried]:

@@ -1,20 +1,15 @@
-"""Reads the results of a study's finished runs, as tables with one row per observation.
-
-Each file of a run is checked against its digest and its schema. Runs of earlier versions recorded
-no digests: only the schema of their files is checked. Functions that read raise `DamagedFileError`
-for a file that is missing, changed, or has another schema.
-"""
+"""Reads the results of a study's finished runs, as tables with one row per observation."""
 
 from __future__ import annotations
 
-import csv
 import io
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -24,14 +19,10 @@ from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.study import StudySpec
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.curve_pictures import MEANINGS, read_diagnosis
-from rl_yardstick.pipeline.digests import DamagedFileError, read_shaped
-from rl_yardstick.pipeline.errors import one_line
+from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.yardstick import with_memory
-from rl_yardstick.pipeline.loaded_code import DISTRIBUTIONS
-from rl_yardstick.pipeline.runs import Run
-from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
-from rl_yardstick.safe_files.archives import read_members
-from rl_yardstick.safe_files.files import UnsafeFileError
+from rl_yardstick.pipeline.files import read_arrays, read_bytes
+from rl_yardstick.pipeline.run import RECORD
 from rl_yardstick.verdicts import (
     UNBOUNDED,
     Band,
@@ -42,27 +33,9 @@ from rl_yardstick.verdicts import (
     steps_to_threshold,
 )
 
-# --- The files of one run.
+# --- the files of one run -------------------------------------------------------------------------
 
-LARGEST_FIGURE = 1e300
-_FORMER_BASELINE = "best_blind"  # its name in earlier versions
-_OPTIONAL = ("cpu_seconds",)  # missing in older versions
-_FINAL_FIGURES = (
-    "mean_return",
-    "std_return",
-    "mean_length",
-    "success_rate",
-    "exact",
-    "gap",
-    "score",
-)
-# Missing in runs of earlier versions, and if returns are sampled.
-_OTHER_RETURNS = ("stochastic_return", "discount", "discounted_return", "discounted_optimum")
-# The last one exists only if the optimum is known only within bounds.
-_YARDSTICK = ("optimum", "baseline", "optimum_at_least")
-# These exist only for partially observable environments.
-_HIDDEN = ("full_optimum", "memory_optimum_at_least", "memory_optimum")
-_SCALES = ("observation", "memory")
+MAX_TABLE = 1 << 31  # bytes of a file of a run
 _MAPS = {
     "timesteps": "n",
     "values": "n states",
@@ -70,7 +43,6 @@ _MAPS = {
     "optimal_values": "states",
     "optimal_actions": "states choices",
 }
-_COLUMNS = ["r", "l", "t"]  # return, length, seconds since the beginning
 
 
 @dataclass(frozen=True)
@@ -82,13 +54,12 @@ class Episodes:
     seconds: Floats  # time since the beginning, shape (n,)
 
 
-def read_episodes(run: Run) -> Episodes:
+def read_episodes(folder: Path) -> Episodes:
     """Read the training episodes in Monitor's files."""
-    files = run.files
-    paths = files.matching("*.monitor.csv")
+    paths = sorted(folder.glob("*.monitor.csv"))
     if not paths:
-        raise DamagedFileError(run.path / "0.monitor.csv", "is missing")
-    tables = [_monitor_table(path, files.read(path)) for path in paths]
+        raise UserError(f"{folder} has no 0.monitor.csv")
+    tables = [_monitor_table(path) for path in paths]
     # The environments step together, so all have done the same number of steps.
     steps = np.concatenate([len(paths) * table[:, 1].cumsum() for table in tables])
     order = np.argsort(steps, kind="stable")
@@ -96,131 +67,43 @@ def read_episodes(run: Run) -> Episodes:
     return Episodes(steps[order], rows[:, 0], rows[:, 2])
 
 
-def _monitor_table(path: Path, content: bytes) -> Floats:
-    """Read return, length and time of each episode, shape (n, 3)."""
+def _monitor_table(path: Path) -> Floats:
+    """Return, length and time of each episode, shape (n, 3)."""
+    columns = ["r", "l", "t"]
     try:
-        if not content.startswith(b"#"):
-            raise ValueError("it does not begin with Monitor's line of settings")
-        table = _table_of(content)
-    except (ValueError, OverflowError) as error:
-        raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error
-    if not np.isfinite(table).all() or (table[:, 1] < 1).any():
-        raise DamagedFileError(path, "is damaged: an episode has no return, length or time")
-    return table
+        # Behind a line of settings; environments may add other columns.
+        content = io.BytesIO(read_bytes(path, MAX_TABLE).partition(b"\n")[2])
+        table = pd.read_csv(content, usecols=columns, dtype=np.float64, na_filter=False)
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: {one_line(error)}") from error
+    return table[columns].to_numpy()
 
 
-def _table_of(content: bytes) -> Floats:
-    """Parse the columns of figures; ignores others, which environments may add."""
-    _, names, rows = [*content.split(b"\n", 2), b"", b""][:3]
-    found = next(csv.reader([names.decode()]), [])
-    places = [found.index(name) for name in _COLUMNS]
-    if not rows.strip():
-        return np.empty((0, len(places)))
-    # NumPy's own reader takes three times as long: half of the total time for reading a run.
-    table = pd.read_csv(
-        io.BytesIO(rows), header=None, usecols=places, dtype=np.float64, na_filter=False
-    )
-    return table[places].to_numpy()
-
-
-def _check_finite(path: Path, *arrays: NDArray[Any]) -> None:
-    if not all(np.isfinite(array).all() for array in arrays):
-        raise DamagedFileError(path, "is damaged: it holds a number that is not finite")
-
-
-def read_evaluations(run: Run) -> tuple[Floats, Floats]:
+def read_evaluations(folder: Path) -> tuple[Floats, Floats]:
     """Read steps and mean returns of evaluations during training, each (n_evaluations,)."""
-    path = run.evaluations_path
-    if not run.files.matching(path.name):
+    path = folder / "evaluations.npz"
+    if not path.exists():
         return np.empty(0), np.empty(0)
-    arrays = read_shaped(path, run.files.read(path), {"timesteps": "n", "results": "n episodes"})
-    steps, returns = arrays["timesteps"], arrays["results"]
-    if not returns.size:
-        raise DamagedFileError(path, "is damaged: it holds no evaluation")
-    _check_finite(path, steps, returns)
-    if (steps < 0).any() or (np.diff(steps.astype(np.float64)) < 0).any():
-        raise DamagedFileError(path, "is damaged: its steps do not rise")
-    return steps.astype(np.float64), returns.mean(axis=1, dtype=np.float64)
+    arrays = read_arrays(path, {"timesteps": "n", "results": "n episodes"})
+    return arrays["timesteps"].astype(np.float64), arrays["results"].mean(axis=1, dtype=np.float64)
 
 
-def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
-    """Read the outcome in ``run.json``, with ``required`` names and ``final`` as a dictionary."""
-    info = run.read_info()
-    final = info.get("final")
-    if not (final is None or isinstance(final, dict)):
-        raise DamagedFileError(run.info_path, "is damaged: final holds no figures")
-    final = dict(final or {})
-    if _FORMER_BASELINE in final:
-        final["baseline"] = final.pop(_FORMER_BASELINE)
-    missing = [name for name in required if name not in info]
-    if missing:
-        raise DamagedFileError(run.info_path, f"is damaged: it lacks {missing[0]}")
-    given = {name: info[name] for name in (*required, *_OPTIONAL) if name in info}
-    given.pop("final", None)
-    figures = {name: final[name] for name in (*_FINAL_FIGURES, *_OTHER_RETURNS) if name in final}
-    for name, value in (given | figures).items():
-        if not (value is None or _is_figure(value)):
-            raise DamagedFileError(run.info_path, f"is damaged: {name} is no figure")
-    known = tuple(name for name in _YARDSTICK if name in final)
-    is_whole = known in ((), _YARDSTICK[:2], _YARDSTICK)
-    if not is_whole or not all(_is_figure(final[name]) for name in known):
-        raise DamagedFileError(run.info_path, "is damaged: it lacks the optimum's figures")
-    hidden = [name for name in _HIDDEN if name in final]
-    if hidden and (
-        not all(_is_figure(final.get(name)) for name in _HIDDEN)
-        or final.get("measured_by") not in _SCALES
-        or not known
-    ):
-        raise DamagedFileError(run.info_path, "is damaged: it lacks figures on what is observed")
-    _check_texts(run, info)
-    return {**info, "final": final}
-
-
-def _check_texts(run: Run, info: Mapping[str, Any]) -> None:
-    texts = [info.get("engine") or "", info.get("model_refused") or ""]
-    texts.append((info.get("final") or {}).get("acts_by") or "")
-    for name in ("versions", "machine", DISTRIBUTIONS):
-        named = info.get(name, {})
-        texts += named.values() if isinstance(named, dict) else [None]
-    if not all(isinstance(text, str) for text in texts):
-        raise DamagedFileError(run.info_path, "is damaged: engine, versions or machine are no text")
-
-
-def _is_figure(value: object) -> bool:
-    return isinstance(value, int | float) and abs(value) < LARGEST_FIGURE
-
-
-def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
+def read_value_maps(folder: Path) -> dict[str, NDArray[Any]]:
     """Read the maps of a run that `pipeline.evaluation.value_maps` wrote."""
-    path = run.value_maps_path
-    arrays = read_shaped(path, run.files.read(path), _MAPS)
-    actions, best_actions = arrays["actions"], arrays["optimal_actions"]
-    if not actions.size:
-        raise DamagedFileError(path, "is damaged: it holds no evaluation")
-    if actions.dtype.kind not in "iu" or best_actions.dtype.kind not in "biu":
-        raise DamagedFileError(path, "is damaged: its actions are no whole numbers")
-    if (actions < 0).any() or (actions >= best_actions.shape[1]).any():
-        raise DamagedFileError(path, "is damaged: it has actions that there are not")
-    _check_finite(path, arrays["timesteps"], arrays["values"], arrays["optimal_values"])
-    return arrays
+    return read_arrays(folder / "value_maps.npz", _MAPS)
 
 
-def read_compared(run: Run) -> dict[str, Floats]:
+def read_compared(folder: Path) -> dict[str, Floats]:
     """Read the columns of the diagnosis that `pipeline.evaluation.critics` wrote."""
-    path = run.diagnosis_path
+    path = folder / "diagnosis.csv"
     try:
-        found = read_diagnosis(run.files.read(path))
-        known = {name: found[name] for name in ("timesteps", *MEANINGS) if name in found}
-        if not len(known["timesteps"]) or not np.isfinite(known["timesteps"]).all():
-            raise ValueError("no steps")
+        found = read_diagnosis(read_bytes(path, MAX_TABLE))
+        return {name: found[name] for name in ("timesteps", *MEANINGS) if name in found}
     except (ValueError, KeyError) as error:
-        if isinstance(error, DamagedFileError):
-            raise
-        raise DamagedFileError(path, "is damaged: it is no table of numbers by step") from error
-    return known
+        raise UserError(f"{path} is damaged: it is no table of numbers by step") from error
 
 
-# --- Learning curves.
+# --- learning curves ------------------------------------------------------------------------------
 
 TRAINING_POINTS = 100
 
@@ -269,7 +152,7 @@ def _curve(planned: PlannedRun, kind: str, figures: dict[str, Floats]) -> Curve:
 
 def evaluation_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
     """Mean returns of the evaluations during training."""
-    steps, returns = read_evaluations(planned.run)
+    steps, returns = read_evaluations(planned.path)
     seconds = np.interp(
         steps, np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
     )
@@ -298,18 +181,17 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
     return _curve(planned, "training", columns)
 
 
-# --- The results of runs.
+# --- the results of runs --------------------------------------------------------------------------
 
 LAST_EPISODES = 100
-RUNS_IN_A_PIECE = 1000  # number of runs with curves in memory while tables are written
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A run that is left out because one of its files is damaged."""
+    """A run that is left out because one of its files cannot be read."""
 
     planned: PlannedRun  #: the run
-    reason: str  #: the file and its damage, in one line
+    reason: str  #: the file and its fault, in one line
 
 
 @dataclass(frozen=True)
@@ -318,21 +200,6 @@ class RunResults:
 
     rows: list[dict[str, Any]]  #: rows of the summary, see `RUN_COLUMNS`
     curves: list[Curve] = field(default_factory=list)  #: its learning curves
-
-
-class RunsInFile(Protocol):
-    """Stored runs: those of an agent on an environment in a file instead of folders."""
-
-    def __contains__(self, seed: int) -> bool: ...
-
-    def column(self, name: str, study: StudySpec) -> list[Any]:
-        """A column of the summary, see `RUN_COLUMNS`."""
-
-    def curves(self, seeds: Sequence[int] | None = None) -> Iterator[list[Curve]]:
-        """The evaluation and the training curve of each run with these seeds; by default of all."""
-
-    def infos(self) -> list[dict[str, Any]]:
-        """The settings and versions in ``run.json``, once for each group of equal ones."""
 
 
 @dataclass(frozen=True)
@@ -346,55 +213,10 @@ class StudyResults:
     planned: tuple[PlannedRun, ...]  #: all runs of the study, including failed ones
     #: On bandits, figures by pull, by labels of agent and environment.
     pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
-    left_out: tuple[LeftOut, ...] = ()  #: the damaged runs
-    n_unchecked: int = 0  #: number of runs without digests, whose damage may go unnoticed
+    left_out: tuple[LeftOut, ...] = ()  #: finished runs with files that cannot be read
     finished: tuple[PlannedRun, ...] = ()  #: the runs in the results
-    #: The details of runs that have just failed, by folder.
+    #: The error messages of runs that have just failed, by folder.
     failures: Mapping[Path, str] = field(default_factory=dict)
-    #: The runs in files instead of folders, by labels; their curves are not in ``curves``.
-    stored: Mapping[tuple[str, str], RunsInFile] = field(default_factory=dict)
-    kept: tuple[PlannedRun, ...] = ()  #: the stored runs that have folders too, to load agents from
-
-    @property
-    def in_folders(self) -> tuple[PlannedRun, ...]:
-        """The runs in the results that have folders."""
-        if not self.stored:
-            return self.finished
-        kept = {(*run.labels, run.seed) for run in self.kept}
-        return tuple(
-            run
-            for run in self.finished
-            if not self.is_stored(run) or (*run.labels, run.seed) in kept
-        )
-
-    def is_stored(self, run: PlannedRun) -> bool:
-        """Whether a finished run is in a file instead of a folder."""
-        return run.labels in self.stored and run.seed in self.stored[run.labels]
-
-    @property
-    def has_curves(self) -> bool:
-        """Whether there are learning curves."""
-        return bool(self.stored) or not self.curves.empty
-
-    def stored_curves(self) -> Iterator[Curve]:
-        """The learning curves of stored runs, in the order of the plan."""
-        size = max(RUNS_IN_A_PIECE // max(len(self.stored), 1), 1)
-        for start in range(0, self.study.n_seeds if self.stored else 0, size):
-            seeds = self.study.seeds[start : start + size]
-            found = [run for runs in self.stored.values() for run in runs.curves(seeds)]
-            for run in sorted(found, key=lambda run: run[0].labels["seed"]):
-                yield from run
-
-    def infos(self) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-        """Agent, environment, settings and versions; once for each group of equal stored runs."""
-        told: set[tuple[str, str]] = set()
-        for run in self.finished:
-            if not self.is_stored(run):
-                yield *run.labels, run.run.read_info()
-            elif run.labels not in told:
-                told.add(run.labels)
-                for info in self.stored[run.labels].infos():
-                    yield *run.labels, info
 
 
 # Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.
@@ -434,7 +256,7 @@ RUN_COLUMNS = (
     "n_timesteps",
     "n_episodes",
     "seconds",
-    "cpu_seconds",  # of the run's process; missing in runs of older versions
+    "cpu_seconds",  # of the run's process
     "engine",
     "path",
 )
@@ -443,183 +265,104 @@ RUN_COLUMNS = (
 # state, and the input of the policies that reach ``optimum``, "observation" or "memory".
 HIDDEN_COLUMNS = ("full_optimum", "measured_by")
 
-# Columns with the same name in ``run.json``.
-_FIGURES = (
+# Columns with the same name in ``run.json``, under ``final`` and beside it.
+_OF_FINAL = (
     *("success_rate", "exact", "optimum", "optimum_at_least", "optimum_is_proven", "baseline"),
-    *("gap", "score", "acts_by", *_OTHER_RETURNS, *HIDDEN_COLUMNS),
+    *("gap", "score", "acts_by", "stochastic_return", "discount", "discounted_return"),
+    *("discounted_optimum", *HIDDEN_COLUMNS),
 )
+_OF_RUN = ("best_timesteps", "n_timesteps", "seconds", "cpu_seconds", "engine")
 
 
 def read_results(
     study: StudySpec,
     planned: Sequence[PlannedRun],
     root: Path,
-    tell: Tell = tell_nobody,
-    read: Callable[[PlannedRun], RunResults | None] | None = None,
-    stored: Mapping[tuple[str, str], RunsInFile] | None = None,
+    known: dict[tuple[Path, int], RunResults] | None = None,
 ) -> StudyResults:
-    """Read all finished runs, except runs with damaged files.
+    """Read all finished runs, except runs with files that cannot be read.
 
     Args:
         study: the study.
         planned: the runs.
         root: the study's folder.
-        tell: receives the progress.
-        read: a function that reads a run, for example from a cache; by default `read_run`.
-        stored: the runs that are in files instead of folders, by labels.
+        known: runs that have been read before; those that are read now are added.
     """
-    stored = stored or {}
-    rows: dict[int, dict[str, Any]] = {}
-    curves, done, left_out, n_rows = [], [], [], 0
-    places: dict[tuple[str, str], list[int]] = {labels: [] for labels in stored}
-    for place, run in enumerate(planned, start=1):
-        tell(f"run {place:,} of {len(planned):,}")
-        if run.labels in stored and run.seed in stored[run.labels]:
-            places[run.labels].append(n_rows)
-            done.append(run)
-            n_rows += 1
-            continue
+    known = {} if known is None else known
+    found, done, left_out = [], [], []
+    for run in planned:
+        key = run.path, run.n_runs
         try:
-            found = read_run(study, run) if read is None else read(run)
-        except DamagedFileError as error:
-            left_out.append(LeftOut(run, str(error)))
+            results = known.get(key) or read_run(study, run)
+        except (UserError, OSError) as error:
+            left_out.append(LeftOut(run, one_line(error)))
             continue
-        if found is not None:
-            rows |= enumerate(found.rows, start=n_rows)
-            n_rows += len(found.rows)
-            curves += found.curves
+        if results is not None:
+            known[key] = results
+            found.append(results)
             done.append(run)
-    apart = [run for run in done if run.labels not in stored or run.seed not in stored[run.labels]]
+    rows = [row for results in found for row in results.rows]
+    is_hidden = any(row.get("full_optimum") is not None for row in rows)
+    columns = [*RUN_COLUMNS, *(HIDDEN_COLUMNS if is_hidden else ())]
     return StudyResults(
         study,
         root,
-        _summary(
-            study, n_rows, rows, {labels: (places[labels], stored[labels]) for labels in stored}
-        ),
-        joined(curves),
+        pd.DataFrame(rows, columns=columns),
+        joined([curve for results in found for curve in results.curves]),
         tuple(planned),
-        read_pulls(apart),
+        read_pulls(done),
         tuple(left_out),
-        sum(run.n_runs for run in apart if run.run.files.digests is None),
         tuple(done),
-        stored=stored,
     )
-
-
-def _summary(
-    study: StudySpec,
-    n_rows: int,
-    rows: Mapping[int, dict[str, Any]],
-    stored: Mapping[tuple[str, str], tuple[list[int], RunsInFile]],
-) -> pd.DataFrame:
-    """The summary of ``rows``, by row number, and of stored runs, given with their row numbers."""
-    if not stored:
-        return pd.DataFrame([*rows.values()], columns=_columns(rows.values()))
-    table = {}
-    for name in _columns(rows.values()):  # one column at a time, to save memory
-        column: list[Any] = [None] * n_rows
-        for number, row in rows.items():
-            column[number] = row.get(name)
-        for numbers, runs in stored.values() if name in RUN_COLUMNS else ():
-            for number, value in zip(numbers, runs.column(name, study), strict=True):
-                column[number] = value
-        table[name] = pd.Series(column)
-    return pd.DataFrame(table)
-
-
-def _columns(rows: Collection[Mapping[str, Any]]) -> list[str]:
-    is_hidden = any(row.get("full_optimum") is not None for row in rows)
-    return [*RUN_COLUMNS, *(HIDDEN_COLUMNS if is_hidden else ())]
 
 
 def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
     """Read the results of a run, or None if it is missing or not finished.
 
     Raises:
-        DamagedFileError: if a file that a comparison reads is missing, changed or invalid.
+        UserError: if a file that a comparison reads is missing or invalid.
     """
-    planned = planned.read()
-    planned.check_record()
-    if not planned.is_finished:
+    recorded = planned.recorded()
+    if not planned.is_finished_by(recorded):
         return None
-    if planned.is_batch:
-        return RunResults(_batch_rows(planned))
-    _check_for_page(study, planned)
-    episodes = read_episodes(planned.run)
-    evaluations = evaluation_curve(planned, episodes)
-    row = _summary_row(study, planned, episodes, evaluations)
+    try:
+        if planned.is_batch:
+            return RunResults(_batch_rows(planned, recorded))
+        episodes = read_episodes(planned.path)
+        evaluations = evaluation_curve(planned, episodes)
+        row = _summary_row(study, planned, recorded, episodes, evaluations)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{planned.path / RECORD} is damaged: {error!r}") from error
     return RunResults([row], [evaluations, training_curve(planned, episodes)])
 
 
-def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
-    """Check the files that the page opens later: maps, and the filmed agent."""
-    run, files = planned.run, planned.run.files
-    for path in files.matching(run.value_maps_path.name):
-        files.check(path)
-        if files.digests is None:
-            read_value_maps(run)
-    if files.matching(run.diagnosis_path.name):
-        read_compared(run)
-    if planned.seed == study.first_seed:
-        files.check(run.model_path)
-        if not run.model_path.exists():
-            raise DamagedFileError(run.model_path, "is missing")
-
-
-def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float | None:
-    """The return that counts as solved; None if it is not defined."""
-    import gymnasium as gym
-
-    if study.threshold is not None:
-        return study.threshold
-    # It is unknown whether any policy reaches an upper bound of the optimum.
-    reachable = final.get("optimum_at_least", final.get("optimum"))
-    if "optimum_at_least" in final or reachable is None:
-        registered = gym.spec(env_id.rpartition(":")[2]).reward_threshold
-        if registered is not None:
-            return float(registered)
-    if reachable is None:
-        return None
-    baseline = float(final["baseline"])
-    return baseline + 0.95 * (float(reachable) - baseline)
-
-
-def _mean(values: Floats) -> float:
-    return float(values.mean()) if len(values) else float("nan")
-
-
-def _batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
+def _batch_rows(planned: PlannedRun, recorded: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Make a row of the summary for each run of a batch."""
-    info = read_outcome(planned.run, ("seconds",))
-    cpu_seconds = info.get("cpu_seconds")
-    path = planned.path / STATISTICS_FILE
-    pulls = PullStatistics.load(path)
-    if pulls.total_reward.size != planned.n_runs or info["seconds"] is None:
-        raise DamagedFileError(path, "is damaged: it is not of as many runs")
+    pulls = PullStatistics.load(planned.path / STATISTICS_FILE)
     shared = {
         **_named(planned),
-        "n_timesteps": planned.spec.hyperparams.n_timesteps,
+        "n_timesteps": planned.spec.n_timesteps,
         "n_episodes": 1,
-        "seconds": info["seconds"] / planned.n_runs,
-        "cpu_seconds": None if cpu_seconds is None else cpu_seconds / planned.n_runs,
-        "engine": info.get("engine"),
+        "seconds": recorded["seconds"] / planned.n_runs,
+        "cpu_seconds": recorded["cpu_seconds"] / planned.n_runs,
+        "engine": recorded["engine"],
     }
+    totals = zip(pulls.total_reward.tolist(), pulls.total_regret.tolist(), strict=True)
     return [
         {**shared, "seed": seed, "training": reward, "last_episodes": reward, "regret": regret}
-        for seed, (reward, regret) in enumerate(
-            zip(pulls.total_reward.tolist(), pulls.total_regret.tolist(), strict=True),
-            start=planned.seed,
-        )
+        for seed, (reward, regret) in enumerate(totals, start=planned.seed)
     ]
 
 
 def _summary_row(
-    study: StudySpec, planned: PlannedRun, episodes: Episodes, evaluations: Curve
+    study: StudySpec,
+    planned: PlannedRun,
+    recorded: Mapping[str, Any],
+    episodes: Episodes,
+    evaluations: Curve,
 ) -> dict[str, Any]:
-    info = read_outcome(
-        planned.run, ("final", "best_mean_return", "best_timesteps", "n_timesteps", "seconds")
-    )
-    final = with_memory(info["final"]) if planned.on_memory_scale else info["final"]
+    final = recorded["final"] or {}
+    final = with_memory(final) if planned.on_memory_scale else final
     steps, values = evaluations.figures["step"], evaluations.figures["value"]
     return {
         **_named(planned),
@@ -627,20 +370,20 @@ def _summary_row(
         "final": final.get("mean_return"),
         "final_std": final.get("std_return"),
         "final_length": final.get("mean_length"),
-        **{name: final.get(name) for name in _FIGURES},
-        "best": info["best_mean_return"],
-        "best_timesteps": info["best_timesteps"],
+        **{name: final.get(name) for name in _OF_FINAL},
+        "best": recorded["best_mean_return"],
         "area": _area(steps, values) if len(steps) else None,
         "training": _mean(episodes.returns),
         "last_episodes": _mean(episodes.returns[-LAST_EPISODES:]),
         "regret": run_regret(planned),
         **speed_figures(study, planned.spec.env_id, final, evaluations.figures),
-        "n_timesteps": info["n_timesteps"],
         "n_episodes": len(episodes.returns),
-        "seconds": info["seconds"],
-        "cpu_seconds": info.get("cpu_seconds"),
-        "engine": info.get("engine"),
+        **{name: recorded[name] for name in _OF_RUN},
     }
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if len(values) else float("nan")
 
 
 def _area(steps: Floats, values: Floats) -> float:
@@ -658,6 +401,22 @@ def _named(planned: PlannedRun) -> dict[str, Any]:
         "env_id": planned.spec.env_id,
         "path": str(planned.path),
     }
+
+
+def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float | None:
+    """The return that counts as solved; None if it is not defined."""
+    if study.threshold is not None:
+        return study.threshold
+    # It is unknown whether any policy reaches an upper bound of the optimum.
+    reachable = final.get("optimum_at_least", final.get("optimum"))
+    if "optimum_at_least" in final or reachable is None:
+        registered = gym.spec(env_id).reward_threshold
+        if registered is not None:
+            return float(registered)
+    if reachable is None:
+        return None
+    baseline = float(final["baseline"])
+    return baseline + 0.95 * (float(reachable) - baseline)
 
 
 def speed_figures(
@@ -684,7 +443,7 @@ def speed_figures(
     }
 
 
-# --- Agents over their seeds.
+# --- agents over their seeds ---------------------------------------------------------------------
 
 CURVE_POINTS = TRAINING_POINTS  # the most points of a run, and of a curve in a figure
 
@@ -712,17 +471,8 @@ def curves_by_agent(
     return found
 
 
-def stored_curves(
-    results: StudyResults, environment: str, agent: str, kind: str
-) -> list[Mapping[str, Floats]]:
-    """The learning curves of stored runs, as `curves_by_agent` has those of the others."""
-    runs = results.stored.get((agent, environment))
-    which = int(kind == "training")
-    return [] if runs is None else [run[which].figures for run in runs.curves()]
-
-
 def mean_curve(
-    curves: Sequence[Mapping[str, Any] | pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED
+    curves: Sequence[pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED
 ) -> tuple[Floats, Band] | None:
     """The mean learning curve of an agent over its seeds.
 
@@ -746,39 +496,11 @@ def mean_curve(
     return grid, curve_band(values, bounds)
 
 
-# --- Comparing two runs.
-
-
-def difference(run: Run, other: Run) -> str:
-    """The difference of two finished runs in words; empty if they are equal to the last bit."""
-    if tensors(run) != tensors(other):
-        return "the agent"
-    one, another = read_episodes(run), read_episodes(other)
-    if not (_same(one.steps, another.steps) and _same(one.returns, another.returns)):
-        return "the episodes"
-    if not all(map(_same, read_evaluations(run), read_evaluations(other))):
-        return "the evaluations"
-    return ""
-
-
-def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    return one.tobytes() == other.tobytes()
-
-
-def tensors(run: Run) -> dict[str, bytes]:
-    """Read the tensors in the zip of the final agent."""
-    try:
-        members = read_members(run.files.read(run.model_path))
-    except UnsafeFileError as error:
-        raise DamagedFileError(run.model_path, str(error)) from error
-    return {name: content for name, content in members.items() if name.endswith(".pth")}
-
-
 def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
     """Versions that differ between the ``run.json`` of runs, in a line; empty if none differ."""
     counts: dict[str, Counter[str]] = {}
     for info in infos:
-        for package, version in {**info.get(DISTRIBUTIONS, {}), **info.get("versions", {})}.items():
+        for package, version in info.get("versions", {}).items():
             counts.setdefault(package, Counter())[version] += info.get("n_runs", 1)
     mixed = [
         f"{package} {', '.join(_counted(*item) for item in sorted(found.items()))}"

@@ -1,36 +1,27 @@
-"""The specification of a study as one immutable value, and its YAML file.
-
-Files are read strictly; errors name file and line.
-"""
+"""The specification of a study as one value, its YAML file, and sweeps over settings."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from rl_yardstick.agents import ALGORITHMS
-from rl_yardstick.experiments import run_limits
-from rl_yardstick.pipeline.environments import check_env_id, map_name, titled, with_maps_read
+from rl_yardstick.agents.registry import ALGORITHMS
+from rl_yardstick.pipeline.environments import check_env_id, map_name
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
-from rl_yardstick.pipeline.files import LONGEST_NAME, plain, portable_name, write_text
-from rl_yardstick.pipeline.runs import environment_name
-from rl_yardstick.pipeline.settings.hyperparams import override
-from rl_yardstick.pipeline.settings.values import coerce
-from rl_yardstick.pipeline.settings.yaml import key_lines, read_yaml
-from rl_yardstick.pipeline.user_modules import UserModule
+from rl_yardstick.pipeline.files import LONGEST_NAME, portable_name, read_text
+from rl_yardstick.pipeline.settings import BUDGETS, ENV_KWARGS, override, read_yaml
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
-
-Keep = Literal["all", "figures"]
-
 METRIC_WORDS: dict[str, str] = {
     "final": "return of the final policy",
     "best": "return of the best policy during training",
@@ -39,34 +30,15 @@ METRIC_WORDS: dict[str, str] = {
     "last_episodes": "mean return of the last 100 training episodes",
     "regret": "regret of a run",
 }
-
-# For these metrics, lower is better.
-COSTS = ("regret",)
-
-
-# Metrics that are mean returns of training episodes.
-OF_TRAINING = ("training", "last_episodes")
-
-
-# Settings that are mappings: these are merged key by key.
-MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
-
-
+COSTS = ("regret",)  # metrics of which less is better
+OF_TRAINING = ("training", "last_episodes")  # mean returns of training episodes
 # Settings of a training variant of the environment, with the values that switch it off.
 AS_IT_COMES: dict[str, Any] = {"train_env_kwargs": None, "train_env_wrapper": None}
+MOST_AGENTS = 10_000
+MOST_PAIRS = 10  # of agent and environment, for two seeds of each in a quick look
+_SHIPPED = Path(__file__).resolve().parents[1] / "studies"
 
-
-def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with ``changes`` applied."""
-    merged = {
-        key: {**settings[key], **changes[key]}
-        for key in MERGED
-        if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
-    }
-    return override(settings, {**changes, **merged})
-
-
-# Symbols of settings in labels and on axes, as usual in the field.
+# Symbols of settings in labels and on axes, as usual in the field; their spelling in file names.
 _SYMBOLS = {
     "learning_rate": "α",
     "gamma": "γ",
@@ -76,7 +48,6 @@ _SYMBOLS = {
     "kappa": "κ",
     "initial_q": "initial Q",
 }
-# Their spelling in file names.
 _SPELT = {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa"}
 
 
@@ -89,6 +60,16 @@ def file_name(label: str, longest: int = LONGEST_NAME) -> str:
     """The label as a folder name of at most ``longest`` bytes."""
     label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
     return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
+
+
+def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with ``changes`` applied; arguments of environments are merged one by one."""
+    merged = {
+        key: {**settings[key], **changes[key]}
+        for key in ENV_KWARGS
+        if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
+    }
+    return override(settings, {**changes, **merged})
 
 
 @dataclass(frozen=True)
@@ -105,8 +86,7 @@ class AgentSpec:
     #: Another file of hyperparameters to start from; None for the shipped one.
     conf_file: Path | None = None
     summary: str = ""  #: a short description for the report
-    #: Its place in a study file, for error messages.
-    where: str = field(default="", compare=False)
+    where: str = field(default="", compare=False)  #: its place in a study file, for messages
     group: str = ""  #: for a member of a sweep, the common label
     swept: dict[str, Any] = field(default_factory=dict)  #: its values of the swept settings
 
@@ -125,8 +105,9 @@ class EnvironmentSpec:
     @property
     def folder(self) -> str:
         """The label as a file name; for an id, the same name as in `train.py`."""
-        is_id = self.label == titled(self.env_id, self.map_name)
-        return file_name(environment_name(self.env_id) if is_id else self.label)
+        usual = f"{self.env_id} ({self.map_name})" if self.map_name else self.env_id
+        is_id = self.label == usual
+        return file_name(self.env_id.replace("/", "-") if is_id else self.label)
 
 
 @dataclass(frozen=True)
@@ -167,23 +148,16 @@ class StudySpec:
     episodes_table: int = 0
     quick: QuickSpec = field(default_factory=QuickSpec)  #: its reduction for a quick look
     is_quick: bool = False  #: whether it is reduced
-    #: Names of the user's modules, whose classes settings may name.
-    gym_packages: tuple[str, ...] = ()
-    user_modules: tuple[UserModule, ...] = ()  #: the same, importable in another process
+    gym_packages: tuple[str, ...] = ()  #: modules that the user typed
     tensorboard: bool = False  #: whether each run writes a TensorBoard log
     render_every: int = 0  #: episodes between two films; 0 for no films
     #: Whether values and gradients are compared with exact ones at evaluations.
     diagnose: bool = False
     #: Whether the page links to pages that play the first training of each agent.
     learning_pages: bool = False
-    #: The file formats of figures: "png", "svg", "pdf".
-    figures: Sequence[str] = ("png", "svg")
+    figures: tuple[str, ...] = ("png", "svg")  #: formats of figures: "png", "svg", "pdf"
     run_timeout: float | None = None  #: seconds that each run may take; None for no limit
-    run_memory: int | None = None  #: bytes of memory that each run may take; None for no limit
-    source: Path | None = None  #: its file, or None
     first_seed: int = 0  #: the first seed; the others follow it
-    #: ``"figures"`` to keep figures and curves of runs in files, and few of their folders.
-    keep: Keep | None = None
     #: Label of the only agent to compare the others with; empty for all pairs.
     against: str = ""
 
@@ -195,107 +169,169 @@ class StudySpec:
     def quickened(self) -> StudySpec:
         """The study with few seeds and a small budget, in a separate folder."""
         n_pairs = len(self.agents) * len(self.environments)
-        return replace(
-            self,
-            name=f"{self.name}-quick",
-            n_seeds=min(self.quick.seeds or (1 if n_pairs > MOST_PAIRS else 2), self.n_seeds),
-            is_quick=True,
-        )
+        n_seeds = self.quick.seeds or (1 if n_pairs > MOST_PAIRS else 2)
+        name = f"{self.name}-quick"
+        return replace(self, name=name, n_seeds=min(n_seeds, self.n_seeds), is_quick=True)
 
 
-# --- Study files.
+def with_maps_named(study: StudySpec) -> StudySpec:
+    """The study with the file of its map in the label of an environment, where that is its id."""
+    environments = []
+    for one in study.environments:
+        found = {map_name(one.env_id, layered(one.settings, a.settings)) for a in study.agents}
+        name = found.pop() if one.label == one.env_id and len(found) == 1 else ""
+        label = f"{one.label} ({name})" if name else one.label
+        environments.append(replace(one, label=label, map_name=name))
+    return replace(study, environments=tuple(environments))
 
-# The studies that are shipped with the project.
-_SHIPPED = Path(__file__).resolve().parents[1] / "studies"
 
-MOST_AGENTS = 10_000
-MOST_PAIRS = 10  # of agent and environment, for two seeds of each in a quick look
+# --- sweeps ---------------------------------------------------------------------------------------
 
-BUDGETS = ("n_timesteps", "n_episodes")
 
-# Keys of a study, and the types of their values.
-_STUDY_VALUES: dict[str, Any] = {
-    "title": str,
-    "description": str,
-    "n_timesteps": int,
-    "n_episodes": int,
-    "tuned": bool,
-    "eval_freq": int,
-    "eval_episodes": int,
-    "metric": Metric,
-    "margin": float,
-    "shared_randomness": bool,
-    "threshold": float,
-    "episodes_table": int,
-    "keep": Keep,
-    "diagnose": bool,
-}
-# Limits of each run, in the format of the command line.
-_LIMITS: dict[str, Callable[[str], float]] = {
-    "run_timeout": run_limits.seconds,
-    "run_memory": run_limits.memory,
-}
-_PARTS = ("agents", "environments", "seeds", "settings", "sweep", "quick")
-_STUDY_KEYS = (*_STUDY_VALUES, *_LIMITS, *_PARTS)
-_AGENT_KEYS = ("algo", "tuned", "conf_file", "summary", "sweep")
-_QUICK_VALUES: dict[str, Any] = {"seeds": int, "budget": float}
-_NOT_NEGATIVE = ("margin", "episodes_table", "first")
-_SEEDS = {"first": "first_seed", "count": "n_seeds"}
-_AT_LEAST_ONE = ("seeds", "count", "n_timesteps", "n_episodes", "eval_freq", "eval_episodes")
+def swept(agent: AgentSpec, sweep: Mapping[str, Sequence[Any]]) -> Iterator[AgentSpec]:
+    """The agent for each combination of swept values, labelled by these values."""
+    texts = {name: _as_texts(values) for name, values in sweep.items()}
+    for places in product(*(range(len(values)) for values in sweep.values())):
+        at = dict(zip(sweep, places, strict=True))
+        chosen = {name: sweep[name][place] for name, place in at.items()}
+        each = [f"{symbol(name)} = {texts[name][place]}" for name, place in at.items()]
+        label, settings = " with ".join([agent.label, *each]), layered(agent.settings, chosen)
+        yield replace(agent, label=label, settings=settings, group=agent.label, swept=chosen)
 
-Keys = tuple[str | int, ...]
+
+def _as_texts(values: Sequence[Any]) -> list[str]:
+    """Values for labels: numbers with four digits if these distinguish them."""
+    short = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in values]
+    return short if len(set(short)) == len(set(map(str, values))) else [str(v) for v in values]
+
+
+# --- study files ----------------------------------------------------------------------------------
+
+
+def _number(value: Any) -> Any:
+    """YAML reads 1e5 as text, and Python counts True as 1."""
+    if isinstance(value, bool):
+        raise ValueError(f"must be a number, not {shown(value)}")
+    with suppress(ValueError):
+        return float(value) if isinstance(value, str) else value
+    return value
+
+
+def _seconds(value: Any) -> Any:
+    """A time such as 90, 90s, 10m, 2h or 1d."""
+    found = re.fullmatch(r"([0-9.]+)\s*(|s|m|min|h|d)", str(value).strip())
+    unit = {"m": 60.0, "min": 60.0, "h": 3600.0, "d": 86400.0}.get(found[2], 1.0) if found else 0.0
+    if found is None or found[1].count(".") > 1 or not float(found[1]) * unit > 0:
+        raise ValueError(f"must be a time such as 90s, 10m or 2h, not {shown(value)}")
+    return float(found[1]) * unit
+
+
+def _by_label(value: Any) -> Any:
+    """Entries by label, from a list of names or a mapping."""
+    if isinstance(value, list) and all(isinstance(item, str) for item in value):
+        if len(set(value)) < len(value):
+            raise ValueError("names one of them twice")
+        value = dict.fromkeys(value)
+    elif isinstance(value, list):
+        raise ValueError("must list names, or map them to settings")
+    if not value:
+        raise ValueError("must list at least one name")
+    return {key: entry or {} for key, entry in value.items()} if isinstance(value, dict) else value
+
+
+def _or_empty(value: Any) -> Any:
+    return {} if value is None else value
+
+
+_Count = Annotated[int, BeforeValidator(_number), Field(ge=1)]
+_FromZero = Annotated[int, BeforeValidator(_number), Field(ge=0)]
+_Float = Annotated[float, BeforeValidator(_number)]
+_Settings = Annotated[dict[str, Any], BeforeValidator(_or_empty)]
+_Sweep = Annotated[dict[str, Annotated[list[Any], Field(min_length=1)]], BeforeValidator(_or_empty)]
+
+
+class _Part(BaseModel):
+    """A mapping in a study file, whose unknown keys are mistakes."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class _Open(BaseModel):
+    """A mapping whose other keys are hyperparameters."""
+
+    model_config = ConfigDict(extra="allow", protected_namespaces=())
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return dict(self.__pydantic_extra__ or {})
+
+
+class _Agent(_Open):
+    algo: str | None = None
+    tuned: bool | None = None
+    conf_file: str | None = None
+    summary: str = ""
+    sweep: _Sweep = {}
+
+
+class _Environment(_Open):
+    id: str | None = None
+    as_it_comes: bool = False
+
+
+class _Seeds(_Part):
+    first: _FromZero = 0
+    count: _Count = 10
+
+
+class _Quick(_Part):
+    seeds: _Count | None = None
+    budget: Annotated[_Float, Field(gt=0, le=1)] | None = None
+
+
+def _count(value: Any) -> Any:
+    return value if isinstance(value, dict) else {"count": value}
+
+
+class _File(_Part):
+    title: str = ""
+    description: str = ""
+    agents: Annotated[dict[str, _Agent], BeforeValidator(_by_label)] = Field({})
+    environments: Annotated[dict[str, _Environment], BeforeValidator(_by_label)] = Field({})
+    seeds: Annotated[_Seeds, BeforeValidator(_count)] = _Seeds()
+    settings: _Settings = {}
+    sweep: _Sweep = {}
+    quick: Annotated[_Quick, BeforeValidator(_or_empty)] = _Quick()
+    n_timesteps: _Count | None = None
+    n_episodes: _Count | None = None
+    tuned: bool = True
+    eval_freq: _Count | None = None
+    eval_episodes: _Count = 20
+    metric: Metric = "final"
+    margin: Annotated[_Float, Field(ge=0)] | None = None
+    shared_randomness: bool = False
+    threshold: _Float | None = None
+    episodes_table: _FromZero = 0
+    diagnose: bool = False
+    run_timeout: Annotated[float, BeforeValidator(_seconds)] | None = None
+
+
+# Keys that mean the same as fields of `StudySpec`.
+_SAME = ("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness")
+_SAME += ("threshold", "episodes_table", "diagnose", "run_timeout")
 
 
 @dataclass(frozen=True)
-class _Document:
-    """A study file with the line numbers of its values."""
+class _Lines:
+    """A study file, and the line number of each value by its keys."""
 
     path: Path
-    lines: Mapping[Keys, int]
+    lines: Mapping[tuple[str | int, ...], int]
 
     def at(self, *keys: str | int) -> str:
-        """The place of a value, as ``file:line``."""
-        return f"{self.path}:{self.lines.get(keys, 1)}"
-
-    def mapping(self, value: Any, *keys: str | int) -> dict[str, Any]:
-        """The value if it is a mapping, or empty inside the document; otherwise an error."""
-        if value is None and keys:
-            return {}
-        if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
-            what = str(keys[-1]) if keys else "a study"
-            raise UserError(f"{self.at(*keys)}: {what} must map names to values")
-        return value
-
-    def check_names(self, names: Iterable[str], known: Iterable[str], *keys: str | int) -> None:
-        """Refuse an unknown name."""
-        known = list(known)
-        for name in names:
-            if name not in known:
-                raise unknown(f"{self.at(*keys, name)}: unknown key", name, known)
-
-    def values(
-        self, data: Mapping[str, Any], kinds: Mapping[str, Any], *keys: str | int
-    ) -> dict[str, Any]:
-        """Check and convert the plain values among ``data`` by their types."""
-        result = {}
-        for key, kind in kinds.items():
-            if data.get(key) is None:
-                continue
-            place = f"{self.at(*keys, key)}: {key}"
-            result[key] = coerce(data[key], kind, place)
-            if key in _AT_LEAST_ONE and result[key] < 1:
-                raise UserError(f"{place} must be at least 1, not {result[key]}")
-            if key in _NOT_NEGATIVE and result[key] < 0:
-                raise UserError(f"{place} must be at least 0, not {result[key]}")
-            if key == "budget" and not 0 < result[key] <= 1:
-                raise UserError(f"{place} must be a share above 0 and up to 1, not {result[key]}")
-        return result
-
-    def check_budget(self, data: Mapping[str, Any], *keys: str | int) -> None:
-        """Refuse two budgets in one mapping."""
-        if all(data.get(key) is not None for key in BUDGETS):
-            place = self.at(*keys, BUDGETS[1])
-            raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
+        """The place of a value, or of what it is in, as ``file:line``."""
+        known = (keys[:n] for n in range(len(keys), 0, -1) if keys[:n] in self.lines)
+        return f"{self.path}:{self.lines[found] if (found := next(known, None)) else 1}"
 
 
 def find_study(given: str) -> Path:
@@ -314,7 +350,7 @@ def find_study(given: str) -> Path:
     shipped = {known.stem: known for known in sorted(_SHIPPED.glob("*.yml"))}
     name = path.name.removesuffix(".yml")
     if name not in shipped:
-        raise unknown(f"{given}: cannot be read: no such file, and no study", name, shipped)
+        raise unknown(f"{given}: no such file, and no shipped study", name, shipped)
     return shipped[name]
 
 
@@ -325,236 +361,126 @@ def read_study(path: Path) -> StudySpec:
         UserError: if it cannot be read, or contains unknown or invalid settings.
     """
     data = read_yaml(path)
-    document = _Document(path, key_lines(path))
-    data = document.mapping(data)
-    document.check_names(data, _STUDY_KEYS)
-    values = {"title": path.stem, **document.values(data, _STUDY_VALUES)}
-    values |= {**_run_limits(document, data), **_seeds(document, data.get("seeds"))}
-    document.check_budget(data)
-    shared = document.mapping(data.get("settings"), "settings")
-    document.check_budget(shared, "settings")
-    budget = {key: values.pop(key) for key in BUDGETS if key in values}
-    tuned = values.pop("tuned", True)
-    quick = document.mapping(data.get("quick"), "quick")
-    document.check_names(quick, _QUICK_VALUES, "quick")
+    document = _Lines(path, dict(_key_lines(yaml.compose(read_text(path), yaml.SafeLoader), ())))
+    if not (isinstance(data, dict) and all(isinstance(key, str) for key in data)):
+        raise UserError(f"{document.at()}: a study must map names to values")
+    # What is not given is read too: lists of names that are missing.
+    data = {
+        "agents": None,
+        "environments": None,
+        **{k: v for k, v in data.items() if v is not None},
+    }
+    try:
+        file = _File.model_validate(data)
+    except ValidationError as error:
+        raise _in_one_line(document, error) from None
+    for keys in ((), ("settings",), *((p, label) for p in _LISTS for label in getattr(file, p))):
+        _check_budget(document, data, keys)
+    given = {key: value for key in BUDGETS if (value := getattr(file, key)) is not None}
     return StudySpec(
         name=path.stem,
-        agents=_agents(document, data, tuned),
-        environments=_environments(document, data, layered(shared, budget)),
-        quick=QuickSpec(**document.values(quick, _QUICK_VALUES, "quick")),
-        source=path,
-        **values,
+        title=file.title or path.stem,
+        agents=tuple(_agents(document, file)),
+        environments=tuple(_environments(document, file, layered(file.settings, given))),
+        n_seeds=file.seeds.count,
+        first_seed=file.seeds.first,
+        quick=QuickSpec(file.quick.seeds, file.quick.budget),
+        **{key: getattr(file, key) for key in _SAME},
     )
 
 
-def with_maps_named(study: StudySpec) -> StudySpec:
-    """The study with the file of its map in the label of an environment, where that is its id."""
-    environments = []
-    for one in study.environments:
-        found = {map_name(one.env_id, layered(one.settings, a.settings)) for a in study.agents}
-        name = found.pop() if one.label == one.env_id and len(found) == 1 else ""
-        environments.append(replace(one, label=titled(one.label, name), map_name=name))
-    return replace(study, environments=tuple(environments))
+_LISTS = ("agents", "environments")
+_PARTS: Mapping[tuple[str, ...], type[_Part]] = {(): _File, ("quick",): _Quick, ("seeds",): _Seeds}
 
 
-def write_study(root: Path, study: StudySpec) -> None:
-    """Write the study's specification as a study file in its folder, so that others can repeat it.
-
-    The file includes changes by flags and the rows of maps; agents' own files of hyperparameters
-    are copied beside it. A quick look has no such file.
-    """
-    if study.is_quick:
-        return
-    groups: dict[str, list[AgentSpec]] = {}
-    for agent in study.agents:
-        groups.setdefault(agent.group or agent.label, []).append(agent)
-    agents: dict[str, Any] = {}
-    for label, members in groups.items():
-        entry = _swept_entry(members)
-        entries = {member.label: _agent_entry(member, member.settings) for member in members}
-        entries = entries if entry is None else {label: entry}
-        for environment in study.environments:
-            entries = {key: with_maps_read(environment.env_id, e) for key, e in entries.items()}
-        if (conf_file := members[0].conf_file) is not None:
-            copied = Path("settings", f"{file_name(label)}.yml")
-            (root / copied).parent.mkdir(exist_ok=True)
-            write_text(root / copied, conf_file.read_text(encoding="utf-8"))
-            entries = {label: {**e, "conf_file": copied.as_posix()} for label, e in entries.items()}
-        agents |= entries
-    data = {key: getattr(study, key) for key in _STUDY_VALUES if hasattr(study, key)}
-    limits = {key: str(limit) for key in _LIMITS if (limit := getattr(study, key)) is not None}
-    data |= {"seeds": {key: getattr(study, name) for key, name in _SEEDS.items()}, **limits}
-    data["quick"] = {key: value for key, value in vars(study.quick).items() if value is not None}
-    data["environments"] = {
-        environment.label: {
-            "id": environment.env_id,
-            **with_maps_read(environment.env_id, environment.settings),
-        }
-        for environment in study.environments
-    }
-    data["agents"] = agents
-    data["diagnose"] = study.diagnose or None
-    known = {key: value for key, value in data.items() if value not in (None, "")}
-    text = yaml.safe_dump(plain(known), sort_keys=False, allow_unicode=True)
-    write_text(root / "study.yml", text)
+def _key_lines(node: Any, keys: tuple[str | int, ...]) -> Iterator[tuple[Any, int]]:
+    """The line numbers, from 1, of the values below a node; items of lists also by their text."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            inner = (*keys, str(key.value))
+            yield from _key_lines(value, inner)
+            yield inner, key.start_mark.line + 1
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            if isinstance(item, yaml.ScalarNode):
+                yield (*keys, str(item.value)), item.start_mark.line + 1
 
 
-def _agent_entry(agent: AgentSpec, settings: Mapping[str, Any]) -> dict[str, Any]:
-    tuned = {} if agent.tuned or agent.conf_file is not None else {"tuned": False}
-    summary = {"summary": agent.summary} if agent.summary else {}
-    return {"algo": agent.algo, **tuned, **summary, **settings}
+def _in_one_line(document: _Lines, error: ValidationError) -> UserError:
+    """The first mistake, with its place."""
+    first = error.errors()[0]
+    keys = tuple(key for key in first["loc"] if key != "[key]")
+    place, value = document.at(*keys), first["input"]
+    key = next(
+        (k for n, k in enumerate(keys[::-1]) if keys[: len(keys) - n] in document.lines), keys[0]
+    )
+    if first["type"] == "extra_forbidden":
+        known = _PARTS[tuple(map(str, keys[:-1]))].model_fields
+        return unknown(f"{place}: unknown key", str(key), known)
+    if first["type"] == "literal_error":
+        return unknown(f"{place}: unknown {key}", str(value), METRICS)
+    if first["type"] == "value_error":
+        return UserError(f"{place}: {key} {first['msg'].removeprefix('Value error, ')}")
+    reason = first["msg"].replace("Input should", "must").replace("List should", "must")
+    reason = reason.partition(" or instance of")[0].partition(", unable")[0].partition(" after")[0]
+    return UserError(f"{place}: {key} {reason}, not {shown(value)}")
 
 
-def _swept_entry(members: Sequence[AgentSpec]) -> dict[str, Any] | None:
-    """One entry for all members of a sweep; None if no entry gives exactly these members."""
-    first = members[0]
-    kept = {key: value for key, value in first.settings.items() if key not in first.swept}
-    agent = replace(first, label=first.group or first.label, settings=kept, swept={}, group="")
-    sweep = {
-        key: list({repr(m.swept[key]): m.swept[key] for m in members}.values())
-        for key in first.swept
-    }
-    found = swept(agent, sweep)
-    alone = [replace(a, label=a.label.removeprefix(f"{agent.label} with ")) for a in found]
-    if [replace(member, group=agent.label) for member in members] not in (found, alone):
-        return None
-    return {**_agent_entry(agent, kept), **({"sweep": sweep} if sweep else {})}
+def _check_budget(document: _Lines, data: Mapping[str, Any], keys: tuple[str, ...]) -> None:
+    """Refuse two budgets in one mapping."""
+    inner: Any = data
+    for key in keys:
+        inner = inner.get(key) if isinstance(inner, dict) else None
+    if isinstance(inner, dict) and all(inner.get(key) is not None for key in BUDGETS):
+        place = document.at(*keys, BUDGETS[1])
+        raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
 
 
-def _seeds(document: _Document, given: Any) -> dict[str, int]:
-    """The seeds as a number, or as first seed and number."""
-    if given is None:
-        return {}
-    if not isinstance(given, dict):
-        return {"n_seeds": document.values({"seeds": given}, {"seeds": int})["seeds"]}
-    document.check_names(document.mapping(given, "seeds"), _SEEDS, "seeds")
-    values = document.values(given, dict.fromkeys(_SEEDS, int), "seeds")
-    return {_SEEDS[key]: value for key, value in values.items()}
-
-
-def _run_limits(document: _Document, data: Mapping[str, Any]) -> dict[str, float]:
-    limits = {}
-    for key, read in _LIMITS.items():
-        if data.get(key) is not None:
-            try:
-                limits[key] = read(str(data[key]))
-            except ValueError as error:
-                raise UserError(f"{document.at(key)}: {key} {error}") from error
-    return limits
-
-
-def _entries(
-    document: _Document, data: Mapping[str, Any], key: str
-) -> dict[str, tuple[Keys, dict[str, Any]]]:
-    """Read the entries under ``key`` by label, from a list of names or a mapping."""
-    value = data.get(key)
-    if isinstance(value, list) and all(isinstance(item, str) for item in value):
-        entries: dict[str, tuple[Keys, dict[str, Any]]] = {
-            item: ((key, index), {}) for index, item in enumerate(value)
-        }
-        if len(entries) < len(value):
-            raise UserError(f"{document.at(key)}: {key} names one of them twice")
-    elif isinstance(value, list):
-        raise UserError(f"{document.at(key)}: {key} must list names, or map them to settings")
-    else:
-        entries = {
-            label: ((key, label), document.mapping(entry, key, label))
-            for label, entry in document.mapping(value, key).items()
-        }
-    if not entries:
-        raise UserError(f"{document.at(key)}: {key} must list at least one name")
-    for keys, entry in entries.values():
-        document.check_budget(entry, *keys)
-    return entries
-
-
-def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[AgentSpec, ...]:
-    shared_sweep = _sweep(document, data)
+def _agents(document: _Lines, file: _File) -> list[AgentSpec]:
     agents: list[AgentSpec] = []
-    for label, (keys, entry) in _entries(document, data, "agents").items():
-        algo = entry.get("algo", label)
-        if not (isinstance(algo, str) and algo in ALGORITHMS):
-            place = document.at(*keys, "algo") if "algo" in entry else document.at(*keys)
-            raise unknown(f"{place}: unknown agent", str(algo), ALGORITHMS)
-        values = document.values(entry, {"tuned": bool, "summary": str}, *keys)
-        values["conf_file"] = _conf_file(document, entry, keys)
-        settings = {key: entry[key] for key in entry if key not in _AGENT_KEYS}
-        values = {"tuned": tuned, "where": document.at(*keys), **values}
-        agent = AgentSpec(label, algo, settings, **values)
-        sweep = {**shared_sweep, **_sweep(document, entry, *keys)}
+    for label, entry in file.agents.items():
+        keys = ("agents", label)
+        algo = label if entry.algo is None else entry.algo
+        if algo not in ALGORITHMS:
+            raise unknown(f"{document.at(*keys, 'algo')}: unknown agent", algo, ALGORITHMS)
+        conf_file = None
+        if entry.conf_file is not None:
+            place = f"{document.at(*keys, 'conf_file')}: conf_file"
+            conf_file = document.path.parent / entry.conf_file
+            if entry.tuned is False:
+                raise UserError(f"{place} and tuned: false contradict each other: leave one out")
+            if not conf_file.is_file():
+                raise UserError(f"{place}: there is no file {conf_file}")
+        agent = AgentSpec(
+            label,
+            algo,
+            entry.settings,
+            tuned=file.tuned if entry.tuned is None else entry.tuned,
+            conf_file=conf_file,
+            summary=entry.summary,
+            where=document.at(*keys),
+        )
+        sweep = {**file.sweep, **entry.sweep}
         n_agents = len(agents) + math.prod(map(len, sweep.values()))
         if n_agents > MOST_AGENTS:
-            place = document.at(*keys)
             raise UserError(
-                f"{place}: {n_agents:,} agents up to here; a study has {MOST_AGENTS:,} at most"
+                f"{agent.where}: {n_agents:,} agents up to here; a study has {MOST_AGENTS:,} at "
+                "most"
             )
         agents += swept(agent, sweep)
     if len({agent.group for agent in agents}) == 1 and agents[0].swept:
         agents = [replace(a, label=a.label.removeprefix(f"{a.group} with ")) for a in agents]
-    return tuple(agents)
-
-
-def _conf_file(document: _Document, entry: Mapping[str, Any], keys: Keys) -> Path | None:
-    """The agent's own file of hyperparameters, relative to the study; refuses ``tuned: false``."""
-    given = entry.get("conf_file")
-    if given is None:
-        return None
-    place = f"{document.at(*keys, 'conf_file')}: conf_file"
-    path = document.path.parent / str(coerce(given, str, place))
-    if entry.get("tuned") is False:
-        raise UserError(f"{place} and tuned: false contradict each other: leave one out")
-    if not path.is_file():
-        raise UserError(f"{place}: there is no file {path}")
-    return path
-
-
-def _sweep(document: _Document, data: Mapping[str, Any], *keys: str | int) -> dict[str, list[Any]]:
-    sweep = document.mapping(data.get("sweep"), *keys, "sweep")
-    for name, values in sweep.items():
-        if not (isinstance(values, list) and values):
-            place = document.at(*keys, "sweep", name)
-            raise UserError(f"{place}: {name} must be a list of values, not {shown(values)}")
-    return sweep
-
-
-def _as_texts(values: Sequence[Any]) -> list[str]:
-    """Values for labels: numbers with four digits if these distinguish them."""
-    short = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in values]
-    return short if len(set(short)) == len(set(map(str, values))) else [str(v) for v in values]
-
-
-def swept(agent: AgentSpec, sweep: Mapping[str, Sequence[Any]]) -> list[AgentSpec]:
-    """The agent for each combination of swept values, labelled by these values."""
-    agents = []
-    texts = {name: _as_texts(values) for name, values in sweep.items()}
-    for places in product(*(range(len(values)) for values in sweep.values())):
-        at = dict(zip(sweep, places, strict=True))
-        chosen = {name: sweep[name][place] for name, place in at.items()}
-        each = [f"{symbol(name)} = {texts[name][place]}" for name, place in at.items()]
-        label = " with ".join([agent.label, *each])
-        settings = layered(agent.settings, chosen)
-        agents.append(
-            replace(agent, label=label, settings=settings, group=agent.label, swept=chosen)
-        )
     return agents
 
 
 def _environments(
-    document: _Document, data: Mapping[str, Any], shared: Mapping[str, Any]
-) -> tuple[EnvironmentSpec, ...]:
-    environments = []
-    for label, (keys, entry) in _entries(document, data, "environments").items():
-        env_id = entry.get("id", label)
-        if not isinstance(env_id, str):
-            raise UserError(f"{document.at(*keys, 'id')}: id must be a text, not {shown(env_id)}")
+    document: _Lines, file: _File, shared: Mapping[str, Any]
+) -> Iterator[EnvironmentSpec]:
+    for label, entry in file.environments.items():
+        env_id = label if entry.id is None else entry.id
         try:
             check_env_id(env_id)
         except UserError as error:
-            place = document.at(*keys, "id") if "id" in entry else document.at(*keys)
-            raise UserError(f"{place}: {error}") from error
-        own = {key: value for key, value in entry.items() if key not in ("id", "as_it_comes")}
-        values = document.values(entry, {"as_it_comes": bool}, *keys)
-        if values.get("as_it_comes"):
-            own = {**AS_IT_COMES, **own}
-        environments.append(EnvironmentSpec(label, env_id, layered(shared, own)))
-    return tuple(environments)
+            raise UserError(f"{document.at('environments', label, 'id')}: {error}") from error
+        as_it_comes = AS_IT_COMES if entry.as_it_comes else {}
+        yield EnvironmentSpec(label, env_id, layered(shared, {**as_it_comes, **entry.settings}))

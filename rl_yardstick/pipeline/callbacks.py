@@ -1,11 +1,11 @@
-"""Callbacks of a training: evaluations, checkpoints, pulls, and callbacks from settings."""
+"""Callbacks of a training: evaluations, checkpoints, states, checks of numbers, pulls."""
 
 from __future__ import annotations
 
 import math
+import pickle
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from rl_yardstick.agents.bandits.runs import PullLog
 from rl_yardstick.agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from rl_yardstick.machine_code import WorkTime
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.critics import CriticRecorder
+from rl_yardstick.pipeline.evaluation.judge import Judge
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
 from rl_yardstick.pipeline.files import replacing
@@ -35,74 +35,37 @@ from rl_yardstick.pipeline.finite_numbers import (
     check_rows,
     is_finite,
 )
-from rl_yardstick.pipeline.models.find import checkpoint_file
-from rl_yardstick.pipeline.models.load import save_model, save_normalization, save_replay_buffer
-from rl_yardstick.pipeline.runs import LAST_PULLS, PULLS_FILE, Run
-from rl_yardstick.pipeline.settings import components
-from rl_yardstick.pipeline.stopping import current
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.run import LAST_PULLS, PULLS_FILE, Run
+from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.states import load_state, roots_of, save_state
 
-# --- callbacks for settings: checkpoints, and exploration that decays per update ------------------
+# --- checkpoints, and exploration that decays per update ------------------------------------------
 
 
-class Checkpoint(BlockCallback):
-    """Base class of checkpoints: saves the agent as ``rl_model_<steps>_steps.zip``.
+class StepCheckpoint(BlockCallback):
+    """Saves ``rl_model_<steps>_steps.zip`` every ``every_n_steps`` steps of all environments."""
 
-    It also saves VecNormalize statistics, under the file name of `CheckpointCallback`, and
-    optionally the replay buffer.
-    """
-
-    def __init__(self, save_path: str | Path, with_replay_buffer: bool = False) -> None:
+    def __init__(self, run: Run, every_n_steps: int, with_replay_buffer: bool = False) -> None:
         super().__init__()
-        self.save_path = Path(save_path)
+        self.run, self.every_n_steps = run, every_n_steps
         self.with_replay_buffer = with_replay_buffer
 
-    def save(self) -> None:
-        """Write the current agent."""
-        path = self.save_path / f"rl_model_{self.num_timesteps}_steps.zip"
-        with current().held():
-            save_model(self.model, path)
-            save_normalization(self.model, checkpoint_file(path, "vecnormalize"))
-            if self.with_replay_buffer:
-                save_replay_buffer(self.model, checkpoint_file(path, "replay_buffer"))
-
-
-class StepCheckpoint(Checkpoint):
-    """Saves a checkpoint every ``every_n_steps`` steps, counted over all environments."""
-
-    def __init__(
-        self, every_n_steps: int, save_path: str | Path, with_replay_buffer: bool = False
-    ) -> None:
-        super().__init__(save_path, with_replay_buffer)
-        if every_n_steps < 1:
-            raise ValueError(f"every_n_steps must be at least 1, not {every_n_steps}")
-        self.every_n_steps = every_n_steps
-
     def _on_step(self) -> bool:
-        self.save()
+        save_checkpoint(self.run, self.model, self.with_replay_buffer)
         return True
 
 
-class EpisodeCheckpoint(Checkpoint):
-    """Saves a checkpoint every ``every_n_episodes`` episodes, counted over all environments.
+class EpisodeCheckpoint(BlockCallback):
+    """Saves a checkpoint every ``every_n_episodes`` episodes of all environments."""
 
-    Args:
-        every_n_episodes: episodes between two checkpoints, at least 1.
-        save_path: the target folder; in a hyperparameter file, by default the run folder.
-        with_replay_buffer: also write the agent's replay buffer, if it has one.
-    """
-
-    def __init__(
-        self, every_n_episodes: int, save_path: str | Path, with_replay_buffer: bool = False
-    ) -> None:
-        super().__init__(save_path, with_replay_buffer)
-        if every_n_episodes < 1:
-            raise ValueError(f"every_n_episodes must be at least 1, not {every_n_episodes}")
-        self.every_n_episodes = every_n_episodes
+    def __init__(self, run: Run, every_n_episodes: int, with_replay_buffer: bool = False) -> None:
+        super().__init__()
+        self.run, self.every_n_episodes = run, every_n_episodes
+        self.with_replay_buffer = with_replay_buffer
         self.episodes_seen = 0
 
     def horizon(self) -> Horizon:
-        return Horizon(episodes=self.every_n_episodes - self.episodes_seen % self.every_n_episodes)
+        return Horizon(episodes=calls_until_multiple(self.episodes_seen, self.every_n_episodes))
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
         super().pass_over(n_calls, n_episodes)
@@ -112,8 +75,17 @@ class EpisodeCheckpoint(Checkpoint):
         before = self.episodes_seen
         self.episodes_seen += int(np.sum(self.locals["dones"]))
         if self.episodes_seen // self.every_n_episodes > before // self.every_n_episodes:
-            self.save()
+            save_checkpoint(self.run, self.model, self.with_replay_buffer)
         return True
+
+
+def save_checkpoint(run: Run, model: Any, with_replay_buffer: bool) -> None:
+    """Save the current agent, its statistics, and its replay buffer, if that is asked for."""
+    steps = model.num_timesteps
+    run.save(model, run.path / f"rl_model_{steps}_steps.zip")
+    if with_replay_buffer and getattr(model, "replay_buffer", None) is not None:
+        with replacing(run.path / f"rl_model_replay_buffer_{steps}_steps.pkl") as beside:
+            model.save_replay_buffer(beside)
 
 
 class ExponentialExploration(BaseCallback):
@@ -129,18 +101,15 @@ class ExponentialExploration(BaseCallback):
         self, initial_eps: float = 1.0, final_eps: float = 0.01, decay: float = 0.995
     ) -> None:
         super().__init__()
-        self.initial_eps = initial_eps
-        self.final_eps = final_eps
-        self.decay = decay
+        self.initial_eps, self.final_eps, self.decay = initial_eps, final_eps, decay
         for name in ("initial_eps", "final_eps", "decay"):
             if not 0 <= (value := getattr(self, name)) <= 1:
                 raise ValueError(f"{name} must lie between 0 and 1, not {value}")
 
-    def check_model(self, model: BaseAlgorithm) -> None:
-        """Raise ValueError for agents other than DQN and its subclasses."""
-        if not isinstance(model, DQN):
-            name = type(model).__name__
-            raise ValueError(f"ExponentialExploration is for DQN and subclasses, not for {name}")
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, DQN):
+            name = type(self.model).__name__
+            raise UserError(f"ExponentialExploration is for DQN and subclasses, not for {name}")
 
     def _on_rollout_start(self) -> None:
         updates = self.model._n_updates
@@ -154,18 +123,78 @@ class ExponentialExploration(BaseCallback):
         return True
 
 
-# --- non-finite numbers end a training ------------------------------------------------------------
+# --- states ---------------------------------------------------------------------------------------
 
-# The log entries with losses of the library's agents. Other entries may be nan, for example the
-# explained variance of constant returns.
-LOSSES = (
-    "train/loss",
-    "train/actor_loss",
-    "train/critic_loss",
-    "train/ent_coef_loss",
-    "train/value_loss",
+
+class StateCallback(BlockCallback):
+    """Saves the training's state now and then, and ends the training after a signal.
+
+    Both happen at a safe moment: after the last update and before the next step. At the first one
+    of a resumed run, the saved state is put back.
+
+    Attributes:
+        others: the other callbacks, whose state is saved too.
+        share_of_time: the share of the time that saving may take.
+        shortest_pause: seconds between two states.
+    """
+
+    takes_blocks = True
+    share_of_time, shortest_pause = 0.02, 1.0
+
+    def __init__(self, run: Run, resumes: bool, clock: Any, judge: Judge) -> None:
+        super().__init__()
+        self.run, self.resumes, self.clock = run, resumes, clock
+        self.evaluator = judge.evaluator
+        self.process = {"run": run, "exact": judge.exact, "eval_env": judge.env}
+        self.is_possible = True
+        self.others: list[BaseCallback] = []
+        self.saved_at, self.pause = time.monotonic(), self.shortest_pause
+
+    def wants_position(self) -> bool:
+        return self.resumes or self._is_due() or bool(self.run.stop.number)
+
+    def _is_due(self) -> bool:
+        return self.is_possible and time.monotonic() - self.saved_at >= self.pause
+
+    def _roots(self) -> dict[str, Any]:
+        roots = roots_of(self.model, self.others, **self.process)
+        is_exact = self.evaluator is self.process["exact"]  # which has no state of its own
+        return roots if is_exact else {**roots, "evaluator": self.evaluator}
+
+    def _on_rollout_start(self) -> None:
+        if self.resumes:
+            load_state(self.run.state_path, self._roots())
+            self.resumes = False
+            self.run.console.print(f"resuming at step {self.model.num_timesteps:,}")
+        elif self._is_due() or (self.is_possible and self.run.stop.number):
+            self.save()
+        self.run.has_begun = True
+        self.run.stop.check()
+
+    def save(self) -> None:
+        """Save the state; called between two updates."""
+        begun = time.monotonic()
+        self.clock.stop()
+        try:
+            save_state(self.run.state_path, self._roots(), ("logger", *self.process))
+        except (TypeError, AttributeError, ValueError, pickle.PicklingError) as error:
+            self.is_possible = False
+            self.run.console.print(
+                f"no state can be saved, so the training cannot be resumed: {one_line(error)}"
+            )
+        self.saved_at = time.monotonic()
+        self.pause = max((self.saved_at - begun) / self.share_of_time, self.shortest_pause)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+# --- numbers that are not finite end a training ---------------------------------------------------
+
+# Log entries of the library's agents. Others may be nan, as the explained variance of constants.
+_LOSSES = tuple(
+    f"train/{name}" for name in ("loss", "actor_loss", "critic_loss", "ent_coef_loss", "value_loss")
 )
-
 _NO_EPISODE: Mapping[str, float] = {"r": 0.0}
 
 
@@ -175,17 +204,17 @@ class NumberWatch(BlockCallback):
     takes_blocks = True
 
     def update_locals(self, locals_: dict[str, Any]) -> None:
-        """Store the training loop's variables without a copy, because this runs at each step."""
+        """Keep the training loop's variables without a copy, because this runs at each step."""
         self.locals = locals_
 
     def _on_training_start(self) -> None:
-        when = f"at step {self.model.num_timesteps:,}"
         if self.model._last_obs is not None:
+            when = f"at step {self.model.num_timesteps:,}"
             check_rows(self.model._last_obs, "observation", when)
 
     def _on_rollout_start(self) -> None:
         log = self.model.logger.name_to_value
-        for name in LOSSES:
+        for name in _LOSSES:
             if name in log and not isfinite(log[name]):
                 raise NotFiniteError(f"{name} at step {self.model.num_timesteps:,}", log[name])
 
@@ -221,13 +250,13 @@ class NumberWatch(BlockCallback):
 class PullSummary:
     """Summary of the pulls of a training."""
 
-    n_pulls: int  # over all environments
-    n_matched: int  # pulls with a reward in the log; all pulls without a log
-    reward: float | None  # mean of the matched pulls; None if no pull matched
-    # sum over pulls of the best expected reward minus that of the pulled arm; None if expected
-    # rewards are unknown, as with a log
+    n_pulls: int  #: over all environments
+    n_matched: int  #: pulls with a reward in the log; all pulls without a log
+    reward: float | None  #: mean of the matched pulls; None if no pull matched
+    #: sum over pulls of the best expected reward minus that of the pulled arm; None if expected
+    #: rewards are unknown, as with a log
     regret: float | None
-    optimal: float | None  # share of best arms among the last pulls; None as for ``regret``
+    optimal: float | None  #: share of best arms among the last pulls; None as for ``regret``
 
 
 def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
@@ -251,56 +280,46 @@ class PullRecorder(PullLog):
         self.folder = folder
 
     def _on_training_end(self) -> None:
-        self.write()
-
-    def write(self) -> None:
-        """Write the pulls up to now."""
-        with replacing(self.folder / PULLS_FILE) as file:
-            np.savez(file, allow_pickle=False, **self.arrays())
+        with replacing(self.folder / PULLS_FILE) as beside:
+            np.savez(beside, allow_pickle=False, **self.arrays())
 
 
-# --- evaluations during training: when they are due, and what they store --------------------------
+# --- evaluations during training: when they are due, and what they leave --------------------------
 
 SECONDS_BETWEEN_WRITES = 1.0
+EVALUATIONS_PER_RUN = 20
 
 
 class EvaluationCallback(EvalCallback):
-    """An `EvalCallback` with a given evaluation function and atomically written files.
+    """An `EvalCallback` with an evaluator of ours: ``evaluations.npz`` and ``best_model.zip``.
 
-    It writes ``evaluations.npz`` and ``best_model.zip`` with its VecNormalize statistics. It
-    triggers the same callbacks and log entries as its base class.
+    Attributes:
+        eval_freq: calls of ``VecEnv.step`` between two evaluations; 0 for none.
+        eval_episode_freq: episodes between two evaluations, likewise.
+        taken: the time of all evaluations.
+        n_episodes: of each evaluation; 0 if it is exact.
     """
+
+    excluded_from_states = ("eval_env", "taken")
 
     def __init__(
         self,
         run: Run,
         eval_env: VecEnv,
-        evaluator: Callable[[BaseAlgorithm], Evaluation],
-        eval_freq: int,
-        eval_episode_freq: int = 0,
-        callback_after_eval: BaseCallback | None = None,
+        evaluator: Any,
+        frequencies: tuple[int, int],
         value_maps: ValueMapRecorder | None = None,
         critics: CriticRecorder | None = None,
-        during: Callable[[str], AbstractContextManager[object]] = nullcontext,
     ) -> None:
-        # Calls of `VecEnv.step` between two evaluations, or episodes; 0 for none.
-        super().__init__(
-            eval_env, callback_after_eval=callback_after_eval, eval_freq=eval_freq, verbose=0
-        )
-        self.eval_episode_freq = eval_episode_freq
-        self.run = run
-        self.evaluator = evaluator
-        self.value_maps = value_maps
-        self.critics = critics  # with ``--diagnose``
-        self.during = during  # shows the activity during evaluations
+        super().__init__(eval_env, eval_freq=frequencies[0], verbose=0)
+        self.eval_episode_freq = frequencies[1]
+        self.run, self.evaluator = run, evaluator
+        self.value_maps, self.critics = value_maps, critics
         self.episodes_seen = 0
-        self.last_evaluation: Evaluation | None = None
-        self.best_timesteps = 0
-        self.best_episodes = 0
-        self.taken = WorkTime()  # the total time of evaluations
-        self.n_episodes: list[int] = []  # of each evaluation; 0 if it is exact
-        self._is_written = True
-        self._written_at = -np.inf
+        self.best_timesteps = self.best_episodes = 0
+        self.taken = WorkTime()
+        self.n_episodes: list[int] = []
+        self._written_at = -math.inf
 
     def horizon(self) -> Horizon:
         """When the next evaluation is due."""
@@ -316,8 +335,13 @@ class EvaluationCallback(EvalCallback):
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether evaluations during training are requested."""
+        """Whether there are evaluations during training."""
         return self.eval_freq > 0 or self.eval_episode_freq > 0
+
+    @property
+    def best(self) -> float | None:
+        """The best mean return of all evaluations in training."""
+        return self.best_mean_reward if self.best_timesteps else None
 
     def _init_callback(self) -> None:
         """Skip the library's check that training and evaluation environments have one type."""
@@ -330,42 +354,37 @@ class EvaluationCallback(EvalCallback):
             is_due |= self.episodes_seen // every > before // every
         if is_due and isinstance(self.evaluator, SampledEvaluator):
             is_due = self.evaluator.can_afford(self.model, self.episodes_seen)
-        return self.evaluate_now() if is_due else True
+        return self.evaluate() if is_due else True
 
     def _on_training_end(self) -> None:
         self.write()
 
-    @contextmanager
-    def timed(self) -> Iterator[None]:
-        """Add the duration of the ``with`` statement to the time of evaluations."""
-        begun = WorkTime.now()
-        try:
-            yield
-        finally:
-            self.taken += WorkTime.now() - begun
-
-    def evaluate_now(self) -> bool:
+    def evaluate(self) -> bool:
         """Evaluate the current agent; False if a callback asks to stop the training."""
         check_model(self.model)
         self.take_statistics()
-        with self.during("evaluating"), self.timed():
-            evaluation = self.evaluator(self.model)
-        self.last_evaluation = evaluation
-        self.last_mean_reward = evaluation.mean_return
-        self._append(evaluation)
+        begun = WorkTime.now()
+        found: Evaluation = self.evaluator(self.model)
+        self.taken += WorkTime.now() - begun
+        self.last_mean_reward = found.mean_return
+        self.evaluations_timesteps.append(self.num_timesteps)
+        self.evaluations_results.append(found.returns.tolist())
+        self.evaluations_length.append(found.lengths.tolist())
+        if found.successes is not None:
+            self.evaluations_successes.append(found.successes.tolist())
+        self.n_episodes.append(0 if found.is_exact else len(found.returns))
+        # Replacing a file takes longer than an exact evaluation.
+        if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
+            self.write()
         if self.value_maps is not None:
             self.value_maps.record(self.model, self.num_timesteps)
         if self.critics is not None:
             self.critics.judge(self.num_timesteps, self.episodes_seen)
-        self._log(evaluation)
-        if evaluation.mean_return > self.best_mean_reward:
-            self.best_mean_reward = evaluation.mean_return
-            self.best_timesteps = self.num_timesteps
-            self.best_episodes = self.n_episodes[-1]
-            best = self.run.best_model_path
-            with current().held():
-                save_model(self.model, best)
-                save_normalization(self.model, checkpoint_file(best, "vecnormalize"))
+        self._log(found)
+        if found.mean_return > self.best_mean_reward:
+            self.best_mean_reward = found.mean_return
+            self.best_timesteps, self.best_episodes = self.num_timesteps, self.n_episodes[-1]
+            self.run.save(self.model, self.run.best_model_path)
         return self._on_event() if self.callback is not None else True
 
     def take_statistics(self) -> None:
@@ -373,21 +392,9 @@ class EvaluationCallback(EvalCallback):
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
 
-    def _append(self, evaluation: Evaluation) -> None:
-        self.evaluations_timesteps.append(self.num_timesteps)
-        self.evaluations_results.append(evaluation.returns.tolist())
-        self.evaluations_length.append(evaluation.lengths.tolist())
-        if evaluation.successes is not None:
-            self.evaluations_successes.append(evaluation.successes.tolist())
-        self.n_episodes.append(0 if evaluation.is_exact else len(evaluation.returns))
-        self._is_written = False
-        # Replacing a file takes longer than an exact evaluation.
-        if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
-            self.write()
-
     def write(self) -> None:
-        """Write the evaluations that are not written yet."""
-        if self._is_written:
+        """Write ``evaluations.npz``."""
+        if not self.evaluations_timesteps:
             return
         arrays: dict[str, Any] = {
             "timesteps": self.evaluations_timesteps,
@@ -398,19 +405,20 @@ class EvaluationCallback(EvalCallback):
             arrays["successes"] = _table(self.evaluations_successes)
         if len(set(self.n_episodes)) > 1:
             arrays["n_episodes"] = self.n_episodes
-        with replacing(self.run.evaluations_path) as file:
-            np.savez(file, **arrays)
-        self._is_written, self._written_at = True, time.monotonic()
+        with replacing(self.run.path / "evaluations.npz") as beside:
+            np.savez(beside, **arrays)
+        self._written_at = time.monotonic()
 
-    def _log(self, evaluation: Evaluation) -> None:
-        self.logger.record("eval/mean_reward", evaluation.mean_return)
-        self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
-        if evaluation.success_rate is not None:
-            self.logger.record("eval/success_rate", evaluation.success_rate)
-        if evaluation.yardstick is not None:
-            self.logger.record("eval/gap", evaluation.yardstick.gap(evaluation.mean_return))
-            self.logger.record("eval/score", evaluation.yardstick.score(evaluation.mean_return))
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+    def _log(self, found: Evaluation) -> None:
+        record = self.logger.record
+        record("eval/mean_reward", found.mean_return)
+        record("eval/mean_ep_length", float(found.lengths.mean()))
+        if found.success_rate is not None:
+            record("eval/success_rate", found.success_rate)
+        if found.yardstick is not None:
+            record("eval/gap", found.yardstick.gap(found.mean_return))
+            record("eval/score", found.yardstick.score(found.mean_return))
+        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
 
@@ -420,43 +428,14 @@ def _table(rows: list[list[Any]]) -> NDArray[Any]:
     return np.array([row * (width // len(row)) for row in rows])
 
 
-# --- the callbacks of a training ------------------------------------------------------------------
-
-EVALUATIONS_PER_RUN = 20
-
-
-def named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[BaseCallback]:
-    """The callbacks from the hyperparameters, and the requested checkpoints."""
-    callbacks: list[BaseCallback] = components.callbacks(
-        spec.hyperparams.callback, spec.gym_packages, run.path
-    )
-    for callback in callbacks:
-        if isinstance(callback, ExponentialExploration):
-            callback.check_model(model)
-    if spec.hyperparams.n_episodes is not None and isinstance(model, OnPolicyAlgorithm):
-        schedules = [getattr(model, name, None) for name in ("lr_schedule", "clip_range")]
-        if any(callable(s) and s(1.0) != s(0.0) for s in schedules):
-            raise UserError(
-                f"the schedules of {spec.algo} run by steps: give n_timesteps instead of "
-                "n_episodes, or constant values"
-            )
-    if spec.save_freq > 0:
-        callbacks.append(StepCheckpoint(spec.save_freq, run.path, spec.save_replay_buffer))
-    if spec.save_every_n_episodes > 0:
-        every = spec.save_every_n_episodes
-        callbacks.append(EpisodeCheckpoint(every, run.path, spec.save_replay_buffer))
-    return callbacks
-
-
-def evaluation_intervals(
-    spec: TrainSpec, n_envs: int, is_judged_by_regret: bool
+def evaluation_frequencies(
+    spec: TrainSpec, agent: BaseAlgorithm, by_regret: bool
 ) -> tuple[int, int]:
-    """Calls of `VecEnv.step`, and episodes, between two evaluations; 0 for none."""
+    """Calls of ``VecEnv.step``, and episodes, between two evaluations; 0 for none."""
     if spec.eval_freq is not None:
-        return (max(spec.eval_freq // n_envs, 1), 0) if spec.eval_freq > 0 else (0, 0)
-    if is_judged_by_regret:
-        # Evaluation episodes may have other arms, so training pulls are more informative.
+        return (max(spec.eval_freq // agent.n_envs, 1), 0) if spec.eval_freq > 0 else (0, 0)
+    if by_regret:  # evaluation episodes may have other arms: training's pulls tell more
         return 0, 0
-    if spec.hyperparams.n_timesteps is not None:
-        return max(spec.hyperparams.n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1), 0
-    return 0, -(-(spec.hyperparams.n_episodes or 1) // EVALUATIONS_PER_RUN)
+    if spec.n_timesteps is not None:
+        return max(spec.n_timesteps // EVALUATIONS_PER_RUN // agent.n_envs, 1), 0
+    return 0, -(-(spec.n_episodes or 1) // EVALUATIONS_PER_RUN)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.pipeline.runs import LAST_PULLS, Run
+from rl_yardstick.pipeline.run import LAST_PULLS
 from rl_yardstick.safe_files.files import NO_LIMIT, read_file
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ def write_png(figure: Figure, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas: Any = FigureCanvasAgg(figure)
-    with replacing(path) as file:
-        canvas.print_png(file)
+    with replacing(path) as beside:
+        canvas.print_png(beside)
 
 
 # Okabe and Ito's colours, which colour-blind readers can distinguish.
@@ -147,7 +147,7 @@ def _places(figure: Figure, *, apart: bool) -> tuple[Axes, Axes]:
 
 
 def draw_learning_curve(
-    run: Run,
+    folder: Path,
     title: str,
     first_step: int = 0,
     yardstick: Yardstick | None = None,
@@ -159,10 +159,10 @@ def draw_learning_curve(
     from matplotlib.lines import Line2D
 
     figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
-    steps, returns = read_monitors(run.path)
+    steps, returns = read_monitors(folder)
     evaluated_at = means = np.empty(0)
-    if run.evaluations_path.exists():
-        with np.load(BytesIO(read_file(run.evaluations_path, NO_LIMIT))) as arrays:
+    if (folder / "evaluations.npz").exists():
+        with np.load(folder / "evaluations.npz") as arrays:
             evaluated_at, means = arrays["timesteps"], arrays["results"].mean(axis=1)
     has_judgement = len(means) > 0 or yardstick is not None
     apart = on_variant and len(steps) > 0 and has_judgement
@@ -187,7 +187,7 @@ def draw_learning_curve(
             if isinstance(handle, Line2D) and handle.get_color() == GREY:
                 handle.set(markersize=6, alpha=1)  # a dot of the drawn size is hard to see
     fix_layout(figure)
-    write_png(figure, run.curve_path)
+    write_png(figure, folder / "learning_curve.png")
 
 
 def _style(axes: Axes) -> None:
@@ -236,11 +236,11 @@ def read_diagnosis(content: bytes) -> dict[str, Floats]:
     return dict(zip(names, np.array(table).T, strict=True))
 
 
-def draw_diagnosis(run: Run, title: str) -> None:
+def draw_diagnosis(folder: Path, title: str) -> None:
     """Draw the errors of values, advantages and gradients during training."""
     from matplotlib.figure import Figure
 
-    found = read_diagnosis(read_file(run.diagnosis_path, NO_LIMIT))
+    found = read_diagnosis((folder / "diagnosis.csv").read_bytes())
     panels = {word: [n for n in names if n in found] for word, names in PANELS.items()}
     panels = {word: names for word, names in panels.items() if names}
     n_rows = -(-len(panels) // 3)
@@ -259,7 +259,7 @@ def draw_diagnosis(run: Run, title: str) -> None:
         _style(axes)
     figure.suptitle(title, x=0.01, ha="left")
     fix_layout(figure)
-    write_png(figure, run.path / "diagnosis.png")
+    write_png(figure, folder / "diagnosis.png")
 
 
 def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> None:

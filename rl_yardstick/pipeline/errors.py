@@ -93,3 +93,15 @@ def unknown(what: str, name: str, known: Iterable[str], n: int = 1) -> UserError
 def one_line(error: BaseException) -> str:
     """The message of an exception in one line, or its type if it has no message."""
     return " ".join(str(error).split()) or type(error).__name__
+
+
+class Stopped(Exception):  # noqa: N818  # no error
+    """A signal has ended the work at a safe moment.
+
+    Attributes:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number

@@ -1,157 +1,137 @@
-"""Writes files atomically, makes portable file names, and converts values to JSON."""
+"""Files: read with a limit, written beside their name and renamed into place."""
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import hashlib
+import io
 import json
 import math
 import os
 import re
 import secrets
-import sys
-import time
-from collections.abc import Iterator, Mapping
+import stat
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from io import BufferedWriter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-# Fails if the name exists, even as a link.
-NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+from rl_yardstick.pipeline.errors import UserError
 
-# Windows limits a whole path to 260 characters, Linux a name to 255 bytes.
-LONGEST_NAME = 100  # bytes
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAX_TEXT = 10_000_000  # bytes of a settings file
+MAX_ARRAYS = 1 << 31  # bytes of an archive of arrays
+LONGEST_NAME = 100  # bytes; Windows limits a whole path to 260 characters
 
 _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
-# Names of the temporary files of `replacing`.
-_DRAFT = re.compile(r"\..+\.[0-9a-f]{16}\.tmp", re.DOTALL)
-_DEVICE = re.compile(r"(con|prn|aux|nul|(con(in|out)\$)|(com|lpt)[0-9¹²³]) *(\.|$)", re.IGNORECASE)
-
-# Errors while writing for which the system does not name the file.
-DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.EIO)})
-
-# Errors for parent folders of other users, and for file systems that cannot flush folders.
-_CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
-
-_SYNCED_AT_ONCE = 8
-
-# Windows refuses to rename a file that a reader or virus scanner has open, mostly briefly.
-_PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
 
 
 def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
     """The name, or a similar one of at most ``longest`` bytes that is valid on every system."""
     plain = _REFUSED_SIGNS.sub("_", name) or "_"
-    is_device = _DEVICE.match(plain) is not None
-    if plain == name and not is_device and len(name.encode(errors="surrogatepass")) <= longest:
+    if plain == name and len(name.encode()) <= longest:
         return name
-    if is_device:
-        plain = plain.replace(".", "_")  # "nul.txt" is a device name too
-    digest = hashlib.sha256(name.encode(errors="surrogatepass")).hexdigest()[:8]
+    digest = hashlib.sha256(name.encode(errors="replace")).hexdigest()[:8]
     kept = plain.encode(errors="replace")[: longest - len(digest) - 1]
     return f"{kept.decode(errors='ignore')}-{digest}"
 
 
-def put_in_place(draft: Path, path: Path) -> None:
-    """Rename a file or folder to ``path`` atomically."""
-    for pause in (*(_PAUSES if sys.platform == "win32" else ()), None):
-        try:
-            os.replace(draft, path)
-            return
-        except PermissionError:
-            if pause is None:
-                raise
-            time.sleep(pause)
+def read_bytes(path: Path, limit: int = MAX_TEXT) -> bytes:
+    """The content of a regular file of at most ``limit`` bytes.
+
+    Raises:
+        UserError: if the file is missing, unreadable, too large, or not a regular file.
+    """
+    try:
+        # Without O_NONBLOCK, opening a named pipe waits for somebody who writes to it.
+        number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        with os.fdopen(number, "rb") as file:
+            status = os.fstat(number)
+            if not stat.S_ISREG(status.st_mode):
+                raise UserError(f"{path} is not a regular file")
+            if status.st_size > limit:
+                raise UserError(f"{path}: {status.st_size:,} bytes, the limit is {limit:,}")
+            return file.read(status.st_size)
+    except OSError as error:
+        raise UserError(f"{path}: {(error.strerror or str(error)).lower()}") from error
+
+
+def read_text(path: Path, limit: int = MAX_TEXT) -> str:
+    """The content of a UTF-8 text file."""
+    try:
+        return read_bytes(path, limit).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is no UTF-8 text: byte {error.start}") from error
+
+
+def read_json(path: Path, limit: int = MAX_TEXT) -> Any:
+    """The content of a JSON file."""
+    try:
+        return json.loads(read_text(path, limit))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is no valid JSON: {error}") from error
+
+
+def read_arrays(
+    path: Path, shapes: Mapping[str, str], optional: Collection[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Arrays of numbers in a NumPy archive, which is read as data.
+
+    Args:
+        path: the archive.
+        shapes: names of arrays, and of their axes: axes of one name must have the same length.
+        optional: names of arrays that may be missing.
+    """
+    from numpy.lib.format import read_array
+
+    from rl_yardstick.safe_files.archives import read_members
+
+    found: dict[str, NDArray[Any]] = {}
+    lengths: dict[str, int] = {}
+    try:
+        members = read_members(read_bytes(path, MAX_ARRAYS), most=100)
+        for name, axes in shapes.items():
+            if name in optional and f"{name}.npy" not in members:
+                continue
+            content = members[f"{name}.npy"]
+            found[name] = read_array(io.BytesIO(content), allow_pickle=False)
+            sizes = zip(axes.split(), found[name].shape, strict=True)
+            wanted = [int(a) if a.isdigit() else lengths.setdefault(a, n) for a, n in sizes]
+            if found[name].dtype.kind not in "biuf" or tuple(wanted) != found[name].shape:
+                raise ValueError(f"{name} has another shape or kind")
+    except (ValueError, LookupError, OverflowError, MemoryError) as error:
+        raise UserError(f"{path} is damaged: {error}") from error
+    return found
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Add ``path`` to OSErrors that name no file."""
+def replacing(path: Path) -> Iterator[Path]:
+    """A name beside ``path`` to write to, which then takes its place; the suffix is the same.
+
+    This is the only way in which a file gets its name, so files with their names are whole.
+    """
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
-        yield
-    except OSError as error:
-        if error.errno in DISK_ERRORS and error.filename is None:
+        yield beside
+        beside.replace(path)
+    except BaseException as error:
+        # Writing to a full disk names no file, and the name beside is an internal one.
+        if isinstance(error, OSError) and error.filename in (None, str(beside)):
             error.filename = str(path)
+        beside.unlink(missing_ok=True)
         raise
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[BufferedWriter]:
-    """Open a temporary file for writing, and rename it to ``path`` once it is complete.
-
-    Readers never see a half-written file, even if the process dies; a power cut may still lose the
-    file. A link or pipe at ``path`` is replaced, not written to.
-    """
-    # A predictable name might exist already, as a link to another user's file.
-    name = f".{path.name}.{secrets.token_hex(8)}.tmp"
-    draft = path.with_name(name)
-    with naming(path):
-        try:
-            with os.fdopen(os.open(draft, NEW, 0o666), "wb") as file:
-                yield file
-            put_in_place(draft, path)
-        except OSError as error:
-            if str(error.filename) == str(draft):  # an internal name
-                error.filename = str(path)
-            raise
-        finally:
-            with contextlib.suppress(OSError):  # fails on a disk that has become read-only
-                os.unlink(draft)
-
-
-def settle(folder: Path) -> None:
-    """Flush a folder and all its contents to disk."""
-    sync(*files_below(folder), *(Path(parent) for parent, *_ in os.walk(folder)))
-
-
-def sync(*paths: Path) -> None:
-    """Flush files and folders to disk, several at once."""
-    from concurrent.futures import ThreadPoolExecutor  # half of this module's import time
-
-    with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
-        list(pool.map(_sync, paths))
-
-
-def _sync(path: Path) -> None:
-    is_folder = path.is_dir()
-    if sys.platform == "win32" and is_folder:  # it journals names, and cannot flush folders
-        return
-    try:
-        # Windows flushes only files that are open for writing.
-        access = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
-        number = os.open(path, access)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
-    except OSError as error:
-        if not is_folder or error.errno not in _CANNOT_SYNC:
-            raise
-
-
-def files_below(folder: Path) -> list[Path]:
-    """The regular files in a folder and its subfolders, without links."""
-    paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
-    return [path for path in paths if path.is_file() and not path.is_symlink()]
-
-
-def drafts_in(folder: Path) -> list[Path]:
-    """The temporary files of `replacing` in a folder and its subfolders."""
-    return [path for path in files_below(folder) if _DRAFT.fullmatch(path.name)]
-
-
 def write_text(path: Path, text: str) -> None:
-    """Replace the file at ``path`` by ``text``, with the same bytes on every system."""
-    with replacing(path) as file:
-        file.write(text.encode())
+    """Write a text file whole or not at all, with the same bytes on every system."""
+    with replacing(path) as beside:
+        beside.write_bytes(text.encode())
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Replace the file at ``path`` by ``data`` as indented JSON; nan becomes null."""
-    with replacing(path) as file:
-        file.write(f"{json_text(data, indent=2)}\n".encode())
+    """Write ``data`` as indented JSON; nan becomes null."""
+    write_text(path, f"{json_text(data, indent=2)}\n")
 
 
 # A valid JSON number that is too large for a double: Python and browsers read it as infinity.
@@ -171,11 +151,7 @@ def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
         case None | bool() | int() | str():
             return value
         case _:
-            import numpy as np  # only here: `--help` does not need NumPy
-
-            if not isinstance(value, np.generic | np.ndarray):
-                raise TypeError(f"a {type(value).__name__} has no place in JSON")
-            return plain(value.tolist(), infinities)
+            return plain(value.tolist(), infinities)  # of NumPy
 
 
 def json_text(value: Any, indent: int | None = None) -> str:

@@ -6,6 +6,7 @@ import errno
 import importlib.util
 import io
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -16,8 +17,7 @@ import numpy as np
 from rl_yardstick.pipeline.environments import make_evaluation_env
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.pipeline.models.choose import ChosenModel
-from rl_yardstick.pipeline.models.load import take_over
+from rl_yardstick.pipeline.models import Model, take_statistics
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -25,39 +25,51 @@ if TYPE_CHECKING:
 
 RenderMode = Literal["human", "ansi", "rgb_array"]
 
-# In these modes, an environment returns frames instead of showing them.
-KEPT_MODES: tuple[RenderMode, ...] = ("ansi", "rgb_array")
-
-# After this many known frames in a row, an episode counts as repeating itself.
-FRAMES_OF_A_REPETITION = 20
-
 
 def playing_env(
-    chosen: ChosenModel,
+    model: Model,
     mode: RenderMode | None,
     n_envs: int = 1,
     monitor_folder: Path | None = None,
+    norm_reward: bool = False,
 ) -> VecEnv:
-    """Make the VecEnv for playing, with this render mode; `FrameTaker` returns its frames."""
+    """Make the VecEnv for playing.
+
+    Args:
+        model: the model to play.
+        mode: the render mode; `FrameTaker` returns the frames of ``ansi`` and ``rgb_array``.
+        n_envs: environments in it.
+        monitor_folder: where Monitors write.
+        norm_reward: whether returns are sums of normalised rewards, as in training.
+    """
     if mode == "rgb_array":
         # Rendering into memory needs no display, but SDL complains if there is none.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     extra = {} if mode is None else {"render_mode": mode}
     # A VecEnv resets a finished environment at once, so frames are stored before that.
     wrap_innermost = None
-    if mode in KEPT_MODES:
+    if mode in ("ansi", "rgb_array"):
         from gymnasium.wrappers import RenderCollection
 
         wrap_innermost = partial(RenderCollection, pop_frames=True, reset_clean=False)
-    spec = chosen.spec
-    env: VecEnv = make_evaluation_env(
-        spec, n_envs, wrap_innermost=wrap_innermost, monitor_folder=monitor_folder, **extra
-    )
+    spec = model.spec
+    env: VecEnv = make_evaluation_env(spec, n_envs, wrap_innermost, monitor_folder, **extra)
     if mode is not None and mode not in env.get_attr("metadata")[0].get("render_modes", []):
         raise UserError(f"{spec.env_id} cannot be rendered as {mode}")
-    if chosen.statistics is not None:
-        take_over(env, chosen.statistics)
-    return env
+    if model.statistics is not None:
+        take_statistics(env, model.statistics)
+    if not norm_reward:
+        return env
+    from stable_baselines3.common.vec_env import VecMonitor, unwrap_vec_normalize
+
+    normalization = unwrap_vec_normalize(env)
+    if normalization is None:
+        raise UserError("--norm-reward: no statistics of VecNormalize belong to this model")
+    normalization.norm_reward = True
+    with warnings.catch_warnings():
+        # Overwriting the statistics of the inner Monitor is intended.
+        warnings.filterwarnings("ignore", "The environment is already wrapped with a `Monitor`")
+        return VecMonitor(env)
 
 
 def play_episodes(
@@ -106,25 +118,6 @@ def play_episodes(
                 yield episode["r"], episode["l"]
 
 
-class Repetition:
-    """Detects that an episode only repeats frames."""
-
-    def __init__(self) -> None:
-        self._seen: set[Any] = set()
-        self._n_known = 0  # consecutive
-
-    def goes_on(self, frame: Any) -> bool:
-        """Whether this frame and the last `FRAMES_OF_A_REPETITION` were all shown before."""
-        self._n_known = self._n_known + 1 if frame in self._seen else 0
-        self._seen.add(frame)
-        return self._n_known > FRAMES_OF_A_REPETITION
-
-    def forget(self) -> None:
-        """Start again with another episode."""
-        self._seen.clear()
-        self._n_known = 0
-
-
 class FrameTaker:
     """Returns the frames of an environment of `playing_env`, separated by episode."""
 
@@ -151,8 +144,6 @@ def check_film_path(path: Path) -> None:
         raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
     if not path.absolute().parent.is_dir():
         raise UserError(f"--record: there is no folder {path.parent}")
-    if not os.access(path.absolute().parent, os.W_OK):
-        raise UserError(f"--record: nothing can be written in {path.parent}")
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise UserError("--record to .mp4 needs: pip install 'rl-yardstick[video]'")
 
@@ -161,22 +152,23 @@ def film_episode(
     model: BaseAlgorithm, env: VecEnv, max_steps: int, *, deterministic: bool
 ) -> tuple[list[Any], tuple[float, int] | None]:
     """Play an episode; returns its frames, and return and length, None if it did not end."""
-    taker = FrameTaker(env)
-    frames: list[Any] = []
-
-    def keep(done: bool) -> None:
-        frames.extend(taker.take(done))
-
-    played = play_episodes(model, env, 1, max_steps, deterministic=deterministic, after_step=keep)
-    ended = list(played)
-    return frames, ended[0] if ended else None
+    taker, frames = FrameTaker(env), list[Any]()
+    played = play_episodes(
+        model,
+        env,
+        1,
+        max_steps,
+        deterministic=deterministic,
+        after_step=lambda done: frames.extend(taker.take(done)),
+    )
+    return frames, next(played, None)
 
 
 def write_film(path: Path, frames: list[Any]) -> None:
     """Write frames, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
     film = _as_mp4(frames) if path.suffix == ".mp4" else as_gif(frames)
-    with replacing(path) as file:
-        file.write(film)
+    with replacing(path) as beside:
+        beside.write_bytes(film)
 
 
 def as_gif(frames: list[Any]) -> bytes:

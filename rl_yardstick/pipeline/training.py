@@ -1,321 +1,387 @@
-"""Runs a training from a spec to a finished folder: `prepare`, then `carry_out`."""
+"""A training from its spec to a finished folder: `train`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
-from signal import Signals
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import set_random_seed
 
+import rl_yardstick
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.agents.common.callbacks import BlockCallback, EpisodeBudget
 from rl_yardstick.machine_code import WorkTime
 from rl_yardstick.machine_code.compiling import compile_timer
-from rl_yardstick.pipeline import loading_libraries
-from rl_yardstick.pipeline.callbacks import PullSummary, summarise_pulls
-from rl_yardstick.pipeline.curve_pictures import draw_diagnosis, draw_learning_curve, draw_pulls
-from rl_yardstick.pipeline.environments import titled
-from rl_yardstick.pipeline.errors import UserError, one_line
-from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
-from rl_yardstick.pipeline.evaluation.value_maps import value_map
-from rl_yardstick.pipeline.failures import LibraryError, blame_settings, exits_as_mistakes
-from rl_yardstick.pipeline.files import DISK_ERRORS, naming
-from rl_yardstick.pipeline.finite_numbers import check_model
-from rl_yardstick.pipeline.locks import FolderGoneError, is_gone
-from rl_yardstick.pipeline.map_pictures import draw_value_map
-from rl_yardstick.pipeline.models.find import REPLAY_BUFFER
-from rl_yardstick.pipeline.models.load import save_model, save_normalization, save_replay_buffer
-from rl_yardstick.pipeline.preparation import NEW, UNBOUNDED_TIMESTEPS, Training, is_unread, prepare
-from rl_yardstick.pipeline.runs import FINISHED, INTERRUPTED, Run, remove_states
-from rl_yardstick.pipeline.signs_of_life import Activity, doing
-from rl_yardstick.pipeline.state_saver import (
-    IterationInterval,
-    default_log_interval,
-    iterations_before,
+from rl_yardstick.pipeline.callbacks import (
+    EpisodeCheckpoint,
+    EvaluationCallback,
+    NumberWatch,
+    PullRecorder,
+    PullSummary,
+    StateCallback,
+    StepCheckpoint,
+    evaluation_frequencies,
+    summarise_pulls,
 )
-from rl_yardstick.pipeline.stopping import close_environments, current, deaths_told
-from rl_yardstick.pipeline.train_spec import TrainSpec
-from rl_yardstick.pipeline.unfinished_runs import StateKeeping
+from rl_yardstick.pipeline.components import action_noise, build, constructor_arguments
+from rl_yardstick.pipeline.environments import (
+    first_seed,
+    make_training_env,
+    training_changes,
+)
+from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
+from rl_yardstick.pipeline.evaluation.advice import Advice, advice
+from rl_yardstick.pipeline.evaluation.critics import recorder_of
+from rl_yardstick.pipeline.evaluation.judge import Judge
+from rl_yardstick.pipeline.evaluation.sampled import Evaluation
+from rl_yardstick.pipeline.evaluation.value_maps import ValueMapRecorder
+from rl_yardstick.pipeline.files import replacing
+from rl_yardstick.pipeline.finite_numbers import check_model
+from rl_yardstick.pipeline.models import REPLAY_BUFFER, begun_with, load_to_train
+from rl_yardstick.pipeline.pictures import draw
+from rl_yardstick.pipeline.progress import ProgressCallback
+from rl_yardstick.pipeline.run import FAILED, FINISHED, INTERRUPTED, Run
+from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.watching import EvaluationMaps, Watch, watch_of
 
-# After a stop signal: how long the training may continue to the next safe moment, and when
-# evaluating and drawing must be finished.
-SECONDS_TO_A_SAFE_MOMENT = 1.0
-SECONDS_TO_THE_PICTURES = 1.6
+# What libraries raise for settings that they cannot work with.
+OF_LIBRARIES = (
+    *(ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError),
+)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a run."""
+    """What a run came to."""
 
-    run: Run  #: its folder
-    state: str  #: ``"finished"`` or ``"interrupted"``
-    n_steps: int  #: environment steps done
+    n_timesteps: int  #: environment steps done
     taken: WorkTime  #: the time of training and its evaluations, without compiling
-    final: Evaluation | None  #: the final evaluation; None if turned off or interrupted
-    best_return: float | None  #: mean return of the best evaluation during training, if any
-    best_timesteps: int  #: the time step of that evaluation
-    engine: str | None  #: whether training was compiled, and if not, why; None if unknown
-    best_episodes: int  #: the number of episodes of that evaluation; 0 if it is exact
+    final: Evaluation | None  #: of the agent at the end; None if there are no evaluations
+    best: float | None  #: mean return of the best evaluation during training
+    best_timesteps: int  #: the step of that evaluation
+    best_episodes: int  #: its episodes; 0 if it is exact
     evaluating: WorkTime  #: the time of all evaluations, including the last one
     evaluation_steps: int  #: environment steps of sampled evaluations
-    pulls: PullSummary | None = None  #: on bandits, the summary of the training pulls
+    engine: str | None  #: whether training was compiled, and if not, why; None if unknown
+    pulls: PullSummary | None  #: of a training on a bandit
+    watch: Watch | None  #: what a page plays of the training
+    advice: Advice | None  #: on an agent that has failed
+    can_be_explained: bool  #: whether its gap can be split into parts
+
+    def figures(self) -> dict[str, Any]:
+        """The figures for ``run.json``."""
+        pulls = self.pulls
+        return {
+            "n_timesteps": self.n_timesteps,
+            "final": None if self.final is None else self.final.summary(),
+            "best_mean_return": self.best,
+            "best_timesteps": self.best_timesteps,
+            "best_episodes": self.best_episodes,
+            "evaluation_steps": self.evaluation_steps,
+            "engine": self.engine,
+            **self.taken.as_data(),
+            **({} if pulls is None else {"regret": pulls.regret, "pulls": asdict(pulls)}),
+        }
 
 
 def train(
     spec: TrainSpec,
-    console: Console,
-    args: dict[str, Any],
-    command: str,
-    run: Run | None = None,
-    keeping: StateKeeping = NEW,
+    run: Run,
+    resumes: bool = False,
+    tell: Callable[[Parts], object] = lambda parts: None,
 ) -> Outcome:
-    """Train the agent and leave a run folder: `prepare`, then `carry_out`."""
-    return carry_out(prepare(spec, console, args, command, run, keeping))
+    """Train an agent and leave a finished run folder.
 
-
-def carry_out(training: Training, tell: Callable[[Outcome], object] = lambda _: None) -> Outcome:
-    """Train, then save, evaluate and draw the agent, also after a signal ended training early.
-
-    ``tell`` gets the outcome before it is drawn and recorded.
+    Args:
+        spec: the training.
+        run: its folder, held by the caller.
+        resumes: whether to go on from the folder's state, if it has one.
+        tell: is given the parts of the training before it begins.
 
     Raises:
-        UserError: if the agent cannot take its first step; then no folder is left behind.
-        ForeignExitError: if the environment or a callback asks the program to end.
-        KeyboardInterrupt: if it is stopped before the first step, likewise.
+        UserError: if something does not fit; a new run without a step leaves no folder.
+        Stopped: after a signal; the state and the agent are saved.
     """
-    with current().held():
-        is_over = False
-        try:
-            with naming(training.run.path):
-                outcome = _train_and_finish(training, tell)
-            is_over = True
-            close(training)
-        except BaseException as error:
-            if not is_over:
-                with suppress(BaseException):  # it would hide the original error
-                    close(training)
-            give_up(training, error)
-            raise
-    return outcome
-
-
-def _train_and_finish(training: Training, tell: Callable[[Outcome], object]) -> Outcome:
-    started = WorkTime.now()
-    state = FINISHED
-    with compile_timer() as time_compiling:
-        try:
-            with current().waiting(SECONDS_TO_A_SAFE_MOMENT):
-                _learn(training)
-        except KeyboardInterrupt:
-            if not has_begun(training):
-                raise
-            state = INTERRUPTED
-        finally:
-            training.display.close()
-        taken = WorkTime.now() - started - time_compiling()
-    taken += training.saver.time_before
-    with doing(training.display.console, "saving what was learnt") as activity:
-        outcome = _judged(training, state, taken, activity)
-        tell(outcome)
-        outcome = _drawn(training, state, outcome, activity)
-    if outcome.state == FINISHED and not training.keeping.stays:
-        remove_states(training.run.state_path)
-    return outcome
-
-
-@exits_as_mistakes()
-def _learn(training: Training) -> None:
-    spec = training.spec
-    kwargs: dict[str, Any] = {}
-    if is_unread(spec):
-        kwargs["log_interval"] = None
-    elif spec.log_interval != -1:
-        kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
-    begun = training.keeping.state
-    interval = kwargs.get("log_interval", default_log_interval(training.model))
-    before = 0 if begun is None else iterations_before(training.model, begun.note)
-    if before and interval is not None:
-        kwargs["log_interval"] = IterationInterval(interval)
-        kwargs["log_interval"].before = before
-    env = training.model.get_env()
-    assert env is not None
+    if spec.n_threads > 0:
+        th.set_num_threads(spec.n_threads)
+    parts = Parts(begun_with(spec), run, resumes and run.state_path.exists())
     try:
-        with deaths_told(env):
-            training.model.learn(
-                spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
-                callback=training.callback,
-                tb_log_name=spec.algo,
-                reset_num_timesteps=spec.trained_agent is None,
-                **kwargs,
-            )
-    except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as e:
-        check_model(training.model)  # PyTorch's error for nan in distributions is obscure
-        blame_settings(spec.algo, training.model, e)
+        tell(parts)
+        parts.learn()
+        parts.save()
+        outcome = parts.outcome()
+        draw(run.path, parts)
+    except Stopped as stopped:
+        if run.has_begun:
+            parts.save()
+            parts.evaluation.write()
+            figures = {"stopped_by": stopped.number, "n_timesteps": parts.agent.num_timesteps}
+            run.record(parts.spec, INTERRUPTED, **figures)
         raise
-
-
-def has_begun(training: Training) -> bool:
-    """Whether the agent has trained, in this process or earlier ones."""
-    model, is_back = training.model, training.saver.state is None
-    return is_back and model.num_timesteps > model._num_timesteps_at_start
-
-
-def _judged(training: Training, state: str, taken: WorkTime, activity: Activity) -> Outcome:
-    """Save and evaluate the agent."""
-    model, evaluation = training.model, training.evaluation
-    pulls = _save(training, state)
-    final: Evaluation | None = None
-    try:
-        with _stoppable(state):
-            activity.now("evaluating the final policy")
-            final = _judge(training, state)
-    except KeyboardInterrupt:
-        state = INTERRUPTED
-    return Outcome(
-        training.run,
-        state,
-        n_steps=model.num_timesteps,
-        taken=taken,
-        final=final,
-        best_return=evaluation.best_mean_reward if evaluation.best_timesteps else None,
-        best_timesteps=evaluation.best_timesteps,
-        engine=getattr(model, "engine_in_use", None),
-        pulls=pulls,
-        best_episodes=evaluation.best_episodes,
-        evaluating=evaluation.taken,
-        evaluation_steps=getattr(evaluation.evaluator, "n_steps", 0),
-    )
-
-
-def _save(training: Training, state: str) -> PullSummary | None:
-    """Save the agent and the pulls; returns the summary of the pulls."""
-    run, model, recorder = training.run, training.model, training.pulls
-    save_model(model, run.model_path)
-    save_normalization(model, run.vecnormalize_path)
-    if training.spec.save_replay_buffer and not current().is_urgent:
-        save_replay_buffer(model, run.path / REPLAY_BUFFER)
-    if recorder is None or not recorder.n_calls:
-        return None
-    if state == INTERRUPTED:
-        recorder.write()  # the recorder does so itself unless the training was interrupted
-    return summarise_pulls(recorder.arrays())
-
-
-def _judge(training: Training, state: str) -> Evaluation | None:
-    """Do missing evaluations, and the final one if the training was not interrupted."""
-    evaluation, model = training.evaluation, training.model
-    if not evaluation.is_asked_for:
-        return None
-    if not evaluation.evaluations_timesteps:
-        # The run was shorter than the first evaluation interval, or called no callback.
-        evaluation.init_callback(model)
-        evaluation.evaluate_now()
-    evaluation.write()
-    if evaluation.value_maps is not None:
-        evaluation.value_maps.finish(model, model.num_timesteps)
-    if evaluation.critics is not None:
-        evaluation.critics.finish(model.num_timesteps)
-    if state != FINISHED:
-        return None
-    evaluation.take_statistics()
-    with evaluation.timed():
-        if isinstance(evaluation.evaluator, SampledEvaluator | ExactEvaluator):
-            return evaluation.evaluator.at_the_end(model)
-        return evaluation.evaluator(model)
-
-
-def _drawn(training: Training, state: str, outcome: Outcome, activity: Activity) -> Outcome:
-    """Draw the results; then write ``run.json`` as the last file."""
-    try:
-        with _stoppable(state):
-            activity.now("drawing the pictures")
-            if training.spec.pictures:
-                with loading_libraries():  # Matplotlib
-                    draw(training, outcome.final)
-    except KeyboardInterrupt:
-        if outcome.state == FINISHED:
-            activity.say("stopped while drawing: the run counts as interrupted")
-        outcome = replace(outcome, state=INTERRUPTED)
-    pulls, number = outcome.pulls, current().number
-    outcome.run.end(
-        state=outcome.state,
-        n_timesteps=outcome.n_steps,
-        final=None if outcome.final is None else outcome.final.summary(),
-        best_mean_return=outcome.best_return,
-        best_timesteps=outcome.best_timesteps,
-        best_episodes=outcome.best_episodes,
-        evaluation_steps=outcome.evaluation_steps,
-        engine=outcome.engine,
-        **outcome.taken.as_data(),
-        **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),
-        **({} if pulls is None else {"regret": pulls.regret, "pulls": asdict(pulls)}),
-    )
+    except BaseException as error:
+        if run.has_begun or not run.is_new:
+            run.record(parts.spec, FAILED, reason=one_line(error))
+        raise
+    finally:
+        parts.close()
+    facts = {} if parts.judge.refusal is None else {"model_refused": parts.judge.refusal}
+    run.record(parts.spec, FINISHED, **outcome.figures(), **facts)
+    run.state_path.unlink(missing_ok=True)
     return outcome
 
 
-@contextmanager
-def _stoppable(state: str) -> Iterator[None]:
-    """Let a signal end the block at once, or after a time limit if one has ended training."""
-    seconds_left = SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0
-    with current().waiting(seconds_left), exits_as_mistakes():
-        yield
+class Parts:
+    """The parts of a training: the agent on its environments, its judge, and its callbacks."""
+
+    def __init__(self, spec: TrainSpec, run: Run, resumes: bool) -> None:
+        self.spec, self.run = spec, run
+        self.agent = make_agent(spec, run.path, resumes)
+        self.is_bandit = self.agent.env is not None and self.agent.env.has_attr("n_arms")
+        self.judge = Judge(spec, self.agent, run.console)
+        exact = self.judge.exact
+        frequencies = evaluation_frequencies(spec, self.agent, self.is_bandit and exact is None)
+        critics = None
+        if spec.diagnose:
+            is_evaluated = max(frequencies) > 0
+            found = recorder_of(
+                run.path / "diagnosis.csv", spec, self.agent, is_evaluated=is_evaluated
+            )
+            critics = found if not isinstance(found, str) else None
+            if critics is None:
+                run.console.print(f"no diagnosis: {found}", style="dim", markup=False)
+        maps = None if exact is None else ValueMapRecorder(run.path / "value_maps.npz", exact)
+        evaluator, eval_env = self.judge.evaluator, self.judge.env
+        self.evaluation = EvaluationCallback(run, eval_env, evaluator, frequencies, maps, critics)
+        self.watch = watch_of(spec, self.agent, exact)
+        self.pulls = self._pull_recorder()
+        self.clock = Clock()
+        self.progress = ProgressCallback(
+            run.console, spec.total_timesteps, bool(training_changes(spec))
+        )
+        self.callback = self._callbacks(resumes)
+
+    def _pull_recorder(self) -> PullRecorder | None:
+        if not self.is_bandit:
+            return None
+        if getattr(self.agent, "engine", None) == "compiled":  # it does not stop at pulls
+            note = "engine: compiled keeps no pulls, so regret is not known"
+            self.run.console.print(note, style="dim")
+            return None
+        return PullRecorder(self.run.path)
+
+    def _callbacks(self, resumes: bool) -> CallbackList:
+        """All callbacks, in the order in which they act.
+
+        Numbers are checked before anything keeps them, and a saved state is put back before any
+        other callback acts.
+        """
+        spec, run, watch = self.spec, self.run, self.watch
+        if isinstance(watch, EvaluationMaps):
+            self.evaluation.callback, watch = watch, None
+        with_buffer = spec.save_replay_buffer
+        others: list[BaseCallback | None] = [
+            *(self._of_settings()),
+            StepCheckpoint(run, spec.save_freq, with_buffer) if spec.save_freq > 0 else None,
+            EpisodeCheckpoint(run, spec.save_every_n_episodes, with_buffer)
+            if spec.save_every_n_episodes > 0
+            else None,
+            *(self.pulls, self.evaluation.critics, watch, self.evaluation),
+            EpisodeBudget(spec.n_episodes) if spec.n_episodes is not None else None,
+            *(self.clock, self.progress),
+        ]
+        saver = StateCallback(run, resumes, self.clock, self.judge)
+        saver.others = [callback for callback in others if callback is not None]
+        return CallbackList([NumberWatch(), saver, *saver.others])
+
+    def _of_settings(self) -> list[BaseCallback]:
+        spec, typed, folder = self.spec, self.spec.gym_packages, self.run.path
+        schedules = [getattr(self.agent, name, None) for name in ("lr_schedule", "clip_range")]
+        runs_by_steps = any(callable(s) and s(1.0) != s(0.0) for s in schedules)
+        is_on_policy = isinstance(self.agent, OnPolicyAlgorithm)
+        if spec.n_episodes is not None and is_on_policy and runs_by_steps:
+            raise UserError(
+                f"the schedules of {spec.algo} run by steps: give n_timesteps instead of "
+                "n_episodes, or constant values"
+            )
+        return [build(one, BaseCallback, "callback", typed, folder) for one in spec.callback]
+
+    def learn(self) -> None:
+        """Let the agent learn.
+
+        Raises:
+            UserError: for a library's error about the settings; those of the user's own code go
+                through as they are.
+        """
+        spec, agent = self.spec, self.agent
+        kwargs: dict[str, Any] = {}
+        if not (spec.tensorboard_log or spec.library_log):
+            kwargs["log_interval"] = None  # nobody reads it
+        elif spec.log_interval != -1:
+            kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
+        try:
+            with compile_timer() as time_compiling:
+                self.clock.start(time_compiling)
+                agent.learn(
+                    spec.total_timesteps,
+                    callback=self.callback,
+                    tb_log_name=spec.algo,
+                    reset_num_timesteps=spec.trained_agent is None,
+                    **kwargs,
+                )
+                self.clock.stop()
+        except OF_LIBRARIES as e:
+            check_model(agent)  # PyTorch's error for nan in distributions is obscure
+            if is_of_user(e):
+                raise
+            when = f"{spec.title}, at step {agent.num_timesteps:,}"
+            raise UserError(f"{when}: {one_line(e)}") from e
+        finally:
+            self.progress.close()
+
+    def save(self) -> None:
+        """Save the agent at the end, and its replay buffer if that is asked for."""
+        self.run.save(self.agent, self.run.model_path(self.spec))
+        agent: Any = self.agent
+        if self.spec.save_replay_buffer and getattr(agent, "replay_buffer", None) is not None:
+            with replacing(self.run.path / REPLAY_BUFFER) as beside:
+                agent.save_replay_buffer(beside)
+
+    def outcome(self) -> Outcome:
+        """Do missing evaluations and the final one."""
+        evaluation, agent, final = self.evaluation, self.agent, None
+        if evaluation.is_asked_for:
+            if not evaluation.evaluations_timesteps:  # the run was shorter than their interval
+                evaluation.init_callback(agent)
+                evaluation.evaluate()
+            evaluation.write()
+            if evaluation.value_maps is not None:
+                evaluation.value_maps.finish(agent, agent.num_timesteps)
+            if evaluation.critics is not None:
+                evaluation.critics.finish(agent.num_timesteps)
+            evaluation.take_statistics()
+            begun = WorkTime.now()
+            final = self.judge.at_the_end(agent)
+            evaluation.taken += WorkTime.now() - begun
+        pulled = self.pulls is not None and self.pulls.n_calls > 0
+        return Outcome(
+            agent.num_timesteps,
+            self.clock.taken,
+            final,
+            evaluation.best,
+            evaluation.best_timesteps,
+            evaluation.best_episodes,
+            evaluation.taken,
+            getattr(evaluation.evaluator, "n_steps", 0),
+            getattr(agent, "engine_in_use", None),
+            summarise_pulls(self.pulls.arrays()) if self.pulls is not None and pulled else None,
+            self.watch,
+            self._advice(final),
+            self.judge.exact is not None,
+        )
+
+    def _advice(self, final: Evaluation | None) -> Advice | None:
+        if final is None or self.run.console.quiet:
+            return None
+        agent = self.agent
+        return advice(self.spec, agent, self.judge.evaluator, final, agent.num_timesteps)
+
+    def close(self) -> None:
+        """Close all environments."""
+        self.progress.close()
+        if self.agent.env is not None:
+            self.agent.env.close()
+        self.judge.env.close()
+        if hasattr(self.agent, "_logger"):
+            self.agent.logger.close()
 
 
-def draw(training: Training, final: Evaluation | None) -> None:
-    """Draw the pulls, the learning curve and the map of the final policy, if they exist."""
-    run, spec, recorder = training.run, training.spec, training.pulls
-    title = f"{spec.algo} on {titled(run.env_name, spec.map_name)}, seed {spec.seed}"
-    has_pulls = recorder is not None and recorder.n_calls > 0
-    if recorder is not None and has_pulls:
-        draw_pulls(run.path / "pulls.png", title, recorder.arrays())
-    if not has_pulls or training.evaluation.evaluations_timesteps:
-        yardstick = None if final is None else final.yardstick
-        first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant
-        draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
-    maps = training.evaluation.value_maps
-    if maps is not None and training.evaluation.is_asked_for:
-        found = value_map(maps.evaluator, training.model)
-        if found is not None:
-            draw_value_map(run.value_map_path, title, found)
-    if training.evaluation.critics is not None:
-        draw_diagnosis(run, title)
+class Clock(BlockCallback):
+    """The time of a training over all its starts, without compiling."""
+
+    excluded_from_states = ("_begun", "_compiling")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.taken = WorkTime()
+
+    def start(self, time_compiling: Any) -> None:
+        """Begin to count."""
+        self._begun, self._compiling = WorkTime.now() - time_compiling(), time_compiling
+
+    def stop(self) -> None:
+        """Add the time since the start, and go on counting from here."""
+        now = WorkTime.now() - self._compiling()
+        self.taken, self._begun = self.taken + (now - self._begun), now
+
+    def _on_step(self) -> bool:
+        return True
 
 
-# --- the end of a training, also after an error ---------------------------------------------------
+def make_agent(spec: TrainSpec, folder: Path | None, appending: bool = False) -> BaseAlgorithm:
+    """The agent on its training environments, whose Monitors write into ``folder``.
+
+    Raises:
+        UserError: if the constructor refuses an argument.
+    """
+    algorithm: Any = load_algorithm(spec.algo)
+    env = make_training_env(spec, folder, appending)
+    try:
+        is_dict = isinstance(env.observation_space, spaces.Dict)
+        arguments = constructor_arguments(spec, algorithm, is_dict)
+        log = spec.tensorboard_log
+        common: dict[str, Any] = {
+            "seed": spec.seed,
+            "verbose": int(spec.library_log),
+            "tensorboard_log": None if log is None else str(Path(log) / spec.env_name),
+            **action_noise(spec, env.action_space),
+        }
+        if spec.trained_agent is not None:
+            agent = load_to_train(spec, env, device=spec.device, **common, **arguments)
+        else:
+            agent = _constructed(algorithm, env, {"device": spec.device, **common}, arguments)
+    except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
+        env.close()
+        raise UserError(f"{spec.algo} on {spec.place}: {one_line(error)}") from error
+    if not (spec.tensorboard_log or spec.library_log):
+        agent.set_logger(Logger(folder=None, output_formats=[]))
+    elif appending and spec.tensorboard_log:
+        logs = (Path(spec.tensorboard_log) / spec.env_name).glob(f"{spec.algo}_*")
+        newest = max(logs, key=lambda path: path.stat().st_mtime, default=None)
+        if newest is not None:  # the library would begin another log
+            agent.set_logger(configure(str(newest), ["tensorboard"]))
+    # The library seeds environment i with seed + i, so neighbouring seeds would share most.
+    env.seed(first_seed(spec))
+    return agent
 
 
-@exits_as_mistakes()
-def close(training: Training) -> None:
-    """Close all open parts; an error in one does not keep the others open."""
-    model = training.model
-    with ExitStack() as stack:
-        if model.env is not None:
-            stack.callback(close_environments, model.env)
-        stack.callback(close_environments, training.eval_env)
-        if hasattr(model, "_logger"):
-            stack.callback(model.logger.close)
+def _constructed(
+    algorithm: Any, env: Any, common: dict[str, Any], arguments: dict[str, Any]
+) -> BaseAlgorithm:
+    """A new agent; what its constructor does not take is set afterwards."""
+    from rl_yardstick.pipeline.arguments import constructor_parameters
+
+    taken = {key: common[key] for key in common if key in constructor_parameters(algorithm)}
+    if "seed" not in taken:
+        set_random_seed(common["seed"])
+    agent: BaseAlgorithm = algorithm(env=env, **taken, **arguments)
+    for name in common.keys() - taken.keys() - {"device"}:
+        setattr(agent, name, common[name])
+    if "seed" not in taken:
+        agent.set_random_seed(common["seed"])
+    return agent
 
 
-def give_up(training: Training, error: BaseException) -> None:
-    """Record the reason; or remove the folder if the agent failed before its first step."""
-    run, is_new = training.run, not training.keeping.goes_on
-    if is_gone(run.path):
-        raise FolderGoneError(run.path) from error
-    is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt | LibraryError)
-    if is_new and is_expected and not has_begun(training):
-        run.discard()
-        if not isinstance(error, ValueError):  # the other errors explain themselves
-            return
-        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
-        raise UserError(message) from error
-    with suppress(OSError):  # the original error says more
-        training.evaluation.write()
-    if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
-        run.end(state=INTERRUPTED)
-        return
-    run.fail(one_line(error))
-    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-        when = f"the run has failed at step {training.model.num_timesteps:,}"
-        raise UserError(f"{error.filename}: {error.strerror}: {when}") from error
+def is_of_user(error: Exception) -> bool:
+    """Whether an error comes from code outside the libraries; its traceback is shown as it is."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = "site-packages", str(Path(rl_yardstick.__file__).parent)
+    return not any(place in frames[-1].filename for place in ours)

@@ -25,7 +25,7 @@ from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES, best_actions_of
 from rl_yardstick.pipeline.finite_numbers import NotFiniteError, check_model
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec
 
 
 class GrowingRows:

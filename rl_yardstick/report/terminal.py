@@ -13,7 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from rl_yardstick.experiments.off_policy.estimators import difference_in_value, mean_reward
+from rl_yardstick.experiments.off_policy import difference_in_value, mean_reward
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.study import METRIC_WORDS, StudySpec
 from rl_yardstick.report.conclusions import (
@@ -28,7 +28,7 @@ from rl_yardstick.report.words import enumeration, number, optimum_words, seed_s
 from rl_yardstick.verdicts import FEW, Estimate
 
 if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
-    from rl_yardstick.experiments.off_policy.logged_policies import Comparison, Judged
+    from rl_yardstick.experiments.off_policy import Comparison, Judged
 
 # A study in the terminal.
 

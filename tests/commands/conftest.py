@@ -1,35 +1,11 @@
 import os
 import random
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-import compare
-import enjoy
-import train
-import tune
-from rl_yardstick.commands import explain, main, shaping, share
-from rl_yardstick.commands.cli import run_command
-from rl_yardstick.pipeline.signs_of_life import Silence
-
-MAINS = {
-    "train.py": train.main,
-    "enjoy.py": enjoy.main,
-    "explain.py": explain.main,
-    "shaping.py": shaping.main,
-    "compare.py": compare.main,
-    "tune.py": tune.main,
-}
-COMMANDS = {name: partial(run_command, main) for name, main in MAINS.items()}
-COMMANDS |= {"pack": partial(run_command, share.pack), "yardstick": main}
-
-
-@pytest.fixture(autouse=True)
-def nothing_takes_long(monkeypatch):
-    """However slow the machine is, no command says that it is still loading."""
-    monkeypatch.setattr(Silence.__init__, "__defaults__", (1e9,))
+from rl_yardstick.commands import main, run_command
 
 
 @pytest.fixture(autouse=True)
@@ -54,6 +30,7 @@ def no_pictures_elsewhere(request, monkeypatch):
 @pytest.fixture(scope="session")
 def train_in():
     """Train inside a folder, without pictures."""
+    from rl_yardstick.commands import train
 
     def do(folder, *words):
         with pytest.MonkeyPatch.context() as patch:
@@ -66,17 +43,26 @@ def train_in():
     return do
 
 
+def exit_code(*words):
+    """The exit code of a command line that is run in this process."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stop:
+        patch.setattr(os, "_exit", sys.exit)
+        patch.setattr(sys, "path", [*sys.path])
+        patch.setattr(sys, "argv", [str(word) for word in words])
+        name = Path(words[0]).name
+        main() if name == "yardstick" else run_command(name.removesuffix(".py"))
+    return stop.value.code
+
+
 @pytest.fixture
 def type_command(monkeypatch, capsys, tmp_path):
-    """Run a command line in this process, inside an empty folder: exit code, output, errors."""
+    """Run a command line inside an empty folder: exit code, output, errors."""
     monkeypatch.chdir(tmp_path)
 
     def run(*words):
-        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-        with pytest.raises(SystemExit) as stop:
-            COMMANDS[Path(words[0]).name]()
+        code = exit_code(*words)
         captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
+        return code, captured.out, captured.err
 
     return run
 
@@ -84,14 +70,12 @@ def type_command(monkeypatch, capsys, tmp_path):
 @pytest.fixture
 def type_study(own_folder, monkeypatch, capfd):
     """Run ``compare.py`` or ``tune.py`` in a user's own folder; also what child processes say."""
-    path = os.pathsep.join([str(own_folder), str(Path(compare.__file__).parent)])
+    path = os.pathsep.join([str(own_folder), str(Path(__file__).parents[2])])
     monkeypatch.setenv("PYTHONPATH", path)
 
     def run(*words, program="compare.py"):
-        monkeypatch.setattr(sys, "argv", [program, *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            run_command(tune.main if program == "tune.py" else compare.main)
+        code = exit_code(program, *words)
         captured = capfd.readouterr()
-        return stop.value.code, captured.out, captured.err
+        return code, captured.out, captured.err
 
     return run

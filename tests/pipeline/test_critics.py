@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rl_yardstick.mdp import TransitionModel, policy_return, state_visitation
 from rl_yardstick.mdp.advantages import expected_estimates
+from rl_yardstick.pipeline.callbacks import StateCallback
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.evaluation import critics
 from rl_yardstick.pipeline.evaluation.critics import (
@@ -25,11 +26,11 @@ from rl_yardstick.pipeline.evaluation.critics import (
     recorder_of,
 )
 from rl_yardstick.pipeline.evaluation.policies import policy_matrix
-from rl_yardstick.pipeline.preparation import prepare
-from rl_yardstick.pipeline.training import close
+from rl_yardstick.pipeline.run import Run
+from rl_yardstick.pipeline.training import Parts
 from tests.envs.corridors import Corridor
-from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
-from tests.pipeline.test_resuming import carried_out, content, cut_off, gone_on
+from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of
+from tests.pipeline.test_resuming import content, cut_off, resumed
 from tests.pipeline.test_resuming import spec_of as resumable
 
 PPO = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2, "gae_lambda": 0.8}
@@ -38,7 +39,7 @@ COMPILED = {**PPO, "engine": "compiled"}
 
 
 def rows_of(run):
-    with run.diagnosis_path.open() as file:
+    with (run.path / "diagnosis.csv").open() as file:
         return [{k: float(v or "nan") for k, v in row.items()} for row in csv.DictReader(file)]
 
 
@@ -289,31 +290,33 @@ def test_the_agent_is_the_same_to_the_last_bit_and_figures_those_of_a_run_that_w
     """Without ``eval_freq`` not every evaluation is compared."""
     monkeypatch.setattr(critics, "SECONDS_IN_ANY_CASE", 2e-3)
     monkeypatch.setattr(critics, "SECONDS_OF_NETWORKS", 5e-2)
-    spec = resumable(tmp_path / "plain", LAKE, algo, 400, settings, eval_freq=eval_freq)
-    plain = carried_out(spec)
-    spec = replace(spec, diagnose=True)
-    whole = carried_out(replace(spec, log_folder=tmp_path / "whole"))
-    for path in sorted(plain.run.path.rglob("*.zip")):
-        again = whole.run.path / path.relative_to(plain.run.path)
+    monkeypatch.setattr(StateCallback, "share_of_time", 1e9)
+    monkeypatch.setattr(StateCallback, "shortest_pause", 0.0)
+    spec = resumable(LAKE, algo, 400, settings, eval_freq=eval_freq)
+    plain, _ = run_of(spec, tmp_path / "plain")
+    spec = spec.changed(diagnose=True)
+    whole, _ = run_of(spec, tmp_path / "whole")
+    for path in sorted(plain.path.rglob("*.zip")):
+        again = whole.path / path.relative_to(plain.path)
         assert content(path) == content(again), path.name
-    assert not plain.run.diagnosis_path.exists()
-    rows = rows_of(whole.run)
+    assert not (plain.path / "diagnosis.csv").exists()
+    rows = rows_of(whole)
     assert len(rows) >= (1 if eval_freq is None else 4)
     assert np.isfinite([row[column] for row in rows[:4]]).all()
-    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
-    gone_on(run)
-    assert run.diagnosis_path.read_bytes() == whole.run.diagnosis_path.read_bytes()
+    run = resumed(cut_off(spec, monkeypatch, folder=tmp_path / "parts"))
+    one, other = ((each.path / "diagnosis.csv").read_bytes() for each in (run, whole))
+    assert one == other
 
 
 def test_where_it_cannot_be_done_a_line_says_so(tmp_path):
-    spec = spec_of("ppo", CART, n_timesteps=50, log_folder=tmp_path, diagnose=True, verbose=1)
+    spec = spec_of("ppo", CART, n_timesteps=50, diagnose=True)
     file = io.StringIO()
-    training = prepare(spec, Console(file=file, width=1000), {}, "train.py")
+    parts = Parts(spec, Run(tmp_path, Console(file=file, width=1000)), False)
     lines = file.getvalue().splitlines()
     (line,) = [line for line in lines if line.startswith("no diagnosis")]
     assert line.startswith("no diagnosis: the exact model of CartPole-v1 is not known")
-    assert training.evaluation.critics is None
-    close(training)
+    assert parts.evaluation.critics is None
+    parts.close()
 
 
 def test_comparisons_are_thinned_out_evenly_and_by_no_clock(tmp_path, monkeypatch):
@@ -321,17 +324,11 @@ def test_comparisons_are_thinned_out_evenly_and_by_no_clock(tmp_path, monkeypatc
     monkeypatch.setattr(critics, "SHARE", 1.0)
     monkeypatch.setattr(critics, "seconds_per_step", lambda _: 1e-3)
     monkeypatch.setattr(critics, "seconds_of_comparison", lambda *_, **__: 0.39)
-    spec = resumable(tmp_path, LAKE, "qlearning", 2000, {}, diagnose=True)
-    steps = [row["timesteps"] for row in rows_of(carried_out(spec).run)]
+    spec = resumable(LAKE, "qlearning", 2000, {}, diagnose=True)
+    steps = [row["timesteps"] for row in rows_of(run_of(spec, tmp_path)[0])]
     assert steps == [400, 800, 1200, 1600, 2000]  # of 20 evaluations
-    each = resumable(tmp_path, LAKE, "qlearning", 500, {}, diagnose=True, eval_freq=50)
-    assert len(rows_of(carried_out(each).run)) == 10
-
-
-def test_figures_reach_a_picture(tmp_path):
-    spec = resumable(tmp_path, LAKE, "qlearning", 200, {}, diagnose=True, eval_freq=100)
-    run = carried_out(replace(spec, pictures=True)).run
-    assert (run.path / "diagnosis.png").stat().st_size > 5000
+    each = resumable(LAKE, "qlearning", 500, {}, diagnose=True, eval_freq=50)
+    assert len(rows_of(run_of(each, tmp_path)[0])) == 10
 
 
 def test_where_states_look_alike_values_are_compared_and_rollouts_are_not():

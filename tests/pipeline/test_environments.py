@@ -16,8 +16,7 @@ from rl_yardstick.pipeline.environments import (
     map_name,
     training_changes,
     training_kwargs,
-    with_logs_located,
-    with_maps_read,
+    with_files_read,
 )
 from rl_yardstick.pipeline.errors import UserError
 from tests.pipeline.short_runs import spec_of as spec_for
@@ -183,8 +182,8 @@ MISTAKES = [
         "unknown argument 'slippery': did you mean 'is_slippery'?",
     ),
     ("FrozenLake-v1", {"map_name": "9x9"}, "unknown map_name '9x9': known are 4x4, 8x8"),
-    ("envs:Warehouse-v0", {"slip": 2}, "slip must be a finite number from 0 to 1, not 2"),
-    ("envs:Warehouse-v0", {"desc": []}, "the map is empty (with desc=[])"),
+    ("Warehouse-v0", {"slip": 2}, "slip must be a finite number from 0 to 1, not 2"),
+    ("Warehouse-v0", {"desc": []}, "the map is empty (with desc=[])"),
 ]
 
 
@@ -208,15 +207,15 @@ def map_file(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("map_file")
 def test_a_maps_rows_take_the_place_of_its_path():
-    env_id = "envs:Warehouse-v0"
+    env_id = "Warehouse-v0"
     for key in ("env_kwargs", "train_env_kwargs", "eval_env_kwargs"):
         settings = {"gamma": 0.9, key: {"desc": "map.txt", "slip": 0.1}}
         read = {"gamma": 0.9, key: {"desc": ROWS, "slip": 0.1}}
-        assert with_maps_read(env_id, settings) == with_maps_read(env_id, read) == read
+        assert with_files_read(env_id, settings) == with_files_read(env_id, read) == read
         assert settings[key]["desc"] == "map.txt"
-    assert with_maps_read("FrozenLake-v1", settings) == settings
+    assert with_files_read("FrozenLake-v1", settings) == settings
     with pytest.raises(UserError, match=r"Warehouse-v0: desc: cannot read the map file no\.txt"):
-        with_maps_read("Warehouse-v0", {"env_kwargs": {"desc": "no.txt"}, "eval_env_kwargs": None})
+        with_files_read("Warehouse-v0", {"env_kwargs": {"desc": "no.txt"}, "eval_env_kwargs": None})
 
 
 def test_a_maps_name_is_that_of_the_file_that_is_evaluated_on():
@@ -237,7 +236,7 @@ def test_a_maps_name_is_that_of_the_file_that_is_evaluated_on():
 @pytest.mark.usefixtures("map_file")
 def test_a_log_is_found_from_other_folders(tmp_path):
     settings = {"env_kwargs": {"log": "pulls.csv"}, "eval_env_kwargs": {"log": "/a.csv"}}
-    found = with_logs_located("ReplayBandit-v0", settings)
+    found = with_files_read("ReplayBandit-v0", settings)
     place = str(tmp_path / "pulls.csv")
     assert found == {"env_kwargs": {"log": place}, "eval_env_kwargs": {"log": "/a.csv"}}
-    assert with_logs_located("FrozenLake-v1", settings) == settings
+    assert with_files_read("FrozenLake-v1", settings) == settings

@@ -505,11 +505,11 @@ def test_all_histories_say_what_many_episodes_say():
 
 def test_runs_say_by_which_scale_they_are_measured(tmp_path):
     brief = {**SHORT, "env_kwargs": {"max_episode_steps": 4}}
-    outcome = trained("ppo_lstm", TIGER, brief, n_timesteps=32, log_folder=tmp_path)
+    run, outcome = trained("ppo_lstm", TIGER, brief, n_timesteps=32, folder=tmp_path)
     assert outcome.final.is_exact
-    assert outcome.run.read_info()["final"]["measured_by"] == "memory"
-    plain = trained("qlearning", TIGER, n_timesteps=200, log_folder=tmp_path)
-    final = plain.run.read_info()["final"]
+    assert run.recorded()["final"]["measured_by"] == "memory"
+    plain, _ = trained("qlearning", TIGER, n_timesteps=200, folder=tmp_path)
+    final = plain.recorded()["final"]
     assert (final["measured_by"], final["optimum"], final["full_optimum"]) == (
         "observation", -10, 100,
     )  # fmt: skip

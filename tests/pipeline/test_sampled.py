@@ -1,17 +1,14 @@
 """Sampled evaluation: it repeats, leaves training alone, takes its share, and has a yardstick."""
 
 import itertools
-import json
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.envs.registration import EnvSpec
-from rich.console import Console
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -19,7 +16,6 @@ from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.compiled import greedy_play
 from rl_yardstick.commands.terminal import result_lines
 from rl_yardstick.envs.wrappers import DiscretizeObservation
-from rl_yardstick.pipeline.agent_settings import without_auto
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
 from rl_yardstick.pipeline.evaluation import sampled
 from rl_yardstick.pipeline.evaluation.sampled import (
@@ -35,16 +31,11 @@ from rl_yardstick.pipeline.evaluation.sampled import (
     evaluation_seed,
     is_sure,
 )
-from rl_yardstick.pipeline.settings import hyperparams
-from rl_yardstick.pipeline.settings.hyperparams import TUNED_ON, split
-from rl_yardstick.pipeline.settings.yaml import read_yaml
-from rl_yardstick.pipeline.train_spec import TrainSpec
-from rl_yardstick.pipeline.training import train
-from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of, trained
+from rl_yardstick.pipeline.settings import HYPERPARAMS, TUNED_ON, read_yaml
+from tests.pipeline.short_runs import CART, LAKE, agent_of, run_of, spec_of, trained
 
 CAR = "MountainCar-v0"
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
-AS_FEW_AS_WILL_DO = {"eval_episodes": None, "final_episodes": None}
 
 
 def figures(evaluation):
@@ -71,7 +62,7 @@ def test_the_same_seed_gives_the_same_episodes_whatever_was_played_meanwhile():
     assert all(a != b for i, a in enumerate(different) for b in different[:i])
 
 
-def seeds_of_run(n_envs, seed, n_eval_envs=TrainSpec.n_eval_envs):
+def seeds_of_run(n_envs, seed, n_eval_envs=10):
     """All seeds of environments, of action spaces and of the agent."""
     starts = [evaluation_seed(seed, purpose) for purpose in PURPOSES]
     evaluations = (range(start, start + n_eval_envs) for start in starts)
@@ -85,9 +76,9 @@ def test_seeds_of_all_purposes_lie_apart_and_tuning_and_judgement_share_no_strea
     assert len(set(evaluations)) == len(evaluations)
     assert all(min(np.diff(sorted(row))) > 100 for row in starts)  # environments
     # With every shipped entry, and with any two of them: runs of one study may be of several.
-    files = sorted((Path(hyperparams.__file__).parents[2] / "hyperparams").glob("*.yml"))
+    files = sorted(HYPERPARAMS.glob("*.yml"))
     entries = [entry for path in files for key, entry in read_yaml(path).items() if key != TUNED_ON]
-    numbers = {split(without_auto(entry)).n_envs for entry in entries}
+    numbers = {entry.get("n_envs", 1) for entry in entries}
     assert numbers == {1, 4, 8, 16, 32}
     tuned, judged = (
         set().union(*(seeds_of_run(n_envs, seed) for n_envs in numbers for seed in seeds))
@@ -112,8 +103,8 @@ def test_deterministic_play_is_the_policys_best():
 
 def test_successes_are_counted_where_the_environment_tells_them():
     env_kwargs = {"slip": 0.3, "shelf_reward": -1, "max_episode_steps": 40}
-    model = agent_of("qlearning", "envs:Warehouse-v0", learning_rate=0.3).learn(60_000)
-    env = make_vec_env("envs:Warehouse-v0", 4, env_kwargs=env_kwargs)
+    model = agent_of("qlearning", "rl_yardstick.envs:Warehouse-v0", learning_rate=0.3).learn(60_000)
+    env = make_vec_env("rl_yardstick.envs:Warehouse-v0", 4, env_kwargs=env_kwargs)
     evaluation = evaluate(model, env, 200, seed=0)
     # Each move costs 1, and the last one brings 100 if it succeeds.
     failed = evaluation.returns == -evaluation.lengths
@@ -129,22 +120,27 @@ NORMALIZED |= {"n_epochs": 2, "n_envs": 2, "normalize": True}
 
 def test_training_is_the_same_with_and_without_evaluations(tmp_path):
     def learnt(run):
-        weights = load_algorithm("ppo").load(run.model_path).policy.state_dict()
+        model = run.path / f"{CART}.zip"
+        weights = load_algorithm("ppo").load(model).policy.state_dict()
         rows = [
             [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()[2:]]
             for path in sorted(run.path.glob("*.monitor.csv"))
         ]
         assert sum(map(len, rows)) > 5
-        statistics = VecNormalize.load(str(run.vecnormalize_path), make_vec_env(CART, 1))
+        statistics = VecNormalize.load(
+            str(run.path / CART / "vecnormalize.pkl"), make_vec_env(CART, 1)
+        )
         kept = [*statistics.obs_rms.mean, statistics.ret_rms.var]
         return rows, {key: value.tolist() for key, value in weights.items()}, kept
 
-    common = {"n_timesteps": 400, "log_folder": tmp_path, "eval_episodes": 3}
-    often, never = (trained("ppo", CART, NORMALIZED, eval_freq=n, **common) for n in (40, -1))
-    assert len(np.load(often.run.evaluations_path)["timesteps"]) >= 10
-    assert not never.run.evaluations_path.exists()
-    assert (often.final is None, never.final is None) == (False, True)
-    assert learnt(often.run) == learnt(never.run)
+    common = {"n_timesteps": 400, "folder": tmp_path, "eval_episodes": 3}
+    (often, found), (never, none) = (
+        trained("ppo", CART, NORMALIZED, eval_freq=n, **common) for n in (40, -1)
+    )
+    assert len(np.load(often.path / "evaluations.npz")["timesteps"]) >= 10
+    assert not (never.path / "evaluations.npz").exists()
+    assert (found.final is None, none.final is None) == (False, True)
+    assert learnt(often) == learnt(never)
 
 
 # --- how much of it ------------------------------------------------------------------------------
@@ -192,7 +188,7 @@ def steady(monkeypatch):
 
     def make(returns, length, **fields):
         entry = {"env_kwargs": {"returns": returns, "length": length}}
-        return spec_of("random", "Steady-v0", entry, n_eval_envs=1, **AS_FEW_AS_WILL_DO, **fields)
+        return spec_of("random", "Steady-v0", entry, n_eval_envs=1, **fields)
 
     return make
 
@@ -218,25 +214,26 @@ def test_the_last_evaluation_ends_when_it_is_sure_or_dear(steady, returns, lengt
 def test_evaluations_are_left_out_while_they_are_too_dear(steady, tmp_path, monkeypatch):
     """Five episodes are 75 steps, and half of 300 are allowed over the whole training."""
     monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 0)  # in so short a training
-    spec = steady([1.0, 5.0], 15, n_timesteps=1500, log_folder=tmp_path)
-    run = train(spec, Console(quiet=True), {}, "").run
-    with np.load(run.evaluations_path) as evaluations:
+    spec = steady([1.0, 5.0], 15, n_timesteps=1500)
+    run, _ = run_of(spec, tmp_path)
+    with np.load(run.path / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == [750, 1500]
         assert evaluations["results"].shape == (2, 5)
 
 
 def test_what_is_asked_for_is_done_and_a_run_says_what_its_evaluations_took(tmp_path):
-    common = {"log_folder": tmp_path, "n_timesteps": 500}
-    run = trained("random", CART, eval_freq=100, eval_episodes=3, final_episodes=3, **common).run
-    evaluations = np.load(run.evaluations_path)
+    common, asked = {"folder": tmp_path, "n_timesteps": 500}, {"eval_freq": 100}
+    asked |= {"eval_episodes": 3, "final_episodes": 3}
+    run, _ = trained("random", CART, **asked, **common)
+    evaluations = np.load(run.path / "evaluations.npz")
     assert evaluations["results"].shape == (5, 3)
     assert "n_episodes" not in evaluations, "all have as many as there are columns"
-    assert json.loads(run.info_path.read_text())["final"]["n_episodes"] == 3
+    assert run.recorded()["final"]["n_episodes"] == 3
     entry = {"n_steps": 50, "batch_size": 50, "n_epochs": 1}
-    outcome = trained("ppo", CART, entry, **AS_FEW_AS_WILL_DO, **common)
-    info = json.loads(outcome.run.info_path.read_text())
+    run, outcome = trained("ppo", CART, entry, **common)
+    info = run.recorded()
     assert info["evaluation_steps"] == outcome.evaluation_steps > 0
-    evaluations = np.load(outcome.run.evaluations_path)
+    evaluations = np.load(run.path / "evaluations.npz")
     final, n_columns = info["final"], evaluations["results"].shape[1]
     counts = np.array(evaluations.get("n_episodes", [n_columns] * len(evaluations["timesteps"])))
     during = (evaluations["ep_lengths"].mean(axis=1) * counts).sum()

@@ -1,271 +1,176 @@
-"""A training: its callbacks, what settings do to it, what it leaves, and bandits."""
+"""Trainings: what an outcome tells, when evaluations come, what ends a training, and pictures."""
 
-import csv
-import io
-from functools import partial
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
+from gymnasium import spaces
 from rich.console import Console
-from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    CallbackList,
-    EvalCallback,
+
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.evaluation import sampled
+from rl_yardstick.pipeline.run import Run
+from rl_yardstick.pipeline.training import train
+from tests.pipeline.short_runs import CART, LAKE, run_of, spec_of, trained
+
+SMALL_PPO = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "n_envs": 1}
+
+
+@pytest.fixture(autouse=True)
+def own_place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 200)
+
+
+@pytest.mark.parametrize(
+    ("algo", "entry", "fields", "steps"),
+    [
+        ("qlearning", {}, {"eval_freq": 250}, [250, 500, 750, 1000]),
+        ("qlearning", {"n_envs": 4}, {"eval_freq": 250}, [248, 496, 744, 992]),
+        ("qlearning", {}, {"eval_freq": 700}, [700]),
+        ("qlearning", {}, {}, list(range(50, 1001, 50))),
+        ("qlearning", {}, {"eval_freq": 5000}, [1000]),  # at the end, if at no other time
+        ("qlearning", {}, {"eval_freq": -1}, None),
+        ("qlearning", {"engine": "interpreted"}, {"eval_freq": 300}, [300, 600, 900]),
+    ],
 )
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import configure
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecNormalize
+def test_when_evaluations_come(algo, entry, fields, steps):
+    run, outcome = trained(algo, LAKE, entry, n_timesteps=1000, **fields)
+    path = run.path / "evaluations.npz"
+    assert (steps is None) == (outcome.final is None) == (not path.exists())
+    if steps is not None:
+        assert np.load(path)["timesteps"].tolist() == steps
+        assert outcome.best_timesteps in steps
 
-from rl_yardstick.agents.common.callbacks import EpisodeBudget
-from rl_yardstick.commands.train import describe_pulls, print_outcome
-from rl_yardstick.envs.bandits import log_uniformly
-from rl_yardstick.pipeline.callbacks import (
-    EpisodeCheckpoint,
-    EvaluationCallback,
-    ExponentialExploration,
-    PullSummary,
-    StepCheckpoint,
-    summarise_pulls,
+
+def test_an_outcome_tells_what_the_run_folder_has():
+    run, outcome = trained("qlearning", LAKE, n_timesteps=2000)
+    record = run.recorded()
+    figures = outcome.figures()
+    assert {key: record[key] for key in figures} == figures
+    assert outcome.final.is_exact
+    assert figures["final"]["gap"] == pytest.approx(
+        figures["final"]["optimum"] - figures["final"]["mean_return"]
+    )
+    assert (outcome.n_timesteps, outcome.engine, outcome.pulls) == (2000, "compiled", None)
+    assert outcome.taken.cpu_seconds > 0
+    assert record["versions"]["python"].startswith("3.")
+
+
+def test_a_budget_of_episodes_ends_after_so_many():
+    run, outcome = trained("sarsa", LAKE, {"n_episodes": 25}, eval_freq=-1)
+    rows = (run.path / "0.monitor.csv").read_text().splitlines()
+    assert len(rows) == 2 + 25
+    assert outcome.n_timesteps == sum(int(row.split(",")[1]) for row in rows[2:])
+    with pytest.raises(UserError, match="the schedules of ppo run by steps"):
+        trained("ppo", CART, {**SMALL_PPO, "n_episodes": 3, "learning_rate": "lin_0.001"})
+
+
+def test_a_bandits_pulls_are_summed_up():
+    run, outcome = trained("ucb", "BernoulliBandit-v0", n_timesteps=300)
+    pulls = np.load(run.path / "pulls.npz")
+    assert outcome.pulls.n_pulls == 300 == pulls["regrets"].size
+    assert outcome.pulls.regret == pytest.approx(float(pulls["regrets"].sum()))
+    assert run.recorded()["regret"] == outcome.pulls.regret
+    assert outcome.final is None or outcome.final.mean_return is not None
+
+
+# --- numbers that are not finite, and errors ------------------------------------------------------
+
+
+class Sick(gym.Env):
+    """Returns a wrong number, or raises an error, at its 30th step."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+    fault = None
+
+    def __init__(self, fault="reward"):
+        self.fault, self.n_steps = fault, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        is_time = self.n_steps == 30
+        if is_time and self.fault == "error":
+            raise RuntimeError("the motor is broken")
+        if is_time and self.fault == "exit":
+            raise SystemExit("enough")
+        obs = np.full(2, np.nan if is_time and self.fault == "observation" else 0, np.float32)
+        reward = float("inf") if is_time and self.fault == "reward" else 1.0
+        return obs, reward, self.n_steps % 10 == 0, False, {}
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "said"),
+    [
+        ("reward", UserError, "reward of environment 0 at step 30 is inf"),
+        ("observation", UserError, "observation of environment 0 at step 30 is nan"),
+        ("error", RuntimeError, "the motor is broken"),  # of the user's own code, as it is
+        ("exit", SystemExit, "enough"),
+    ],
 )
-from rl_yardstick.pipeline.evaluation.sampled import Evaluation, evaluate
-from rl_yardstick.pipeline.models.find import checkpoint_file
-from rl_yardstick.pipeline.runs import PULLS_FILE, Run
-from rl_yardstick.pipeline.training import carry_out, prepare, train
-from rl_yardstick.pipeline.unfinished_runs import run_of_spec
-from tests.pipeline.short_runs import CART, LAKE, agent_of, spec_of
-
-TINY_DQN = {"buffer_size": 200, "batch_size": 4, "learning_starts": 20}
-TINY_DQN |= {"policy_kwargs": {"net_arch": [4]}}
-
-
-def evaluation_of(mean_return):
-    return Evaluation(np.array([float(mean_return)]), np.array([1]), None)
-
-
-@pytest.fixture
-def run(tmp_path):
-    return Run.claim(tmp_path / "logs", "qlearning", "Warehouse-v0")
+def test_what_an_environment_does_wrong(fault, kind, said, monkeypatch):
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
+    gym.register("Sick-v0", Sick, max_episode_steps=50, kwargs={"fault": fault})
+    spec = spec_of("ppo", "Sick-v0", SMALL_PPO, n_timesteps=64, eval_freq=16, eval_episodes=1)
+    run = Run.claim(Path("logs"), spec)
+    run.begin(spec, {}, "train.py")
+    with pytest.raises(kind, match=said), run:
+        train(spec, run)
+    record = run.recorded()
+    assert record["state"] == "failed"
+    assert said.split()[-1] in record["reason"]
+    assert not (run.path / "Sick-v0.zip").exists()
 
 
-# --- evaluation in training ----------------------------------------------------------------------
-
-# Five moves to the goal: a return of 96 at best.
-SMALL_WAREHOUSE = ("envs:Warehouse-v0", {"desc": ["S...", ".##.", "...G"], "max_episode_steps": 20})
-
-
-def train_with(callback, folder, env_id, env_kwargs, n_envs=1, steps=1000):
-    env = make_vec_env(env_id, n_envs, seed=0, env_kwargs=env_kwargs)
-    model = agent_of("qlearning", env, learning_rate=0.5, exploration_initial_eps=0.3)
-    model.set_logger(configure(str(folder), ["csv"]))
-    model.learn(steps, callback=callback, log_interval=None)
-    model.logger.close()
-    with (folder / "progress.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    # What the two callbacks themselves log, and when.
-    names = [name for name in rows[0] if name.startswith("eval/")] + ["time/total_timesteps"]
-    return model, [{name: row[name] for name in names} for row in rows]
+def test_an_agent_that_learns_nonsense_is_not_saved():
+    entry = {**SMALL_PPO, "learning_rate": 1e30, "max_grad_norm": 1e30}
+    with pytest.raises(UserError, match=r"is (nan|inf|-inf)"):
+        trained("ppo", CART, entry, n_timesteps=128, eval_freq=-1)
+    assert not list(Path("logs").rglob("CartPole-v1.zip"))
 
 
-def both_callbacks(run, folder, env_id, env_kwargs, eval_freq):
-    """Ours and the library's, which see the same episodes: nothing is random there."""
-    env, other = (make_vec_env(env_id, 1, env_kwargs=env_kwargs) for _ in range(2))
-    play = partial(evaluate, env=env, n_episodes=3, seed=99)
-    paths = {"log_path": str(folder), "best_model_save_path": str(folder)}
-    library = EvalCallback(other, n_eval_episodes=3, verbose=0, eval_freq=eval_freq, **paths)
-    return EvaluationCallback(run, env, play, eval_freq=eval_freq), library
+@pytest.mark.parametrize(
+    ("algo", "entry", "said"),
+    [
+        ("ppo", {"policy": "CnnPolicy"}, "CnnPolicy"),
+        ("ppo", {"policy": "MlpPolcy"}, "unknown policy 'MlpPolcy': did you mean 'MlpPolicy'"),
+        ("ppo", {"policy_kwargs": {"net_arhc": [4]}}, "net_arhc"),
+        ("ppo", {"rollout_buffer_class": "HerReplayBuffer"}, "HerReplayBuffer"),
+        ("dqn", {"train_freq": [1, "day"]}, "day"),
+    ],
+)
+def test_what_only_the_constructor_knows_is_one_line_and_leaves_no_folder(algo, entry, said):
+    with pytest.raises(UserError) as caught:
+        trained(algo, CART, entry, n_timesteps=64)
+    assert said in str(caught.value)
+    assert not Path("logs").exists()
 
 
-def test_evaluations_are_written_as_the_library_writes_them(run, tmp_path):
-    world, n_envs, steps = SMALL_WAREHOUSE, 3, 500
-    freq = steps // n_envs // 15
-    own, library = both_callbacks(run, tmp_path / "library", *world, eval_freq=freq)
-    _, expected_log = train_with(library, tmp_path / "library", *world, n_envs, steps)
-    model, log = train_with(own, tmp_path / "own", *world, n_envs, steps)
-    expected = np.load(tmp_path / "library" / "evaluations.npz")
-    written = np.load(run.evaluations_path)
-    assert written.files == expected.files
-    assert "successes" in written.files
-    for name in expected.files:
-        assert written[name].dtype == expected[name].dtype
-        np.testing.assert_array_equal(written[name], expected[name])
-    # There was something to tell apart.
-    assert len(np.unique(expected["results"])) > 1
-    assert own.best_mean_reward == library.best_mean_reward
-    assert own.last_mean_reward == library.last_mean_reward
-    assert log == expected_log
-    best = type(model).load(run.best_model_path)
-    expected_best = type(model).load(tmp_path / "library" / "best_model.zip")
-    assert th.equal(best.policy.q_tables, expected_best.policy.q_tables)
-    assert best.num_timesteps == expected_best.num_timesteps == own.best_timesteps
-    means = expected["results"].mean(axis=1)
-    assert own.best_timesteps == expected["timesteps"][means.argmax()]
+# --- what is printed and drawn --------------------------------------------------------------------
 
 
-def test_evaluation_sees_the_normalisation_of_training(run):
-    env = VecNormalize(make_vec_env(CART, 1, seed=0), norm_reward=False)
-    eval_env = VecNormalize(make_vec_env(CART, 1), training=False, norm_reward=False)
-    seen = []
-
-    def evaluator(model):
-        seen.append(eval_env.obs_rms.mean.copy())
-        return evaluation_of(len(seen))
-
-    callback = EvaluationCallback(run, eval_env, evaluator, 25)
-    agent_of("random", env).learn(50, callback=callback)
-    assert not np.array_equal(*seen)
-    np.testing.assert_array_equal(seen[1], env.obs_rms.mean)
-    # The statistics belong to the best model, and lie where they are looked for.
-    path = checkpoint_file(run.best_model_path, "vecnormalize")
-    loaded = VecNormalize.load(str(path), make_vec_env(CART, 1))
-    np.testing.assert_array_equal(loaded.obs_rms.mean, seen[1])
+def test_remarks_and_pictures(monkeypatch):
+    console = Console(record=True, width=200, force_terminal=False)
+    spec = spec_of("qlearning", LAKE, {"gamma": 0.5}, n_timesteps=2000, diagnose=True)
+    run, outcome = run_of(spec.changed(pictures=True), console=console)
+    text = console.export_text()
+    assert "at gamma 0.5 even exact planning scores" in text
+    assert outcome.can_be_explained
+    for name in ("learning_curve.png", "value_map.png", "diagnosis.png"):
+        assert (run.path / name).stat().st_size > 5000
 
 
-# --- budgets, checkpoints, exploration -----------------------------------------------------------
-
-
-class Record(BaseCallback):
-    """Notes at each step the progress, and how many episodes had ended before it."""
-
-    def __init__(self):
-        super().__init__()
-        self.progress = []
-        self.ended = [0]
-
-    def _on_step(self):
-        self.progress.append(self.model._current_progress_remaining)
-        self.ended.append(self.ended[-1] + int(np.sum(self.locals["dones"])))
-        return True
-
-
-@pytest.mark.parametrize(("name", "n_envs"), [("qlearning", 1), ("dqn", 3)])
-def test_an_episode_budget_ends_training_and_drives_the_schedules(name, n_envs):
-    n_episodes = 20
-    kwargs = TINY_DQN if name == "dqn" else {}
-    model = agent_of(name, make_vec_env(LAKE, n_envs, seed=0), **kwargs)
-    record = Record()
-    model.learn(10**12, callback=CallbackList([record, EpisodeBudget(n_episodes)]))
-    # It ends with the step in which the last episode does, whatever else ends in the same step.
-    assert record.ended[-2] < n_episodes <= record.ended[-1]
-    assert model.num_timesteps == n_envs * len(record.progress)
-    for step, progress in enumerate(record.progress):
-        assert progress == pytest.approx(1 - record.ended[step] / n_episodes, abs=1e-9)
-
-
-def checkpoint_steps(folder):
-    names = [path.name for path in folder.glob("*")]
-    assert all(name.startswith("rl_model_") and name.endswith("_steps.zip") for name in names)
-    return sorted(int(name.split("_")[2]) for name in names)
-
-
-def test_checkpoints_by_steps_and_by_episodes(tmp_path):
-    for n_envs, every, steps in ((1, 70, [70, 140]), (3, 50, [51, 102, 150, 201]), (1, 500, [])):
-        folder = tmp_path / f"steps {every}"  # the first step at or after each multiple
-        folder.mkdir()
-        model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
-        model.learn(200, callback=StepCheckpoint(every, folder))
-        assert checkpoint_steps(folder) == steps
-    loaded = type(model).load(tmp_path / "steps 50" / "rl_model_102_steps.zip")
-    assert loaded.num_timesteps == 102
-    for n_envs, every in ((1, 1), (3, 4)):
-        folder, record = tmp_path / f"episodes {every}", Record()
-        folder.mkdir()
-        model = agent_of("qlearning", make_vec_env(LAKE, n_envs, seed=0))
-        model.learn(300, callback=CallbackList([record, EpisodeCheckpoint(every, folder)]))
-        expected = n_envs * np.flatnonzero(np.diff(np.array(record.ended) // every)) + n_envs
-        assert checkpoint_steps(folder) == expected.tolist()
-        assert len(expected) > 3
-
-
-def test_epsilon_falls_with_each_update():
-    seen = []
-
-    class Look(BaseCallback):
-        def _on_step(self):
-            seen.append((self.model._n_updates, self.model.exploration_rate))
-            return True
-
-    exploration = ExponentialExploration(initial_eps=0.9, final_eps=0.2, decay=0.97)
-    rhythm = {"train_freq": 4, "gradient_steps": 2, "seed": 0}
-    model = DQN("MlpPolicy", Monitor(gym.make(LAKE)), **rhythm, **TINY_DQN)
-    model.learn(150, callback=CallbackList([exploration, Look()]))
-    assert len(seen) == model.num_timesteps
-    # Nothing is learnt in the first 20 steps, and it takes 50 updates to come down to the floor.
-    assert seen[19] == (0, 0.9)
-    assert seen[-1][0] >= 50
-    for n_updates, epsilon in seen:
-        assert epsilon == max(0.2, 0.9 * 0.97**n_updates)
-
-
-# --- how it ends ---------------------------------------------------------------------------------
-
-
-def test_a_run_that_is_stopped_once_more_while_it_ends_can_be_gone_on_with(tmp_path):
-    def stop(outcome):
-        raise KeyboardInterrupt
-
-    training = prepare(spec_of("qlearning", log_folder=tmp_path), Console(quiet=True), {}, "")
-    with pytest.raises(KeyboardInterrupt):
-        carry_out(training, stop)
-    assert training.run.read_info()["state"] == "interrupted"
-    assert run_of_spec(training.spec, any_seed=False).path == training.run.path
-
-
-# --- settings of the libraries -------------------------------------------------------------------
-
-
-# --- bandits: judged by regret, drawn by pull, kept when interrupted -----------------------------
-
-
-def train_on(folder, algo, env_id, **settings):
-    """The outcome, its pulls, the names of its files and what is printed of it."""
-    fields = {"log_folder": folder, "pictures": True, "verbose": 1}
-    spec = spec_of(algo, env_id, settings, n_timesteps=300, **fields)
-    console = Console(width=160, file=io.StringIO())
-    outcome = train(spec, console, {}, "train.py")
-    print_outcome(console, outcome)
-    path = outcome.run.path
-    pulls = dict(np.load(path / PULLS_FILE)) if (path / PULLS_FILE).exists() else None
-    return outcome, pulls, {file.name for file in path.iterdir()}, console.file.getvalue()
-
-
-def test_regret_is_the_judgement_where_arms_are_drawn_anew(tmp_path):
-    outcome, pulls, names, text = train_on(tmp_path, "linucb", "LinearBandit-v0")
-    regret = float(pulls["regrets"].sum())
-    info = outcome.run.read_info()
-    assert outcome.pulls.regret == info["regret"] == regret > 0
-    assert (outcome.final, outcome.best_return, info["pulls"]["n_pulls"]) == (None, None, 300)
-    assert {"pulls.npz", "pulls.png", "run.json"} <= names
-    assert not names & {"evaluations.npz", "learning_curve.png", "best_model.zip"}
-    assert f"regret {regret:,.2f} over 300 pulls   best arm in" in text
-
-
-def test_a_log_knows_no_regret(tmp_path):
-    log_uniformly(gym.make("SegmentBandit-v0"), 300, 0, tmp_path / "log.csv")
-    kwargs = {"log": str(tmp_path / "log.csv")}
-    outcome, pulls, names, text = train_on(tmp_path, "ucb", "ReplayBandit-v0", env_kwargs=kwargs)
-    matched = int(pulls["matched"].sum())
-    assert 60 < matched < 140
-    assert (outcome.pulls.regret, outcome.pulls.optimal, outcome.final) == (None, None, None)
-    assert outcome.pulls.reward == pytest.approx(pulls["rewards"].sum() / matched)
-    assert f"over the {matched} of 300 that are in the log" in text
-    assert "pulls.png" in names
-
-
-def test_pulls_summed_up_by_hand():
-    pulls = {
-        "rewards": np.array([[1.0, 0.0, 1.0, 0.0]], dtype=np.float32),
-        "regrets": np.array([[0.0, 0.5, 0.25, 0.0]]),
-        "matched": np.ones((1, 4), dtype=bool),
-        "optimal": np.array([[True, False, False, True]]),
-    }
-    found = summarise_pulls(pulls)
-    assert found == PullSummary(n_pulls=4, n_matched=4, reward=0.5, regret=0.75, optimal=0.5)
-    assert describe_pulls(found) == "regret 0.75 over 4 pulls   best arm in 50 % of the last 4"
-    unknown = pulls | {"regrets": np.full((1, 4), np.nan), "matched": np.zeros((1, 4), dtype=bool)}
-    found = summarise_pulls(unknown)
-    assert (found.reward, found.regret, found.optimal) == (None, None, None)
-    assert describe_pulls(found) == "regret not known: none of 4 pulls is in the log"
+def test_subprocesses_do_the_same():
+    common = {"n_timesteps": 128, "eval_freq": 64, "eval_episodes": 1, "final_episodes": 1}
+    entry = {**SMALL_PPO, "n_envs": 2}
+    here, _ = trained("ppo", CART, entry, **common)
+    there, _ = trained("ppo", CART, entry, vec_env="subproc", **common)
+    one, other = (np.load(run.path / "evaluations.npz")["results"] for run in (here, there))
+    np.testing.assert_array_equal(one, other)

@@ -3,7 +3,6 @@
 import io
 import json
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -17,27 +16,22 @@ import rl_yardstick.envs  # noqa: F401  # registers the environments
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.pipeline import map_pictures as drawing
 from rl_yardstick.pipeline import progress, watching
-from rl_yardstick.pipeline.agent_settings import resolved_spec
 from rl_yardstick.pipeline.curve_pictures import read_monitors
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.value_maps import value_map
-from rl_yardstick.pipeline.models.load import load_model
-from rl_yardstick.pipeline.preparation import algorithm_kwargs, make_model
-from rl_yardstick.pipeline.progress import ProgressDisplay
-from rl_yardstick.pipeline.settings.hyperparams import read_hyperparams
-from rl_yardstick.pipeline.signs_of_life import Heartbeat
-from rl_yardstick.pipeline.training import carry_out, prepare
+from rl_yardstick.pipeline.progress import ProgressCallback
+from rl_yardstick.pipeline.settings import override, read_entry, read_spec
+from rl_yardstick.pipeline.training import make_agent
 from rl_yardstick.pipeline.watching import TERMINATED, TableRecorder
-from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, spec_of, trained
+from tests.pipeline.short_runs import CART, LAKE, WAREHOUSE, agent_of, run_of, spec_of, trained
 
 
-def watched_spec(tmp_path, algo="qlearning", settings=None, **fields):
+def watched_spec(algo="qlearning", settings=None, **fields):
     """Of a run that is watched, for a page that nobody writes."""
-    places = {"log_folder": tmp_path / "logs", "watch_learning": tmp_path / "page.html"}
     fields = {"n_timesteps": 300, "seed": 3, "eval_episodes": 5, "final_episodes": 5, **fields}
-    return spec_of(algo, entry=settings, **{**places, **fields})
+    return spec_of(algo, entry=settings, **{"watch_learning": "page.html", **fields})
 
 
 def watched(env, name="qlearning", n_timesteps=300, n_episodes=0, **settings):
@@ -80,11 +74,6 @@ def episodes_of(folder):
     return [row.split(",")[:2] for row in rows]
 
 
-def done(spec):
-    training = prepare(spec, Console(quiet=True), {}, "")
-    return training, carry_out(training)
-
-
 SMALL_PPO = {"n_steps": 32, "batch_size": 32}
 SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradient_steps": 2}
 
@@ -97,20 +86,20 @@ SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradie
     ],
 )
 def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
-    spec = watched_spec(tmp_path, algo, settings, n_timesteps=160)
-    _, alone = done(replace(spec, watch_learning=None))
-    training, outcome = done(spec)
-    assert outcome.engine == alone.engine
+    spec = watched_spec(algo, settings, n_timesteps=160)
+    alone, plain = run_of(spec.changed(watch_learning=None), tmp_path)
+    run, outcome = run_of(spec, tmp_path)
+    assert outcome.engine == plain.engine
     one, other = (
-        load_algorithm(algo).load(run.run.model_path).policy.state_dict()
-        for run in (alone, outcome)
+        load_algorithm(algo).load(each.model_path(spec)).policy.state_dict()
+        for each in (alone, run)
     )
     assert all(one[name].numpy().tobytes() == other[name].numpy().tobytes() for name in one)
-    one, other = (episodes_of(run.run.path) for run in (alone, outcome))
+    one, other = (episodes_of(each.path) for each in (alone, run))
     assert one == other
-    one, other = (np.load(run.run.evaluations_path) for run in (alone, outcome))
+    one, other = (np.load(each.path / "evaluations.npz") for each in (alone, run))
     assert one["results"].tobytes() == other["results"].tobytes()
-    assert len(training.watch.steps if algo == "qlearning" else training.watch.moments) > 4
+    assert len(outcome.watch.steps if algo == "qlearning" else outcome.watch.moments) > 4
 
 
 @pytest.mark.parametrize(
@@ -121,29 +110,29 @@ def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     ],
 )
 def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, steps):
-    training, outcome = done(watched_spec(tmp_path, algo, settings))
-    training.watch.finish()
-    rows = training.watch.moments.rows
-    assert (rows["timesteps"].tolist(), training.watch.n_units) == ([*steps], len(steps) - 1)
+    run, outcome = run_of(watched_spec(algo, settings), tmp_path)
+    watch = outcome.watch
+    watch.finish()
+    rows = watch.moments.rows
+    assert (rows["timesteps"].tolist(), watch.n_units) == ([*steps], len(steps) - 1)
     assert rows["number"].tolist() == [*range(len(steps))]
-    assert rows["loss"][-1] == training.model.logger.name_to_value["train/loss"]
+    assert rows["loss"][-1] == watch.model.logger.name_to_value["train/loss"]
     assert np.isnan(rows[0]["loss"])
     assert np.isnan(rows["value_loss"][1:]).any() == (algo == "dqn")
     # What the start is worth at the end is the return that was computed of the final agent.
-    at_start = rows["values"] @ training.watch.evaluator.model.initial
+    at_start = rows["values"] @ watch.evaluator.model.initial
     assert at_start[-1] == pytest.approx(outcome.final.mean_return, abs=1e-12)
     assert rows["exploration"][0] == (1.0 if algo == "dqn" else pytest.approx(np.nan, nan_ok=True))
-    lengths = [float(row[0]) for row in episodes_of(outcome.run.path)]
+    lengths = [float(row[0]) for row in episodes_of(run.path)]
     assert rows["training_return"][-1] == pytest.approx(np.mean(lengths[-100:]))
 
 
 def test_what_is_played_covers_the_rise_of_the_greedy_policys_return():
     """Replayed from the records: it is low where the window begins, and high where it ends."""
-    settings = read_hyperparams("qlearning", LAKE) | {"n_timesteps": 60_000}
-    settings.pop("n_episodes", None)
-    spec = resolved_spec(settings, algo="qlearning", env_id=LAKE, seed=0)
-    exact, env = exact_evaluator(spec), make_training_env(spec, None)
-    agent, recorder = make_model(spec, None, env, algorithm_kwargs(spec)), TableRecorder(0, exact)
+    settings = override(read_entry("qlearning", LAKE), {"n_timesteps": 60_000})
+    spec = read_spec("qlearning", LAKE, settings)
+    exact = exact_evaluator(spec)
+    agent, recorder = make_agent(spec, None), TableRecorder(0, exact)
     agent.learn(60_000, recorder)
     begin, end = recorder.window()
     table = recorder.initial["q_tables"].copy()
@@ -168,30 +157,16 @@ def test_what_is_played_covers_the_rise_of_the_greedy_policys_return():
 def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
     small = {"learning_starts": 50, "buffer_size": 200}
     with pytest.raises(UserError, match="dqn on CartPole-v1 has neither"):
-        done(watched_spec(tmp_path, "dqn", small, env_id=CART))
+        run_of(watched_spec("dqn", small, env_id=CART), tmp_path / "logs")
     with pytest.raises(UserError, match="--watch-episodes is for agents with tables: dqn"):
-        done(watched_spec(tmp_path, "dqn", small, watch_episodes=3))
+        run_of(watched_spec("dqn", small, watch_episodes=3), tmp_path / "logs")
     monkeypatch.setattr(watching, "MOST_ENTRIES", 63)
     with pytest.raises(UserError, match=r"up to 63 entries; those of qlearning on Froz.* have 64"):
-        done(watched_spec(tmp_path))
+        run_of(watched_spec(), tmp_path / "logs")
     assert not (tmp_path / "logs").exists()
 
 
 # --- progress, in terminals and elsewhere ---------------------------------------------------------
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    """A clock on which a step takes 10 milliseconds, as far as the display asks for the time."""
-    fake = SimpleNamespace(now=0.0)
-
-    def monotonic():
-        fake.now += 0.01
-        return fake.now
-
-    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=monotonic))
-    still = {"start": lambda self: None, "stop": lambda self: None}  # nothing beats by itself
-    monkeypatch.setattr(progress, "Heartbeat", type("StillHeart", (Heartbeat,), still))
 
 
 def text_shown(n_steps, *, live):
@@ -199,30 +174,19 @@ def text_shown(n_steps, *, live):
     file = io.StringIO()
     console = Console(file=file, width=120, force_terminal=live, color_system=None)
     learner = load_algorithm("qlearning")(env=LAKE, seed=0, engine="interpreted")
-    learner.learn(n_steps, callback=ProgressDisplay(console, live=live))
+    learner.learn(n_steps, callback=ProgressCallback(console, n_steps))
     return file.getvalue()
 
 
-@pytest.mark.usefixtures("clock")
-def test_elsewhere_ten_plain_lines_and_in_a_terminal_a_bar():
-    text_shown(1, live=False)  # what it needs is compiled before anything is counted
+def test_elsewhere_plain_lines_now_and_then_and_in_a_terminal_a_bar(monkeypatch):
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
     lines = text_shown(1000, live=False).splitlines()
-    form = r" *(\d+)%  ([\d,]+) steps  mean return in training 0\.\d\d"
-    first, *others = (re.match(rf"{form}(?:  about (\d+) s left by the clock)?$", t) for t in lines)
-    assert int(first[1]) in (10, 11)
-    for tenth, line in enumerate(others, 2):
-        share = int(line[1])
-        assert 10 * tenth <= share <= 10 * tenth + 1
-        # A hundred readings of the clock a second, one for each step and more for each line.
-        assert int(line[3] or 0) == pytest.approx((100 - share) / 10, abs=1.5)
+    form = r" *(\d+)%  ([\d,]+) steps(  mean return in training 0\.\d\d)?"
+    assert all(re.fullmatch(form, line) for line in lines)
     assert lines[-1].startswith("100%  1,000 steps")
-    text = text_shown(1000, live=True)
-    plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)  # without what moves the cursor
-    shown = [int(share) for share in re.findall(r"(\d+)% ", plain)]
-    assert shown == sorted(shown)
-    # Ten seconds, by a clock of which every reading takes a hundredth: ten times a second at most.
-    assert 20 < len(shown) <= 110
-    assert re.search(r"100% +1,000 steps  mean return in training 0\.\d\d", plain)
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 1e9)
+    assert text_shown(1000, live=False) == ""
+    assert "\x1b[" in text_shown(1000, live=True)
 
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -280,24 +244,24 @@ def test_an_action_among_several_best_ones_does_not_differ():
 def test_a_run_keeps_the_maps_of_the_agents_that_it_saves(tmp_path):
     entry = {"learning_rate": 0.5, "env_kwargs": {"slip": 0.2}}
     kept = {"n_timesteps": 450, "eval_freq": 100, "save_freq": 100, "pictures": True}
-    run = trained("qlearning", WAREHOUSE, entry, log_folder=tmp_path, **kept).run
-    with np.load(run.value_maps_path) as file:
+    run, _ = trained("qlearning", WAREHOUSE, entry, folder=tmp_path, **kept)
+    with np.load(run.path / "value_maps.npz") as file:
         maps = dict(file)
     assert maps["timesteps"].tolist() == [100, 200, 300, 400, 450]
     evaluator = exact_evaluator(spec_of("qlearning", WAREHOUSE, entry))
-    paths = [*(run.checkpoint_path(n) for n in (100, 200, 300, 400)), run.model_path]
+    paths = [*run.checkpoints().values(), run.path / f"{WAREHOUSE}.zip"]
     for path, values, actions in zip(paths, maps["values"], maps["actions"], strict=True):
-        found = value_map(evaluator, load_model("qlearning", path))
+        found = value_map(evaluator, load_algorithm("qlearning").load(path))
         np.testing.assert_array_equal(values, found.values)
         np.testing.assert_array_equal(actions, found.actions)
     np.testing.assert_array_equal(maps["optimal_values"], found.optimal_values)
     np.testing.assert_array_equal(maps["optimal_actions"], found.optimal_actions)
     # The agent did change, or there would be nothing to tell apart.
     assert len(np.unique(maps["values"], axis=0)) > 1
-    with np.load(run.evaluations_path) as evaluations:
+    with np.load(run.path / "evaluations.npz") as evaluations:
         at_start = maps["values"][:-1] @ evaluator.model.initial
         np.testing.assert_allclose(at_start, evaluations["results"][:, 0], rtol=1e-12)
-    assert run.value_map_path.read_bytes().startswith(b"\x89PNG")
+    assert (run.path / "value_map.png").read_bytes().startswith(b"\x89PNG")
 
 
 # --- the picture of a map ------------------------------------------------------------------------

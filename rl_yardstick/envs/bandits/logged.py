@@ -10,6 +10,7 @@ import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import gymnasium as gym
@@ -113,11 +114,14 @@ class LoggedData:
         raise ValueError(f"{self.source} has {context}{words}, the agent observes {space}")
 
 
-def read_log(path: str | Path) -> LoggedData:
+def read_log(
+    path: str | Path, own_names: Mapping[str, str] = MappingProxyType({})
+) -> LoggedData:
     """Read logged pulls.
 
     Args:
         path: a CSV file, separated by commas, with a header; see the module.
+        own_names: the file's own names of the columns ``arm``, ``reward`` and ``propensity``.
 
     Raises:
         ValueError: if it cannot be read, a column is missing or duplicated, a row is too short or
@@ -126,7 +130,7 @@ def read_log(path: str | Path) -> LoggedData:
     """
     try:
         with opened(Path(path), MAX_BYTES) as binary:
-            found = _read_columns(binary)
+            found = _read_columns(binary, own_names)
     except (OSError, UnsafeFileError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error).strip()
         raise ValueError(f"cannot read {path}: {reason}") from error
@@ -148,7 +152,7 @@ def read_log(path: str | Path) -> LoggedData:
     )
 
 
-def _read_columns(binary: BinaryIO) -> dict[str, pd.Series[Any]]:
+def _read_columns(binary: BinaryIO, own_names: Mapping[str, str]) -> dict[str, pd.Series[Any]]:
     """The columns of a log by name, each of numbers or of text."""
     import pandas as pd
 
@@ -161,12 +165,14 @@ def _read_columns(binary: BinaryIO) -> dict[str, pd.Series[Any]]:
     header = pd.read_csv(binary, header=None, nrows=1, dtype=str, **settings).iloc[0].tolist()
     if len(header) > MAX_COLUMNS:
         raise ValueError(f"it has {len(header):,} columns, more than {MAX_COLUMNS:,}")
+    meant = {own: name for name, own in own_names.items()}
+    header = [meant.get(name, name) for name in header]
     for name in (ARM, REWARD, *header):
         if header.count(name) != 1:
             number = "no" if name not in header else "more than one"
             raise ValueError(f"it has {number} column {name!r}, but {some(header)}")
     binary.seek(0)
-    frame = pd.read_csv(binary, **settings)
+    frame = pd.read_csv(binary, **settings).rename(columns=meant)
     if not isinstance(frame.index, pd.RangeIndex):
         raise ValueError("its rows have more values than its header")
     if not len(frame):

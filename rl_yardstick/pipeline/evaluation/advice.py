@@ -19,12 +19,12 @@ from rl_yardstick.agents.reference import RandomAgent
 from rl_yardstick.envs.known_models import observations_of_states, transition_model
 from rl_yardstick.mdp import TransitionModel, policy_return, state_visitation, value_iteration
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.agent_settings import shipped_settings
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
 from rl_yardstick.pipeline.evaluation.yardstick import FAILED, NEARLY_ALL
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.settings import shipped_hyperparams
+from rl_yardstick.pipeline.spec import TrainSpec
 
 SOLVED = 0.5  # planning must reach this score for a recommendation
 NEAR_OPTIMUM = 0.01  # relative to the optimum
@@ -140,9 +140,9 @@ def _try_first(
         enough = max(MANY_STEPS * n_pairs, 4 * n_steps)
         unit: int = 10 ** max(len(str(enough)) - 2, 0)
         enough = -(-enough // unit) * unit  # rounded up to two digits
-        shipped = shipped_settings(spec).get("n_timesteps") or 0
+        shipped = shipped_hyperparams(spec).get("n_timesteps") or 0
         flags.append(f"-n {max(enough, shipped)}")
-        instead = ", instead of --n-episodes" if spec.hyperparams.n_episodes else ""
+        instead = ", instead of --n-episodes" if spec.n_episodes else ""
         now.append(f"{n_steps / n_pairs:.3g} for each state and action{instead}")
     if raises_gamma:
         even = (

@@ -50,7 +50,7 @@ from rl_yardstick.pipeline.evaluation.policies import (
     takes_masks,
 )
 from rl_yardstick.pipeline.files import write_text
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec
 
 SECONDS_BETWEEN_WRITES = 1.0
 
@@ -201,8 +201,8 @@ class CriticRecorder(BlockCallback):
         self.path, self.world, self.explores = path, world, explores
         # With an explicit evaluation interval, the agent is compared at each evaluation.
         self.is_limited = spec.eval_freq is None
-        self.training_steps = spec.hyperparams.n_timesteps
-        self.training_episodes = spec.hyperparams.n_episodes
+        self.training_steps = spec.n_timesteps
+        self.training_episodes = spec.n_episodes
         self.rows: list[dict[str, float]] = []
         self._written_at = -np.inf
 

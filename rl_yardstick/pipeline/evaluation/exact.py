@@ -53,7 +53,7 @@ from rl_yardstick.pipeline.evaluation.policies import (
 )
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from rl_yardstick.pipeline.train_spec import TrainSpec, is_plain
+from rl_yardstick.pipeline.spec import TrainSpec
 
 # Limit for the array with the observations of all states.
 MOST_BYTES_OBSERVED = 1 << 30
@@ -248,19 +248,17 @@ def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> st
 
 def is_wrapped_as_vector(spec: TrainSpec) -> bool:
     """Whether a VecEnv wrapper changes the agent's observations."""
-    special = spec.hyperparams
-    return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)
+    return bool(spec.normalize is not None or spec.frame_stack or spec.vec_env_wrapper)
 
 
 _kept: OrderedDict[str, ExactEvaluator] = OrderedDict()
 
 
 def evaluator_of(spec: TrainSpec) -> ExactEvaluator | None:
-    """Like `exact_evaluator`, cached for plain runs on the same environment."""
-    if not is_plain(spec):
+    """Like `exact_evaluator`, cached for runs on the same environment without wrappers."""
+    if spec.env_wrapper or spec.gym_packages or is_wrapped_as_vector(spec):
         return exact_evaluator(spec)
-    # The key: everything that determines the evaluation environment of a plain run.
-    masks = spec.hyperparams.algorithm.get("mask_actions", False)
+    masks = spec.algorithm.get("mask_actions", False)
     key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
     evaluator = _kept.pop(key, None) or exact_evaluator(spec)
     if evaluator is not None and evaluator.model.n_states <= MOST_STATES_KEPT:

@@ -21,12 +21,12 @@ from stable_baselines3.common.vec_env.stacked_observations import StackedObserva
 from rl_yardstick.agents.reference import RandomAgent
 from rl_yardstick.mdp.memoryless import observation_groups
 from rl_yardstick.mdp.transition_model import Ints
-from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.environments import make_single_env, remembers
 from rl_yardstick.pipeline.evaluation.exact import ExactEvaluator, evaluator_of_single
 from rl_yardstick.pipeline.evaluation.policies import KNOWN_LIBRARIES, has_memory, takes_masks
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
-from rl_yardstick.pipeline.train_spec import TrainSpec, remembers
+from rl_yardstick.pipeline.spec import TrainSpec
 
 # Histories at one step, and in all: a second or two. Each call of `predict` counts as at least 10.
 MOST_HISTORIES, MOST_IN_ALL, LEAST_AT_ONCE = 3_000, 30_000, 10
@@ -39,8 +39,8 @@ BY_HISTORIES = (
 
 def world_of_memory(spec: TrainSpec, agent: BaseAlgorithm) -> ExactEvaluator | None:
     """The exact evaluator of an agent with memory; None if histories cannot be followed."""
-    special, home = spec.hyperparams, type(agent).__module__.partition(".")[0]
-    is_covered = special.normalize is not None or bool(special.vec_env_wrapper)
+    home = type(agent).__module__.partition(".")[0]
+    is_covered = spec.normalize is not None or bool(spec.vec_env_wrapper)
     # The memory of other agents has an unknown form, and some sample their actions.
     is_known = home in (*KNOWN_LIBRARIES, "sb3_contrib") and not isinstance(agent, RandomAgent)
     if is_covered or not is_known or not (has_memory(agent) or remembers(spec)):
@@ -80,7 +80,7 @@ def by_histories(spec: TrainSpec, agent: BaseAlgorithm, world: ExactEvaluator) -
     """The exact evaluation of an agent with memory; None if there are too many histories."""
     with closing(make_single_env(spec)) as single:
         space = single.observation_space
-    found = _of_histories(world, agent, spec.hyperparams.frame_stack or 1, space)
+    found = _of_histories(world, agent, spec.frame_stack or 1, space)
     if found is None:
         return None
     mean, second, length, success = found

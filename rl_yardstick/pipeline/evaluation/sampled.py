@@ -26,7 +26,7 @@ from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.pipeline.evaluation.policies import KNOWN_LIBRARIES, is_network, player
 from rl_yardstick.pipeline.evaluation.yardstick import Yardstick
 from rl_yardstick.pipeline.finite_numbers import FinitePlayer, check_numbers
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.spec import TrainSpec
 
 # A mean this many standard errors above an upper bound shows that the bound is wrong.
 BEYOND_CHANCE = 6.0
@@ -187,7 +187,7 @@ def evaluation_seed(seed: int, purpose: int) -> int:
 
 def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
     """The known bracket of the evaluation environment's optimum, or None."""
-    if spec.hyperparams.vec_env_wrapper or not may_have_bracket(spec.env_id):
+    if spec.vec_env_wrapper or not may_have_bracket(spec.env_id):
         return None
     with closing(make_single_env(spec)) as env:
         found = optimum_bracket(env)
@@ -263,8 +263,8 @@ class SampledEvaluator:
         self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
         # Explicit intervals or numbers of episodes take precedence over the limit.
         self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
-        self.training_steps = spec.hyperparams.n_timesteps
-        self.training_episodes = spec.hyperparams.n_episodes
+        self.training_steps = spec.n_timesteps
+        self.training_episodes = spec.n_episodes
         self.n_steps = 0  # in all evaluations
         self._left = math.inf
         self._last_length: float | None = None

@@ -141,6 +141,6 @@ class ValueMapRecorder:
             "optimal_values": optimal_values,
             "optimal_actions": optimal_actions,
         }
-        with replacing(self.path) as file:
-            np.savez(file, **arrays)
+        with replacing(self.path) as beside:
+            np.savez(beside, **arrays)
         self._last_write = time.monotonic()

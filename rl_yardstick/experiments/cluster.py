@@ -1,0 +1,176 @@
+"""Runs of a study on a cluster, through Dask: `do_run`, unchanged, on its workers.
+
+The workers share the study's folder with this process, and have the same versions of the libraries:
+both are checked at the start. Runs of a worker that is lost are done again by others. Encryption
+and certificates are matters of Dask's own configuration.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import cached_property
+from pathlib import Path
+from signal import SIGTERM
+from typing import Any
+
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.experiments.pool import Workers, do_run
+from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown
+from rl_yardstick.pipeline.run import Stop, versions
+from rl_yardstick.pipeline.settings import read_yaml
+
+RETRIES = 3  # of a run whose worker is lost
+# The classes of dask-jobqueue by system.
+QUEUES = {
+    "htcondor": "HTCondorCluster",
+    "lsf": "LSFCluster",
+    "moab": "MoabCluster",
+    "oar": "OARCluster",
+    "pbs": "PBSCluster",
+    "sge": "SGECluster",
+    "slurm": "SLURMCluster",
+}
+_FORMS = "ADDRESS:PORT, a scheduler's file, a YAML of dask-jobqueue, or local:N"
+_ONE_AT_A_TIME = threading.Lock()  # the libraries' generators belong to a whole process
+
+
+class ClusterWorkers(Workers):
+    """The workers of a Dask cluster, which is connected to when the first run is submitted.
+
+    Args:
+        where: the scheduler's address, its file, a YAML file of dask-jobqueue, or ``local:N``.
+        n_jobs: runs at once, for a queue of jobs.
+        root: the study's folder, which all workers share.
+        timeout: seconds for each run; None for any time.
+
+    Raises:
+        UserError: if ``where`` says nothing that can be connected to.
+    """
+
+    def __init__(self, where: str, n_jobs: int, root: Path, timeout: float | None = None) -> None:
+        super().__init__(n_jobs or 1, timeout)
+        self.where, self.root, self.words = where, root, f"on the cluster {where}"
+        self._cluster: Any = None
+        self._start = _reader(where, n_jobs)
+
+    def submit(self, planned: PlannedRun, command: str) -> Future[None]:
+        """Do a run as soon as a worker is free."""
+        home, timeout = str(Path.cwd()), self.timeout
+        future: Future[None] = self._executor.submit(_do_run, planned, command, home, timeout)
+        self.n_at_once = 2 * max(len(self._client.scheduler_info(-1)["workers"]), 1)
+        return future
+
+    def end(self) -> None:
+        """Give back the workers; Dask sends them a SIGTERM."""
+        if "_client" in vars(self):
+            self._client.close(timeout=5)
+        if self._cluster is not None:
+            self._cluster.close(timeout=30)
+
+    @cached_property
+    def _client(self) -> Any:
+        """The connection, after a check of versions and of the shared folder."""
+        from distributed import Client
+
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        try:
+            self._cluster = self._start()
+            client = Client(self._cluster) if self._cluster is not None else _connected(self.where)
+            client.wait_for_workers(1, timeout=600 if self._cluster is not None else 60)
+            client.get_versions(check=True)
+            found = client.run(_facts, str(self.root.absolute()))
+        except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
+            raise UserError(f"--cluster {self.where}: {one_line(error)}") from error
+        for worker, (theirs, shares_folder) in found.items():
+            for name, version in versions().items():
+                if theirs.get(name) != version:
+                    there = f"{name} {theirs.get(name)}"
+                    raise UserError(f"worker {worker} has {there}, here is {version}")
+            if not shares_folder:
+                raise UserError(f"worker {worker} does not have the folder {self.root.absolute()}")
+        return client
+
+    @cached_property
+    def _executor(self) -> Any:
+        return self._client.get_executor(pure=False, retries=RETRIES)
+
+
+def _do_run(planned: PlannedRun, command: str, home: str, timeout: float | None) -> None:
+    """Do a run on a worker, in the folder in which the command was typed."""
+    stop = Stop()
+    timer = threading.Timer(timeout or threading.TIMEOUT_MAX, setattr, (stop, "number", SIGTERM))
+    timer.daemon = True
+    with _ONE_AT_A_TIME:
+        os.chdir(home)
+        timer.start()
+        try:
+            do_run(planned, command, stop)
+        except Stopped:
+            raise UserError(f"took longer than --run-timeout allows, {timeout:g} s") from None
+        finally:
+            timer.cancel()
+
+
+def _facts(root: str) -> tuple[dict[str, str], bool]:
+    return versions(), Path(root).is_dir()
+
+
+def _connected(where: str) -> Any:
+    from distributed import Client
+
+    return Client(scheduler_file=where) if Path(where).is_file() else Client(where, timeout=30)
+
+
+def _reader(where: str, n_jobs: int) -> Callable[[], Any]:
+    """What starts the cluster; it returns None where a scheduler runs already."""
+    if where.startswith("local:"):
+        number = where.removeprefix("local:")
+        if not (number.isdecimal() and 0 < int(number) <= 1024):
+            raise UserError(f"--cluster local:N: N is 1 to 1024, not {shown(number)}")
+        return lambda: _local(int(number))
+    if where.endswith((".yml", ".yaml")):
+        return _job_queue(Path(where), n_jobs)
+    if n_jobs:
+        raise UserError("--jobs is for this machine or a queue of jobs; a cluster has its workers")
+    if not (Path(where).is_file() or where.rpartition(":")[2].isdecimal()):
+        raise UserError(f"--cluster {shown(where)}: give {_FORMS}")
+    return lambda: None
+
+
+def _local(n_workers: int) -> Any:
+    from distributed import LocalCluster
+
+    return LocalCluster(
+        n_workers=n_workers, threads_per_worker=1, dashboard_address=None, protocol="tcp"
+    )
+
+
+def _job_queue(path: Path, n_jobs: int) -> Callable[[], Any]:
+    """Jobs of a queueing system, as dask-jobqueue's own YAML describes them."""
+    content = read_yaml(path)
+    queues = content.get("jobqueue") if isinstance(content, dict) else None
+    if not isinstance(queues, dict) or len(queues) != 1:
+        raise UserError(f"{path} must hold the key jobqueue, and in it one queueing system")
+    ((system, settings),) = queues.items()
+    if system not in QUEUES or not isinstance(settings, dict):
+        raise UserError(f"{path}: {shown(system)} is none of {', '.join(QUEUES)}")
+    if n_jobs < 1:
+        raise UserError(f"{path}: say how many runs to do at once: --jobs N")
+
+    def start() -> Any:
+        import dask
+
+        # The library's own defaults for what the file leaves out.
+        dask.config.set({f"jobqueue.{system}": {**dask.config.get(f"jobqueue.{system}"), **given}})
+        cluster = getattr(importlib.import_module("dask_jobqueue"), QUEUES[system])()
+        cluster.scale(n_jobs)
+        return cluster
+
+    importlib.import_module("dask_jobqueue")
+    given = {str(name).replace("_", "-"): value for name, value in settings.items()}
+    return start

@@ -1,0 +1,569 @@
+"""Off-policy evaluation: the value of policies, estimated from pulls that another policy made.
+
+``compare.py --logged`` judges trained agents by a log of pulls. Each estimator returns a term for
+each logged pull. The estimate is the mean of the terms; its standard error is their standard
+deviation divided by the square root of their number. So two policies on one log are compared by
+differences of their terms: see `difference_in_value`.
+
+For a pull in context x of arm a, which the log chose with probability p and which gave reward r, a
+policy with probabilities pi(arm | x), and an estimate q(x, arm) of the mean reward:
+
+    importance weight        w = pi(a | x) / p
+    inverse propensities     mean of w r
+    self-normalised          sum of w r / sum of w
+    direct method            mean of sum over arms of pi(arm | x) q(x, arm)
+    doubly robust            the direct method's terms, plus w (r - q(x, a))
+
+The estimates q are linear in the rewards to which they are fitted. This gives the influence of each
+reward on a prediction. A model predicts only pulls to which it was not fitted (cross-fitting).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from rl_yardstick.envs.bandits import LoggedData, read_log
+from rl_yardstick.mdp.transition_model import Floats, Ints
+from rl_yardstick.pipeline.errors import UserError, one_line
+from rl_yardstick.verdicts import Estimate
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+N_FOLDS = 5
+RIDGE = 1.0  # the weight of each coefficient's prior, in pulls
+
+# --- models of the rewards ------------------------------------------------------------------------
+
+
+class ArmMeans:
+    """The mean reward of each arm in each context; without pulls, the arm's overall mean.
+
+    A saturated model: it assumes nothing about rewards. Contexts are integers from 0, shape (n,).
+    """
+
+    def __init__(
+        self, contexts: Ints, arms: Ints, rewards: Floats, n_arms: int, n_contexts: int
+    ) -> None:
+        self.contexts, self.arms = contexts, arms
+        size, cells = n_contexts * n_arms, contexts * n_arms + arms
+        shape = (n_contexts, n_arms)
+        self.counts = np.bincount(cells, minlength=size).reshape(shape)
+        sums = np.bincount(cells, rewards, minlength=size).reshape(shape)
+        self.arm_counts = self.counts.sum(axis=0)
+        overall = np.full(n_arms, rewards.mean())
+        np.divide(sums.sum(axis=0), self.arm_counts, out=overall, where=self.arm_counts > 0)
+        self.means = np.tile(overall, (n_contexts, 1))
+        np.divide(sums, self.counts, out=self.means, where=self.counts > 0)
+
+    def predict(self, contexts: Ints) -> Floats:
+        """The mean reward of each arm in each of m contexts, shape (m, n_arms)."""
+        return np.asarray(self.means[contexts])
+
+    def sensitivity(self, contexts: Ints, policy: Floats) -> Floats:
+        """The derivative of a policy's predicted total reward by each reward in the fit.
+
+        That is, the derivatives of the sum of ``policy * predict(contexts)``; ``policy`` has the
+        probability of each arm in each of m contexts, shape (m, n_arms).
+        """
+        n_contexts = len(self.counts)
+        mass = np.stack([np.bincount(contexts, p, minlength=n_contexts) for p in policy.T], axis=1)
+        seen = self.counts > 0
+        by_cell = np.where(seen, mass, 0) / np.maximum(self.counts, 1)
+        by_arm = np.where(seen, 0, mass).sum(axis=0) / np.maximum(self.arm_counts, 1)
+        return np.asarray(by_cell[self.contexts, self.arms] + by_arm[self.arms])
+
+
+class ArmRegressions:
+    """A ridge regression of the rewards on the context for each arm.
+
+    Features are standardised, and rewards are centred on their mean, which is the prediction for an
+    arm without pulls. Contexts have the shape (n, d).
+
+    Source: Hoerl and Kennard (1970), "Ridge regression", Technometrics 12.
+    """
+
+    def __init__(self, contexts: Floats, arms: Ints, rewards: Floats, n_arms: int) -> None:
+        self.arms, self.centre, self.scale = arms, contexts.mean(axis=0), contexts.std(axis=0)
+        self.scale[self.scale == 0] = 1
+        self.inputs = self._standardised(contexts)
+        self.level = float(rewards.mean())
+        prior = RIDGE * np.eye(self.inputs.shape[1])
+        self._factors = []
+        self.coefficients = np.zeros((n_arms, len(prior)))
+        for arm in range(n_arms):
+            rows = self.inputs[arms == arm]
+            self._factors.append(linalg.cho_factor(rows.T @ rows + prior))
+            moments = rows.T @ (rewards[arms == arm] - self.level)
+            self.coefficients[arm] = linalg.cho_solve(self._factors[arm], moments)
+
+    def predict(self, contexts: Floats) -> Floats:
+        """As `ArmMeans.predict`."""
+        return np.asarray(self.level + self._standardised(contexts) @ self.coefficients.T)
+
+    def sensitivity(self, contexts: Floats, policy: Floats) -> Floats:
+        """As `ArmMeans.sensitivity`; treats the mean reward as fixed."""
+        totals = policy.T @ self._standardised(contexts)
+        solved = [linalg.cho_solve(*pair) for pair in zip(self._factors, totals, strict=True)]
+        return np.asarray((self.inputs * np.stack(solved)[self.arms]).sum(axis=1))
+
+    def _standardised(self, contexts: Floats) -> Floats:
+        scaled = (contexts - self.centre) / self.scale
+        return np.column_stack([np.ones(len(contexts)), scaled])
+
+
+@dataclass(frozen=True, eq=False)
+class CrossFit:
+    """Models of the rewards; none predicts a pull to which it was fitted."""
+
+    contexts: NDArray[Any]  # of the pulls, shape (n,) or (n, d)
+    arms: Ints  # shape (n,)
+    rewards: Floats  # shape (n,)
+    fold: Ints  # the fold of each pull, shape (n,)
+    models: Sequence[ArmMeans | ArmRegressions]  # for each fold, a model fitted to all other folds
+    predicted: Floats  # mean reward of each arm before each pull, shape (n, n_arms)
+
+    def reward_influence(self, policy: Floats) -> Floats:
+        """The effect of each reward's deviation from its model on the policy's predictions.
+
+        On the scale of a term: the mean of the results is their total effect.
+        """
+        added = np.zeros(len(self.arms))
+        for fold, model in enumerate(self.models):
+            held_out = self.fold == fold
+            fitted = np.flatnonzero(~held_out)
+            arms = self.arms[fitted]
+            expected = model.predict(self.contexts[fitted])[np.arange(len(arms)), arms]
+            counts = model.sensitivity(self.contexts[held_out], policy[held_out])
+            added[fitted] += counts * (self.rewards[fitted] - expected)
+        return added
+
+
+def cross_fit(
+    contexts: NDArray[Any],
+    arms: Ints,
+    rewards: Floats,
+    n_arms: int,
+    *,
+    n_folds: int = N_FOLDS,
+    seed: int = 0,
+) -> CrossFit:
+    """Fit models of the rewards: means for numbered contexts, else regressions.
+
+    Args:
+        contexts: integers from 0, shape (n,), or vectors, shape (n, d).
+        arms: shape (n,).
+        rewards: shape (n,).
+        n_arms: number of arms, including arms that were not pulled.
+        n_folds: number of random parts of the pulls.
+        seed: the seed of this partition.
+
+    Raises:
+        ValueError: if there are fewer than two pulls or folds.
+    """
+    if len(arms) < 2 or n_folds < 2:
+        raise ValueError(
+            f"a model of the rewards needs two pulls and two folds or more: there are {len(arms)} "
+            f"and {n_folds}"
+        )
+    n_folds = min(n_folds, len(arms))
+    fold = np.random.default_rng(seed).permutation(len(arms)) % n_folds
+    models: list[ArmMeans | ArmRegressions] = []
+    predicted = np.zeros((len(arms), n_arms))
+    for held_out in (fold == i for i in range(n_folds)):
+        part = contexts[~held_out], arms[~held_out], rewards[~held_out], n_arms
+        model = (
+            ArmMeans(*part, int(contexts.max()) + 1)
+            if contexts.ndim == 1
+            else ArmRegressions(*part)
+        )
+        models.append(model)
+        predicted[held_out] = model.predict(contexts[held_out])
+    return CrossFit(contexts, arms, rewards, fold, models, predicted)
+
+
+# --- the estimators -------------------------------------------------------------------------------
+
+# By how many standard errors the mean weight may differ from 1 before the log is refused. Chance
+# causes this only if the log has almost none of the policy's actions.
+MOST_ERRORS = 5.0
+# An additional tolerance, because files round propensities.
+ROUNDED = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyTerms:
+    """The terms of each estimator, shapes (n,)."""
+
+    ips: Floats  # inverse propensities
+    snips: Floats  # self-normalised
+    direct: Floats  # the direct method
+    doubly_robust: Floats  # doubly robust
+    effective: float  # the effective sample size, in pulls of the policy itself
+    weights: Floats  # probability of each pull under the policy, relative to the log
+    errors: Floats  # each reward minus the model's prediction
+
+
+def evaluate_policy(
+    policy: Floats, arms: Ints, rewards: Floats, propensities: Floats, model: CrossFit
+) -> PolicyTerms:
+    """Evaluate a policy by all four estimators.
+
+    Args:
+        policy: its probability of each arm at each pull, shape (n, n_arms).
+        arms: the arms pulled, shape (n,).
+        rewards: their rewards, shape (n,).
+        propensities: the log's probability of each pulled arm, shape (n,).
+        model: the reward model; see `cross_fit`.
+
+    Raises:
+        ValueError: if the log cannot support an estimate.
+    """
+    weights = importance_weights(policy, arms, propensities)
+    check_support(policy, arms, weights)
+    return PolicyTerms(
+        ips=ips(weights, rewards),
+        snips=snips(weights, rewards),
+        direct=direct_method(policy, model),
+        doubly_robust=doubly_robust(policy, weights, arms, rewards, model.predicted),
+        effective=effective_sample_size(weights),
+        weights=weights,
+        errors=_errors(arms, rewards, model.predicted),
+    )
+
+
+def terms_as_logged(arms: Ints, rewards: Floats, model: CrossFit) -> PolicyTerms:
+    """The terms of the log's own policy, which are the rewards themselves."""
+    n, errors = len(rewards), _errors(arms, rewards, model.predicted)
+    return PolicyTerms(rewards, rewards, rewards, rewards, float(n), np.ones(n), errors)
+
+
+def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
+    """The mean of an estimator's terms with its t interval.
+
+    The interval is valid for many terms without dominating ones: check the effective sample size.
+    It does not cover the bias of an estimator.
+    """
+    mean = float(terms.mean())
+    reach = float(stats.t.isf((1 - confidence) / 2, len(terms) - 1) * stats.sem(terms))
+    return Estimate(mean, mean - reach, mean + reach, len(terms))
+
+
+def difference_in_value(
+    first: PolicyTerms, second: PolicyTerms, n_comparisons: int = 1
+) -> Estimate:
+    """The difference of two policies' values per pull, doubly robust, with a t interval.
+
+    The standard deviation of the terms has a lower bound: its value if rewards had the same noise
+    everywhere. If few pulls inform a choice, all may have had equal rewards by chance, and the
+    terms alone would look too certain.
+
+    Args:
+        first: the terms of one policy.
+        second: the terms of the other, on the same log.
+        n_comparisons: the number of comparisons; the intervals of all of them hold
+            simultaneously with 95 %.
+    """
+    confidence = 1 - 0.05 / n_comparisons
+    found = mean_reward(first.doubly_robust - second.doubly_robust, confidence)
+    apart = first.weights - second.weights
+    variance = float((apart**2).mean() * (first.errors**2).mean()) / len(apart)
+    half = float(stats.t.isf(0.05 / n_comparisons / 2, len(apart) - 1)) * np.sqrt(variance)
+    half = max(half, found.high - found.point)
+    return replace(found, low=found.point - half, high=found.point + half)
+
+
+def importance_weights(policy: Floats, arms: Ints, propensities: Floats) -> Floats:
+    """The policy's probability of each pull divided by the log's, shape (n,)."""
+    return np.asarray(policy[np.arange(len(arms)), arms] / propensities)
+
+
+def check_support(policy: Floats, arms: Ints, weights: Floats) -> None:
+    """Refuse a log that does not cover the policy's actions.
+
+    The mean weight is 1 if the propensities are right and the log could choose every arm that the
+    policy chooses in each context. The deviation from 1 is measured in standard errors under a
+    mean of 1, because too few large weights would underestimate their own variance.
+
+    Raises:
+        ValueError: names the arm that was never logged, or the mean weight.
+    """
+    share = policy.mean(axis=0)
+    unlogged = np.setdiff1d(np.flatnonzero(share > 0), arms)
+    if len(unlogged):
+        arm = unlogged[0]
+        raise ValueError(
+            f"arm {arm} was never logged, and the policy chooses it for {share[arm]:.1%} of the "
+            "pulls: nothing is known of its rewards"
+        )
+    mean = weights.mean()
+    if mean == 0:
+        raise ValueError("the policy would have made none of the logged pulls")
+    variance = max(float((weights**2).mean() / mean) - 1, 0.0)
+    allowed = MOST_ERRORS * np.sqrt(variance / len(weights)) + ROUNDED
+    if mean < 1 - allowed:
+        raise ValueError(
+            f"the log holds too little of what the policy does: its weights are {mean:.3g} on "
+            "average, not 1, so it chooses arms in contexts in which they were hardly ever logged"
+        )
+    if mean > 1 + allowed:
+        raise ValueError(
+            f"the propensities are too small: the weights are {mean:.3g} on average, not 1; each "
+            "must be the probability with which the logged arm was chosen"
+        )
+
+
+def ips(weights: Floats, rewards: Floats) -> Floats:
+    """Inverse propensity scoring: w r, with an unbiased mean if the propensities are right.
+
+    Source: Horvitz and Thompson (1952), "A generalization of sampling without replacement from a
+    finite universe", JASA 47; for policies Strehl, Langford, Li and Kakade (2010), "Learning from
+    logged implicit exploration data", NeurIPS.
+    """
+    return weights * rewards
+
+
+def snips(weights: Floats, rewards: Floats) -> Floats:
+    """Self-normalised inverse propensities: a weighted mean of rewards, so within their range.
+
+    Consistent, with a bias of order 1/n. The terms are the ratio's linear approximation (delta
+    method): s + w (r - s) / mean(w), where s is the estimate. Not all weights may be 0.
+
+    Source: Swaminathan and Joachims (2015), "The self-normalized estimator for counterfactual
+    learning", NeurIPS.
+    """
+    total = weights.sum()
+    estimate = weights @ rewards / total
+    return np.asarray(estimate + weights * (rewards - estimate) * (len(weights) / total))
+
+
+def direct_method(policy: Floats, model: CrossFit) -> Floats:
+    """The direct method: a model's predicted rewards of the policy's actions.
+
+    It needs no propensities. It has the bias of the model, which the interval does not cover. The
+    interval does cover that the model was fitted to a sample: the terms contain each reward's
+    first-order effect through the model (delta method), which has mean 0.
+
+    Source: Dudik, Langford and Li (2011), "Doubly robust policy evaluation and learning", ICML;
+    the variance as in Stefanski and Boos (2002), "The calculus of M-estimation", The American
+    Statistician 56.
+    """
+    added = model.reward_influence(policy)
+    return np.asarray((policy * model.predicted).sum(axis=1) + added - added.mean())
+
+
+def doubly_robust(
+    policy: Floats, weights: Floats, arms: Ints, rewards: Floats, predicted: Floats
+) -> Floats:
+    """The direct method, with the model's errors corrected by inverse propensities.
+
+    Unbiased if the propensities are right, for any model that predicts only pulls outside its fit.
+    A better model gives a smaller variance.
+
+    Source: Dudik, Langford and Li (2011); crossing folds as in Chernozhukov et al. (2018),
+    "Double/debiased machine learning", The Econometrics Journal 21.
+    """
+    errors = _errors(arms, rewards, predicted)
+    return np.asarray((policy * predicted).sum(axis=1) + weights * errors)
+
+
+def _errors(arms: Ints, rewards: Floats, predicted: Floats) -> Floats:
+    return np.asarray(rewards - predicted[np.arange(len(arms)), arms])
+
+
+def effective_sample_size(weights: Floats) -> float:
+    """The equivalent number of pulls by the policy itself: (sum of w)^2 / sum of w^2.
+
+    0 if all weights are 0. Source: Kish (1965), Survey Sampling, section 11.7.
+    """
+    squares = float(weights @ weights)
+    return float(weights.sum()) ** 2 / squares if squares else 0.0
+
+
+# --- agents on a log ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LoggedPolicy:
+    """A trained agent for evaluation on a log."""
+
+    name: str  # its path, as given
+    agent: BaseAlgorithm  # the loaded agent
+    log: Path | None  # the log of its training; None if there was none, or it is unknown
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One row of the comparison."""
+
+    name: str  # of the policy
+    terms: PolicyTerms  # the terms of its estimates
+    is_given: bool = False  # whether the user asked about it; otherwise it is an alternative
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The comparison of policies on one log."""
+
+    data: LoggedData  # the log
+    # The user's policies; then each arm as a constant policy, and the log's own policy.
+    rows: tuple[Judged, ...]
+    notes: tuple[str, ...]  # notes for reading the figures
+
+
+# Settings that change an agent's observations, so that they differ from the log's contexts.
+_OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
+
+
+def read_logged(path: Path, columns: Mapping[str, str] | None = None) -> LoggedData:
+    """Read a log with propensities.
+
+    Args:
+        path: the CSV file.
+        columns: the file's names of ``arm``, ``reward`` and ``propensity``, where they differ.
+
+    Raises:
+        UserError: if it cannot be read or lacks them.
+    """
+    try:
+        data = read_log(path, columns or {})
+    except ValueError as error:
+        raise UserError(one_line(error)) from error
+    if data.propensities is None:
+        raise UserError(
+            f"{path} has no column 'propensity': off-policy evaluation needs the probability with "
+            "which each arm was chosen, 1 divided by the number of arms where all were equally "
+            "likely; --columns propensity=NAME says which column it is"
+        )
+    return data
+
+
+def load_policy(path: Path, typed: Sequence[str] = ()) -> LoggedPolicy:
+    """Load the agent of a run folder or a zip; ``typed`` are modules that the user typed.
+
+    Raises:
+        UserError: if there is none, or it does not observe the log's contexts.
+    """
+    from rl_yardstick.pipeline.models import Wanted, find_model, load_agent
+
+    wanted = Wanted(path, env_id="ReplayBandit-v0", typed=list(typed), device="cpu")
+    model = find_model(wanted)
+    if changed := next((key for key in _OBSERVATION_SETTINGS if getattr(model.spec, key)), None):
+        raise UserError(f"{path} was trained with {changed}: it observes more than a log holds")
+    agent = load_agent(model)
+    if not isinstance(agent.action_space, spaces.Discrete):
+        raise UserError(f"{path} chooses no arms: its actions are {agent.action_space}")
+    log = model.spec.env_kwargs.get("log")
+    return LoggedPolicy(str(path), agent, Path(log) if isinstance(log, str) else None)
+
+
+def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comparison:
+    """Evaluate policies, each arm as a constant policy, and the log's own policy.
+
+    Raises:
+        UserError: if a policy does not fit the log, or the log cannot support an estimate.
+    """
+    model = reward_model(data, max([data.n_arms, *(_n_arms(p.agent) for p in policies)]))
+    notes = [note for policy in policies for note in _notes(data, policy)]
+    rows = [
+        Judged(policy.name, _judge(data, policy.name, probabilities(policy, data), model), True)
+        for policy in policies
+    ]
+    for arm in range(data.n_arms):
+        always = np.zeros(model.predicted.shape)
+        always[:, arm] = 1
+        try:
+            rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, model)))
+        except UserError as error:
+            notes.append(str(error))
+    as_logged = terms_as_logged(data.arms, data.rewards, model)
+    if data.categories is not None:
+        numbered = ", ".join(f"{i} {name}" for i, name in enumerate(data.categories))
+        notes.append(f"{data.context_names[0]} was read as {numbered}")
+    return Comparison(data, (*rows, Judged("as logged", as_logged)), tuple(notes))
+
+
+def reward_model(data: LoggedData, n_arms: int) -> CrossFit:
+    """Fit means of the rewards for Discrete contexts, else regressions.
+
+    Raises:
+        UserError: if there are too few pulls.
+    """
+    space = data.observation_space
+    discrete = isinstance(space, spaces.Discrete)
+    contexts = data.observations(space) if discrete else data.contexts
+    try:
+        return cross_fit(contexts, data.arms, data.rewards, n_arms)
+    except ValueError as error:
+        raise UserError(f"{data.source}: {one_line(error)}") from error
+
+
+def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
+    """The probability of each arm at each logged pull, shape (n, arms of the agent).
+
+    Raises:
+        UserError: if the agent does not observe the log's contexts, or needs further
+            observations.
+    """
+    from rl_yardstick.pipeline.evaluation.policies import policy_matrix, why_not_exact
+
+    agent: Any = policy.agent
+    try:
+        observations = data.observations(agent.observation_space)
+    except ValueError as error:
+        raise UserError(f"{policy.name}: {one_line(error)}") from error
+    reason = why_not_exact(agent, observations)
+    if reason:
+        raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
+    try:
+        return policy_matrix(agent, observations)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{policy.name} cannot be judged on a log: {one_line(error)}") from error
+
+
+def _n_arms(agent: BaseAlgorithm) -> int:
+    """The number of arms of an agent."""
+    assert isinstance(agent.action_space, spaces.Discrete)
+    return int(agent.action_space.n)
+
+
+def _judge(data: LoggedData, name: str, policy: Floats, model: CrossFit) -> PolicyTerms:
+    """Evaluate a policy that may have fewer arms than the log."""
+    padded = np.zeros(model.predicted.shape)
+    padded[:, : policy.shape[1]] = policy
+    assert data.propensities is not None
+    try:
+        return evaluate_policy(padded, data.arms, data.rewards, data.propensities, model)
+    except ValueError as error:
+        raise UserError(f"{name} on {data.source}: {one_line(error)}") from error
+
+
+def _notes(data: LoggedData, policy: LoggedPolicy) -> list[str]:
+    """Notes on an agent that was trained on a log.
+
+    Raises:
+        UserError: if that log numbered text contexts differently.
+    """
+    if policy.log is None or not policy.log.is_file():
+        return []
+    if policy.log.resolve() == Path(data.source).resolve():
+        return [f"{policy.name} was trained on this log: its figures flatter it; judge by another"]
+    trained = read_logged(policy.log)
+    if trained.categories != data.categories:
+        raise UserError(
+            f"{policy.name} was trained on {policy.log}, whose contexts are "
+            f"{_listed(trained)}; those of {data.source} are {_listed(data)}"
+        )
+    return []
+
+
+def _listed(data: LoggedData) -> str:
+    return "numbers" if data.categories is None else ", ".join(data.categories)

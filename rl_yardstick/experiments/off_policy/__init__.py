@@ -1,1 +1,0 @@
-"""Off-policy evaluation on the pulls of another policy: ``compare.py --logged``."""

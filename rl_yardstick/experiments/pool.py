@@ -1,0 +1,266 @@
+"""Runs of a study in processes of their own: a crash or a time-out hits one run alone."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import wait as wait_for
+from pathlib import Path
+from typing import Any, Self
+
+from pebble import ProcessExpired, ProcessPool
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from rl_yardstick.experiments.plan import PlannedRun
+from rl_yardstick.pipeline.errors import Stopped, UserError, one_line
+from rl_yardstick.pipeline.modules import import_modules
+from rl_yardstick.pipeline.run import INTERRUPTED, LOCK, RUNNING, Run, Stop, resumable
+
+ERROR_FILE = "error.txt"  # the traceback of a run that failed
+SECONDS_BETWEEN_LINES = 10.0
+GRACE = 30.0  # seconds until stopped runs must have saved their states
+_WINDOWS_OR_MAC = sys.platform in ("win32", "darwin")  # where forked libraries crash
+
+
+def do_run(planned: PlannedRun, command: str = "", stop: Stop | None = None) -> None:
+    """Do one run in this process, or what is left of it. This is what any pool or cluster calls.
+
+    Args:
+        planned: the run.
+        command: the user's command, for the run folder.
+        stop: asks the run to stop; by default a SIGTERM does.
+
+    Raises:
+        UserError: with the reason, if the run fails.
+        Stopped: after a SIGTERM; the state of the training is saved.
+    """
+    spec, path = planned.spec, planned.path
+    try:
+        import_modules(spec.gym_packages)
+        path.mkdir(parents=True, exist_ok=True)
+        with _sigterm_noticed(stop) as asked, Run(path, stop=asked) as run:
+            if planned.is_finished:
+                return
+            resumes = _can_resume(planned, run)
+            if not resumes:
+                _clear(planned)
+                run.begin(spec, {"algo": spec.algo, "env": spec.env_id, "seed": spec.seed}, command)
+            if planned.is_batch:
+                from rl_yardstick.experiments.bandits import do_batch
+
+                do_batch(spec, planned.n_runs, run)
+            else:
+                from rl_yardstick.pipeline.training import train
+
+                train(spec, run, resumes)
+    except (UserError, Stopped) as error:  # not of subclasses, which another process cannot read
+        raise (error if isinstance(error, Stopped) else UserError(str(error))) from None
+    except BaseException as error:  # noqa: BLE001  # of the user's code: told in one line
+        with suppress(OSError):
+            (path / ERROR_FILE).write_text(traceback.format_exc(), encoding="utf-8")
+        raise UserError(f"{one_line(error)}; see {path / ERROR_FILE}") from None
+
+
+def _can_resume(planned: PlannedRun, run: Run) -> bool:
+    """Whether the folder has a state of this run, saved with the same versions."""
+    if not run.state_path.exists() or planned.differences(planned.recorded()):
+        return False
+    with suppress(UserError):
+        return resumable(run.path) is not None
+    return False
+
+
+def _clear(planned: PlannedRun) -> None:
+    """Remove what an earlier attempt has left."""
+    for path in planned.path.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != LOCK:
+            path.unlink()
+    if planned.spec.tensorboard_log is not None:
+        shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)
+
+
+@contextmanager
+def _sigterm_noticed(stop: Stop | None) -> Iterator[Stop]:
+    """The request to stop; Ctrl-C reaches all processes, and is the driver's to heed."""
+    if stop is not None:
+        yield stop
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    stop = Stop().listen()
+    signal.signal(signal.SIGINT, before[signal.SIGINT])
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGTERM, before[signal.SIGTERM])
+
+
+# --- workers on this machine ----------------------------------------------------------------------
+
+
+class Workers:
+    """Processes of this machine that do runs, one after another, until the ``with`` ends.
+
+    Args:
+        n_at_once: their number.
+        timeout: seconds for each run; None for any time.
+
+    Attributes:
+        words: the workers in a few words.
+    """
+
+    def __init__(self, n_at_once: int, timeout: float | None = None) -> None:
+        self.n_at_once, self.timeout = n_at_once, timeout
+        self.words = f"{n_at_once} at once"
+        self._pool: ProcessPool | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    def submit(self, planned: PlannedRun, command: str) -> Future[None]:
+        """Do a run as soon as a worker is free; the future raises what `do_run` raises."""
+        if self._pool is None:
+            self._pool = process_pool(self.n_at_once)
+        return self._pool.submit(do_run, self.timeout, planned, command)
+
+    def end(self) -> None:
+        """Let running runs save their states, and end the workers."""
+        if self._pool is not None:
+            workers = [p for p in multiprocessing.active_children() if p.name.startswith("pebble")]
+            for worker in workers:
+                worker.terminate()
+            deadline = time.monotonic() + GRACE
+            for worker in workers:
+                worker.join(max(deadline - time.monotonic(), 0.0))
+            self._pool.stop()
+            self._pool.join()
+            self._pool = None
+
+
+def process_pool(n_workers: int) -> ProcessPool:
+    """A pool of processes that have imported the libraries, and use one thread each."""
+    context = multiprocessing.get_context("spawn" if _WINDOWS_OR_MAC else "forkserver")
+    context.set_forkserver_preload(["rl_yardstick.pipeline.training"])
+    for library in ("OMP", "MKL", "OPENBLAS"):  # small networks are slower with more
+        os.environ[f"{library}_NUM_THREADS"] = "1"
+    return ProcessPool(n_workers, initializer=_follow_parent, context=context)
+
+
+def _follow_parent() -> None:
+    """Let a worker end with the command that started it, also after a SIGKILL."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        wait_for([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def do_aside(function: Callable[..., Any], *args: Any) -> Any:
+    """Call a function in another process, so that this one need not import the libraries."""
+    with process_pool(1) as pool:
+        return pool.schedule(function, args=args).result()
+
+
+def available_cores() -> int:
+    """The number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# --- doing runs -----------------------------------------------------------------------------------
+
+
+def do_runs(
+    runs: Sequence[PlannedRun], workers: Workers, command: str, console: Console, stop: Stop
+) -> dict[Path, str]:
+    """Do runs in their order; tell the progress, and each run that fails in a line.
+
+    Args:
+        runs: those that are to do.
+        workers: who does them.
+        command: the user's command, for the run folders.
+        console: where progress and failures are printed.
+        stop: after a signal, running ones are stopped at their next safe moment.
+
+    Returns:
+        The reason of each failure, by the folder of the run.
+
+    Raises:
+        Stopped: after a signal.
+    """
+    failures: dict[Path, str] = {}
+    to_do, under_way = list(runs)[::-1], dict[Future[None], PlannedRun]()
+    with _progress(console, len(runs)) as advance:
+        while to_do or under_way:
+            # No more than there are workers: what waits in a pool is begun even after a stop.
+            while to_do and len(under_way) < workers.n_at_once and not stop.number:
+                run = to_do.pop()
+                under_way[workers.submit(run, command)] = run
+            done = wait(under_way, timeout=0.2, return_when=FIRST_COMPLETED).done
+            if stop.number:
+                workers.end()
+                _mark_interrupted(under_way.values())
+                stop.check()
+            for future in done:
+                run, error = under_way.pop(future), future.exception()
+                if error is not None:
+                    _mark_interrupted([run])
+                    failures[run.path] = _in_words(error, run, workers.timeout)
+                    console.print(f"failed: {run.title}: {failures[run.path]}", highlight=False)
+                advance(len(failures))
+    return failures
+
+
+def _mark_interrupted(runs: Iterable[PlannedRun]) -> None:
+    """No run is left ``running`` by a worker that had to be killed."""
+    for planned in runs:
+        if planned.recorded().get("state") == RUNNING:
+            planned.run.record(planned.spec, INTERRUPTED)
+
+
+def _in_words(error: BaseException, run: PlannedRun, timeout: float | None) -> str:
+    if isinstance(error, TimeoutError):
+        return f"took longer than --run-timeout allows, {timeout:g} s"
+    if isinstance(error, ProcessExpired):
+        return f"its process died with code {error.exitcode}"
+    return one_line(error)
+
+
+@contextmanager
+def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal, and else a line now and then and at the end."""
+    begun = told_at = time.monotonic()
+    columns = TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    failed = TextColumn("{task.description}")
+    is_live = console.is_terminal and total > 0
+    with Progress(*columns, failed, console=console, transient=True, disable=not is_live) as bar:
+        task, n_done = bar.add_task("", total=total), 0
+
+        def advance(n_failed: int) -> None:
+            nonlocal n_done, told_at
+            n_done += 1
+            words = f", {n_failed} failed" if n_failed else ""
+            bar.update(task, advance=1, description=words.removeprefix(", "))
+            now = time.monotonic()
+            if not is_live and (n_done == total or now - told_at > SECONDS_BETWEEN_LINES):
+                told_at = now
+                text = f"{n_done} of {total} runs in {now - begun:.0f} s{words}"
+                console.print(text, highlight=False)
+
+        yield advance

@@ -1,1 +1,0 @@
-"""Finds, inspects, loads, continues and saves models on disk."""

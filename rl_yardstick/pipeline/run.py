@@ -1,0 +1,245 @@
+"""A run's folder, as rl_zoo3 lays it out, with its lock, its console and the request to stop."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import signal
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from types import FrameType
+from typing import Any, Self
+
+from filelock import FileLock, Timeout
+from pydantic import ValidationError
+from rich.console import Console
+
+from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.files import read_json, replacing, write_json, write_text
+from rl_yardstick.pipeline.spec import TrainSpec
+
+RUNNING, FINISHED, INTERRUPTED, FAILED = "running", "finished", "interrupted", "failed"
+RECORD, STATE, LOCK = "run.json", "state.bin", ".lock"
+PULLS_FILE = "pulls.npz"
+LAST_PULLS = 100  # pulls at the end whose mean is reported
+MAX_RECORD = 100_000_000  # bytes of run.json, which holds the rows of maps
+
+
+class Stop:
+    """The number of the first SIGINT or SIGTERM, or 0; the second signal ends the process."""
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def listen(self) -> Self:
+        """Take over the signals, in a process's main thread; elsewhere Python delivers none."""
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, self._noticed)
+        return self
+
+    def _noticed(self, number: int, frame: FrameType | None) -> None:
+        if self.number:
+            raise KeyboardInterrupt
+        self.number = number
+
+    def check(self) -> None:
+        """Raise `Stopped` after a signal; called between two pieces of work."""
+        if self.number:
+            raise Stopped(self.number)
+
+
+class Run:
+    """A run folder, held by this process while the ``with`` statement lasts.
+
+    Attributes:
+        path: ``<log folder>/<algo>/<env>_<n>``.
+        console: where progress and results are printed.
+        stop: asked between two pieces of work whether to go on.
+        is_new: whether this process has made the folder.
+        has_begun: whether the agent is about to take steps; a new run without any leaves no folder.
+    """
+
+    def __init__(
+        self, path: Path, console: Console | None = None, stop: Stop | None = None
+    ) -> None:
+        self.path = path
+        self.console = console or Console(quiet=True)
+        self.stop = stop or Stop()
+        self.is_new = self.has_begun = False
+        self._lock = FileLock(path / LOCK, timeout=0)
+
+    @classmethod
+    def claim(cls, folder: Path, spec: TrainSpec, suffix: str = "", **kwargs: Any) -> Self:
+        """Make the next free folder of an agent on an environment; ``mkdir`` decides who has it."""
+        parent = folder / spec.algo
+        parent.mkdir(parents=True, exist_ok=True)
+        number = max((n for n, _ in numbered_runs(parent, spec.env_name)), default=0) + 1
+        while True:
+            with suppress(FileExistsError):
+                path = parent / f"{spec.env_name}_{number}{suffix}"
+                path.mkdir()
+                run = cls(path, **kwargs)
+                run.is_new = True
+                return run
+            number += 1
+
+    def __enter__(self) -> Self:
+        try:
+            self._lock.acquire()
+        except Timeout:
+            pid = self.recorded().get("pid", "unknown")
+            raise UserError(f"{self.path} is in use by another command, process {pid}") from None
+        except NotImplementedError as error:  # no flock
+            raise UserError(f"{self.path}: {error}") from error
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if error is not None and self.is_new and not self.has_begun:
+            shutil.rmtree(self.path, ignore_errors=True)
+            for folder in list(self.path.parents)[:2]:  # those that are empty now
+                with suppress(OSError):
+                    folder.rmdir()
+        self._lock.release()
+
+    # --- files ------------------------------------------------------------------------------------
+
+    @property
+    def state_path(self) -> Path:
+        """The state from which the training can go on."""
+        return self.path / STATE
+
+    @property
+    def best_model_path(self) -> Path:
+        """The zip of the agent that evaluated best."""
+        return self.path / "best_model.zip"
+
+    def settings_path(self, spec: TrainSpec) -> Path:
+        """The folder of rl_zoo3's settings files, and of VecNormalize's statistics."""
+        return self.path / spec.env_name
+
+    def model_path(self, spec: TrainSpec) -> Path:
+        """The zip of the agent at the end."""
+        return self.path / f"{spec.env_name}.zip"
+
+    def checkpoints(self) -> dict[int, Path]:
+        """The checkpoints by their steps, in rising order."""
+        return dict(sorted((int(p.stem.split("_")[2]), p) for p in self._named_checkpoints()))
+
+    def _named_checkpoints(self) -> list[Path]:
+        return [p for p in self.path.iterdir() if re.fullmatch(r"rl_model_\d+_steps\.zip", p.name)]
+
+    def recorded(self) -> dict[str, Any]:
+        """The content of ``run.json``; empty if there is none yet."""
+        path = self.path / RECORD
+        data = read_json(path, MAX_RECORD) if path.exists() else {}
+        return data if isinstance(data, dict) else {}
+
+    def spec(self) -> TrainSpec:
+        """The spec in ``run.json``, which is data.
+
+        Raises:
+            UserError: if there is none.
+        """
+        return spec_in(self.recorded(), self.path)
+
+    def begin(self, spec: TrainSpec, args: Mapping[str, Any], command: str) -> None:
+        """Write what the run is about to do: settings for rl_zoo3, and ``run.json``."""
+        import yaml
+
+        def text(data: Mapping[str, Any]) -> str:
+            return str(yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
+
+        settings = self.settings_path(spec)
+        settings.mkdir(exist_ok=True)
+        write_text(settings / "config.yml", text(spec.hyperparams))
+        # rl_zoo3's tools use env_kwargs in args.yml before those in config.yml.
+        write_text(settings / "args.yml", text({**args, "env_kwargs": spec.env_kwargs or None}))
+        write_text(settings / "command.txt", f"{command}\n")
+        self.record(spec, RUNNING)
+
+    def record(self, spec: TrainSpec, state: str, **figures: Any) -> None:
+        """Write ``run.json``; with the state ``finished`` it is the last file of a run."""
+        known = {"state": state, "env_name": spec.env_name, "spec": spec.model_dump()}
+        facts = {"versions": versions(), "machine": machine(), "pid": os.getpid()}
+        write_json(self.path / RECORD, {**known, **facts, **figures})
+
+    def save(self, agent: Any, path: Path) -> None:
+        """Save an agent's zip whole or not at all, and the statistics of its VecNormalize."""
+        from rl_yardstick.pipeline.finite_numbers import check_model
+
+        check_model(agent)
+        with replacing(path) as beside:
+            agent.save(beside)
+        if (statistics := agent.get_vec_normalize_env()) is not None:
+            with replacing(statistics_beside(path)) as beside:
+                statistics.save(str(beside))
+
+
+def statistics_beside(model: Path) -> Path:
+    """Where the statistics of a model's VecNormalize are saved, as in rl_zoo3."""
+    if model.name.startswith("rl_model_"):
+        return model.with_name(f"{model.stem.replace('model', 'model_vecnormalize')}.pkl")
+    if model.stem == "best_model":
+        return model.with_name("best_model_vecnormalize.pkl")
+    return model.with_suffix("") / "vecnormalize.pkl"
+
+
+def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:
+    """The run folders of one environment, by rising number."""
+    form = re.compile(re.escape(env_name) + r"_(\d+)(?:_[0-9a-f-]{36})?")
+    names = [(form.fullmatch(p.name), p) for p in parent.iterdir()] if parent.is_dir() else []
+    return sorted((int(match[1]), path) for match, path in names if match)
+
+
+def spec_in(recorded: Mapping[str, Any], path: Path) -> TrainSpec:
+    """The spec in the content of a ``run.json``."""
+    try:
+        return TrainSpec.model_validate(recorded["spec"])
+    except (ValidationError, LookupError, TypeError) as error:
+        raise UserError(f"{path} is no run folder of this version: {RECORD} has no spec") from error
+
+
+@cache
+def versions() -> dict[str, str]:
+    """The versions on which the bits of a run depend."""
+    from importlib.metadata import version
+
+    names = ("rl-yardstick", "torch", "stable-baselines3", "gymnasium", "numpy", "numba")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+@cache
+def machine() -> dict[str, str]:
+    """Hardware that may affect times and the bits of networks; does not identify the machine."""
+    processor = platform.processor() or platform.machine()
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                processor = line.partition(":")[2].strip()
+                break
+    system = f"{platform.system()} {platform.release()}, {platform.machine()}"
+    return {"processor": processor, "cores": str(os.cpu_count() or ""), "system": system}
+
+
+def resumable(path: Path) -> TrainSpec:
+    """The spec of an unfinished run.
+
+    Raises:
+        UserError: if it has finished, or other versions would give other bits.
+    """
+    run = Run(path)
+    recorded = run.recorded()
+    spec = spec_in(recorded, path)
+    if recorded.get("state") == FINISHED:
+        raise UserError(f"{path} is finished already")
+    for name, version in versions().items() if run.state_path.exists() else ():
+        was = recorded.get("versions", {}).get(name)
+        if was != version:
+            raise UserError(f"{path} was begun with {name} {was}, here is {version}")
+    return spec

@@ -1,0 +1,211 @@
+"""Run folders: names, locks, records, stops; files that are read with a limit and written whole."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rl_yardstick.pipeline import files
+from rl_yardstick.pipeline.callbacks import EvaluationCallback
+from rl_yardstick.pipeline.errors import Stopped, UserError
+from rl_yardstick.pipeline.files import (
+    json_text,
+    portable_name,
+    read_bytes,
+    read_json,
+    read_text,
+    replacing,
+    write_json,
+)
+from rl_yardstick.pipeline.run import Run, Stop, numbered_runs, statistics_beside
+from rl_yardstick.pipeline.training import train
+from tests.pipeline.short_runs import LAKE, run_of, spec_of
+
+
+@pytest.fixture(autouse=True)
+def own_place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+# --- names and locks ------------------------------------------------------------------------------
+
+
+def test_numbers_are_given_once_and_the_newest_is_last():
+    spec = spec_of("qlearning")
+    paths = [Run.claim(Path("logs"), spec).path for _ in range(11)]
+    paths.append(Run.claim(Path("logs"), spec, f"_{'a' * 36}").path)
+    assert [path.name for path in paths[:2]] == ["FrozenLake-v1_1", "FrozenLake-v1_2"]
+    (Path("logs/qlearning") / "FrozenLake-v1_x").mkdir()
+    (Path("logs/qlearning") / "FrozenLake-v1-other_3").mkdir()
+    found = numbered_runs(Path("logs/qlearning"), "FrozenLake-v1")
+    assert [number for number, _ in found] == list(range(1, 13))
+    assert [path for _, path in found] == paths
+
+
+def test_a_run_is_held_by_one_process_and_free_when_that_is_dead():
+    run = Run.claim(Path("logs"), spec_of("qlearning"))
+    run.begin(spec_of("qlearning"), {}, "train.py")
+    code = "import sys, time; from pathlib import Path; from rl_yardstick.pipeline.run import Run\n"
+    code += f"with Run(Path({str(run.path.absolute())!r})): print(1, flush=True); time.sleep(99)"
+    other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    try:
+        assert other.stdout.readline() == b"1\n"
+        with pytest.raises(UserError, match="is in use by another command, process"), run:
+            pass
+    finally:
+        other.kill()
+        other.wait()
+    with run:
+        assert (run.path / "run.json").exists()
+
+
+@pytest.mark.parametrize(("is_new", "has_begun", "stays"), [(1, 0, 0), (1, 1, 1), (0, 0, 1)])
+def test_a_new_run_in_which_nothing_happened_leaves_no_folder(is_new, has_begun, stays):
+    run = Run.claim(Path("logs"), spec_of("qlearning"))
+    run.is_new, run.has_begun = bool(is_new), bool(has_begun)
+    with pytest.raises(UserError), run:
+        raise UserError("wrong")
+    assert run.path.exists() == bool(stays)
+    assert Path("logs").exists() == bool(stays)
+
+
+def test_the_folder_has_the_layout_of_rl_zoo3():
+    entry = {"n_timesteps": 300, "gamma": 0.9, "env_kwargs": {"is_slippery": False}}
+    run, outcome = run_of(spec_of("qlearning", LAKE, entry, save_freq=100, eval_freq=100))
+    names = {str(path.relative_to(run.path)) for path in run.path.rglob("*") if path.is_file()}
+    assert names == {
+        *("FrozenLake-v1.zip", "best_model.zip", "evaluations.npz", "run.json", "value_maps.npz"),
+        *(f"FrozenLake-v1/{name}" for name in ("args.yml", "config.yml", "command.txt")),
+        *("0.monitor.csv", ".lock", *(f"rl_model_{n}_steps.zip" for n in (100, 200, 300))),
+    } - ({".lock"} - names)
+    assert list(run.checkpoints()) == [100, 200, 300]
+    assert run.spec().hyperparams == {**entry, "policy": run.spec().algorithm.get("policy")} or (
+        run.spec().hyperparams == entry
+    )
+    record = run.recorded()
+    assert (record["state"], record["n_timesteps"]) == ("finished", 300)
+    assert record["final"]["mean_return"] == outcome.final.mean_return
+    assert np.load(run.path / "evaluations.npz")["timesteps"].tolist() == [100, 200, 300]
+
+
+@pytest.mark.parametrize(
+    ("model", "statistics"),
+    [
+        ("a/FrozenLake-v1.zip", "a/FrozenLake-v1/vecnormalize.pkl"),
+        ("a/best_model.zip", "a/best_model_vecnormalize.pkl"),
+        ("a/rl_model_300_steps.zip", "a/rl_model_vecnormalize_300_steps.pkl"),
+    ],
+)
+def test_where_statistics_lie(model, statistics):
+    assert statistics_beside(Path(model)) == Path(statistics)
+
+
+# --- stops ----------------------------------------------------------------------------------------
+
+
+def test_the_first_signal_is_a_number_and_the_second_ends_at_once():
+    stop = Stop().listen()
+    stop.check()
+    signal.raise_signal(signal.SIGTERM)
+    with pytest.raises(Stopped) as stopped:
+        stop.check()
+    assert stopped.value.number == signal.SIGTERM
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_a_stop_before_the_first_step_leaves_no_folder():
+    spec = spec_of("qlearning", n_timesteps=1000)
+    run = Run.claim(Path("logs"), spec)
+    run.stop.number = signal.SIGINT
+    with pytest.raises(Stopped), run:
+        train(spec, run)
+    assert run.recorded().get("state") == "interrupted" or not run.path.exists()
+
+
+# --- failures of a training -----------------------------------------------------------------------
+
+
+def test_an_error_is_recorded_and_what_was_written_stays(monkeypatch):
+    evaluate, calls = EvaluationCallback.evaluate, []
+
+    def fail_at_the_third(self):
+        calls.append(1)
+        if len(calls) == 3:
+            raise OSError(28, "No space left on device", "evaluations.npz")
+        return evaluate(self)
+
+    monkeypatch.setattr(EvaluationCallback, "evaluate", fail_at_the_third)
+    spec = spec_of("qlearning", n_timesteps=1000, eval_freq=100)
+    run = Run.claim(Path("logs"), spec)
+    run.begin(spec, {}, "train.py")
+    with pytest.raises(OSError, match="No space"), run:
+        train(spec, run)
+    record = run.recorded()
+    assert record["state"] == "failed"
+    assert "No space left on device" in record["reason"]
+    assert (run.path / "best_model.zip").exists()
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def test_a_file_has_its_name_when_it_is_whole(tmp_path, small_disk):
+    path = tmp_path / "a.txt"
+    path.write_text("before")
+    with pytest.raises(ZeroDivisionError), replacing(path) as beside:
+        beside.write_text(f"half {beside.suffix == '.txt'}: {1 / 0}")
+    assert path.read_text() == "before"
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        too_large = pytest.raises(OSError, match="File too large")
+        with small_disk(10), too_large as full, replacing(path) as beside:
+            beside.write_bytes(bytes(1000))
+    finally:
+        signal.signal(signal.SIGXFSZ, before)
+    assert full.value.filename == str(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_only_regular_files_of_moderate_size_are_read(tmp_path):
+    (tmp_path / "large").write_bytes(bytes(11))
+    (tmp_path / "bad.json").write_text('{"a": ')
+    (tmp_path / "latin.txt").write_bytes("ä".encode("latin-1"))
+    os.mkfifo(tmp_path / "pipe")
+    begun = time.monotonic()
+    for call, said in (
+        (lambda: read_bytes(tmp_path / "large", 10), "11 bytes, the limit is 10"),
+        (lambda: read_bytes(tmp_path / "pipe"), "is not a regular file"),
+        (lambda: read_bytes(tmp_path), "is a directory|is not a regular file"),
+        (lambda: read_bytes(tmp_path / "none"), "no such file"),
+        (lambda: read_json(tmp_path / "bad.json"), r"bad\.json is no valid JSON"),
+        (lambda: read_text(tmp_path / "latin.txt"), "is no UTF-8 text"),
+    ):
+        with pytest.raises(UserError, match=said):
+            call()
+    assert time.monotonic() - begun < 20
+
+
+@given(st.text(min_size=1))
+def test_a_portable_name_is_one_and_stays_one(name):
+    found = portable_name(name)
+    assert portable_name(found) == found
+    assert not set('<>:"/\\|?*') & set(found)
+    assert len(found.encode(errors="replace")) <= files.LONGEST_NAME
+
+
+def test_json_has_no_nan_and_keeps_infinity(tmp_path):
+    data = {"a": np.float64(0.1), "b": [math.nan, -math.inf], "c": np.arange(2), 3: None}
+    write_json(tmp_path / "a.json", data)
+    read = json.loads((tmp_path / "a.json").read_text())
+    assert read == {"a": 0.1, "b": [None, -math.inf], "c": [0, 1], "3": None}
+    assert json_text(math.inf) == "1e999"
