@@ -7,14 +7,15 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
+
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.envs.warehouse import RandomWarehouseEnv
 from rl_yardstick.mdp import policy_iteration, value_iteration
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
-from rl_yardstick.pipeline.settings.hyperparams import split
-from rl_yardstick.pipeline.train_spec import TrainSpec
 from timing import Benchmark, Contender, Rows, seconds
 
 DISCOUNTS = (0.9, 0.99, 0.999, 1.0)

@@ -123,9 +123,10 @@ def planning_score(name: str, discount: float) -> float:
 
 def family_score(name: str, algo: str, seed: int) -> float:
     """Train a table in this process; return the exact score of its greedy policy."""
+    from rl_yardstick.pipeline.preparation import algorithm_kwargs
+
     from rl_yardstick.agents import load_algorithm
     from rl_yardstick.pipeline.environments import make_training_env
-    from rl_yardstick.pipeline.preparation import algorithm_kwargs
 
     spec = _spec(family()[name], algo, seed)
     env = make_training_env(spec, None)

@@ -26,14 +26,14 @@ os.environ.update(OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
 
 import numpy as np
 from numpy.typing import NDArray
+from rl_yardstick.pipeline.preparation import algorithm_kwargs, make_model
+from rl_yardstick.pipeline.train_spec import NETWORKS
 from stable_baselines3.common.logger import Logger
 
 from rl_yardstick.commands.train import build_parser, train_spec
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of
 from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator
-from rl_yardstick.pipeline.preparation import algorithm_kwargs, make_model
-from rl_yardstick.pipeline.train_spec import NETWORKS
 
 BANK = Path(__file__).with_name("verdict_bank.npz")
 N_RUNS, N_NETWORKS = 1500, 100

@@ -6,6 +6,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from rl_yardstick.pipeline.runs import Run
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -27,7 +28,6 @@ from rl_yardstick.agents.common.callbacks import (
 )
 from rl_yardstick.pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
-from rl_yardstick.pipeline.runs import Run
 from tests.agents.trainings import LAKE, environment, make, state_of
 
 ENGINES = ("interpreted", "compiled")

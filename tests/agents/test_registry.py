@@ -8,13 +8,13 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 from gymnasium import spaces
+from rl_yardstick.pipeline.settings.values import algorithm_parameters
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick import agents
 from rl_yardstick.agents import ALGORITHMS, fitting_algorithms, load_algorithm
 from rl_yardstick.agents.bandits.runs import run_batch
-from rl_yardstick.pipeline.settings.values import algorithm_parameters
 from tests.agents.hand_fed import Told
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))

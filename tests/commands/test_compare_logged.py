@@ -7,12 +7,12 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from rl_yardstick.experiments.off_policy.estimators import difference_in_value
 
 import compare
 import rl_yardstick.envs  # noqa: F401
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.envs.bandits import log_uniformly
-from rl_yardstick.experiments.off_policy.estimators import difference_in_value
 
 
 def train(folder, algo, run, **kwargs):

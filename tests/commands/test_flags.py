@@ -4,6 +4,8 @@ import re
 from dataclasses import fields
 
 import pytest
+from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.unfinished_runs import SaveInterval
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.commands import compare, enjoy, train, tune
@@ -15,8 +17,6 @@ from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.study import StudySpec
 from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.train_spec import TrainSpec
-from rl_yardstick.pipeline.unfinished_runs import SaveInterval
 from rl_yardstick.tuning.retesting import Candidate, retest_study
 from rl_yardstick.tuning.suggesting import planned_run
 

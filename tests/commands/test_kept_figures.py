@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from rl_yardstick.experiments.figures_store import checksum_of, packed, unpacked
-from rl_yardstick.experiments.results import difference
 from rl_yardstick.pipeline.runs import Run
+
+from rl_yardstick.experiments.results import difference
 
 NAME = "FrozenLake-v1_qlearning-sarsa"
 TWO = ["--env", "FrozenLake-v1", "--algos", "qlearning", "sarsa", "--n-episodes", "30", "-j", "2"]

@@ -10,12 +10,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
+from rl_yardstick.experiments.launching import RunFailure
+from rl_yardstick.pipeline.runs import Run
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
 
 from rl_yardstick.commands import compare, terminal
 from rl_yardstick.commands.compare import StudyProgress
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.commands.train import next_commands, other_agent, print_outcome
-from rl_yardstick.experiments.launching import RunFailure
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.machine_code import WorkTime
@@ -23,9 +26,6 @@ from rl_yardstick.pipeline import signs_of_life
 from rl_yardstick.pipeline.callbacks import PullSummary
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation, OtherReturns
 from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
-from rl_yardstick.pipeline.runs import Run
-from rl_yardstick.pipeline.settings.hyperparams import split
-from rl_yardstick.pipeline.train_spec import TrainSpec
 
 
 def run_of(final=None, pulls=None, **fields):

@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from rl_yardstick.pipeline.runs import Run
+from rl_yardstick.pipeline.state_saver import StateSaver
 
 import train
 from rl_yardstick.commands.cli import run_command
 from rl_yardstick.pipeline import files, preparation, stopping, training
-from rl_yardstick.pipeline.runs import Run
-from rl_yardstick.pipeline.state_saver import StateSaver
 
 # --- signals at named moments of a training: what is left, and how the process ends ---------------
 

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from rl_yardstick.diagnosis.probes import Finding, watkins_table
 
 from rl_yardstick.commands.audit import KINDS, main
 from rl_yardstick.commands.cli import run_command
@@ -13,7 +14,6 @@ from rl_yardstick.diagnosis import probes, subjects
 from rl_yardstick.diagnosis.audit import TITLES, Verdict, audit
 from rl_yardstick.diagnosis.faults import FAULTS
 from rl_yardstick.diagnosis.probe_worlds import Record, World
-from rl_yardstick.diagnosis.probes import Finding, watkins_table
 from rl_yardstick.diagnosis.subjects import GAMMA, ClassSubject, ScriptSubject, class_named
 from tests.diagnosis import planted_classes
 from tests.diagnosis.planted_tables import (

@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
+from rl_yardstick.pipeline.agent_settings import resolved_spec
+from rl_yardstick.pipeline.preparation import algorithm_kwargs
+from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
+from rl_yardstick.pipeline.settings.values import parse_assignments
 
 from rl_yardstick.diagnosis.explanation import explanation
 from rl_yardstick.experiments.interventions import AS_IT_IS, SHIPPED, Tried, intervention_study
 from rl_yardstick.experiments.study import file_name
-from rl_yardstick.pipeline.agent_settings import resolved_spec
 from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
-from rl_yardstick.pipeline.preparation import algorithm_kwargs
-from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
-from rl_yardstick.pipeline.settings.values import parse_assignments
 from rl_yardstick.report.why import tried_lines
 from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of, spec_of
 

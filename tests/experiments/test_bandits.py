@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from rl_yardstick.pipeline.runs import PULLS_FILE, Run
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -26,7 +27,6 @@ from rl_yardstick.experiments.bandits import (
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
 from rl_yardstick.pipeline.callbacks import PullRecorder
-from rl_yardstick.pipeline.runs import PULLS_FILE, Run
 from rl_yardstick.pipeline.training import train
 from rl_yardstick.report.series import auer_bound
 

@@ -13,9 +13,6 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-
-import compare
-from rl_yardstick.experiments import child_processes
 from rl_yardstick.experiments.child_processes import (
     StoppedError,
     TaskDiedError,
@@ -25,13 +22,16 @@ from rl_yardstick.experiments.child_processes import (
     supervise,
 )
 from rl_yardstick.experiments.launching import execute, local_launcher
-from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.run_folders import draft_path
 from rl_yardstick.experiments.run_in_child import do_run
 from rl_yardstick.experiments.run_limits import RunLimits, memory, resident_memory, seconds
-from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.settings.hyperparams import ComponentSpec
 from rl_yardstick.pipeline.train_spec import is_plain
+
+import compare
+from rl_yardstick.experiments import child_processes
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 
 ROOT = Path(compare.__file__).parent
 

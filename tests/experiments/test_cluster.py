@@ -19,10 +19,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-
-import compare
 from rl_yardstick.experiments.child_processes import NO_LIMITS
-from rl_yardstick.experiments.cluster import answers, cluster_launcher, schedulers
 from rl_yardstick.experiments.cluster.answers import (
     Answer,
     RefusedAnswerError,
@@ -52,16 +49,19 @@ from rl_yardstick.experiments.cluster.schedulers import (
 )
 from rl_yardstick.experiments.cluster.sent_code import SentCode, SentModule, UnfitError
 from rl_yardstick.experiments.cluster.working import Probe, RunOrder
-from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.run_folders import draft_path
 from rl_yardstick.experiments.run_in_child import do_run
-from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline import digests
-from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.loaded_code import DISTRIBUTIONS, files_in_settings
 from rl_yardstick.pipeline.locks import mark
 from rl_yardstick.pipeline.settings.hyperparams import split
 from rl_yardstick.pipeline.user_modules import import_typed
+
+import compare
+from rl_yardstick.experiments.cluster import answers, cluster_launcher, schedulers
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline import digests
+from rl_yardstick.pipeline.errors import UserError
 
 ROOT = Path(compare.__file__).parent
 

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from rl_yardstick.experiments.child_processes import NO_LIMITS
+from rl_yardstick.experiments.run_folders import draft_path, move_damaged_aside
+from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.pipeline.digests import DamagedFileError
+from rl_yardstick.pipeline.runs import PULLS_FILE, Run
 
 from rl_yardstick.commands.compare import RunContext, repair, run_study
 from rl_yardstick.experiments.bandits import STATISTICS_FILE
-from rl_yardstick.experiments.child_processes import NO_LIMITS
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import (
     read_episodes,
     read_results,
 )
-from rl_yardstick.experiments.run_folders import draft_path, move_damaged_aside
-from rl_yardstick.experiments.run_in_child import do_run
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.digests import DamagedFileError
-from rl_yardstick.pipeline.runs import PULLS_FILE, Run
 
 STEPS = {"n_timesteps": 60}
 WAREHOUSE = EnvironmentSpec("grid", "Warehouse-v0", STEPS)

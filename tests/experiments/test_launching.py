@@ -12,8 +12,6 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
-
-from rl_yardstick.experiments import child_processes
 from rl_yardstick.experiments.launching import (
     BUSY,
     TimeLeft,
@@ -21,7 +19,6 @@ from rl_yardstick.experiments.launching import (
     failure_log,
     local_launcher,
 )
-from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.run_folders import (
     check_settings_kept,
     draft_path,
@@ -34,11 +31,14 @@ from rl_yardstick.experiments.run_folders import (
     take_over,
 )
 from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.pipeline.state_files import SOURCES, read_state, state_key, write_state
+from rl_yardstick.pipeline.user_modules import import_typed
+
+from rl_yardstick.experiments import child_processes
+from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline import state_saver
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.state_files import SOURCES, read_state, state_key, write_state
-from rl_yardstick.pipeline.user_modules import import_typed
 
 LAKE = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_timesteps": 20})
 ARMS = EnvironmentSpec("arms", "BernoulliBandit-v0", {"n_timesteps": 20})

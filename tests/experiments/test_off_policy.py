@@ -6,9 +6,6 @@ from contextlib import nullcontext
 import gymnasium as gym
 import numpy as np
 import pytest
-
-from rl_yardstick.agents import load_algorithm
-from rl_yardstick.envs.bandits import ReplayBandit, log_uniformly, read_log
 from rl_yardstick.experiments.off_policy.estimators import (
     ArmMeans,
     ArmRegressions,
@@ -31,6 +28,9 @@ from rl_yardstick.experiments.off_policy.logged_policies import (
     read_logged,
 )
 from rl_yardstick.experiments.off_policy.policy_files import find_policy
+
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.envs.bandits import ReplayBandit, log_uniformly, read_log
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.verdicts import Estimate
 

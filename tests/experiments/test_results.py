@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from rl_yardstick.experiments.launching import EarlyResults
+from rl_yardstick.pipeline.runs import FINISHED
 
 import compare
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.experiments.analysis import analyse
-from rl_yardstick.experiments.launching import EarlyResults
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import (
     RUN_COLUMNS,
@@ -23,7 +24,6 @@ from rl_yardstick.experiments.results import (
     values_over_seeds,
 )
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.runs import FINISHED
 from rl_yardstick.report.conclusions import places_without_a_run
 from rl_yardstick.report.documents import write_tables
 from rl_yardstick.report.figures import write_figures

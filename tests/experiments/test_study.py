@@ -9,6 +9,9 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from rl_yardstick.pipeline.digests import DamagedFileError
+from rl_yardstick.pipeline.runs import FAILED, FINISHED
+from rl_yardstick.pipeline.train_spec import TrainSpec
 
 import compare
 from rl_yardstick.experiments.plan import check_settings, plan, tuning_seeds
@@ -21,10 +24,7 @@ from rl_yardstick.experiments.study import (
     read_study,
     write_study,
 )
-from rl_yardstick.pipeline.digests import DamagedFileError
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.runs import FAILED, FINISHED
-from rl_yardstick.pipeline.train_spec import TrainSpec
 from rl_yardstick.report.words import seed_sentence
 
 SHIPPED = Path(compare.__file__).parent / "studies"

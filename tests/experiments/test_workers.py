@@ -20,20 +20,20 @@ from pathlib import Path
 import psutil
 import pytest
 from distributed import LocalCluster
-
-import compare
-from rl_yardstick.experiments.cluster import cluster_launcher
 from rl_yardstick.experiments.cluster.schedulers import LocalWorkers, SchedulerAddress
 from rl_yardstick.experiments.cluster.sent_code import SentCode
 from rl_yardstick.experiments.cluster.working import Probe
 from rl_yardstick.experiments.launching import execute
-from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.run_folders import draft_path
 from rl_yardstick.experiments.run_in_child import do_run
-from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.loaded_code import recorded_code
 from rl_yardstick.pipeline.user_modules import import_typed
+
+import compare
+from rl_yardstick.experiments.cluster import cluster_launcher
+from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError
 
 ROOT = Path(compare.__file__).parent
 

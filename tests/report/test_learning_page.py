@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rich.console import Console
-
-from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.child_processes import TaskFailedError
-from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.settings.hyperparams import split
 from rl_yardstick.pipeline.train_spec import TrainSpec
+
+from rl_yardstick.experiments.analysis import analyse
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.training import carry_out, prepare
 from rl_yardstick.report.page import learning
 from rl_yardstick.report.page.frame import as_json

@@ -10,13 +10,13 @@ import gymnasium as gym
 import pytest
 from gymnasium.envs.toy_text import TaxiEnv
 from rich.console import Console
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
-from rl_yardstick.pipeline.settings.hyperparams import split
-from rl_yardstick.pipeline.train_spec import TrainSpec
 from rl_yardstick.pipeline.training import carry_out, prepare
 from rl_yardstick.report.page.learning import write_learning_page
 from rl_yardstick.report.page.tuning import write_tuning_page

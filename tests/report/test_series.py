@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+from rl_yardstick.pipeline.settings.hyperparams import split
+from rl_yardstick.pipeline.train_spec import TrainSpec
 from scipy import integrate
 
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
@@ -15,8 +17,6 @@ from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.bandits import pull_statistics
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.settings.hyperparams import split
-from rl_yardstick.pipeline.train_spec import TrainSpec
 from rl_yardstick.report.series import (
     auer_bound,
     best_expected_reward,

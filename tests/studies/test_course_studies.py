@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rl_yardstick.experiments.run_in_child import do_run
+from rl_yardstick.pipeline.models.load import load_model
+from rl_yardstick.pipeline.preparation import algorithm_kwargs
 
 import compare
 from rl_yardstick.envs.warehouse import WarehouseEnv
 from rl_yardstick.experiments.plan import plan
 from rl_yardstick.experiments.results import read_episodes, read_results
-from rl_yardstick.experiments.run_in_child import do_run
 from rl_yardstick.experiments.study import read_study
 from rl_yardstick.mdp import value_iteration
-from rl_yardstick.pipeline.models.load import load_model
-from rl_yardstick.pipeline.preparation import algorithm_kwargs
 
 ROOT = Path(compare.__file__).parent
 # Bandits have a guide of their own.

@@ -8,15 +8,15 @@ import gymnasium as gym
 import optuna
 import pytest
 from optuna.trial import FixedTrial
-
-from rl_yardstick.agents import ALGORITHMS, load_algorithm
-from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.agent_settings import resolved_spec
-from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.settings import hyperparams
 from rl_yardstick.pipeline.settings.components import build_algorithm_kwargs, default_policy
 from rl_yardstick.pipeline.settings.hyperparams import entry_names, read_hyperparams, split
 from rl_yardstick.pipeline.settings.yaml import read_yaml
+
+from rl_yardstick.agents import ALGORITHMS, load_algorithm
+from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.settings import hyperparams
 from rl_yardstick.tuning import search_spaces
 from rl_yardstick.tuning.dimensions import same
 from rl_yardstick.tuning.search_spaces import corners, read_search_space

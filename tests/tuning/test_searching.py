@@ -10,6 +10,7 @@ import numpy as np
 import optuna
 import pandas as pd
 import pytest
+from rl_yardstick.pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
 
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.growing import looked
@@ -22,7 +23,6 @@ from rl_yardstick.experiments.results import (
     StudyResults,
 )
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
 from rl_yardstick.tuning import retesting, searching
 from rl_yardstick.tuning.pruning import PRUNERS, is_hopeless
 from rl_yardstick.tuning.retesting import (

@@ -114,9 +114,7 @@ class LoggedData:
         raise ValueError(f"{self.source} has {context}{words}, the agent observes {space}")
 
 
-def read_log(
-    path: str | Path, own_names: Mapping[str, str] = MappingProxyType({})
-) -> LoggedData:
+def read_log(path: str | Path, own_names: Mapping[str, str] = MappingProxyType({})) -> LoggedData:
     """Read logged pulls.
 
     Args:
