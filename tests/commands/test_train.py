@@ -1,4 +1,4 @@
-"""train.py as a user types it: what is printed, what is written down, stops, and what to type next."""
+"""train.py as a user types it: output, files, signals, and the commands to type next."""
 
 import json
 import signal
@@ -22,6 +22,7 @@ from rl_yardstick.pipeline.evaluation.yardstick import HiddenState, Yardstick
 from rl_yardstick.pipeline.run import Run
 from tests.pipeline.short_runs import spec_of
 
+LAKE = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
 TRAIN = str(Path(__file__).parents[2] / "train.py")
 
 
@@ -200,7 +201,7 @@ def test_the_head_tells_what_auto_stands_for_and_what_a_discount_costs(type_comm
 
 @pytest.mark.usefixtures("pictures")
 def test_a_run_with_its_page_and_a_run_from_its_model(type_command, tmp_path):
-    words = ["train.py", "--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "600", "--seed", "1"]
+    words = ["train.py", *LAKE, "-n", "600", "--seed", "1"]
     code, out, err = type_command(*words, "--watch-learning", "page.html")
     assert (code, err) == (0, "")
     assert "learning" in out.splitlines()[-1]
@@ -214,7 +215,7 @@ def test_a_run_with_its_page_and_a_run_from_its_model(type_command, tmp_path):
 
 
 def test_scripts_that_a_queue_starts_again(type_command, tmp_path):
-    words = ["train.py", "--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "300", "--seed", "1"]
+    words = ["train.py", *LAKE, "-n", "300", "--seed", "1"]
     words.append("--resume-or-start")
     assert type_command(*words)[0] == 0
     code, out, _ = type_command(*words)
