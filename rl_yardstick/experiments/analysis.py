@@ -52,7 +52,7 @@ MARGIN = 0.02  # of the gap between the best random or constant policy and the o
 OVERALL = "all environments"  # the name of the comparison of scores over all environments
 
 
-# --- The evidence for verdicts.
+# --- the evidence for verdicts --------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def verdicts_on(
     )
 
 
-# --- All environments together.
+# --- all environments together --------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def _in_order(pairs: Sequence[Pair], names: Sequence[str]) -> tuple[Pair, ...]:
     return tuple(sorted(turned, key=lambda pair: (place[pair.first], place[pair.second])))
 
 
-# --- Each environment.
+# --- each environment -----------------------------------------------------------------------------
 
 # The mark of agents that were trained on a changed environment.
 MARK = "†"
@@ -399,17 +399,10 @@ def _analyse_environment(
         optimum_at_least=evidence.optimum_at_least,
         optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # likewise
         full_optimum=_first(table, "full_optimum") if "full_optimum" in table else None,
-        measured_by=_measured_by(table),
+        measured_by=_only(table["measured_by"]) or None if "measured_by" in table else None,
         optima=_differing_optima(table),
         impossible=_impossible(evidence, table),
     )
-
-
-def _measured_by(table: pd.DataFrame) -> str | None:
-    if "measured_by" not in table:
-        return None
-    found = table["measured_by"].dropna()
-    return str(found.iloc[0]) if len(found) else None
 
 
 def _impossible(evidence: Evidence, table: pd.DataFrame) -> tuple[str, ...]:
@@ -494,7 +487,7 @@ def _only(texts: pd.Series) -> str:
     return str(found[0]) if len(found) == 1 else ""
 
 
-# --- Advice on failed runs, once for each agent.
+# --- advice on failed runs, once for each agent ---------------------------------------------------
 
 # The largest number of agents per environment with advice, because each agent is loaded.
 MOST_TOLD = 4
@@ -549,24 +542,18 @@ def _failed_runs(
 
 def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
     """The advice on the agent of each run; None for a run without advice."""
-    return [_advice_on(run) for run in runs]
-
-
-def _advice_on(planned: PlannedRun) -> tuple[str, str | None] | None:
     from rl_yardstick.pipeline.evaluation.advice import advice
     from rl_yardstick.pipeline.evaluation.exact import evaluator_of
     from rl_yardstick.pipeline.models import load_agent, model_of_run
 
-    run, spec = planned.run, planned.spec
-    with suppress(UserError, OSError):
-        import_modules(spec.gym_packages)
-        evaluator = evaluator_of(spec)
-        if evaluator is None:
-            return None
-        agent = load_agent(model_of_run(run))
-        if evaluator.obstacle(agent):
-            return None
-        n_steps = int(planned.recorded()["n_timesteps"])
-        found = advice(spec, agent, evaluator, evaluator(agent), n_steps)
-        return None if found is None else (found.instead, found.try_first)
-    return None
+    answers: list[tuple[str, str | None] | None] = []
+    for planned in runs:
+        found, spec = None, planned.spec
+        with suppress(UserError, OSError):
+            import_modules(spec.gym_packages)
+            evaluator, agent = evaluator_of(spec), load_agent(model_of_run(planned.run))
+            if evaluator is not None and not evaluator.obstacle(agent):
+                n_steps = int(planned.recorded()["n_timesteps"])
+                found = advice(spec, agent, evaluator, evaluator(agent), n_steps)
+        answers.append(None if found is None else (found.instead, found.try_first))
+    return answers

@@ -1,22 +1,24 @@
 """Runs of a study on a cluster, through Dask: `do_run`, unchanged, on its workers.
 
 The workers share the study's folder with this process, and have the same versions of the libraries:
-both are checked at the start. Runs of a worker that is lost are done again by others. Encryption
-and certificates are matters of Dask's own configuration.
+both are checked at the start. Runs of a worker that is lost are done again by others, three times at
+most. Encryption and certificates are matters of Dask's own configuration.
 """
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 import threading
-from collections.abc import Callable
 from concurrent.futures import Future
 from functools import cached_property
 from pathlib import Path
 from signal import SIGTERM
 from typing import Any
+
+import dask
+import dask_jobqueue
+from distributed import Client, LocalCluster
 
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.experiments.pool import Workers, do_run
@@ -24,7 +26,6 @@ from rl_yardstick.pipeline.errors import Stopped, UserError, one_line, shown
 from rl_yardstick.pipeline.run import Stop, versions
 from rl_yardstick.pipeline.settings import read_yaml
 
-RETRIES = 3  # of a run whose worker is lost
 # The classes of dask-jobqueue by system.
 QUEUES = {
     "htcondor": "HTCondorCluster",
@@ -35,7 +36,6 @@ QUEUES = {
     "sge": "SGECluster",
     "slurm": "SLURMCluster",
 }
-_FORMS = "ADDRESS:PORT, a scheduler's file, a YAML of dask-jobqueue, or local:N"
 _ONE_AT_A_TIME = threading.Lock()  # the libraries' generators belong to a whole process
 
 
@@ -47,21 +47,19 @@ class ClusterWorkers(Workers):
         n_jobs: runs at once, for a queue of jobs.
         root: the study's folder, which all workers share.
         timeout: seconds for each run; None for any time.
-
-    Raises:
-        UserError: if ``where`` says nothing that can be connected to.
     """
 
     def __init__(self, where: str, n_jobs: int, root: Path, timeout: float | None = None) -> None:
-        super().__init__(n_jobs or 1, timeout)
-        self.where, self.root, self.words = where, root, f"on the cluster {where}"
-        self._cluster: Any = None
-        self._start = _reader(where, n_jobs)
+        super().__init__(max(n_jobs, 1), timeout)
+        self.where, self.n_jobs, self.root = where, n_jobs, root.absolute()
+        self.words, self._cluster = f"on the cluster {where}", None
+        if n_jobs and not where.endswith((".yml", ".yaml")):
+            raise UserError("--jobs is for this machine or a queue of jobs: leave it out")
 
     def submit(self, planned: PlannedRun, command: str) -> Future[None]:
         """Do a run as soon as a worker is free."""
-        home, timeout = str(Path.cwd()), self.timeout
-        future: Future[None] = self._executor.submit(_do_run, planned, command, home, timeout)
+        given = planned, command, str(Path.cwd()), self.timeout
+        future: Future[None] = self._executor.submit(_do_run, *given)
         self.n_at_once = 2 * max(len(self._client.scheduler_info(-1)["workers"]), 1)
         return future
 
@@ -73,18 +71,19 @@ class ClusterWorkers(Workers):
             self._cluster.close(timeout=30)
 
     @cached_property
+    def _executor(self) -> Any:
+        return self._client.get_executor(pure=False)
+
+    @cached_property
     def _client(self) -> Any:
         """The connection, after a check of versions and of the shared folder."""
-        from distributed import Client
-
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         try:
-            self._cluster = self._start()
-            client = Client(self._cluster) if self._cluster is not None else _connected(self.where)
-            client.wait_for_workers(1, timeout=600 if self._cluster is not None else 60)
+            client = self._connected()
+            client.wait_for_workers(1, timeout=600)
             client.get_versions(check=True)
-            found = client.run(_facts, str(self.root.absolute()))
-        except (OSError, ValueError, TypeError, RuntimeError, ImportError) as error:
+            found = client.run(_facts, str(self.root))
+        except (OSError, ValueError, TypeError, RuntimeError) as error:
             raise UserError(f"--cluster {self.where}: {one_line(error)}") from error
         for worker, (theirs, shares_folder) in found.items():
             for name, version in versions().items():
@@ -92,12 +91,45 @@ class ClusterWorkers(Workers):
                     there = f"{name} {theirs.get(name)}"
                     raise UserError(f"worker {worker} has {there}, here is {version}")
             if not shares_folder:
-                raise UserError(f"worker {worker} does not have the folder {self.root.absolute()}")
+                raise UserError(f"worker {worker} does not have the folder {self.root}")
         return client
 
-    @cached_property
-    def _executor(self) -> Any:
-        return self._client.get_executor(pure=False, retries=RETRIES)
+    def _connected(self) -> Client:
+        kind, _, number = self.where.partition(":")
+        if kind == "local" and number.isdecimal() and int(number) > 0:
+            options = {"threads_per_worker": 1, "dashboard_address": None}
+            self._cluster = LocalCluster(n_workers=int(number), **options)
+        elif self.where.endswith((".yml", ".yaml")):
+            self._cluster = _job_queue(Path(self.where), self.n_jobs)
+        elif Path(self.where).is_file():
+            return Client(scheduler_file=self.where)
+        elif not number.rpartition(":")[2].isdecimal():
+            forms = "ADDRESS:PORT, a scheduler's file, a YAML of dask-jobqueue, or local:N"
+            raise ValueError(f"give {forms}")
+        return Client(self._cluster or self.where)
+
+
+def _job_queue(path: Path, n_jobs: int) -> Any:
+    """Jobs of a queueing system, as dask-jobqueue's own YAML describes them."""
+    content = read_yaml(path)
+    queues = content.get("jobqueue") if isinstance(content, dict) else None
+    if not isinstance(queues, dict) or len(queues) != 1:
+        raise UserError(f"{path} must hold the key jobqueue, and in it one queueing system")
+    ((system, given),) = queues.items()
+    if system not in QUEUES or not isinstance(given, dict):
+        raise UserError(f"{path}: {shown(system)} is none of {', '.join(QUEUES)}")
+    if n_jobs < 1:
+        raise UserError(f"{path}: say how many runs to do at once: --jobs N")
+    settings = {str(name).replace("_", "-"): value for name, value in given.items()}
+    # The library's own defaults for what the file leaves out.
+    dask.config.set({f"jobqueue.{system}": {**dask.config.get(f"jobqueue.{system}"), **settings}})
+    cluster = getattr(dask_jobqueue, QUEUES[system])()
+    cluster.scale(n_jobs)
+    return cluster
+
+
+def _facts(root: str) -> tuple[dict[str, str], bool]:
+    return versions(), Path(root).is_dir()
 
 
 def _do_run(planned: PlannedRun, command: str, home: str, timeout: float | None) -> None:
@@ -114,63 +146,3 @@ def _do_run(planned: PlannedRun, command: str, home: str, timeout: float | None)
             raise UserError(f"took longer than --run-timeout allows, {timeout:g} s") from None
         finally:
             timer.cancel()
-
-
-def _facts(root: str) -> tuple[dict[str, str], bool]:
-    return versions(), Path(root).is_dir()
-
-
-def _connected(where: str) -> Any:
-    from distributed import Client
-
-    return Client(scheduler_file=where) if Path(where).is_file() else Client(where, timeout=30)
-
-
-def _reader(where: str, n_jobs: int) -> Callable[[], Any]:
-    """What starts the cluster; it returns None where a scheduler runs already."""
-    if where.startswith("local:"):
-        number = where.removeprefix("local:")
-        if not (number.isdecimal() and 0 < int(number) <= 1024):
-            raise UserError(f"--cluster local:N: N is 1 to 1024, not {shown(number)}")
-        return lambda: _local(int(number))
-    if where.endswith((".yml", ".yaml")):
-        return _job_queue(Path(where), n_jobs)
-    if n_jobs:
-        raise UserError("--jobs is for this machine or a queue of jobs; a cluster has its workers")
-    if not (Path(where).is_file() or where.rpartition(":")[2].isdecimal()):
-        raise UserError(f"--cluster {shown(where)}: give {_FORMS}")
-    return lambda: None
-
-
-def _local(n_workers: int) -> Any:
-    from distributed import LocalCluster
-
-    return LocalCluster(
-        n_workers=n_workers, threads_per_worker=1, dashboard_address=None, protocol="tcp"
-    )
-
-
-def _job_queue(path: Path, n_jobs: int) -> Callable[[], Any]:
-    """Jobs of a queueing system, as dask-jobqueue's own YAML describes them."""
-    content = read_yaml(path)
-    queues = content.get("jobqueue") if isinstance(content, dict) else None
-    if not isinstance(queues, dict) or len(queues) != 1:
-        raise UserError(f"{path} must hold the key jobqueue, and in it one queueing system")
-    ((system, settings),) = queues.items()
-    if system not in QUEUES or not isinstance(settings, dict):
-        raise UserError(f"{path}: {shown(system)} is none of {', '.join(QUEUES)}")
-    if n_jobs < 1:
-        raise UserError(f"{path}: say how many runs to do at once: --jobs N")
-
-    def start() -> Any:
-        import dask
-
-        # The library's own defaults for what the file leaves out.
-        dask.config.set({f"jobqueue.{system}": {**dask.config.get(f"jobqueue.{system}"), **given}})
-        cluster = getattr(importlib.import_module("dask_jobqueue"), QUEUES[system])()
-        cluster.scale(n_jobs)
-        return cluster
-
-    importlib.import_module("dask_jobqueue")
-    given = {str(name).replace("_", "-"): value for name, value in settings.items()}
-    return start

@@ -11,11 +11,9 @@ policy with probabilities pi(arm | x), and an estimate q(x, arm) of the mean rew
     importance weight        w = pi(a | x) / p
     inverse propensities     mean of w r
     self-normalised          sum of w r / sum of w
-    direct method            mean of sum over arms of pi(arm | x) q(x, arm)
-    doubly robust            the direct method's terms, plus w (r - q(x, a))
+    doubly robust            mean of sum over arms of pi(arm | x) q(x, arm), plus w (r - q(x, a))
 
-The estimates q are linear in the rewards to which they are fitted. This gives the influence of each
-reward on a prediction. A model predicts only pulls to which it was not fitted (cross-fitting).
+A model of the rewards predicts only pulls to which it was not fitted (cross-fitting).
 """
 
 from __future__ import annotations
@@ -44,150 +42,79 @@ RIDGE = 1.0  # the weight of each coefficient's prior, in pulls
 # --- models of the rewards ------------------------------------------------------------------------
 
 
-class ArmMeans:
+def arm_means(contexts: Ints, arms: Ints, rewards: Floats, shape: tuple[int, int]) -> Floats:
     """The mean reward of each arm in each context; without pulls, the arm's overall mean.
 
-    A saturated model: it assumes nothing about rewards. Contexts are integers from 0, shape (n,).
+    A saturated model: it assumes nothing about rewards.
+
+    Args:
+        contexts: integers from 0, shape (n,).
+        arms: shape (n,).
+        rewards: shape (n,).
+        shape: numbers of contexts and arms, the shape of the result.
     """
-
-    def __init__(
-        self, contexts: Ints, arms: Ints, rewards: Floats, n_arms: int, n_contexts: int
-    ) -> None:
-        self.contexts, self.arms = contexts, arms
-        size, cells = n_contexts * n_arms, contexts * n_arms + arms
-        shape = (n_contexts, n_arms)
-        self.counts = np.bincount(cells, minlength=size).reshape(shape)
-        sums = np.bincount(cells, rewards, minlength=size).reshape(shape)
-        self.arm_counts = self.counts.sum(axis=0)
-        overall = np.full(n_arms, rewards.mean())
-        np.divide(sums.sum(axis=0), self.arm_counts, out=overall, where=self.arm_counts > 0)
-        self.means = np.tile(overall, (n_contexts, 1))
-        np.divide(sums, self.counts, out=self.means, where=self.counts > 0)
-
-    def predict(self, contexts: Ints) -> Floats:
-        """The mean reward of each arm in each of m contexts, shape (m, n_arms)."""
-        return np.asarray(self.means[contexts])
-
-    def sensitivity(self, contexts: Ints, policy: Floats) -> Floats:
-        """The derivative of a policy's predicted total reward by each reward in the fit.
-
-        That is, the derivatives of the sum of ``policy * predict(contexts)``; ``policy`` has the
-        probability of each arm in each of m contexts, shape (m, n_arms).
-        """
-        n_contexts = len(self.counts)
-        mass = np.stack([np.bincount(contexts, p, minlength=n_contexts) for p in policy.T], axis=1)
-        seen = self.counts > 0
-        by_cell = np.where(seen, mass, 0) / np.maximum(self.counts, 1)
-        by_arm = np.where(seen, 0, mass).sum(axis=0) / np.maximum(self.arm_counts, 1)
-        return np.asarray(by_cell[self.contexts, self.arms] + by_arm[self.arms])
+    cells, size = contexts * shape[1] + arms, shape[0] * shape[1]
+    counts = np.bincount(cells, minlength=size).reshape(shape)
+    sums = np.bincount(cells, rewards, minlength=size).reshape(shape)
+    overall, by_arm = np.full(shape[1], rewards.mean()), counts.sum(axis=0)
+    np.divide(sums.sum(axis=0), by_arm, out=overall, where=by_arm > 0)
+    means = np.tile(overall, (shape[0], 1))
+    return np.divide(sums, counts, out=means, where=counts > 0)
 
 
-class ArmRegressions:
-    """A ridge regression of the rewards on the context for each arm.
+def arm_regressions(
+    contexts: Floats, arms: Ints, rewards: Floats, n_arms: int, asked: Floats
+) -> Floats:
+    """The predictions of a ridge regression of the rewards on the context for each arm.
 
     Features are standardised, and rewards are centred on their mean, which is the prediction for an
-    arm without pulls. Contexts have the shape (n, d).
+    arm without pulls. Contexts have the shape (n, d), ``asked`` (m, d), the result (m, n_arms).
 
     Source: Hoerl and Kennard (1970), "Ridge regression", Technometrics 12.
     """
+    centre, scale = contexts.mean(axis=0), contexts.std(axis=0)
+    scale[scale == 0] = 1
 
-    def __init__(self, contexts: Floats, arms: Ints, rewards: Floats, n_arms: int) -> None:
-        self.arms, self.centre, self.scale = arms, contexts.mean(axis=0), contexts.std(axis=0)
-        self.scale[self.scale == 0] = 1
-        self.inputs = self._standardised(contexts)
-        self.level = float(rewards.mean())
-        prior = RIDGE * np.eye(self.inputs.shape[1])
-        self._factors = []
-        self.coefficients = np.zeros((n_arms, len(prior)))
-        for arm in range(n_arms):
-            rows = self.inputs[arms == arm]
-            self._factors.append(linalg.cho_factor(rows.T @ rows + prior))
-            moments = rows.T @ (rewards[arms == arm] - self.level)
-            self.coefficients[arm] = linalg.cho_solve(self._factors[arm], moments)
+    def inputs(rows: Floats) -> Floats:
+        return np.column_stack([np.ones(len(rows)), (rows - centre) / scale])
 
-    def predict(self, contexts: Floats) -> Floats:
-        """As `ArmMeans.predict`."""
-        return np.asarray(self.level + self._standardised(contexts) @ self.coefficients.T)
-
-    def sensitivity(self, contexts: Floats, policy: Floats) -> Floats:
-        """As `ArmMeans.sensitivity`; treats the mean reward as fixed."""
-        totals = policy.T @ self._standardised(contexts)
-        solved = [linalg.cho_solve(*pair) for pair in zip(self._factors, totals, strict=True)]
-        return np.asarray((self.inputs * np.stack(solved)[self.arms]).sum(axis=1))
-
-    def _standardised(self, contexts: Floats) -> Floats:
-        scaled = (contexts - self.centre) / self.scale
-        return np.column_stack([np.ones(len(contexts)), scaled])
-
-
-@dataclass(frozen=True, eq=False)
-class CrossFit:
-    """Models of the rewards; none predicts a pull to which it was fitted."""
-
-    contexts: NDArray[Any]  # of the pulls, shape (n,) or (n, d)
-    arms: Ints  # shape (n,)
-    rewards: Floats  # shape (n,)
-    fold: Ints  # the fold of each pull, shape (n,)
-    models: Sequence[ArmMeans | ArmRegressions]  # for each fold, a model fitted to all other folds
-    predicted: Floats  # mean reward of each arm before each pull, shape (n, n_arms)
-
-    def reward_influence(self, policy: Floats) -> Floats:
-        """The effect of each reward's deviation from its model on the policy's predictions.
-
-        On the scale of a term: the mean of the results is their total effect.
-        """
-        added = np.zeros(len(self.arms))
-        for fold, model in enumerate(self.models):
-            held_out = self.fold == fold
-            fitted = np.flatnonzero(~held_out)
-            arms = self.arms[fitted]
-            expected = model.predict(self.contexts[fitted])[np.arange(len(arms)), arms]
-            counts = model.sensitivity(self.contexts[held_out], policy[held_out])
-            added[fitted] += counts * (self.rewards[fitted] - expected)
-        return added
+    level, known = rewards.mean(), inputs(contexts)
+    prior = RIDGE * np.eye(known.shape[1])
+    coefficients = np.zeros((n_arms, len(prior)))
+    for arm in range(n_arms):
+        rows = known[arms == arm]
+        moments = rows.T @ (rewards[arms == arm] - level)
+        coefficients[arm] = linalg.cho_solve(linalg.cho_factor(rows.T @ rows + prior), moments)
+    return np.asarray(level + inputs(asked) @ coefficients.T)
 
 
 def cross_fit(
-    contexts: NDArray[Any],
-    arms: Ints,
-    rewards: Floats,
-    n_arms: int,
-    *,
-    n_folds: int = N_FOLDS,
-    seed: int = 0,
-) -> CrossFit:
-    """Fit models of the rewards: means for numbered contexts, else regressions.
+    contexts: NDArray[Any], arms: Ints, rewards: Floats, n_arms: int, n_folds: int = N_FOLDS
+) -> Floats:
+    """The mean reward of each arm before each pull, shape (n, n_arms), from the other folds' pulls.
 
     Args:
-        contexts: integers from 0, shape (n,), or vectors, shape (n, d).
+        contexts: integers from 0, shape (n,), for means; or vectors, shape (n, d), for regressions.
         arms: shape (n,).
         rewards: shape (n,).
         n_arms: number of arms, including arms that were not pulled.
         n_folds: number of random parts of the pulls.
-        seed: the seed of this partition.
 
     Raises:
-        ValueError: if there are fewer than two pulls or folds.
+        ValueError: if there are fewer than two pulls.
     """
-    if len(arms) < 2 or n_folds < 2:
-        raise ValueError(
-            f"a model of the rewards needs two pulls and two folds or more: there are {len(arms)} "
-            f"and {n_folds}"
-        )
-    n_folds = min(n_folds, len(arms))
-    fold = np.random.default_rng(seed).permutation(len(arms)) % n_folds
-    models: list[ArmMeans | ArmRegressions] = []
+    if len(arms) < 2:
+        raise ValueError("a model of the rewards needs two pulls or more")
+    fold = np.random.default_rng(0).permutation(len(arms)) % min(n_folds, len(arms))
     predicted = np.zeros((len(arms), n_arms))
-    for held_out in (fold == i for i in range(n_folds)):
-        part = contexts[~held_out], arms[~held_out], rewards[~held_out], n_arms
-        model = (
-            ArmMeans(*part, int(contexts.max()) + 1)
-            if contexts.ndim == 1
-            else ArmRegressions(*part)
-        )
-        models.append(model)
-        predicted[held_out] = model.predict(contexts[held_out])
-    return CrossFit(contexts, arms, rewards, fold, models, predicted)
+    for held_out in (fold == i for i in range(fold.max() + 1)):
+        part = contexts[~held_out], arms[~held_out], rewards[~held_out]
+        if contexts.ndim == 1:
+            means = arm_means(*part, (int(contexts.max()) + 1, n_arms))
+            predicted[held_out] = means[contexts[held_out]]
+        else:
+            predicted[held_out] = arm_regressions(*part, n_arms, contexts[held_out])
+    return predicted
 
 
 # --- the estimators -------------------------------------------------------------------------------
@@ -205,7 +132,6 @@ class PolicyTerms:
 
     ips: Floats  # inverse propensities
     snips: Floats  # self-normalised
-    direct: Floats  # the direct method
     doubly_robust: Floats  # doubly robust
     effective: float  # the effective sample size, in pulls of the policy itself
     weights: Floats  # probability of each pull under the policy, relative to the log
@@ -213,16 +139,16 @@ class PolicyTerms:
 
 
 def evaluate_policy(
-    policy: Floats, arms: Ints, rewards: Floats, propensities: Floats, model: CrossFit
+    policy: Floats, arms: Ints, rewards: Floats, propensities: Floats, predicted: Floats
 ) -> PolicyTerms:
-    """Evaluate a policy by all four estimators.
+    """Evaluate a policy by all three estimators.
 
     Args:
         policy: its probability of each arm at each pull, shape (n, n_arms).
         arms: the arms pulled, shape (n,).
         rewards: their rewards, shape (n,).
         propensities: the log's probability of each pulled arm, shape (n,).
-        model: the reward model; see `cross_fit`.
+        predicted: mean reward of each arm at each pull; see `cross_fit`.
 
     Raises:
         ValueError: if the log cannot support an estimate.
@@ -232,18 +158,17 @@ def evaluate_policy(
     return PolicyTerms(
         ips=ips(weights, rewards),
         snips=snips(weights, rewards),
-        direct=direct_method(policy, model),
-        doubly_robust=doubly_robust(policy, weights, arms, rewards, model.predicted),
+        doubly_robust=doubly_robust(policy, weights, arms, rewards, predicted),
         effective=effective_sample_size(weights),
         weights=weights,
-        errors=_errors(arms, rewards, model.predicted),
+        errors=_errors(arms, rewards, predicted),
     )
 
 
-def terms_as_logged(arms: Ints, rewards: Floats, model: CrossFit) -> PolicyTerms:
+def terms_as_logged(arms: Ints, rewards: Floats, predicted: Floats) -> PolicyTerms:
     """The terms of the log's own policy, which are the rewards themselves."""
-    n, errors = len(rewards), _errors(arms, rewards, model.predicted)
-    return PolicyTerms(rewards, rewards, rewards, rewards, float(n), np.ones(n), errors)
+    n, errors = len(rewards), _errors(arms, rewards, predicted)
+    return PolicyTerms(rewards, rewards, rewards, float(n), np.ones(n), errors)
 
 
 def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
@@ -345,25 +270,10 @@ def snips(weights: Floats, rewards: Floats) -> Floats:
     return np.asarray(estimate + weights * (rewards - estimate) * (len(weights) / total))
 
 
-def direct_method(policy: Floats, model: CrossFit) -> Floats:
-    """The direct method: a model's predicted rewards of the policy's actions.
-
-    It needs no propensities. It has the bias of the model, which the interval does not cover. The
-    interval does cover that the model was fitted to a sample: the terms contain each reward's
-    first-order effect through the model (delta method), which has mean 0.
-
-    Source: Dudik, Langford and Li (2011), "Doubly robust policy evaluation and learning", ICML;
-    the variance as in Stefanski and Boos (2002), "The calculus of M-estimation", The American
-    Statistician 56.
-    """
-    added = model.reward_influence(policy)
-    return np.asarray((policy * model.predicted).sum(axis=1) + added - added.mean())
-
-
 def doubly_robust(
     policy: Floats, weights: Floats, arms: Ints, rewards: Floats, predicted: Floats
 ) -> Floats:
-    """The direct method, with the model's errors corrected by inverse propensities.
+    """A model's mean reward of the policy's actions, its errors corrected by inverse propensities.
 
     Unbiased if the propensities are right, for any model that predicts only pulls outside its fit.
     A better model gives a smaller variance.
@@ -471,28 +381,28 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
     Raises:
         UserError: if a policy does not fit the log, or the log cannot support an estimate.
     """
-    model = reward_model(data, max([data.n_arms, *(_n_arms(p.agent) for p in policies)]))
+    predicted = predictions(data, max([data.n_arms, *(_n_arms(p.agent) for p in policies)]))
     notes = [note for policy in policies for note in _notes(data, policy)]
     rows = [
-        Judged(policy.name, _judge(data, policy.name, probabilities(policy, data), model), True)
+        Judged(policy.name, _judge(data, policy.name, probabilities(policy, data), predicted), True)
         for policy in policies
     ]
     for arm in range(data.n_arms):
-        always = np.zeros(model.predicted.shape)
+        always = np.zeros(predicted.shape)
         always[:, arm] = 1
         try:
-            rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, model)))
+            rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, predicted)))
         except UserError as error:
             notes.append(str(error))
-    as_logged = terms_as_logged(data.arms, data.rewards, model)
+    as_logged = terms_as_logged(data.arms, data.rewards, predicted)
     if data.categories is not None:
         numbered = ", ".join(f"{i} {name}" for i, name in enumerate(data.categories))
         notes.append(f"{data.context_names[0]} was read as {numbered}")
     return Comparison(data, (*rows, Judged("as logged", as_logged)), tuple(notes))
 
 
-def reward_model(data: LoggedData, n_arms: int) -> CrossFit:
-    """Fit means of the rewards for Discrete contexts, else regressions.
+def predictions(data: LoggedData, n_arms: int) -> Floats:
+    """The mean reward of each arm at each pull: means for Discrete contexts, else regressions.
 
     Raises:
         UserError: if there are too few pulls.
@@ -535,13 +445,13 @@ def _n_arms(agent: BaseAlgorithm) -> int:
     return int(agent.action_space.n)
 
 
-def _judge(data: LoggedData, name: str, policy: Floats, model: CrossFit) -> PolicyTerms:
+def _judge(data: LoggedData, name: str, policy: Floats, predicted: Floats) -> PolicyTerms:
     """Evaluate a policy that may have fewer arms than the log."""
-    padded = np.zeros(model.predicted.shape)
+    padded = np.zeros(predicted.shape)
     padded[:, : policy.shape[1]] = policy
     assert data.propensities is not None
     try:
-        return evaluate_policy(padded, data.arms, data.rewards, data.propensities, model)
+        return evaluate_policy(padded, data.arms, data.rewards, data.propensities, predicted)
     except ValueError as error:
         raise UserError(f"{name} on {data.source}: {one_line(error)}") from error
 

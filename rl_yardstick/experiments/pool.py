@@ -205,26 +205,58 @@ def do_runs(
         Stopped: after a signal.
     """
     failures: dict[Path, str] = {}
-    to_do, under_way = list(runs)[::-1], dict[Future[None], PlannedRun]()
+    to_do = list(runs)[::-1]
     with _progress(console, len(runs)) as advance:
-        while to_do or under_way:
-            # No more than there are workers: what waits in a pool is begun even after a stop.
-            while to_do and len(under_way) < workers.n_at_once and not stop.number:
-                run = to_do.pop()
-                under_way[workers.submit(run, command)] = run
-            done = wait(under_way, timeout=0.2, return_when=FIRST_COMPLETED).done
-            if stop.number:
-                workers.end()
-                _mark_interrupted(under_way.values())
-                stop.check()
-            for future in done:
-                run, error = under_way.pop(future), future.exception()
-                if error is not None:
-                    _mark_interrupted([run])
-                    failures[run.path] = _in_words(error, run, workers.timeout)
-                    console.print(f"failed: {run.title}: {failures[run.path]}", highlight=False)
-                advance(len(failures))
+
+        def ended(run: PlannedRun, reason: str) -> None:
+            if reason:
+                failures[run.path] = reason
+                console.print(f"failed: {run.title}: {reason}", highlight=False)
+            advance(len(failures))
+
+        keep_busy(workers, lambda: to_do.pop() if to_do else None, ended, command, stop)
     return failures
+
+
+def keep_busy(
+    workers: Workers,
+    next_run: Callable[[], PlannedRun | None],
+    ended: Callable[[PlannedRun, str], None],
+    command: str,
+    stop: Stop,
+) -> None:
+    """Do runs until there is none to begin, and none under way.
+
+    Args:
+        workers: who does them.
+        next_run: the next run; None if none can begin before another ends.
+        ended: called after each run, with the reason if it has failed.
+        command: the user's command, for the run folders.
+        stop: after a signal, running ones are stopped at their next safe moment.
+
+    Raises:
+        Stopped: after a signal.
+    """
+    under_way = dict[Future[None], PlannedRun]()
+    while True:
+        # No more than there are workers: what waits in a pool is begun even after a stop.
+        while len(under_way) < workers.n_at_once and not stop.number:
+            if (run := next_run()) is None:
+                break
+            under_way[workers.submit(run, command)] = run
+        if not under_way:
+            stop.check()
+            return
+        done = wait(under_way, timeout=0.2, return_when=FIRST_COMPLETED).done
+        if stop.number:
+            workers.end()
+            _mark_interrupted(under_way.values())
+            stop.check()
+        for future in done:
+            run, error = under_way.pop(future), future.exception()
+            if error is not None:
+                _mark_interrupted([run])
+            ended(run, "" if error is None else _in_words(error, run, workers.timeout))
 
 
 def _mark_interrupted(runs: Iterable[PlannedRun]) -> None:

@@ -145,6 +145,15 @@ class Parts:
     def __init__(self, spec: TrainSpec, run: Run, resumes: bool) -> None:
         self.spec, self.run = spec, run
         self.agent = make_agent(spec, run.path, resumes)
+        try:
+            self._make_others(resumes)
+        except BaseException:
+            if self.agent.env is not None:
+                self.agent.env.close()
+            raise
+
+    def _make_others(self, resumes: bool) -> None:
+        spec, run = self.spec, self.run
         self.is_bandit = self.agent.env is not None and self.agent.env.has_attr("n_arms")
         self.judge = Judge(spec, self.agent, run.console)
         exact = self.judge.exact

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from rl_yardstick.experiments.analysis import (
     MARK,
     ON_THE_SCALE,
-    AgentAnalysis,
     EnvironmentAnalysis,
     StudyAnalysis,
 )
@@ -33,12 +32,8 @@ def pairs_both_ways(pairs: Iterable[Pair]) -> dict[tuple[str, str], Pair]:
     return {(one.first, one.second): one for one in seen}
 
 
-def pair_sentences(environment: EnvironmentAnalysis) -> list[str]:
+def pair_sentences(environment: EnvironmentAnalysis) -> Iterator[str]:
     """The words on all pairs, one sentence for each first agent and word."""
-    return [sentence for group in _groups(environment) for sentence in group]
-
-
-def _groups(environment: EnvironmentAnalysis) -> Iterable[list[str]]:
     oriented = [pair.swapped() if pair.word == "worse" else pair for pair in environment.pairs]
     ways = {"better": "{} is {} than {}.", "tied": "{} is {} with {}."}
     for name in (agent.agent for agent in environment.agents):
@@ -46,12 +41,9 @@ def _groups(environment: EnvironmentAnalysis) -> Iterable[list[str]]:
         for pair in oriented:
             if pair.first == name:
                 told.setdefault(pair.text, []).append(pair)
-        yield [
-            ways.get(pairs[0].word, "{} is {} against {}.").format(
-                name, text, enumeration([_other(environment, pair) for pair in pairs])
-            )
-            for text, pairs in sorted(told.items(), key=lambda item: item[0])
-        ]
+        for text, pairs in sorted(told.items()):
+            others = enumeration([_other(environment, pair) for pair in pairs])
+            yield ways.get(pairs[0].word, "{} is {} against {}.").format(name, text, others)
 
 
 def _other(environment: EnvironmentAnalysis, pair: Pair) -> str:
@@ -80,24 +72,6 @@ def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     return seeds(*(environment.seeds.values() or [study.n_seeds]))
 
 
-def failed_runs(environment: EnvironmentAnalysis) -> str:
-    """How many runs of each agent failed; empty if none did."""
-    return enumeration(
-        [
-            f"{agent.runs.failed} of {agent.runs.n} runs of {agent.agent} failed"
-            for agent in environment.agents
-            if agent.runs.failed
-        ]
-    )
-
-
-def failed_words(environment: EnvironmentAnalysis) -> str:
-    """What a failed run is; empty where failures have no meaning."""
-    if environment.failure_threshold is None:
-        return ""
-    return f"failed: a score below {number(environment.failure_threshold)}, half the best median"
-
-
 def unseen_sentence(analysis: StudyAnalysis) -> str:
     """What this many runs cannot show; once on every page."""
     counts = [agent.runs.n for one in analysis.environments for agent in one.agents]
@@ -112,7 +86,7 @@ def unseen_sentence(analysis: StudyAnalysis) -> str:
 # Sentences on how soon agents stay above the threshold.
 
 
-def speed_sentences(environment: EnvironmentAnalysis) -> Iterable[str]:
+def speed_sentences(environment: EnvironmentAnalysis) -> Iterator[str]:
     """How many runs reach the threshold and stay there, and from which step."""
     told = [
         (agent.agent, agent.steps_to_stay.share_reached, agent.steps_to_stay.median.point)
@@ -164,17 +138,14 @@ class Conclusion:
 
 def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion:
     """What a study has shown on one environment."""
-    failed = failed_runs(environment)
     return Conclusion(
         lead=_lead(study, environment),
         pairs=tuple(pair_sentences(environment)),
         notes=(
-            *([f"{failed}."] if failed else []),
-            *_on_other_tasks(environment),
-            *_on_the_hidden(environment),
+            *_on_failures(environment),
+            *_on_the_task(environment),
             *speed_sentences(environment),
-            *_on_the_impossible(environment),
-            *_on_variants(study, environment),
+            *_on_what_cannot_be_compared(study, environment),
             *on_changes([environment]),
             *_on_missing(study, environment),
             *environment.advice,
@@ -190,8 +161,8 @@ def overall_sentences(analysis: StudyAnalysis) -> list[str]:
         return []
     n = len(analysis.environments)
     where = "Over both environments" if n == 2 else f"Over all {n} environments"
-    means = {name: overall.scores[name].mean.point for name in overall.scores}
-    told = [f"{name} {score_number(means[name])}" for name in overall.best.agents]
+    means = [(name, overall.scores[name].mean.point) for name in overall.best.agents]
+    told = [f"{name} {score_number(mean)}" for name, mean in means]
     scores = f"mean score: {', '.join(told)}"
     return [f"{where}, best: {overall.best}; {scores}.", *unproven_sentences(analysis.environments)]
 
@@ -216,28 +187,21 @@ def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     agents, words = environment.agents, METRIC_WORDS[study.metric]
     if math.isnan(agents[0].runs.mean):
         return f"No run has a figure for the {words}."
-    optimum = _optimum(study, environment)
+    optimum = ""
+    if study.metric in ON_THE_SCALE and environment.optimum is not None:
+        ends = environment.optimum, environment.optimum_at_least
+        optimum = f"; the optimum is {optimum_words(*ends, environment.optimum_is_proven)}"
     if none_has_learnt(study, environment):
         figure = f"the best mean {words} is {number(agents[0].metric.mean.point)}"
         return (
             "None of the agents has learnt: no median is above the best random or constant "
             f"policy's {number(environment.baseline)}; {figure}{optimum}."
         )
-    if len(agents) == 1:
-        return f"{agents[0].agent}: {words} {_figure(environment, agents[0])}{optimum}."
-    return f"Best: {environment.best}{optimum}."
-
-
-def _figure(environment: EnvironmentAnalysis, agent: AgentAnalysis) -> str:
-    text = number(agent.metric.mean.point)
-    return f"{text}, score {score_number(agent.judged.point)}" if environment.is_score else text
-
-
-def _optimum(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    known = study.metric in ON_THE_SCALE and environment.optimum is not None
-    ends = environment.optimum, environment.optimum_at_least
-    words = optimum_words(*ends, environment.optimum_is_proven)
-    return f"; the optimum is {words}" if known else ""
+    if len(agents) > 1:
+        return f"Best: {environment.best}{optimum}."
+    (one,) = agents
+    score = f", score {score_number(one.judged.point)}" if environment.is_score else ""
+    return f"{one.agent}: {words} {number(one.metric.mean.point)}{score}{optimum}."
 
 
 def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
@@ -251,38 +215,42 @@ def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
     return optimum > baseline and all(median <= reach for median in medians)
 
 
-def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """A warning if the settings of an agent change the environment, and so the optimum."""
+def _on_failures(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """How many runs of each agent failed."""
+    failed = [
+        f"{agent.runs.failed} of {agent.runs.n} runs of {agent.agent} failed"
+        for agent in environment.agents
+        if agent.runs.failed
+    ]
+    if failed:
+        yield f"{enumeration(failed)}."
+
+
+def _on_the_task(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """Settings that change the environment, and so the optimum; what observations hide."""
     if environment.optima:
         each = [f"{number(optimum)} for {name}" for name, optimum in environment.optima.items()]
         yield (
             f"The agents do NOT PLAY THE SAME ENVIRONMENT: the optimum is {enumeration(each)}. "
             "Their returns cannot be compared."
         )
-
-
-def _on_the_hidden(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Under partial observability: what the optimum is based on, and that of the full state."""
-    words = scale_words(environment.full_optimum, environment.measured_by)
-    if words:
+    if words := scale_words(environment.full_optimum, environment.measured_by):
         yield f"{words[0].upper()}{words[1:]}."
 
 
-def _on_the_impossible(environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Agents whose returns exceed the upper bound on the optimum."""
-    names, most = environment.impossible, environment.optimum
+def _on_what_cannot_be_compared(
+    study: StudySpec, environment: EnvironmentAnalysis
+) -> Iterator[str]:
+    """Returns above the upper bound on the optimum; training returns of another environment."""
+    names = environment.impossible
     if names:
         verb = "has" if len(names) == 1 else "have"
         yield (
-            f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, {number(most)}: the "
-            "bracket belongs to another environment, or is wrong"
-            f"{'.' if environment.optimum_is_proven else '; its upper end is not proven.'}"
+            f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, "
+            f"{number(environment.optimum)}: the bracket belongs to another environment, or is "
+            f"wrong{'.' if environment.optimum_is_proven else '; its upper end is not proven.'}"
         )
-
-
-def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
-    """Agents trained on a changed environment, if the verdicts are on training returns."""
-    names = [agent.agent for agent in environment.agents if agent.on_variant]
+    names = tuple(agent.agent for agent in environment.agents if agent.on_variant)
     if names and study.metric in OF_TRAINING:
         verb = "was" if len(names) == 1 else "were"
         yield (
@@ -306,7 +274,7 @@ def on_changes(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
     return [f"{MARK}: trained on a changed environment: {'; '.join(told)}."] if told else []
 
 
-def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
+def _on_looks(environment: EnvironmentAnalysis) -> Iterator[str]:
     """How often a growing study is looked at."""
     n = len(environment.looks)
     if n:
@@ -315,7 +283,7 @@ def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
         yield f"Agents got more seeds until they were decided: {looks}, at {sizes} seeds."
 
 
-def _on_missing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
+def _on_missing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterator[str]:
     for agent, n_missing in environment.missing.items():
         n_seeds = environment.seeds.get(agent, study.n_seeds)
         if n_missing == n_seeds:

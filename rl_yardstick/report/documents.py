@@ -252,41 +252,40 @@ def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[st
 
 
 def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
-    """The agents of an environment with their figures, the best first."""
+    """The agents of an environment with their figures, the best first.
+
+    A column in which no agent has a figure is left out.
+    """
     costs = processor_seconds(results)
-    rows = []
+    found: list[dict[str, str]] = []
     for agent in environment.agents:
         runs, stays = agent.runs, agent.steps_to_stay
         cost = costs.get((agent.agent, environment.environment))
-        figures = [
-            interval(agent.metric.mean),
-            number(agent.metric.median.point),
-            NOTHING if agent.score is None else interval(agent.score, score_number),
-            NOTHING if runs.failed is None else f"{runs.failed} of {runs.n}",
-            NOTHING if stays is None else number(stays.median.point),
-            NOTHING if cost is None else duration(cost),
-        ]
-        rows.append(Row(agent.agent, bool(agent.changes), list(map(Cell, figures))))
-    headings = ["mean", "median", "score", "failed", "stays from", "processor time"]
-    # A column in which no agent has a figure is left out.
-    kept = [k for k in range(len(headings)) if any(row.cells[k].figure != NOTHING for row in rows)]
+        figures = {
+            "mean": interval(agent.metric.mean),
+            "median": number(agent.metric.median.point),
+            "score": NOTHING if agent.score is None else interval(agent.score, score_number),
+            "failed": NOTHING if runs.failed is None else f"{runs.failed} of {runs.n}",
+            "stays from": NOTHING if stays is None else number(stays.median.point),
+            "processor time": NOTHING if cost is None else duration(cost),
+        }
+        found.append(figures)
+    kept = [name for name in found[0] if any(figures[name] != NOTHING for figures in found)]
+    rows = [
+        Row(agent.agent, bool(agent.changes), [Cell(figures[name]) for name in kept])
+        for agent, figures in zip(environment.agents, found, strict=True)
+    ]
     metric = METRIC_WORDS[results.study.metric]
-    return Table(
-        ["", *(headings[k] for k in kept)],
-        [row._replace(cells=[row.cells[k] for k in kept]) for row in rows],
-        f"{environment.environment}: {metric}, with 95 % intervals over seeds.",
-    )
+    caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
+    return Table(["", *kept], rows, caption)
 
 
 def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
     """Median CPU seconds of a run by agent and environment, if all their runs were measured."""
-    table = results.summary
-    found = {}
-    for (agent, environment), rows in table.groupby(["agent", "environment"], sort=False):
-        times = rows["cpu_seconds"].astype(float)
-        if len(times) and times.notna().all():
-            found[str(agent), str(environment)] = float(times.median())
-    return found
+    times = results.summary.astype({"cpu_seconds": float})
+    grouped = times.groupby(["agent", "environment"], sort=False)["cpu_seconds"]
+    medians = grouped.agg(lambda runs: runs.median(skipna=False)).dropna()
+    return {(str(agent), str(place)): float(time) for (agent, place), time in medians.items()}
 
 
 def duration(time: float) -> str:

@@ -26,16 +26,13 @@ class Cell:
     in_line: str = ""  # the terminal's text, if it differs
     aside: str = ""  # its tooltip on the page
     # Low end, point and high end of a bar to draw, each between 0 and 1; or None.
-    bar: tuple[float, float, float] | None = None
+    bar: tuple[float, ...] | None = None
 
 
-def bar(score: Estimate) -> tuple[float, float, float]:
+def bar(score: Estimate) -> tuple[float, ...]:
     """Low end, point and high end of a score, clipped to [0, 1]."""
-    return (_share(score.low), _share(score.point), _share(score.high))
-
-
-def _share(value: float) -> float:
-    return 0.0 if math.isnan(value) else round(min(max(value, 0.0), 1.0), 4)
+    ends = score.low, score.point, score.high
+    return tuple(0.0 if math.isnan(end) else round(min(max(end, 0.0), 1.0), 4) for end in ends)
 
 
 def _known(value: float) -> float | None:
@@ -76,7 +73,7 @@ class Row:
     pulls: PullStatistics | None = None  # on a bandit: its figures by pull
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Column:
     """One column, left out of the page or the terminal if its heading there is empty."""
 
@@ -149,6 +146,10 @@ def _stays_from(row: Row) -> Cell | None:
     return replace(cell, aside=aside)
 
 
+def _episodes(row: Row) -> Cell | None:
+    return threshold_cell(row.agent.episodes_to_stay)
+
+
 def _seconds(row: Row) -> Cell | None:
     seconds = row.agent.seconds
     if math.isnan(seconds.point):
@@ -177,59 +178,36 @@ def _by_pulls(cell: Callable[[PullStatistics], Cell]) -> Callable[[Row], Cell | 
 
 
 COLUMNS = (
+    Column(lambda row: estimate_cell(row.agent.metric.mean), "Mean", "over seeds", "mean"),
+    Column(lambda row: number_cell(row.agent.metric.iqm), "IQM", "middle half"),
+    Column(lambda row: estimate_cell(row.agent.metric.median), "Median", "over seeds", "median"),
+    Column(_score, "Score", "1 is optimal", "score", best_first="descending"),
     Column(
-        page="Mean",
-        help="over seeds",
-        terminal="mean",
-        cell=lambda row: estimate_cell(row.agent.metric.mean),
-    ),
-    Column(page="IQM", help="middle half", cell=lambda row: number_cell(row.agent.metric.iqm)),
-    Column(
-        page="Median",
-        help="over seeds",
-        terminal="median",
-        cell=lambda row: estimate_cell(row.agent.metric.median),
-    ),
-    Column(
-        page="Score", help="1 is optimal", terminal="score", best_first="descending", cell=_score
-    ),
-    Column(
-        page="Failed",
-        help="runs below {failed}",
-        terminal="failed",
+        _failed,
+        "Failed",
+        "runs below {failed}",
+        "failed",
         caption="runs with a score below {failed}, half the best median",
         best_first="ascending",
-        cell=_failed,
     ),
-    Column(page="Gap", help="to the optimum", best_first="ascending", cell=_gap),
+    Column(_gap, "Gap", "to the optimum", best_first="ascending"),
     Column(
+        _training,
         terminal="training",
         caption="return of the last 100 training episodes{variants}",
-        cell=_training,
     ),
-    Column(page="Success", help="in the end", best_first="descending", cell=_success),
+    Column(_success, "Success", "in the end", best_first="descending"),
     Column(
-        page="Stays from",
-        help="step, at {threshold}",
-        terminal="stays from",
+        _stays_from,
+        "Stays from",
+        "step, at {threshold}",
+        "stays from",
         caption="median step from which the return stays above {threshold}",
         best_first="ascending",
-        cell=_stays_from,
     ),
-    Column(
-        page="Episodes",
-        help="to stay at {threshold}",
-        best_first="ascending",
-        cell=lambda row: threshold_cell(row.agent.episodes_to_stay),
-    ),
-    Column(
-        page="CPU time",
-        help="seconds of training",
-        terminal="CPU time",
-        best_first="ascending",
-        cell=_seconds,
-    ),
-    Column(page="Runs", help="finished", best_first="descending", cell=_runs),
+    Column(_episodes, "Episodes", "to stay at {threshold}", best_first="ascending"),
+    Column(_seconds, "CPU time", "seconds of training", "CPU time", best_first="ascending"),
+    Column(_runs, "Runs", "finished", best_first="descending"),
 )
 
 # On the page, folded below the ranking.
@@ -246,42 +224,35 @@ def _discounted(row: Row) -> Cell | None:
     discount, optimum = row.agent.discount, row.agent.discounted_optimum
     if discount is None:  # an agent that has none
         return None
-    words = [f"by {discount:g}", *([f"optimum {number(optimum)}"] if optimum is not None else [])]
-    return _other_return(row.agent.discounted, "; ".join(words))
+    words = f"by {discount:g}" + ("" if optimum is None else f"; optimum {number(optimum)}")
+    return _other_return(row.agent.discounted, words)
 
 
 OTHER_RETURNS = (
     Column(
-        page="Greedy",
-        help="the final policy's return",
+        lambda row: estimate_cell(row.agent.final),
+        "Greedy",
+        "the final policy's return",
         best_first="descending",
-        cell=lambda row: estimate_cell(row.agent.final),
     ),
     Column(
-        page="Stochastic",
-        help="as it acts in training",
+        lambda row: _other_return(row.agent.stochastic, row.agent.acts_by),
+        "Stochastic",
+        "as it acts in training",
         best_first="descending",
-        cell=lambda row: _other_return(row.agent.stochastic, row.agent.acts_by),
     ),
-    Column(
-        page="Discounted",
-        help="greedy, under its own discount",
-        best_first="descending",
-        cell=_discounted,
-    ),
+    Column(_discounted, "Discounted", "greedy, under its own discount", best_first="descending"),
 )
 
 # In the terminal, bandits have a table of their own; on the page, a section.
 BANDIT_COLUMNS = (
-    Column(terminal="mean regret", cell=lambda row: estimate_cell(row.agent.regret)),
-    Column(terminal=f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs", cell=_by_pulls(_spread)),
+    Column(lambda row: estimate_cell(row.agent.regret), terminal="mean regret"),
+    Column(_by_pulls(_spread), terminal=f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs"),
+    Column(_by_pulls(lambda p: number_cell(p.simple_regret[-1])), terminal="simple regret"),
+    Column(_by_pulls(lambda p: number_cell(p.reward[-1])), terminal="reward"),
     Column(
-        terminal="simple regret", cell=_by_pulls(lambda pulls: number_cell(pulls.simple_regret[-1]))
-    ),
-    Column(terminal="reward", cell=_by_pulls(lambda pulls: number_cell(pulls.reward[-1]))),
-    Column(
+        _by_pulls(lambda p: Cell(f"{p.optimal[-1]:.1%}", float(p.optimal[-1]))),
         terminal="best arm",
-        cell=_by_pulls(lambda p: Cell(f"{p.optimal[-1]:.1%}", float(p.optimal[-1]))),
     ),
-    Column(terminal="CPU time", cell=_seconds),
+    Column(_seconds, terminal="CPU time"),
 )

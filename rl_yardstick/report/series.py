@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -20,14 +22,12 @@ from rl_yardstick.experiments.results import (
     curves_by_agent,
     mean_curve,
     read_episodes,
-    stored_curves,
     values_over_seeds,
 )
 from rl_yardstick.experiments.study import AgentSpec, StudySpec, symbol
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.curve_pictures import DWARFED
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
 from rl_yardstick.verdicts import UNBOUNDED, Bounds, Estimate
 
 # One colour and one line style for each agent, the same in every figure of a study.
@@ -99,22 +99,19 @@ def learning_curves(
     results: StudyResults, environment: EnvironmentAnalysis
 ) -> dict[str, LearningCurves]:
     """The curves on an environment, by kind; none where each would be a single point."""
-    found = {}
     here = [run.spec for run in results.planned if run.environment == environment.environment]
-    by_episode = here and all(spec.hyperparams.n_timesteps is None for spec in here)
+    by_episode = here and all(spec.n_timesteps is None for spec in here)
+    agents = [agent.agent for agent in environment.agents]
     variants = tuple(agent.agent for agent in environment.agents if agent.on_variant)
     runs = curves_by_agent(results, environment.environment)
+    found = {}
     for kind in KINDS:
-        by_axis: dict[str, dict[str, Curve]] = {by: {} for by in AXES}
         # Training returns of a changed environment have other bounds.
         bounds = UNBOUNDED if kind == "training" and variants else environment.bounds
-        for agent in (each.agent for each in environment.agents):
-            of_agent: list[Any] = runs.get((agent, kind), [])
-            if stored := stored_curves(results, environment.environment, agent, kind):
-                of_agent = [*of_agent, *stored]
-            for by in AXES:
-                if (curve := _curve(of_agent, by, bounds)) is not None:
-                    by_axis[by][agent] = curve
+        by_axis: dict[str, dict[str, Curve]] = {by: {} for by in AXES}
+        for by, agent in product(AXES, agents):
+            if (curve := mean_of(runs.get((agent, kind), []), by, bounds)) is not None:
+                by_axis[by][agent] = curve
         for by, curves in by_axis.items():
             if all(len(curve.x) == 1 for curve in curves.values()):
                 by_axis[by] = {}
@@ -125,11 +122,9 @@ def learning_curves(
     return found
 
 
-def _curve(runs: Sequence[Any], by: str, bounds: Bounds) -> Curve | None:
-    try:
-        found = mean_curve(runs, by, bounds)
-    except ValueError:
-        return None  # the clock was set back, so wall times decrease
+def mean_of(runs: Sequence[pd.DataFrame], by: str, bounds: Bounds = UNBOUNDED) -> Curve | None:
+    """The mean curve of an agent over its runs; None without runs that overlap."""
+    found = mean_curve(runs, by, bounds)
     if found is None:
         return None
     points, band = found
@@ -159,19 +154,18 @@ def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
 
     Columns agent, environment, episode (the last of the block), average, minimum, maximum.
     """
-    rows = []
-    for planned in results.in_folders:
-        returns = read_episodes(planned.run).returns
-        columns = {
-            "agent": planned.agent,
-            "environment": planned.environment,
-            "episode": (np.arange(len(returns)) // width + 1) * width,
-            "return": returns,
-        }
-        rows.append(pd.DataFrame(columns))
-    if not rows:
+    tables = []
+    for planned in results.finished:
+        if planned.is_batch:
+            continue
+        returns = read_episodes(planned.path).returns
+        labels = {"agent": planned.agent, "environment": planned.environment}
+        blocks = (np.arange(len(returns)) // width + 1) * width
+        tables.append(pd.DataFrame({**labels, "episode": blocks, "return": returns}))
+    if not tables:
         return pd.DataFrame(columns=["agent", "environment", "episode"])
-    grouped = pd.concat(rows).groupby(["environment", "agent", "episode"], sort=False)["return"]
+    by = ["environment", "agent", "episode"]
+    grouped = pd.concat(tables).groupby(by, sort=False)["return"]
     return grouped.agg(average="mean", minimum="min", maximum="max").reset_index()
 
 
@@ -197,7 +191,7 @@ def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Bel
     spec = next(planned.spec for planned in results.planned if planned.agent == agent)
     means = statistics.true_means
     # Parameters: mean and standard deviation of a normal, alpha and beta of a Beta distribution.
-    if spec.hyperparams.algorithm.get("likelihood") == "gaussian":
+    if spec.algorithm.get("likelihood") == "gaussian":
         family, low, high = stats.norm, means.min() - 2, means.max() + 2
     else:
         family, low, high = stats.beta, 0.0, min(2 * float(means.max()), 1.0)
@@ -258,13 +252,12 @@ def best_expected_reward(env: gym.Env[object, object]) -> float | None:
 
     None if it drifts with time, or has no closed form.
     """
-    bandit = env.unwrapped
+    bandit: Any = env.unwrapped
     if getattr(bandit, "drift_std", 0.0) > 0:
         return None
     if getattr(bandit, "redraws", False):
-        if bandit.kind != "gaussian":  # type: ignore[attr-defined]
-            return None
-        return float(bandit.mean_loc + best_of_normals(bandit.n_arms))  # type: ignore[attr-defined]
+        is_normal = bandit.kind == "gaussian"
+        return float(bandit.mean_loc + best_of_normals(bandit.n_arms)) if is_normal else None
     means = getattr(bandit, "means", None)
     if means is None:
         return None
@@ -327,11 +320,9 @@ def pull_series(results: StudyResults, environment: EnvironmentAnalysis) -> Pull
     }
     if not pulls:
         return None
-    env = make_single_env(next(p for p in results.planned if p.environment == label).spec)
-    try:
+    spec = next(run.spec for run in results.planned if run.environment == label)
+    with closing(make_single_env(spec)) as env:
         best, bounds = best_expected_reward(env), regret_bounds(env, next(iter(pulls.values())))
-    finally:
-        env.close()
     known = {agent: found for agent, found in pulls.items() if found.true_means.size}
     beliefs = [belief(results, agent, p) for agent, p in known.items() if len(p.moments)]
     return PullSeries(pulls, best, bounds, arm_series(known), tuple(beliefs))
@@ -513,12 +504,11 @@ class StudySeries:
     environments: tuple[EnvironmentSeries, ...]  # by environment
 
 
-def study_series(analysis: StudyAnalysis, tell: Tell = tell_nobody) -> StudySeries:
+def study_series(analysis: StudyAnalysis) -> StudySeries:
     """Compute all that is drawn; most of the time goes into the intervals of the curves."""
     results, agents = analysis.results, analysis.study.agents
     environments = []
     for one in analysis.environments:
-        tell(one.environment)
         pulls = pull_series(results, one)
         found = EnvironmentSeries(
             environment=one,

@@ -30,8 +30,6 @@ from rl_yardstick.verdicts import FEW, Estimate
 if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
     from rl_yardstick.experiments.off_policy import Comparison, Judged
 
-# A study in the terminal.
-
 MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
 UNBOUNDED = 10_000  # columns
 # Columns to drop, in this order, while a table is wider than the terminal, and then all but the
@@ -43,30 +41,25 @@ FIRST_LEFT_OUT = (
 
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
-    """Print a table and a conclusion for each environment, then a sentence on the seeds."""
+    """Print a table and a conclusion for each environment, then a sentence on the seeds.
+
+    The pairs are a table of words for three agents or more, if it fits, and else sentences.
+    """
     for sentence in overall_sentences(analysis):
         console.print()
         console.print(sentence, highlight=False)
     for environment in analysis.environments:
         console.print()
         _print_ranking(console, analysis, environment)
-        _print_conclusion(console, analysis.study, environment)
+        said, words = conclusion(analysis.study, environment), _words_of_pairs(environment)
+        as_table = len(environment.agents) > 2 and _width(console, words) <= console.width
+        for each in (said.lead, *((words,) if as_table else said.pairs), *said.notes):
+            console.print(each, highlight=False)
     console.print()
     if unseen := unseen_sentence(analysis):
         console.print(unseen, highlight=False)
     origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
     console.print(origin, highlight=False)
-
-
-def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
-    """Print the lead, the pairs (as a table of words for three agents or more), and the notes."""
-    said = conclusion(study, environment)
-    told: list[str | Table] = [said.lead]
-    table = _words_of_pairs(environment)
-    fits = len(environment.agents) > 2 and _width(console, table) <= console.width
-    told += [table] if fits else said.pairs
-    for each in (*told, *said.notes):
-        console.print(each, highlight=False)
 
 
 def _words_of_pairs(environment: EnvironmentAnalysis) -> Table:
@@ -78,9 +71,8 @@ def _words_of_pairs(environment: EnvironmentAnalysis) -> Table:
         table.add_column(f"vs {name}", overflow="fold", max_width=MOST_AGENT_WIDTH)
     pairs = pairs_both_ways(environment.pairs)
     for place, name in enumerate(names[:-1], start=1):
-        words = [
-            pairs[name, other].text if (name, other) in pairs else "" for other in names[place:]
-        ]
+        found = [pairs.get((name, other)) for other in names[place:]]
+        words = ["" if pair is None else pair.text for pair in found]
         table.add_row(name, *[""] * (place - 1), *words)
     return table
 
@@ -97,12 +89,12 @@ def _print_ranking(
         left_out = _print_fitting(console, label, BANDIT_COLUMNS, on_bandit)
         explained = _bandit_caption(analysis.study, left_out)
     else:
-        columns = [column for column in COLUMNS if column.terminal]
         title = label
         if environment.optimum is not None:
             ends = environment.optimum, environment.optimum_at_least
             title += f": optimum {optimum_words(*ends, environment.optimum_is_proven)}"
             title += f", best random or constant policy {number(environment.baseline)}"
+        columns = [column for column in COLUMNS if column.terminal]
         left_out = _print_fitting(console, title, columns, rows)
         explained = _caption(analysis.study, environment, left_out)
     if left_out:
@@ -223,12 +215,8 @@ def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
     printed.add_column("episode", justify="right")
     for agent in agents:
         printed.add_column(folded(str(agent), MOST_AGENT_WIDTH), justify="right", no_wrap=True)
-    cells = {
-        (row["episode"], row["agent"]): "  ".join(
-            number(row[name]) for name in ("average", "minimum", "maximum")
-        )
-        for _, row in rows.iterrows()
-    }
+    figures = rows.set_index(["episode", "agent"])[["average", "minimum", "maximum"]]
+    cells = {at: "  ".join(map(number, row)) for at, *row in figures.itertuples()}
     for episode in sorted(set(rows["episode"])):
         printed.add_row(f"{episode:,}", *(cells.get((episode, agent), "-") for agent in agents))
     return printed
@@ -243,8 +231,15 @@ def _width(console: Console, table: Table) -> int:
 # With a smaller effective sample size, the interval of an estimate is unreliable.
 FEW_PULLS = 100
 SHORT, MOST_DECIMALS = 3, 6
+# The estimates of a policy, by heading.
+ESTIMATES = {
+    "IPS": "ips",
+    "self-normalised": "snips",
+    "direct": "direct",
+    "doubly robust": "doubly_robust",
+}
 # Columns to drop, in this order, while the table is wider than the terminal.
-OFF_POLICY_LEFT_OUT = ("IPS", "self-normalised", "direct", "effective")
+OFF_POLICY_LEFT_OUT = ("IPS", "self-normalised", "effective")
 
 
 def print_comparison(console: Console, comparison: Comparison) -> None:
@@ -252,7 +247,11 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     data = comparison.data
     title = f"{data.source}: {len(data):,} pulls, {data.n_arms} arms"
     console.print(title, style="italic", highlight=False)
-    table, left_out = _fitting(console, _off_policy_cells(comparison), OFF_POLICY_LEFT_OUT)
+    cells = {"policy": [row.name for row in comparison.rows]}
+    for heading, kind in ESTIMATES.items():
+        cells[heading] = [shown(mean_reward(getattr(row.terms, kind))) for row in comparison.rows]
+    cells["effective"] = [f"{row.terms.effective:,.0f}" for row in comparison.rows]
+    table, left_out = _fitting(console, cells, OFF_POLICY_LEFT_OUT)
     console.print(table, crop=False)
     explained = (
         "mean reward a pull, ± half the 95 % interval; effective: effective sample size in pulls; "
@@ -262,19 +261,6 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     console.print(explained, style="italic dim", highlight=False)
     for sentence in [*sentences(comparison), *comparison.notes]:
         console.print(f"  {sentence}")
-
-
-def _off_policy_cells(comparison: Comparison) -> dict[str, list[str]]:
-    """The cells of the table by heading."""
-    terms = [row.terms for row in comparison.rows]
-    return {
-        "policy": [row.name for row in comparison.rows],
-        "IPS": [shown(mean_reward(one.ips)) for one in terms],
-        "self-normalised": [shown(mean_reward(one.snips)) for one in terms],
-        "direct": [shown(mean_reward(one.direct)) for one in terms],
-        "doubly robust": [shown(mean_reward(one.doubly_robust)) for one in terms],
-        "effective": [f"{one.effective:,.0f}" for one in terms],
-    }
 
 
 def sentences(comparison: Comparison) -> list[str]:
@@ -309,16 +295,8 @@ def _difference(first: Judged, second: Judged, n_pairs: int) -> str:
     point, low, high = (
         f"{value:+.{decimals}f}" for value in (difference.point, difference.low, difference.high)
     )
-    return (
-        f"{first.name} against {second.name}: {point} [{low}, {high}] a pull, {verdict(difference)}"
-    )
-
-
-def verdict(difference: Estimate) -> str:
-    """What the interval of a difference says."""
-    if difference.low > 0:
-        return "better"
-    return "worse" if difference.high < 0 else "undecided"
+    word = "better" if difference.low > 0 else "worse" if difference.high < 0 else "undecided"
+    return f"{first.name} against {second.name}: {point} [{low}, {high}] a pull, {word}"
 
 
 def shown(estimate: Estimate) -> str:

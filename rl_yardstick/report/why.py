@@ -6,17 +6,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.train_spec import TrainSpec
+from rl_yardstick.pipeline.modules import import_modules
 
 if TYPE_CHECKING:
-    from rl_yardstick.diagnosis.explanation import Explanation, Part, Parting, StateLoss
+    from rl_yardstick.diagnosis.explanation import Explanation, Parting, StateLoss
     from rl_yardstick.experiments.interventions import Tried
+    from rl_yardstick.experiments.plan import PlannedRun
 
 # A part below this share of the gap has no line.
 LEAST_SHARE = 0.02
@@ -34,8 +34,11 @@ def why_lines(explained: Explanation) -> list[str]:
         explained.ending,
         f"gap {gap:.4g}: it returns {explained.value:.6g}, the optimum is {optimum:.6g}",
     ]
-    shown = [part for part in explained.parts if _is_shown(part, gap)]
-    told += [f"  {part.loss:>9.4g} {part.name}: {part.meaning}" for part in shown]
+    told += [
+        f"  {part.loss:>9.4g} {part.name}: {part.meaning}"
+        for part in explained.parts
+        if part.name == "not observable" or abs(part.loss) >= LEAST_SHARE * gap
+    ]
     if explained.own_gap is not None:
         own = f"in its own objective, at discount {explained.discount:g}"
         told.append(f"the gap at the start {own}: {explained.own_gap:.4g}")
@@ -44,8 +47,12 @@ def why_lines(explained: Explanation) -> list[str]:
         told += [_state(state, gap) for state in worst if state.loss >= LEAST_SHARE * gap]
     elif explained.road:
         told.append(explained.road)
-    if explained.repairs:
-        told.append(_repairs(explained))
+    regained = [
+        f"{place}: {reached:.5g}, {(reached - explained.value) / gap:.1%} of the gap regained"
+        for place, reached in explained.repairs
+    ]
+    if regained:
+        told.append(f"with the best action in {'; and in '.join(regained)}")
     return told
 
 
@@ -57,30 +64,27 @@ class Why:
     proposal: str | None  # a change that may help, as ``explain.py --test`` takes it
 
 
-def whys_of(runs: Sequence[tuple[TrainSpec, Path]]) -> list[Why | None]:
-    """Explain each run, given its spec and model zip; None where its gap cannot be split.
+def whys_of(runs: Sequence[PlannedRun]) -> list[Why | None]:
+    """Explain each run; None where its gap cannot be split.
 
     Call this in a child process: it loads PyTorch.
     """
-    return [_why_of(spec, path) for spec, path in runs]
+    return [_why_of(run) for run in runs]
 
 
-def _why_of(spec: TrainSpec, path: Path) -> Why | None:
+def _why_of(planned: PlannedRun) -> Why | None:
     from rl_yardstick.diagnosis.explanation import explanation
     from rl_yardstick.pipeline.evaluation.exact import evaluator_of
-    from rl_yardstick.pipeline.models.load import load_model
+    from rl_yardstick.pipeline.models import load_agent, model_of_run
 
+    spec = planned.spec
     with suppress(UserError, OSError):
+        import_modules(spec.gym_packages)
         evaluator = evaluator_of(spec)
         if evaluator is not None:
-            agent = load_model(spec.algo, path, modules=spec.user_modules, device="cpu")
-            found = explanation(spec, agent, evaluator)
+            found = explanation(spec, load_agent(model_of_run(planned.run)), evaluator)
             return Why(why_lines(found), next(map(as_words, found.proposals), None))
     return None
-
-
-def _is_shown(part: Part, gap: float) -> bool:
-    return part.name == "not observable" or abs(part.loss) >= LEAST_SHARE * gap
 
 
 def _state(state: StateLoss, gap: float) -> str:
@@ -98,14 +102,6 @@ def _state(state: StateLoss, gap: float) -> str:
             told = [f"{one}, {n:,} updates" for one, n in zip(told, state.updates, strict=True)]
         text += f" ({state.action}: {told[0]}; {state.best}: {told[1]})"
     return text
-
-
-def _repairs(explained: Explanation) -> str:
-    told = []
-    for place, reached in explained.repairs:
-        share = (reached - explained.value) / explained.gap
-        told.append(f"{place}: {reached:.5g}, {share:.1%} of the gap regained")
-    return f"with the best action in {'; and in '.join(told)}"
 
 
 def parting_lines(parting: Parting) -> list[str]:
@@ -152,10 +148,8 @@ def tried_lines(tried: Sequence[Tried], optimum: float) -> list[str]:
     before = next(one for one in tried if one.change.endswith(AS_IT_IS))
     gap, n_seeds = optimum - before.mean, len(before.returns)
     if not 1e-9 * max(1.0, abs(optimum)) < gap < np.inf:
-        return [
-            *told,
-            "as it is, every run is optimal" if gap < np.inf else "nothing to compare with",
-        ]
+        nothing = "as it is, every run is optimal" if gap < np.inf else "nothing to compare with"
+        return [*told, nothing]
     helpful: dict[str, tuple[float, int]] = {}
     for one in tried:
         least = np.minimum(before.returns + REMEDY * gap, optimum - REMEDY * gap)
@@ -165,7 +159,8 @@ def tried_lines(tried: Sequence[Tried], optimum: float) -> list[str]:
     changes = {change: found for change, found in helpful.items() if change != SHIPPED}
     if not changes:
         told.append(f"no change closes {REMEDY:.0%} of the gap and helps half of the seeds")
-    for change in [max(changes or helpful, key=helpful.__getitem__)] if helpful else []:
+    if helpful:
+        change = max(changes or helpful, key=helpful.__getitem__)
         closed, n_better = helpful[change]
         share = f"closes {closed:.0%} of the gap on average"
         told.append(f"{change} helps most: it {share}, in {n_better} of {n_seeds} seeds")

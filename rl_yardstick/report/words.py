@@ -94,11 +94,11 @@ MOST_NAMES = 6
 
 def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
     """Say which of the seeds of a study the settings of its agents were tuned on."""
+    these = _these(seeds)
     parts = [
         *_tuned(seeds, tuning.shipped, "the shipped settings of"),
         *_tuned(seeds, tuning.files, "the settings in"),
     ]
-    these = _these(seeds)
     if tuning.elsewhere:
         names = _names(tuning.elsewhere)
         parts.append(f"the settings of {names} were tuned with other arguments of the environment")
@@ -118,11 +118,11 @@ def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str) -> list[str]:
     for name, shared in found.items():
         if shared:
             groups.setdefault(shared, []).append(name)
-    told = []
-    for shared, names in groups.items():
-        which = f"{spans(shared)} of these" if len(shared) < len(seeds) else _these(seeds)
-        told.append(f"{whose} {_names(names)} were tuned on {which}")
-    return told
+    return [
+        f"{whose} {_names(names)} were tuned on "
+        + (f"{spans(shared)} of these" if len(shared) < len(seeds) else _these(seeds))
+        for shared, names in groups.items()
+    ]
 
 
 def _these(seeds: range) -> str:

@@ -7,9 +7,9 @@ setting with the value `LEFT_OUT` is not given.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -20,9 +20,8 @@ from optuna.distributions import (
     FloatDistribution,
     IntDistribution,
 )
+from pydantic.dataclasses import dataclass
 
-from rl_yardstick.pipeline.errors import UserError
-from rl_yardstick.pipeline.settings.values import DottedName, parse_schedule
 from rl_yardstick.tuning.tuning_spec import SHIPPED
 
 # The value that Optuna stores for a choice.
@@ -30,25 +29,22 @@ Word = str | int | float | bool | None
 # A function that chooses a value for the parameter of this name.
 Pick = Callable[[str, BaseDistribution], Any]
 # By the name of another choice, the words of which one must be chosen there; empty for none.
-Conditions = Mapping[str, tuple[Word, ...]]
+Conditions = dict[str, tuple[Word, ...]]
 
 Scale = Literal["linear", "log", "log_below_one", "powers_of_two"]
 # The meaning of a number: a constant, or the start of a schedule.
 FORMS = ("constant", "linear", "exponential")
 FINAL_SHARE = (0.001, 1.0)
-_DIGITS = 6
-_PREFIXES: Mapping[str, str] = {"log_below_one": "one_minus_", "powers_of_two": "log2_"}
-
-
 LEFT_OUT = object()  # in place of a setting that is not given
+_PREFIXES: Mapping[str, str] = {"log_below_one": "one_minus_", "powers_of_two": "log2_"}
 
 
 @dataclass(frozen=True)
 class Choice:
     """One of several values, or one of several sets of settings."""
 
-    name: str  # name of the parameter
-    options: Mapping[Word, Mapping[str, Any]]  # the flat settings of each word
+    name: str  #: name of the parameter
+    options: dict[Word, dict[str, Any]]  #: the flat settings of each word
     when: Conditions = field(default_factory=dict)
 
     @cached_property
@@ -74,17 +70,15 @@ class Choice:
 
     def including(self, settings: Mapping[str, Any]) -> Choice:
         """This dimension, widened if necessary to include these settings."""
-        try:
+        with suppress(LookupError):
             self.params_of(settings)
-        except LookupError:
-            added = self._decided(settings)
-            value = added.get(self.name, LEFT_OUT)
-            # The value itself, if that is clearer for readers.
-            speaks = all(is_word(option.get(self.name)) for option in self.options.values())
-            speaks = speaks and is_word(value) and value not in self.options
-            word = value if speaks else SHIPPED
-            return replace(self, options={**self.options, word: added})
-        return self
+            return self
+        added = self._decided(settings)
+        value = added.get(self.name, LEFT_OUT)
+        # The value itself, if that is clearer for readers.
+        speaks = all(is_word(option.get(self.name)) for option in self.options.values())
+        word = value if speaks and is_word(value) and value not in self.options else SHIPPED
+        return replace(self, options={**self.options, word: added})
 
     def _decided(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         return {key: settings.get(key, LEFT_OUT) for key in self.keys}
@@ -97,52 +91,67 @@ class NumberRange:
     Chosen numbers have six digits to keep files readable.
     """
 
-    name: str  # name of the setting
-    low: float  # included
-    high: float  # included
-    scale: Scale = "linear"  # the scale of equal steps; on "powers_of_two" only these are values
-    forms: tuple[str, ...] = ("constant",)  # the allowed words of `FORMS`
-    # The range of an exponential schedule's end, as a share of its start.
+    name: str  #: name of the setting
+    low: int | float  #: included
+    high: int | float  #: included
+    scale: Scale = "linear"  #: of equal steps; on "powers_of_two" only these are values
+    #: The allowed words of `FORMS`, and words that replace the number.
+    forms: tuple[Word, ...] = ("constant",)
+    #: The range of an exponential schedule's end, as a share of its start.
     final_share: tuple[float, float] = FINAL_SHARE
-    # Values in place of a number, by Optuna's words for them.
-    instead: Mapping[Word, Any] = field(default_factory=dict)
     when: Conditions = field(default_factory=dict)
+    instead: dict[str, Any] = field(default_factory=dict)  #: other values in place of the number
+
+    def __post_init__(self) -> None:
+        low, high, share = self.low, self.high, self.final_share
+        if not -np.inf < low < high < np.inf:
+            raise ValueError(f"low must be below high, and both finite: not {low} and {high}")
+        if self.scale == "log" and low <= 0:
+            raise ValueError(f"scale log needs low above 0, not {low}")
+        if self.scale == "log_below_one" and high >= 1:
+            raise ValueError(f"scale log_below_one needs high below 1, not {high}")
+        if self.scale == "powers_of_two" and not (is_power(low) and is_power(high)):
+            raise ValueError("scale powers_of_two needs whole powers of two as low and high")
+        if not any(form in FORMS for form in self.forms):
+            raise ValueError(f"forms must name one of {', '.join(FORMS)}, and what else may be")
+        if not 0 < share[0] < share[1] < np.inf:
+            raise ValueError("final_share must be two numbers above 0, the smaller one first")
+        if not (isinstance(low, int) and isinstance(high, int)):
+            object.__setattr__(self, "low", float(low))
+            object.__setattr__(self, "high", float(high))
 
     @property
     def keys(self) -> tuple[str, ...]:
         """The names of its settings."""
         return (self.name,)
 
-    @property
-    def _number(self) -> str:
-        return _PREFIXES.get(self.scale, "") + self.name
-
-    @property
-    def _form(self) -> str:
-        return f"{self.name}_form"
-
-    @property
-    def _share(self) -> str:
-        return f"{self.name}_final_share"
-
-    @property
+    @cached_property
     def _words(self) -> tuple[Word, ...]:
-        return (*self.forms, *self.instead)
+        """Optuna's words for the forms, the schedules first."""
+        first = sorted(self.forms, key=lambda form: form not in FORMS)
+        return tuple(dict.fromkeys((*first, *self.instead)))
+
+    @property
+    def _names(self) -> tuple[str, str, str]:
+        """The names of its parameters: number, form, and share of the end."""
+        prefix = _PREFIXES.get(self.scale, "")
+        return prefix + self.name, f"{self.name}_form", f"{self.name}_final_share"
 
     @cached_property
     def distributions(self) -> dict[str, BaseDistribution]:
         """The distribution of each of its parameters."""
+        number, form, share = self._names
         found: dict[str, BaseDistribution] = {}
         if len(self._words) > 1:
-            found[self._form] = CategoricalDistribution(self._words)
+            found[form] = CategoricalDistribution(self._words)
         low, high = sorted((self._parameter(self.low), self._parameter(self.high)))
         is_log = self.scale in ("log", "log_below_one")
         if isinstance(low, int) and isinstance(high, int):
-            found[self._number] = IntDistribution(low, high, log=is_log)
+            found[number] = IntDistribution(low, high, log=is_log)
         else:
-            found[self._number] = FloatDistribution(low, high, log=is_log)
+            found[number] = FloatDistribution(low, high, log=is_log)
         if "exponential" in self.forms:
-            found[self._share] = FloatDistribution(*self.final_share, log=True)
+            found[share] = FloatDistribution(*self.final_share, log=True)
         return found
 
     def _parameter(self, number: float) -> float:
@@ -162,34 +171,35 @@ class NumberRange:
 
     def settings(self, pick: Pick) -> dict[str, Any]:
         """The chosen settings; calls ``pick`` only for the needed parameters."""
+        number, form, share = self._names
         ranges = self.distributions
-        form = pick(self._form, ranges[self._form]) if self._form in ranges else self._words[0]
-        if form not in self.forms:
-            return {self.name: self.instead[form]}
-        number = self._number_of(pick(self._number, ranges[self._number]))
-        if form == "constant":
-            return {self.name: number}
-        if form == "linear":
-            return {self.name: f"lin_{number}"}
-        end = tidy(number * pick(self._share, ranges[self._share]))
-        return {self.name: f"exp_{number}_{end}"}
+        word = pick(form, ranges[form]) if form in ranges else self._words[0]
+        if word not in FORMS:
+            return {self.name: self.instead.get(word, word)}
+        start = self._number_of(pick(number, ranges[number]))
+        if word == "constant":
+            return {self.name: start}
+        if word == "linear":
+            return {self.name: f"lin_{start}"}
+        return {self.name: f"exp_{start}_{tidy(start * pick(share, ranges[share]))}"}
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """The parameters that give these settings; LookupError if there are none."""
+        number, form, share = self._names
         value = settings.get(self.name, LEFT_OUT)
-        for word, other in self.instead.items():
-            if same(value, other):
-                return {self._form: word}
-        form, start, end = _read(value)
-        if form is None:
+        for word in self._words:
+            if word not in FORMS and same(value, self.instead.get(word, word)):  # type: ignore[arg-type]
+                return {form: word}
+        kind, start, end = read = _read(value)
+        if kind is None:
             raise LookupError(self.name)
-        params: dict[str, Any] = {self._form: form} if len(self._words) > 1 else {}
-        params[self._number] = self._parameter(start)
-        if form == "exponential":
-            params[self._share] = end / start
+        params: dict[str, Any] = {form: kind} if form in self.distributions else {}
+        params[number] = self._parameter(start)
+        if kind == "exponential":
+            params[share] = end / start
         if all(self._holds(name, value) for name, value in params.items()):
             again = self.settings(lambda name, _: params[name])[self.name]
-            if _read(again) == (form, start, end):
+            if _read(again) == read:
                 return params
         raise LookupError(self.name)
 
@@ -202,26 +212,23 @@ class NumberRange:
     def including(self, settings: Mapping[str, Any]) -> NumberRange:
         """This dimension, widened if necessary to include these settings."""
         value = settings.get(self.name, LEFT_OUT)
-        form, start, end = _read(value)
-        wider = [self]
-        if form is not None:
-            wider.append(replace(self, forms=tuple(dict.fromkeys((*self.forms, form)))))
-        if form is not None and (self.scale != "log" or start > 0):
+        kind, start, end = _read(value)
+        changes: list[dict[str, Any]] = [{}]
+        if kind is not None:
             low, high = self.final_share
-            share = end / start if form == "exponential" else low
-            reaching = replace(
-                wider[-1],
-                low=min(self.low, start),
-                high=max(self.high, start),
-                final_share=(min(low, share), max(high, share)),
-            )
-            wider.append(reaching)
-        for each in wider:
-            with contextlib.suppress(LookupError, ValueError):
-                each.params_of(settings)
-                return each
-        word = value if is_word(value) and value not in self._words else SHIPPED
-        return replace(self, instead={**self.instead, word: value})
+            share = end / start if kind == "exponential" else low
+            other = {"forms": tuple(dict.fromkeys((*self.forms, kind)))}
+            ends = {"low": min(self.low, start), "high": max(self.high, start)}
+            ends["final_share"] = min(low, share), max(high, share)
+            changes += [other, {**other, **ends}]
+        for each in changes:
+            with suppress(LookupError, ValueError):
+                wider = replace(self, **each)
+                wider.params_of(settings)
+                return wider
+        if is_word(value) and value not in self._words:
+            return replace(self, forms=(*self.forms, value))
+        return replace(self, instead={**self.instead, SHIPPED: value})
 
 
 Dimension = Choice | NumberRange
@@ -242,17 +249,23 @@ def spread(distribution: BaseDistribution, n: int) -> list[Any]:
 
 def tidy(number: float) -> float:
     """Round a number to six digits."""
-    return float(f"{number:.{_DIGITS}g}")
+    return float(f"{number:.6g}")
+
+
+def is_power(number: float) -> bool:
+    """Whether a number is a whole power of two."""
+    return isinstance(number, int) and number > 0 and number.bit_count() == 1
 
 
 def _read(value: Any) -> tuple[str | None, float, float]:
     """Form, start and end of a number or schedule; no form for other values."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return "constant", value, value
-    if isinstance(value, str):
-        with contextlib.suppress(UserError):
-            schedule = parse_schedule(value, "")
-            return schedule.kind, schedule.start, schedule.end
+    kind, *numbers = value.split("_") if isinstance(value, str) else [""]
+    with suppress(ValueError, LookupError):
+        form = {"lin": "linear", "exp": "exponential"}[kind]
+        start, end = [*map(float, numbers), 0.0][:2]
+        return form, start, end
     return None, 0.0, 0.0
 
 
@@ -271,6 +284,4 @@ def _comparable(value: object) -> object:
         return {key: _comparable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_comparable(item) for item in value]
-    if isinstance(value, DottedName):
-        return value.name
     return (bool, value) if isinstance(value, bool) else value

@@ -7,70 +7,36 @@ name.
 
 from __future__ import annotations
 
-import inspect
-import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from optuna.distributions import (
-    BaseDistribution,
-    CategoricalDistribution,
-    FloatDistribution,
-    IntDistribution,
-)
-from optuna.trial import BaseTrial
+from optuna.distributions import BaseDistribution, FloatDistribution
+from optuna.trial import FixedTrial, Trial
+from pydantic import ValidationError
 
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.pipeline.arguments import constructor_parameters
 from rl_yardstick.pipeline.errors import UserError, shown, unknown
-from rl_yardstick.pipeline.models.load import agent_class
-from rl_yardstick.pipeline.settings.components import default_policy
-from rl_yardstick.pipeline.settings.hyperparams import (
-    Hyperparams,
-    check_algorithm_kwargs,
-    override,
-    split,
-)
-from rl_yardstick.pipeline.settings.values import (
-    DottedName,
-    algorithm_parameters,
-    check_arguments,
-    constructor_parameters,
-    parse_literal,
-)
-from rl_yardstick.pipeline.settings.yaml import read_yaml
+from rl_yardstick.pipeline.settings import COMPONENTS, HYPERPARAMS, SPECIAL, override, read_yaml
+from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.tuning.dimensions import (
-    FINAL_SHARE,
-    FORMS,
     LEFT_OUT,
     Choice,
     Dimension,
     NumberRange,
     Pick,
-    Scale,
-    Word,
     is_word,
     same,
     spread,
 )
 
-# The number of points over a range for a check between its ends: the second is rarely an integer.
-_PARTS = 98
-
-_FOLDER = Path(__file__).resolve().parents[1] / "hyperparams" / "search_spaces"
 # Settings that change the task, so that a search would choose the easiest task.
 _TASK = ("env_kwargs", "eval_env_kwargs")
-# The keys of each type of entry, and their types.
-_RANGE: Mapping[str, Any] = {
-    "low": float,
-    "high": float,
-    "scale": Scale,
-    "forms": list[Any],
-    "final_share": list[float],
-    "when": dict[str, Any],
-}
-_CHOICE: Mapping[str, Any] = {"choices": dict[str, Any] | list[Any], "when": dict[str, Any]}
-_SETS: Mapping[str, Any] = {"sets": dict[str, dict[str, Any]], "when": dict[str, Any]}
+# Of so many points over a range, the second is rarely an integer.
+_PARTS = 98
 
 
 @dataclass(frozen=True)
@@ -78,7 +44,7 @@ class SearchSpace:
     """The search space of one agent on one environment."""
 
     entries: Mapping[str, Dimension]  #: dimensions by name, in the order of sampling
-    #: The default values of settings; settings without one are left out.
+    #: The default values of the agent's settings; settings without one are left out.
     defaults: Mapping[str, Any]
     widened: tuple[str, ...] = ()  #: names of the dimensions that `including` widened
 
@@ -87,22 +53,25 @@ class SearchSpace:
         """The names of the space's settings, nested ones dotted: ``policy_kwargs.net_arch``."""
         return tuple(dict.fromkeys(key for each in self.entries.values() for key in each.keys))
 
-    def suggest(self, trial: BaseTrial) -> dict[str, Any]:
+    @property
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """The distributions of all Optuna parameters, including conditional ones."""
+        every = self.entries.values()
+        return {name: kind for each in every for name, kind in each.distributions.items()}
+
+    def suggest(self, trial: Trial | FixedTrial) -> dict[str, Any]:
         """Sample settings in the form of hyperparameter files; `merged` puts them into an entry.
 
-        Samples a conditional parameter only if its conditions hold. ``trial`` may be a FixedTrial.
+        Samples a conditional parameter only if its conditions hold.
         """
-        return self._chosen(lambda name, ends: _ask(trial, name, ends))
+        return self.chosen(trial._suggest)
 
-    def at(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings of parameters; parameters whose conditions do not hold are ignored."""
-        return self._chosen(lambda name, _: params[name])
-
-    def _chosen(self, pick: Pick) -> dict[str, Any]:
+    def chosen(self, pick: Pick) -> dict[str, Any]:
+        """The settings of the parameters that ``pick`` chooses; see `suggest`."""
         words: dict[str, Any] = {}
 
-        def noting(name: str, ends: BaseDistribution) -> Any:
-            words[name] = pick(name, ends)
+        def noting(name: str, kind: BaseDistribution) -> Any:
+            words[name] = pick(name, kind)
             return words[name]
 
         chosen: dict[str, Any] = {}
@@ -116,50 +85,22 @@ class SearchSpace:
                 (nested.setdefault(outer, {}) if inner else nested)[inner or outer] = value
         return nested
 
-    def distributions(self) -> dict[str, BaseDistribution]:
-        """The distributions of all Optuna parameters, including conditional ones."""
-        return {
-            name: ends
-            for each in self.entries.values()
-            for name, ends in each.distributions.items()
-        }
+    def including(self, settings: Mapping[str, Any]) -> tuple[SearchSpace, dict[str, Any]]:
+        """The space, widened if necessary to include these settings; missing ones have defaults.
 
-    def grid(self, n: int) -> dict[str, list[Any]]:
-        """Grid values of each parameter: all words, or at most ``n`` numbers from end to end."""
-        return {name: spread(ends, n) for name, ends in self.distributions().items()}
-
-    def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters for which `suggest` returns these settings; missing ones have defaults.
-
-        Raises:
-            UserError: if the settings lie outside the space, see `including`.
+        Returns:
+            The space, whose ``widened`` names the dimensions that were too narrow; and the
+            parameters for which its `suggest` returns the settings.
         """
-        flat = self.flat(settings)
-        params: dict[str, Any] = {}
-        for each in self.entries.values():
-            if not _is_there(each, params):
-                continue
-            try:
-                params.update(each.params_of(flat))
-            except LookupError as error:
-                raise UserError(
-                    f"{each.name}: the search space does not hold {shown(flat.get(each.name))}"
-                ) from error
-        return params
-
-    def including(self, settings: Mapping[str, Any]) -> SearchSpace:
-        """The space, widened if necessary to include these settings; see ``widened``."""
         flat = self.flat(settings)
         params: dict[str, Any] = {}
         entries, widened = dict(self.entries), list(self.widened)
         for name, each in self.entries.items():
-            if not _is_there(each, params):
-                continue
-            entries[name] = each.including(flat)
-            params.update(entries[name].params_of(flat))
-            if entries[name] != each:
-                widened.append(name)
-        return replace(self, entries=entries, widened=tuple(widened))
+            if _is_there(each, params):
+                entries[name] = each.including(flat)
+                params.update(entries[name].params_of(flat))
+                widened += [name] if entries[name] != each else []
+        return replace(self, entries=entries, widened=tuple(widened)), params
 
     def merged(self, shipped: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
         """The shipped entry of hyperparameters, changed by the settings that `suggest` returned.
@@ -167,13 +108,15 @@ class SearchSpace:
         Removes settings of the space that are not in ``settings``, because their conditions do not
         hold.
         """
-        kept = _with_mappings(shipped, self.keys)
+        kept = {
+            k: dict(value) if isinstance(value, dict) else value for k, value in shipped.items()
+        }
         for key in self.keys:
             outer, _, inner = key.partition(".")
-            if inner and isinstance(kept.get(outer), dict):
-                kept[outer] = {k: v for k, v in kept[outer].items() if k != inner}
-            elif not inner:
+            if not inner:
                 kept.pop(outer, None)
+            elif isinstance(kept.get(outer), dict):
+                kept[outer].pop(inner, None)
         changes = {
             key: {**kept[key], **value}
             if isinstance(value, dict) and isinstance(kept.get(key), dict)
@@ -184,32 +127,14 @@ class SearchSpace:
 
     def flat(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """The values of an entry for the space's keys; missing settings have their defaults."""
-        given, found = _with_mappings(settings, self.keys), {}
+        found = {}
         for key in self.keys:
             outer, _, inner = key.partition(".")
-            value = given.get(outer, LEFT_OUT)
+            value = settings.get(outer, LEFT_OUT)
             if inner:
                 value = value.get(inner, LEFT_OUT) if isinstance(value, Mapping) else LEFT_OUT
             found[key] = self.defaults.get(key, LEFT_OUT) if value is LEFT_OUT else value
         return found
-
-
-def _with_mappings(settings: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """The settings; mappings that are written as texts are parsed if the keys are nested."""
-    outer = {key.partition(".")[0] for key in keys if "." in key}
-    return {
-        key: _plain(parse_literal(value, key)) if key in outer and isinstance(value, str) else value
-        for key, value in settings.items()
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Replace class names by texts, as in a file."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value.name if isinstance(value, DottedName) else value
 
 
 def _is_there(dimension: Dimension, chosen: Mapping[str, Any]) -> bool:
@@ -220,56 +145,35 @@ def _is_there(dimension: Dimension, chosen: Mapping[str, Any]) -> bool:
     )
 
 
-def _ask(trial: BaseTrial, name: str, kind: BaseDistribution) -> Any:
-    match kind:
-        case FloatDistribution():
-            return trial.suggest_float(name, kind.low, kind.high, log=kind.log)
-        case IntDistribution():
-            return trial.suggest_int(name, kind.low, kind.high, log=kind.log)
-        case CategoricalDistribution():
-            return trial.suggest_categorical(name, kind.choices)
-    raise TypeError(kind)
-
-
-# Points of a space.
-
-
 def corners(space: SearchSpace) -> Iterator[dict[str, Any]]:
-    """Settings at the ends of the space: all low, all high, and each end or word separately."""
-    lowest, highest = _ends(space)
-    yield space.at(lowest)
-    yield space.at(highest)
-    yield from steps_aside(space, lowest)
+    """Settings at the ends of the space: all low, all high, and each end or word separately.
+
+    Of a range of numbers that are not whole, also one between the ends.
+    """
+    ends = {name: spread(kind, 2) for name, kind in space.distributions.items()}
+    lowest = {name: values[0] for name, values in ends.items()}
+    yield space.chosen(lambda name, _: lowest[name])
+    yield space.chosen(lambda name, _: ends[name][-1])
+    for each in space.entries.values():
+        needed = _needed(space, each)
+        for name, kind in each.distributions.items():
+            between = spread(kind, _PARTS)[1:2] if isinstance(kind, FloatDistribution) else []
+            for value in (*ends[name], *between):
+                params = {**lowest, **needed, name: value}
+                yield space.chosen(lambda name, _: params[name])  # noqa: B023  # called at once
 
 
-def steps_aside(space: SearchSpace, params: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Settings that differ from those of the parameters in one end or word."""
-    base = {**_ends(space)[0], **params}  # including parameters of other conditions
-    for changed, values in space.grid(2).items():
-        for value in values:
-            yield _with_one(space, base, changed, value)
-
-
-def _ends(space: SearchSpace) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The lowest and the highest parameters."""
-    grid = space.grid(2)
-    return {name: v[0] for name, v in grid.items()}, {name: v[-1] for name, v in grid.items()}
-
-
-def _with_one(
-    space: SearchSpace, params: Mapping[str, Any], changed: str, value: Any
-) -> dict[str, Any]:
-    """Settings of the parameters with one changed, and words that fulfil its conditions."""
+def _needed(space: SearchSpace, dimension: Dimension) -> dict[str, Any]:
+    """Words that fulfil the conditions of a dimension, and the conditions of these."""
     needed: dict[str, Any] = {}
-    names = [name for name, each in space.entries.items() if changed in each.distributions]
-    while names:
-        for other, words in space.entries[names.pop()].when.items():
-            needed[other] = words[0]
-            names.append(other)
-    return space.at({**params, **needed, changed: value})
+    for other, words in dimension.when.items():
+        needed |= {other: words[0], **_needed(space, space.entries[other])}
+    return needed
 
 
-# Reading from a file.
+# --- reading from a file --------------------------------------------------------------------------
+
+_RANGE = ("low", "high", "scale", "forms", "final_share", "when")
 
 
 def read_search_space(algo: str, env_id: str, path: Path | str | None = None) -> SearchSpace:
@@ -277,35 +181,23 @@ def read_search_space(algo: str, env_id: str, path: Path | str | None = None) ->
 
     Args:
         algo: the agent, whose file is ``hyperparams/search_spaces/<algo>.yml``.
-        env_id: the environment; for ``envs:Warehouse-v0``, the part after the colon is used.
+        env_id: the environment.
         path: another file to read.
 
     Raises:
-        UserError: if the file cannot be read, is not of this format, has nothing to search, or
-            has settings that the agent refuses.
+        UserError: if the file cannot be read, is not of this format, or has nothing to search.
+            Whether the agent takes its settings is for the agent to say, see `corners`.
     """
-    path = _FOLDER / f"{algo}.yml" if path is None else Path(path)
+    path = HYPERPARAMS / "search_spaces" / f"{algo}.yml" if path is None else Path(path)
     if not path.is_file():
         raise UserError(f"{path}: there is no such file: name one with --search-space FILE")
-    where, said = _entry(path, env_id.partition(":")[2] or env_id)
+    where, said = _entry(path, env_id)
     entries = {name: _dimension(name, value, f"{where}: {name}") for name, value in said.items()}
     if not entries:
         raise UserError(f"{where}: there is nothing to search for {algo}")
     _check_names(entries, where)
     _check_conditions(entries, where)
-    space = SearchSpace(entries, {})
-    known = _defaults(algo)
-    space = replace(space, defaults={key: known[key] for key in space.keys if key in known})
-    for settings in corners(space):
-        _check_settings(algo, settings, where)
-    for name, kind in space.distributions().items():  # also between the ends
-        if isinstance(kind, FloatDistribution):
-            between = _with_one(space, _ends(space)[0], name, spread(kind, _PARTS)[1])
-            try:
-                _check_settings(algo, between, where)
-            except UserError as error:
-                raise UserError(f"{error}: write low and high without a point") from error
-    return space
+    return SearchSpace(entries, _defaults(algo))
 
 
 def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
@@ -326,78 +218,38 @@ def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
 
 def _dimension(name: str, said: Any, place: str) -> Dimension:
     """Read the value of a name: a list, or a mapping as described in `docs/search-spaces.md`."""
-    if isinstance(said, list):
-        said = {"choices": said}
+    said = {"choices": said} if isinstance(said, list) else said
     if not isinstance(said, dict):
         raise UserError(
             f"{place} must be a list of values, or map low and high, choices or sets to theirs; "
             f"not {shown(said)}"
         )
-    known = _CHOICE if "choices" in said else _SETS if "sets" in said else _RANGE
-    parameters = {
-        key: inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
-        for key, annotation in known.items()
-    }
-    checked = check_arguments(said, parameters, place, "key")
-    when = {other: _words(said, place) for other, said in checked.get("when", {}).items()}
-    if known is _RANGE:
-        ends = {end: said[end] for end in ("low", "high") if isinstance(said.get(end), int)}
-        # A range has integers if both ends are written as integers.
-        whole = ends if len(ends) == 2 else {}
-        return replace(_number_range(name, {**checked, **whole}, place), when=when)
-    options = checked["sets"] if known is _SETS else _options(name, checked["choices"], place)
-    if len(options) < 2:
-        raise UserError(f"{place}: there must be two values at least to choose from")
-    return Choice(name, options, when)
-
-
-def _words(said: Any, place: str) -> tuple[Word, ...]:
-    words = said if isinstance(said, list) else [said]
-    for word in words:
-        if not is_word(word):
-            raise UserError(f"{place}: when names values of another choice, not {shown(word)}")
-    return tuple(words)
-
-
-def _options(name: str, choices: Any, place: str) -> dict[Word, dict[str, Any]]:
-    if isinstance(choices, dict):
-        return {word: {name: value} for word, value in choices.items()}
-    for value in choices:
-        if not is_word(value):
-            raise UserError(
-                f"{place}: {shown(value)} needs a name, as in choices: {{small: [64, 64]}}"
-            )
-    return {value: {name: value} for value in choices}
-
-
-def _number_range(name: str, checked: Mapping[str, Any], place: str) -> NumberRange:
-    for end in ("low", "high"):
-        if end not in checked:
-            raise UserError(f"{place}: {end} is missing")
-    low, high, scale = checked["low"], checked["high"], checked.get("scale", "linear")
-    if not -math.inf < low < high < math.inf:
-        raise UserError(
-            f"{place}: low must be below high, and both finite: not {shown(low)} and {shown(high)}"
-        )
-    if scale in {"log", "powers_of_two"} and low <= 0:
-        raise UserError(f"{place}: scale {scale} needs low above 0, not {shown(low)}")
-    if scale == "log_below_one" and high >= 1:
-        raise UserError(f"{place}: scale {scale} needs high below 1, not {shown(high)}")
-    are_powers = (isinstance(end, int) and end.bit_count() == 1 for end in (low, high))
-    if scale == "powers_of_two" and not all(are_powers):
-        raise UserError(f"{place}: scale {scale} needs whole powers of two as low and high")
-    forms = checked.get("forms", ["constant"])
-    if not any(isinstance(form, str) and form in FORMS for form in forms):
-        raise UserError(f"{place}: forms must name one of {', '.join(FORMS)}, and what else may be")
-    for form in forms:
-        if not is_word(form):
-            raise UserError(f"{place}: forms are words and single values, not {shown(form)}")
-    share = tuple(checked.get("final_share", FINAL_SHARE))
-    if len(share) != 2 or not 0 < share[0] < share[1] < math.inf:
-        raise UserError(f"{place}: final_share must be two numbers above 0, the smaller one first")
-    own = tuple(form for form in forms if form in FORMS)
-    instead = {form: form for form in forms if form not in FORMS}
-    return NumberRange(name, low, high, scale, own, (share[0], share[1]), instead)
+    kind = next((key for key in ("choices", "sets") if key in said), "low")
+    known = _RANGE if kind == "low" else (kind, "when")
+    for key in said:
+        if key not in known:
+            raise unknown(f"{place}: unknown key", str(key), known)
+    found: dict[str, Any] = {"name": name, **said}
+    if isinstance(when := said.get("when"), dict):
+        found["when"] = {k: v if isinstance(v, list) else [v] for k, v in when.items()}
+    if kind != "low":
+        options = found.pop(kind)
+        if isinstance(options, list):
+            if strange := [value for value in options if not is_word(value)]:
+                example = "choices: {small: [64, 64]}"
+                raise UserError(f"{place}: {shown(strange[0])} needs a name, as in {example}")
+            options = dict(zip(options, options, strict=True))
+        if not isinstance(options, dict) or len(options) < 2:
+            raise UserError(f"{place}: there must be two values at least to choose from")
+        is_set = kind == "sets"
+        found["options"] = options if is_set else {k: {name: v} for k, v in options.items()}
+    try:
+        return NumberRange(**found) if kind == "low" else Choice(**found)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = f"{first['loc'][0]} " if first["loc"] else ""
+        reason = first["msg"].removeprefix("Value error, ").replace("Input should", "must")
+        raise UserError(f"{place}: {key.replace('options', kind)}{reason}") from None
 
 
 def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
@@ -433,28 +285,18 @@ def _check_conditions(entries: Mapping[str, Dimension], where: str) -> None:
             before[name] = each
 
 
-def _check_settings(algo: str, settings: Mapping[str, Any], where: str) -> None:
-    """Check that an agent accepts settings, by names, types and bounds."""
-    parameters = algorithm_parameters(agent_class(algo))
-    check_algorithm_kwargs(split(settings, where).algorithm, parameters, where)
-
-
-def _defaults(algo: str) -> dict[str, Any]:
+@cache
+def _defaults(algo: str) -> Mapping[str, Any]:
     """The default values of an agent's settings, as far as there are defaults."""
-    algorithm = agent_class(algo)
-    policy = algorithm.policy_aliases.get(default_policy(algorithm, is_dict=False), object)
-    return {
-        **{key.name: key.default for key in fields(Hyperparams) if "wrapper" not in key.name},
-        **dict.fromkeys(("env_wrapper", "train_env_wrapper", "vec_env_wrapper", "callback")),
-        "normalize": False,
-        **_argument_defaults(algorithm_parameters(algorithm), ""),
-        **_argument_defaults(constructor_parameters(policy), "policy_kwargs."),
-    }
-
-
-def _argument_defaults(parameters: Mapping[str, inspect.Parameter], prefix: str) -> dict[str, Any]:
-    return {
-        prefix + name: f"nn.{p.default.__name__}" if isinstance(p.default, type) else p.default
-        for name, p in parameters.items()
-        if p.default is not p.empty
-    }
+    algorithm = load_algorithm(algo)
+    policies = algorithm.policy_aliases
+    usual = next((name for name in policies if name.startswith("Mlp")), next(iter(policies), ""))
+    defaults = {key: TrainSpec.model_fields[key].default for key in SPECIAL}
+    defaults |= {**dict.fromkeys(COMPONENTS), "normalize": False}
+    for prefix, cls in (("", algorithm), ("policy_kwargs.", policies.get(usual, object))):
+        for name, parameter in constructor_parameters(cls).items():
+            value = parameter.default
+            if value is not parameter.empty:
+                is_class = isinstance(value, type)
+                defaults[prefix + name] = f"nn.{value.__name__}" if is_class else value
+    return defaults

@@ -1,10 +1,8 @@
 """Suggests the settings of trials, and plans their runs.
 
 The first trial has the shipped settings; the others are points of a grid, or come from one of
-Optuna's samplers. Samplers with the same seed in several drivers would draw the same settings, and
-a sampler that restarts after a kill would draw its first settings again. So each trial has its own
-generator, seeded by the search's seed and the trial's number: its settings do not depend on the
-driver, nor on the driver's start.
+Optuna's samplers. A sampler that restarts after a kill would draw its first settings again. So each
+trial has its own generator, seeded by the search's seed and the trial's number.
 """
 
 from __future__ import annotations
@@ -29,13 +27,16 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.samplers import BaseSampler, GPSampler, RandomSampler, TPESampler
 from optuna.trial import FixedTrial, FrozenTrial
 
-from rl_yardstick.experiments.plan import PlannedRun, check_settings, plan
+from rl_yardstick.agents import load_algorithm
+from rl_yardstick.experiments.plan import PlannedRun, plan, specs_of
 from rl_yardstick.experiments.study import AgentSpec, layered
+from rl_yardstick.pipeline.arguments import arguments_of
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import json_text
-from rl_yardstick.pipeline.models.load import agent_class
-from rl_yardstick.pipeline.settings.values import algorithm_parameters
-from rl_yardstick.tuning.search_spaces import SearchSpace
+from rl_yardstick.pipeline.settings import COMPONENTS
+from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.tuning.dimensions import spread
+from rl_yardstick.tuning.search_spaces import SearchSpace, corners
 from rl_yardstick.tuning.tuning_spec import TuningSpec
 
 # Values of each number in the finest grid.
@@ -79,37 +80,26 @@ class SeededSampler(BaseSampler):
 
 
 def make_sampler(tuning: TuningSpec) -> BaseSampler:
-    """Make the sampler of a tuning; a grid has fixed trials, and ignores its sampler.
+    """Make the sampler of a search; a grid has fixed trials, and ignores its sampler.
 
     Options are explicit although they are Optuna 5's defaults, because Optuna 5 changed them. TPE
     draws parameters jointly (``multivariate``), conditional ones together with others of the same
     condition (``group``), and treats running trials as bad ones (``constant_liar``), so that
     parallel trials do not try the same settings.
     """
+    n_startup = {"n_startup_trials": tuning.n_startup_trials}
 
     def make(seed: int) -> BaseSampler:
-        match tuning.sampler:
-            case "tpe":
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", ExperimentalWarning)  # of ``group``, since 2.8
-                    return TPESampler(
-                        n_startup_trials=tuning.n_startup_trials,
-                        n_ei_candidates=24,
-                        seed=seed,
-                        multivariate=True,
-                        group=True,
-                        constant_liar=True,
-                    )
-            case "gp":
-                return GPSampler(
-                    seed=seed,
-                    independent_sampler=RandomSampler(seed=seed),
-                    n_startup_trials=tuning.n_startup_trials,
-                    deterministic_objective=False,
-                    warn_independent_sampling=False,
-                )
-            case "random" | "grid":
-                return RandomSampler(seed=seed)
+        if tuning.sampler == "tpe":
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ExperimentalWarning)  # of ``group``, since 2.8
+                options = dict.fromkeys(("multivariate", "group", "constant_liar"), True)
+                return TPESampler(seed=seed, n_ei_candidates=24, **n_startup, **options)
+        if tuning.sampler == "gp":
+            drawn = RandomSampler(seed=seed)
+            options = dict.fromkeys(("deterministic_objective", "warn_independent_sampling"), False)
+            return GPSampler(seed=seed, independent_sampler=drawn, **n_startup, **options)
+        return RandomSampler(seed=seed)
 
     return SeededSampler(make, tuning.seed)
 
@@ -119,8 +109,8 @@ class Suggestions:
 
     def __init__(self, tuning: TuningSpec, space: SearchSpace, shipped: Mapping[str, Any]) -> None:
         self.tuning, self.shipped = tuning, dict(shipped)
-        self.space = space.including(self.shipped)
-        self.first = self.space.params_of(self.shipped)  # the parameters of the first trial
+        # The space, widened if necessary, and the parameters of the first trial.
+        self.space, self.first = space.including(self.shipped)
         self._fixed = self._settled()
         self.fits_batches = self._fits_batches()
 
@@ -135,18 +125,16 @@ class Suggestions:
         """Whether trials sample sizes of batches or buffers, and the agent splits its buffer."""
         from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-        algorithm = agent_class(self.tuning.agent.algo)
+        algo = self.tuning.agent.algo
         keys = {"batch_size", "n_steps", "n_envs"} & set(self.space.keys)
-        return (
-            issubclass(algorithm, OnPolicyAlgorithm)
-            and "batch_size" in algorithm_parameters(algorithm)
-            and bool(keys - set(self.tuning.agent.settings))
-        )
+        is_free = bool(keys - set(self.tuning.agent.settings))
+        splits = "batch_size" in arguments_of(algo)
+        return is_free and splits and issubclass(load_algorithm(algo), OnPolicyAlgorithm)
 
     @property
     def n_free(self) -> int:
         """The number of parameters to choose."""
-        return len(self.space.distributions().keys() - self._fixed.keys())
+        return len(self.space.distributions.keys() - self._fixed.keys())
 
     @cached_property
     def grid(self) -> list[dict[str, Any]]:
@@ -168,11 +156,10 @@ class Suggestions:
 
     def _points(self, n: int) -> list[dict[str, Any]]:
         """The distinct points of a grid; conditional parameters can make points equal."""
-        values = {**self.space.grid(n), **{name: [v] for name, v in self._fixed.items()}}
+        values = {name: spread(kind, n) for name, kind in self.space.distributions.items()}
+        values |= {name: [value] for name, value in self._fixed.items()}
         points: dict[str, dict[str, Any]] = {}
-        for number, point in enumerate(itertools.product(*values.values())):
-            if number >= MOST_POINTS:
-                break
+        for point in itertools.islice(itertools.product(*values.values()), MOST_POINTS):
             trial = FixedTrial(dict(zip(values, point, strict=True)))
             self.space.suggest(trial)
             points[json.dumps(trial.params, sort_keys=True)] = trial.params
@@ -181,24 +168,19 @@ class Suggestions:
     @property
     def n_trials(self) -> int:
         """The number of trials; with a grid, at most one more than the number of points."""
-        if self.tuning.sampler == "grid":
-            return min(self.tuning.n_trials, 1 + len(self.grid))
-        return self.tuning.n_trials
+        n_trials = self.tuning.n_trials
+        return min(n_trials, 1 + len(self.grid)) if self.tuning.sampler == "grid" else n_trials
 
     def params(self, number: int) -> dict[str, Any]:
         """Parameters of a trial that are fixed before sampling."""
         if number == 0:
             return self.first
-        if self.tuning.sampler == "grid":
-            return self.grid[number - 1]
-        return self._fixed
+        return self.grid[number - 1] if self.tuning.sampler == "grid" else self._fixed
 
     def entry(self, trial: Trial) -> dict[str, Any]:
         """The hyperparameters of a trial."""
         suggested = self.space.suggest(trial)
-        if trial.number == 0:
-            return self.shipped
-        return self.merged(suggested)
+        return self.merged(suggested) if trial.number else self.shipped
 
     def merged(self, suggested: Mapping[str, Any]) -> dict[str, Any]:
         """The shipped hyperparameters with suggested settings and the user's fixed settings."""
@@ -212,22 +194,31 @@ class Suggestions:
         If the user has fixed the batch size, the number of steps is changed instead. The sampler
         keeps the parameters that it drew.
         """
-        parameters = algorithm_parameters(agent_class(self.tuning.agent.algo))
-        found = {key: entry.get(key, parameters[key].default) for key in ("n_steps", "batch_size")}
-        n_steps, batch_size, n_envs = *found.values(), entry.get("n_envs", 1)
+        names, fixed = ("n_steps", "batch_size"), self.tuning.agent.settings
+        n_steps, batch_size = (entry.get(name, self.space.defaults[name]) for name in names)
+        n_envs = entry.get("n_envs", 1)
         if batch_size is None:
             return entry
-        if "batch_size" not in self.tuning.agent.settings:
+        if "batch_size" not in fixed:
             divisors = [k for k in range(2, n_steps * n_envs + 1) if n_steps * n_envs % k == 0]
             nearest = min(divisors, key=lambda k: abs(k - batch_size), default=batch_size)
             return entry if nearest == batch_size else {**entry, "batch_size": nearest}
         unit = batch_size // math.gcd(batch_size, n_envs)
         nearest = max(round(n_steps / unit), 1) * unit
-        is_fixed = nearest == n_steps or "n_steps" in self.tuning.agent.settings
+        is_fixed = nearest == n_steps or "n_steps" in fixed
         return entry if is_fixed else {**entry, "n_steps": nearest}
 
+    def check(self, root: Path) -> None:
+        """Check that the agent takes all ends and words of the space.
 
-# The runs of a trial: one for each seed; trials with equal settings share folders.
+        Raises:
+            UserError: with the file of the space, and what is wrong there.
+        """
+        for settings in corners(self.space):
+            planned_runs(self.tuning, root, self.merged(settings))
+
+
+# --- the runs of a trial: one for each seed; trials with equal settings share folders -------------
 
 
 def name_of(entry: Mapping[str, Any]) -> str:
@@ -241,21 +232,21 @@ def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
     return plan(replace(tuning.study, n_seeds=1), root)[0]
 
 
-def check_entry(tuning: TuningSpec, root: Path, entry: Mapping[str, Any]) -> None:
-    """Check that the agent can be made with settings of the space."""
-    where = "its space" if tuning.search_space is None else str(tuning.search_space)
-    agent = replace(_agent(tuning, tuning.agent.algo, entry), where=where)
+def shipped_entry(spec: TrainSpec) -> dict[str, Any]:
+    """The entry of a training in the form of files, without what follows from its other values."""
+    entry = spec.hyperparams
+    scaled = entry.get("normalize")
+    if scaled is not None and scaled.get("gamma") == spec.algorithm.get("gamma"):
+        entry["normalize"] = {key: scaled[key] for key in scaled if key != "gamma"} or True
+    alone = {key: entry[key][0] for key in COMPONENTS if len(entry.get(key, ())) == 1}
+    return {**entry, **alone}
+
+
+def planned_runs(tuning: TuningSpec, root: Path, entry: Mapping[str, Any]) -> list[PlannedRun]:
+    """The runs of a trial, in the order of its seeds."""
+    where = "its search space" if tuning.search_space is None else str(tuning.search_space)
+    settings, algo = tuning.searched(entry), tuning.agent.algo
+    agent = AgentSpec(name_of(entry), algo, settings, tuned=False, where=where)
     study = replace(tuning.study, agents=(agent,), n_seeds=1)
-    check_settings(study, plan(study, root))
-
-
-def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
-    """Plan one run of a trial."""
-    agent = _agent(tuning, name_of(entry), entry)
-    study = replace(tuning.study, agents=(agent,), first_seed=seed, n_seeds=1)
-    (planned,) = plan(study, root)
-    return planned
-
-
-def _agent(tuning: TuningSpec, label: str, entry: Mapping[str, Any]) -> AgentSpec:
-    return AgentSpec(label, tuning.agent.algo, tuning.searched(entry), tuned=False)
+    specs = specs_of(study)
+    return [plan(replace(study, first_seed=seed), root, specs=specs)[0] for seed in tuning.seeds]

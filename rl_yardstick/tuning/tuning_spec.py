@@ -1,11 +1,9 @@
-"""The specification of a tuning as one immutable value, and the value of a setting."""
+"""The specification of a search as one immutable value, and the value of a setting."""
 
 from __future__ import annotations
 
-import contextlib
-import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 
 from rl_yardstick.agents import ALGORITHMS
 from rl_yardstick.experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
-from rl_yardstick.pipeline.errors import UserError, one_line, shown
+from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import plain
 
 Floats = NDArray[np.float64]
@@ -29,13 +27,11 @@ COST_OF_THRESHOLD = ("steps", "seconds")
 FIGURES = ("score", *METRICS, *COST_OF_THRESHOLD)
 CHEAPER_IS_BETTER = (*COSTS, *COST_OF_THRESHOLD)
 
-AUTO = "auto"
-SHIPPED = "shipped"
+AUTO, SHIPPED = "auto", "shipped"
 LOWER = 0.25
-
-# Fields that may change when a tuning is continued; any other change makes another tuning.
-_OF_RETEST = ("retest", "retest_seeds", "first_retest_seed", "until_decided", "max_retest_seeds")
-_MAY_CHANGE = ("study", "n_trials", *_OF_RETEST)
+# What may differ when a search continues: its length, and all about the re-test.
+_MAY_CHANGE = {"study", "n_trials", "retest", "retest_seeds", "first_retest_seed", "until_decided"}
+_MAY_CHANGE |= {"max_retest_seeds"}
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,7 @@ class TuningSpec:
     retest_seeds: int = 20  #: number of held-out seeds
     first_retest_seed: int = 1000  #: the first held-out seed
     until_decided: bool = False  #: whether the re-test grows until its winner is decided
-    max_retest_seeds: int | None = None  #: the most held-out seeds then; None for 50
+    max_retest_seeds: int | None = None  #: the most held-out seeds then; None for 80
 
     @property
     def agent(self) -> AgentSpec:
@@ -67,7 +63,7 @@ class TuningSpec:
 
     @property
     def environment(self) -> EnvironmentSpec:
-        """The environment of the tuning."""
+        """The environment of the search."""
         return self.study.environments[0]
 
     @property
@@ -100,11 +96,15 @@ class TuningSpec:
         engines = ALGORITHMS[self.agent.algo].engines
         return {**({"engine": "auto"} if "auto" in engines[1:] else {}), **entry}
 
+    def value(self, figures: Sequence[float] | Floats) -> float:
+        """The value of a setting by the figures of its runs."""
+        return judged(figures, self.objective, is_cost=self.is_cost)
+
     def check(self) -> None:
         """Check that search and re-test share no seeds, and that a re-test can grow."""
         held_out = self.held_out
         if self.until_decided:
-            held_out = range(held_out.start, held_out.start + self._check_growing())
+            held_out = range(held_out.start, held_out.start + self._most_seeds())
         elif self.max_retest_seeds is not None:
             raise UserError("--max-retest-seeds belongs to --until-decided: give both")
         shared = sorted(set(self.seeds) & set(held_out))
@@ -114,8 +114,8 @@ class TuningSpec:
                 "seeds is judged on others; see --first-seed and --first-retest-seed"
             )
 
-    def _check_growing(self) -> int:
-        """Check that the re-test can grow until decided; returns the most seeds."""
+    def _most_seeds(self) -> int:
+        """The most seeds of a re-test that grows until it is decided; checks that it can."""
         from rl_yardstick.experiments.growing import MOST_SEEDS
 
         if not self.retest:
@@ -131,25 +131,22 @@ class TuningSpec:
         return most
 
     def identity(self, shipped: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
-        """The identity of this tuning as JSON."""
-        entry = self.searched(shipped)
-        data = plain(
-            {
-                **{key: value for key, value in vars(self).items() if key not in _MAY_CHANGE},
-                **({"search_engine": entry["engine"]} if entry.keys() - shipped.keys() else {}),
-                "algo": self.agent.algo,
-                "env": self.environment.env_id,
-                "hyperparams": dict(shipped),
-                "first_seed": self.study.first_seed,
-                "seeds_per_trial": self.study.n_seeds,
-                "eval_freq": self.study.eval_freq,
-                "eval_episodes": self.study.eval_episodes,
-                "threshold": self.study.threshold,
-                "search_space": dict(space),
-            }
-        )
-        assert isinstance(data, dict)
-        return data
+        """What must be the same when a search continues, as JSON."""
+        entry, study = self.searched(shipped), self.study
+        found = {
+            **{key: value for key, value in vars(self).items() if key not in _MAY_CHANGE},
+            **({"search_engine": entry["engine"]} if entry.keys() - shipped.keys() else {}),
+            "algo": self.agent.algo,
+            "env": self.environment.env_id,
+            "hyperparams": dict(shipped),
+            "first_seed": study.first_seed,
+            "seeds_per_trial": study.n_seeds,
+            "eval_freq": study.eval_freq,
+            "eval_episodes": study.eval_episodes,
+            "threshold": study.threshold,
+            "search_space": dict(space),
+        }
+        return dict(plain(found))
 
 
 def judged(figures: Sequence[float] | Floats, objective: Objective, *, is_cost: bool) -> float:
@@ -168,52 +165,6 @@ def judged(figures: Sequence[float] | Floats, objective: Objective, *, is_cost: 
     return float(values[cut : len(values) - cut].mean())
 
 
-# The type of ``--storage``, and one-line messages for its failures: Optuna itself is loaded later.
-
-OWN_FILE = "trials.db"
-KNOWN = "a file for a journal, sqlite:///FILE, postgresql://..., mysql://..., grpc://HOST:PORT"
-# Packages whose errors are failures of the storage.
-_LIBRARIES = frozenset({"optuna", "sqlalchemy", "sqlite3", "grpc", "json"})
-_DATABASES = ("sqlite", "postgresql", "mysql", "mariadb")
-_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://)", re.IGNORECASE)
-_SECRET = re.compile(r"(?<=://)([^\s/@:]*):[^\s/@]*@")
-
-
-def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
-    """The type of a storage by its name."""
-    scheme = _SCHEME.match(given)
-    if scheme is None:
-        return "journal"
-    name = scheme[0].partition("+")[0].lower()
-    if name not in (*_DATABASES, "grpc"):
-        raise UserError(f"--storage: {shown(without_secret(given))} is no storage: {KNOWN}")
-    return "proxy" if name == "grpc" else "database"
-
-
 def without_secret(text: str) -> str:
     """The text without the passwords in its URLs."""
-    return _SECRET.sub(r"\1:***@", text)
-
-
-@contextlib.contextmanager
-def failing_in_a_line(given: str | None) -> Iterator[None]:
-    """Report a failure of the storage in one line: full, unreachable, or damaged."""
-    try:
-        yield
-    except Exception as error:
-        if not _LIBRARIES & {kind.__module__.partition(".")[0] for kind in type(error).__mro__}:
-            raise
-        name = OWN_FILE if given is None else f"--storage {without_secret(given)}"
-        goes_on = "; finished work is kept, and the same command continues"
-        if isinstance(error, json.JSONDecodeError):
-            name, goes_on = f"{name} is damaged", ""
-        raise UserError(f"{name}: {reason_of(error)}{goes_on}") from error
-
-
-def reason_of(error: Exception) -> str:
-    """A library's message in one line, without questions, links to its manual, and passwords."""
-    cause = error.__cause__ if type(error).__name__ == "StorageInternalError" else None
-    said = one_line(cause or error)
-    for rest in ("(Background on", "[SQL: "):
-        said = said.partition(rest)[0]
-    return without_secret(said.strip())
+    return re.sub(r"(?<=://)([^\s/@:]*):[^\s/@]*@", r"\1:***@", text)

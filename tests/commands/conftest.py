@@ -1,6 +1,8 @@
 import os
 import random
+import signal
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -45,12 +47,17 @@ def train_in():
 
 def exit_code(*words):
     """The exit code of a command line that is run in this process."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stop:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    name = Path(words[0]).name
+    command = main if name == "yardstick" else partial(run_command, name.removesuffix(".py"))
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "_exit", sys.exit)
         patch.setattr(sys, "path", [*sys.path])
         patch.setattr(sys, "argv", [str(word) for word in words])
-        name = Path(words[0]).name
-        main() if name == "yardstick" else run_command(name.removesuffix(".py"))
+        with pytest.raises(SystemExit) as stop:
+            command()
+    for number, handler in handlers.items():  # the process would end with its command
+        signal.signal(number, handler)
     return stop.value.code
 
 

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-import compare
 from tests.peers.peer_environment import peer_python
 
-ROOT = Path(compare.__file__).parent
+ROOT = Path(__file__).parents[2]
 ENV_ID = "FrozenLake-v1"
 SHORT = ["-n", "120", "--eval-freq", "40", "--eval-episodes", "3"]
 SHORT += ["--eval-env-kwargs", "max_episode_steps:20"]
@@ -65,7 +64,7 @@ def test_plots_and_enjoy_of_rl_zoo3_take_our_runs(tmp_path, train_in):
     play = ["--algo", "ppo", "--env", ENV_ID, "-f", "logs", "--no-render", "-n", 150]
     plotted, played = zoo(
         ["rl_zoo3.plots.all_plots", *plot],
-        ["rl_zoo3.enjoy", *play, "--device", "cpu", "--gym-packages", "envs"],
+        ["rl_zoo3.enjoy", *play, "--device", "cpu", "--gym-packages", "rl_yardstick.envs"],
         cwd=tmp_path,
     )
     assert f"ppo/{ENV_ID}_1" in played

@@ -1,4 +1,4 @@
-"""``shaping.py`` as a user types it: settings of agents, arguments, wrappers, refusals."""
+"""``shaping`` as a user types it: settings of agents, arguments, wrappers, refusals."""
 
 import json
 from pathlib import Path
@@ -48,7 +48,7 @@ def shape(type_command, tmp_path):
     (tmp_path / "walk.py").write_text(WALK)
 
     def run(*words):
-        code, out, err = type_command("shaping.py", *words, "--json", "s.json")
+        code, out, err = type_command("shaping", *words, "--json", "s.json")
         assert (code, err) == (0, "")
         return out.splitlines(), json.loads(Path("s.json").read_text())
 
@@ -114,6 +114,6 @@ REFUSED = {
 
 def test_what_has_no_model_is_refused_in_one_line(type_command):
     for words, said in REFUSED.items():
-        code, _, err = type_command("shaping.py", *words.split())
+        code, _, err = type_command("shaping", *words.split())
         assert (code, err.count("\n")) == (2, 1)
         assert said in err

@@ -65,7 +65,7 @@ def evil_zip(own_folder, payload):
 
 
 def write_run(folder, **spec):
-    spec = {"env_id": ENV, "hyperparams": {}, **spec}
+    spec = {"env_id": ENV, "n_timesteps": 8, **spec}
     (folder / "run.json").write_text(json.dumps({"env_name": ENV, "spec": spec}))
 
 
@@ -143,7 +143,7 @@ ASKING = {
     "the environment's id": {"env_id": f"gift.extra:{ENV}"},
     "a wrapper in its folder": {
         "gym_packages": ["gift"],
-        "hyperparams": {"env_wrapper": "gift.extra.Wrapper"},
+        "env_wrapper": [{"name": "gift.extra.Wrapper", "kwargs": {}}],
     },
 }
 

@@ -161,7 +161,7 @@ def test_wrappers_stand_in_their_order():
 
 
 def test_normalisation_learns_in_training_alone_and_rewards_are_evaluated_as_they_are():
-    spec = spec_of("CartPole-v1", {"normalize": True, "gamma": 0.9, "n_envs": 2})
+    spec = spec_for("ppo", "CartPole-v1", {"normalize": True, "gamma": 0.9, "n_envs": 2})
     env, eval_env = make_training_env(spec, None), make_evaluation_env(spec, 1)
     for made, trains in ((env, True), (eval_env, False)):
         assert (made.norm_obs, made.norm_reward, made.training) == (True, trains, trains)
@@ -181,7 +181,7 @@ MISTAKES = [
         {"slippery": True},
         "unknown argument 'slippery': did you mean 'is_slippery'?",
     ),
-    ("FrozenLake-v1", {"map_name": "9x9"}, "unknown map_name '9x9': known are 4x4, 8x8"),
+    ("FrozenLake-v1", {"map_name": "9x9"}, "there is no '9x9' (with map_name='9x9')"),
     ("Warehouse-v0", {"slip": 2}, "slip must be a finite number from 0 to 1, not 2"),
     ("Warehouse-v0", {"desc": []}, "the map is empty (with desc=[])"),
 ]

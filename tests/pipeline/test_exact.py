@@ -99,7 +99,7 @@ class Lookup:
         (CART, {}),
         (LAKE, {"normalize": {"norm_obs": False}}),
         # Twenty-two thousand states of as many numbers each are two gigabytes.
-        ("envs:RandomWarehouse-v0", {"env_kwargs": {"size": 150, "observation": "one_hot"}}),
+        ("RandomWarehouse-v0", {"env_kwargs": {"size": 150, "observation": "one_hot"}}),
     ],
 )
 def test_where_episodes_must_be_sampled(env_id, entry):
@@ -369,7 +369,7 @@ def test_of_a_policy_that_samples_its_probabilities_and_of_others_nothing():
     assert figures_of("ppo_lstm", [0], **lstm)[1] is None
 
 
-CORRIDOR, TIGER = "envs:ShortCorridor-v0", "envs:Tiger-v0"
+CORRIDOR, TIGER = "ShortCorridor-v0", "Tiger-v0"
 BEST_OF_CORRIDOR = -(6 + 4 * np.sqrt(2))
 SHORT = {"n_steps": 16, "batch_size": 16}
 
@@ -418,7 +418,7 @@ def test_a_bracket_on_the_scale_of_memory_has_both_of_its_ends():
     ("env_id", "entry"),
     [
         (LAKE, {}),
-        ("envs:Warehouse-v0", {"env_kwargs": {"observation": "position"}}),
+        ("Warehouse-v0", {"env_kwargs": {"observation": "position"}}),
         (CORRIDOR, {"env_kwargs": {"max_episode_steps": 1}}),
     ],
 )

@@ -21,7 +21,7 @@ from rl_yardstick.pipeline.models import (
     model_in,
     replay_buffer_of,
 )
-from rl_yardstick.pipeline.playing import play_episodes, playing_env, with_normalised_rewards
+from rl_yardstick.pipeline.playing import play_episodes, playing_env
 from tests.pipeline.short_runs import CART, run_of, spec_of
 
 SMALL_A2C = {"policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}
@@ -239,7 +239,7 @@ def test_it_plays_as_the_library_evaluates_it(zoo, tmp_path):
 
 def test_returns_of_rewards_as_training_normalised_them(zoo):
     chosen = find_model(Wanted(algo="a2c", env_id=CART, log_folder=zoo))
-    env = with_normalised_rewards(playing_env(chosen, None))
+    env = playing_env(chosen, None, norm_reward=True)
     ((total, length),) = play_episodes(load_agent(chosen, env), env, 1)
     # Every reward of CartPole is 1, and the statistics stay as training left them.
     one = float(unwrap_vec_normalize(env).normalize_reward(np.ones(1))[0])

@@ -56,14 +56,11 @@ def test_a_run_is_held_by_one_process_and_free_when_that_is_dead():
     run.begin(spec_of("qlearning"), {}, "train.py")
     code = "import sys, time; from pathlib import Path; from rl_yardstick.pipeline.run import Run\n"
     code += f"with Run(Path({str(run.path.absolute())!r})): print(1, flush=True); time.sleep(99)"
-    other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    try:
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
         assert other.stdout.readline() == b"1\n"
         with pytest.raises(UserError, match="is in use by another command, process"), run:
             pass
-    finally:
         other.kill()
-        other.wait()
     with run:
         assert (run.path / "run.json").exists()
 
@@ -113,6 +110,7 @@ def test_where_statistics_lie(model, statistics):
 
 
 def test_the_first_signal_is_a_number_and_the_second_ends_at_once():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     stop = Stop().listen()
     stop.check()
     signal.raise_signal(signal.SIGTERM)
@@ -121,6 +119,8 @@ def test_the_first_signal_is_a_number_and_the_second_ends_at_once():
     assert stopped.value.number == signal.SIGTERM
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def test_a_stop_before_the_first_step_leaves_no_folder():

@@ -103,8 +103,8 @@ def test_deterministic_play_is_the_policys_best():
 
 def test_successes_are_counted_where_the_environment_tells_them():
     env_kwargs = {"slip": 0.3, "shelf_reward": -1, "max_episode_steps": 40}
-    model = agent_of("qlearning", "rl_yardstick.envs:Warehouse-v0", learning_rate=0.3).learn(60_000)
-    env = make_vec_env("rl_yardstick.envs:Warehouse-v0", 4, env_kwargs=env_kwargs)
+    model = agent_of("qlearning", "Warehouse-v0", learning_rate=0.3).learn(60_000)
+    env = make_vec_env("Warehouse-v0", 4, env_kwargs=env_kwargs)
     evaluation = evaluate(model, env, 200, seed=0)
     # Each move costs 1, and the last one brings 100 if it succeeds.
     failed = evaluation.returns == -evaluation.lengths

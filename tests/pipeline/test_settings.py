@@ -367,7 +367,6 @@ class Unknown(gym.Env):
     ("env_id", "raw", "said"),
     [
         ("Unknown-v0", {"initial_q": "auto"}, "initial_q: auto needs a known model"),
-        ("Unknown-v0", {"gamma": "auto"}, "gamma: auto needs an environment with a time limit"),
         ("Unknown-v0", {"train_env_wrapper": [SCALE]}, "scale: auto needs an environment with a"),
         ("CartPole-v1", {"n_timesteps": "auto"}, "qlearning does not fit CartPole-v1"),
     ],

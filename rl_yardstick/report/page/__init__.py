@@ -45,13 +45,7 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
 
 def write_report(report: Report, path: Path) -> None:
     """Write the page of a study: one self-contained file, which needs no network."""
-    sections = []
-    for place, make in enumerate(SECTIONS, start=1):
-        report.tell(f"section {place} of {len(SECTIONS)}")
-        section = make(report)
-        if section is not None:
-            sections.append(section)
-    report.tell("all sections as one file")
+    sections = [section for make in SECTIONS if (section := make(report)) is not None]
     write_text(path, render(report, sections))
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, is_dataclass
 from importlib.resources import files
 from typing import Any
 
-import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -21,7 +20,6 @@ from rl_yardstick.envs.layout import GridLayout
 from rl_yardstick.experiments.analysis import StudyAnalysis
 from rl_yardstick.experiments.plan import PlannedRun
 from rl_yardstick.pipeline.errors import visible
-from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
 from rl_yardstick.report.ranking import bar
 from rl_yardstick.report.series import StudySeries
 from rl_yardstick.report.words import (
@@ -76,24 +74,15 @@ def rounded(number: float) -> float | None:
     return float(f"{number:.{SIGNIFICANT}g}") if math.isfinite(number) else None
 
 
-def plain(value: Any, of_float: Callable[[float], Any] = rounded) -> Any:
-    """Convert a value to JSON's types, and its floats by ``of_float``."""
-    if isinstance(value, float):
-        return of_float(value)
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist(), of_float)
-    if isinstance(value, dict):
-        return {str(key): plain(item, of_float) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item, of_float) for item in value]
-    if is_dataclass(value):
-        return plain(vars(value), of_float)
-    return value
-
-
 def as_json(value: Any, of_float: Callable[[float], Any] = rounded) -> str:
-    """Compact JSON of a value converted by `plain`."""
-    return json.dumps(plain(value, of_float), separators=(",", ":"), allow_nan=False)
+    """Compact JSON of a value, also of arrays and dataclasses, with its floats by ``of_float``."""
+
+    def read(text: str) -> Any:
+        return of_float(float(text))
+
+    text = json.dumps(value, default=lambda one: vars(one) if is_dataclass(one) else one.tolist())
+    value = json.loads(text, parse_float=read, parse_constant=read)
+    return json.dumps(value, separators=(",", ":"), allow_nan=False)
 
 
 def data_uri(kind: str, content: bytes) -> str:
@@ -166,7 +155,6 @@ class Report:
 
     series: StudySeries  # the numbers in its figures
     command: str  # the command that reproduces the study
-    tell: Tell = tell_nobody  # receives the progress of the slow parts
     # The pages that play trainings, where they were asked for.
     learning: Sequence[LearningPage] = ()
 
@@ -196,7 +184,7 @@ class Section:
 def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
     """By environment, the first finished run of each agent; no batches, which save no agent."""
     first: dict[tuple[str, str], PlannedRun] = {}
-    for run in analysis.results.in_folders:
+    for run in analysis.results.finished:
         if not run.is_batch:
             first.setdefault((run.agent, run.environment), run)
     ranked = (

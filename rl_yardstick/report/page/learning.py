@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from functools import cache, partial
-from hashlib import sha256
+from concurrent.futures import wait
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,27 +13,22 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from rich.console import Console
 
 from rl_yardstick.envs.known_models import observations_of_states
 from rl_yardstick.envs.layout import GridLayout, action_names, grid_layout
 from rl_yardstick.experiments.analysis import StudyAnalysis
-from rl_yardstick.experiments.child_processes import TaskFailedError, local_executor, supervise
 from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.results import difference
-from rl_yardstick.experiments.run_limits import RunLimits
+from rl_yardstick.experiments.pool import process_pool
 from rl_yardstick.mdp.transition_model import Floats
-from rl_yardstick.pipeline.environments import make_single_env, titled
-from rl_yardstick.pipeline.errors import UserError
+from rl_yardstick.pipeline.environments import make_single_env
+from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.evaluation.value_maps import MAX_STATES
-from rl_yardstick.pipeline.files import write_json, write_text
-from rl_yardstick.pipeline.preparation import prepare
-from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
-from rl_yardstick.pipeline.train_spec import TrainSpec, is_plain
-from rl_yardstick.pipeline.training import carry_out
-from rl_yardstick.pipeline.unfinished_runs import SaveInterval, StateKeeping
-from rl_yardstick.pipeline.user_modules import import_again
-from rl_yardstick.pipeline.watching import LOGGED, MapRecorder, TableRecorder
+from rl_yardstick.pipeline.files import read_bytes, read_json, write_json, write_text
+from rl_yardstick.pipeline.models import MAX_MODEL
+from rl_yardstick.pipeline.modules import import_modules
+from rl_yardstick.pipeline.run import RECORD, Run, Stop
+from rl_yardstick.pipeline.spec import TrainSpec
+from rl_yardstick.pipeline.watching import LOGGED, MapRecorder, TableRecorder, Watch
 from rl_yardstick.report.page.frame import (
     LearningPage,
     as_json,
@@ -48,7 +40,7 @@ from rl_yardstick.report.page.frame import (
     template_file,
     templates,
 )
-from rl_yardstick.safe_files.files import NO_LIMIT, UnsafeFileError, read_file
+from rl_yardstick.safe_files.archives import read_members
 
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
@@ -130,6 +122,7 @@ def _columns(rows: NDArray[np.void]) -> dict[str, Any]:
 
 
 def _table(name: str, values: Floats) -> dict[str, Any]:
+    """A table before the first step; its one number, if all are equal."""
     fill = values.reshape(-1)[0]
     is_even = bool((values == fill).all())
     initial = {"fill": float(fill)} if is_even else {"values": values.reshape(-1)}
@@ -162,21 +155,19 @@ def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
     }
 
 
-def place_data(spec: TrainSpec, recorder: TableRecorder | MapRecorder) -> dict[str, Any]:
+def place_data(spec: TrainSpec, recorder: Watch) -> dict[str, Any]:
     """The layout of the states, and the names of the actions."""
-    layout, n_states, n_actions = None, 0, 0
+    layout: GridLayout | None = None
+    n_states = n_actions = 0
     if isinstance(recorder, MapRecorder):
         model, layout = recorder.evaluator.model, recorder.evaluator.layout
         n_states, n_actions = model.n_states, model.n_actions
     elif recorder.has_actions:
         *_, n_states, n_actions = recorder.initial[recorder.names[0]].shape
-    env = make_single_env(spec, training=True)
-    try:
+    with closing(make_single_env(spec, training=True)) as env:
         layout = layout or _layout_of(env, n_states)
         names = action_names(env)
         n_arms = int(getattr(env.action_space, "n", n_actions))
-    finally:
-        env.close()
     if len(names) < n_arms:
         names = tuple(f"action {action}" for action in range(n_arms))
     return {
@@ -212,32 +203,23 @@ MOST_BYTES = 2_900_000
 SCRIPTS = ("replay", "board", "readout", "curves", "steps", "maps", "player")
 
 
-def write_learning_page(
-    spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path, title: str = ""
-) -> str:
+def write_learning_page(spec: TrainSpec, recorder: Watch, path: Path, title: str = "") -> str:
     """Write the page of a training; return what it shows, in words.
 
     The default title names the agent and the environment.
     """
     place = place_data(spec, recorder)
-    title = title or f"{spec.algo} on {titled(spec.env_id, spec.map_name)}"
+    heading = {"title": title or f"{spec.algo} on {spec.place}", "seed": spec.seed}
     for data in _ever_less(recorder):
         words = page_words(spec, data)
-        text = _render({"title": title, "seed": spec.seed, **words}, {**data, **place})
+        text = _render({**heading, **words}, {**data, **place})
         if len(text.encode()) <= MOST_BYTES:
             break
     write_text(path, text)
     return f"{words['kind']}, {words['extent']}"
 
 
-@cache
-def page_version() -> str:
-    """A digest of a page without its data: template, scripts and styles."""
-    words = {"title": "", "seed": 0, "kind": "", "extent": "", "note": ""}
-    return sha256(_render(words, {}).encode()).hexdigest()
-
-
-def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]]:
+def _ever_less(recorder: Watch) -> Iterator[dict[str, Any]]:
     """The recorded data, then ever less: 3/4 of the steps, or half of the maps, and so on."""
     if isinstance(recorder, MapRecorder):
         recorder.finish()
@@ -268,122 +250,80 @@ def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     )
 
 
-# Learning pages in the folder of a study, each with a note of digests of its inputs.
-
-FOLDER = "learning"
-LONGEST_WORDS = 300
-_MOST_NOTED = 10_000  # bytes
-
-
-def page_path(root: Path, run: PlannedRun) -> Path:
-    """Where the page of a run is written."""
-    return root / FOLDER / run.path.parent.name / f"{run.path.name}.html"
-
-
-def kept_page(root: Path, run: PlannedRun) -> LearningPage | None:
-    """The cached page of a run; None if it is missing, or was made from other inputs."""
-    path = page_path(root, run)
-    try:
-        content = read_file(path, 2 * MOST_BYTES)
-        note = json.loads(read_file(path.with_suffix(".json"), _MOST_NOTED))
-    except (OSError, ValueError, RecursionError, UnsafeFileError):
-        return None
-    words = note.pop("words", None) if isinstance(note, dict) else None
-    if not isinstance(words, str) or len(words) > LONGEST_WORDS:
-        return None
-    made_from = _made_from(run, content)
-    is_whole = made_from["agent"] and note == made_from
-    return _page(root, run, words, content) if is_whole else None
-
-
-def _made_from(run: PlannedRun, content: bytes) -> dict[str, str]:
-    """The digests that a cached page must match; the agent's is empty if its run recorded none."""
-    digests = run.run.files.digests or {}
-    return {
-        "agent": digests.get(run.run.model_path.name, ""),
-        "page": sha256(content).hexdigest(),
-        "version": page_version(),
-    }
-
-
-def _page(root: Path, run: PlannedRun, words: str, content: bytes) -> LearningPage:
-    place = page_path(root, run).relative_to(root).as_posix()
-    return LearningPage(run.agent, run.environment, run.seed, place, words, len(content))
-
-
 # The first training of each agent of a study, repeated to be recorded.
 
 BATCH = "its runs were done as one batch, which saves no agent"
-WITHOUT_STATES = StateKeeping(SaveInterval(is_off=True))
 
 
-def write_first_pages(
-    analysis: StudyAnalysis, n_workers: int, tell: Tell = tell_nobody
-) -> list[LearningPage]:
-    """Write a page for the first run of each agent, into ``learning``; valid cached pages stay.
+def write_first_pages(analysis: StudyAnalysis, n_workers: int, stop: Stop) -> list[LearningPage]:
+    """Write a page for the first run of each agent, into ``learning``; newer pages stay.
 
-    ``n_workers`` trainings run at once, each in a child process. For an agent that cannot be
-    shown, the returned page has the reason.
+    Args:
+        analysis: the study.
+        n_workers: how many trainings are repeated at once, each in a process of its own.
+        stop: ends them after a signal.
+
+    Returns:
+        For each agent on each environment its page, or the reason why there is none.
     """
-    root, study = analysis.results.root, analysis.study
-    runs = [run for group in first_runs(analysis) for run in group]
-    kept = {run.path: kept_page(root, run) for run in runs}
-    to_do = [run for run in runs if kept[run.path] is None]
-    if to_do:
-        limits = RunLimits(study.run_timeout, study.run_memory)
-        with local_executor(n_workers) as executor:
-            futures = [executor.submit(_watched, root, run, limits) for run in to_do]
-            for n, (run, future) in enumerate(zip(to_do, futures, strict=True), start=1):
-                what = f"{run.agent} on {run.environment}"
-                tell(f"training again to be watched, {n} of {len(to_do)}: {what}")
-                kept[run.path] = future.result()
-    pages = [page for page in kept.values() if page is not None]
-    there = {(page.agent, page.environment) for page in pages}
-    batches = {(run.agent, run.environment) for run in analysis.results.finished if run.is_batch}
-    names = [(each.agent, one.environment) for one in analysis.environments for each in one.agents]
-    for agent, environment in names:
-        if (agent, environment) not in there:
-            is_batch = (agent, environment) in batches
-            reason = BATCH if is_batch else "no run of it has finished"
-            pages.append(LearningPage(agent, environment, 0, "", reason))
-    return pages
+    root, timeout = analysis.results.root, analysis.study.run_timeout
+    pages = {run.labels: _page_of(root, run) for runs in first_runs(analysis) for run in runs}
+    runs = [run for group in first_runs(analysis) for run in group if pages[run.labels] is None]
+    pool = process_pool(n_workers)
+    try:
+        again = {pool.submit(_train_again, timeout, root, run): run for run in runs}
+        while wait(again, timeout=0.2).not_done:
+            stop.check()
+    finally:
+        pool.stop()
+        pool.join()
+    for future, run in again.items():
+        error = future.exception()
+        reason = "" if error is None else one_line(error)
+        pages[run.labels] = _page_of(root, run) or LearningPage(*run.labels, run.seed, "", reason)
+    batches = {run.labels for run in analysis.results.finished if run.is_batch}
+    for one in analysis.environments:
+        for labels in ((agent.agent, one.environment) for agent in one.agents):
+            reason = BATCH if labels in batches else "no run of it has finished"
+            pages.setdefault(labels, LearningPage(*labels, 0, "", reason))
+    return [page for page in pages.values() if page is not None]
 
 
-def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
-    """The page of a run, written by a child process."""
-    path = page_path(root, run)
-    with TemporaryDirectory(prefix="yardstick-learning-", ignore_cleanup_errors=True) as folder:
-        try:
-            words = supervise(
-                _train_again,
-                run,
-                path,
-                Path(folder),
-                clean_up=partial(shutil.rmtree, folder, ignore_errors=True),
-                limits=limits,
-                shares_process=is_plain(run.spec),
+def _path_of(root: Path, run: PlannedRun) -> Path:
+    return root / "learning" / run.path.parent.name / f"{run.path.name}.html"
+
+
+def _page_of(root: Path, run: PlannedRun) -> LearningPage | None:
+    """The page of a run, with its words from the file beside it; None if the run is newer."""
+    path = _path_of(root, run)
+    note = path.with_suffix(".json")
+    if not note.exists() or note.stat().st_mtime < (run.path / RECORD).stat().st_mtime:
+        return None
+    place, words = path.relative_to(root).as_posix(), str(read_json(note)["words"])
+    return LearningPage(*run.labels, run.seed, place, words, path.stat().st_size)
+
+
+def _train_again(root: Path, planned: PlannedRun) -> None:
+    """Train again in a temporary folder, compare the agents, and write the page."""
+    from rl_yardstick.pipeline.training import train
+
+    path = _path_of(root, planned)
+    import_modules(planned.spec.gym_packages)
+    spec = planned.spec.changed(tensorboard_log=None, watch_learning=str(path))
+    with TemporaryDirectory(prefix="yardstick-learning-") as folder, Run(Path(folder)) as run:
+        run.begin(spec, {}, "")
+        watch = train(spec, run).watch
+        if _tensors(run.model_path(spec)) != _tensors(planned.run.model_path(spec)):
+            raise UserError(
+                "the agent came out differently than in the run: another version or processor?"
             )
-        except TaskFailedError as error:
-            path.unlink(missing_ok=True)
-            reason = str(error)[:LONGEST_WORDS]
-            return LearningPage(run.agent, run.environment, run.seed, "", reason)
-    content = read_file(path, NO_LIMIT)
-    write_json(path.with_suffix(".json"), {"words": words, **_made_from(run, content)})
-    return _page(root, run, words, content)
-
-
-def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:
-    """Train again in ``folder``, compare with the run, write the page; return what it shows."""
-    import_again(planned.spec.user_modules)
-    spec = replace(planned.spec, log_folder=folder, tensorboard_log=None, watch_learning=path)
-    training = prepare(spec, Console(quiet=True), {}, "", keeping=WITHOUT_STATES)
-    carry_out(training)
-    what = difference(planned.run, training.run)
-    if what:
-        raise UserError(
-            f"{what} came out differently than in the run: another version or processor?"
-        )
-    assert training.watch is not None
+    assert watch is not None
     path.parent.mkdir(parents=True, exist_ok=True)
-    title = f"{planned.agent} on {planned.environment}"
-    return write_learning_page(spec, training.watch, path, title)
+    words = write_learning_page(spec, watch, path, f"{planned.agent} on {planned.environment}")
+    write_json(path.with_suffix(".json"), {"words": words})
+
+
+def _tensors(model: Path) -> dict[str, bytes]:
+    """The files of numbers in the zip of an agent."""
+    members = read_members(read_bytes(model, MAX_MODEL))
+    return {name: content for name, content in members.items() if name.endswith(".pth")}

@@ -10,9 +10,12 @@ import numpy as np
 
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis
 from rl_yardstick.experiments.plan import tuning_seeds
+from rl_yardstick.experiments.pool import ERROR_FILE
 from rl_yardstick.experiments.results import StudyResults, mixed_versions
 from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
+from rl_yardstick.pipeline.files import read_text
+from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.report.conclusions import (
     conclusion,
     on_changes,
@@ -206,7 +209,7 @@ def curves(report: Report) -> Section | None:
     Bandits have a section of their own, with curves by pull.
     """
     curves = [one.curves for one in report.series.environments]
-    if not (report.analysis.results.has_curves and any(curves)):
+    if not (len(report.analysis.results.curves) and any(curves)):
         return None
     units = ["step" if item is None else item["evaluation"].budget for item in curves]
     shown = [
@@ -304,15 +307,17 @@ ABSENT = "-"
 def settings(report: Report) -> Section | None:
     """Settings by environment; command, seeds, versions and missing runs of the whole study."""
     results, environments = report.analysis.results, report.analysis.environments
-    done = list(results.infos())
-    infos = [info for *_, info in done]
+    runs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for run in results.finished:
+        runs.setdefault(run.labels, []).append(run.recorded())
+    infos = [info for of_agent in runs.values() for info in of_agent]
     context = {
         "command": report.command,
         "seeds": seed_sentence(results.study.seeds, tuning_seeds(results.study)),
         "absent": ABSENT,
         "tables": [
-            _settings_table([(agent, info) for agent, on, info in done if on == e.environment])
-            for e in environments
+            _settings_table({a: found for (a, on), found in runs.items() if on == one.environment})
+            for one in environments
         ],
         "versions": recorded("versions", infos),
         "machine": recorded("machine", infos),
@@ -322,11 +327,9 @@ def settings(report: Report) -> Section | None:
     return Section("settings", "Settings", context, by_environment=True)
 
 
-def _settings_table(runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+def _settings_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """The agents, and for each setting its values by agent and whether these differ."""
-    columns: dict[str, dict[str, str]] = {}
-    for agent in dict.fromkeys(agent for agent, _ in runs):
-        columns[agent] = _column([info for one, info in runs if one == agent])
+    columns = {agent: _column(infos) for agent, infos in runs.items()}
     rows = {}
     for name in dict.fromkeys(name for column in columns.values() for name in column):
         values = [column.get(name, ABSENT) for column in columns.values()]
@@ -334,42 +337,39 @@ def _settings_table(runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]
     return {"agents": list(columns), "rows": rows}
 
 
-def _column(infos: list[Mapping[str, Any]]) -> dict[str, str]:
+def _column(infos: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """The settings of an agent, which its seeds share, and how long its runs were."""
-    spec = infos[0]["spec"]
+    spec = TrainSpec.model_validate(infos[0]["spec"])
     steps = sorted(info["n_timesteps"] for info in infos)
     lengths = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
-    column = {"agent": spec["algo"], "steps run": lengths}
-    engines = sorted({str(info["engine"]) for info in infos if info.get("engine")})
-    if engines:
+    column = {"agent": spec.algo, "steps run": lengths}
+    if engines := sorted({str(info["engine"]) for info in infos if info.get("engine")}):
         column["engine"] = "; ".join(engines)
-    return column | {name: setting(value) for name, value in spec["hyperparams"].items()}
+    return column | {name: setting(value) for name, value in spec.hyperparams.items()}
 
 
 def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """Versions or parts of the machine by name, all distinct values joined; old runs have none."""
+    """Versions or parts of the machine by name, all distinct values joined."""
     found: dict[str, set[str]] = {}
     for info in infos:
-        for name, value in info.get(what, {}).items():
+        for name, value in info[what].items():
             found.setdefault(name, set()).add(value)
     return {name: ", ".join(sorted(values)) for name, values in found.items()}
 
 
 def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
-    """Missing runs, grouped by agent, environment and reason.
-
-    The reason is the last line of a run's record of failure; the details are all of the last one.
-    """
+    """Missing runs, grouped by agent, environment and reason."""
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
-    damaged = {one.planned.path: one.reason for one in results.left_out}
-    there = {(*run.labels, run.seed) for run in results.finished}
+    unreadable = {one.planned.path: one.reason for one in results.left_out}
+    there = {run.path for run in results.finished}
     for run in results.planned:
-        if (*run.labels, run.seed) in there:
+        if run.path in there:
             continue
-        details = results.failures.get(run.path, "").strip()
-        reason = damaged.get(run.path) or (details.splitlines()[-1] if details else "not done yet")
+        reason = unreadable.get(run.path) or results.failures.get(run.path) or "not done yet"
+        error = run.path / ERROR_FILE
+        details = read_text(error) if run.path in results.failures and error.exists() else ""
         new = {"agent": run.agent, "environment": run.environment, "reason": reason, "seeds": []}
         group = groups.setdefault((run.agent, run.environment, reason), new)
         group["seeds"].append(run.seed)
-        group["details"] = details
+        group["details"] = details.strip()
     return list(groups.values())

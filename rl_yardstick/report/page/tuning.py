@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rl_yardstick.pipeline.environments import titled
 from rl_yardstick.pipeline.files import write_text
 from rl_yardstick.report.page.frame import (
     SHARED,
@@ -57,15 +56,16 @@ class Trials:
     @property
     def best_first(self) -> list[Mapping[str, Any]]:
         """The trials judged on all seeds, the best first, and then the others."""
-        whole = [trial for trial in self.judged if kind(trial) == COMPLETE]
-        whole.sort(key=lambda trial: trial["value"], reverse=not self.is_cost)
-        whole.sort(key=self._steps_at_optimum)
-        return whole + [trial for trial in self.ended if trial not in whole]
+        sign = 1.0 if self.is_cost else -1.0
 
-    def _steps_at_optimum(self, trial: Mapping[str, Any]) -> float:
-        steps = [*trial.get("at_optimum", {}).values()]
-        is_optimal = bool(steps) and len(steps) == len(trial["figures"])
-        return sum(steps) / len(steps) if is_optimal else math.inf
+        def rank(trial: Mapping[str, Any]) -> tuple[float, float]:
+            # Those that have the optimum on all seeds go by their steps to it.
+            steps = [*trial.get("at_optimum", {}).values()]
+            is_optimal = bool(steps) and len(steps) == len(trial["figures"])
+            return sum(steps) / len(steps) if is_optimal else math.inf, sign * trial["value"]
+
+        whole = sorted((t for t in self.judged if kind(t) == COMPLETE), key=rank)
+        return whole + [trial for trial in self.ended if trial not in whole]
 
     def distributions(self) -> dict[str, BaseDistribution]:
         """The distribution of each parameter."""
@@ -102,10 +102,10 @@ def importances(trials: Trials) -> dict[str, float]:
     direction = directions.MINIMIZE if trials.is_cost else directions.MAXIMIZE
     study = optuna.create_study(direction=direction, sampler=optuna.samplers.RandomSampler(0))
     for trial in judged:
-        params = {name: value for name, value in trial["params"].items() if name in ranges}
-        drawn_from = {name: ranges[name] for name in params}
+        drawn = {name: ranges[name] for name in trial["params"] if name in ranges}
+        params = {name: trial["params"][name] for name in drawn}
         study.add_trial(
-            optuna.create_trial(value=trial["value"], params=params, distributions=drawn_from)
+            optuna.create_trial(value=trial["value"], params=params, distributions=drawn)
         )
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     with warnings.catch_warnings():
@@ -132,20 +132,20 @@ def history(trials: Trials) -> dict[str, Any]:
         if kind(trial) == COMPLETE and trial["value"] is not None:
             best = trial["value"] if best is None else better(best, trial["value"])
         steps.append(best)
-    shipped = next((t["value"] for t in trials.ended if t["number"] == 0), None)
+    values = {trial["number"]: _value(trial) for trial in trials.ended}
     return {
         "isCost": trials.is_cost,
         "figure": trials.record["figure"],
         "edge": _edge(trials),
-        "shipped": shipped,
-        "numbers": [trial["number"] for trial in trials.ended],
+        "shipped": next((t["value"] for t in trials.ended if t["number"] == 0), None),
+        "numbers": [*values],
         "best": steps,
         "values": {
-            name: [_value(trial) if kind(trial) == name else None for trial in trials.ended]
+            name: [values[t["number"]] if kind(t) == name else None for t in trials.ended]
             for name in (COMPLETE, PRUNED)
         },
         "texts": [_text(trial) for trial in trials.ended],
-        "failed": [t["number"] for t in trials.ended if _value(t) is None],
+        "failed": [number for number, value in values.items() if value is None],
     }
 
 
@@ -167,12 +167,11 @@ def _edge(trials: Trials) -> float | None:
     includes the shipped settings unless these would more than double it.
     """
     sign = -1.0 if trials.is_cost else 1.0
-    values = [
-        (kind(t), t["number"], sign * v) for t in trials.ended if (v := _value(t)) is not None
-    ]
-    goods = np.array([value for *_, value in values])
-    whole = np.array([value for name, _, value in values if name == COMPLETE])
-    shipped = next((value for _, number, value in values if number == 0), -math.inf)
+    found = {t["number"]: (kind(t), _value(t)) for t in trials.ended}
+    values = {at: (name, sign * value) for at, (name, value) in found.items() if value is not None}
+    goods = np.array([value for _, value in values.values()])
+    whole = np.array([value for name, value in values.values() if name == COMPLETE])
+    _, shipped = values.get(0, ("", -math.inf))
     for some in (whole, goods):
         if some.size and (room := some.max() - np.quantile(some, _BELOW)) > 0:
             best = float(some.max())
@@ -246,15 +245,12 @@ class Change(NamedTuple):
 def changes(trials: Trials, winner: int) -> list[Change]:
     """The settings of a trial that differ from those that the search began with."""
     settings = {trial["number"]: trial["settings"] or {} for trial in trials.ended}
-    before, after = (
-        {name: setting(value) for name, value in settings.get(number, {}).items()}
-        for number in (0, winner)
-    )
-    return [
-        Change(name, before.get(name, LEFT_OUT), after.get(name, LEFT_OUT))
-        for name in dict.fromkeys([*before, *after])
-        if before.get(name) != after.get(name)
+    before, after = settings.get(0, {}), settings.get(winner, {})
+    found = [
+        Change(name, *(setting(of[name]) if name in of else LEFT_OUT for of in (before, after)))
+        for name in {**before, **after}
     ]
+    return [change for change in found if change.shipped != change.found]
 
 
 def cost(trials: Trials) -> list[tuple[str, str]]:
@@ -308,10 +304,11 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     sections = _sections(trials, shares, winner)
     data: dict[str, Any] = {"page": {"agents": [], "environments": []}}
     data |= {section.name: section.data for section in sections if section.data}
-    environment = titled(asked.get("env", "an environment"), record.get("map_name", ""))
+    place = asked.get("env", "an environment")
+    place += f" ({record['map_name']})" if record.get("map_name") else ""
     template = templates("tuning").get_template("tuning.html")
     text = template.render(
-        title=f"{asked.get('algo', 'an agent')} on {environment}",
+        title=f"{asked.get('algo', 'an agent')} on {place}",
         record=record,
         asked=asked,
         sections=sections,

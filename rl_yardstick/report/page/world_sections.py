@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,25 @@ from PIL import Image
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.envs.layout import GridLayout, grid_layout
 from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from rl_yardstick.experiments.child_processes import do_aside
 from rl_yardstick.experiments.plan import PlannedRun
-from rl_yardstick.experiments.results import mean_curve, read_compared, read_value_maps
+from rl_yardstick.experiments.pool import do_aside
+from rl_yardstick.experiments.results import read_compared, read_value_maps
 from rl_yardstick.pipeline.curve_pictures import MEANINGS
 from rl_yardstick.pipeline.environments import make_single_env
-from rl_yardstick.report.films import MAX_BYTES, films_of, has_film
+from rl_yardstick.pipeline.files import read_bytes, read_json
+from rl_yardstick.report.films import films_of, has_film
 from rl_yardstick.report.page.frame import Report, Section, data_uri, first_runs, layout_data
-from rl_yardstick.report.series import SPREAD, Curve, Pulls, PullSeries, mean_regret, regret_of_runs
+from rl_yardstick.report.series import (
+    SPREAD,
+    Curve,
+    Pulls,
+    PullSeries,
+    mean_of,
+    mean_regret,
+    regret_of_runs,
+)
 from rl_yardstick.report.why import whys_of
 from rl_yardstick.report.words import number
-from rl_yardstick.safe_files.files import NO_LIMIT, read_file
 
 # Bandits: rewards and regret by pull, shares of the pulls, posteriors.
 
@@ -107,7 +115,7 @@ def why(report: Report) -> Section | None:
     """The explanation of each agent's median run; None if no gap can be split."""
     analysis = report.analysis
     chosen = [_median_runs(analysis, one)[:MOST_EXPLAINED] for one in analysis.environments]
-    asked = [(run.spec, run.run.model_path) for runs in chosen for run in runs]
+    asked = [run for runs in chosen for run in runs]
     answers = iter(do_aside(whys_of, asked) if asked else ())
     told = [[(run, next(answers)) for run in runs] for runs in chosen]
     told = [[(run, why) for run, why in of_runs if why is not None] for of_runs in told]
@@ -118,19 +126,15 @@ def why(report: Report) -> Section | None:
 
 def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> list[PlannedRun]:
     """Each agent's run with the (lower) median final return among its exactly evaluated runs."""
-    table = analysis.results.summary
-    here = (table["environment"] == environment.environment) & table["exact"].astype(bool)
-    runs: dict[tuple[str, str], dict[int, PlannedRun]] = {}
-    for run in analysis.results.in_folders:
-        if not run.is_batch:
-            runs.setdefault(run.labels, {})[run.seed] = run
+    table, label = analysis.results.summary, environment.environment
+    exact = table[(table["environment"] == label) & (table["exact"] == True)]  # noqa: E712  # or None
+    here = [run for run in analysis.results.finished if run.environment == label]
+    runs = {(run.agent, run.seed): run for run in here}
     found = []
     for agent in environment.agents:
-        rows = table[here & (table["agent"] == agent.agent)].sort_values("final", kind="stable")
-        of_agent = runs.get((agent.agent, environment.environment), {})
-        if len(rows) and of_agent:
-            median = int(rows["seed"].iloc[(len(rows) - 1) // 2])
-            found += [of_agent[median]] if median in of_agent else []
+        rows = exact[exact["agent"] == agent.agent].sort_values("final", kind="stable")
+        if len(rows):
+            found.append(runs[agent.agent, int(rows["seed"].iloc[(len(rows) - 1) // 2])])
     return found
 
 
@@ -154,24 +158,19 @@ def _compared(
     analysis: StudyAnalysis, environment: EnvironmentAnalysis
 ) -> dict[str, dict[str, Curve]]:
     """By column of the files and by agent, the mean over seeds with its interval."""
-    found: dict[str, dict[str, list[pd.DataFrame]]] = {name: {} for name in MEANINGS}
+    rows: dict[tuple[str, str], list[pd.DataFrame]] = {}
     for planned in analysis.results.finished:
-        if planned.environment != environment.environment or planned.is_batch:
-            continue
-        if not planned.run.diagnosis_path.exists():
-            continue
-        columns = read_compared(planned.run)
-        for name in columns.keys() & found.keys():
-            rows = pd.DataFrame({"step": columns["timesteps"], "value": columns[name]}).dropna()
-            if len(rows):
-                found[name].setdefault(planned.agent, []).append(rows)
+        here = planned.environment == environment.environment
+        if here and (planned.path / "diagnosis.csv").exists():
+            table = pd.DataFrame(read_compared(planned.path))
+            for name in table.columns.drop("timesteps"):
+                known = table[["timesteps", name]].dropna().set_axis(["step", "value"], axis=1)
+                if len(known):
+                    rows.setdefault((name, planned.agent), []).append(known)
     curves: dict[str, dict[str, Curve]] = {}
-    for name, of_agents in found.items():
+    for name in MEANINGS:
         for agent in (one.agent for one in environment.agents):
-            mean = mean_curve(of_agents.get(agent, []), "step")
-            if mean is not None:
-                points, band = mean
-                curve = Curve(points, band.point, band.low, band.high)
+            if (curve := mean_of(rows.get((name, agent), []), "step")) is not None:
                 curves.setdefault(name, {})[agent] = curve
     return curves
 
@@ -203,18 +202,15 @@ def _policy_data(
     order = [agent.agent for agent in environment.agents]
     runs = [
         run
-        for run in analysis.results.in_folders
-        if run.environment == environment.environment and run.run.value_maps_path.exists()
+        for run in analysis.results.finished
+        if run.environment == environment.environment and (run.path / "value_maps.npz").exists()
     ]
     if not runs:
         return None
     # By seed, the best agent first.
     runs.sort(key=lambda run: (run.seed, order.index(run.agent)))
-    env = make_single_env(runs[0].spec)
-    try:
+    with closing(make_single_env(runs[0].spec)) as env:
         layout, model = grid_layout(env), transition_model(env)
-    finally:
-        env.close()
     if layout is None or model is None:
         return None
     maps = _read_maps(runs, layout, room)
@@ -252,7 +248,7 @@ def _read_maps(
     maps: dict[tuple[str, int], Arrays] = {}
     figures = 0
     for run in runs:
-        arrays = read_value_maps(run.run)
+        arrays = read_value_maps(run.path)
         n = len(arrays["timesteps"])
         if n > n_maps:  # the first and the last among them
             kept = np.linspace(0, n - 1, n_maps).round().astype(np.int64)
@@ -280,14 +276,13 @@ ALL_BYTES = 1_000_000  # of the films of a page, before base64
 
 def played_episodes(report: Report) -> Section | None:
     """The films of each environment; None where nothing can be drawn."""
-    groups: list[list[dict[str, Any]]] = []
-    contents: dict[bytes, int] = {}  # of each film its place on the page; equal films share one
-    without_room: list[list[str]] = []
     ranked = first_runs(report.analysis)
     to_film = [run for runs in ranked for run in runs[:MOST_FILMED]]
-    report.tell("filming episodes")
     made = films_of(to_film) if all(map(has_film, to_film)) else do_aside(films_of, to_film)
     paths = dict(zip((run.path for run in to_film), made, strict=True))
+    contents: dict[bytes, int] = {}  # of each film its place on the page; equal films share one
+    groups: list[list[dict[str, Any]]] = []
+    without_room: list[list[str]] = []
     for n_done, runs in enumerate(ranked, start=1):
         groups.append([])
         without_room.append([])
@@ -295,7 +290,7 @@ def played_episodes(report: Report) -> Section | None:
             path = paths[run.path]
             if path is None:
                 continue
-            content = read_file(path, NO_LIMIT)
+            content = read_bytes(path)
             # Space that an environment does not use is left to the next ones.
             room = ALL_BYTES * n_done // len(ranked) - sum(map(len, contents))
             if content in contents or len(content) <= room:
@@ -317,7 +312,7 @@ def _film(path: Path, content: bytes) -> dict[str, Any]:
     with Image.open(io.BytesIO(content)) as picture:
         width, height = picture.size
         picture.convert("RGB").quantize(64).save(still, "PNG", optimize=True)
-    episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
+    episode = read_json(path.with_suffix(".json"))
     shown, steps = episode["frames"] - 1, episode["steps"]
     if steps is None:
         caption = f"the first {shown} steps"
