@@ -24,7 +24,6 @@ import statistics
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +55,8 @@ def prepared_folder(folder: Path) -> None:
 
 def outcome(training: str, seed: int, folder: Path) -> dict[str, Any]:
     """The results of one run: its return, its score if there is one, and its processor time."""
-    from rich.console import Console
-
-    from rl_yardstick.commands.train import build_parser, train_spec
+    from rl_yardstick.commands.train import build_parser, spec_from_flags
+    from rl_yardstick.pipeline.run import Run
     from rl_yardstick.pipeline.training import train
 
     words = [*shlex.split(training), "--seed", str(seed), "--verbose", "0", "-f", str(folder)]
@@ -66,11 +64,12 @@ def outcome(training: str, seed: int, folder: Path) -> dict[str, Any]:
     args = parser.parse_args(words)
     if "engine" in args:
         args.engine = "auto"
-    spec = replace(train_spec(args), pictures=False)
+    spec = spec_from_flags(args).changed(pictures=False)
     before = time.process_time()
-    done = train(spec, Console(quiet=True), {}, "a benchmark")
+    with Run.claim(folder, spec) as run:
+        train(spec, run)
     spent = time.process_time() - before
-    info = json.loads((done.run.path / "run.json").read_text())
+    info = run.recorded()
     final = info["final"] or {}
     return {
         "return": final.get("mean_return"),

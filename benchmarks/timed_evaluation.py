@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -21,8 +20,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.common.callbacks import BlockCallback
-from rl_yardstick.commands.train import build_parser, train_spec
+from rl_yardstick.commands.train import build_parser, spec_from_flags
 from rl_yardstick.envs.wrappers import DiscretizeObservation
+from rl_yardstick.pipeline.run import Run
 from rl_yardstick.pipeline.training import train
 from timing import Benchmark, Contender, Rows
 
@@ -59,9 +59,10 @@ def typed(words: str, *more: str) -> Contender:
     def measure() -> float:
         with tempfile.TemporaryDirectory() as folder:
             flags = [*words.split(), "-n", str(N_STEPS), "--seed", "0", "-f", folder, *more]
-            spec = train_spec(build_parser().parse_args([*flags, "--num-threads", "1"]))
+            spec = spec_from_flags(build_parser().parse_args([*flags, "--num-threads", "1"]))
             started = time.process_time()
-            train(spec, Console(quiet=True), {}, "")
+            with Run.claim(Path(folder), spec) as run:
+                train(spec, run)
             return time.process_time() - started
 
     return measure

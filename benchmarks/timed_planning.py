@@ -7,15 +7,13 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from rl_yardstick.pipeline.settings.hyperparams import split
-from rl_yardstick.pipeline.train_spec import TrainSpec
-
 from rl_yardstick.agents import load_algorithm
 from rl_yardstick.envs.warehouse import RandomWarehouseEnv
 from rl_yardstick.mdp import policy_iteration, value_iteration
 from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
 from rl_yardstick.pipeline.evaluation.sampled import evaluate
+from rl_yardstick.pipeline.spec import TrainSpec
 from timing import Benchmark, Contender, Rows, seconds
 
 DISCOUNTS = (0.9, 0.99, 0.999, 1.0)
@@ -28,8 +26,7 @@ def evaluations(env_id: str, *, greedily: bool) -> dict[str, Contender]:
 
     Two agents take turns, because the evaluator caches the value of the last policy.
     """
-    entry = {"n_timesteps": STEPS}
-    spec = TrainSpec("qlearning", env_id, split(entry), entry, seed=0)
+    spec = TrainSpec(algo="qlearning", env_id=env_id, n_timesteps=STEPS)
     evaluator = exact_evaluator(spec)
     assert evaluator is not None
     algorithm: Any = load_algorithm("qlearning")

@@ -97,11 +97,10 @@ PLANNABLE = 0.95
 
 
 def _spec(member: Member, algo: str, seed: int) -> Any:
-    from rl_yardstick.pipeline.agent_settings import resolved_spec
-    from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
+    from rl_yardstick.pipeline.settings import override, read_entry, read_spec
 
-    raw = override(read_hyperparams(algo, member.env_id), {"env_kwargs": member.env_kwargs})
-    return resolved_spec(raw, algo=algo, env_id=member.env_id, seed=seed)
+    entry = override(read_entry(algo, member.env_id), {"env_kwargs": member.env_kwargs})
+    return read_spec(algo, member.env_id, entry, seed=seed)
 
 
 @cache
@@ -123,17 +122,12 @@ def planning_score(name: str, discount: float) -> float:
 
 def family_score(name: str, algo: str, seed: int) -> float:
     """Train a table in this process; return the exact score of its greedy policy."""
-    from rl_yardstick.pipeline.preparation import algorithm_kwargs
-
-    from rl_yardstick.agents import load_algorithm
-    from rl_yardstick.pipeline.environments import make_training_env
+    from rl_yardstick.pipeline.training import make_agent
 
     spec = _spec(family()[name], algo, seed)
-    env = make_training_env(spec, None)
-    algorithm: Any = load_algorithm(algo)
-    agent = algorithm(env=env, device="cpu", seed=seed, **algorithm_kwargs(spec))
-    agent.learn(spec.hyperparams.n_timesteps)
-    env.close()
+    agent: Any = make_agent(spec, None)
+    agent.learn(spec.total_timesteps)
+    agent.env.close()
     judge = _evaluator(name)
     return float(judge.yardstick.score(float(judge(agent).returns[0])))
 

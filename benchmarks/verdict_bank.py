@@ -19,21 +19,19 @@ from __future__ import annotations
 import argparse
 import os
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 os.environ.update(OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
 
 import numpy as np
 from numpy.typing import NDArray
-from rl_yardstick.pipeline.preparation import algorithm_kwargs, make_model
-from rl_yardstick.pipeline.train_spec import NETWORKS
-from stable_baselines3.common.logger import Logger
 
-from rl_yardstick.commands.train import build_parser, train_spec
-from rl_yardstick.pipeline.environments import make_evaluation_env, make_training_env
+from rl_yardstick.commands.engines import NETWORKS
+from rl_yardstick.commands.train import build_parser, spec_from_flags
+from rl_yardstick.pipeline.environments import make_evaluation_env
 from rl_yardstick.pipeline.evaluation.exact import evaluator_of
 from rl_yardstick.pipeline.evaluation.sampled import SampledEvaluator
+from rl_yardstick.pipeline.training import make_agent
 
 BANK = Path(__file__).with_name("verdict_bank.npz")
 N_RUNS, N_NETWORKS = 1500, 100
@@ -69,15 +67,13 @@ def scores_of(env_id: str, algo: str, n_steps: int, most: int) -> NDArray[np.flo
     typed = f"--env {env_id} --algo {algo} -n {n_steps} --seed 0 --eval-episodes 100".split()
     if algo in NETWORKS:
         typed += ["--engine", "compiled", "--device", "cpu"]
-    first = train_spec(build_parser().parse_args(typed))
+    first = spec_from_flags(build_parser().parse_args(typed))
     n_runs = N_NETWORKS if algo in NETWORKS else FEWER.get(env_id, N_RUNS)
-    env, eval_env = make_training_env(first, None), make_evaluation_env(first, first.n_eval_envs)
-    kwargs, exact = algorithm_kwargs(first), evaluator_of(first)
+    eval_env, exact = make_evaluation_env(first, first.n_eval_envs), evaluator_of(first)
     scores: list[float] = []
     for seed in range(min(n_runs, most)):
-        spec = replace(first, seed=seed)
-        model = make_model(spec, None, env, kwargs)
-        model.set_logger(Logger(folder=None, output_formats=[]))
+        spec = first.changed(seed=seed)
+        model = make_agent(spec, None)
         model.learn(n_steps, log_interval=None)  # type: ignore[arg-type]
         found = exact(model) if exact else SampledEvaluator(spec, eval_env).at_the_end(model)
         assert found.yardstick is not None

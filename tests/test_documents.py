@@ -10,10 +10,10 @@ import pytest
 
 from rl_yardstick.commands import audit, compare, enjoy, explain, shaping, train, tune
 from rl_yardstick.commands.compare import study_spec
-from rl_yardstick.commands.train import train_spec
+from rl_yardstick.commands.train import spec_from_flags
 from rl_yardstick.commands.tune import tuning_spec
 from rl_yardstick.experiments.plan import plan
-from rl_yardstick.experiments.study import _STUDY_KEYS, read_study
+from rl_yardstick.experiments.study import _File, read_study
 
 ROOT = Path(__file__).parent.parent
 sys.path += [str(ROOT / "benchmarks"), str(ROOT / "docs" / "scripts")]
@@ -61,7 +61,7 @@ def test_commands_can_be_carried_out(tmp_path, monkeypatch, command):
         monkeypatch.chdir(tmp_path)
         args = train.build_parser().parse_args(words)
         args.trained_agent = ""
-        assert args.list or train_spec(args).env_id == args.env
+        assert args.list or spec_from_flags(args).env_id == args.env
     elif script == "enjoy.py":
         args = enjoy.build_parser().parse_args(words)
         assert args.model is not None or args.env == "Warehouse-v0"
@@ -121,7 +121,7 @@ def test_the_example_of_a_study_is_one_and_every_key_is_documented(tmp_path):
     assert len(plan(study.quickened(), tmp_path)) == 4 * 2 * 3
     table = COMPARE.partition("| key | meaning |")[2].partition("\n\n")[0]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
-    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(_STUDY_KEYS)
+    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(_File.model_fields)
 
 
 # --- what the commands reach ----------------------------------------------------------------------

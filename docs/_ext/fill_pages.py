@@ -82,14 +82,14 @@ def filled(text: str, folder: Path) -> str:
 
 def pictured_environments() -> dict[str, dict[str, object]]:
     """The environments that pages show, with their arguments."""
-    from rl_yardstick.pipeline.settings.values import parse_assignments
+    from rl_yardstick.pipeline.settings import parse_assignments
 
     found = {}
     for path in sorted(DOCS.rglob("*.md")):
         for _, kind, arguments in LINE.findall(path.read_text(encoding="utf-8")):
             if kind in ("environment", "facts"):
                 env_id, *pairs = arguments.split()
-                found[env_id] = parse_assignments(pairs)
+                found[env_id] = parse_assignments(pairs, env_id)
     return found
 
 

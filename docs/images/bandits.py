@@ -10,11 +10,11 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
-from rl_yardstick.experiments.off_policy.estimators import cross_fit, evaluate_policy, mean_reward
 
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick.agents.bandits.runs import run_batch
 from rl_yardstick.envs.bandits import log_uniformly, read_log
+from rl_yardstick.experiments.off_policy import cross_fit, evaluate_policy, mean_reward
 from rl_yardstick.report.series import COLOURS
 
 FOLDER = Path(__file__).parent

@@ -20,8 +20,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
-from rl_yardstick.pipeline.settings.hyperparams import entry_names
-from rl_yardstick.pipeline.settings.values import parse_assignments
 
 from rl_yardstick import envs
 from rl_yardstick.agents.registry import ALGORITHMS
@@ -42,6 +40,7 @@ from rl_yardstick.mdp import (
 from rl_yardstick.mdp.beliefs import Bracket
 from rl_yardstick.mdp.evaluation import PolicyReturn
 from rl_yardstick.pipeline.evaluation.observability import HiddenScale, hidden_scale
+from rl_yardstick.pipeline.settings import entry_names, parse_assignments
 
 PAGES = Path(__file__).resolve().parents[1] / "environments"
 HARDNESS_HEADS = (

@@ -37,7 +37,7 @@ def engine_outlook(
         return None
     from rl_yardstick.agents.compiled.worlds import NotCompilable
     from rl_yardstick.agents.networks.engine_setting import CompiledNetworks
-    from rl_yardstick.agents.networks.network_worlds import network_world
+    from rl_yardstick.agents.compiled.env_states import observed_world
 
     if not isinstance(agent, CompiledNetworks):
         return None
@@ -45,7 +45,7 @@ def engine_outlook(
     auto = agent.engine_plan(spec.total_timesteps, callbacks, "auto")
     work = None
     with suppress(NotCompilable):
-        network_world(agent.env)
+        observed_world(agent.env)
         work = agent.work(spec.total_timesteps, callbacks)
     return EngineOutlook(plan, auto, work)
 

@@ -6,7 +6,6 @@ import zipfile
 
 import numpy as np
 import pytest
-from rl_yardstick.pipeline.runs import Run
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -28,6 +27,8 @@ from rl_yardstick.agents.common.callbacks import (
 )
 from rl_yardstick.pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
 from rl_yardstick.pipeline.evaluation.sampled import Evaluation
+from rl_yardstick.pipeline.run import Run
+from rl_yardstick.pipeline.spec import TrainSpec
 from tests.agents.trainings import LAKE, environment, make, state_of
 
 ENGINES = ("interpreted", "compiled")
@@ -93,15 +94,18 @@ def every_kind(folder, evaluated):
         evaluated.append(snapshot(model))
         return Evaluation(np.array([float(len(evaluated))]), np.array([1]), None)
 
-    run = Run.claim(folder / "logs", "sarsa", LAKE)
+    run, steps, episodes = (
+        Run.claim(folder / name, TrainSpec(algo="sarsa", env_id=LAKE, n_timesteps=1))
+        for name in ("logs", "steps", "episodes")
+    )
     return [
         EvalCallback(env, eval_freq=90, n_eval_episodes=2, log_path=str(folder), verbose=0),
         CheckpointCallback(110, str(folder), name_prefix="library"),
         EveryNTimesteps(70, Recorder()),
         LogEveryNTimesteps(130),
-        EvaluationCallback(run, env, evaluator, 55),
-        StepCheckpoint(85, folder / "steps"),
-        EpisodeCheckpoint(9, folder / "episodes"),
+        EvaluationCallback(run, env, evaluator, (55, 0)),
+        StepCheckpoint(steps, 85),
+        EpisodeCheckpoint(episodes, 9),
         ProgressBarCallback(),
         CallbackList([Watcher(), StopTrainingOnMaxEpisodes(60)]),
     ]
@@ -119,8 +123,6 @@ def saved(path):
 
 def trained(engine, folder):
     """Everything that happened in a training with all callbacks."""
-    for name in ("steps", "episodes"):
-        (folder / name).mkdir(parents=True)
     model, evaluated = lake(engine, 3, "sarsa", exploration_final_eps=0.3), []
     callbacks = every_kind(folder, evaluated)
     model.learn(2000, callback=callbacks, log_interval=11)

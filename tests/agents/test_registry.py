@@ -8,13 +8,13 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 from gymnasium import spaces
-from rl_yardstick.pipeline.settings.values import algorithm_parameters
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import rl_yardstick.envs  # noqa: F401  # registers the bandits
 from rl_yardstick import agents
 from rl_yardstick.agents import ALGORITHMS, fitting_algorithms, load_algorithm
 from rl_yardstick.agents.bandits.runs import run_batch
+from rl_yardstick.pipeline.arguments import constructor_parameters
 from tests.agents.hand_fed import Told
 
 DISCRETE, BOX = spaces.Discrete(4), spaces.Box(-1, 1, (4,))
@@ -47,7 +47,7 @@ def test_every_name_stands_for_an_algorithm_of_its_own():
         assert entry.entry_point.endswith(f":{classes[name].__name__}")
         assert classes[name].policy_aliases
         # What `--engine` offers without importing a class is what its constructor takes.
-        parameter = algorithm_parameters(classes[name]).get("engine")
+        parameter = constructor_parameters(classes[name]).get("engine")
         default = parameter and parameter.default
         assert (len(entry.engines) > 1) == (default is not None), name
         assert default in {None, *entry.engines[:1]}, name

@@ -13,18 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rl_yardstick.experiments.run_in_child import do_run
-from rl_yardstick.pipeline.models.load import load_model
-from rl_yardstick.pipeline.preparation import algorithm_kwargs
 
-import compare
+from rl_yardstick.agents import load_algorithm
 from rl_yardstick.envs.warehouse import WarehouseEnv
 from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.pool import do_run
 from rl_yardstick.experiments.results import read_episodes, read_results
 from rl_yardstick.experiments.study import read_study
 from rl_yardstick.mdp import value_iteration
+from rl_yardstick.pipeline.components import constructor_arguments
 
-ROOT = Path(compare.__file__).parent
+ROOT = Path(__file__).parents[2]
 # Bandits have a guide of their own.
 STUDIES = [
     path for path in sorted((ROOT / "studies").glob("*.yml")) if not path.name.startswith("bandit-")
@@ -54,13 +53,13 @@ def run(spec, folder):
     """Do all runs of a study in this process; its results."""
     planned = plan(spec, folder)
     for one in planned:
-        do_run(one, folder / "draft", "a test")
+        do_run(one, "a test")
     return read_results(spec, planned, folder)
 
 
 def training_returns(results, agent):
     """Returns of the training episodes, shape (n_seeds, n_episodes)."""
-    runs = [one.run for one in results.planned if one.agent == agent]
+    runs = [one.path for one in results.planned if one.agent == agent]
     assert len(runs) == results.study.n_seeds
     return np.array([read_episodes(one).returns for one in runs])
 
@@ -82,7 +81,11 @@ def test_a_study_reads_plans_and_fits(path, tmp_path):
     assert len({one.path for one in planned}) == len(planned)
     for one in planned:
         if one.seed == 0:
-            assert algorithm_kwargs(one.spec).keys() >= one.spec.hyperparams.algorithm.keys()
+            algorithm = load_algorithm(one.spec.algo)
+            assert (
+                constructor_arguments(one.spec, algorithm, False).keys()
+                >= one.spec.algorithm.keys()
+            )
     short = plan(whole.quickened(), tmp_path)
     assert len(short) < len(planned)
 
@@ -160,7 +163,7 @@ def test_values_of_the_small_grid(tmp_path):
     results = run(part, tmp_path)
     corner = {agent.label: [] for agent in part.agents}
     for one in results.planned:
-        model = load_model(one.agent, one.run.model_path)
+        model = load_algorithm(one.agent).load(one.run.model_path(one.spec))
         corner[one.agent].append(model.policy.q_table[0].max())
     assert corner["qlearning"] == pytest.approx([0.95**5] * 3, abs=1e-9)
     assert np.mean(corner["sarsa"]) < 0.95**5 - 0.02

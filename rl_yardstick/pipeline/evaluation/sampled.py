@@ -387,7 +387,7 @@ def evaluate_compiled(
     """Like `evaluate`, in compiled code; the library's network decides near ties."""
     from rl_yardstick.agents.compiled.greedy_play import play_episodes
     from rl_yardstick.agents.compiled.records import DECIMALS
-    from rl_yardstick.agents.networks.network_worlds import EnvStates
+    from rl_yardstick.agents.compiled.env_states import EnvStates
     from rl_yardstick.agents.networks.perceptron import one_thread
 
     env, n_envs = copy.env, copy.env.num_envs
