@@ -223,7 +223,7 @@ def test_moves_lead_where_the_layout_says(name):
     assert {letters[start] for start in np.flatnonzero(model.initial)} == {"S"}
 
 
-def test_layers_and_other_layouts():
+def test_layers_other_layouts_and_names():
     layout = grid_layout(make("MineMaze"))
     assert (layout.n_layers, layout.n_states, layout.prizes) == (8, 288, (9, 23, 31))
     # Row 2, column 4, with the first and the last power collected: 16 + 36 * 0b101.
@@ -236,13 +236,13 @@ def test_layers_and_other_layouts():
     assert field.moves == (UP, DOWN, LEFT, RIGHT, *diagonal)
     for env_id in ("Taxi-v4", "CartPole-v1"):
         assert grid_layout(gym.make(env_id)) is None
-
-
-def test_actions_and_states_are_called_as_the_environment_says_or_by_their_moves():
-    assert action_names(gym.make("FrozenLake-v1")) == ("left", "down", "right", "up")
-    assert action_names(gym.make("CartPole-v1")) == ()
-    assert action_names(gym.make("Taxi-v4"))[1:5:3] == ("north", "pick up")
-    assert action_names(gym.make("WindyGridworld-v0", moves="king"))[3:5] == ("right", "up left")
+    for env_id, kwargs, place, names in (
+        ("FrozenLake-v1", {}, slice(4), ("left", "down", "right", "up")),
+        ("CartPole-v1", {}, slice(4), ()),
+        ("Taxi-v4", {}, slice(1, 5, 3), ("north", "pick up")),
+        ("WindyGridworld-v0", {"moves": "king"}, slice(3, 5), ("right", "up left")),
+    ):
+        assert action_names(gym.make(env_id, **kwargs))[place] == names
     taxi = make("Taxi")
     state = taxi.unwrapped.encode(0, 3, 4, 1)
     assert state_name(taxi, None, state) == "row 1, column 4, passenger on board, to G"

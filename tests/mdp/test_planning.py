@@ -52,19 +52,6 @@ def test_known_optima_are_found_and_earned(plan, env_id, kwargs, discount, optim
     assert earned == pytest.approx(found.start_value, abs=1e-8)
 
 
-def test_optima_under_a_time_limit():
-    for env_id, kwargs, horizon, optimum in (
-        ("Warehouse-v0", {}, 1000, 79.0),
-        ("Warehouse-v0", {}, 21, -21.0),
-        ("FrozenLake-v1", {"map_name": "8x8"}, 200, 0.9132),
-    ):
-        model = model_of(env_id, **kwargs)
-        found = finite_horizon_optimum(model, horizon)
-        assert found.start_value == pytest.approx(optimum, abs=5e-5)
-        earned = policy_return(model, found.policy, horizon).expected_return
-        assert earned == pytest.approx(found.start_value, abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "discount", "most"),
     [
@@ -81,27 +68,6 @@ def test_sweeps_that_end_early_say_by_how_much_they_may_be_wrong(env_id, kwargs,
         found = value_iteration(model, discount, tolerance)
         error = np.abs(found.values - exact)[model.reachable].max()
         assert most * found.error_bound < error <= found.error_bound <= tolerance
-
-
-def test_a_time_limit_out_of_reach_costs_no_memory():
-    found = finite_horizon_optimum(model_of("Warehouse-v0"), 10**6)
-    assert found.actions_left.dtype == np.uint8
-    assert len(found.actions_left) < 40
-    np.testing.assert_array_equal(found.actions(0), found.actions(10**6 - 40))
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "discount", "sweeps"),
-    [
-        # On the shortest ways, in the order of the distances, one sweep does it.
-        ("RandomWarehouse-v0", {"size": 30, "slip": 0.0}, 1.0, 1),
-        ("RandomWarehouse-v0", {"size": 30, "slip": 0.1}, 1.0, 12),
-        # Where the greedy policy is not evaluated between them, 500 sweeps are needed.
-        ("FrozenLake-v1", {"map_name": "8x8"}, 0.99, 30),
-    ],
-)
-def test_few_sweeps_are_enough(env_id, kwargs, discount, sweeps):
-    assert value_iteration(model_of(env_id, **kwargs), discount).iterations <= sweeps
 
 
 def test_sweeps_that_contract_slowly_are_helped_out():
