@@ -23,7 +23,7 @@ from rl_yardstick.agents.common.settings import (
     TieBreaking,
     check_settings,
 )
-from rl_yardstick.agents.compiled.loop import CompiledClass, check_functions, settings_dtype
+from rl_yardstick.agents.compiled.loop import check_functions, settings_dtype
 from rl_yardstick.agents.compiled.worlds import PROGRESS, NotCompilable
 
 # One for training, and some for exploring with another generator or number of observations.
@@ -32,7 +32,7 @@ MOST_WORKSPACES = 4
 StepSize = float | Schedule | Literal["sample_average"]
 
 
-class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
+class LearningAlgorithm(OnlineAlgorithm):
     """Learns with a step size, explores by a schedule, and breaks ties between best actions.
 
     Compiled functions, which are attributes of the class, define how the agent acts and learns.

@@ -314,9 +314,9 @@ class CompiledNetworks(BaseAlgorithm):
 
         return network_player(self.shared_networks(seen)[0][0], seen, predicted)
 
-    def _schedules(self) -> list[Schedule]:
-        """The schedules that compiled code evaluates."""
-        return [self.lr_schedule]
+    def schedules(self) -> dict[str, Schedule]:
+        """The schedules that compiled code evaluates after each step, by name in its record."""
+        return {"learning_rate": self.lr_schedule}
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
         """Train as the library's ``learn`` does, on the engine of the settings."""
@@ -396,7 +396,8 @@ class CompiledNetworks(BaseAlgorithm):
         waited_for = [type(each).__name__ for each in _each(callback) if heeds_rollouts(each)]
         if waited_for:
             raise NotCompilable(f"{', '.join(waited_for)} must be asked at each rollout")
-        for schedule in self._schedules():
+        bounds = (getattr(self, name, None) for name in ("clip_range", "clip_range_vf"))
+        for schedule in (*self.schedules().values(), *filter(None, bounds)):
             compiled_schedule(schedule)
         assert self.env is not None
         return observed_world(self.env)

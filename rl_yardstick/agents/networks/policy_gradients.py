@@ -642,10 +642,6 @@ class PolicyTraining(NetworkTraining):
         addresses = (address_of(function, self.learner) for function in functions)
         return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
 
-    def schedules(self) -> dict[str, Schedule]:
-        """The schedules that compiled code evaluates after each step, by name in its record."""
-        return {"learning_rate": self.agent.lr_schedule}
-
     def take_over_progress(self, remaining: float) -> None:
         """Set the agent's share of the training that remained after the last rollout."""
         self.agent._current_progress_remaining = float(self.place["remaining"][0])
@@ -850,10 +846,6 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
             n_updates,
             batch_size,
         )
-
-    def _schedules(self) -> list[Schedule]:
-        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
-        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
 
     def collect_rollouts(
         self,

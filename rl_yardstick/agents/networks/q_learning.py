@@ -492,13 +492,6 @@ class QTraining(NetworkTraining):
         choose, learn = (address_of(function, learner) for function in (choose_greedily, train))
         return QAgent(learner, self.memory, self.seen, choose, learn)
 
-    def schedules(self) -> dict[str, Schedule]:
-        """The schedules that compiled code evaluates after each step, by name in its record."""
-        return {
-            "exploration": self.agent.exploration_schedule,
-            "learning_rate": self.agent.lr_schedule,
-        }
-
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
         self.read_generator()
@@ -654,8 +647,8 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
         seen = self.observation_space
         return work_of("q", [self.q_net], seen, n_steps, self.n_envs, n_updates, self.batch_size)
 
-    def _schedules(self) -> list[Schedule]:
-        return [*super()._schedules(), self.exploration_schedule]
+    def schedules(self) -> dict[str, Schedule]:
+        return {**super().schedules(), "exploration": self.exploration_schedule}
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
