@@ -65,7 +65,7 @@ class LearningAlgorithm(OnlineAlgorithm):
     _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
 
-    hidden_arguments = ("supported_action_spaces",)
+    hidden_arguments: ClassVar[tuple[str, ...]] = ("supported_action_spaces",)
 
     _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspaces")
     excluded_from_states: ClassVar[tuple[str, ...]] = ("_workspaces",)

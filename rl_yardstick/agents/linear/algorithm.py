@@ -169,7 +169,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
     parameters = {"gamma": np.float64}  # noqa: RUF012
     ranges = {"gamma": SHARE}  # noqa: RUF012
     values_states: ClassVar[bool] = False
-    hidden_arguments = ("policy_kwargs",)
+    hidden_arguments: ClassVar[tuple[str, ...]] = ("policy_kwargs",)
 
     act = act_on_tiles
 

@@ -145,6 +145,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self,
         policy: str | type[BasePolicy] = "QTablePolicy",
         env: GymEnv | str | None = None,
+        *,
         learning_rate: StepSize = 0.1,
         gamma: float = 0.99,
         exploration: ExplorationStrategy = "epsilon_greedy",
