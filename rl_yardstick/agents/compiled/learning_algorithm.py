@@ -172,7 +172,9 @@ class LearningAlgorithm(OnlineAlgorithm):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copied workspace would not share its arrays with the copied policy.
-        return {**self.__dict__, "_workspaces": {}}
+        classes = (vars(cls) for cls in type(self).__mro__)
+        names = {name for known in classes for name in known.get("excluded_from_states", ())}
+        return {**self.__dict__, **dict.fromkeys(names), "_workspaces": {}}
 
     def settings(self) -> NDArray[np.void]:
         """The agent's settings: an array of one record."""

@@ -19,8 +19,10 @@ from rl_yardstick.agents.compiled.env_states import (
     AFTER,
     BEFORE,
     Numbers,
+    look,
     move_on,
     observe,
+    show,
 )
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.references import Reference, address_of, call
@@ -32,7 +34,6 @@ from rl_yardstick.agents.networks.engine_setting import (
     Work,
     work_of,
 )
-from rl_yardstick.agents.networks.network_worlds import look, show
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -304,7 +305,7 @@ class QAgent(NamedTuple):
 
     learner: Any  # a reference to a `QLearner`
     memory: Any  # a reference to its `Memory`
-    seen: Any  # how observations are read, of `agents.networks.network_worlds`
+    seen: Any  # how observations are read, of `agents.compiled.env_states`
     choose: np.uintp  # the address of `choose_greedily`
     train: np.uintp  # the address of `train`
 
