@@ -14,7 +14,6 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
 )
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rl_yardstick.envs  # noqa: F401  # registers the environments
@@ -66,14 +65,10 @@ INTERPRETED = {  # reason: environment, settings, callback
     "rewards are drawn, and the environment's model": (partial(gym.make, "MaximizationBias-v0"),),
     "the environments are not alike": (
         lambda: DummyVecEnv([make_lake, partial(make_lake, is_slippery=False)]),),
-    "RecordEpisodeStatistics must see every step": (
-        partial(lake, wrapper_class=gym.wrappers.RecordEpisodeStatistics),),
     "the environment is shown on the screen": (partial(lake, env_kwargs={"render_mode": "human"}),),
     "a time limit lies outside Monitor": (
         partial(lake, wrapper_class=partial(TimeLimit, max_episode_steps=9)),),
-    "more than one Monitor": (partial(lake, wrapper_class=Monitor),),
     "under DiscretizeObservation and Monitor alone": (partial(pole, gym.wrappers.Autoreset),),
-    "with its default reward alone": (partial(pole, sutton_barto_reward=True),),
     "does not continue from the state": (lambda: TimeLimit(Deaf(), 10),),
     "the environment's P is not what step does: state ": (calm,),
     "schedule is a Python function": (lake, {"learning_rate": lambda progress: 0.1 * progress}),
@@ -169,16 +164,6 @@ def test_an_observation_outside_of_the_space_is_refused(name):
             model = load_algorithm(name)(env=Liar(*shown), seed=0)
             with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
                 model.learn(5)
-
-
-@pytest.mark.parametrize("name", ["qlearning", "semi_gradient_q", "optimal"])
-def test_predict_refuses_what_is_not_in_the_space(name):
-    """A negative number would be looked up from the table's end, and a fraction cut off."""
-    model = load_algorithm(name)(env=Liar(), seed=0)
-    for outside in (4, -1, 1.5):
-        for obs in (outside, np.array([0, outside])):
-            with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
-                model.predict(obs)
 
 
 # --- agents of one's own -------------------------------------------------------------------------

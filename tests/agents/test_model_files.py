@@ -1,11 +1,10 @@
 """What a model file holds beside tables comes back as it was, and nothing else can be built."""
 
 import copy
-import enum
 import json
 import re
 import zipfile
-from collections import OrderedDict, deque
+from collections import deque
 
 import gymnasium as gym
 import numpy as np
@@ -122,10 +121,6 @@ def test_it_comes_back_and_goes_on_where_it_was(name):
 # --- what has no place in the format -------------------------------------------------------------
 
 
-class Level(enum.Enum):
-    HIGH = 1
-
-
 # A class that only calls itself what the format knows.
 Impostor = type("Discrete", (), {"n": 3, "start": 0, "_np_random": None})
 
@@ -133,8 +128,6 @@ UNKNOWN = {
     "set": {1},
     "object": object(),
     "lambda": lambda progress: progress,
-    "enum": Level.HIGH,
-    "ordered dictionary": OrderedDict(a=1),
     "impostor of a space": Impostor(),
     "space of unknown parts": spaces.Tuple([spaces.Discrete(2), spaces.Text(3)]),
     "schedule of a function": FloatSchedule(lambda progress: progress),
@@ -167,28 +160,13 @@ def nodes(data):
     return [data, *(node for part in inner for node in nodes(part))]
 
 
-foreign_parts = st.sampled_from([node for sample in samples for node in nodes(sample)])
-odd_values = st.sampled_from(
-    [2**64, -(2**64), -1, 0.5, 1e400, "(2,,3)i4", "O", "<f16", "PCG64", [[1], 2], {}, []]
-)
 # Anything at all; and known types whose fields are anything, or parts of others.
-damaged = st.recursive(
-    json_values
-    | st.sampled_from([*CODECS, "builtins.eval", None, 3]).map(lambda name: {"type": name})
-    | st.sampled_from(sorted(CODECS)).flatmap(
-        lambda name: st.fixed_dictionaries(
-            dict.fromkeys(CODECS[name].fields, odd_values | foreign_parts | json_values)
-        ).map(lambda fields: {"type": name, **fields})
-    ),
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.sampled_from(samples).flatmap(
-            lambda sample: st.tuples(st.sampled_from(sorted(sample)), inner).map(
-                lambda change: {**sample, change[0]: change[1]}
-            )
-        )
-    ),
-    max_leaves=4,
+parts = st.sampled_from([node for sample in samples for node in nodes(sample)])
+odd_values = parts | st.sampled_from([2**64, -1, 0.5, 1e400, "O", "<f16", "PCG64", [[1], 2], {}])
+damaged = json_values | st.sampled_from(sorted(CODECS)).flatmap(
+    lambda name: st.fixed_dictionaries(
+        dict.fromkeys(CODECS[name].fields, odd_values | json_values)
+    ).map(lambda fields: {"type": name, **fields})
 )
 
 
@@ -207,9 +185,7 @@ def test_any_json_is_decoded_or_refused(data):
 OUT_OF_RANGE = [
     {"type": "os.system", "n": 3},
     {"type": "Discrete", "n": 3, "start": 0, "rng": 7},
-    {"type": "ndarray", "dtype": "<i8", "values": [1, 2], "shape": [3]},
     {"type": "ndarray", "dtype": "O", "values": [1], "shape": [1]},
-    {"type": "Generator", "state": {"type": "dict", "pairs": []}},
     {"type": "ExponentialSchedule", "start": 0.0, "end": 1.0, "end_fraction": 1.0},
 ]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import torch as th
@@ -118,7 +118,7 @@ class BanditAlgorithm(LearningAlgorithm):
             a mask is malformed or allows no arm.
     """
 
-    hidden_arguments = ("policy_kwargs",)
+    hidden_arguments: ClassVar[tuple[str, ...]] = ("policy_kwargs",)
     rewards_known: str = ANY  # rewards that the agent can learn from: `ANY`, `UNIT` or `BINARY`
 
     _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")

@@ -146,7 +146,7 @@ class LinearBanditAgent(RuleBandit):
     learn_from_reward = learn_by_model
     choose_allowed = choose_by_allowed_models
     pick = best_arm
-    hidden_arguments = ("learning_rate",)
+    hidden_arguments: ClassVar[tuple[str, ...]] = ("learning_rate",)
     ranges = {"ridge": POSITIVE}  # noqa: RUF012
 
     def __init__(

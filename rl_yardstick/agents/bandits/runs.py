@@ -20,8 +20,8 @@ from rl_yardstick.agents.bandits.linear import LinearBanditAgent
 from rl_yardstick.agents.bandits.tables import TableBandit
 from rl_yardstick.agents.bandits.thompson import Thompson
 from rl_yardstick.agents.compiled.engine import check_class
+from rl_yardstick.agents.compiled.env_states import COMPENSATED_SUM
 from rl_yardstick.agents.compiled.generators import generator_of, handles_of
-from rl_yardstick.agents.compiled.greedy_play import COMPENSATED_SUM
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
 from rl_yardstick.agents.compiled.loop import learn_from_last_step, run_block
 from rl_yardstick.agents.compiled.worlds import EPISODE, NotCompilable, env_dtype

@@ -106,6 +106,7 @@ class TableBandit(RuleBandit):
         self,
         policy: str | type[BasePolicy] = "BanditPolicy",
         env: GymEnv | str | None = None,
+        *,
         learning_rate: StepSize = 0.0,
         ignore_context: bool = False,
         **kwargs: Any,

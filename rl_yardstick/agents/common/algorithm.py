@@ -150,11 +150,6 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        if self.env is not None and self.env.num_envs != self.n_envs:
-            raise ValueError(
-                f"the agent works on {self.n_envs} environments, not {self.env.num_envs}: "
-                "change them by set_env"
-            )
         if reset_num_timesteps or self._last_obs is None:
             self._begin_episodes()
         total_timesteps, callback = super()._setup_learn(

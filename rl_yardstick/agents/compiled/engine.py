@@ -251,6 +251,7 @@ SETTINGS = (
     "_make_memory",
     "_make_policy",
     "_memory_in_use",
+    "_policy_arguments",
     "strategy",
     "tie_scale",
     "averages_samples",

@@ -56,6 +56,25 @@ def number_at(env: Any, moment: int) -> int:
     return int(env.obs if moment == BEFORE else env.next_obs)
 
 
+@inlined
+def look(seen: Any, env: Any, moment: int, inputs: Any, one_hot: int) -> None:
+    """Write the observation at this moment into the first row of a network's inputs."""
+    if one_hot:
+        inputs.indices[0] = number_at(env, moment)
+    else:
+        observe(seen, env, moment, inputs.vectors[0])
+
+
+@inlined
+def show(inputs: Any, i: int, row: Any, one_hot: int) -> None:
+    """Write a row of a buffer into the i-th row of a network's inputs."""
+    if one_hot:
+        inputs.indices[i] = int(row[0])
+    else:
+        for j in range(len(row)):
+            inputs.vectors[i, j] = np.float32(row[j])
+
+
 class Numbers(NamedTuple):
     """Observations are numbers, which networks get as one-hot vectors."""
 

@@ -23,7 +23,7 @@ from rl_yardstick.agents.common.settings import (
     TieBreaking,
     check_settings,
 )
-from rl_yardstick.agents.compiled.loop import CompiledClass, check_functions, settings_dtype
+from rl_yardstick.agents.compiled.loop import check_functions, settings_dtype
 from rl_yardstick.agents.compiled.worlds import PROGRESS, NotCompilable
 
 # One for training, and some for exploring with another generator or number of observations.
@@ -32,7 +32,7 @@ MOST_WORKSPACES = 4
 StepSize = float | Schedule | Literal["sample_average"]
 
 
-class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
+class LearningAlgorithm(OnlineAlgorithm):
     """Learns with a step size, explores by a schedule, and breaks ties between best actions.
 
     Compiled functions, which are attributes of the class, define how the agent acts and learns.
@@ -65,7 +65,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
 
-    hidden_arguments = ("supported_action_spaces",)
+    hidden_arguments: ClassVar[tuple[str, ...]] = ("supported_action_spaces",)
 
     _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspaces")
     excluded_from_states: ClassVar[tuple[str, ...]] = ("_workspaces",)
@@ -172,7 +172,9 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copied workspace would not share its arrays with the copied policy.
-        return {**self.__dict__, "_workspaces": {}}
+        classes = (vars(cls) for cls in type(self).__mro__)
+        names = {name for known in classes for name in known.get("excluded_from_states", ())}
+        return {**self.__dict__, **dict.fromkeys(names), "_workspaces": {}}
 
     def settings(self) -> NDArray[np.void]:
         """The agent's settings: an array of one record."""

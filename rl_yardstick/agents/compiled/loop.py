@@ -12,7 +12,6 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from rl_yardstick.agents.common.schedules import schedule_value
-from rl_yardstick.agents.common.settings import CheckedConstructor
 from rl_yardstick.machine_code.cache import RULE_PREFIX
 from rl_yardstick.machine_code.compiling import (
     INLINED_OPTIONS,
@@ -69,17 +68,6 @@ def _class_of(argument: Any) -> type | None:
         return next((_ALGORITHMS[name] for name in record.fields if name in _ALGORITHMS), None)
     chosen: type = kind.instance_class
     return chosen
-
-
-class CompiledClass(CheckedConstructor):
-    """Metaclass of algorithms; refuses to replace functions that are compiled into loops."""
-
-    def __setattr__(cls, name: str, value: object) -> None:  # noqa: N805  # of a metaclass
-        if name in _NAMES:
-            raise AttributeError(
-                f"{cls.__name__}.{name} is compiled into its loop: define a subclass with another"
-            )
-        super().__setattr__(name, value)
 
 
 def check_functions(algorithm: type) -> None:

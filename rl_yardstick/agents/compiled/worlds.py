@@ -121,8 +121,6 @@ EPISODE = np.dtype(
 # A `FiniteModel` repeats the environment's own `step` and `reset` bit for bit, with the same
 # generator: each call draws one uniform number.
 
-FINITE_ENV = env_dtype(("state", np.int64))
-
 # One outcome of an action: S states, A actions and K outcomes make an array of shape (S, A, K).
 OUTCOME = np.dtype(
     [

@@ -10,7 +10,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
@@ -23,7 +22,7 @@ from rl_yardstick.agents.common.settings import (
     check_space,
     check_vectors,
 )
-from rl_yardstick.agents.compiled.engine import EngineChoice, choose_engine
+from rl_yardstick.agents.compiled.engine import EngineChoice
 from rl_yardstick.agents.compiled.env_states import BEFORE, move_on
 from rl_yardstick.agents.compiled.generators import handles_of
 from rl_yardstick.agents.compiled.worlds import env_dtype
@@ -169,7 +168,7 @@ class TileAlgorithm(WorkspaceAlgorithm):
     parameters = {"gamma": np.float64}  # noqa: RUF012
     ranges = {"gamma": SHARE}  # noqa: RUF012
     values_states: ClassVar[bool] = False
-    hidden_arguments = ("policy_kwargs",)
+    hidden_arguments: ClassVar[tuple[str, ...]] = ("policy_kwargs",)
 
     act = act_on_tiles
 
@@ -240,13 +239,6 @@ class TileAlgorithm(WorkspaceAlgorithm):
         """A player with the same actions as `predict` on compiled environments."""
         agent = self.compiled_agent(self.rng, seen)
         return TilePlayer(agent.weights, agent.tiles, agent.seen, agent.room)
-
-    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        engine = choose_engine(self, callback, log_interval)
-        if engine is not None:
-            engine.run(total_timesteps)
-            return
-        super()._run(total_timesteps, callback, log_interval)
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> TileWorkspace:
         return TileWorkspace(self.compiled_agent(rng), self.observation_space, rng, n)

@@ -116,7 +116,7 @@ class NetworkEngine(CompiledEngine):
         super().__init__(training.agent, (world, training.seen), callback, log_interval)
 
     def _learner(self) -> Any:
-        for name, schedule in self.training.schedules().items():
+        for name, schedule in self.agent.schedules().items():
             self.progress[0][f"{name}_schedule"] = compiled_schedule(schedule)
         self.training.read_settings()
         self._take_generators()

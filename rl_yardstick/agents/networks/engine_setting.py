@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import inspect
 import statistics
-import sys
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
@@ -195,30 +193,18 @@ def machine_pace() -> float:
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
 TOO_SHORT = "so short a training is not worth compiling"
-# The attribute in which PyTorch's ``_disable_dynamo`` keeps a method excluded from its compiler.
-_KEPT_OUT = "__dynamo_disable"
 
 
 def do_without_torch_compiler() -> None:
     """Let optimizers be made, saved and loaded without importing PyTorch's compiler.
 
-    At the first call their methods import the compiler, only to exclude themselves from it, which
-    takes a second. That is needless until something else imports it. ``step`` imports it anyway.
+    At the first call their methods import the compiler, which takes a second, only to exclude
+    themselves from it; unless they find themselves in this attribute. ``step`` imports it anyway.
     """
     for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
         method = getattr(getattr(Optimizer, name), "__wrapped__", None)
-        if method is not None and not hasattr(method, _KEPT_OUT):
-            setattr(method, _KEPT_OUT, partial(_call_without_compiler, name, method))
-
-
-def _call_without_compiler(
-    name: str, method: Any, optimizer: Optimizer, *args: Any, **kwargs: Any
-) -> Any:
-    if "torch._dynamo" not in sys.modules:
-        return method(optimizer, *args, **kwargs)
-    if hasattr(method, _KEPT_OUT):
-        delattr(method, _KEPT_OUT)
-    return getattr(Optimizer, name)(optimizer, *args, **kwargs)
+        if method is not None and not hasattr(method, "__dynamo_disable"):
+            setattr(method, "__dynamo_disable", method)  # no name to mangle
 
 
 @dataclass(frozen=True)
@@ -314,9 +300,9 @@ class CompiledNetworks(BaseAlgorithm):
 
         return network_player(self.shared_networks(seen)[0][0], seen, predicted)
 
-    def _schedules(self) -> list[Schedule]:
-        """The schedules that compiled code evaluates."""
-        return [self.lr_schedule]
+    def schedules(self) -> dict[str, Schedule]:
+        """The schedules that compiled code evaluates after each step, by name in its record."""
+        return {"learning_rate": self.lr_schedule}
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
         """Train as the library's ``learn`` does, on the engine of the settings."""
@@ -396,7 +382,8 @@ class CompiledNetworks(BaseAlgorithm):
         waited_for = [type(each).__name__ for each in _each(callback) if heeds_rollouts(each)]
         if waited_for:
             raise NotCompilable(f"{', '.join(waited_for)} must be asked at each rollout")
-        for schedule in self._schedules():
+        bounds = (getattr(self, name, None) for name in ("clip_range", "clip_range_vf"))
+        for schedule in (*self.schedules().values(), *filter(None, bounds)):
             compiled_schedule(schedule)
         assert self.env is not None
         return observed_world(self.env)

@@ -14,9 +14,12 @@ import numpy as np
 import torch as th
 
 from rl_yardstick.agents.common.exploration import first_best
-from rl_yardstick.agents.compiled.env_states import BEFORE, move_on
+from rl_yardstick.agents.compiled.env_states import (
+    BEFORE,
+    look,
+    move_on,
+)
 from rl_yardstick.agents.compiled.references import Reference, address_of, call
-from rl_yardstick.agents.networks.network_worlds import look
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -103,7 +106,7 @@ class NetworkPlayer(NamedTuple):
     """The agent for the compiled loop."""
 
     network: Any  # an `AskingNetwork`
-    seen: Any  # how observations are read, of `agents.networks.network_worlds`
+    seen: Any  # how observations are read, of `agents.compiled.env_states`
     choose: np.uintp  # the address of `choose_surely`
 
     @inlined

@@ -23,8 +23,10 @@ from rl_yardstick.agents.compiled.env_states import (
     AFTER,
     BEFORE,
     Numbers,
+    look,
     move_on,
     observe,
+    show,
 )
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.learning_algorithm import compiled_schedule
@@ -32,7 +34,6 @@ from rl_yardstick.agents.compiled.references import Reference, address_of, call
 from rl_yardstick.agents.compiled.worlds import SCHEDULE, NotCompilable
 from rl_yardstick.agents.networks.engine import NOWHERE, NetworkTraining, record_of
 from rl_yardstick.agents.networks.engine_setting import CompiledNetworks, Work, work_of
-from rl_yardstick.agents.networks.network_worlds import look, show
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -458,7 +459,7 @@ class PolicyAgent(NamedTuple):
 
     learner: Any  # a reference to a `PolicyLearner`
     memory: Any  # a reference to its `RolloutMemory`
-    seen: Any  # how observations are read, of `agents.networks.network_worlds`
+    seen: Any  # how observations are read, of `agents.compiled.env_states`
     choose: np.uintp  # the address of `choose_randomly`
     evaluate: np.uintp  # the address of `evaluate`
     estimate: np.uintp  # the address of `estimate_advantages`
@@ -641,10 +642,6 @@ class PolicyTraining(NetworkTraining):
         functions = (choose_randomly, evaluate, estimate_advantages, train)
         addresses = (address_of(function, self.learner) for function in functions)
         return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
-
-    def schedules(self) -> dict[str, Schedule]:
-        """The schedules that compiled code evaluates after each step, by name in its record."""
-        return {"learning_rate": self.agent.lr_schedule}
 
     def take_over_progress(self, remaining: float) -> None:
         """Set the agent's share of the training that remained after the last rollout."""
@@ -850,10 +847,6 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
             n_updates,
             batch_size,
         )
-
-    def _schedules(self) -> list[Schedule]:
-        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
-        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
 
     def collect_rollouts(
         self,

@@ -19,8 +19,10 @@ from rl_yardstick.agents.compiled.env_states import (
     AFTER,
     BEFORE,
     Numbers,
+    look,
     move_on,
     observe,
+    show,
 )
 from rl_yardstick.agents.compiled.generators import handles_of, next_uniform
 from rl_yardstick.agents.compiled.references import Reference, address_of, call
@@ -32,7 +34,6 @@ from rl_yardstick.agents.networks.engine_setting import (
     Work,
     work_of,
 )
-from rl_yardstick.agents.networks.network_worlds import look, show
 from rl_yardstick.agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -304,7 +305,7 @@ class QAgent(NamedTuple):
 
     learner: Any  # a reference to a `QLearner`
     memory: Any  # a reference to its `Memory`
-    seen: Any  # how observations are read, of `agents.networks.network_worlds`
+    seen: Any  # how observations are read, of `agents.compiled.env_states`
     choose: np.uintp  # the address of `choose_greedily`
     train: np.uintp  # the address of `train`
 
@@ -492,13 +493,6 @@ class QTraining(NetworkTraining):
         choose, learn = (address_of(function, learner) for function in (choose_greedily, train))
         return QAgent(learner, self.memory, self.seen, choose, learn)
 
-    def schedules(self) -> dict[str, Schedule]:
-        """The schedules that compiled code evaluates after each step, by name in its record."""
-        return {
-            "exploration": self.agent.exploration_schedule,
-            "learning_rate": self.agent.lr_schedule,
-        }
-
     def read_settings(self) -> None:
         """Read settings that a callback may have changed."""
         self.read_generator()
@@ -654,8 +648,8 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
         seen = self.observation_space
         return work_of("q", [self.q_net], seen, n_steps, self.n_envs, n_updates, self.batch_size)
 
-    def _schedules(self) -> list[Schedule]:
-        return [*super()._schedules(), self.exploration_schedule]
+    def schedules(self) -> dict[str, Schedule]:
+        return {**super().schedules(), "exploration": self.exploration_schedule}
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

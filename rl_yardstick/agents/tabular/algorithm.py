@@ -35,7 +35,7 @@ from rl_yardstick.agents.common.settings import (
     TieBreaking,
     check_space,
 )
-from rl_yardstick.agents.compiled.engine import EngineChoice, choose_engine
+from rl_yardstick.agents.compiled.engine import EngineChoice
 from rl_yardstick.agents.compiled.generators import handles_of
 from rl_yardstick.agents.compiled.greedy_play import Plan
 from rl_yardstick.agents.compiled.learning_algorithm import StepSize
@@ -145,6 +145,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         self,
         policy: str | type[BasePolicy] = "QTablePolicy",
         env: GymEnv | str | None = None,
+        *,
         learning_rate: StepSize = 0.1,
         gamma: float = 0.99,
         exploration: ExplorationStrategy = "epsilon_greedy",
@@ -250,17 +251,6 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         if self.asks_for_masks:
             raise NotCompilable("the action masks are not known of all states")
 
-    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        engine = choose_engine(self, callback, log_interval)
-        if engine is not None:
-            engine.run(total_timesteps)
-            return
-        self._in_use = None
-        super()._run(total_timesteps, callback, log_interval)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "last_steps": None}
-
     def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Take over the records of the compiled loop."""
         super().take_over(envs, progress)
@@ -274,12 +264,7 @@ class TabularAlgorithm(WorkspaceAlgorithm):
         if self.asks_for_masks:
             assert self.env is not None
             self.policy.note_masks(self._last_obs, present_masks(self.env, self._last_obs))
-        workspace: TableWorkspace | None = self._in_use
-        if workspace is None or workspace.rng is not self.rng:
-            return super()._choose_actions()
-        # The workspace is up to date since the last learning, except for ended episodes.
-        workspace.episodes[0] = self._episode_num
-        return workspace.act(self._last_obs)
+        return super()._choose_actions()
 
     def _learn_from(self, transitions: Transitions) -> None:
         if self.asks_for_masks:

@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import is_vectorized_observation
 
 from rl_yardstick.agents.common.algorithm import Transitions
+from rl_yardstick.agents.compiled.engine import choose_engine
 from rl_yardstick.agents.compiled.learning_algorithm import LearningAlgorithm
 from rl_yardstick.agents.compiled.loop import act, learn_from_step
 from rl_yardstick.agents.compiled.references import Reference, address_of
@@ -144,9 +146,6 @@ class WorkspaceAlgorithm(LearningAlgorithm):
         self._in_use: Any = None  # the workspace of the last learning
         super().__init__(*args, **kwargs)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_in_use": None}
-
     def _make_memory(self) -> tuple[Any, ...]:
         """An empty memory for ``n_envs`` environments: a NamedTuple of arrays."""
         return ()
@@ -158,6 +157,13 @@ class WorkspaceAlgorithm(LearningAlgorithm):
     def _begin_episodes(self) -> None:
         self._next_actions = np.full(self.n_envs, UNDECIDED)
         self._memory = self._make_memory()
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        engine = choose_engine(self, callback, log_interval)
+        if engine is None:
+            super()._run(total_timesteps, callback, log_interval)
+        else:
+            engine.run(total_timesteps)
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Write the agent's state into the records of the compiled loop."""
