@@ -16,7 +16,7 @@ from rl_yardstick.pipeline.environments import training_changes
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.tuning.retesting import Candidate, retest_study
-from rl_yardstick.tuning.suggesting import planned_run
+from rl_yardstick.tuning.suggesting import planned_runs
 
 TRAIN, ENJOY, COMPARE = train, enjoy, compare
 LAKE = ["--env", "FrozenLake-v1"]
@@ -178,7 +178,7 @@ def test_a_search_runs_on_auto_and_is_tested_again_as_it_will_be_used(tmp_path):
     ):
         tuning = tuned("--algo", *words.split())
         entry = {"n_timesteps": 10, **tuning.agent.settings}
-        run = planned_run(tuning, tmp_path, entry, seed=0)
+        run, *_ = planned_runs(tuning, tmp_path, entry)
         assert run.spec.algorithm.get("engine") == search
         study = retest_study(tuning, tmp_path, [Candidate(1, entry, 0.5)])
         engines = {r.spec.algorithm.get("engine") for r in plan(study, tmp_path)}
