@@ -104,13 +104,14 @@ def test_each_run_ends_for_itself_alone(walk):
 
 
 def test_a_run_that_takes_too_long_goes_on_later(walk, own_folder):
-    _, (run,) = walk(3)
-    failures, _ = done([run], timeout=2.0)
-    assert failures == {3: "took longer than --run-timeout allows, 2 s"}
+    _, (run,) = walk(3, n_timesteps=5000)
+    failures, _ = done([run], timeout=10.0)
+    assert failures == {3: "took longer than --run-timeout allows, 10 s"}
     assert states([run]) == [INTERRUPTED]
     assert (run.path / "state.bin").exists()
     (own_folder / "mark").touch()
-    assert done([run]) == ({}, "1 of 1 runs in 0 s\n") or states([run]) == [FINISHED]
+    assert done([run])[0] == {}
+    assert states([run]) == [FINISHED]
     assert not (run.path / "state.bin").exists()
 
 
