@@ -89,11 +89,21 @@ def build_parser() -> argparse.ArgumentParser:
     resumed = "do what is left of the study in this folder, as it was asked for"
     add("--resume", type=Path, metavar="STUDY", help=resumed)
 
-    group = parser.add_argument_group("judgement and output")
+    _add_output_flags(parser.add_argument_group("judgement and output"))
+
+    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
+    add("--logged", type=Path, metavar="LOG.csv", help="judge trained agents on logged pulls")
+    add("--policy", nargs="+", default=[], type=Path, metavar="RUN", help="run folders or zips")
+    named = "the log's own names of columns, e.g. arm=item_id reward=click"
+    add("--columns", nargs="+", default=[], metavar="NAME=COLUMN", help=named)
+    return parser
+
+
+def _add_output_flags(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
     add("--metric", help="the figure that verdicts compare: final, best, area, regret, ...")
-    margin = "difference of the means within which agents are tied"
-    add("--margin", type=_margin, help=margin)
+    tied = "difference of the means within which agents are tied"
+    add("--margin", type=_margin, help=tied)
     add("--episodes-table", type=COUNT, metavar="N", help="average, min, max of every N episodes")
     filmed = "film one episode after every N episodes"
     add("--render-every", type=whole_number(0), default=0, metavar="N", help=filmed)
@@ -109,13 +119,6 @@ def build_parser() -> argparse.ArgumentParser:
     add("--figures", nargs="+", choices=kinds, metavar="FORMAT", help=formats)
     add("--no-report", action="store_true", help="only tables: no figures and no page")
 
-    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
-    add("--logged", type=Path, metavar="LOG.csv", help="judge trained agents on logged pulls")
-    add("--policy", nargs="+", default=[], type=Path, metavar="RUN", help="run folders or zips")
-    named = "the log's own names of columns, e.g. arm=item_id reward=click"
-    add("--columns", nargs="+", default=[], metavar="NAME=COLUMN", help=named)
-    return parser
-
 
 def _margin(text: str) -> float:
     with suppress(ValueError):
@@ -130,7 +133,7 @@ def _margin(text: str) -> float:
 def main() -> int:
     """Do a study, or judge policies on a log; return the exit code."""
     args = build_parser().parse_args()
-    from rl_yardstick.pipeline.modules import import_modules, split_id
+    from rl_yardstick.pipeline.modules import check_typed, import_modules, split_id
     from rl_yardstick.pipeline.run import Stop
 
     stop = Stop().listen()
@@ -162,13 +165,6 @@ def main() -> int:
             looks = plan_of_looks(record.study, root, args.max_seeds)
             record = replace(record, looks=looks)
         return carry_out(job, record, args.replace)
-
-
-def check_typed(recorded: Sequence[str], typed: Sequence[str], where: str) -> None:
-    """Refuse to import what only a file names."""
-    from rl_yardstick.pipeline.modules import check_typed as check
-
-    check(recorded, typed, where)
 
 
 @dataclass(frozen=True)
@@ -289,7 +285,7 @@ def _engines(planned: Sequence[PlannedRun]) -> str:
 def do_study(
     job: Job, study: StudySpec, planned: Sequence[PlannedRun], known: dict[Any, Any] | None = None
 ) -> StudyResults:
-    """Do the missing runs of a study, and read all results; ``known`` were read or failed before."""
+    """Do the missing runs of a study, and read all; ``known`` were read or failed before."""
     from rl_yardstick.experiments.pool import do_runs
 
     known = {} if known is None else known
@@ -331,31 +327,19 @@ def look_by_look(
         is_over = said.is_done or is_enough(said)
         if said.n_looks != n_said:
             n_said = said.n_looks
-            job.console.print(_on_look(said, record.looks, is_over=is_over))
+            job.console.print(_on_look(said, record.looks))
         if is_over:
             return results, said
         counts = {**counts, **next_counts(said)}
 
 
-def _on_look(said: Study, looks: Sequence[int], *, is_over: bool) -> str:
-    """The result of a look: the number of undecided pairs, and which agents get more seeds."""
-    from rl_yardstick.report.words import enumeration, seeds
-
-    text = f"look {said.n_looks} of {len(looks)}, at {seeds(looks[max(said.n_looks - 1, 0)])}: "
+def _on_look(said: Study, looks: Sequence[int]) -> str:
+    """The result of a look: its number of seeds, and of undecided pairs."""
+    text = f"look {said.n_looks} of {len(looks)}, at {looks[max(said.n_looks - 1, 0)]:,} seeds: "
     n_undecided = sum(pair.word == "undecided" for pair in said.pairs)
     if not n_undecided:
         return f"{text}all pairs are decided"
-    text += f"{n_undecided} of {len(said.pairs)} pairs undecided"
-    if is_over:
-        return text
-    size = looks[said.n_looks]
-    names = [
-        f"{name} on {environment}" if len(said.seeds) > 1 else name
-        for environment, by in said.seeds.items()
-        for name, wanted in by.items()
-        if wanted == size
-    ]
-    return f"{text}; {enumeration(names)} {'goes' if len(names) == 1 else 'go'} on to {seeds(size)}"
+    return f"{text}{n_undecided} of {len(said.pairs)} pairs undecided"
 
 
 def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
@@ -371,9 +355,6 @@ def conclude(job: Job, results: StudyResults, looks: tuple[int, ...]) -> int:
                 tell(f"{environment}: {refusal}; figures are sampled")
         if note := mixed_versions(run.recorded() for run in results.finished):
             tell(note)
-    for path, reason in results.failures.items():
-        run = next(run for run in results.planned if run.path == path)
-        tell(f"failed: {run.title}: {reason}")
     for one in results.left_out:
         again = f"remove {one.planned.path} to do it again"
         tell(f"left out: {one.planned.title}: {one.reason}; {again}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +26,7 @@ from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.evaluation.yardstick import FAILED, Yardstick
 from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.verdicts import (
+    UNBOUNDED,
     AgentRuns,
     Best,
     Bounds,
@@ -41,9 +42,7 @@ from rl_yardstick.verdicts import (
     summarise_steps,
 )
 
-# The metrics on the scale of the best random or constant policy.
-ON_THE_SCALE = ("final", "best")
-
+ON_THE_SCALE = ("final", "best")  # metrics on the scale of the best random or constant policy
 # Prefixes of the entry points of agents that do not learn.
 FIXED_POLICIES = ("rl_yardstick.agents.planning:", "rl_yardstick.agents.reference:")
 
@@ -55,23 +54,24 @@ OVERALL = "all environments"  # the name of the comparison of scores over all en
 # --- the evidence for verdicts --------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Evidence:
     """The evidence for verdicts on an environment."""
 
     environment: str  #: its label
     #: By agent, the metric of its seeds, shape (n_seeds,): NaN for a missing run.
-    values: Mapping[str, Floats]
-    seeds: Mapping[str, int]  #: by agent, the planned number of seeds
+    values: Mapping[str, Floats] = field(default_factory=dict)
+    seeds: Mapping[str, int] = field(default_factory=dict)  #: by agent, its planned seeds
     #: The highest expected return of any policy, or an upper bound of it; None if unknown.
     optimum: float | None
-    optimum_at_least: float | None  #: a lower bound of the optimum; None if it is exact or unknown
+    #: A lower bound of the optimum; None if ``optimum`` is exact or unknown.
+    optimum_at_least: float | None = None
     baseline: float | None  #: expected return of the best random or constant policy, or None
     threshold: float | None  #: the return that counts as solved, or None
     bounds: Bounds  #: the least and the greatest possible return
-    certain: frozenset[str]  #: the agents that do not depend on chance
+    certain: frozenset[str] = frozenset()  #: the agents that do not depend on chance
     is_score: bool  #: whether verdicts are on scores, from the baseline (0) to the optimum (1)
-    is_cost: bool  #: whether a lower metric is better
+    is_cost: bool = False  #: whether a lower metric is better
     margin: float  #: the largest difference that does not matter, in scores or else in the metric
 
     @cached_property
@@ -144,7 +144,7 @@ def _bounds(results: StudyResults, environment: str, optimum: float | None) -> B
         return 0.0, np.inf
     first = {run.agent: run for run in results.planned if run.environment == environment}
     if study.metric in OF_TRAINING and any(training_changes(r.spec) for r in first.values()):
-        return -np.inf, np.inf  # returns of training on a changed environment
+        return UNBOUNDED  # returns of training on a changed environment
     with closing(make_single_env(next(iter(first.values())).spec)) as env:
         low, high = return_bounds(env)
     return low, high if optimum is None or study.metric in OF_TRAINING else min(high, optimum)
@@ -248,8 +248,7 @@ def _in_order(pairs: Sequence[Pair], names: Sequence[str]) -> tuple[Pair, ...]:
 
 # --- each environment -----------------------------------------------------------------------------
 
-# The mark of agents that were trained on a changed environment.
-MARK = "†"
+MARK = "†"  # of agents that were trained on a changed environment
 
 
 @dataclass(frozen=True)
@@ -275,8 +274,7 @@ class AgentAnalysis:
     steps_to_threshold: ThresholdSummary | None
     episodes_to_stay: ThresholdSummary | None  #: episodes until it reached the threshold for good
     success_rate: Estimate | None  #: of the final policy; None if not reported
-    #: Processor time of training; nan for runs of older versions, which did not measure it.
-    seconds: Estimate
+    seconds: Estimate  #: processor time of training
     #: Whether it was trained on a variant of the environment, whose returns cannot be compared
     #: with those of evaluations or the optimum.
     on_variant: bool = False
@@ -298,19 +296,11 @@ class AgentAnalysis:
         return f"{self.agent} {MARK}" if self.changes else self.agent
 
 
-@dataclass(frozen=True)
-class EnvironmentAnalysis:
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentAnalysis(Evidence):
     """The comparison of agents on one environment."""
 
-    environment: str  #: its label
     env_id: str  #: its Gymnasium id
-    #: The highest expected return of any policy, or an upper bound of it; None if unknown.
-    optimum: float | None
-    baseline: float | None  #: expected return of the best random or constant policy, or None
-    threshold: float | None  #: the return that counts as solved, or None
-    is_score: bool  #: whether verdicts are on scores, from the baseline (0) to the optimum (1)
-    margin: float  #: the largest difference that does not matter, in scores or else in the metric
-    bounds: Bounds  #: the least and the greatest possible return
     exact: bool  #: whether all final returns are exact expectations, not means of episodes
     agents: tuple[AgentAnalysis, ...]  #: the agents, the best first
     pairs: tuple[Pair, ...]  #: all pairs, better ranked agent first
@@ -318,10 +308,7 @@ class EnvironmentAnalysis:
     failure_threshold: float | None  #: the score below which a run failed; None if not defined
     #: Missing runs by agent, including agents without a finished run.
     missing: Mapping[str, int] = field(default_factory=dict)
-    seeds: Mapping[str, int] = field(default_factory=dict)  #: by agent, its planned seeds
     looks: tuple[int, ...] = ()  #: the seeds at each look, if the study grows until it is decided
-    #: A lower bound of the optimum; None if ``optimum`` is exact or unknown.
-    optimum_at_least: float | None = None
     optimum_is_proven: bool = True  #: whether the upper bound is proven
     #: In a partially observable environment, the optimum of agents that see the state; else None.
     full_optimum: float | None = None
@@ -380,23 +367,15 @@ def _analyse_environment(
     agents.sort(key=lambda a: last if np.isnan(a.runs.mean) else a.runs.mean, reverse=True)
     names, threshold = [agent.agent for agent in agents], said.failure_threshold[environment]
     return EnvironmentAnalysis(
-        environment=environment,
+        **{one.name: getattr(evidence, one.name) for one in fields(evidence)},
         env_id=str(table["env_id"].iloc[0]),
-        optimum=evidence.optimum,
-        baseline=evidence.baseline,
-        threshold=evidence.threshold,
-        is_score=evidence.is_score,
-        margin=evidence.margin,
-        bounds=evidence.bounds,
         exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is neither True nor False
         agents=tuple(agents),
         pairs=_in_order([p for p in said.pairs if p.environment == environment], names),
         best=said.best[environment],
         failure_threshold=None if np.isnan(threshold) else threshold,
         missing=missing,
-        seeds=evidence.seeds,
         looks=tuple(looks),
-        optimum_at_least=evidence.optimum_at_least,
         optimum_is_proven=not (table["optimum_is_proven"] == False).any(),  # noqa: E712  # likewise
         full_optimum=_first(table, "full_optimum") if "full_optimum" in table else None,
         measured_by=_only(table["measured_by"]) or None if "measured_by" in table else None,
@@ -436,12 +415,18 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         column_of = table.set_index("seed")[column].reindex(study.seeds[:n_seeds])
         return column_of.to_numpy(dtype=np.float64, na_value=np.nan)
 
-    def mean(column: str, bounds: Bounds = (-np.inf, np.inf)) -> Estimate:
+    def mean(column: str, bounds: Bounds = UNBOUNDED) -> Estimate:
         return mean_over_runs(values(column), bounds)
 
-    has_threshold = bool(table["threshold"].notna().any())
+    def steps(column: str) -> ThresholdSummary | None:
+        has_threshold = table["threshold"].notna().any()
+        return summarise_steps(values(column)) if has_threshold else None
+
+    def known(column: str, bounds: Bounds = UNBOUNDED) -> Estimate | None:
+        return mean(column, bounds) if table[column].notna().any() else None
+
     compared = evidence.scores[agent]
-    known = compared[np.isfinite(compared)]
+    finite = compared[np.isfinite(compared)]
     sign = -1.0 if evidence.is_cost else 1.0
     low, high = evidence.score_bounds if evidence.is_score else evidence.bounds
     judged = mean_over_runs(compared if evidence.is_score else sign * compared, (low, high))
@@ -449,7 +434,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
     score = None
     if optimum is not None and baseline is not None and Yardstick(optimum, baseline).has_scale:
         score = mean_over_runs(np.clip(values("score"), 0, 1), UNIT)
-    of_returns = evidence.bounds if study.metric in ON_THE_SCALE else (-np.inf, np.inf)
+    of_returns = evidence.bounds if study.metric in ON_THE_SCALE else UNBOUNDED
     first = next(run for run in results.planned if run.labels == (agent, environment))
     changes = training_changes(first.spec)
     return AgentAnalysis(
@@ -457,7 +442,7 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
         runs=runs,
         judged=judged,
-        spread=float(known.std(ddof=1)) if len(known) > 1 else 0.0,
+        spread=float(finite.std(ddof=1)) if len(finite) > 1 else 0.0,
         n_runs=len(table),
         n_missing=n_seeds - len(table),
         metric=summarise(values(study.metric), evidence.bounds),
@@ -466,16 +451,16 @@ def _analyse_agent(results: StudyResults, evidence: Evidence, runs: AgentRuns) -
         area=mean("area", of_returns),
         last_episodes=mean("last_episodes"),
         regret=mean("regret", (0.0, np.inf)),
-        steps_to_threshold=summarise_steps(values("steps_to_threshold")) if has_threshold else None,
-        steps_to_stay=summarise_steps(values("steps_to_stay")) if has_threshold else None,
-        episodes_to_stay=summarise_steps(values("episodes_to_stay")) if has_threshold else None,
-        success_rate=mean("success_rate", UNIT) if table["success_rate"].notna().any() else None,
+        steps_to_threshold=steps("steps_to_threshold"),
+        steps_to_stay=steps("steps_to_stay"),
+        episodes_to_stay=steps("episodes_to_stay"),
+        success_rate=known("success_rate", UNIT),
         seconds=mean("cpu_seconds", (0.0, np.inf)),
         on_variant=bool(changes),
         changes=changes,
-        stochastic=mean("stochastic_return") if table["stochastic_return"].notna().any() else None,
+        stochastic=known("stochastic_return"),
         acts_by=_only(table["acts_by"]),
-        discounted=mean("discounted_return") if table["discounted_return"].notna().any() else None,
+        discounted=known("discounted_return"),
         discount=_first(table, "discount"),
         discounted_optimum=_first(table, "discounted_optimum"),
     )

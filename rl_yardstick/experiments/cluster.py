@@ -1,8 +1,8 @@
 """Runs of a study on a cluster, through Dask: `do_run`, unchanged, on its workers.
 
 The workers share the study's folder with this process, and have the same versions of the libraries:
-both are checked at the start. Runs of a worker that is lost are done again by others, three times at
-most. Encryption and certificates are matters of Dask's own configuration.
+both are checked at the start. Runs of a lost worker are done again by others, three times at most.
+Encryption and certificates are matters of Dask's own configuration.
 """
 
 from __future__ import annotations

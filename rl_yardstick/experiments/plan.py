@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -178,11 +178,8 @@ def specs_of(study: StudySpec) -> dict[Labels, TrainSpec]:
             f"{study.name}: {n_agents:,} agents on {n_environments:,} environments with "
             f"{study.n_seeds:,} seeds are {n_runs:,} runs; a study has {MOST_RUNS:,} at most"
         )
-    _check_folders(
-        "agents", {agent.label: file_name(agent.label) for agent in study.agents}, n_agents
-    )
-    folders = {environment.label: environment.folder for environment in study.environments}
-    _check_folders("environments", folders, n_environments)
+    _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
+    _check_folders("environments", [(one.label, one.folder) for one in study.environments])
     specs = {}
     for environment, agent in product(study.environments, study.agents):
         check_env_id(environment.env_id)
@@ -202,19 +199,18 @@ def _naming_the_place(agent: AgentSpec, environment: EnvironmentSpec) -> Iterato
         raise UserError(f"{place}{agent.label} on {environment.label}: {error}") from error
 
 
-def _check_folders(what: str, folders: Mapping[str, str], n: int) -> None:
+def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
     """Refuse labels that are equal, or lead to the same folder."""
-    if len(folders) < n:
-        raise UserError(f"{what}: two of them have the same label")
     taken: dict[str, str] = {}
-    for label, folder in folders.items():
+    for label, folder in places:
         # Some file systems ignore case, and the difference of "ä" and "a" with a combining mark.
-        first = taken.setdefault(normalize("NFC", folder.casefold()), label)
-        if first != label:
+        key = normalize("NFC", folder.casefold())
+        if key in taken:
             raise UserError(
-                f"{what}: {first!r} and {label!r} would share the folder {folder}: "
+                f"{what}: {taken[key]!r} and {label!r} would share the folder {folder}: "
                 "give them labels that differ in letters or digits"
             )
+        taken[key] = label
 
 
 def _is_batch(spec: TrainSpec) -> bool:
@@ -318,7 +314,7 @@ class StudyRecord:
             {"agent": agent, "environment": environment, "spec": spec.model_dump()}
             for (agent, environment), spec in self.specs.items()
         ]
-        study = _STUDY.dump_python(self.study, mode="json")
+        study = asdict(self.study, dict_factory=_with_paths_as_texts)
         write_json(root / RECORD, {"study": study, "looks": self.looks, "specs": specs})
 
     @classmethod
@@ -340,6 +336,10 @@ class StudyRecord:
             return cls(_STUDY.validate_python(data["study"]), specs, looks)
         except (ValidationError, LookupError, TypeError, ValueError) as error:
             raise UserError(f"{root / RECORD} is no study of this version") from error
+
+
+def _with_paths_as_texts(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {key: str(value) if isinstance(value, Path) else value for key, value in pairs}
 
 
 def other_settings(planned: Sequence[PlannedRun]) -> list[tuple[PlannedRun, dict[str, Any]]]:

@@ -146,7 +146,7 @@ class Workers:
             deadline = time.monotonic() + GRACE
             for worker in workers:
                 worker.join(max(deadline - time.monotonic(), 0.0))
-            self._pool.stop()
+            self._pool.stop()  # type: ignore[no-untyped-call]
             self._pool.join()
             self._pool = None
 

@@ -317,8 +317,10 @@ class _File(_Part):
 
 
 # Keys that mean the same as fields of `StudySpec`.
-_SAME = ("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness")
-_SAME += ("threshold", "episodes_table", "diagnose", "run_timeout")
+_SAME = (
+    *("description", "eval_freq", "eval_episodes", "metric", "margin", "shared_randomness"),
+    *("threshold", "episodes_table", "diagnose", "run_timeout"),
+)
 
 
 @dataclass(frozen=True)

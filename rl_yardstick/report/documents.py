@@ -21,20 +21,8 @@ from rl_yardstick.experiments.results import StudyResults
 from rl_yardstick.experiments.study import METRIC_WORDS
 from rl_yardstick.pipeline.errors import visible
 from rl_yardstick.pipeline.files import replacing, write_json, write_text
-from rl_yardstick.report.conclusions import (
-    conclusion,
-    none_has_learnt,
-    on_changes,
-    unproven_sentences,
-    unseen_sentence,
-)
-from rl_yardstick.report.words import (
-    enumeration,
-    interval,
-    number,
-    score_number,
-    seed_sentence,
-)
+from rl_yardstick.report import words
+from rl_yardstick.report.words import enumeration, interval, number, score_number, seed_sentence
 
 # A markup is named by the suffix of its files and of its templates.
 Markup = Literal["md", "tex"]
@@ -42,8 +30,6 @@ MARKUPS: tuple[Markup, ...] = get_args(Markup)
 
 PLAIN_NAME = re.compile(r"[\w.=+-]+")
 
-
-# Escaping of plain text.
 
 # What Markdown takes for markup: no underscores inside words, no brackets without a link.
 _MARKUP = re.compile(r"[\\`*<>|~&]|(?<!\w)_|_(?!\w)|\](?=[(\[:])|^[#+-]")
@@ -172,13 +158,13 @@ def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
         title=study.title,
         command=visible(command),
         seeds=seed_sentence(study.seeds, tuning_seeds(study)),
-        unseen=unseen_sentence(analysis),
+        unseen=words.unseen_sentence(analysis),
         headline=headline(analysis),
         environments=[
             {
                 "name": environment.environment,
                 "ranking": ranking(analysis.results, environment),
-                "sentences": conclusion(study, environment).everything,
+                "sentences": words.conclusion(study, environment).everything,
             }
             for environment in analysis.environments
         ],
@@ -209,6 +195,7 @@ def headline(analysis: StudyAnalysis) -> Table:
 
 def _legend(analysis: StudyAnalysis) -> str:
     study, environments = analysis.study, analysis.environments
+    what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
     if all(one.is_score for one in environments):
         what = (
             "Mean score: 1 is the optimum, 0 the best random or constant policy, and less counts "
@@ -217,32 +204,29 @@ def _legend(analysis: StudyAnalysis) -> str:
         names = [one.environment for one in environments if one.optimum_at_least is not None]
         if names:
             what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
-            what = " ".join([what, *unproven_sentences(environments)])
-    else:
-        what = f"{METRIC_WORDS[study.metric].capitalize()}: the mean; scores where they are known."
+            what = " ".join([what, *words.unproven_sentences(environments)])
     text = (
         f"{what} ±: the standard deviation of runs. Bold: the best agents, where another is shown "
         "to be worse on average."
     )
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
-    return " ".join([text, *on_changes(environments)])
+    return " ".join([text, *words.on_changes(environments)])
 
 
 def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Cell]:
     """The cell of each agent that has a run."""
     best = environment.best.agents
-    if none_has_learnt(analysis.study, environment) or len(best) == len(environment.agents):
-        best = ()  # nobody is shown to be worse
-    costs = processor_seconds(analysis.results)
-    cells = {}
+    is_for_all = len(best) == len(environment.agents)  # nobody is shown to be worse
+    if is_for_all or words.none_has_learnt(analysis.study, environment):
+        best = ()
+    costs, cells = processor_seconds(analysis.results), {}
     for agent in environment.agents:
         figure = number(agent.metric.mean.point)
         if environment.is_score:
             figure = score_number(agent.judged.point)
         cost = costs.get((agent.agent, environment.environment))
-        runs = agent.runs
-        spread = number(float(f"{agent.spread:.2g}"))
+        spread, runs = number(float(f"{agent.spread:.2g}")), agent.runs
         notes = "" if spread == "0" else f" ± {spread}"
         notes += "" if cost is None else f" ({duration(cost)})"
         notes += f", {runs.failed} of {runs.n} failed" if runs.failed else ""
@@ -295,8 +279,6 @@ def duration(time: float) -> str:
     digits = 1 - math.floor(math.log10(time))
     return f"{round(time, digits):,.{max(digits, 0)}f} s"
 
-
-# A study as files: comma-separated values, and verdicts as Markdown and LaTeX.
 
 PAIR_COLUMNS = (
     *("environment", "first", "second", "verdict", "word", "so_far", "difference", "low", "high"),

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -30,7 +30,6 @@ from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, file_name
 from rl_yardstick.mdp.transition_model import Floats, Ints
 from rl_yardstick.pipeline.curve_pictures import DWARFED, symlog_ticks
 from rl_yardstick.pipeline.files import replacing
-from rl_yardstick.pipeline.signs_of_life import Tell, tell_nobody
 from rl_yardstick.report.series import (
     COLOURS,
     DASHES,
@@ -89,6 +88,16 @@ FORMATS = ("png", "svg", "pdf")
 
 LOG = "(log scale)"
 
+# A name beside the end of a line, and what leads to it.
+_NAME: Any = {
+    "textcoords": "axes fraction",
+    "fontsize": _SMALL,
+    "verticalalignment": "center",
+    "linespacing": 1.1,
+    "annotation_clip": False,
+}
+_TO_A_NAME: Any = {"arrowstyle": "-", "shrinkA": 0, "shrinkB": 0, "relpos": (0, 0.5)}
+
 
 def line_style(mark: Mark) -> dict[str, Any]:
     """Colour and line style of an agent, as Matplotlib's functions take them."""
@@ -124,17 +133,17 @@ class FigureFiles:
             yield axes
             for form in sorted(set(self.formats), key=FORMATS.index):
                 self.written.append(self.folder / f"{name}.{form}")
-                with replacing(self.written[-1]) as file:
-                    write(canvas, form, file)
+                with replacing(self.written[-1]) as beside:
+                    write(canvas, form, beside)
                 # The other formats keep the layout of the first: computing it takes longest.
                 canvas.set_layout_engine("none")
 
 
-def write(canvas: Figure, form: str, file: BinaryIO) -> None:
+def write(canvas: Figure, form: str, path: Path) -> None:
     """Write a figure by its backend; `savefig` would draw twice, first for the layout."""
     backend = import_module(f"matplotlib.backends.backend_{'agg' if form == 'png' else form}")
     undated = {"svg": {"metadata": {"Date": None}}, "pdf": {"metadata": {"CreationDate": None}}}
-    getattr(backend.FigureCanvas(canvas), f"print_{form}")(file, **undated.get(form, {}))
+    getattr(backend.FigureCanvas(canvas), f"print_{form}")(path, **undated.get(form, {}))
 
 
 def width_of(text: str, size: float = _SMALL) -> float:
@@ -181,9 +190,7 @@ def _figure_of(axes: Axes) -> Figure:
 
 def band_words(n_curves: int) -> str:
     """The legend's entry for the shaded intervals of ``n_curves`` curves."""
-    return (
-        "95 % interval" if n_curves <= MOST_BANDS else f"95 % interval, of the first {MOST_BANDS}"
-    )
+    return "95 % interval" + (f", of the first {MOST_BANDS}" if n_curves > MOST_BANDS else "")
 
 
 def shared_legend(*places: Axes, band: str = "") -> None:
@@ -195,17 +202,16 @@ def shared_legend(*places: Axes, band: str = "") -> None:
     # Agents before references.
     grey = {name for name in found if getattr(found[name], "get_color", str)() == REFERENCE}
     found = {name: found[name] for name in sorted(found, key=grey.__contains__)}
-    figure = _figure_of(places[0])
     found |= {band: Patch(color=REFERENCE, alpha=0.2, linewidth=0)} if band else {}
+    figure = _figure_of(places[0])
     names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in found]
     lines = [name.split("\n") for name in names]
-    widest = max(width_of(line, _SMALL) for name in lines for line in name) + 0.65
+    widest = max(width_of(line) for name in lines for line in name) + 0.65
     n_columns = min(len(names), max(int((figure.get_figwidth() - 0.3) / widest), 1))
     n_rows = -(-len(names) // n_columns) * max(map(len, lines))
     figure.set_figheight(figure.get_figheight() + _LINE * (n_rows + 1))
-    handles = list(found.values())
     style = {"ncols": n_columns, "frameon": False, "handlelength": 2.5}  # as long as a dash and dot
-    figure.legend(handles, names, loc="outside lower center", **style)
+    figure.legend([*found.values()], names, loc="outside lower center", **style)
 
 
 def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
@@ -224,49 +230,30 @@ def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> Non
     heights = [(y - low) / ((high - low) or 1.0) for y in seen]
     places = _apart(heights, [inch / inches for inch in needed])
     for name, (_, x, _, colour), y, place in zip(names, ends, seen, places, strict=True):
-        axes.annotate(
-            name,
-            (x, y),
-            xytext=(1.04, place),
-            textcoords="axes fraction",
-            fontsize=_SMALL,
-            color=colour,
-            verticalalignment="center",
-            linespacing=1.1,
-            annotation_clip=False,
-            arrowprops={
-                "arrowstyle": "-",
-                "color": colour,
-                "linewidth": 0.5 if y < high else 0,
-                "shrinkA": 0,
-                "shrinkB": 0,
-                "relpos": (0, 0.5),
-            },
-        )
+        arrow = {"color": colour, "linewidth": 0.5 if y < high else 0, **_TO_A_NAME}
+        axes.annotate(name, (x, y), (1.04, place), color=colour, arrowprops=arrow, **_NAME)
 
 
 def _apart(wanted: Sequence[float], sizes: Sequence[float]) -> list[float]:
     """Centres in [0, 1] near the wanted ones, so that no labels of these sizes overlap."""
 
-    def span(group: list[int]) -> tuple[float, float]:
-        # Bottom and top of a stack of labels, near the mean of their wanted centres.
+    def bottom(group: list[int]) -> float:
+        """That of a stack of labels, near the mean of their wanted centres."""
         total = sum(sizes[k] for k in group)
         middle = float(np.mean([wanted[k] for k in group]))
-        bottom = min(max(middle - total / 2, 0.0), 1 - total)
-        return bottom, bottom + total
+        return min(max(middle - total / 2, 0.0), 1 - total)
 
-    groups: list[list[int]] = []
-    for k in sorted(range(len(wanted)), key=lambda k: wanted[k]):
-        group = [k]
-        while groups and span(groups[-1])[1] > span(group)[0]:
-            group = groups.pop() + group
-        groups.append(group)
+    stacks: list[list[int]] = []
+    for k in np.argsort(wanted, kind="stable").tolist():
+        stack = [k]
+        while stacks and bottom(stacks[-1]) + sum(sizes[j] for j in stacks[-1]) > bottom(stack):
+            stack = stacks.pop() + stack
+        stacks.append(stack)
     places = list(wanted)
-    for group in groups:
-        bottom = span(group)[0]
-        for k in group:
-            places[k] = bottom + sizes[k] / 2
-            bottom += sizes[k]
+    for stack in stacks:
+        tops = bottom(stack) + np.cumsum([sizes[k] for k in stack])
+        for k, top in zip(stack, tops.tolist(), strict=True):
+            places[k] = top - sizes[k] / 2
     return places
 
 
@@ -281,8 +268,7 @@ UPRIGHT = 6  # the largest number of names that fit side by side
 
 def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks: Marks) -> None:
     """Average reward and share of optimal arms by pull: figure 2.2 of Sutton and Barto."""
-    found = series.pulls.items()
-    rewards: list[Line] = [(a, p.pulls, p.reward, line_style(marks[a])) for a, p in found]
+    rewards = _by_pull(series, "reward", marks)
     if series.best is not None:
         pulls = rewards[0][1][[0, -1]]
         style = {"color": REFERENCE, "linestyle": "-"}
@@ -290,9 +276,16 @@ def draw_rewards(upper: Axes, lower: Axes, series: PullSeries, place: str, marks
     _draw_lines(upper, rewards)
     lettering(upper, title=f"{place}, {series.n_runs:,} runs", x="pulls", y="average reward")
     lower.set_ylim(0, 1)
-    _draw_lines(lower, [(a, p.pulls, p.optimal, line_style(marks[a])) for a, p in found])
+    _draw_lines(lower, _by_pull(series, "optimal", marks))
     lower.yaxis.set_major_formatter(PercentFormatter(1))
     lettering(lower, x="pulls", y="runs that pull a best arm")
+
+
+def _by_pull(series: PullSeries, what: str, marks: Marks) -> list[Line]:
+    """A statistic as a line for each agent that has it."""
+    found = [(agent, p, getattr(p, what)) for agent, p in series.pulls.items()]
+    known = [one for one in found if np.isfinite(one[-1]).any()]
+    return [(agent, p.pulls, y, line_style(marks[agent])) for agent, p, y in known]
 
 
 def _draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
@@ -305,11 +298,10 @@ def _draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
 def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> None:
     """Cumulative regret on a logarithmic axis of pulls, with the bounds from theory."""
     axes.set_xscale("log")
-    lines: list[Line] = []
+    lines = _by_pull(series, "cumulative_regret", marks)
     # The interval of the mean and the spread of runs, or fewer bands where agents are many.
     kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
     for agent, pulls in series.pulls.items():
-        lines.append((agent, pulls.pulls, mean_regret(pulls).y, line_style(marks[agent])))
         for curve_of, alpha in kinds:
             fill_band(axes, curve_of(pulls), marks[agent], alpha)
     words = ("", " with its 95 % interval", f", its 95 % interval, and {SPREAD} of the runs")
@@ -332,9 +324,7 @@ def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> Non
 def draw_simple_regret(axes: Axes, series: PullSeries, marks: Marks) -> None:
     """Simple regret: the best mean reward less that of the arm pulled most so far."""
     axes.set_xscale("log")
-    found = series.pulls.items()
-    known = [(a, p) for a, p in found if np.isfinite(p.simple_regret).any()]
-    _draw_lines(axes, [(a, p.pulls, p.simple_regret, line_style(marks[a])) for a, p in known])
+    _draw_lines(axes, _by_pull(series, "simple_regret", marks))
     title = "of recommending the arm pulled most"
     lettering(axes, title=title, x=_PULLS, y="simple regret")
 
@@ -407,38 +397,35 @@ def draw_learning_curves(
     marks: Marks,
 ) -> None:
     """Draw each of the `panels` on its axes, with intervals for the first (best) agents."""
-    title = f"{environment.environment}: "
-    kinds = panels(curves)
+    kinds, on_variant = panels(curves), curves["training"].on_variant
     scales = {kind: curves[kind].linear_up_to for kind, _ in kinds}
     # Returns on a variant are another metric, with an axis of its own.
-    if not curves["training"].on_variant:
+    if not on_variant:
         known = [scale for scale in scales.values() if scale is not None]
         scales = dict.fromkeys(scales, known[0] if known else None)
-        for place in places[1:]:
-            place.sharey(places[0])
-    for place, (kind, by) in zip(places, kinds, strict=True):
+        for axes in places[1:]:
+            axes.sharey(places[0])
+    for axes, (kind, by) in zip(places, kinds, strict=True):
         found = curves[kind]
         # Before the lines, because the limits depend on the scale.
-        words = _set_scale(place, scales[kind])
-        _draw_curves(place, found.by_axis[by], marks)
-        for agent, curve in found.by_axis[by].items():
-            if agent in found.on_variant:
-                # Circles mark the curve of a variant without colour.
-                colour = COLOURS[marks[agent].colour]
-                (circles,) = place.plot(curve.x, curve.y, "o", ms=5, mfc="white", color=colour)
-                circles.set_markevery(CIRCLES_APART)
-        if not found.on_variant:
-            _draw_references(place, environment)
+        words = _set_scale(axes, scales[kind])
+        _draw_curves(axes, found.by_axis[by], marks)
+        for agent in filter(found.by_axis[by].__contains__, found.on_variant):
+            # Circles mark the curve of a variant without colour.
+            curve, colour = found.by_axis[by][agent], COLOURS[marks[agent].colour]
+            (circles,) = axes.plot(curve.x, curve.y, "o", ms=5, mfc="white", color=colour)
+            circles.set_markevery(CIRCLES_APART)
+        title = f"{environment.environment}: " if axes is places[0] else ""
         title += "evaluations" if kind == "evaluation" else "training episodes"
         if found.on_variant:
-            n = len(found.on_variant)
-            names = found.on_variant[0] if n == 1 else f"{n} agents"
+            n = len(on_variant)
+            names = on_variant[0] if n == 1 else f"{n} agents"
             title += f" ({names}: on a variant of the environment)"
-        lettering(place, title=title, x=_AXES[by], y=f"return{words}")
-        place.xaxis.set_major_formatter(EngFormatter(sep=""))
-        title = ""
-    if curves["training"].on_variant:
-        # The legend's entry for the circles.
+        else:
+            _draw_references(axes, environment)
+        lettering(axes, title=title, x=_AXES[by], y=f"return{words}")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    if on_variant:  # the legend's entry for the circles
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
     shared_legend(*places, band=band_words(len(environment.agents)))
 
@@ -467,10 +454,11 @@ def _set_scale(axes: Axes, linear_up_to: float | None) -> str:
 
 
 def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
-    is_known = environment.optimum_at_least is None
-    most = "optimum, at most" if environment.optimum_is_proven else "optimum, at most (not proven)"
+    most = "optimum"
+    if environment.optimum_at_least is not None:
+        most += ", at most" + ("" if environment.optimum_is_proven else " (not proven)")
     for label, height, style in (
-        ("optimum" if is_known else most, environment.optimum, "-"),
+        (most, environment.optimum, "-"),
         ("optimum, at least", environment.optimum_at_least, "--"),
         ("best random or constant policy", environment.baseline, ":"),
     ):
@@ -488,28 +476,29 @@ def draw_runs(
     """Each run as a dot, the mean with its interval; the best agent on top."""
     upwards = runs[::-1]
     for row, agent in enumerate(upwards):
-        colour = COLOURS[marks[agent.agent].colour]
-        n = len(agent.values)
+        colour, mean, n = COLOURS[marks[agent.agent].colour], agent.mean, len(agent.values)
         spread = np.linspace(-0.18, 0.18, n) if n > 1 else np.zeros(n)
         axes.plot(agent.values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
-        mean = agent.mean
         bar = "D" if mean.low == mean.high else "-"  # a bar of no length is invisible
         axes.plot([mean.low, mean.high], [row, row], bar, color=colour, lw=5, ms=7, alpha=0.35)
         axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
     names = [wrapped(agent.agent, NAMES) for agent in upwards]
-    axes.set_yticks(range(len(upwards)), names)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(-0.6, len(names) - 0.4)
     lines = max(name.count("\n") + 1 for name in names)
     _figure_of(axes).set_figheight(1.1 + len(names) * max(0.32, _LINE * lines + 0.04))
-    axes.set_ylim(-0.6, len(upwards) - 0.4)
     title = environment.environment
     if metric in ("final", "best") and environment.optimum is not None:
-        axes.axvline(environment.optimum, color=REFERENCE, linewidth=1)
-        if environment.optimum_at_least is None:
-            title += "; the line is the optimum"
-        else:
-            axes.axvline(environment.optimum_at_least, color=REFERENCE, linewidth=1)
-            title += "; the optimum lies between the lines"
-            title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
+        at_least = environment.optimum_at_least
+        for end in (environment.optimum, at_least):
+            if end is not None:
+                axes.axvline(end, color=REFERENCE, linewidth=1)
+        title += (
+            "; the line is the optimum"
+            if at_least is None
+            else "; the optimum lies between the lines"
+        )
+        title += "" if environment.optimum_is_proven else " (the upper one is not proven)"
     ends = "range" if all(a.mean.is_range for a in runs) else "95 % interval"
     x = f"{METRIC_WORDS[metric]}; mean, {ends}, each seed"
     x += "; diamond: all runs are equal" if any(a.mean.low == a.mean.high for a in runs) else ""
@@ -525,6 +514,8 @@ def draw_sweeps(
     names = list(dict.fromkeys(sweep.parameter for sweep in sweeps.values()))
     values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
     words = _set_scale_of_values(axes, values)
+    best = with_best_mean(environment, *(sweep.labels for sweep in sweeps.values()))
+    rings: list[tuple[float, float]] = []
     for place, (group, sweep) in enumerate(sweeps.items()):
         mark = Mark(group, place % len(COLOURS), DASHES[place % len(DASHES)])
         x, y = sweep.means.x, sweep.means.y
@@ -536,22 +527,13 @@ def draw_sweeps(
             ends, colour = (sweep.means.low, sweep.means.high), COLOURS[mark.colour]
             axes.vlines(x, *ends, color=colour, alpha=0.35, linewidth=4, transform=at)
             axes.update_datalim(np.column_stack([np.tile(x, 2), np.concatenate(ends)]))
+        rings += [at for *at, name in zip(x, y, sweep.labels, strict=True) if name in best]
     axes.autoscale_view()
-    best = with_best_mean(
-        environment, [label for sweep in sweeps.values() for label in sweep.labels]
-    )
-    rings = [
-        (x, y)
-        for sweep in sweeps.values()
-        for label, x, y in zip(sweep.labels, sweep.means.x, sweep.means.y, strict=True)
-        if label in best
-    ]
     if rings:
-        x, y = np.transpose(rings)
         prefix = f"{next(iter(sweeps))} with " if len(sweeps) == 1 else ""
         told = enumeration([label.removeprefix(prefix) for label in best])
         label = f"best mean: {told}" if len(best) <= FEW else "best mean"
-        axes.scatter(x, y, 90, "none", edgecolor="black", label=label, zorder=3)
+        axes.scatter(*np.transpose(rings), 90, "none", edgecolor="black", label=label, zorder=3)
     if len(values) <= MOST_TICKS:
         axes.xaxis.set_major_locator(FixedLocator(_ticks_apart(axes, values)))
         axes.xaxis.set_minor_locator(NullLocator())
@@ -595,7 +577,7 @@ def draw_grid(
     colours = mpl.colormaps["Blues"](0.05 + 0.75 * shares)
     across, down = (np.arange(-0.5, n) for n in grid.means.shape[::-1])  # edges of the cells
     axes.pcolormesh(across, down, colours, edgecolor="white", linewidth=1)
-    best = with_best_mean(environment, [label for row in grid.labels for label in row])
+    best = with_best_mean(environment, *grid.labels)
     for (row, column), mean in np.ndenumerate(grid.means):
         if not np.isnan(mean):
             ink = "white" if shares[row, column] > 0.6 else "black"
@@ -621,15 +603,6 @@ def _brief(text: str) -> str:
     return wrapped(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…", 1.0)
 
 
-def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark, scale: float | None) -> None:
-    """Average, minimum and maximum of each block of an agent's episodes."""
-    words = _set_scale(axes, scale)
-    colour = COLOURS[mark.colour]
-    for column, style in BLOCKS.items():
-        axes.plot(rows["episode"], rows[column], style, marker="o", markersize=3, color=colour)
-    lettering(axes, title=mark.label, x="episode", y=f"return{words}")
-
-
 def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
     """The share of runs whose score is higher than each threshold."""
     for agent, shares in overall.profiles.items():
@@ -649,9 +622,7 @@ MOST_LINES = 14
 MOST_IN_PAIRS = 8  # the largest number of panels in two columns; more are in three
 
 
-def write_figures(
-    series: StudySeries, episodes_table: pd.DataFrame | None, tell: Tell = tell_nobody
-) -> list[Path]:
+def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> list[Path]:
     """Draw all figures that the study's runs allow into its folder ``figures``; return the files.
 
     ``episodes_table`` is the result of `report.series.episodes_table`, or None for no such figure.
@@ -660,14 +631,10 @@ def write_figures(
     files.folder.mkdir(exist_ok=True)
     for one in series.environments:
         if one.pulls is not None:
-            name = one.environment.environment
-            tell(name)
-            _bandit_figures(files, one.pulls, name, series.marks)
+            _bandit_figures(files, one.pulls, one.environment.environment, series.marks)
     for one in series.environments:
-        tell(one.environment.environment)
         _study_figures(files, series, one, episodes_table)
     if series.analysis.overall is not None:
-        tell("all environments")
         with files.figure("performance_profiles") as (axes,):
             draw_profiles(axes, series.analysis.overall, series.marks)
     return files.written
@@ -699,22 +666,25 @@ def _study_figures(
 
 
 def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Marks) -> None:
-    agents = list(dict.fromkeys(rows["agent"]))
-    if agents:
-        n_columns = min(len(agents), 2 if len(agents) <= MOST_IN_PAIRS else 3)
-        n_rows = -(-len(agents) // n_columns)
-        with files.figure(name, n_columns, n_rows, height=2.2) as places:
-            found = {agent: rows[rows["agent"] == agent] for agent in agents}
-            curves = [each[column].to_numpy(float) for each in found.values() for column in BLOCKS]
-            for axes in places[1 : len(agents)]:
-                axes.sharey(places[0])
-            for axes, (agent, blocks) in zip(places, found.items(), strict=False):
-                draw_blocks(axes, blocks, marks[agent], linear_up_to(curves, None))
-            for axes in places[len(agents) :]:
-                axes.set_visible(False)
-            for label, style in BLOCKS.items():
-                places[0].plot([], [], style, marker="o", ms=3, color=REFERENCE, label=label)
-            shared_legend(places[0])
+    found = {str(agent): found for agent, found in rows.groupby("agent", sort=False)}
+    if not found:
+        return
+    n_columns = min(len(found), 2 if len(found) <= MOST_IN_PAIRS else 3)
+    curves = [each[column].to_numpy(float) for each in found.values() for column in BLOCKS]
+    with files.figure(name, n_columns, -(-len(found) // n_columns), height=2.2) as places:
+        for axes in places[1 : len(found)]:
+            axes.sharey(places[0])
+        for axes, (agent, blocks) in zip(places, found.items(), strict=False):
+            words = _set_scale(axes, linear_up_to(curves, None))
+            look = {"marker": "o", "markersize": 3, "color": COLOURS[marks[agent].colour]}
+            for column, style in BLOCKS.items():
+                axes.plot(blocks["episode"], blocks[column], style, **look)
+            lettering(axes, title=agent, x="episode", y=f"return{words}")
+        for axes in places[len(found) :]:
+            axes.set_visible(False)
+        for label, style in BLOCKS.items():
+            places[0].plot([], [], style, marker="o", ms=3, color=REFERENCE, label=label)
+        shared_legend(places[0])
 
 
 def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:

@@ -177,6 +177,7 @@ def _by_pulls(cell: Callable[[PullStatistics], Cell]) -> Callable[[Row], Cell | 
     return lambda row: None if row.pulls is None else cell(row.pulls)
 
 
+# A new statistic is one more entry.
 COLUMNS = (
     Column(lambda row: estimate_cell(row.agent.metric.mean), "Mean", "over seeds", "mean"),
     Column(lambda row: number_cell(row.agent.metric.iqm), "IQM", "middle half"),

@@ -30,8 +30,6 @@ from rl_yardstick.pipeline.curve_pictures import DWARFED
 from rl_yardstick.pipeline.environments import make_single_env
 from rl_yardstick.verdicts import UNBOUNDED, Bounds, Estimate
 
-# One colour and one line style for each agent, the same in every figure of a study.
-
 # Okabe and Ito's palette, which is safe for colour-blind readers. The page's style sheet repeats
 # it, and has another one for the dark theme.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -57,14 +55,12 @@ class Mark:
 def agent_marks(study: StudySpec) -> dict[str, Mark]:
     """The marks of the agents by label, in the order of the study."""
     marks = {}
-    for place, label in enumerate(agent.label for agent in study.agents):
-        dash = DASHES[place % len(DASHES)]
+    for place, agent in enumerate(study.agents):
         again, colour = divmod(place, len(COLOURS))
-        marks[label] = Mark(label, colour, dash, again % len(DASHES))
+        dash, shape = DASHES[place % len(DASHES)], again % len(DASHES)
+        marks[agent.label] = Mark(agent.label, colour, dash, shape)
     return marks
 
-
-# Learning curves of all agents, by step, episode and wall time.
 
 KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
@@ -140,13 +136,10 @@ def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | Non
     known = [finite for curve in curves if len(finite := curve[np.isfinite(curve)])]
     if not known:
         return None
-    if optimum is None:
-        optimum = max(float(np.abs(curve[-max(len(curve) // 4, 1) :]).max()) for curve in known)
-    scale = max(abs(optimum), 1.0)
+    ends = [curve[-max(len(curve) // 4, 1) :] for curve in known]
+    magnitude = max(float(np.abs(end).max()) for end in ends) if optimum is None else abs(optimum)
+    scale = max(magnitude, 1.0)
     return scale if max(float(np.abs(curve).max()) for curve in known) >= DWARFED * scale else None
-
-
-# Training returns, summed up by blocks of episodes.
 
 
 def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
@@ -169,8 +162,6 @@ def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
     return grouped.agg(average="mean", minimum="min", maximum="max").reset_index()
 
 
-# The posteriors of Thompson sampling, as densities to draw.
-
 N_POINTS = 241
 
 
@@ -189,22 +180,18 @@ class Belief:
 def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Belief:
     """The densities of an agent's posteriors, at all recorded moments."""
     spec = next(planned.spec for planned in results.planned if planned.agent == agent)
-    means = statistics.true_means
+    means, parameters = statistics.true_means, statistics.posteriors
     # Parameters: mean and standard deviation of a normal, alpha and beta of a Beta distribution.
     if spec.algorithm.get("likelihood") == "gaussian":
         family, low, high = stats.norm, means.min() - 2, means.max() + 2
     else:
         family, low, high = stats.beta, 0.0, min(2 * float(means.max()), 1.0)
     points = np.linspace(low, high, N_POINTS)
-    parameters = statistics.posteriors
+    densities = family.pdf(points, parameters[..., :1], parameters[..., 1:])
     _, n_contexts, n_arms, _ = parameters.shape
-    return Belief(
-        agent,
-        statistics.moments,
-        points,
-        family.pdf(points, parameters[..., :1], parameters[..., 1:]),
-        means.tolist() if n_contexts == len(means) else [[None] * n_arms] * n_contexts,
-    )
+    has_means = n_contexts == len(means)
+    true_means = means.tolist() if has_means else [[None] * n_arms] * n_contexts
+    return Belief(agent, statistics.moments, points, densities, true_means)
 
 
 # Bounds from theory on the regret of bandit agents.
@@ -336,8 +323,7 @@ def mean_regret(statistics: PullStatistics) -> Curve:
 
 def regret_of_runs(statistics: PullStatistics) -> Curve:
     """Cumulative regret: the median over runs, and the outer quantiles as its interval."""
-    low, *_, high = statistics.cumulative_regret_quantiles
-    median = statistics.cumulative_regret_quantiles[QUANTILES.index(0.5)]
+    low, _, median, _, high = statistics.cumulative_regret_quantiles
     return Curve(statistics.pulls.astype(np.float64), median, low, high)
 
 
@@ -353,30 +339,26 @@ def regret_bounds(env: gym.Env[Any, Any], statistics: PullStatistics) -> RegretB
 
 def arm_series(known: Pulls) -> ArmSeries | None:
     """Shares and estimates of arms that are the same in all runs; None if there are none."""
-    if not known:
+    means = next((statistics.true_means for statistics in known.values()), None)
+    if means is None:
         return None
-    means = next(iter(known.values())).true_means
-    contexts, arms = means.shape
+    n_contexts, n_arms = means.shape
+    estimates = {
+        agent: (
+            np.broadcast_to(statistics.estimates, means.shape).ravel(),
+            np.broadcast_to(statistics.estimates_std, means.shape).ravel(),
+        )
+        for agent, statistics in known.items()
+        if np.isfinite(statistics.estimates).any()
+    }
+    where = [f"context {context}, " if n_contexts > 1 else "" for context in range(n_contexts)]
     return ArmSeries(
-        names=[
-            f"arm {arm}" if contexts == 1 else f"context {context}, arm {arm}"
-            for context in range(contexts)
-            for arm in range(arms)
-        ],
+        names=[f"{context}arm {arm}" for context in where for arm in range(n_arms)],
         means=means.ravel(),
         shares={agent: statistics.shares.ravel() for agent, statistics in known.items()},
-        estimates={
-            agent: (
-                np.broadcast_to(statistics.estimates, means.shape).ravel(),
-                np.broadcast_to(statistics.estimates_std, means.shape).ravel(),
-            )
-            for agent, statistics in known.items()
-            if np.isfinite(statistics.estimates).any()
-        },
+        estimates=estimates,
     )
 
-
-# The metric of each run, and the means with their intervals.
 
 LEAST_VALUES = 3  # the smallest number of values of a parameter for a figure
 
@@ -460,9 +442,10 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
     return found
 
 
-def with_best_mean(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
-    """Which of these agents have the best mean."""
-    means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in labels}
+def with_best_mean(environment: EnvironmentAnalysis, *labels: Sequence[str]) -> list[str]:
+    """Which of the agents with these labels have the best mean."""
+    known = set().union(*labels)
+    means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in known}
     best = next(iter(means.values()), math.nan)
     return [label for label, mean in means.items() if math.isclose(mean, best)]
 
@@ -477,9 +460,6 @@ def _groups(
         if len(spec.swept) == n_parameters and spec.label in there:
             groups.setdefault((spec.group, *spec.swept), []).append(spec)
     return groups
-
-
-# All numbers in the figures of a study, the same for paper and for the page.
 
 
 @dataclass(frozen=True)
@@ -510,13 +490,7 @@ def study_series(analysis: StudyAnalysis) -> StudySeries:
     environments = []
     for one in analysis.environments:
         pulls = pull_series(results, one)
-        found = EnvironmentSeries(
-            environment=one,
-            curves=learning_curves(results, one) if pulls is None else None,
-            runs=run_series(results, one),
-            pulls=pulls,
-            sweeps=sweeps(agents, one),
-            grids=grids(agents, one),
-        )
-        environments.append(found)
+        curves = learning_curves(results, one) if pulls is None else None
+        swept = sweeps(agents, one), grids(agents, one)
+        environments.append(EnvironmentSeries(one, curves, run_series(results, one), pulls, *swept))
     return StudySeries(analysis, agent_marks(analysis.study), tuple(environments))

@@ -16,19 +16,22 @@ from rl_yardstick.experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from rl_yardstick.experiments.off_policy import difference_in_value, mean_reward
 from rl_yardstick.experiments.plan import tuning_seeds
 from rl_yardstick.experiments.study import METRIC_WORDS, StudySpec
-from rl_yardstick.report.conclusions import (
+from rl_yardstick.report.ranking import BANDIT_COLUMNS, COLUMNS, Column, Row, filled
+from rl_yardstick.report.words import (
     conclusion,
+    enumeration,
+    number,
+    optimum_words,
     overall_sentences,
     pairs_both_ways,
+    seed_sentence,
     seeds_of,
     unseen_sentence,
 )
-from rl_yardstick.report.ranking import BANDIT_COLUMNS, COLUMNS, Column, Row, filled
-from rl_yardstick.report.words import enumeration, number, optimum_words, seed_sentence
 from rl_yardstick.verdicts import FEW, Estimate
 
 if TYPE_CHECKING:  # a study loads no PyTorch in the process that reads it
-    from rl_yardstick.experiments.off_policy import Comparison, Judged
+    from rl_yardstick.experiments.off_policy import Comparison
 
 MOST_AGENT_WIDTH, LEAST_AGENT_WIDTH = 20, 12
 UNBOUNDED = 10_000  # columns
@@ -91,8 +94,7 @@ def _print_ranking(
     else:
         title = label
         if environment.optimum is not None:
-            ends = environment.optimum, environment.optimum_at_least
-            title += f": optimum {optimum_words(*ends, environment.optimum_is_proven)}"
+            title += f": optimum {optimum_words(environment)}"
             title += f", best random or constant policy {number(environment.baseline)}"
         columns = [column for column in COLUMNS if column.terminal]
         left_out = _print_fitting(console, title, columns, rows)
@@ -277,7 +279,18 @@ def sentences(comparison: Comparison) -> list[str]:
     n_pairs = len(given) * len(alternatives) + math.comb(len(given), 2)
     pairs = [(row, alternative) for row in given]
     pairs += [(leader, row) for row in given if row is not leader]
-    result = [_difference(*pair, n_pairs) for pair in pairs]
+    result = []
+    for one, other in pairs:
+        difference = difference_in_value(one.terms, other.terms, n_pairs)
+        if difference.low == difference.high == 0:
+            result.append(f"{one.name} and {other.name} do the same on this log")
+            continue
+        form = f"+.{_decimals(difference)}f"
+        word = "better" if difference.low > 0 else "worse" if difference.high < 0 else "undecided"
+        result.append(
+            f"{one.name} against {other.name}: {difference.point:{form}} "
+            f"[{difference.low:{form}}, {difference.high:{form}}] a pull, {word}"
+        )
     result += [
         f"{row.name} rests on {row.terms.effective:.0f} effective pulls: too few to rely on its "
         "intervals"
@@ -285,18 +298,6 @@ def sentences(comparison: Comparison) -> list[str]:
         if row.terms.effective < FEW_PULLS
     ]
     return result
-
-
-def _difference(first: Judged, second: Judged, n_pairs: int) -> str:
-    difference = difference_in_value(first.terms, second.terms, n_pairs)
-    if difference.low == difference.high == 0:
-        return f"{first.name} and {second.name} do the same on this log"
-    decimals = _decimals(difference)
-    point, low, high = (
-        f"{value:+.{decimals}f}" for value in (difference.point, difference.low, difference.high)
-    )
-    word = "better" if difference.low > 0 else "worse" if difference.high < 0 else "undecided"
-    return f"{first.name} against {second.name}: {point} [{low}, {high}] a pull, {word}"
 
 
 def shown(estimate: Estimate) -> str:

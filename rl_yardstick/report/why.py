@@ -69,22 +69,19 @@ def whys_of(runs: Sequence[PlannedRun]) -> list[Why | None]:
 
     Call this in a child process: it loads PyTorch.
     """
-    return [_why_of(run) for run in runs]
-
-
-def _why_of(planned: PlannedRun) -> Why | None:
     from rl_yardstick.diagnosis.explanation import explanation
     from rl_yardstick.pipeline.evaluation.exact import evaluator_of
     from rl_yardstick.pipeline.models import load_agent, model_of_run
 
-    spec = planned.spec
-    with suppress(UserError, OSError):
-        import_modules(spec.gym_packages)
-        evaluator = evaluator_of(spec)
-        if evaluator is not None:
-            found = explanation(spec, load_agent(model_of_run(planned.run)), evaluator)
-            return Why(why_lines(found), next(map(as_words, found.proposals), None))
-    return None
+    told: list[Why | None] = []
+    for run in runs:
+        told.append(None)
+        with suppress(UserError, OSError):
+            import_modules(run.spec.gym_packages)
+            if (evaluator := evaluator_of(run.spec)) is not None:
+                found = explanation(run.spec, load_agent(model_of_run(run.run)), evaluator)
+                told[-1] = Why(why_lines(found), next(map(as_words, found.proposals), None))
+    return told
 
 
 def _state(state: StateLoss, gap: float) -> str:

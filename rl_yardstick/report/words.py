@@ -1,14 +1,22 @@
-"""Numbers as text, and sentences on seeds."""
+"""The words of a study: numbers as text, sentences on seeds, and its conclusions as sentences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
+from rl_yardstick.experiments.analysis import (
+    MARK,
+    ON_THE_SCALE,
+    EnvironmentAnalysis,
+    StudyAnalysis,
+)
 from rl_yardstick.experiments.plan import Seeds, TuningSeeds
+from rl_yardstick.experiments.study import METRIC_WORDS, OF_TRAINING, StudySpec
 from rl_yardstick.pipeline.evaluation.yardstick import bracket_mark
-from rl_yardstick.verdicts import Estimate
+from rl_yardstick.verdicts import Estimate, Pair, unseen_share
 
 SIGNIFICANT = 4  # digits
 
@@ -55,24 +63,27 @@ def interval_alone(estimate: Estimate, as_text: Format = number) -> str:
     return f"{as_text(estimate.low)} to {as_text(estimate.high)}"
 
 
-def optimum_words(optimum: float | None, at_least: float | None, is_proven: bool = True) -> str:
+def optimum_words(environment: EnvironmentAnalysis) -> str:
     """The optimum, or both ends of its bracket, with three decimals where they look equal."""
+    at_least, optimum = environment.optimum_at_least, environment.optimum
     if at_least is None or optimum is None:
         return number(optimum)
     ends = [number(at_least), number(optimum)]
     if ends[0] == ends[1]:
         ends = [f"{at_least:,.3f}", f"{optimum:,.3f}"]
-    return f"{ends[0]} to {ends[1]} {bracket_mark(is_proven)}"
+    return f"{ends[0]} to {ends[1]} {bracket_mark(environment.optimum_is_proven)}"
 
 
-def scale_words(full_optimum: float | None, measured_by: str | None) -> str:
+def scale_words(environment: EnvironmentAnalysis) -> str:
     """Under partial observability: what the optimum is based on, and that of the full state."""
-    if full_optimum is None:
+    if environment.full_optimum is None:
         return ""
-    goes_by = "all that it has observed" if measured_by == "memory" else "what it observes now"
+    has_memory = environment.measured_by == "memory"
+    goes_by = "all that it has observed" if has_memory else "what it observes now"
     return (
         f"observations hide the state: the optimum, the same for all agents, is that of an agent "
-        f"that acts on {goes_by}; one that saw the state could have {number(full_optimum)}"
+        f"that acts on {goes_by}; one that saw the state could have "
+        f"{number(environment.full_optimum)}"
     )
 
 
@@ -87,17 +98,15 @@ def seeds(*counts: int) -> str:
     return f"{'' if least == most else f'{least:,} to '}{most:,} seed{'s' if most != 1 else ''}"
 
 
-# On which seeds the settings of a study were tuned, in one line.
-
-MOST_NAMES = 6
+MOST_NAMES = 6  # in the sentence on seeds
 
 
 def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
     """Say which of the seeds of a study the settings of its agents were tuned on."""
-    these = _these(seeds)
+    these = "these" if len(seeds) > 1 else "it"
     parts = [
-        *_tuned(seeds, tuning.shipped, "the shipped settings of"),
-        *_tuned(seeds, tuning.files, "the settings in"),
+        *_tuned(seeds, tuning.shipped, "the shipped settings of", these),
+        *_tuned(seeds, tuning.files, "the settings in", these),
     ]
     if tuning.elsewhere:
         names = _names(tuning.elsewhere)
@@ -112,21 +121,17 @@ def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
     return f"{'Seeds' if len(seeds) > 1 else 'Seed'} {spans(seeds)}: {'; '.join(parts)}."
 
 
-def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str) -> list[str]:
+def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str, these: str) -> list[str]:
     """One clause for each set of seeds: whose settings were tuned on them."""
     groups: dict[Seeds, list[str]] = {}
     for name, shared in found.items():
-        if shared:
-            groups.setdefault(shared, []).append(name)
-    return [
-        f"{whose} {_names(names)} were tuned on "
-        + (f"{spans(shared)} of these" if len(shared) < len(seeds) else _these(seeds))
-        for shared, names in groups.items()
-    ]
-
-
-def _these(seeds: range) -> str:
-    return "these" if len(seeds) > 1 else "it"
+        groups.setdefault(shared, []).append(name)
+    told = {
+        shared: f"{spans(shared)} of these" if len(shared) < len(seeds) else these
+        for shared in groups
+        if shared
+    }
+    return [f"{whose} {_names(groups[one])} were tuned on {which}" for one, which in told.items()]
 
 
 def _names(names: Sequence[str]) -> str:
@@ -141,3 +146,261 @@ def spans(numbers: Iterable[int]) -> str:
     starts = ordered[:1] + [two for one, two in pairwise(ordered) if two != one + 1]
     pairs = zip(starts, ends, strict=True)
     return ", ".join(f"{low} to {high}" if low != high else str(low) for low, high in pairs)
+
+
+# --- conclusions: who is best, pair by pair, who failed, and how soon -----------------------------
+
+
+def pairs_both_ways(pairs: Iterable[Pair]) -> dict[tuple[str, str], Pair]:
+    """Every pair in both orders, by first and second agent."""
+    seen = [one for pair in pairs for one in (pair, pair.swapped())]
+    return {(one.first, one.second): one for one in seen}
+
+
+def pair_sentences(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """The words on all pairs, one sentence for each first agent and word."""
+    oriented = [pair.swapped() if pair.word == "worse" else pair for pair in environment.pairs]
+    ways = {"better": "{} is {} than {}.", "tied": "{} is {} with {}."}
+    for name in (agent.agent for agent in environment.agents):
+        told: dict[str, list[Pair]] = {}
+        for pair in oriented:
+            if pair.first == name:
+                told.setdefault(pair.text, []).append(pair)
+        for text, pairs in sorted(told.items()):
+            others = enumeration([_other(environment, pair) for pair in pairs])
+            yield ways.get(pairs[0].word, "{} is {} against {}.").format(name, text, others)
+
+
+def _other(environment: EnvironmentAnalysis, pair: Pair) -> str:
+    """The other agent, and the difference; of an undecided pair also how many seeds it would take.
+
+    A study that grows says how many seeds decided the pair.
+    """
+    low, high = map(number, pair.interval)
+    unit = " of the score" if environment.is_score else ""
+    told = [f"by {low} to {high}{unit}"]
+    if pair.word == "tied":
+        told = [f"within {number(environment.margin)}{unit}"]
+    elif pair.word == "undecided":
+        told = [f"difference {low} to {high}{unit}"]
+        if math.isinf(pair.interval[0]) or math.isinf(pair.interval[1]):
+            told = ["too few runs"]
+        if pair.seeds_needed is not None:
+            told.append(f"about {seeds(pair.seeds_needed)} would decide")
+    if environment.looks:
+        told.append(f"with {seeds(pair.n)}")
+    return f"{pair.second} ({'; '.join(told)})"
+
+
+def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    """The planned numbers of seeds of the agents, in words."""
+    return seeds(*(environment.seeds.values() or [study.n_seeds]))
+
+
+def unseen_sentence(analysis: StudyAnalysis) -> str:
+    """What this many runs cannot show; once on every page."""
+    counts = [agent.runs.n for one in analysis.environments for agent in one.agents]
+    n = min(counts, default=0)
+    if not n:
+        return ""
+    runs = "1 run" if n == 1 else f"{n:,} runs"
+    share = f"{100 * unseen_share(n):.2g} % of further runs"
+    return f"A failure that no run showed is not counted: with {runs} up to {share} could fail."
+
+
+def speed_sentences(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """How many runs reach the threshold and stay there, and from which step."""
+    told = [
+        (agent.agent, agent.steps_to_stay.share_reached, agent.steps_to_stay.median.point)
+        for agent in environment.agents
+        if agent.steps_to_stay is not None and agent.steps_to_stay.share_reached.n
+    ]
+    arrived = sorted((one for one in told if one[1].point > 0), key=lambda one: one[2])
+    if len(told) < 2 or not arrived:
+        return
+    threshold, optimum, baseline = environment.threshold, environment.optimum, environment.baseline
+    goal = f"a return of {number(threshold)}"
+    if threshold is not None and optimum is not None and baseline is not None:
+        share = (threshold - baseline) / (optimum - baseline) if optimum > baseline else 0.0
+        goal = "a score of 0.95" if math.isclose(share, 0.95) else goal
+    parts: list[str] = []
+    for name, share_of, steps in arrived:
+        stays = "" if parts else f"stays above {goal} "
+        parts.append(f"{name} {stays}in {round(share_of.point * share_of.n)} of {share_of.n} runs")
+        if not math.isinf(steps):
+            parts[-1] += f", in the median run from step {steps:,.0f}"
+    never = [name for name, share_of, _ in told if share_of.point == 0]
+    if never:
+        parts.append(f"{enumeration(never)} in none")
+    yield f"{'; '.join(parts)}."
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """The sentences on an environment."""
+
+    lead: str  # who is best, and the optimum
+    pairs: tuple[str, ...]  # every word, with figures; several in a sentence
+    # Failures, how soon agents arrive, training on variants, missing runs, what failed agents
+    # do instead, and the number of looks.
+    notes: tuple[str, ...]
+
+    @property
+    def everything(self) -> tuple[str, ...]:
+        """All sentences."""
+        return (self.lead, *self.pairs, *self.notes)
+
+
+def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion:
+    """What a study has shown on one environment."""
+    return Conclusion(
+        lead=_lead(study, environment),
+        pairs=tuple(pair_sentences(environment)),
+        notes=(
+            *_on_failures(environment),
+            *_on_the_task(environment),
+            *speed_sentences(environment),
+            *_on_what_cannot_be_compared(study, environment),
+            *on_changes([environment]),
+            *_on_missing(study, environment),
+            *environment.advice,
+            *_on_looks(environment),
+        ),
+    )
+
+
+def overall_sentences(analysis: StudyAnalysis) -> list[str]:
+    """Who is best over all environments; nothing for a single one."""
+    overall = analysis.overall
+    if overall is None or overall.best is None or len(overall.scores) < 2:
+        return []
+    n = len(analysis.environments)
+    where = "Over both environments" if n == 2 else f"Over all {n} environments"
+    means = [(name, overall.scores[name].mean.point) for name in overall.best.agents]
+    told = [f"{name} {score_number(mean)}" for name, mean in means]
+    scores = f"mean score: {', '.join(told)}"
+    return [f"{where}, best: {overall.best}; {scores}.", *unproven_sentences(analysis.environments)]
+
+
+def unproven_sentences(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
+    """On which environments a score may be too high, because no proof bounds the optimum."""
+    names = [one.environment for one in environments if not one.optimum_is_proven]
+    if not names:
+        return []
+    told = f"On {enumeration(names)} the upper end of the optimum's bracket is not proven"
+    return [f"{told}: a score there may be too high."]
+
+
+def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
+    """A sentence for each environment on which nothing has finished."""
+    there = {environment.environment for environment in analysis.environments}
+    absent = [e.label for e in analysis.study.environments if e.label not in there]
+    return [f"On {label}, no run has finished." for label in absent]
+
+
+def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    agents, words = environment.agents, METRIC_WORDS[study.metric]
+    if math.isnan(agents[0].runs.mean):
+        return f"No run has a figure for the {words}."
+    optimum = ""
+    if study.metric in ON_THE_SCALE and environment.optimum is not None:
+        optimum = f"; the optimum is {optimum_words(environment)}"
+    if none_has_learnt(study, environment):
+        figure = f"the best mean {words} is {number(agents[0].metric.mean.point)}"
+        return (
+            "None of the agents has learnt: no median is above the best random or constant "
+            f"policy's {number(environment.baseline)}; {figure}{optimum}."
+        )
+    if len(agents) > 1:
+        return f"Best: {environment.best}{optimum}."
+    (one,) = agents
+    score = f", score {score_number(one.judged.point)}" if environment.is_score else ""
+    return f"{one.agent}: {words} {number(one.metric.mean.point)}{score}{optimum}."
+
+
+def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
+    """Whether no median exceeds the best random or constant policy by more than the margin."""
+    baseline, optimum = environment.baseline, environment.optimum
+    if study.metric not in ON_THE_SCALE or baseline is None or optimum is None:
+        return False
+    margin = environment.margin * (optimum - baseline if environment.is_score else 1.0)
+    reach = baseline + margin
+    medians = [agent.metric.median.point for agent in environment.agents]
+    return optimum > baseline and all(median <= reach for median in medians)
+
+
+def _on_failures(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """How many runs of each agent failed."""
+    failed = [
+        f"{agent.runs.failed} of {agent.runs.n} runs of {agent.agent} failed"
+        for agent in environment.agents
+        if agent.runs.failed
+    ]
+    if failed:
+        yield f"{enumeration(failed)}."
+
+
+def _on_the_task(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """Settings that change the environment, and so the optimum; what observations hide."""
+    if environment.optima:
+        each = [f"{number(optimum)} for {name}" for name, optimum in environment.optima.items()]
+        yield (
+            f"The agents do NOT PLAY THE SAME ENVIRONMENT: the optimum is {enumeration(each)}. "
+            "Their returns cannot be compared."
+        )
+    if words := scale_words(environment):
+        yield f"{words[0].upper()}{words[1:]}."
+
+
+def _on_what_cannot_be_compared(
+    study: StudySpec, environment: EnvironmentAnalysis
+) -> Iterator[str]:
+    """Returns above the upper bound on the optimum; training returns of another environment."""
+    names = environment.impossible
+    if names:
+        verb = "has" if len(names) == 1 else "have"
+        yield (
+            f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, "
+            f"{number(environment.optimum)}: the bracket belongs to another environment, or is "
+            f"wrong{'.' if environment.optimum_is_proven else '; its upper end is not proven.'}"
+        )
+    names = tuple(agent.agent for agent in environment.agents if agent.on_variant)
+    if names and study.metric in OF_TRAINING:
+        verb = "was" if len(names) == 1 else "were"
+        yield (
+            f"{enumeration(names)} {verb} trained on a changed environment: training returns are "
+            "those of that one."
+        )
+
+
+def on_changes(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
+    """Which agents were trained on a changed environment, and what was changed: one sentence.
+
+    It names the environments if there are several, and groups agents with the same changes.
+    """
+    found: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for environment in environments:
+        place = f" on {environment.environment}" if len(environments) > 1 else ""
+        for agent in environment.agents:
+            if agent.changes:
+                found.setdefault((place, agent.changes), []).append(agent.agent)
+    told = [f"{enumeration(a)}{place} ({', '.join(what)})" for (place, what), a in found.items()]
+    return [f"{MARK}: trained on a changed environment: {'; '.join(told)}."] if told else []
+
+
+def _on_looks(environment: EnvironmentAnalysis) -> Iterator[str]:
+    """How often a growing study is looked at."""
+    if n := len(environment.looks):
+        looks = "1 look" if n == 1 else f"up to {n} looks"
+        sizes = enumeration([f"{size:,}" for size in environment.looks])
+        yield f"Agents got more seeds until they were decided: {looks}, at {sizes} seeds."
+
+
+def _on_missing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterator[str]:
+    for agent, n_missing in environment.missing.items():
+        n_seeds = environment.seeds.get(agent, study.n_seeds)
+        if n_missing == n_seeds:
+            yield f"No run of {agent} has finished."
+        elif n_missing:
+            verb = "is" if n_missing == 1 else "are"
+            yield f"{n_missing} of {n_seeds} runs of {agent} {verb} missing."

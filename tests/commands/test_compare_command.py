@@ -1,8 +1,8 @@
 """compare.py as a user types it: what is run, what is skipped, and what survives."""
 
 import contextlib
+import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,16 +13,12 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-import compare
-import train
-
+COMPARE = Path(__file__).parents[2] / "compare.py"
 LAKE = ["--env", "FrozenLake-v1", "--no-report", "-f", "studies"]
 PAIR = [*LAKE, "--algos", "qlearning", "sarsa", "--n-episodes", "60"]
 
-# Environments of a user's own, which the command imports.
-FRAGILE = '''
-import os
-import signal
+# An environment of a user's own, slow while there is no file that says it may hurry.
+WALKS = """
 import time
 from pathlib import Path
 
@@ -31,59 +27,29 @@ import gymnasium as gym
 MARK = Path(__file__).with_name("mark")
 
 
-class Walk(gym.Env):
-    """Five places in a row; the goal is the last."""
-
+class Slow(gym.Env):
     observation_space = gym.spaces.Discrete(5)
     action_space = gym.spaces.Discrete(2)
-    steps = 0
-    seed = None
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.place, self.seed = 0, self.seed if seed is None else seed
+        self.place = 0
         return 0, {}
 
     def step(self, action):
-        self.steps += 1
-        self.act()
+        if not MARK.exists():
+            time.sleep(0.02)
         self.place = min(max(self.place + 2 * int(action) - 1, 0), 4)
         return self.place, float(self.place == 4), self.place == 4, False, {}
 
 
-class Fragile(Walk):
-    """Kills its process once, when there is a state, or raises; then says how far it has come."""
-
-    def act(self):
-        if self.seed == 1:
-            if self.steps == 50:
-                raise RuntimeError("thin ice")
-        elif MARK.exists():
-            if not MARK.read_text():
-                MARK.write_text(str(self.steps))
-        elif self.steps == 30:
-            time.sleep(1.1)
-        elif self.steps == 60:
-            MARK.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-
-
-class Slow(Walk):
-    """Takes its time while there is no file that says it may hurry."""
-
-    def act(self):
-        if not MARK.exists():
-            time.sleep(0.05)
-
-
-for kind in (Fragile, Slow):
-    gym.register(f"{kind.__name__}-v0", entry_point=kind, max_episode_steps=20)
-'''
+gym.register("Slow-v0", entry_point=Slow, max_episode_steps=20)
+"""
 
 
 @pytest.fixture
 def folder(own_folder):
-    (own_folder / "fragile_walks.py").write_text(FRAGILE)
+    (own_folder / "walks.py").write_text(WALKS)
     return own_folder
 
 
@@ -99,7 +65,7 @@ def wait_for(condition, seconds=60):
         time.sleep(0.05)
 
 
-FILES = ["curves.csv.gz", "runs", "study.yml", "summary.csv"]
+FILES = ["curves.csv.gz", "runs", "study.json", "summary.csv"]
 FILES += [f"verdicts.{suffix}" for suffix in ("csv", "json", "md", "tex")]
 
 
@@ -116,12 +82,10 @@ def rows(study):
 
 
 def names(folder):
-    return sorted(path.name for path in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir() if path.name != ".lock")
 
 
-def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(
-    type_command, folder, monkeypatch
-):
+def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(type_command, folder, train_in):
     study = folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
     code, out, err = type_command(*PAIR, "--seeds", 1)
     assert (code, err) == (0, "")
@@ -133,8 +97,7 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(
     assert first.items() <= records(study).items()
     assert sorted(rows(study)["seed"]) == [0, 0, 1, 1]
     words = "train.py --algo sarsa --env FrozenLake-v1 --seed 0 --n-episodes 60 --verbose 0"
-    monkeypatch.setattr(sys, "argv", words.split())
-    assert train.main() == 0
+    assert train_in(folder, *words.split()[1:]) == folder
     places = (folder / "logs", study / "runs")
     paths = (place / "sarsa" / "FrozenLake-v1_1" / "0.monitor.csv" for place in places)
     theirs, ours = (pd.read_csv(path, skiprows=1)[["r", "l"]] for path in paths)
@@ -142,16 +105,24 @@ def test_what_is_there_is_not_run_again_and_is_what_train_py_makes(
     # Finished runs of other settings are replaced only when that is asked for.
     first, other = records(study), [*PAIR, "--seeds", 2, "-params", "gamma:0.9"]
     code, out, err = type_command(*other)
-    assert (code, out.count("\n"), err.count("\n")) == (2, 1, 1)
+    assert (code, err.count("\n")) == (2, 1)
     assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now): --name" in err
     assert records(study) == first
     code, out, _ = type_command(*other, "--replace")
     assert (code, "4 runs, 0 of them there already" in out) == (0, True)
     assert not set(records(study).values()) & set(first.values())
     place = study / "replaced" / "1"
-    assert f"4 runs that are done again: the old folders are in {place.relative_to(folder)}" in out
+    assert f"4 runs are done again: the old folders are in {place.relative_to(folder)} now" in out
     place.rename(place.parent / "runs")
     assert records(place.parent) == first
+    # What a study's record says is enough to do it elsewhere.
+    (folder / "copy").mkdir()
+    (folder / "copy" / "study.json").write_bytes((study / "study.json").read_bytes())
+    assert type_command("--resume", "copy", "--no-report")[0] == 0
+    columns = ["agent", "seed", "final", "training", "n_timesteps"]
+    assert rows(folder / "copy")[columns].equals(rows(study)[columns])
+    code, _, err = type_command("--resume", "copy", "--seeds", 3)
+    assert (code, "leave out seeds" in err) == (2, True)
 
 
 def test_films_and_pages_of_training(type_command, folder, monkeypatch):
@@ -178,26 +149,6 @@ def test_films_and_pages_of_training(type_command, folder, monkeypatch):
     assert "leave out --no-report" in err
 
 
-# --- runs that fail or are killed -----------------------------------------------------------------
-
-
-def test_each_run_ends_for_itself_alone(type_command, folder):
-    """A killed one goes on from what it has saved; what fails is told, and where it was."""
-    words = ["--env", "Fragile-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
-    words += ["-n", 200, "--seeds", 2, "-j", 2, "--no-report", "--name", "walks", "-f", "studies"]
-    code, out, err = type_command(*words)
-    assert (code, err) == (1, "")
-    assert int((folder / "mark").read_text()) > 1
-    study = folder / "studies" / "walks"
-    assert rows(study)["seed"].tolist() == [0]
-    assert not (study / ".drafts").exists()
-    (log,) = (study / "failures").iterdir()
-    assert "RuntimeError: thin ice" in log.read_text()
-    assert re.search(r"qlearning on Fragile-v0, seed 1: .*thin ice", out)
-    assert str(log.relative_to(folder)) in out
-    assert "1 of 2 runs of qlearning is missing" in " ".join(out.split())
-
-
 # --- a command that is stopped, and a second one beside it ----------------------------------------
 
 
@@ -220,7 +171,7 @@ def session_of(leader):
     return found
 
 
-SLOW = ["--env", "Slow-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+SLOW = ["--env", "Slow-v0", "--gym-packages", "walks", "--algos", "qlearning"]
 SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"]
 
 
@@ -228,40 +179,47 @@ SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"
 def begun(folder, type_command):
     """A study in the middle of its runs: the command, its folder, all of its processes."""
     process = subprocess.Popen(
-        [sys.executable, compare.__file__, *SLOW],
+        [sys.executable, str(COMPARE), *SLOW],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     )
     study = folder / "studies" / "Slow-v0_qlearning"
-    wait_for(lambda: len(list(study.glob(".drafts/*/0.monitor.csv"))) == 2)
-    started = session_of(process.pid)
-    assert len(started) >= 4
-    yield process, study, started
+    wait_for(lambda: len(list(study.glob("runs/*/*/state.bin"))) == 2)
+    yield process, study, session_of(process.pid)
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-def test_ctrl_c_ends_all_and_the_same_command_goes_on(type_command, folder, begun):
+def states(study):
+    return [json.loads(path.read_text())["state"] for path in study.glob("runs/*/*/run.json")]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_the_same_command_does_what_is_left(number, type_command, folder, begun):
     process, study, started = begun
-    # A second driver says who is at work, and touches nothing.
-    before = [*sorted(study.iterdir()), *sorted(study.glob(".drafts/*"))]
-    code, _, err = type_command(*SLOW, "-params", "gamma:0.5", "--replace", "--repair")
-    assert (code, err.count("\n")) == (2, 1)
-    assert f"process {process.pid} on " in err
-    assert [*sorted(study.iterdir()), *sorted(study.glob(".drafts/*"))] == before
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    # A second command says that the folder is in use, and touches nothing.
+    code, _, err = type_command(*SLOW, "-params", "gamma:0.5", "--replace")
+    assert (code, err.count("\n"), "in use by another command" in err) == (2, 1, True)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as a terminal sends it
+    else:
+        process.send_signal(number)
+    out, err = process.communicate(timeout=120)
     wait_for(lambda: not any(map(is_alive, started)))
-    assert (process.returncode, err) == (130, "compare.py: interrupted\n")
-    assert "0 of 2 runs" in out
-    assert "the same command continues" in out
-    assert not study.exists()
+    if number == signal.SIGKILL:
+        assert process.returncode == -number
+    else:
+        assert (process.returncode, err) == (128 + number, "")
+        assert f"stopped; continue with: python {COMPARE} --resume studies/Slow-v0_qlearning" in out
+        assert states(study) == ["interrupted"] * 2
     (folder / "mark").touch()
-    code, out, _ = type_command(*SLOW)
+    begun_at = {path: path.stat().st_mtime_ns for path in study.glob("runs/*/*/0.monitor.csv")}
+    code, out, _ = type_command("--resume", study, "--gym-packages", "walks", "--no-report")
     assert (code, "2 runs, 0 of them there already" in out) == (0, True)
-    assert len(records(study)) == 2
+    assert len(begun_at) == 2
+    assert states(study) == ["finished"] * 2
     assert names(study) == FILES
 
 
@@ -289,9 +247,9 @@ def test_it_grows_until_decided_and_remembers_its_looks(type_command, folder):
     assert (code, err) == (0, "")
     assert "look 1 of 3, at 6 seeds: " in whole
     study = folder / "s" / "bandits"
-    n_runs, looks = len(rows(study)), (study / "looks.json").read_bytes()
+    n_runs, record = len(rows(study)), (study / "study.json").read_bytes()
     last = f"{n_runs} runs, where 14 seeds of each agent would be 42; "
     assert last_line(whole).startswith(last)
     code, out, _ = type_command(*words)
     assert (code, last_line(out)) == (0, last_line(whole))
-    assert (study / "looks.json").read_bytes() == looks
+    assert (study / "study.json").read_bytes() == record

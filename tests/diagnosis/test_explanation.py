@@ -8,20 +8,20 @@ import torch as th
 from rl_yardstick.diagnosis.explanation import explanation, parting
 from rl_yardstick.envs.known_models import transition_model
 from rl_yardstick.mdp import policy_iteration
-from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
+from rl_yardstick.pipeline.training import make_agent
 from rl_yardstick.report.why import parting_lines, why_lines
-from tests.pipeline.short_runs import agent_of, spec_of
+from tests.pipeline.short_runs import spec_of
 
 LAKE = {"env_kwargs": {"is_slippery": False, "max_episode_steps": 30}}
-SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
+SMALL = {"policy_kwargs": {"net_arch": [16]}}
 
 
 def run_of(algo, env_id, entry=None):
     """The spec of a run, and its agent before it has learnt anything."""
     has_discount = algo not in ("random", "optimal")
     spec = spec_of(algo, env_id, {**({"gamma": 0.95} if has_discount else {}), **(entry or {})})
-    return spec, agent_of(algo, make_training_env(spec, None), **spec.hyperparams.algorithm)
+    return spec, make_agent(spec, None)
 
 
 def explained(algo, env_id, entry=None, change=None, steps=0):

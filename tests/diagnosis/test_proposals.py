@@ -2,18 +2,15 @@
 
 import numpy as np
 import pytest
-from rl_yardstick.pipeline.agent_settings import resolved_spec
-from rl_yardstick.pipeline.preparation import algorithm_kwargs
-from rl_yardstick.pipeline.settings.hyperparams import override, read_hyperparams
-from rl_yardstick.pipeline.settings.values import parse_assignments
 
 from rl_yardstick.diagnosis.explanation import explanation
 from rl_yardstick.experiments.interventions import AS_IT_IS, SHIPPED, Tried, intervention_study
 from rl_yardstick.experiments.study import file_name
-from rl_yardstick.pipeline.environments import make_training_env
 from rl_yardstick.pipeline.evaluation.exact import exact_evaluator
+from rl_yardstick.pipeline.settings import override, parse_assignments, read_entry, read_spec
+from rl_yardstick.pipeline.training import make_agent
 from rl_yardstick.report.why import tried_lines
-from tests.pipeline.short_runs import LAKE, WAREHOUSE, agent_of, spec_of
+from tests.pipeline.short_runs import LAKE, WAREHOUSE, spec_of
 
 TAXI, CLIFF = "Taxi-v4", "CliffWalking-v1"
 NO_EPSILON = {"exploration_initial_eps": 0.0, "exploration_final_eps": 0.0}
@@ -54,13 +51,17 @@ CAUSES = {
 }  # fmt: skip
 
 
+def shipped(algo, env_id, change):
+    """The spec with shipped settings, but for a change."""
+    entry = {**override(read_entry(algo, env_id), change), "engine": "auto"}
+    return read_spec(algo, env_id, entry, device="cpu")
+
+
 def proposals_of(algo, env_id, change=None, steps=None):
     """The proposals for an agent with shipped settings, but for a change, after its training."""
-    raw = {**override(read_hyperparams(algo, env_id), change or {}), "engine": "auto"}
-    spec = resolved_spec(raw, algo=algo, env_id=env_id, seed=0, device="cpu")
-    arguments = {key: value for key, value in algorithm_kwargs(spec).items() if key != "policy"}
-    agent = agent_of(algo, make_training_env(spec, None), **arguments)
-    agent.learn(steps or spec.hyperparams.n_timesteps)
+    spec = shipped(algo, env_id, change or {})
+    agent = make_agent(spec, None)
+    agent.learn(steps or spec.n_timesteps)
     return explanation(spec, agent, exact_evaluator(spec)).proposals
 
 
@@ -89,14 +90,12 @@ def test_every_proposal_changes_a_setting_that_the_agent_has(algo, env_id, chang
     found = proposals_of(algo, env_id, change, steps=50)
     assert found
     assert not [one for one in found if one.startswith(absent)]
-    raw = {**override(read_hyperparams(algo, env_id), change), "engine": "auto"}
-    fields = {"algo": algo, "env_id": env_id, "seed": 0}
-    before = resolved_spec(raw, **fields)
+    before = shipped(algo, env_id, change).hyperparams
     for one in found:
-        typed = parse_assignments(one.split())
-        after = resolved_spec(override(before.saved_hyperparams, typed), **fields)
-        assert after.saved_hyperparams != before.saved_hyperparams, one
-        algorithm_kwargs(after)  # it accepts these settings
+        typed = parse_assignments(one.split(), "--test")
+        after = read_spec(algo, env_id, override(before, typed))
+        assert after.hyperparams != before, one
+        make_agent(after, None)  # it accepts these settings
 
 
 def test_networks_are_also_offered_a_larger_one_and_the_unchanged_task():

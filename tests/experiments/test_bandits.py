@@ -1,4 +1,4 @@
-"""Pulls of bandits: their record, figures worked the plain way, batches, the shipped studies."""
+"""Pulls of bandits: figures worked the plain way, batches, the shipped studies."""
 
 import dataclasses
 from dataclasses import replace
@@ -6,13 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
-from rl_yardstick.pipeline.runs import PULLS_FILE, Run
-from stable_baselines3 import PPO
-from stable_baselines3.common.env_util import make_vec_env
 
-import compare
-from rl_yardstick.agents import load_algorithm
 from rl_yardstick.agents.bandits.runs import run_batch
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.bandits import (
@@ -25,45 +19,23 @@ from rl_yardstick.experiments.bandits import (
     stacked_statistics,
 )
 from rl_yardstick.experiments.plan import plan
-from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
-from rl_yardstick.pipeline.callbacks import PullRecorder
+from rl_yardstick.experiments.study import (
+    AgentSpec,
+    EnvironmentSpec,
+    StudySpec,
+    find_study,
+    read_study,
+)
+from rl_yardstick.pipeline.run import PULLS_FILE, Run
 from rl_yardstick.pipeline.training import train
 from rl_yardstick.report.series import auer_bound
 
-SEGMENT_MEANS = np.array([[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]])
 COINS = (0.2, 0.5, 0.75)
 
 
 def pulls_in(folder):
     with np.load(folder / PULLS_FILE) as file:
         return dict(file)
-
-
-def recorded(algorithm, folder, env_id="SegmentBandit-v0", n_envs=2, **kwargs):
-    env = make_vec_env(env_id, n_envs, seed=0)
-    algorithm(env=env, seed=0, **kwargs).learn(100, callback=PullRecorder(folder))
-    env.close()
-    return pulls_in(folder)
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "kwargs"),
-    [
-        (load_algorithm("ucb"), {}),
-        (PPO, {"policy": "MlpPolicy", "n_steps": 25, "batch_size": 25}),
-    ],
-)
-def test_any_agent_leaves_its_pulls(algorithm, kwargs, tmp_path):
-    pulls = recorded(algorithm, tmp_path, **kwargs)
-    names = {"arms", "rewards", "expected_rewards", "regrets", "optimal", "matched", "contexts"}
-    assert {name: array.shape for name, array in pulls.items()} == dict.fromkeys(names, (2, 50))
-    worth = SEGMENT_MEANS[pulls["contexts"], pulls["arms"]]
-    assert pulls["expected_rewards"] == pytest.approx(worth)
-    assert pulls["regrets"] == pytest.approx(SEGMENT_MEANS.max(axis=1)[pulls["contexts"]] - worth)
-    assert np.array_equal(pulls["optimal"], pulls["regrets"] == 0)
-    assert pulls["matched"].all()
-    assert set(np.unique(pulls["rewards"])) <= {0.0, 1.0}
-    assert [path.name for path in tmp_path.iterdir()] == ["pulls.npz"]
 
 
 # --- Figures by pull, worked on paper where something is missing, else the plain way.
@@ -121,7 +93,6 @@ def test_statistics_are_read_as_they_were_written(tmp_path):
 
 # --- Batches where they may be, equal to their runs to the last bit.
 
-STUDIES = sorted((Path(compare.__file__).parent / "studies").glob("bandit-*.yml"))
 SEGMENTS = EnvironmentSpec("segments", "SegmentBandit-v0", {"n_timesteps": 200})
 LONG = EnvironmentSpec(
     "long", "BernoulliBandit-v0", {"n_timesteps": 3000, "env_kwargs": {"pulls": 3000}}
@@ -158,9 +129,9 @@ def test_a_batch_is_its_runs(tmp_path, do_study):
     batches, (planned,) = do_study(study, tmp_path), plan(study, tmp_path)
     folders = [tmp_path / str(seed) for seed in range(5)]
     for seed, folder in enumerate(folders):  # as train.py does each
-        run = Run(folder, "SegmentBandit-v0")
-        run.params_path.mkdir(parents=True)
-        train(replace(planned.spec, seed=seed, verbose=0), Console(quiet=True), {}, "", run)
+        folder.mkdir()
+        with Run(folder) as run:
+            train(planned.spec.changed(seed=seed), run)
     rows = batches.summary
     assert rows["seed"].tolist() == [0, 1, 2, 3, 4]
     pulls = [pulls_in(folder) for folder in folders]
@@ -178,7 +149,7 @@ def test_a_batch_is_its_runs(tmp_path, do_study):
     assert np.array_equal(ours.posteriors, result.posteriors[0])
     assert ours.moments.tolist() == [10, 100, 200]
     assert ours.estimates == pytest.approx(np.nanmean(result.estimates, axis=0))
-    info = planned.run.read_info()
+    info = planned.recorded()
     assert (info["engine"], info["n_runs"], info["n_timesteps"]) == ("compiled batch", 5, 200)
 
 
@@ -225,8 +196,7 @@ def test_regret_of_ten_thousand_pulls(do_study, tmp_path, name, expected):
 
     How well agents do is tested with the agents; here that a label stands for its agent.
     """
-    (path,) = [path for path in STUDIES if path.stem == f"bandit-{name}"]
-    study = read_study(path)
+    study = read_study(find_study(f"bandit-{name}"))
     kept = tuple(spec for spec in study.agents if spec.label in expected)
     place = study.environments[0]
     study = replace(study, agents=kept, environments=(place,), n_seeds=60)

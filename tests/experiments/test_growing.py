@@ -1,21 +1,18 @@
-"""Studies that get more seeds until they are decided, and the file with their planned looks."""
+"""Studies that get more seeds until they are decided, and their planned looks."""
 
 import pandas as pd
 import pytest
 
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.growing import (
-    LOOKS_FILE,
     first_counts,
     grown,
     look_sizes,
     looked,
-    looks_of,
     next_counts,
     plan_of_looks,
-    write_looks,
 )
-from rl_yardstick.experiments.plan import plan
+from rl_yardstick.experiments.plan import StudyRecord, plan
 from rl_yardstick.experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from rl_yardstick.pipeline.errors import UserError
@@ -51,13 +48,12 @@ def results_of(study, root, ends=ENDS, counts=None):
 
 def grow(study, root, most=None, steps=99, ends=ENDS):
     """What the command does, with made-up runs; the verdicts after each look."""
-    root.mkdir(exist_ok=True)
     looks = plan_of_looks(study, root, most)
-    write_looks(root, looks)
+    StudyRecord(study, {}, looks).write(root)
     counts, found = first_counts(study), []
     for _ in range(steps):
         now = results_of(grown(study, counts), root, ends, counts)
-        found.append(looked(now, looks_of(root)))
+        found.append(looked(now, looks))
         if found[-1].is_done:
             break
         counts = next_counts(found[-1])
@@ -66,7 +62,7 @@ def grow(study, root, most=None, steps=99, ends=ENDS):
 
 def test_a_study_grows_where_it_is_undecided(tmp_path):
     found = grow(study_of(THREE), tmp_path, most=40)
-    assert looks_of(tmp_path) == (10, 20, 40)
+    assert StudyRecord.read(tmp_path).looks == (10, 20, 40)
     assert [each.n_looks for each in found] == [1, 2, 3]
     assert [each.seeds["lake"]["sarsa"] for each in found] == [20, 40, 40]
     assert {each.seeds["lake"]["qlearning"] for each in found} == {10}
@@ -80,7 +76,7 @@ def test_a_growing_study_is_judged_by_its_looks_wherever_it_is_shown(tmp_path):
     said = grow(study_of(THREE), tmp_path, most=40)[-1]
     counts = next_counts(said)
     results = results_of(grown(study_of(THREE), counts), tmp_path, counts=counts)
-    shown = analyse(results, looks=looks_of(tmp_path))
+    shown = analyse(results, looks=(10, 20, 40))
     assert shown.verdicts == said
     assert {agent.n_runs for agent in shown.environments[0].agents} == {10, 40}
 
@@ -106,14 +102,6 @@ def test_what_was_planned_cannot_change(tmp_path):
         with pytest.raises(UserError, match="looks were planned before the first") as refusal:
             plan_of_looks(study_of(**{"agents": THREE, **changes}), tmp_path, most)
         assert words in str(refusal.value)
-
-
-def test_a_plan_that_cannot_be_read_is_refused(tmp_path):
-    assert looks_of(tmp_path) == ()
-    for text in ("", "{", "[]", '{"looks": []}', '{"looks": ["a"]}'):
-        (tmp_path / LOOKS_FILE).write_text(text)
-        with pytest.raises(UserError, match=r"looks\.json cannot be read .*: remove it"):
-            looks_of(tmp_path)
 
 
 @pytest.mark.parametrize(

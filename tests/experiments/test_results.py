@@ -1,6 +1,5 @@
 """From run folders to tables, judgements, sentences and files, on runs written by hand."""
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -9,10 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from rl_yardstick.experiments.launching import EarlyResults
-from rl_yardstick.pipeline.runs import FINISHED
 
-import compare
 from rl_yardstick.commands.terminal import TextConsole
 from rl_yardstick.experiments.analysis import analyse
 from rl_yardstick.experiments.plan import plan
@@ -24,6 +20,7 @@ from rl_yardstick.experiments.results import (
     values_over_seeds,
 )
 from rl_yardstick.experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from rl_yardstick.pipeline.run import FINISHED
 from rl_yardstick.report.conclusions import places_without_a_run
 from rl_yardstick.report.documents import write_tables
 from rl_yardstick.report.figures import write_figures
@@ -44,16 +41,16 @@ def write_run(planned, evaluations, episodes=((10, 1.0),) * 10, **info):
 
     The optimum of the warehouse is 100, and the best constant policy earns 0.
     """
-    run = planned.run
-    run.params_path.mkdir(parents=True)
+    folder = planned.path
+    folder.mkdir(parents=True)
     rows = [f"{r},{length},{n + 1}.0" for n, (length, r) in enumerate(episodes)]
     text = "\n".join(['#{"t_start": 0, "env_id": "x"}', "r,l,t", *rows, ""])
-    (run.path / "0.monitor.csv").write_text(text)
+    (folder / "0.monitor.csv").write_text(text)
     final, is_known = None, planned.spec.env_id == HOUSE.env_id
     if evaluations:
         steps, values = zip(*evaluations, strict=True)
         results = np.array(values, dtype=float)[:, None]
-        np.savez(run.evaluations_path, timesteps=steps, results=results, ep_lengths=results)
+        np.savez(folder / "evaluations.npz", timesteps=steps, results=results, ep_lengths=results)
         final = {"mean_return": values[-1], "std_return": 0.0, "mean_length": 10.0}
         final |= {"success_rate": 1.0, "exact": is_known}
         if is_known:
@@ -62,12 +59,10 @@ def write_run(planned, evaluations, episodes=((10, 1.0),) * 10, **info):
             final |= {"acts_by": "epsilon 0.1", "stochastic_return": values[-1] - 5}
             final |= {"discount": 0.9, "discounted_return": values[-1] / 2}
             final |= {"discounted_optimum": 50.0}
-    record = {"state": FINISHED, "spec": planned.spec.as_data(), "final": final}
-    record |= {"best_mean_return": max((v for _, v in evaluations), default=None)}
+    record = {"final": final, "best_mean_return": max((v for _, v in evaluations), default=None)}
     record |= {"best_timesteps": 50 if evaluations else 0, "n_timesteps": 100, "engine": "compiled"}
     record |= {"seconds": 9.5, "cpu_seconds": 2.5}
-    run.info_path.write_text(json.dumps(record | info))
-    run.model_path.touch()
+    planned.run.record(planned.spec, FINISHED, **record | info)
 
 
 def results_of(study, root, finals):
@@ -144,7 +139,7 @@ def test_where_an_agent_remembers_all_have_its_scale(tmp_path):
 
 def test_the_columns_of_the_files_are_documented():
     """What the files hold is recorded in ``tests/golden``."""
-    text = (Path(compare.__file__).parent / "docs" / "compare.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "compare.md").read_text()
     table = text.partition("columns of `summary.csv`")[2].partition("\n\n`")[0]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     assert re.findall(r"`(\w+)`", " ".join(rows)) == list(RUN_COLUMNS)
@@ -165,19 +160,42 @@ def test_learning_curves_by_step_episode_and_time(tmp_path):
     assert training["episode"].iloc[[0, 1, -1]].tolist() == [3, 6, 250]
 
 
-def test_runs_that_were_read_early_are_not_read_again(tmp_path):
+def test_runs_that_were_read_are_not_read_again(tmp_path):
     study = study_of(n_seeds=2, agents=("qlearning",))
     first, second = plan(study, tmp_path)
     write_run(first, [(20, 10.0)], [(10, 1.0)])
-    early = EarlyResults(study)
-    early.read(first)
-    early.read(second)  # it is not there
+    known = {}
+    read_results(study, [first, second], tmp_path, known)
     write_run(second, [(20, 12.0)], [(10, 1.0)])
     expected = read_results(study, [first, second], tmp_path)
     (first.path / "evaluations.npz").write_bytes(b"damaged since")
-    found = read_results(study, [first, second], tmp_path, read=early.of)
+    found = read_results(study, [first, second], tmp_path, known)
     pd.testing.assert_frame_equal(found.summary, expected.summary)
     pd.testing.assert_frame_equal(found.curves, expected.curves)
+
+
+# What somebody has made of a file of a run, and what is said of it.
+DAMAGE = {
+    "evaluations.npz": (b"PK", "evaluations.npz is damaged"),
+    "0.monitor.csv": (b"#\nr,l\n1,2\n", "0.monitor.csv is damaged"),
+    "run.json": (None, "run.json is damaged"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_run_with_files_that_cannot_be_read_is_left_out(name, tmp_path):
+    results = results_of(study_of(), tmp_path, {"qlearning": [90] * 4, "sarsa": [80] * 4})
+    first = results.planned[0]
+    content, reason = DAMAGE[name]
+    if content is None:
+        first.run.record(first.spec, FINISHED, final=3)
+    else:
+        (first.path / name).write_bytes(content)
+    found = read_results(study_of(), results.planned, tmp_path)
+    assert (len(found.summary), len(found.finished)) == (7, 7)
+    ((left_out),) = found.left_out
+    assert left_out.planned == first
+    assert reason in left_out.reason
 
 
 @pytest.mark.parametrize(

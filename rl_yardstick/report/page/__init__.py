@@ -9,21 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
 from rl_yardstick.pipeline.files import write_text
-from rl_yardstick.report.page import result_sections, world_sections
-from rl_yardstick.report.page.frame import (
-    SHARED,
-    Report,
-    Section,
-    as_json,
-    packed,
-    page_frame,
-    templates,
-)
+from rl_yardstick.report.page import frame, result_sections, world_sections
+from rl_yardstick.report.page.frame import Report, Section
 
 # To add a section, list its function here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
@@ -50,8 +41,8 @@ def write_report(report: Report, path: Path) -> None:
 
 
 def render(report: Report, sections: list[Section]) -> str:
-    """The page as HTML."""
-    environment = templates()
+    """The page as HTML; the data of a script are in the HTML element with its name."""
+    environment = frame.templates()
     study, environments = report.analysis.study, report.analysis.environments
     shared = {"study": study, "environments": environments, "marks": report.series.marks}
     bodies = {
@@ -60,8 +51,23 @@ def render(report: Report, sections: list[Section]) -> str:
         )
         for section in sections
     }
+    places = [
+        {
+            "label": one.environment,
+            "optimum": one.optimum,
+            "optimum_at_least": one.optimum_at_least,
+            "optimum_is_proven": one.optimum_is_proven,
+            "baseline": one.baseline,
+            "agents": [agent.agent for agent in one.agents],
+        }
+        for one in environments
+    ]
+    data = {"page": {"agents": list(report.series.marks.values()), "environments": places}}
+    for section in sections:
+        data[section.name] = section.data
+        data |= {f"{section.name}-{place}": item for place, item in enumerate(section.places)}
     moving = [section for section in sections if section.data is not None or section.places]
-    scripts = [*SHARED, *(f"{section.name}.js" for section in moving), "paper.js"]
+    scripts = [*frame.SHARED, *(f"{section.name}.js" for section in moving), "paper.js"]
     return environment.get_template("page.html").render(
         title=study.title,
         study=study,
@@ -69,28 +75,8 @@ def render(report: Report, sections: list[Section]) -> str:
         sections=sections,
         bodies=bodies,
         is_sweep=any(one.sweeps or one.grids for one in report.series.environments),
-        data={name: packed(as_json(item)) for name, item in _data(report, sections).items()},
-        **page_frame(scripts),
+        data={
+            name: frame.packed(frame.as_json(one)) for name, one in data.items() if one is not None
+        },
+        **frame.page_frame(scripts),
     )
-
-
-def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
-    """The data of the scripts, by the name of the HTML element that holds it."""
-    page = {
-        "agents": list(report.series.marks.values()),
-        "environments": [
-            {
-                "label": environment.environment,
-                "optimum": environment.optimum,
-                "optimum_at_least": environment.optimum_at_least,
-                "optimum_is_proven": environment.optimum_is_proven,
-                "baseline": environment.baseline,
-                "agents": [agent.agent for agent in environment.agents],
-            }
-            for environment in report.analysis.environments
-        ],
-    }
-    data = {"page": page, **{section.name: section.data for section in sections}}
-    for section in sections:
-        data |= {f"{section.name}-{place}": item for place, item in enumerate(section.places)}
-    return {name: item for name, item in data.items() if item is not None}

@@ -30,8 +30,6 @@ from rl_yardstick.report.words import (
     score_number,
 )
 
-# Data as text for a browser: templates, JSON, inline scripts.
-
 _WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
 
 STYLES = ("parts.css", "page.css", "paper.css")
@@ -55,7 +53,7 @@ def templates(folder: str = "") -> Environment:
     environment.filters.update(
         number=number,
         optimum=optimum_words,
-        hidden=lambda one: scale_words(one.full_optimum, one.measured_by),
+        hidden=scale_words,
         interval=interval_alone,
         score=score_number,
         bar=bar,
@@ -132,9 +130,6 @@ def breakable(label: str) -> Markup:
 def setting(value: Any) -> str:
     """A hyperparameter as its YAML file has it."""
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-# What the page and its sections have in common.
 
 
 @dataclass(frozen=True)

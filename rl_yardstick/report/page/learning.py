@@ -29,50 +29,37 @@ from rl_yardstick.pipeline.modules import import_modules
 from rl_yardstick.pipeline.run import RECORD, Run, Stop
 from rl_yardstick.pipeline.spec import TrainSpec
 from rl_yardstick.pipeline.watching import LOGGED, MapRecorder, TableRecorder, Watch
-from rl_yardstick.report.page.frame import (
-    LearningPage,
-    as_json,
-    first_runs,
-    inline_script,
-    layout_data,
-    packed,
-    script_hash,
-    template_file,
-    templates,
-)
+from rl_yardstick.report.page import frame
+from rl_yardstick.report.page.frame import LearningPage, first_runs
 from rl_yardstick.safe_files.archives import read_members
 
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     """The template's variables whose words depend on the data."""
-    note = ""
     if data["kind"] == "maps":
         unit, stride = data["unit"], data["stride"]
         extent = _count(data["n_units"], unit)
-        if stride > 1:
-            extent += f", one in {stride:,} of which is shown"
-        if unit == "update":
-            note = "an update: all learning from one rollout, at its end"
+        extent += f", one in {stride:,} of which is shown" if stride > 1 else ""
+        is_update = unit == "update"
+        note = "an update: all learning from one rollout, at its end" if is_update else ""
         return {"kind": f"from {unit} to {unit}", "extent": extent, "note": note}
-    n_steps = len(data["steps"]["timesteps"])
-    n_episodes = int(np.count_nonzero(data["moves"]["end"]))
+    steps, note = data["steps"]["timesteps"], ""
     if data["is_cut"] and spec.watch_episodes:
         asked = _count(spec.watch_episodes, "episode")
-        note = f"a page has room for {n_steps:,} steps, and ends before the first {asked} do"
+        note = f"a page has room for {len(steps):,} steps, and ends before the first {asked} do"
     elif data["begin"]:
         note = "these steps, as the return of the greedy policy rises in them"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
-    extent = _count(n_steps, "step")
+    extent = _count(len(steps), "step")
     if data["begin"] or data["is_longer"]:
-        first, last = (int(data["steps"]["timesteps"][place]) for place in (0, -1))
-        extent = f"steps {first:,} to {last:,} of {data['n_timesteps']:,}"
-    extent += f", {_count(n_episodes, 'whole episode')}"
+        extent = f"steps {steps[0]:,} to {steps[-1]:,} of {data['n_timesteps']:,}"
+    extent += f", {_count(int(np.count_nonzero(data['moves']['end'])), 'whole episode')}"
     return {"kind": "step by step", "extent": extent, "note": note}
 
 
 def _count(number: int, word: str) -> str:
-    return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
+    return f"{number:,} {word}{'' if number == 1 else 's'}"
 
 
 # The page's data: the steps, the positions of states on a map, and the names of actions.
@@ -135,20 +122,20 @@ def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
     Every ``stride``-th update or evaluation is shown, and the last in any case.
     """
     evaluator, rows = recorder.evaluator, recorder.moments.rows
-    is_shown = rows["number"] % stride == 0
-    is_shown[-1] = True
-    shown = rows[is_shown]
-    optimal = evaluator.optimum[0][evaluator.model.reachable]
+    shown = rows[(rows["number"] % stride == 0) | (np.arange(len(rows)) == len(rows) - 1)]
+    reachable = evaluator.model.reachable
+    optimal = evaluator.optimum[0][reachable]
+    moments = {
+        **_columns(shown),
+        "values": np.where(reachable, shown["values"], np.nan),
+        "return": shown["values"] @ evaluator.model.initial,
+    }
     return {
         "kind": "maps",
         "unit": recorder.unit,
         "n_units": recorder.n_units,
         "stride": stride,
-        "moments": {
-            **_columns(shown),
-            "values": np.where(evaluator.model.reachable, shown["values"], np.nan),
-            "return": shown["values"] @ evaluator.model.initial,
-        },
+        "moments": moments,
         "logged": LOGGED,
         "optimum": evaluator.yardstick.optimum,
         "optimal_range": [optimal.min(), optimal.max()],
@@ -173,7 +160,7 @@ def place_data(spec: TrainSpec, recorder: Watch) -> dict[str, Any]:
     return {
         "n_states": n_states,
         "actions": names[:n_arms],
-        "layout": None if layout is None else layout_data(layout),
+        "layout": None if layout is None else frame.layout_data(layout),
         "is_drawn": 1 < n_states <= MAX_STATES,
     }
 
@@ -189,12 +176,10 @@ def exactly(number: float) -> float | str | None:
 
 def _layout_of(env: Any, n_states: int) -> GridLayout | None:
     """The map, if the agent observes the number of the state; else None."""
-    layout = grid_layout(env)
-    if layout is None or layout.n_states != n_states:
+    layout, seen = grid_layout(env), observations_of_states(env)
+    if layout is None or layout.n_states != n_states or seen is None:
         return None
-    seen = observations_of_states(env)
-    is_number = seen is not None and np.array_equal(seen, np.arange(n_states))
-    return layout if is_number else None
+    return layout if np.array_equal(seen, np.arange(n_states)) else None
 
 
 # The page as one file: it needs nothing else and no network.
@@ -236,17 +221,17 @@ def _ever_less(recorder: Watch) -> Iterator[dict[str, Any]]:
 
 
 def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    early = template_file("theme.js")
-    own = "\n".join(template_file(f"learning/learning_{name}.js") for name in SCRIPTS)
-    style = f"{template_file('page.css')}\n{template_file('learning/learning.css')}"
-    template = templates("learning").get_template("learning.html")
+    early = frame.template_file("theme.js")
+    own = "\n".join(frame.template_file(f"learning/learning_{name}.js") for name in SCRIPTS)
+    style = f"{frame.template_file('page.css')}\n{frame.template_file('learning/learning.css')}"
+    template = frame.templates("learning").get_template("learning.html")
     return template.render(
         **words,
-        data=packed(as_json(data, exactly)),
+        data=frame.packed(frame.as_json(data, exactly)),
         style=Markup(style),  # noqa: S704  # our own
-        early=inline_script(early),
-        own=inline_script(own),
-        policy=" ".join(map(script_hash, [early, own])),
+        early=frame.inline_script(early),
+        own=frame.inline_script(own),
+        policy=" ".join(map(frame.script_hash, [early, own])),
     )
 
 

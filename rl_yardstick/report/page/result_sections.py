@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,15 +16,7 @@ from rl_yardstick.experiments.study import COSTS, METRIC_WORDS, StudySpec
 from rl_yardstick.mdp.transition_model import Floats
 from rl_yardstick.pipeline.files import read_text
 from rl_yardstick.pipeline.spec import TrainSpec
-from rl_yardstick.report.conclusions import (
-    conclusion,
-    on_changes,
-    overall_sentences,
-    pairs_both_ways,
-    places_without_a_run,
-    unproven_sentences,
-    unseen_sentence,
-)
+from rl_yardstick.report import words
 from rl_yardstick.report.documents import MARKUPS, verdicts_as
 from rl_yardstick.report.page.frame import Report, Section, setting
 from rl_yardstick.report.ranking import COLUMNS, OTHER_RETURNS, Column, Row, filled
@@ -42,27 +34,19 @@ from rl_yardstick.report.words import number, seed_sentence
 WIDTH, HEIGHT = 200, 100  # of a small figure, in the drawing's own unit
 
 
-class SmallFigure(NamedTuple):
-    """The curves of an environment."""
-
-    name: str  # the environment's
-    what: str  # the label of the y axis
-    lines: Mapping[str, str]  # by agent, the points of its SVG polyline
-    optimum: float | None  # its distance from the top; None if it is unknown or not shown
-
-
 def overview(report: Report) -> Section | None:
     """All environments side by side, each as a small figure; None for a single one."""
     environments = report.series.environments
     if len(environments) < 2:
         return None
     figures = [_small_figure(one) for one in environments]
-    agents = [label for label in report.series.marks if any(label in f.lines for f in figures)]
+    agents = [label for label in report.series.marks if any(label in f["lines"] for f in figures)]
     context = {"figures": figures, "agents": agents, "width": WIDTH, "height": HEIGHT}
     return Section("overview", "Environments", context, data={})
 
 
-def _small_figure(one: EnvironmentSeries) -> SmallFigure:
+def _small_figure(one: EnvironmentSeries) -> dict[str, Any]:
+    """By agent the points of an SVG polyline, and the distance of the optimum from the top."""
     curves: Mapping[str, Curve] = {}
     linear, optimum = None, None
     if one.pulls is not None:
@@ -85,16 +69,13 @@ def _small_figure(one: EnvironmentSeries) -> SmallFigure:
         # The distance from the top, with a margin for the width of a line.
         return 4 + (HEIGHT - 8) * (high - height) / ((high - low) or 1.0)
 
-    lines = {
-        agent: " ".join(
-            f"{WIDTH * x / last:.1f},{down(y):.1f}"
-            for x, y in zip(curves[agent].x, values, strict=True)
-            if math.isfinite(y)
-        )
-        for agent, values in heights.items()
-    }
-    name = one.environment.environment
-    return SmallFigure(name, what, lines, down(float(best[0])) if best.size else None)
+    lines = {}
+    for agent, curve in curves.items():
+        known_points = zip(WIDTH * curve.x / last, heights[agent], strict=True)
+        points = [f"{x:.1f},{down(y):.1f}" for x, y in known_points if math.isfinite(y)]
+        lines[agent] = " ".join(points)
+    optimum = down(float(best[0])) if best.size else None
+    return {"name": one.environment.environment, "what": what, "lines": lines, "optimum": optimum}
 
 
 def _compressed(values: Floats, linear: float | None) -> Floats:
@@ -107,34 +88,38 @@ def _compressed(values: Floats, linear: float | None) -> Floats:
 
 def verdict(report: Report) -> Section | None:
     """For each environment the lead, the pairs as a matrix or sentences, and the notes."""
-    study, environments = report.analysis.study, report.series.environments
-    metric = METRIC_WORDS[study.metric]
+    analysis, environments = report.analysis, report.series.environments
+    metric = METRIC_WORDS[analysis.study.metric]
     cards = [
         {
             "environment": one.environment,
-            "conclusion": conclusion(study, one.environment),
-            "pairs": pairs_both_ways(one.environment.pairs),
+            "conclusion": words.conclusion(analysis.study, one.environment),
+            "pairs": words.pairs_both_ways(one.environment.pairs),
             "has_sweeps": bool(one.sweeps),
-            "grids": {name: _grid(one, grid, study.metric) for name, grid in one.grids.items()},
+            "grids": {
+                name: _grid(one.environment, grid, analysis.study.metric)
+                for name, grid in one.grids.items()
+            },
         }
         for one in environments
     ]
     context = {
-        "general": [*overall_sentences(report.analysis), *places_without_a_run(report.analysis)],
+        "general": [
+            *words.overall_sentences(analysis),
+            *words.places_without_a_run(analysis),
+        ],
         "cards": cards,
-        "unseen": unseen_sentence(report.analysis),
+        "unseen": words.unseen_sentence(analysis),
         "metric": metric,
     }
-    files = {name: verdicts_as(name, report.analysis, report.command) for name in MARKUPS}
+    files = {name: verdicts_as(name, analysis, report.command) for name in MARKUPS}
     data = {"files": files, "metric": metric, "sweeps": [_sweeps(one) for one in environments]}
     return Section("verdict", "Verdict", context, data)
 
 
 def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
     """By sweep, the means by parameter, and which of them are the best of all sweeps."""
-    best = with_best_mean(
-        one.environment, [at for sweep in one.sweeps.values() for at in sweep.labels]
-    )
+    best = with_best_mean(one.environment, *(sweep.labels for sweep in one.sweeps.values()))
     return {
         group: {
             **vars(sweep.means),
@@ -145,9 +130,9 @@ def _sweeps(one: EnvironmentSeries) -> dict[str, dict[str, Any]]:
     }
 
 
-def _grid(one: EnvironmentSeries, grid: Grid, metric: str) -> dict[str, Any]:
+def _grid(environment: EnvironmentAnalysis, grid: Grid, metric: str) -> dict[str, Any]:
     """The heat map of an agent: its rows of cells."""
-    best = with_best_mean(one.environment, [label for row in grid.labels for label in row])
+    best = with_best_mean(environment, *grid.labels)
     shares = grid.shares(is_cost=metric in COSTS)
     rows = [
         [
@@ -174,29 +159,18 @@ def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, An
     return {
         **_table(study, [column for column in COLUMNS if column.page], rows),
         "others": _table(study, OTHER_RETURNS, rows) if has_others else None,
-        "changes": on_changes([environment]),
+        "changes": words.on_changes([environment]),
     }
 
 
 def _table(study: StudySpec, columns: Sequence[Column], rows: Sequence[Row]) -> dict[str, Any]:
-    """The headings, and each agent's cells."""
-    shown = filled(columns, rows)
-    of = rows[0].environment if rows else None
-    words = {"threshold": "", "failed": ""}
-    if of is not None:
-        words = {"threshold": number(of.threshold), "failed": number(of.failure_threshold)}
+    """The columns, the words in their headings, and each agent's cells."""
+    shown, of = filled(columns, rows), rows[0].environment
     return {
-        "headings": [
-            {
-                "title": column.page,
-                "help": column.help.format(**words),
-                "order": column.order(study),
-            }
-            for column, _ in shown
-        ],
-        "rows": [
-            (row.agent, [cells[place] for _, cells in shown]) for place, row in enumerate(rows)
-        ],
+        "columns": [column for column, _ in shown],
+        "orders": [column.order(study) for column, _ in shown],
+        "words": {"threshold": number(of.threshold), "failed": number(of.failure_threshold)},
+        "rows": [(row.agent, [cells[k] for _, cells in shown]) for k, row in enumerate(rows)],
     }
 
 
@@ -211,19 +185,18 @@ def curves(report: Report) -> Section | None:
     curves = [one.curves for one in report.series.environments]
     if not (len(report.analysis.results.curves) and any(curves)):
         return None
-    units = ["step" if item is None else item["evaluation"].budget for item in curves]
-    shown = [
-        {} if item is None else item["evaluation"].by_axis[unit]
-        for item, unit in zip(curves, units, strict=True)
-    ]
+    # For readers who cannot see the figure: the evaluations as a table.
+    shown = [None if item is None else item["evaluation"] for item in curves]
     context = {
         "has_curves": [item is not None for item in curves],
         "stages": STAGES,
-        "units": units,
-        # For readers who cannot see the figure.
+        "units": ["step" if found is None else found.budget for found in shown],
         "tables": [
-            [(agent, [_at(curve, share) for share in STAGES]) for agent, curve in of_agents.items()]
-            for of_agents in shown
+            [
+                (agent, [_at(curve, share) for share in STAGES])
+                for agent, curve in (found.by_axis[found.budget].items() if found else ())
+            ]
+            for found in shown
         ],
     }
     return Section("curves", "Learning curves", context, places=curves, by_environment=True)
@@ -241,13 +214,9 @@ MOST_DOTS = 300
 
 def comparison(report: Report) -> Section | None:
     """Intervals and each run as figures, the pairs as a table and as a matrix."""
-    analysis = report.analysis
-    metric = METRIC_WORDS[analysis.study.metric]
-    context = {
-        "metric": metric,
-        "most_dots": MOST_DOTS,
-        "lower_is_better": analysis.study.metric in COSTS,
-    }
+    study = report.analysis.study
+    metric, is_cost = METRIC_WORDS[study.metric], study.metric in COSTS
+    context = {"metric": metric, "most_dots": MOST_DOTS, "lower_is_better": is_cost}
     places = [
         {
             "intervals": [_runs(agent) for agent in one.runs],
@@ -280,8 +249,8 @@ def overall(report: Report) -> Section | None:
     context = {
         "agents": agents,
         "scores": scores,
-        "pairs": pairs_both_ways(overall.pairs),
-        "unproven": unproven_sentences(report.analysis.environments),
+        "pairs": words.pairs_both_ways(overall.pairs),
+        "unproven": words.unproven_sentences(report.analysis.environments),
     }
     data = {
         "agents": agents,
@@ -299,13 +268,11 @@ def watching(report: Report) -> Section | None:
     return Section("watching", "See it learn", {"pages": report.learning}, by_environment=True)
 
 
-# What a reader needs to repeat the study: settings as run, seeds, looks, versions, failures.
-
 ABSENT = "-"
 
 
 def settings(report: Report) -> Section | None:
-    """Settings by environment; command, seeds, versions and missing runs of the whole study."""
+    """What a reader needs to repeat the study: settings, command, seeds, versions, failures."""
     results, environments = report.analysis.results, report.analysis.environments
     runs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in results.finished:
@@ -358,18 +325,20 @@ def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
-    """Missing runs, grouped by agent, environment and reason."""
+    """Missing runs, grouped by agent, environment and reason: an error's last line."""
     groups: dict[tuple[str, str, str], dict[str, Any]] = {}
     unreadable = {one.planned.path: one.reason for one in results.left_out}
     there = {run.path for run in results.finished}
     for run in results.planned:
         if run.path in there:
             continue
-        reason = unreadable.get(run.path) or results.failures.get(run.path) or "not done yet"
-        error = run.path / ERROR_FILE
-        details = read_text(error) if run.path in results.failures and error.exists() else ""
+        failure, error = results.failures.get(run.path), run.path / ERROR_FILE
+        details = read_text(error).strip() if failure and error.exists() else ""
+        reason = (
+            unreadable.get(run.path) or details.rpartition("\n")[2] or failure or "not done yet"
+        )
         new = {"agent": run.agent, "environment": run.environment, "reason": reason, "seeds": []}
         group = groups.setdefault((run.agent, run.environment, reason), new)
         group["seeds"].append(run.seed)
-        group["details"] = details.strip()
+        group["details"] = details
     return list(groups.values())

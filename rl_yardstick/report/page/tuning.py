@@ -10,20 +10,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from rl_yardstick.pipeline.files import write_text
-from rl_yardstick.report.page.frame import (
-    SHARED,
-    Section,
-    as_json,
-    packed,
-    page_frame,
-    setting,
-    templates,
-)
+from rl_yardstick.report.page import frame
+from rl_yardstick.report.page.frame import Section, setting
 from rl_yardstick.report.words import number
 
 if TYPE_CHECKING:
@@ -42,6 +36,13 @@ class Trials:
     def ended(self) -> list[Mapping[str, Any]]:
         """The trials that have ended, in the order of the record."""
         return [t for t in self.record["trials"] if t["state"] in {"complete", "pruned", "fail"}]
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """A row for each of these, by its number: how it ended, and its value, NaN for none."""
+        rows = {t["number"]: (kind(t), t["value"] if t["figures"] else None) for t in self.ended}
+        table = pd.DataFrame.from_dict(rows, orient="index", columns=["kind", "value"])
+        return table.assign(value=table["value"].astype(float).replace([np.inf, -np.inf], np.nan))
 
     @property
     def is_cost(self) -> bool:
@@ -67,11 +68,12 @@ class Trials:
         whole = sorted((t for t in self.judged if kind(t) == COMPLETE), key=rank)
         return whole + [trial for trial in self.ended if trial not in whole]
 
+    @cached_property
     def distributions(self) -> dict[str, BaseDistribution]:
         """The distribution of each parameter."""
         from optuna.distributions import json_to_distribution
 
-        space = (self.record.get("asked") or {}).get("search_space", {})
+        space = (self.record["asked"] or {}).get("search_space", {})
         return {name: json_to_distribution(text) for name, text in space.items()}
 
 
@@ -94,7 +96,7 @@ def importances(trials: Trials) -> dict[str, float]:
     """
     import optuna
 
-    ranges = trials.distributions()
+    ranges = trials.distributions
     judged = trials.judged
     if len({trial["value"] for trial in judged}) < 2 or not ranges:
         return {}
@@ -115,8 +117,6 @@ def importances(trials: Trials) -> dict[str, float]:
     return {name: share for name, share in found.items() if share > 0}
 
 
-# The numbers behind the figures.
-
 # The share of the worst trials that the axis of values may cut off, to show the best apart.
 _BELOW = 0.25
 # The number of groups of ranks, each drawn with its own opacity.
@@ -126,38 +126,28 @@ _ABSENT = object()
 
 def history(trials: Trials) -> dict[str, Any]:
     """The value of each trial, the best so far, and the value of the shipped settings."""
-    best, steps = None, []
-    better = min if trials.is_cost else max
-    for trial in trials.ended:
-        if kind(trial) == COMPLETE and trial["value"] is not None:
-            best = trial["value"] if best is None else better(best, trial["value"])
-        steps.append(best)
-    values = {trial["number"]: _value(trial) for trial in trials.ended}
+    table = trials.table
+    whole = table["value"].where(table["kind"] == COMPLETE)
     return {
         "isCost": trials.is_cost,
         "figure": trials.record["figure"],
         "edge": _edge(trials),
-        "shipped": next((t["value"] for t in trials.ended if t["number"] == 0), None),
-        "numbers": [*values],
-        "best": steps,
+        "shipped": table["value"].get(0),
+        "numbers": table.index,
+        "best": (whole.cummin() if trials.is_cost else whole.cummax()).ffill(),
         "values": {
-            name: [values[t["number"]] if kind(t) == name else None for t in trials.ended]
-            for name in (COMPLETE, PRUNED)
+            COMPLETE: whole,
+            PRUNED: table["value"].where(table["kind"] == PRUNED),
         },
         "texts": [_text(trial) for trial in trials.ended],
-        "failed": [number for number, value in values.items() if value is None],
+        "failed": table.index[table["value"].isna()],
     }
-
-
-def _value(trial: Mapping[str, Any]) -> float | None:
-    value = trial["value"] if trial["figures"] else None
-    return value if value is not None and math.isfinite(value) else None
 
 
 def _text(trial: Mapping[str, Any]) -> str:
     n_seeds = len(trial["figures"])
-    seeds = f"{n_seeds} seed{'' if n_seeds == 1 else 's'}"
-    return f"trial {trial['number']}: {number(_value(trial))} on {seeds}"
+    value = number(trial["value"] if n_seeds else None)
+    return f"trial {trial['number']}: {value} on {n_seeds} seed{'' if n_seeds == 1 else 's'}"
 
 
 def _edge(trials: Trials) -> float | None:
@@ -167,23 +157,19 @@ def _edge(trials: Trials) -> float | None:
     includes the shipped settings unless these would more than double it.
     """
     sign = -1.0 if trials.is_cost else 1.0
-    found = {t["number"]: (kind(t), _value(t)) for t in trials.ended}
-    values = {at: (name, sign * value) for at, (name, value) in found.items() if value is not None}
-    goods = np.array([value for _, value in values.values()])
-    whole = np.array([value for name, value in values.values() if name == COMPLETE])
-    _, shipped = values.get(0, ("", -math.inf))
-    for some in (whole, goods):
-        if some.size and (room := some.max() - np.quantile(some, _BELOW)) > 0:
-            best = float(some.max())
-            room = max(room, best - shipped) if best - shipped <= 2 * room else room
-            edge = best - 1.15 * float(room)
-            return sign * edge if edge > goods.min() else None
+    values = sign * trials.table["value"].dropna()
+    for some in (values[trials.table["kind"] == COMPLETE], values):
+        best, worst = some.max(), some.quantile(_BELOW)
+        if best > worst:
+            room, shipped = best - worst, best - values.get(0, -math.inf)
+            edge = best - 1.15 * (max(room, shipped) if shipped <= 2 * room else room)
+            return float(sign * edge) if edge > values.min() else None
     return None
 
 
 def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
     """Each trial as a line through its parameters, the most important ones first."""
-    ranges = trials.distributions()
+    ranges = trials.distributions
     names = [*shares, *(name for name in ranges if name not in shares)]
     ranked = sorted(trials.judged, key=lambda t: t["value"], reverse=trials.is_cost)
     return {
@@ -217,9 +203,9 @@ def _place(ends: BaseDistribution, value: Any) -> float | None:
     return 0.5 if low == high else (at - low) / (high - low)
 
 
-def _ticks(ends: BaseDistribution) -> list[tuple[float | None, str]]:
-    words = getattr(ends, "choices", None) or (ends.low, ends.high)  # type: ignore[attr-defined]
-    return [(_place(ends, word), _said(word)) for word in words]
+def _ticks(ends: Any) -> list[tuple[float | None, str]]:
+    values = getattr(ends, "choices", None) or (ends.low, ends.high)
+    return [(_place(ends, value), _said(value)) for value in values]
 
 
 def _said(value: Any) -> str:
@@ -229,28 +215,19 @@ def _said(value: Any) -> str:
     return number(value) if is_number else setting(value)
 
 
-# The tables: changed settings, and the cost.
-
 LEFT_OUT = "-"
 
 
-class Change(NamedTuple):
-    """A setting that differs between the winner and the shipped settings, as in a YAML file."""
-
-    name: str
-    shipped: str
-    found: str
-
-
-def changes(trials: Trials, winner: int) -> list[Change]:
-    """The settings of a trial that differ from those that the search began with."""
+def changes(trials: Trials, winner: int) -> list[tuple[str, str, str]]:
+    """Names and values of settings that differ between the start of the search and a trial."""
     settings = {trial["number"]: trial["settings"] or {} for trial in trials.ended}
     before, after = settings.get(0, {}), settings.get(winner, {})
-    found = [
-        Change(name, *(setting(of[name]) if name in of else LEFT_OUT for of in (before, after)))
-        for name in {**before, **after}
-    ]
-    return [change for change in found if change.shipped != change.found]
+    was, now = (
+        [setting(values[name]) if name in values else LEFT_OUT for name in {**before, **after}]
+        for values in (before, after)
+    )
+    found = zip({**before, **after}, was, now, strict=True)
+    return [change for change in found if change[1] != change[2]]
 
 
 def cost(trials: Trials) -> list[tuple[str, str]]:
@@ -281,11 +258,7 @@ def _duration(seconds: float | None) -> str:
         return LEFT_OUT
     if seconds < 90:
         return f"{seconds:.0f} s"
-    minutes, hours = seconds / 60, seconds / 3600
-    return f"{minutes:.0f} min" if minutes < 90 else f"{hours:.1f} h"
-
-
-# The page as one file, in the frame of a study's page.
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = "") -> None:
@@ -306,7 +279,7 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     data |= {section.name: section.data for section in sections if section.data}
     place = asked.get("env", "an environment")
     place += f" ({record['map_name']})" if record.get("map_name") else ""
-    template = templates("tuning").get_template("tuning.html")
+    template = frame.templates("tuning").get_template("tuning.html")
     text = template.render(
         title=f"{asked.get('algo', 'an agent')} on {place}",
         record=record,
@@ -316,14 +289,14 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         retest_page=retest_page,
         winner=winner,
         changes=[] if winner is None else changes(trials, winner["number"]),
-        n_params=len(trials.distributions()),
+        n_params=len(trials.distributions),
         cost=cost(trials),
         trials=trials.best_first,
         kind=kind,
         said=_said,
         shares=shares,
-        data={name: packed(as_json(item)) for name, item in data.items()},
-        **page_frame([*SHARED, "tuning/tuning.js", "paper.js"]),
+        data={name: frame.packed(frame.as_json(item)) for name, item in data.items()},
+        **frame.page_frame([*frame.SHARED, "tuning/tuning.js", "paper.js"]),
     )
     write_text(path, text)
 

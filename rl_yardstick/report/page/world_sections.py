@@ -29,14 +29,13 @@ from rl_yardstick.report.series import (
     Curve,
     Pulls,
     PullSeries,
+    astype,
     mean_of,
     mean_regret,
     regret_of_runs,
 )
 from rl_yardstick.report.why import whys_of
 from rl_yardstick.report.words import number
-
-# Bandits: rewards and regret by pull, shares of the pulls, posteriors.
 
 MOST_ARMS = 40  # over all contexts, in a table or in a figure
 
@@ -46,7 +45,6 @@ def bandits(report: Report) -> Section | None:
     bandits = [one.pulls for one in report.series.environments]
     if not any(bandits):
         return None
-    data = [None if series is None else _bandit_data(series) for series in bandits]
     pulls = [{} if series is None else series.pulls for series in bandits]
     context = {
         "is_bandit": [series is not None for series in bandits],
@@ -55,16 +53,15 @@ def bandits(report: Report) -> Section | None:
         "spread": SPREAD,
         "has_bounds": any(series is not None and series.bounds for series in bandits),
     }
+    data = [None if series is None else _bandit_data(series) for series in bandits]
     return Section("bandits", "Pulls and regret", context, places=data, by_environment=True)
 
 
 def context_tables(pulls: Pulls) -> list[dict[str, Any]]:
     """Shares of the pulls by context; empty if true means differ between runs."""
     known = {agent: p for agent, p in pulls.items() if p.true_means.size}
-    if not known:
-        return []
-    means = next(iter(known.values())).true_means
-    if means.size > MOST_ARMS:
+    means = next((p.true_means for p in known.values()), np.empty(0))
+    if not 0 < means.size <= MOST_ARMS:
         return []
     gaps = means.max(axis=1, keepdims=True) - means
     n_contexts, n_arms = means.shape
@@ -96,7 +93,10 @@ def _bandit_data(series: PullSeries) -> dict[str, Any]:
                 "x": pulls.pulls,
                 "reward": pulls.reward,
                 "optimal": pulls.optimal,
-                "regret": {"mean": mean_regret(pulls), "runs": regret_of_runs(pulls)},
+                "regret": {
+                    "mean": mean_regret(pulls),
+                    "runs": regret_of_runs(pulls),
+                },
                 "simple": pulls.simple_regret,
             }
             for agent, pulls in series.pulls.items()
@@ -106,13 +106,11 @@ def _bandit_data(series: PullSeries) -> dict[str, Any]:
     }
 
 
-# Where the median run of each agent loses return.
-
 MOST_EXPLAINED = 8  # the largest number of agents per environment, because each is loaded
 
 
 def why(report: Report) -> Section | None:
-    """The explanation of each agent's median run; None if no gap can be split."""
+    """Where the median run of each agent loses return; None if no gap can be split."""
     analysis = report.analysis
     chosen = [_median_runs(analysis, one)[:MOST_EXPLAINED] for one in analysis.environments]
     asked = [run for runs in chosen for run in runs]
@@ -138,19 +136,15 @@ def _median_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> l
     return found
 
 
-# Errors of values, advantages and gradients, in runs with `diagnose`.
-
-
 def diagnosis(report: Report) -> Section | None:
     """A curve for each figure of `diagnosis.csv`; None where no run has one."""
     analysis = report.analysis
-    data = [_compared(analysis, environment) for environment in analysis.environments]
+    data = [_compared(analysis, environment) or None for environment in analysis.environments]
     if not any(data):
         return None
-    context = {"is_there": [bool(item) for item in data]}
-    places = [item or None for item in data]
+    context = {"is_there": [item is not None for item in data]}
     return Section(
-        "diagnosis", "Critics and gradients", context, MEANINGS, places, by_environment=True
+        "diagnosis", "Critics and gradients", context, MEANINGS, data, by_environment=True
     )
 
 
@@ -175,8 +169,6 @@ def _compared(
     return curves
 
 
-# What agents do on each cell of a grid world, over their training, beside the optimum.
-
 MAX_MAPS = 40  # of a run: more than a slider needs
 MIN_MAPS = 2  # the first and the last
 # The most values and actions on a page, shared by its environments; each takes 4 bytes.
@@ -186,7 +178,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def policies(report: Report) -> Section | None:
-    """The maps of every grid world; None where there is none."""
+    """What agents do on each cell of a grid world, over their training, beside the optimum."""
     analysis = report.analysis
     room = MAX_FIGURES // len(analysis.environments)
     data = [_policy_data(analysis, environment, room) for environment in analysis.environments]
@@ -211,10 +203,7 @@ def _policy_data(
     runs.sort(key=lambda run: (run.seed, order.index(run.agent)))
     with closing(make_single_env(runs[0].spec)) as env:
         layout, model = grid_layout(env), transition_model(env)
-    if layout is None or model is None:
-        return None
-    maps = _read_maps(runs, layout, room)
-    if not maps:
+    if layout is None or model is None or not (maps := _read_maps(runs, layout, room)):
         return None
     optimum = next(iter(maps.values()))
     return {
@@ -265,39 +254,34 @@ def _read_maps(
 
 def _digits(numbers: NDArray[Any]) -> str:
     """Numbers below ten as one text, which is shortest."""
-    return "".join(map(str, numbers.astype(np.int64).tolist()))
+    return "".join(map(str, astype(np.int64).tolist()))
 
-
-# An episode of each agent as an animated picture inside the page.
 
 MOST_FILMED = 8  # agents of an environment, the best of them
 ALL_BYTES = 1_000_000  # of the films of a page, before base64
 
 
 def played_episodes(report: Report) -> Section | None:
-    """The films of each environment; None where nothing can be drawn."""
+    """An episode of each agent as an animated picture; None where nothing can be drawn."""
     ranked = first_runs(report.analysis)
     to_film = [run for runs in ranked for run in runs[:MOST_FILMED]]
     made = films_of(to_film) if all(map(has_film, to_film)) else do_aside(films_of, to_film)
     paths = dict(zip((run.path for run in to_film), made, strict=True))
     contents: dict[bytes, int] = {}  # of each film its place on the page; equal films share one
-    groups: list[list[dict[str, Any]]] = []
-    without_room: list[list[str]] = []
-    for n_done, runs in enumerate(ranked, start=1):
-        groups.append([])
-        without_room.append([])
+    groups: list[list[dict[str, Any]]] = [[] for _ in ranked]
+    without_room: list[list[str]] = [[] for _ in ranked]
+    for place, runs in enumerate(ranked):
         for run in runs[:MOST_FILMED]:
-            path = paths[run.path]
-            if path is None:
+            if (path := paths[run.path]) is None:
                 continue
             content = read_bytes(path)
             # Space that an environment does not use is left to the next ones.
-            room = ALL_BYTES * n_done // len(ranked) - sum(map(len, contents))
+            room = ALL_BYTES * (place + 1) // len(ranked) - sum(map(len, contents))
             if content in contents or len(content) <= room:
-                place = contents.setdefault(content, len(contents))
-                groups[-1].append({"agent": run.agent, "place": place, **_film(path, content)})
+                film = {"place": contents.setdefault(content, len(contents))}
+                groups[place].append({"agent": run.agent, **film, **_film(path, content)})
             else:
-                without_room[-1].append(run.agent)
+                without_room[place].append(run.agent)
     if not any(groups):
         return None
     data = [data_uri("image/gif", content) for content in contents]
