@@ -18,7 +18,6 @@ import pytest
 
 from rl_yardstick.experiments.child_processes import PRELOADED
 from rl_yardstick.pipeline.stopping import SIGNALS
-from rl_yardstick.safe_files import files as unsafe_files
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -85,14 +84,6 @@ def signals_are_left_as_they_were():
         if after[number] != before[number]:
             signal.signal(number, before[number])
     assert after == before
-
-
-@pytest.fixture(autouse=True)
-def folders_are_held_for_one_test():
-    """A process holds folders for good; tests share one, and the folders above their own."""
-    before = set(unsafe_files._held)
-    yield
-    unsafe_files._held.intersection_update(before)
 
 
 @pytest.fixture

@@ -175,11 +175,9 @@ def _compare(args: argparse.Namespace) -> int:
     from rl_yardstick.experiments.plan import plan
     from rl_yardstick.experiments.run_limits import RunLimits
     from rl_yardstick.pipeline.locks import folder_lock, told_if_gone
-    from rl_yardstick.safe_files.files import take_up
 
     go_on_unread()
     root = Path(args.log_folder) / study.name
-    take_up(root)
     console = table_console()
     limits = RunLimits(study.run_timeout, study.run_memory)
     context = run_context(args, root, command_line(), limits, console)
@@ -212,10 +210,8 @@ def results_of(study: StudySpec, context: RunContext) -> StudyResults:
     from rl_yardstick.experiments.launching import EarlyResults
     from rl_yardstick.experiments.plan import plan
     from rl_yardstick.pipeline.locks import folder_lock, told_if_gone
-    from rl_yardstick.safe_files.files import take_up
 
     root = context.root
-    take_up(root)
     planned, early = plan(study, root), EarlyResults(study)
     with folder_lock(root, give_way, partial(say, context.console)), told_if_gone(root):
         try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -104,29 +104,22 @@ def inspect() -> int:
     parser.add_argument("model", metavar="ZIP", help="zip of an agent of Stable-Baselines3 or ours")
     path = Path(parser.parse_args().model)
     from rl_yardstick.commands.terminal import say, table_console
-    from rl_yardstick.safe_files import inspect_model
+    from rl_yardstick.safe_files.models import inspect_model
 
     try:
-        report = inspect_model(path)
+        found = inspect_model(path)
     except FileNotFoundError:
         raise UserError(f"no such model file: {path}") from None
     except (OSError, ValueError) as error:
         raise UserError(f"{path} is no model: {one_line(error)}") from error
-    found: dict[str, Mapping[str, str]] = {
-        "members": {name: f"{size:,} bytes" for name, size in report.sizes.items()},
-        "weights": {name: str(shape) for name, shape in report.weights.items()},
-        "settings": report.settings,
-    }
-    if report.suspicious:
-        found["suspicious"] = dict.fromkeys(report.suspicious, "")
-    else:
-        found["nothing in it is suspicious"] = {}
+    suspicious = found.pop("suspicious")
+    found["suspicious" if suspicious else "nothing in it is suspicious"] = suspicious
     console = table_console()
     for title, lines in found.items():
         width = max(map(len, lines), default=0)
         rows = [f"  {name:<{width}}  {text}".rstrip() for name, text in lines.items()]
         say(console, "\n".join([title, *rows]))
-    return SUSPICIOUS if report.suspicious else 0
+    return SUSPICIOUS if suspicious else 0
 
 
 if __name__ == "__main__":

@@ -41,7 +41,6 @@ from rl_yardstick.pipeline.errors import one_line
 from rl_yardstick.pipeline.files import write_text
 from rl_yardstick.pipeline.locks import FolderGoneError, is_gone
 from rl_yardstick.pipeline.train_spec import FAMILIES, NETWORKS, TrainSpec, is_plain
-from rl_yardstick.safe_files.files import hold
 
 if TYPE_CHECKING:
     from rl_yardstick.experiments.results import RunResults
@@ -166,7 +165,6 @@ def _do_planned_run(planned: PlannedRun, root: Path, command: str, home: Path) -
 
         os.chdir(home)
         import_checked(planned.spec.user_modules)
-    hold(root)
     do_run(planned, draft_path(root, planned), command)
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from rl_yardstick.pipeline.errors import UserError, one_line
 from rl_yardstick.pipeline.files import files_below, plain
-from rl_yardstick.safe_files.files import NO_LIMIT, Budget, UnsafeFileError, hold, opened, read_file
+from rl_yardstick.safe_files.files import NO_LIMIT, Budget, UnsafeFileError, opened, read_file
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -128,7 +128,6 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def read_record(path: Path) -> dict[str, Any]:
     """Read a ``run.json``, and check its digest."""
-    hold(path.parent)
     try:
         content = read_file(path, LARGEST_RECORD)
         Budget(len(content)).charge_json(content)

@@ -18,7 +18,8 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
-from rl_yardstick.safe_files.files import NEW, folder_of, open_number
+# Fails if the name exists, even as a link.
+NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 # Windows limits a whole path to 260 characters, Linux a name to 255 bytes.
 LONGEST_NAME = 100  # bytes
@@ -53,11 +54,11 @@ def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
     return f"{kept.decode(errors='ignore')}-{digest}"
 
 
-def put_in_place(draft: Path, path: Path, folder: int | None = None) -> None:
-    """Rename a file or folder to ``path`` atomically; relative to an open ``folder``, if given."""
+def put_in_place(draft: Path, path: Path) -> None:
+    """Rename a file or folder to ``path`` atomically."""
     for pause in (*(_PAUSES if sys.platform == "win32" else ()), None):
         try:
-            os.replace(draft, path, src_dir_fd=folder, dst_dir_fd=folder)
+            draft.replace(path)
             return
         except PermissionError:
             if pause is None:
@@ -81,24 +82,23 @@ def replacing(path: Path) -> Iterator[BufferedWriter]:
     """Open a temporary file for writing, and rename it to ``path`` once it is complete.
 
     Readers never see a half-written file, even if the process dies; a power cut may still lose the
-    file. A link or pipe at ``path`` is replaced, not written to. Names are relative to the open
-    folder, so replacing the folder meanwhile has no effect.
+    file. A link or pipe at ``path`` is replaced, not written to.
     """
     # A predictable name might exist already, as a link to another user's file.
     name = f".{path.name}.{secrets.token_hex(8)}.tmp"
-    with naming(path), folder_of(path) as (before, folder):
-        draft = before / name
+    draft = path.with_name(name)
+    with naming(path):
         try:
-            with os.fdopen(os.open(draft, NEW, 0o666, dir_fd=folder), "wb") as file:
+            with os.fdopen(os.open(draft, NEW, 0o666), "wb") as file:
                 yield file
-            put_in_place(draft, before / path.name, folder)
+            put_in_place(draft, path)
         except OSError as error:
             if str(error.filename) == str(draft):  # an internal name
                 error.filename = str(path)
             raise
         finally:
             with contextlib.suppress(OSError):  # fails on a disk that has become read-only
-                os.unlink(draft, dir_fd=folder)
+                draft.unlink()
 
 
 def settle(folder: Path) -> None:
@@ -121,7 +121,7 @@ def _sync(path: Path) -> None:
     try:
         # Windows flushes only files that are open for writing.
         access = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
-        number = os.open(path, access) if is_folder else open_number(path, access)
+        number = os.open(path, access)
         try:
             os.fsync(number)
         finally:

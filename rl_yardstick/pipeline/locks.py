@@ -27,15 +27,9 @@ from typing import Any
 
 from rl_yardstick.pipeline.digests import LOCK
 from rl_yardstick.pipeline.errors import UserError, visible
+from rl_yardstick.pipeline.files import NEW
 from rl_yardstick.pipeline.signs_of_life import Heartbeat
-from rl_yardstick.safe_files.files import (
-    NEW,
-    NO_LIMIT,
-    UnsafeFileError,
-    open_number,
-    opened,
-    read_file,
-)
+from rl_yardstick.safe_files.files import NO_LIMIT, UnsafeFileError, opened, read_file
 
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _MACHINES = ("/etc/machine-id", "/var/lib/dbus/machine-id")
@@ -277,7 +271,7 @@ def _appears(path: Path, content: str) -> bool:
     """Create the lock atomically; False if it exists already."""
     draft = path.with_name(f"{LOCK}.{secrets.token_hex(8)}.tmp")
     try:
-        with os.fdopen(open_number(draft, NEW), "wb") as file:
+        with os.fdopen(os.open(draft, NEW), "wb") as file:
             file.write(content.encode())
         os.link(draft, path)
     except FileExistsError:

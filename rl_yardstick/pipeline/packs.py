@@ -54,7 +54,6 @@ from rl_yardstick.safe_files.files import (
     MAX_ARCHIVE_BYTES,
     Budget,
     UnsafeFileError,
-    hold,
     read_file,
 )
 
@@ -237,7 +236,7 @@ def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
             content = _run_of(study, path.relative_to(study).as_posix())
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             _check_members(archive.infolist())
-        files = read_members(content, most=_MOST)
+        files = read_members(content)
     except _DAMAGE as error:
         raise UserError(f"{path} is no pack that may be opened: {one_line(error)}") from error
     with tempfile.TemporaryDirectory(prefix="yardstick-pack-") as name:
@@ -361,7 +360,6 @@ def is_study(folder: Path) -> bool:
 
 def pack_study(root: Path, target: Path, say: Callable[[str], object]) -> StudyPack:
     """Write a study as a zip, which may replace another; no other command may use the study."""
-    hold(root)
     if target.suffix != ".zip" or target.is_dir():
         raise UserError(f"{target}: a study is packed as a file: name it {target.name}.zip")
     _check_parent(target)

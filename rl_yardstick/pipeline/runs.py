@@ -45,7 +45,6 @@ from rl_yardstick.pipeline.files import (
 )
 from rl_yardstick.pipeline.locks import folder_lock, is_alive, mark
 from rl_yardstick.pipeline.user_modules import COPIES, keep_copies
-from rl_yardstick.safe_files.files import hold, take_up
 
 if TYPE_CHECKING:
     from rl_yardstick.pipeline.train_spec import TrainSpec
@@ -118,9 +117,6 @@ class Run:
 
     path: Path
     env_name: str  # the environment's name in file names
-
-    def __post_init__(self) -> None:
-        hold(self.path)
 
     @classmethod
     def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
@@ -390,7 +386,6 @@ def _processor() -> str:
 @contextmanager
 def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
     """Lock a run inside the ``with`` statement."""
-    take_up(run.path)
     with folder_lock(run.path, partial(_thread.interrupt_main, signal.SIGTERM), say):
         yield
 

@@ -26,7 +26,6 @@ from rl_yardstick.pipeline.digests import DamagedFileError
 from rl_yardstick.pipeline.errors import UserError
 from rl_yardstick.pipeline.files import DISK_ERRORS, plain
 from rl_yardstick.pipeline.locks import FolderGoneError, is_gone
-from rl_yardstick.safe_files.files import take_up
 from rl_yardstick.tuning.pruning import is_hopeless
 from rl_yardstick.tuning.search_spaces import read_search_space, steps_aside
 from rl_yardstick.tuning.suggesting import (
@@ -119,7 +118,6 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
 
     Makes the folder if all checks pass; ``storage`` is the value of ``--storage``.
     """
-    take_up(root)
     run = shipped_run(tuning, root)
     check_settings(tuning.study, [run])
     if tuning.figure == AUTO:

@@ -1,18 +1,12 @@
 """Which model is played or trained further, what belongs to it, and folders of others that lie."""
 
-import hashlib
 import json
-import os
-import pathlib
 import pickle
-import shutil
 from collections import OrderedDict
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
-from rich.console import Console
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -24,8 +18,7 @@ from rl_yardstick.pipeline.models.find import model_at, replay_buffer_of, run_of
 from rl_yardstick.pipeline.models.load import load_model, load_to_play, with_normalised_rewards
 from rl_yardstick.pipeline.playing import play_episodes, playing_env
 from rl_yardstick.pipeline.settings.yaml import read_saved_settings
-from rl_yardstick.pipeline.training import prepare
-from tests.pipeline.short_runs import CART, choose_model, spec_of, trained
+from tests.pipeline.short_runs import CART, choose_model, trained
 
 SMALL_A2C = {"policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}
 SMALL_DQN = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 10, "buffer_size": 500}
@@ -130,58 +123,6 @@ def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them_and_go_on(re
     env = playing_env(chosen, None)
     assert load_to_play("dqn", chosen.path, env).replay_buffer.buffer_size == 1
     env.close()
-
-
-# --- what was checked is what is loaded, though files are exchanged as soon as they are open -----
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """Two runs of an agent with a replay buffer."""
-    fields = {"save_replay_buffer": True, "eval_freq": -1}
-    folder = tmp_path_factory.mktemp("logs")
-    return [train_to(folder, "dqn", SMALL_DQN, 40, seed=seed, **fields) for seed in (0, 1)]
-
-
-@pytest.fixture
-def swapped(runs, tmp_path, monkeypatch):
-    """A copy of the first run, whose files become the second's once they are opened."""
-    genuine, other = runs
-    run = replace(genuine, path=tmp_path / genuine.path.name)
-    shutil.copytree(genuine.path, run.path)
-    opens = []
-
-    def open_and_swap(path, *args, **kwargs):
-        number = opened(path, *args, **kwargs)
-        there = pathlib.Path(f"/proc/self/fd/{number}").readlink()
-        if there.is_relative_to(run.path) and there.suffix in (".zip", ".pkl"):
-            opens.append(there.name)
-            shutil.copyfile(other.path / there.relative_to(run.path), tmp_path / "other")
-            (tmp_path / "other").replace(there)
-        return number
-
-    opened = os.open
-    monkeypatch.setattr(os, "open", open_and_swap)  # somebody else at the disk
-    return run, opens
-
-
-def weights(model):
-    state = model.policy.state_dict().values()
-    return np.concatenate([value.detach().numpy().ravel() for value in state]).tolist()
-
-
-def test_going_on(runs, swapped, tmp_path):
-    run, opens = swapped
-    fields = {"log_folder": tmp_path / "logs", "eval_freq": -1, "n_timesteps": 16}
-    spec = spec_of("dqn", CART, SMALL_DQN, trained_agent=run.model_path, **fields)
-    training = prepare(spec, Console(quiet=True), {}, "train.py")
-    assert opens == ["CartPole-v1.zip", "replay_buffer.pkl"]
-    recorded = training.run.read_info()["trained_agent_digest"]
-    assert recorded == hashlib.sha256(runs[0].model_path.read_bytes()).hexdigest()
-    first, second = (weights(load_model("dqn", each.model_path)) for each in runs)
-    assert weights(training.model) == first != second
-    training.model.env.close()
-    training.eval_env.close()
 
 
 # --- agents of others: rl_zoo3's layout and a model hub's, made with the library alone -----------

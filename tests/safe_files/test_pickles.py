@@ -1,6 +1,7 @@
 """Pickles as data: the tree is what Python's own unpickler makes, where that is harmless."""
 
 import contextlib
+import io
 import pickle
 
 import numpy as np
@@ -8,18 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rl_yardstick.safe_files.files import UnsafeFileError
+from rl_yardstick.safe_files.files import Budget, UnsafeFileError
 from rl_yardstick.safe_files.known_objects import read_pickle
-from rl_yardstick.safe_files.pickles import Made, Name, read_tree
+from rl_yardstick.safe_files.pickles import Made, Name, Reader
 
-KEYS = st.text(max_size=5) | st.integers(-(2**60), 2**60) | st.binary(max_size=5) | st.none()
+KEYS = st.text(max_size=5) | st.integers(-(2**60), 2**60)
 VALUES = st.recursive(
-    KEYS | st.booleans() | st.floats(allow_nan=False),
+    KEYS | st.binary(max_size=5) | st.none() | st.booleans() | st.floats(allow_nan=False),
     lambda inner: (
         st.lists(inner, max_size=4)
         | st.lists(inner, max_size=4).map(tuple)
         | st.dictionaries(KEYS, inner, max_size=4)
-        | st.sets(KEYS, max_size=4)
     ),
     max_leaves=20,
 )
@@ -50,18 +50,10 @@ def test_calls_and_names_are_written_down_and_not_made():
         def __reduce__(self):
             return print, ("called",)
 
-    tree = read_tree(pickle.dumps([Loud(), int]))
-    call, name = tree
+    call, name = Reader(io.BytesIO(pickle.dumps([Loud(), int])), Budget(0)).load()
     assert isinstance(call, Made)
-    assert call.maker == Name("builtins", "print")
-    assert call.args == ("called",)
-    assert name == Name("builtins", "int")
-
-
-def test_shared_parts_stay_shared():
-    part = [1]
-    first, second = read_pickle(pickle.dumps([part, part]))
-    assert first is second
+    assert (call.name, call.args) == ("builtins.print", ("called",))
+    assert name == Name("builtins.int")
 
 
 @pytest.mark.parametrize("axes", [(0, 1, 2), (1, 2, 0)])

@@ -33,7 +33,7 @@ from stable_baselines3.common.utils import (
 )
 
 from rl_yardstick.agents.common.schedules import ExponentialSchedule
-from rl_yardstick.safe_files.archives import MEMBERS, parse_settings, read_members
+from rl_yardstick.safe_files.archives import parse_settings, read_model_members
 from rl_yardstick.safe_files.files import (
     MAX_ARCHIVE_BYTES,
     Budget,
@@ -292,7 +292,7 @@ class JsonAlgorithm(BaseAlgorithm):
         """
         content = _content(path)
         budget = Budget(len(content))
-        members = read_members(content, MEMBERS, budget)
+        members = read_model_members(content, budget)
         if print_system_info:
             text = members.get("system_info.txt", b"").decode("ascii", "replace")
             # No control characters for the terminal.

@@ -87,7 +87,7 @@ def unpacked(content: object) -> Answer:
     if sealed(archive) != content:
         raise RefusedAnswerError("it is damaged")
     try:
-        files = read_members(archive, most=MOST_FILES + 1)
+        files = read_members(archive)
         head = json.loads(files.pop(_HEAD, b""))
     except UnsafeFileError as error:
         raise RefusedAnswerError(f"it {error}") from error

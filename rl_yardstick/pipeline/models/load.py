@@ -186,7 +186,7 @@ def _loaded(
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     from rl_yardstick.agents.common.model_files import JsonAlgorithm
-    from rl_yardstick.safe_files import load_model
+    from rl_yardstick.safe_files.models import load_model
 
     if _is_load_of(JsonAlgorithm, algorithm):
         return algorithm.load(file.stream(), env=env, **kwargs)
@@ -261,7 +261,7 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     from rl_yardstick.agents.library import MaskedReplayBuffer
-    from rl_yardstick.safe_files import load_replay_buffer as load_safely
+    from rl_yardstick.safe_files.buffers_and_statistics import load_replay_buffer as load_safely
     from rl_yardstick.safe_files.files import MAX_BUFFER_BYTES
 
     if not isinstance(model, OffPolicyAlgorithm):

@@ -48,7 +48,7 @@ from rl_yardstick.report.page.frame import (
     template_file,
     templates,
 )
-from rl_yardstick.safe_files.files import NO_LIMIT, UnsafeFileError, hold, read_file
+from rl_yardstick.safe_files.files import NO_LIMIT, UnsafeFileError, read_file
 
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
@@ -374,7 +374,6 @@ def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
 
 def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:
     """Train again in ``folder``, compare with the run, write the page; return what it shows."""
-    hold(path.parents[2])  # the study
     import_again(planned.spec.user_modules)
     spec = replace(planned.spec, log_folder=folder, tensorboard_log=None, watch_learning=path)
     training = prepare(spec, Console(quiet=True), {}, "", keeping=WITHOUT_STATES)
